@@ -1,0 +1,1 @@
+"""eitbench: process tomography as Gymnasium environments, with honest baselines and scores."""

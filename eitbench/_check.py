@@ -1,0 +1,65 @@
+"""Argument checks that name the argument, what came and what was expected."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+import numpy as np
+
+
+def number(name: str, value: object, *, low: float = -math.inf, high: float = math.inf, open_low: bool = False,
+           units: str = "") -> float:
+    """``value`` as a finite float within [low, high] (``open_low``: within (low, high]); else a ``ValueError``."""
+    try:
+        result = float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} must be a number{_in(units)}, got {value!r}") from None
+    if not math.isfinite(result) or result > high or result < low or (open_low and result == low):
+        bracket = "(" if open_low else "["
+        raise ValueError(f"{name} must be a finite number in {bracket}{low:g}, {high:g}]{_in(units)}, got {value!r}")
+    return result
+
+
+def integer(name: str, value: object, *, low: int, high: int | None = None) -> int:
+    """``value`` as an int within [low, high]; else a ``ValueError``."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < low or (
+            high is not None and value > high):
+        above = "" if high is None else f" and at most {high}"
+        raise ValueError(f"{name} must be an integer of at least {low}{above}, got {value!r}")
+    return int(value)
+
+
+def array(name: str, value: object, shape: Iterable[int | None], *, units: str = "",
+          positive: bool = False) -> np.ndarray:
+    """``value`` as a finite float64 array whose trailing axes match ``shape`` (``None``: any length).
+
+    A leading ``-1`` in ``shape`` stands for any number of batch axes.
+    """
+    wanted = list(shape)
+    batched = bool(wanted) and wanted[0] == -1
+    core = wanted[1:] if batched else wanted
+    try:
+        result = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} must be an array of numbers{_in(units)}, got {type(value).__name__}") from None
+    trailing = result.shape[result.ndim - len(core):] if result.ndim >= len(core) else ()
+    fits = (result.ndim >= len(core) if batched else result.ndim == len(core)) and all(
+        want is None or want == have for want, have in zip(core, trailing, strict=True))
+    if not fits:
+        text = ", ".join((["..."] if batched else []) + ["any" if w is None else str(w) for w in core])
+        raise ValueError(f"{name} must have shape ({text}), got {result.shape}")
+    if not np.isfinite(result).all():
+        raise ValueError(f"{name} must be finite{_in(units)}, got {np.count_nonzero(~np.isfinite(result))} "
+                         f"entries that are not, the first at index {_first(~np.isfinite(result))}")
+    if positive and not (result > 0).all():
+        raise ValueError(f"{name} must be positive{_in(units)}, got {result.min():g} at index {_first(result <= 0)}")
+    return result
+
+
+def _first(mask: np.ndarray) -> tuple[int, ...]:
+    return tuple(int(i) for i in np.argwhere(mask)[0])
+
+
+def _in(units: str) -> str:
+    return f" in {units}" if units else ""

@@ -1,0 +1,160 @@
+"""`simulate(scenario, seed) -> Episode`: the truth, computed once and kept in a cache on disk.
+
+Currents do not move the fluid, so an episode's whole measurement content is one transfer-resistance matrix a step.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import tempfile
+import zipfile
+from dataclasses import asdict
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy
+from tqdm import tqdm
+
+from eitbench import _check
+from eitbench.scenarios.base import Discretisation, Scenario
+
+CACHE_VARIABLE = "EITBENCH_CACHE"
+
+
+class Episode(NamedTuple):
+    """What happened, t = 0 … T. The truth: no estimator or policy ever holds one."""
+
+    concentration: np.ndarray
+    """(T + 1, n_truth) float32 nodal concentration in mol/m³ on the truth's CD mesh."""
+    transfer_resistance: np.ndarray
+    """(T, L, L) 𝓡 at t = 1 … T in Ω (Ω·m in 2D)."""
+    noise: np.ndarray
+    """(T, L) standard normal draws, one a reading."""
+
+    def voltages(self, step: int, currents: np.ndarray, scenario: Scenario) -> np.ndarray:
+        """Noisy voltages (L,) in V when ``currents`` (L,) in A (A/m in 2D) are injected at step 1 … T."""
+        clean = self.transfer_resistance[step - 1] @ currents
+        return clean + scenario.noise.std(clean) * self.noise[step - 1]
+
+
+def simulate(scenario: Scenario, seed: int, *, cache: bool = True, progress: bool = True) -> Episode:
+    """The episode of ``scenario`` with this seed, from the cache if it is there.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    seed : int
+        ≥ 0; see `eitbench.seeds` for the public ranges.
+    cache : bool
+        Read from and write to the cache folder ($EITBENCH_CACHE, by default in the user's cache folder). A file that
+        is damaged or of another version, scenario or seed is replaced.
+    progress : bool
+        Show a progress bar, on a terminal only.
+    """
+    seed = _check.integer("seed", seed, low=0)
+    if not cache:
+        return _simulate(scenario, seed, progress)
+    identity = _identity(scenario, seed)
+    path = cache_folder() / f"{type(scenario).__name__}-{_digest(identity.encode())[:16]}-{seed}.npz"
+    episode = _load(path, identity)
+    if episode is None:
+        episode = _simulate(scenario, seed, progress)
+        _store(path, identity, episode)
+    return episode
+
+
+@lru_cache(maxsize=4)
+def truth_discretisation(scenario: Scenario) -> Discretisation:
+    """``scenario.truth()``, built once a process."""
+    return scenario.truth()
+
+
+def _simulate(scenario: Scenario, seed: int, progress: bool) -> Episode:
+    truth = truth_discretisation(scenario)
+    transport, observation = truth
+    flow_rng, noise_rng = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(2))
+    inflow = scenario.draw_inflow(flow_rng)
+    inlet = transport.mesh.points[transport.inlet]
+    noise = noise_rng.standard_normal((scenario.n_steps, observation.cem.n_electrodes))
+
+    c = np.full(transport.mesh.n_nodes, scenario.background)
+    states, resistances = [], []
+    steps = range(-scenario.lead_in + 1, scenario.n_steps + 1)
+    for t in tqdm(steps, desc=f"simulating {type(scenario).__name__}, seed {seed}", unit="step", leave=False,
+                  disable=None if progress else True):
+        for k in range(scenario.truth_steps):
+            before = (t - 1) * scenario.time_step + k * transport.time_step
+            c = transport.step(c, inflow(inlet, before), inflow(inlet, before + transport.time_step))
+        if t >= 0:
+            states.append(c.astype(np.float32))
+        if t >= 1:
+            resistances.append(observation.transfer_resistance(c))
+    return Episode(np.stack(states), np.stack(resistances), noise)
+
+
+# -- cache ------------------------------------------------------------------------------------------------------------
+
+
+def cache_folder() -> Path:
+    """Where episodes are kept: $EITBENCH_CACHE, else $XDG_CACHE_HOME/eitbench, else ~/.cache/eitbench."""
+    if os.environ.get(CACHE_VARIABLE):
+        return Path(os.environ[CACHE_VARIABLE])
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "eitbench"
+
+
+def _identity(scenario: Scenario, seed: int) -> str:
+    """All that the numbers depend on: scenario, seed, the code that simulates, and the libraries beneath it."""
+    return json.dumps({"scenario": type(scenario).__name__, "fields": asdict(scenario), "seed": seed,   # type: ignore
+                       "code": _code_digest(), "numpy": np.__version__, "scipy": scipy.__version__}, sort_keys=True)
+
+
+@lru_cache(maxsize=1)
+def _code_digest() -> str:
+    here = Path(__file__).parent
+    files = sorted([*here.glob("physics/*.py"), *here.glob("scenarios/*.py"), Path(__file__)])
+    return _digest(b"".join(file.read_bytes() for file in files))
+
+
+def _digest(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
+
+
+def _store(path: Path, identity: str, episode: Episode) -> None:
+    """Written beside its place and moved there, so that a reader sees a whole file or none."""
+    content = io.BytesIO()
+    np.savez_compressed(content, identity=identity, checksum=_checksum(episode), **episode._asdict())
+    write_atomically(path, content.getvalue())
+
+
+def write_atomically(path: Path, data: bytes) -> None:
+    """Put ``data`` into ``path`` so that nobody ever sees half of it; parent folders are made."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(data)
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def _load(path: Path, identity: str) -> Episode | None:
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            if str(stored["identity"]) != identity:
+                return None
+            arrays: dict[str, Any] = {name: stored[name] for name in Episode._fields}
+            episode = Episode(**arrays)
+            return episode if str(stored["checksum"]) == _checksum(episode) else None
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zipfile.error):
+        return None
+
+
+def _checksum(episode: Episode) -> str:
+    return _digest(b"".join(np.ascontiguousarray(array).tobytes() for array in episode))

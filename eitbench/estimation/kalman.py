@@ -1,0 +1,146 @@
+"""Kalman filtering of a large state seen through few measurements, exactly: P = Π − Z Zᵀ (problem.md §7)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
+
+from eitbench.estimation.covariance import FreeCovariance
+
+
+class Observation(NamedTuple):
+    """value = matrix c + v, with independent v."""
+
+    matrix: np.ndarray
+    """(m, n)"""
+    value: np.ndarray
+    """(m,)"""
+    noise_variance: np.ndarray
+    """(m,)"""
+
+
+class FilterStep(NamedTuple):
+    """One step of the filter: what a smoother needs to come back over it."""
+
+    time: int
+    predicted_mean: np.ndarray
+    """(n,) c_{t|t−1}"""
+    known: np.ndarray
+    """(n, r) Z with Γ_{t|t−1} = Π_t − Z Zᵀ"""
+    mean: np.ndarray
+    """(n,) c_{t|t}"""
+    variance: np.ndarray
+    """(n,) diagonal of Γ_{t|t}"""
+    matrix: np.ndarray
+    """(m, n) observation matrix H"""
+    cross_covariance: np.ndarray
+    """(n, m) Γ_{t|t−1} Hᵀ"""
+    innovation: np.ndarray
+    """(m,) ν"""
+    innovation_covariance: np.ndarray
+    """(m, m) S"""
+
+
+class KalmanFilter:
+    """The Kalman filter of c⁺ = F c + s + w for small m and large n, without n×n products.
+
+    The covariance is Π_t − Z Zᵀ: Π_t, the covariance without data, is known beforehand; Z gains m columns at every
+    measurement, moves with F, and is compressed to its numerical rank, which stays far below n.
+
+    Parameters
+    ----------
+    transition : (n, n)
+        F.
+    forcing : (n,)
+        s, the deterministic input.
+    mean : (n,)
+        c_{0|0}.
+    covariance : FreeCovariance
+        Π_t; Π_0 = Γ_{0|0}.
+    rank_tolerance : float
+        Directions of Z shorter than this part of its longest are dropped; the covariance loses the square of it.
+    """
+
+    def __init__(self, transition: np.ndarray, forcing: np.ndarray, mean: np.ndarray, covariance: FreeCovariance, *,
+                 rank_tolerance: float = 1e-6) -> None:
+        self.transition, self.forcing, self.covariance = transition, forcing, covariance
+        self.rank_tolerance = rank_tolerance
+        self.time = 0
+        self.mean = np.array(mean, dtype=float)
+        self.known = np.zeros((len(self.mean), 0))
+
+    def predict(self) -> None:
+        """Move one time step on."""
+        self.mean = self.transition @ self.mean + self.forcing
+        self.known = self.transition @ self.known
+        self.time += 1
+
+    def update(self, observation: Observation) -> FilterStep:
+        """Take in one measurement of the present state."""
+        H, value, noise_variance = observation
+        before, known = self.mean, self.known
+        cross = self.covariance.apply(self.time, H.T) - known @ (known.T @ H.T)
+        S = H @ cross
+        S = 0.5 * (S + S.T) + np.diag(noise_variance)
+        innovation = value - H @ before
+        factor = cho_factor(S, lower=True)
+        self.mean = before + cross @ cho_solve(factor, innovation)
+        gained = solve_triangular(factor[0], cross.T, lower=True).T                      # Γ Hᵀ L⁻ᵀ
+        self.known = compressed(np.hstack([known, gained]), self.rank_tolerance)
+        variance = self.covariance.diagonal(self.time) - (self.known**2).sum(axis=1)
+        return FilterStep(self.time, before, known, self.mean, variance, H, cross, innovation, S)
+
+
+def compressed(Z: np.ndarray, tolerance: float) -> np.ndarray:
+    """A matrix with fewer columns and the same Z Zᵀ up to (tolerance·‖Z‖)²."""
+    values, vectors = np.linalg.eigh(Z.T @ Z)
+    keep = values > tolerance**2 * values[-1]
+    return Z if keep.all() else Z @ vectors[:, keep]
+
+
+def kalman_filter(start: KalmanFilter, observations: Iterable[Observation]) -> list[FilterStep]:
+    """Run ``start`` over a whole record: predict, then update, for each observation."""
+    steps = []
+    for observation in observations:
+        start.predict()
+        steps.append(start.update(observation))
+    return steps
+
+
+# -- nonlinear observations -------------------------------------------------------------------------------------------
+
+
+class _ObservationModel(Protocol):
+    def linearise(self, concentration: np.ndarray, currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]: ...
+
+
+class _Noise(Protocol):
+    def std(self, voltages: np.ndarray) -> np.ndarray: ...
+
+
+def linearised(model: _ObservationModel, noise: _Noise, point: np.ndarray, voltages: np.ndarray,
+               currents: np.ndarray) -> Observation:
+    """V_t − R_t(c*) + J_t c* = J_t c + v (thesis 5.2), linearised at ``point`` (n,) for one injection (L,).
+
+    The noise is that of the voltages computed at the point.
+    """
+    computed, jacobian = (array[0] for array in model.linearise(point, currents[None]))
+    return Observation(jacobian, voltages - computed + jacobian @ point, noise.std(computed)**2)
+
+
+class LinearisedObservations:
+    """`linearised` at one point for all injections of an episode; each pattern is computed once."""
+
+    def __init__(self, model: _ObservationModel, noise: _Noise, point: np.ndarray) -> None:
+        self.model, self.noise, self.point = model, noise, point
+        self._seen: dict[bytes, Observation] = {}
+
+    def __call__(self, voltages: np.ndarray, currents: np.ndarray) -> Observation:
+        key = currents.tobytes()
+        if key not in self._seen:
+            self._seen[key] = linearised(self.model, self.noise, self.point, np.zeros_like(voltages), currents)
+        matrix, offset, variance = self._seen[key]
+        return Observation(matrix, voltages + offset, variance)

@@ -1,0 +1,258 @@
+"""Electrical impedance tomography with the complete electrode model (CEM; problem.md §2, thesis ch. 4).
+
+∇·(σ∇u) = 0 in Ω,  u + z_l σ ∂u/∂n = U_l on electrode e_l,  ∫_{e_l} σ ∂u/∂n = I_l,  σ ∂u/∂n = 0 elsewhere,  ΣI = ΣU = 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import scipy.sparse as sp
+import skfem
+from scipy.sparse.linalg import SuperLU, splu
+from skfem.helpers import dot, grad
+
+from eitbench import _check
+from eitbench.physics.fem import element, to_skfem
+from eitbench.physics.mesh import Mesh
+
+
+class CompleteElectrodeModel:
+    """Electrode voltages, and their derivatives, for a nodal conductivity.
+
+    Voltages are linear in the currents, so for one conductivity everything is in one symmetric L×L matrix,
+    U = 𝓡 I with 𝓡1 = 0: one sparse factorisation and L − 1 right-hand sides serve every injection.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        2D or 3D; the conductivity is linear on its cells and given at its nodes.
+    electrodes : sequence of (k, d) int arrays
+        The boundary facets of each electrode, as node numbers (pairs in 2D, triples in 3D).
+    contact_impedance : float or (L,)
+        z_l in Ω·m², > 0.
+    order : int
+        1 or 2: polynomial order of the potential. First order is wrong by several noise standard deviations on meshes
+        of a few thousand unknowns.
+
+    Raises
+    ------
+    ValueError
+        If there are fewer than two electrodes, a facet is not on the boundary, two electrodes share a facet, or a
+        contact impedance is not positive.
+    """
+
+    def __init__(self, mesh: Mesh, electrodes: Sequence[np.ndarray], contact_impedance: float | np.ndarray,
+                 order: int = 2) -> None:
+        self.mesh = mesh
+        self.order = order
+        self.electrodes = _checked_electrodes(mesh, electrodes)
+        self.n_electrodes = n_electrodes = len(self.electrodes)
+        z = np.asarray(contact_impedance, dtype=float)
+        if z.ndim == 0:
+            z = np.full(n_electrodes, float(z))
+        self.contact_impedance = _check.array("contact_impedance", z, (n_electrodes,), units="Ω·m²", positive=True)
+
+        basis = skfem.Basis(to_skfem(mesh), element(mesh.dim, order), intorder=2 * order - 1)
+        n = basis.N
+        self.n_unknowns = n + n_electrodes - 1
+        contact, rows, columns, derivatives = self._contact_terms(basis), *_conduction(basis)
+        # The last electrode is grounded: without its row and column the system is symmetric positive definite.
+        pattern = sp.coo_array((np.ones(len(rows)), (rows, columns)), shape=contact.shape).tocsc()
+        pattern = (pattern + abs(contact))[:-1, :-1].tocsc()
+        order_ = splu(sp.csc_matrix(_diagonally_dominant(pattern)), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
+                      options={"SymmetricMode": True}).perm_c
+        self._place = np.empty(self.n_unknowns, dtype=np.int64)           # position of an unknown in the solver's order
+        self._place[:] = order_
+        self._assemble_into(pattern, contact[:-1, :-1].tocoo(), rows, columns, derivatives)
+
+        loads = np.zeros((self.n_unknowns, n_electrodes - 1))
+        loads[self._place[n:], np.arange(n_electrodes - 1)] = 1.0
+        self._loads = loads
+        # Mean-free currents and potentials: P = I − 11ᵀ/L on both sides of the grounded solution.
+        self._centre = np.eye(n_electrodes) - 1.0 / n_electrodes
+        self._gradient, self._test = _field_operators(basis)
+        self._n_potential = n
+
+    # -- public ---------------------------------------------------------------------------------------------------
+
+    def transfer_resistance(self, conductivity: np.ndarray) -> np.ndarray:
+        """𝓡 with U = 𝓡 I for every injection.
+
+        Parameters
+        ----------
+        conductivity : (..., n_nodes) float
+            σ at the mesh nodes in S/m, finite and > 0.
+
+        Returns
+        -------
+        (..., L, L) array in Ω (Ω·m in 2D, where currents are per metre of depth); symmetric, rows sum to zero.
+        """
+        sigma = self._checked_conductivity(conductivity, batched=True)
+        flat = sigma.reshape(-1, self.mesh.n_nodes)
+        result = np.stack([self._resistance(self._solve(s)) for s in flat])
+        return result.reshape(*sigma.shape[:-1], self.n_electrodes, self.n_electrodes)
+
+    def voltages(self, conductivity: np.ndarray, currents: np.ndarray) -> np.ndarray:
+        """Electrode potentials (K, L) in V for currents (K, L) in A (A/m in 2D) that sum to zero; rows sum to zero."""
+        currents = self._checked_currents(currents)
+        return currents @ self.transfer_resistance(self._checked_conductivity(conductivity))
+
+    def jacobian(self, conductivity: np.ndarray, currents: np.ndarray) -> np.ndarray:
+        """dU/dσ, (K, L, n_nodes) in V·m/S, by adjoint fields: ∂U_m/∂σ_j = −∫ φ_j ∇u·∇w_m."""
+        return self.linearise(conductivity, currents)[1]
+
+    def linearise(self, conductivity: np.ndarray, currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """`voltages` and `jacobian` together, from one factorisation."""
+        currents = self._checked_currents(currents)
+        solution = self._solve(self._checked_conductivity(conductivity))
+        voltages = currents @ self._resistance(solution)
+        potential = solution[self._place[:self._n_potential]]
+        # The field of unit current at electrode m, taken out evenly at all: column m of W; u = W I needs no new solve.
+        fields = np.concatenate([potential, np.zeros((len(potential), 1))], axis=1) @ self._centre
+        E = (self._gradient @ fields).reshape(self.mesh.dim, -1, self.n_electrodes)
+        jacobian = np.empty((len(currents), self.n_electrodes, self.mesh.n_nodes))
+        for k, current in enumerate(currents):
+            product = np.einsum("dqm,dq->qm", E, E @ current)
+            jacobian[k] = -(self._test @ product).T
+        return voltages, jacobian
+
+    # -- the linear system ------------------------------------------------------------------------------------------
+
+    def _contact_terms(self, basis: skfem.CellBasis) -> sp.csr_array:
+        """Σ_l (1/z_l)∫_{e_l}(u − U_l)(φ − Φ_l) on all N + L unknowns."""
+        mesh = basis.mesh
+        number = {tuple(facet): i for i, facet in enumerate(np.sort(mesh.facets, axis=0).T.tolist())}
+        mass = sp.csr_array((basis.N, basis.N))
+        loads = []
+        for facets, z in zip(self.electrodes, self.contact_impedance, strict=True):
+            wall = skfem.FacetBasis(mesh, element(self.mesh.dim, self.order), intorder=2 * self.order,
+                                    facets=np.array([number[tuple(facet)] for facet in facets.tolist()]))
+            mass = mass + sp.csr_array(_wall_mass.assemble(wall)) / z
+            loads.append(_wall_load.assemble(wall) / z)
+        load = sp.csr_array(np.stack(loads, axis=1))
+        return sp.block_array([[mass, -load], [-load.T, sp.diags_array(load.sum(axis=0))]], format="csr")
+
+    def _assemble_into(self, pattern: sp.csc_array, contact: sp.coo_array, rows: np.ndarray, columns: np.ndarray,
+                       derivatives: sp.csr_array) -> None:
+        """Prepare K(σ).data = constant + D σ on the fixed, reordered sparsity pattern."""
+        coo = pattern.tocoo()
+        permuted = sp.csc_array((np.ones(coo.nnz), (self._place[coo.row], self._place[coo.col])), shape=pattern.shape)
+        permuted.sort_indices()
+        self._indices, self._indptr = permuted.indices, permuted.indptr
+        n = pattern.shape[0]
+        positions = (np.repeat(np.arange(n), np.diff(permuted.indptr)) * n + permuted.indices).astype(np.int64)
+
+        def slot(row: np.ndarray, column: np.ndarray) -> np.ndarray:
+            return np.searchsorted(positions, self._place[column].astype(np.int64) * n + self._place[row])
+
+        gather = sp.csr_array((np.ones(len(rows)), (slot(rows, columns), np.arange(len(rows)))),
+                              shape=(permuted.nnz, len(rows)))
+        self._derivatives = (gather @ derivatives).tocsr()
+        self._constant = np.zeros(permuted.nnz)
+        np.add.at(self._constant, slot(contact.row, contact.col), contact.data)
+
+    def _factorise(self, conductivity: np.ndarray) -> SuperLU:
+        data = self._constant + self._derivatives @ conductivity
+        matrix = sp.csc_matrix((data, self._indices, self._indptr), shape=(self.n_unknowns, self.n_unknowns))
+        return splu(matrix, permc_spec="NATURAL", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+
+    def _solve(self, conductivity: np.ndarray) -> np.ndarray:
+        """Potentials, in the solver's order, for a unit current in at each electrode and out at the last one."""
+        return self._factorise(conductivity).solve(self._loads)
+
+    def _resistance(self, solution: np.ndarray) -> np.ndarray:
+        grounded = np.zeros((self.n_electrodes, self.n_electrodes))
+        grounded[:-1, :-1] = solution[self._place[self._n_potential:]]
+        resistance = self._centre @ grounded @ self._centre
+        return 0.5 * (resistance + resistance.T)
+
+    # -- checks -----------------------------------------------------------------------------------------------------
+
+    def _checked_conductivity(self, conductivity: np.ndarray, batched: bool = False) -> np.ndarray:
+        shape = (-1, self.mesh.n_nodes) if batched else (self.mesh.n_nodes,)
+        return _check.array("conductivity", conductivity, shape, units="S/m", positive=True)
+
+    def _checked_currents(self, currents: np.ndarray) -> np.ndarray:
+        currents = _check.array("currents", currents, (None, self.n_electrodes), units="A")
+        surplus = np.abs(currents.sum(axis=1))
+        wrong = surplus > 1e-9 * np.abs(currents).sum(axis=1)
+        if wrong.any():
+            k = int(np.flatnonzero(wrong)[0])
+            raise ValueError(f"currents must sum to zero over the electrodes; pattern {k} sums to "
+                             f"{currents[k].sum():g} A")
+        return currents
+
+
+@skfem.BilinearForm
+def _wall_mass(u, v, _w):
+    return u * v
+
+
+@skfem.LinearForm
+def _wall_load(v, _w):
+    return v
+
+
+@skfem.TrilinearForm
+def _conduction_form(s, u, v, _w):
+    return s * dot(grad(u), grad(v))
+
+
+def _conduction(basis: skfem.CellBasis) -> tuple[np.ndarray, np.ndarray, sp.csr_array]:
+    """∫σ∇u·∇φ as local entries: their rows, columns, and their derivatives (entries, n_nodes) by nodal σ."""
+    sigma = basis.with_element(element(basis.mesh.dim(), 1))
+    tensor = _conduction_form.coo_data(sigma, basis, basis)
+    i, j, k = (np.asarray(index, dtype=np.int64) for index in tensor.indices)
+    key, slot = np.unique(i * basis.N + j, return_inverse=True)
+    derivatives = sp.csr_array((tensor.data, (slot, k)), shape=(len(key), sigma.N))
+    return key // basis.N, key % basis.N, derivatives
+
+
+def _field_operators(basis: skfem.CellBasis) -> tuple[sp.csr_array, sp.csr_array]:
+    """∇ at all quadrature points, (d·Q, N), and the weighted P1 tests ∫φ_j · , (n_nodes, Q)."""
+    quadrature = skfem.Basis(basis.mesh, basis.elem, intorder=2 * (basis.elem.maxdeg - 1) + 1)
+    d, n_cells, n_points = quadrature.global_coordinates().value.shape
+    size = n_cells * n_points
+    point = np.arange(size)
+    gradient = sum(
+        sp.csr_array((phi[0].grad.reshape(d * size), (np.arange(d * size), np.tile(np.repeat(dofs, n_points), d))),
+                     shape=(d * size, basis.N))
+        for phi, dofs in zip(quadrature.basis, quadrature.element_dofs, strict=True))
+    sigma = quadrature.with_element(element(basis.mesh.dim(), 1))
+    test = sum(
+        sp.csr_array(((np.broadcast_to(phi[0].value, (n_cells, n_points)) * quadrature.dx).ravel(),
+                      (np.repeat(dofs, n_points), point)), shape=(sigma.N, size))
+        for phi, dofs in zip(sigma.basis, sigma.element_dofs, strict=True))
+    return gradient.tocsr(), test.tocsr()
+
+
+def _diagonally_dominant(pattern: sp.csc_array) -> sp.csc_array:
+    """A matrix with this symmetric pattern that any ordering factorises."""
+    ones = pattern.copy()
+    ones.data = np.full(pattern.nnz, -1.0)
+    return (ones + sp.diags_array(2.0 + np.diff(pattern.indptr).astype(float))).tocsc()
+
+
+def _checked_electrodes(mesh: Mesh, electrodes: Sequence[np.ndarray]) -> list[np.ndarray]:
+    if len(electrodes) < 2:
+        raise ValueError(f"electrodes must be at least two, got {len(electrodes)}")
+    boundary = {tuple(facet) for facet in mesh.boundary_facets.tolist()}
+    owner: dict[tuple[int, ...], int] = {}
+    checked = []
+    for number, facets in enumerate(electrodes):
+        facets = np.asarray(facets)
+        if facets.ndim != 2 or facets.shape[1] != mesh.dim or len(facets) == 0 or not np.issubdtype(
+                facets.dtype, np.integer):
+            raise ValueError(f"electrodes[{number}] must be integers of shape (n_facets ≥ 1, {mesh.dim}), "
+                             f"got {facets.dtype} of shape {facets.shape}")
+        facets = np.sort(facets, axis=1)
+        for facet in map(tuple, facets.tolist()):
+            if facet not in boundary:
+                raise ValueError(f"electrodes[{number}] has facet {facet}, which is not on the mesh's boundary")
+            if facet in owner:
+                raise ValueError(f"electrodes[{number}] and electrodes[{owner[facet]}] overlap: both hold facet {facet}")
+            owner[facet] = number
+        checked.append(facets)
+    return checked

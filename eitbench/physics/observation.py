@@ -1,0 +1,149 @@
+"""What EIT sees of a concentration: σ(c), voltages and their derivatives by c, and measurement noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import scipy.sparse as sp
+
+from eitbench import _check
+from eitbench.physics.cem import CompleteElectrodeModel
+
+
+class ConductivityLaw(Protocol):
+    """σ(c) in S/m for c in mol/m³, and its derivative in S·m²/mol, entry by entry."""
+
+    def __call__(self, concentration: np.ndarray) -> np.ndarray: ...
+
+    def derivative(self, concentration: np.ndarray) -> np.ndarray: ...
+
+
+@dataclass(frozen=True)
+class LinearConductivity:
+    """σ = Λ c, as in the thesis' pipe example (5.1.1).
+
+    Parameters
+    ----------
+    molar_conductivity : float
+        Λ in S·m²/mol, > 0. Sodium chloride around 30 mol/m³: about 0.011.
+    """
+
+    molar_conductivity: float
+
+    def __post_init__(self) -> None:
+        _check.number("molar_conductivity", self.molar_conductivity, low=0.0, open_low=True, units="S·m²/mol")
+
+    def __call__(self, concentration: np.ndarray) -> np.ndarray:
+        return self.molar_conductivity * concentration
+
+    def derivative(self, concentration: np.ndarray) -> np.ndarray:
+        return np.full_like(concentration, self.molar_conductivity)
+
+
+@dataclass(frozen=True)
+class KohlrauschConductivity:
+    """σ = (Λ₀ − K√c) c, Kohlrausch's square-root law of strong electrolytes; rises up to c = (2Λ₀/3K)².
+
+    The defaults are sodium chloride in water at 25 °C by Onsager's limiting law, Λ₀ = 126.45 and K = 89.1 in
+    S·cm²/mol with c in mol/l (Robinson & Stokes, *Electrolyte Solutions*, 1959), in SI units.
+
+    Parameters
+    ----------
+    limiting_molar_conductivity : float
+        Λ₀ in S·m²/mol, > 0.
+    kohlrausch_coefficient : float
+        K in S·m²/mol per √(mol/m³), ≥ 0.
+    """
+
+    limiting_molar_conductivity: float = 0.012645
+    kohlrausch_coefficient: float = 89.1e-4 / np.sqrt(1000.0)
+
+    def __post_init__(self) -> None:
+        _check.number("limiting_molar_conductivity", self.limiting_molar_conductivity, low=0.0, open_low=True,
+                      units="S·m²/mol")
+        _check.number("kohlrausch_coefficient", self.kohlrausch_coefficient, low=0.0,
+                      units="S·m²/mol per √(mol/m³)")
+
+    def __call__(self, concentration: np.ndarray) -> np.ndarray:
+        return (self.limiting_molar_conductivity - self.kohlrausch_coefficient * np.sqrt(concentration)) * concentration
+
+    def derivative(self, concentration: np.ndarray) -> np.ndarray:
+        return self.limiting_molar_conductivity - 1.5 * self.kohlrausch_coefficient * np.sqrt(concentration)
+
+
+@dataclass(frozen=True)
+class VoltageNoise:
+    """Independent Gaussian noise, std² = (relative·reading)² + (of_largest·largest voltage)² + floor² (thesis 5.1.1).
+
+    The largest voltage is that of the same injection. Without ``floor`` the noise scales with the current.
+
+    Parameters
+    ----------
+    relative : float
+        Part of the reading, ≥ 0; the thesis has 0.01.
+    of_largest : float
+        Part of the largest voltage of the injection, ≥ 0; the thesis has 0.001.
+    floor : float
+        Absolute std in V, ≥ 0; the thesis has none.
+    """
+
+    relative: float = 0.01
+    of_largest: float = 0.001
+    floor: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("relative", "of_largest"):
+            _check.number(name, getattr(self, name), low=0.0)
+        _check.number("floor", self.floor, low=0.0, units="V")
+
+    def std(self, voltages: np.ndarray) -> np.ndarray:
+        """Standard deviation (V) of each reading for noise-free ``voltages`` (..., L)."""
+        largest = np.abs(voltages).max(axis=-1, keepdims=True)
+        return np.sqrt((self.relative * voltages)**2 + (self.of_largest * largest)**2 + self.floor**2)
+
+
+class ObservationModel:
+    """Voltages for a nodal concentration on the CD mesh: V = R(c).
+
+    The concentration is interpolated linearly to the EIT mesh, which does not conform, and turned into a conductivity
+    there. A concentration below ``smallest_concentration`` counts as that value with the law's slope there, so that σ
+    stays positive whatever an estimator proposes.
+
+    Parameters
+    ----------
+    cem : CompleteElectrodeModel
+    interpolation : (n_eit, n_cd) sparse
+        From CD nodes to EIT nodes, see `Mesh.interpolation_to`.
+    conductivity : ConductivityLaw
+    smallest_concentration : float
+        In mol/m³, > 0.
+    """
+
+    def __init__(self, cem: CompleteElectrodeModel, interpolation: sp.csr_array, conductivity: ConductivityLaw,
+                 smallest_concentration: float) -> None:
+        self.cem = cem
+        self.interpolation = interpolation
+        self.conductivity = conductivity
+        self.smallest_concentration = _check.number("smallest_concentration", smallest_concentration, low=0.0,
+                                                    open_low=True, units="mol/m³")
+
+    def transfer_resistance(self, concentration: np.ndarray) -> np.ndarray:
+        """𝓡 (L, L) in Ω (Ω·m in 2D) for nodal ``concentration`` (n_cd,) in mol/m³."""
+        return self.cem.transfer_resistance(self.conductivity(self._at_eit_nodes(concentration)))
+
+    def voltages(self, concentration: np.ndarray, currents: np.ndarray) -> np.ndarray:
+        """Noise-free voltages (K, L) in V for currents (K, L) in A (A/m in 2D)."""
+        return self.cem.voltages(self.conductivity(self._at_eit_nodes(concentration)), currents)
+
+    def linearise(self, concentration: np.ndarray, currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Voltages (K, L) and their derivative by the nodal concentration, (K, L, n_cd) in V·m³/mol (thesis 5.2)."""
+        c = self._at_eit_nodes(concentration)
+        voltages, by_conductivity = self.cem.linearise(self.conductivity(c), currents)
+        by_node = (by_conductivity * self.conductivity.derivative(c)).reshape(-1, len(c))
+        return voltages, (by_node @ self.interpolation).reshape(*voltages.shape, -1)
+
+    def _at_eit_nodes(self, concentration: np.ndarray) -> np.ndarray:
+        concentration = _check.array("concentration", concentration, (self.interpolation.shape[1],), units="mol/m³")
+        return np.maximum(self.interpolation @ concentration, self.smallest_concentration)

@@ -1,0 +1,90 @@
+"""Scores: arrays in, numbers out (problem.md §4). Lower is better unless said; `E` is the relative error (5.12)."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from scipy.special import ndtr, ndtri
+
+
+def step_errors(estimate: np.ndarray, truth: np.ndarray, mass: Any, reference: float = 0.0) -> np.ndarray:
+    """∫(ĉ_t − c_t)² / ∫(c_t − reference)² for each t.
+
+    Parameters
+    ----------
+    estimate, truth : (T, n)
+        Nodal values on the truth's mesh.
+    mass : (n, n) matrix, may be sparse
+        Mass matrix of that mesh.
+    reference : float
+        0 gives the terms of (5.12); the homogeneous estimate gives the contrast form.
+
+    Returns
+    -------
+    (T,) array, no unit.
+    """
+    estimate, truth = _pair(estimate, truth)
+    return _squares(estimate - truth, mass) / _squares(truth - reference, mass)
+
+
+def relative_error(estimate: np.ndarray, truth: np.ndarray, mass: Any, reference: float = 0.0) -> float:
+    """ẽ_c = (1/T) Σ_t ∫(ĉ_t − c_t)² / ∫c_t² (thesis 5.12: squared, no root); arguments as in `step_errors`."""
+    return float(step_errors(estimate, truth, mass, reference).mean())
+
+
+def voltage_discrepancy(measured: np.ndarray, computed: np.ndarray) -> float:
+    """ẽ_V = 1/(T·N_V) Σ_t ‖V_t − V̂_t‖² in V² for (T, N_V) voltages (thesis 5.13)."""
+    measured, computed = _pair(measured, computed)
+    return float(((measured - computed)**2).mean())
+
+
+def normalised_innovations(innovation: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """NIS/m at each t: νᵀS⁻¹ν/m for innovations (T, m) and covariances (T, m, m); averages 1 in a consistent filter."""
+    whitened = np.linalg.solve(covariance, innovation[..., None])[..., 0]
+    return np.einsum("tm,tm->t", innovation, whitened) / innovation.shape[1]
+
+
+def crps(mean: np.ndarray, std: np.ndarray, truth: np.ndarray, weights: np.ndarray) -> float:
+    """Continuous ranked probability score of Gaussian marginals, averaged over time and, with ``weights`` (n,), space.
+
+    In the unit of the truth. (T, n) arrays; a zero ``std`` gives the absolute error (Gneiting & Raftery 2007).
+    """
+    mean, truth = _pair(mean, truth)
+    error = np.abs(truth - mean)
+    spread = np.maximum(std, 1e-300)
+    z = error / spread
+    density = np.exp(-0.5 * np.minimum(z, 1e150)**2) / math.sqrt(2 * math.pi)
+    score = np.where(std > 0, error * (2 * ndtr(z) - 1) + spread * (2 * density - 1 / math.sqrt(math.pi)), error)
+    return float(np.average(score.mean(axis=0), weights=weights))
+
+
+def coverage(mean: np.ndarray, std: np.ndarray, truth: np.ndarray, weights: np.ndarray, level: float) -> float:
+    """Part of space and time where the truth lies in the central ``level`` interval of the Gaussian marginal."""
+    mean, truth = _pair(mean, truth)
+    return float(np.average((np.abs(truth - mean) <= ndtri(0.5 + level / 2) * std).mean(axis=0),
+                            weights=weights))
+
+
+def spread_ratio(mean: np.ndarray, std: np.ndarray, truth: np.ndarray, weights: np.ndarray) -> float:
+    """Mean variance over mean squared error; 1 when the claimed uncertainty is honest, above when too modest."""
+    mean, truth = _pair(mean, truth)
+    claimed = np.average((std**2).mean(axis=0), weights=weights)
+    return float(claimed / np.average(((mean - truth)**2).mean(axis=0), weights=weights))
+
+
+def skill(error: float, homogeneous: float, reference: float) -> float:
+    """(E_bh − E)/(E_bh − E_ref): 0 for the homogeneous estimate, 1 for the reference; higher is better."""
+    return (homogeneous - error) / (homogeneous - reference)
+
+
+def _pair(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
+    if a.shape != b.shape or a.ndim != 2:
+        raise ValueError(f"both arrays must have the same shape (T, n), got {a.shape} and {b.shape}")
+    return a, b
+
+
+def _squares(field: np.ndarray, mass: Any) -> np.ndarray:
+    return np.einsum("tn,nt->t", field, mass @ field.T)

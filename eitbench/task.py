@@ -1,0 +1,97 @@
+"""`Task`: all that an estimator may know about a scenario, and nothing of what happened in an episode."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from eitbench import _check
+from eitbench.physics.mesh import Mesh
+from eitbench.physics.observation import ObservationModel, VoltageNoise
+from eitbench.physics.transport import ConvectionDiffusion, EvolutionModel
+from eitbench.scenarios.base import Discretisation, Scenario
+
+
+class Estimate(NamedTuple):
+    """What an estimator says about one state."""
+
+    mean: np.ndarray
+    """(n,) concentration at the nodes of `Task.mesh`, mol/m³."""
+    variance: np.ndarray | None = None
+    """(n,) its error variance, (mol/m³)²; None: the estimator makes no claim, and calibration is not scored."""
+    innovation: np.ndarray | None = None
+    """(L,) measured minus predicted voltages, V, before this measurement was used; for NIS."""
+    innovation_covariance: np.ndarray | None = None
+    """(L, L) its covariance, V²."""
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """The estimator's side of a scenario.
+
+    Parameters
+    ----------
+    transport : ConvectionDiffusion
+        The evolution model, on `mesh`.
+    observation : ObservationModel
+        Voltages for a concentration on `mesh`.
+    noise : VoltageNoise
+    currents : (K, L)
+        The injection cycle in A (A/m in 2D).
+    n_steps : int
+        Measurements in an episode, t = 1 … n_steps.
+    warm_up : int
+        States t ≤ warm_up are not scored.
+    lag : int
+        At measurement t the state t − lag is asked for: 0 filters, n_steps − 1 smooths over the whole record.
+    expected_concentration : float
+        Rough level in mol/m³, where the search for the best homogeneous estimate begins.
+    """
+
+    transport: ConvectionDiffusion
+    observation: ObservationModel
+    noise: VoltageNoise
+    currents: np.ndarray = field(repr=False)
+    n_steps: int
+    warm_up: int
+    lag: int
+    expected_concentration: float
+
+    @property
+    def mesh(self) -> Mesh:
+        """Where estimates live: the CD mesh."""
+        return self.transport.mesh
+
+    @property
+    def evolution(self) -> EvolutionModel:
+        """F, Y, H of the transport; computed on first use and shared by all tasks with the same model."""
+        return self.transport.evolution_model()
+
+
+def make_task(scenario: Scenario, lag: int | str = 0, **assumptions: float) -> Task:
+    """The task of ``scenario``.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    lag : int or "all"
+        See `Task`; "all" means the whole record.
+    assumptions
+        Passed to ``scenario.model``: what the estimator wrongly believes, such as ``mean_velocity``.
+    """
+    last = scenario.n_steps - 1
+    if isinstance(lag, str) and lag != "all":
+        raise ValueError(f"lag must be 'all' or an integer from 0 to {last}, got {lag!r}")
+    steps = last if lag == "all" else _check.integer("lag", lag, low=0, high=last)
+    model = _model(scenario, tuple(sorted(assumptions.items())))
+    return Task(model.transport, model.observation, scenario.noise, scenario.currents, scenario.n_steps,
+                scenario.warm_up, steps, scenario.background)
+
+
+@lru_cache(maxsize=4)
+def _model(scenario: Scenario, assumptions: tuple[tuple[str, float], ...]) -> Discretisation:
+    """Built once a process; estimators keep what they derive from it with it."""
+    return scenario.model(**dict(assumptions))
