@@ -48,6 +48,7 @@ def array(name: str, value: object, shape: Iterable[int | None], *, units: str =
         want is None or want == have for want, have in zip(core, trailing, strict=True))
     if not fits:
         text = ", ".join((["..."] if batched else []) + ["any" if w is None else str(w) for w in core])
+        text += "," if len(wanted) == 1 else ""
         raise ValueError(f"{name} must have shape ({text}), got {result.shape}")
     if not np.isfinite(result).all():
         raise ValueError(f"{name} must be finite{_in(units)}, got {np.count_nonzero(~np.isfinite(result))} "

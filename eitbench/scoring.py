@@ -53,9 +53,9 @@ def crps(mean: np.ndarray, std: np.ndarray, truth: np.ndarray, weights: np.ndarr
     """
     mean, truth = _pair(mean, truth)
     error = np.abs(truth - mean)
-    spread = np.maximum(std, 1e-300)
+    spread = np.maximum(std, 1e-12 * np.maximum(error, 1e-300))
     z = error / spread
-    density = np.exp(-0.5 * np.minimum(z, 1e150)**2) / math.sqrt(2 * math.pi)
+    density = np.exp(-0.5 * np.minimum(z, 40.0)**2) / math.sqrt(2 * math.pi)
     score = np.where(std > 0, error * (2 * ndtr(z) - 1) + spread * (2 * density - 1 / math.sqrt(math.pi)), error)
     return float(np.average(score.mean(axis=0), weights=weights))
 

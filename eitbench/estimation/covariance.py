@@ -15,7 +15,7 @@ class FreeCovariance:
     Parameters
     ----------
     transition : (n, n)
-        F, with spectral radius below one.
+        F, with spectral radius below one (or F = I without noise, for a target that stands still).
     noise : (n, n)
         Γ_w.
     initial : (n, n)

@@ -34,7 +34,7 @@ def gauss_newton(model: _ObservationModel, voltages: np.ndarray, currents: np.nd
 
     Returns
     -------
-    (n,) concentration in mol/m³.
+    (n,) concentration in mol/m³; the best found so far if ``max_iterations`` run out or no step lowers the objective.
     """
     dense = penalty.toarray() if sp.issparse(penalty) else np.asarray(penalty)
     weight = (1.0 / noise_std).ravel()
@@ -53,7 +53,7 @@ def gauss_newton(model: _ObservationModel, voltages: np.ndarray, currents: np.nd
         if gradient @ direction < tolerance * now:
             return c + direction
         length = 1.0
-        while misfit(c + length * direction, model.voltages(c + length * direction, currents)) > now:
+        while not misfit(c + length * direction, model.voltages(c + length * direction, currents)) <= now:
             length *= 0.5
             if length < 1e-4:
                 return c

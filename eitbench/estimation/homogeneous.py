@@ -39,6 +39,7 @@ def best_homogeneous(model: _ObservationModel, noise: _Noise, n: int, voltages: 
     """
     # Injections repeat: R(c·1) is needed once for each distinct pattern.
     patterns, which = np.unique(currents, axis=0, return_inverse=True)
+    which = which.reshape(-1)
     weight = 1.0 / noise.std(voltages)
     c = float(start)
     for _ in range(max_iterations):

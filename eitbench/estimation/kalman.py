@@ -96,6 +96,8 @@ class KalmanFilter:
 
 def compressed(Z: np.ndarray, tolerance: float) -> np.ndarray:
     """A matrix with fewer columns and the same Z Zᵀ up to (tolerance·‖Z‖)²."""
+    if Z.shape[1] == 0:
+        return Z
     values, vectors = np.linalg.eigh(Z.T @ Z)
     keep = values > tolerance**2 * values[-1]
     return Z if keep.all() else Z @ vectors[:, keep]

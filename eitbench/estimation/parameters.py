@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from eitbench.estimation.covariance import FreeCovariance
 from eitbench.estimation.kalman import KalmanFilter
-from eitbench.physics.transport import ConvectionDiffusion
+
+if TYPE_CHECKING:
+    from eitbench.physics.transport import ConvectionDiffusion
 
 INFLOW_STD = 1 / 4
 """std of the inflow noise η in parts of ĉ_bh [T]"""

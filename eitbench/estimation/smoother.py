@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -22,41 +22,42 @@ class Smoothed(NamedTuple):
 
 def fixed_interval_smoother(start: KalmanFilter, observations: Iterable[Observation]) -> list[Smoothed]:
     """c_{t|T} for t = 1 … T: filter the record, then come back over it."""
-    return smooth(start, kalman_filter(start, observations))
+    steps = kalman_filter(start, observations)
+    return [_smoothed(start, step, later) for step, later in _backwards(start, steps)][::-1]
 
 
-def smooth(filter_: KalmanFilter, steps: Sequence[FilterStep], first: int = 0) -> list[Smoothed]:
-    """Smoothed states of ``steps[first:]`` given the measurements of all ``steps``.
+def smoothed_state(filter_: KalmanFilter, steps: Sequence[FilterStep]) -> Smoothed:
+    """The state of the first of consecutive ``steps`` of ``filter_`` given the measurements of all of them.
 
-    The adjoint λ and the information N = B Bᵀ of later measurements run backwards,
-        λ_t = Hᵀ S⁻¹ ν + (I − K H)ᵀ Fᵀ λ_{t+1},        B_t = [Hᵀ L⁻ᵀ, (I − K H)ᵀ Fᵀ B_{t+1}],    S = L Lᵀ,
-    and give c_{t|T} = c_{t|t−1} + Γ λ_t and Γ_{t|T} = Γ − Γ N_t Γ with Γ = Γ_{t|t−1} = Π_t − Z Zᵀ. B is compressed to its
-    numerical rank like Z.
-
-    Parameters
-    ----------
-    filter_ : KalmanFilter
-        The filter that made the steps.
-    steps : sequence of FilterStep
-        Consecutive steps up to the last measurement.
-    first : int
-        Where to stop on the way back; ``len(steps) - 1 - lag`` and then the first result make a fixed-lag smoother.
+    With the last k + 1 steps this is the fixed-lag smoother c_{t−k|t}.
     """
-    n = len(filter_.mean)
-    later = np.zeros((n, 1))                                                              # λ, then the columns of B
-    results: list[Smoothed] = []
-    for index in range(len(steps) - 1, first - 1, -1):
-        step = steps[index]
+    *_, (step, later) = _backwards(filter_, steps)
+    return _smoothed(filter_, step, later)
+
+
+def _backwards(filter_: KalmanFilter, steps: Sequence[FilterStep]) -> Iterator[tuple[FilterStep, np.ndarray]]:
+    """(step, [λ, B]) from the last step to the first: what its own and later measurements say.
+
+    The adjoint λ and the information N = B Bᵀ obey, with S = L Lᵀ,
+        λ_t = Hᵀ S⁻¹ ν + (I − K H)ᵀ Fᵀ λ_{t+1},        B_t = [Hᵀ L⁻ᵀ, (I − K H)ᵀ Fᵀ B_{t+1}].
+    B is compressed to its numerical rank like the filter's Z.
+    """
+    later = np.zeros((len(filter_.mean), 1))
+    for step in reversed(steps):
         factor = cho_factor(step.innovation_covariance, lower=True)
-        if index < len(steps) - 1:
+        if step is not steps[-1]:
             later = filter_.transition.T @ later
             later -= step.matrix.T @ cho_solve(factor, step.cross_covariance.T @ later)   # (I − K H)ᵀ
         adjoint = later[:, 0] + step.matrix.T @ cho_solve(factor, step.innovation)
         information = solve_triangular(factor[0], step.matrix, lower=True).T
         information = compressed(np.hstack([later[:, 1:], information]), filter_.rank_tolerance)
         later = np.column_stack([adjoint, information])
+        yield step, later
 
-        seen = filter_.covariance.apply(step.time, later) - step.known @ (step.known.T @ later)   # Γ [λ, B]
-        prior = filter_.covariance.diagonal(step.time) - (step.known**2).sum(axis=1)
-        results.append(Smoothed(step.predicted_mean + seen[:, 0], prior - (seen[:, 1:]**2).sum(axis=1)))
-    return results[::-1]
+
+def _smoothed(filter_: KalmanFilter, step: FilterStep, later: np.ndarray) -> Smoothed:
+    """c_{t|t−1} + Γ λ and the diagonal of Γ − Γ N Γ, with Γ = Γ_{t|t−1} = Π_t − Z Zᵀ."""
+    covariance = filter_.covariance
+    seen = covariance.apply(step.time, later) - step.known @ (step.known.T @ later)
+    prior = covariance.diagonal(step.time) - (step.known**2).sum(axis=1)
+    return Smoothed(step.predicted_mean + seen[:, 0], prior - (seen[:, 1:]**2).sum(axis=1))

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 import scipy.sparse as sp
 import skfem
+from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import SuperLU, splu
 from skfem.helpers import dot, grad
 
@@ -39,8 +40,8 @@ class CompleteElectrodeModel:
     Raises
     ------
     ValueError
-        If there are fewer than two electrodes, a facet is not on the boundary, two electrodes share a facet, or a
-        contact impedance is not positive.
+        If the mesh falls apart, there are fewer than two electrodes, a facet is not on the boundary, two electrodes
+        share a facet, or a contact impedance is not positive.
     """
 
     def __init__(self, mesh: Mesh, electrodes: Sequence[np.ndarray], contact_impedance: float | np.ndarray,
@@ -49,9 +50,7 @@ class CompleteElectrodeModel:
         self.order = order
         self.electrodes = _checked_electrodes(mesh, electrodes)
         self.n_electrodes = n_electrodes = len(self.electrodes)
-        z = np.asarray(contact_impedance, dtype=float)
-        if z.ndim == 0:
-            z = np.full(n_electrodes, float(z))
+        z = np.full(n_electrodes, contact_impedance) if np.ndim(contact_impedance) == 0 else contact_impedance
         self.contact_impedance = _check.array("contact_impedance", z, (n_electrodes,), units="Ω·m²", positive=True)
 
         basis = skfem.Basis(to_skfem(mesh), element(mesh.dim, order), intorder=2 * order - 1)
@@ -61,10 +60,9 @@ class CompleteElectrodeModel:
         # The last electrode is grounded: without its row and column the system is symmetric positive definite.
         pattern = sp.coo_array((np.ones(len(rows)), (rows, columns)), shape=contact.shape).tocsc()
         pattern = (pattern + abs(contact))[:-1, :-1].tocsc()
-        order_ = splu(sp.csc_matrix(_diagonally_dominant(pattern)), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
+        place = splu(sp.csc_matrix(_diagonally_dominant(pattern)), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
                       options={"SymmetricMode": True}).perm_c
-        self._place = np.empty(self.n_unknowns, dtype=np.int64)           # position of an unknown in the solver's order
-        self._place[:] = order_
+        self._place = place.astype(np.int64)                             # position of an unknown in the solver's order
         self._assemble_into(pattern, contact[:-1, :-1].tocoo(), rows, columns, derivatives)
 
         loads = np.zeros((self.n_unknowns, n_electrodes - 1))
@@ -91,7 +89,9 @@ class CompleteElectrodeModel:
         """
         sigma = self._checked_conductivity(conductivity, batched=True)
         flat = sigma.reshape(-1, self.mesh.n_nodes)
-        result = np.stack([self._resistance(self._solve(s)) for s in flat])
+        result = np.empty((len(flat), self.n_electrodes, self.n_electrodes))
+        for one, resistance in zip(flat, result, strict=True):
+            resistance[:] = self._resistance(self._solve(one))
         return result.reshape(*sigma.shape[:-1], self.n_electrodes, self.n_electrodes)
 
     def voltages(self, conductivity: np.ndarray, currents: np.ndarray) -> np.ndarray:
@@ -213,7 +213,7 @@ def _conduction(basis: skfem.CellBasis) -> tuple[np.ndarray, np.ndarray, sp.csr_
 def _field_operators(basis: skfem.CellBasis) -> tuple[sp.csr_array, sp.csr_array]:
     """∇ at all quadrature points, (d·Q, N), and the weighted P1 tests ∫φ_j · , (n_nodes, Q)."""
     quadrature = skfem.Basis(basis.mesh, basis.elem, intorder=2 * (basis.elem.maxdeg - 1) + 1)
-    d, n_cells, n_points = quadrature.global_coordinates().value.shape
+    d, n_cells, n_points = np.asarray(quadrature.global_coordinates()).shape
     size = n_cells * n_points
     point = np.arange(size)
     gradient = sum(
@@ -222,7 +222,7 @@ def _field_operators(basis: skfem.CellBasis) -> tuple[sp.csr_array, sp.csr_array
         for phi, dofs in zip(quadrature.basis, quadrature.element_dofs, strict=True))
     sigma = quadrature.with_element(element(basis.mesh.dim(), 1))
     test = sum(
-        sp.csr_array(((np.broadcast_to(phi[0].value, (n_cells, n_points)) * quadrature.dx).ravel(),
+        sp.csr_array(((np.broadcast_to(np.asarray(phi[0]), (n_cells, n_points)) * quadrature.dx).ravel(),
                       (np.repeat(dofs, n_points), point)), shape=(sigma.N, size))
         for phi, dofs in zip(sigma.basis, sigma.element_dofs, strict=True))
     return gradient.tocsr(), test.tocsr()
@@ -236,6 +236,10 @@ def _diagonally_dominant(pattern: sp.csc_array) -> sp.csc_array:
 
 
 def _checked_electrodes(mesh: Mesh, electrodes: Sequence[np.ndarray]) -> list[np.ndarray]:
+    edges = np.concatenate([mesh.cells[:, [0, i]] for i in range(1, mesh.dim + 1)])
+    pieces, _ = connected_components(sp.coo_array((np.ones(len(edges)), edges.T), shape=(mesh.n_nodes,) * 2))
+    if pieces > 1:
+        raise ValueError(f"mesh must be connected, got {pieces} separate pieces")
     if len(electrodes) < 2:
         raise ValueError(f"electrodes must be at least two, got {len(electrodes)}")
     boundary = {tuple(facet) for facet in mesh.boundary_facets.tolist()}
@@ -251,6 +255,8 @@ def _checked_electrodes(mesh: Mesh, electrodes: Sequence[np.ndarray]) -> list[np
         for facet in map(tuple, facets.tolist()):
             if facet not in boundary:
                 raise ValueError(f"electrodes[{number}] has facet {facet}, which is not on the mesh's boundary")
+            if owner.get(facet) == number:
+                raise ValueError(f"electrodes[{number}] holds facet {facet} twice")
             if facet in owner:
                 raise ValueError(f"electrodes[{number}] and electrodes[{owner[facet]}] overlap: both hold facet {facet}")
             owner[facet] = number

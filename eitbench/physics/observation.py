@@ -39,7 +39,7 @@ class LinearConductivity:
         return self.molar_conductivity * concentration
 
     def derivative(self, concentration: np.ndarray) -> np.ndarray:
-        return np.full_like(concentration, self.molar_conductivity)
+        return np.full(np.shape(concentration), self.molar_conductivity)
 
 
 @dataclass(frozen=True)

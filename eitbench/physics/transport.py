@@ -40,7 +40,9 @@ class ConvectionDiffusion:
     The SUPG test function φ + τ v·∇φ also weighs the mass matrix, so the scheme is consistent in time. The first
     sub-step is taken as two backward-Euler halves (Rannacher), which damp node-to-node noise that Crank–Nicolson would
     keep; they use the same matrix, so a step costs one factorisation for ever and ``substeps + 1`` solves. Within a
-    step the inlet value moves linearly from the old to the new one.
+    step the inlet value moves linearly from the old to the new one. Second order in space and in the sub-step; between
+    those, at cell Péclet numbers of about 2–8, the order in space sinks to 1.5, as P1 has no ∇·(κ∇c) to weigh. Because
+    every step starts anew with the two halves, shorter steps at equal ``substeps`` are first order only.
 
     Parameters
     ----------
@@ -69,7 +71,9 @@ class ConvectionDiffusion:
         self.diffusivity = _check.number("diffusivity", diffusivity, low=0.0, open_low=True, units="m²/s")
         self.time_step = _check.number("time_step", time_step, low=0.0, open_low=True, units="s")
         self.substeps = _check.integer("substeps", substeps, low=1)
-        self.inlet = inlet_nodes(mesh, velocity) if inlet is None else np.unique(np.asarray(inlet, dtype=np.int64))
+        self.inlet = inlet_nodes(mesh, velocity) if inlet is None else np.unique(inlet).astype(np.int64)
+        if inlet is not None and np.size(inlet) and not np.issubdtype(np.asarray(inlet).dtype, np.integer):
+            raise ValueError(f"inlet must hold integer node numbers, got {np.asarray(inlet).dtype}")
         if self.inlet.size and (self.inlet[0] < 0 or self.inlet[-1] >= mesh.n_nodes):
             raise ValueError(f"inlet must hold node numbers in [0, {mesh.n_nodes - 1}], got {self.inlet}")
         mass, transport = _supg_matrices(mesh, velocity, self.diffusivity)
@@ -80,10 +84,8 @@ class ConvectionDiffusion:
         # Along a structured pipe the nodes are numbered by cross-section, and the factor stays within the band.
         self._solver = splu(sp.csc_matrix(implicit[free][:, free]), permc_spec="COLAMD")
         self._explicit = sp.csr_matrix(explicit[free])
-        self._mass_rate = sp.csr_matrix(mass[free] / dt)
         self._implicit_inlet = sp.csr_matrix(implicit[free][:, inlet_])
-        self._transport = sp.csc_matrix(transport[free][:, free])
-        self._source = sp.csr_matrix(mass[free] / self.time_step)
+        self._mass = sp.csr_matrix(mass[free])
 
     def step(self, c: np.ndarray, inflow_before: np.ndarray | float, inflow_after: np.ndarray | float) -> np.ndarray:
         """The concentration one time step later.
@@ -113,40 +115,36 @@ class ConvectionDiffusion:
 
     @cached_property
     def _evolution_model(self) -> EvolutionModel:
-        """F costs ``substeps + 1`` solves with n right-hand sides; H needs no stepping.
-
-        A steady source e/Δt has a steady state K c = M e/Δt, and a step shrinks the distance to
-        it just as it shrinks a perturbation, so from nothing the source reaches H e = (I − F) K⁻¹ M e/Δt.
-        """
         n, m = self.mesh.n_nodes, len(self.inlet)
         identity = np.eye(n)
         F = self._advance(identity, identity[self.inlet], np.zeros((m, n)))
         Y = self._advance(np.zeros((n, m)), np.zeros((m, m)), np.eye(m))
-        steady = splu(self._transport).solve(self._source.toarray())
-        H = np.zeros((n, n))
-        H[self._free] = steady - F[np.ix_(self._free, self._free)] @ steady
+        H = self._advance(np.zeros((n, n)), np.zeros((m, n)), np.zeros((m, n)), source=identity / self.time_step)
         return EvolutionModel(F, Y, H)
 
-    def _advance(self, c: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-        """All sub-steps on (n, batch) columns."""
+    def _advance(self, c: np.ndarray, before: np.ndarray, after: np.ndarray,
+                 source: np.ndarray | None = None) -> np.ndarray:
+        """All sub-steps on (n, batch) columns, perhaps with a nodal source of so much concentration a second."""
         c = c.copy()
         c[self.inlet] = before
         slope = (after - before) / self.substeps
+        load = 0.0 if source is None else self._mass @ source
+        rate = self.substeps / self.time_step
         for fraction in (0.5, 1.0):                               # backward Euler, twice half a sub-step
             inlet = before + fraction * slope
-            # (2M/Δt + K) c⁺ = (2M/Δt) c, divided by two: the Crank–Nicolson matrix again
-            right = self._mass_rate @ c - self._implicit_inlet @ inlet
+            # (2M/Δt + K) c⁺ = (2M/Δt) c + f, divided by two: the Crank–Nicolson matrix again
+            right = rate * (self._mass @ c) - self._implicit_inlet @ inlet + 0.5 * load
             c[self._free] = self._solver.solve(right)
             c[self.inlet] = inlet
         for k in range(1, self.substeps):
             inlet = before + (k + 1) * slope
-            c[self._free] = self._solver.solve(self._explicit @ c - self._implicit_inlet @ inlet)
+            c[self._free] = self._solver.solve(self._explicit @ c - self._implicit_inlet @ inlet + load)
             c[self.inlet] = inlet
         c[self.inlet] = after
         return c
 
     def _inflow(self, name: str, value: np.ndarray | float, batch: int) -> np.ndarray:
-        value = np.asarray(value, dtype=float)
+        value = _check.array(name, value, np.shape(value))
         if value.ndim == 1:
             value = value[:, None]
         try:
@@ -159,8 +157,8 @@ class ConvectionDiffusion:
 def inlet_nodes(mesh: Mesh, velocity: VelocityField) -> np.ndarray:
     """Nodes of the boundary facets through which fluid enters: ∫ v·n < 0 (midpoint rule); (n_inlet,) int."""
     basis = skfem.FacetBasis(to_skfem(mesh), element(mesh.dim, 1), intorder=1)
-    x = basis.global_coordinates().value
-    speed = (_velocity_at(velocity, x) * basis.normals.value).sum(axis=0).mean(axis=1)
+    x = np.asarray(basis.global_coordinates())
+    speed = (_velocity_at(velocity, x) * np.asarray(basis.normals)).sum(axis=0).mean(axis=1)
     facets = basis.find[speed < -1e-12 * max(1e-300, np.abs(speed).max())]
     return np.unique(basis.mesh.facets[:, facets])
 
@@ -178,7 +176,7 @@ def _supg_matrices(mesh: Mesh, velocity: VelocityField, diffusivity: float) -> t
     τ = h/(2|v|)·(coth Pe − 1/Pe) with Pe = |v|h/(2κ) and h the cell's length along the flow (Brooks & Hughes 1982).
     """
     basis = skfem.Basis(to_skfem(mesh), element(mesh.dim, 1), intorder=4)
-    v = _velocity_at(velocity, basis.global_coordinates().value)
+    v = _velocity_at(velocity, np.asarray(basis.global_coordinates()))
     speed = np.sqrt((v**2).sum(axis=0))
     along = sum(np.abs((v * phi[0].grad).sum(axis=0)) for phi in basis.basis)        # Σᵢ|v·∇φᵢ| = 2|v|/h
     peclet = speed**2 / np.maximum(along * diffusivity, 1e-300)

@@ -1,0 +1,53 @@
+"""Stationary Gauss–Newton (thesis 5.11): each frame of 16 injections is taken for a target that stands still.
+
+When filtering, the frame is the latest 16 injections; when smoothing, it is the thesis' own: each state takes the image
+of the frame that contains it (Fig. 5.6). ALPHA was tuned once, on stationary targets from the training seeds, by
+`benchmarks/tune_gauss_newton.py`, whose rule is the smallest mean error on a grid of two values an octave.
+"""
+
+import numpy as np
+
+from eitbench import Estimate, Task
+from eitbench.estimation import best_homogeneous, gauss_newton
+from eitbench.physics.fem import stiffness_matrix
+
+ALPHA = 0.177  # 1/(mol/m³): weighs the gradient of c/(1 mol/m³) against voltages in noise standard deviations
+
+
+class Estimator:
+    boards = ("filter", "smoothing")
+    parameters = {"alpha": ALPHA}  # noqa: RUF012 (a plain dict is what a record stores)
+
+    def __init__(self, task: Task) -> None:
+        self.task = task
+        self.voltages: list[np.ndarray] = []
+        self.currents: list[np.ndarray] = []
+        self.penalty = ALPHA**2 * stiffness_matrix(task.mesh)
+        self.images: dict[int, np.ndarray] = {}
+        self.asked_for = -task.lag
+        self.last = np.full(task.mesh.n_nodes, task.expected_concentration)
+
+    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
+        self.asked_for += 1
+        if len(self.voltages) < self.task.n_steps:
+            self.voltages.append(voltages)
+            self.currents.append(currents)
+        if self.asked_for < 1:
+            return None
+        frame = len(self.task.currents)
+        if self.task.lag == 0:
+            end = len(self.voltages)
+        else:
+            end = min(-(-self.asked_for // frame) * frame, self.task.n_steps)
+        return Estimate(self.image(max(0, end - frame), end))
+
+    def image(self, begin: int, end: int) -> np.ndarray:
+        """The stationary image of measurements begin + 1 … end."""
+        if end not in self.images:
+            task = self.task
+            voltages, currents = np.array(self.voltages[begin:end]), np.array(self.currents[begin:end])
+            c_bh = best_homogeneous(task.observation, task.noise, task.mesh.n_nodes, voltages, currents,
+                                    task.expected_concentration)
+            self.images = {end: gauss_newton(task.observation, voltages, currents, task.noise.std(voltages),
+                                             self.penalty, np.full(task.mesh.n_nodes, c_bh))}
+        return self.images[end]

@@ -1,0 +1,29 @@
+"""Linearised Kalman filter (thesis 5.1.2): linear about the first frame's ĉ_bh, parameters of Table 5.1."""
+
+import numpy as np
+
+from eitbench import Estimate, Task
+from eitbench.estimation import FilterStep, FirstFrame, LinearisedObservations, table_5_1
+
+
+class Estimator:
+    boards = ("filter",)
+
+    def __init__(self, task: Task) -> None:
+        self.task = task
+        self.first = FirstFrame(task)
+
+    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate:
+        if not self.first.complete:
+            if not self.first.add(voltages, currents):
+                return Estimate(self.first.mean)
+            self.filter = table_5_1(self.task.transport, self.first.c_bh)
+            self.observations = LinearisedObservations(self.task.observation, self.task.noise, self.filter.mean)
+            for earlier in self.first.measurements[:-1]:
+                self.assimilate(*earlier)
+        step = self.assimilate(voltages, currents)
+        return Estimate(step.mean, step.variance, step.innovation, step.innovation_covariance)
+
+    def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> FilterStep:
+        self.filter.predict()
+        return self.filter.update(self.observations(voltages, currents))

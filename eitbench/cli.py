@@ -1,0 +1,137 @@
+"""The command line: `eitbench list | run | leaderboard | render | reproduce`."""
+
+from __future__ import annotations
+
+import os
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, context_settings={
+    "help_option_names": ["-h", "--help"]}, help="""
+Benchmark estimators that see a flow only through voltages on the pipe's wall.
+
+A first look:  eitbench run  — runs our baselines on four test episodes, prints the table, writes results/index.html.
+""")
+
+Suite = StrEnum("Suite", ["quick", "full"])
+Figure = StrEnum("Figure", {name: name for name in ("fig5.4", "fig5.5", "fig5.6", "fig5.7", "fig5.8")})
+Out = Annotated[Path, typer.Option("--out", "-o", help="Folder of the results.")]
+Jobs = Annotated[int, typer.Option("--jobs", "-j", min=1, help="Processes; each takes one core and up to 1.5 GB.")]
+CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@app.command("list")
+def list_() -> None:
+    """Show the environments and the baselines, and which board each plays on."""
+    from eitbench.envs import ENTRY_POINTS
+    from eitbench.leaderboard.baselines import load_baseline, own_baselines
+    from eitbench.leaderboard.run import Environment, board_of
+    typer.echo("environments")
+    for name in ENTRY_POINTS:
+        env = Environment(name).make()
+        typer.echo(f"  {name:30} {board_of(env):10}  lag {env.task.lag}, {env.task.n_steps - env.task.warm_up} scored "
+                   f"of {env.task.n_steps} states, {env.task.mesh.n_nodes} nodes")
+    typer.echo("baselines")
+    for name in own_baselines():
+        baseline = load_baseline(name)
+        typer.echo(f"  {name:30} {', '.join(baseline.boards):30}  {baseline.title}")
+
+
+@app.command()
+def run(
+    suite: Annotated[Suite, typer.Option(help="quick: test:0-3, two minutes on two cores; full: test:0-19, and "
+                                              "methods that take long.")] = Suite.quick,
+    env: Annotated[list[str] | None, typer.Option(help="Environment id; may be repeated. Default: all.")] = None,
+    baseline: Annotated[list[str] | None, typer.Option(
+        help="Name of one of ours, or the path of your own .py file; may be repeated. Default: all of ours.")] = None,
+    seeds: Annotated[str | None, typer.Option(help="Episodes, such as dev:0-9 or test:3. Default: the suite's.")] = None,
+    jobs: Jobs = CORES,
+    out: Out = Path("results"),
+) -> None:
+    """Run baselines on environments, print the table and write the page.
+
+    Each episode is stored the moment it is done; the same command again resumes where it was interrupted.
+    """
+    from eitbench.leaderboard import suites
+    from eitbench.leaderboard.run import run_jobs
+    from eitbench.leaderboard.store import EpisodeStore
+    from eitbench.seeds import parse_seeds
+    with _clear_errors():
+        todo = suites.jobs(suite.value, env or [], baseline or [], parse_seeds(seeds or suites.SEEDS[suite.value]))
+        run_jobs(todo, EpisodeStore(out), n_jobs=jobs)
+    _report(out)
+
+
+@app.command()
+def leaderboard(out: Out = Path("results")) -> None:
+    """Print the table and write the page again from the results stored in a folder."""
+    _report(out)
+
+
+@app.command()
+def render(
+    env: Annotated[str, typer.Option(help="Environment id.")] = "eitbench/Pipe2D-v0",
+    baseline: Annotated[str, typer.Option(help="Name of one of ours, or the path of a .py file.")] = "kalman_filter",
+    seed: Annotated[str, typer.Option(help="The episode, such as dev:0.")] = "dev:0",
+    step: Annotated[int | None, typer.Option(help="Only this state t, as a PNG.")] = None,
+    out: Annotated[Path, typer.Option("--out", "-o", help="An animation .gif, or a .png with --step.")] = Path(
+        "results/episode.gif"),
+) -> None:
+    """Draw an episode: truth, estimate, its spread, electrodes and the injected pair."""
+    from eitbench.leaderboard.animate import animate
+    with _clear_errors():
+        typer.echo(f"wrote {animate(env, baseline, seed, step, out)}")
+
+
+@app.command()
+def reproduce(
+    name: Annotated[Figure, typer.Argument(help="The figure of the thesis.")],
+    seeds: Annotated[str, typer.Option(help="Episodes; pictures show the first, sweeps average over all.")] = "dev:0-1",
+    jobs: Jobs = CORES,
+    out: Out = Path("results/figures"),
+) -> None:
+    """Draw a figure of the thesis from our data, and say what agrees and what differs."""
+    from eitbench.leaderboard.reproduce import FIGURES
+    from eitbench.seeds import parse_seeds
+    with _clear_errors():
+        path, remark = FIGURES[name.value](parse_seeds(seeds), jobs, out)
+        typer.echo(f"wrote {path}\n{remark}")
+
+
+def _report(out: Path) -> None:
+    from eitbench.episodes import write_atomically
+    from eitbench.leaderboard.page import write_page
+    from eitbench.leaderboard.store import EpisodeStore
+    from eitbench.leaderboard.summary import markdown, summary
+    store = EpisodeStore(out)
+    command = " ".join(["eitbench", *sys.argv[1:]])
+    records = store.write_records(command)
+    if not records:
+        raise typer.BadParameter(f"no results in {out}; make some with `eitbench run`")
+    table = summary(records)
+    write_atomically(out / "leaderboard.md", (markdown(table) + "\n").encode())
+    typer.echo(markdown(table))
+    for record in records:
+        for episode in record["episodes"]:
+            if episode["status"] != "ok":
+                typer.echo(f"failed: {record['baseline']} on {episode['seed']}: {episode['message']}", err=True)
+    typer.echo(f"\nwrote {write_page(store, records, table)}")
+
+
+class _clear_errors:
+    """Turn a ValueError about an argument into a message instead of a traceback."""
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: type | None, error: BaseException | None, _: object) -> None:
+        if isinstance(error, ValueError):
+            raise typer.BadParameter(str(error)) from error
+
+
+if __name__ == "__main__":
+    app()

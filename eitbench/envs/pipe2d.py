@@ -1,0 +1,94 @@
+"""`eitbench/Pipe2D-v0` and its lagged siblings."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from gymnasium.utils import EzPickle
+
+from eitbench.envs.estimation import EstimationEnv
+from eitbench.scenarios import Pipe2D
+from eitbench.task import make_task
+
+
+class Pipe2DEnv(EstimationEnv, EzPickle):
+    """
+    ## Description
+
+    Fluid streams through a straight 2D pipe, 40 cm long and 10 cm wide, at 4.5 m/s on average; slugs of higher and
+    lower concentration enter at random. Sixteen electrodes on the walls, one current injection every 5 ms: while a
+    frame of 16 injections is measured, the fluid moves on by 36 cm. From the voltages of each injection, and a model
+    of flow, estimate the concentration everywhere (Seppänen 2005, ch. 5; all numbers in `eitbench.scenarios.Pipe2D`).
+
+    The truth is computed on finer meshes and time steps than the model in ``env.unwrapped.task``, which holds all that
+    an estimator may know.
+
+    ## Ids
+
+    | id | asks for | board |
+    |---|---|---|
+    | `eitbench/Pipe2D-v0` | c_t when V_1 … V_t are known | filter |
+    | `eitbench/Pipe2DFixedLag-v0` | c_{t−4} when V_1 … V_t are known | fixed-lag |
+    | `eitbench/Pipe2DSmoothing-v0` | every c_t, once the whole record has been played | smoothing |
+
+    ## Action space
+
+    `Box(-300, 300, (1701,), float64)`: the estimate at the nodes of `task.mesh`, mol/m³. Ignored while i ≤ lag.
+
+    ## Observation space
+
+    `Dict`, zeros once the record has been played:
+
+    | key | space | meaning |
+    |---|---|---|
+    | `voltages` | `Box((16,), float64)` | electrode potentials against their mean, V, with noise |
+    | `currents` | `Box((16,), float64)` | injected currents, A per metre of depth, summing to zero |
+
+    ## Reward
+
+    −∫(ĉ_t − c_t)² dΩ / ∫c_t² dΩ for the 80 scored states t = 19 … 98, else 0: minus the mean over the scored states
+    is ẽ_c (thesis 5.12). The homogeneous estimate scores about 0.03, a Kalman filter about 0.006.
+
+    ## Starting state
+
+    The fluid has been flowing for one flush time. `reset(seed=s)` plays episode s (`eitbench.seeds`: train, dev and
+    test ranges); without a seed a random one of the first `episodes` training episodes. The first use of a seed
+    simulates its truth (about 10 s), which is then kept on disk.
+
+    ## Episode end
+
+    Terminated after 98 + lag steps. Never truncated.
+
+    ## Arguments
+
+    | name | default | meaning |
+    |---|---|---|
+    | `lag` | 0 | an integer from 0 to 97, or "all" (= 97): whole record first |
+    | `assumed_mean_velocity` | None | m/s; what the task's model believes; None: the truth |
+    | `scenario` | None | dict of `Pipe2D` fields to change |
+    | `episodes` | 1000 | number of training episodes for unseeded resets |
+    | `render_mode` | None | "rgb_array": truth, estimate, spread and active pair |
+
+    ## Version history
+
+    * v0: first version.
+    """
+
+    def __init__(self, *, lag: int | str = 0, assumed_mean_velocity: float | None = None,
+                 scenario: dict[str, Any] | None = None, episodes: int = 1000, render_mode: str | None = None) -> None:
+        EzPickle.__init__(self, lag=lag, assumed_mean_velocity=assumed_mean_velocity, scenario=scenario,
+                          episodes=episodes, render_mode=render_mode)
+        world = _with_fields(scenario)
+        assumptions = {} if assumed_mean_velocity is None else {"mean_velocity": assumed_mean_velocity}
+        super().__init__(world, make_task(world, lag, **assumptions), episodes=episodes, render_mode=render_mode)
+
+
+def _with_fields(changes: dict[str, Any] | None) -> Pipe2D:
+    """Pipe2D with some fields changed; lists become tuples, since kwargs come from JSON."""
+    changes = {name: tuple(value) if isinstance(value, list) else value for name, value in (changes or {}).items()}
+    unknown = changes.keys() - Pipe2D.__dataclass_fields__.keys()
+    if unknown:
+        raise ValueError(f"scenario has no field {sorted(unknown)[0]!r}; there are "
+                         f"{', '.join(Pipe2D.__dataclass_fields__)}")
+    return replace(Pipe2D(), **changes)

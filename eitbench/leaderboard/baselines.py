@@ -1,0 +1,66 @@
+"""Find and load baselines: one Python file each, with a class `Estimator`."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+BOARDS = ("filter", "fixed-lag", "smoothing")
+
+
+class Baseline(NamedTuple):
+    """A loaded baseline file."""
+
+    name: str
+    """Name of the file without its suffix."""
+    title: str
+    """First line of its docstring, up to a colon, bracket or full stop."""
+    path: Path
+    sha256: str
+    boards: tuple[str, ...]
+    """The boards it can play: `BOARDS`."""
+    parameters: dict[str, Any]
+    estimator: Callable[..., Any]
+    """Estimator(task), with update(voltages, currents) -> Estimate or None."""
+
+
+def baseline_folder() -> Path:
+    """Where our own baselines lie: within an installed package, beside it in a checkout."""
+    package = Path(__file__).parent.parent
+    inside = package / "baselines"
+    return inside if inside.is_dir() else package.parent / "baselines"
+
+
+def own_baselines() -> list[str]:
+    """Names of our own baselines."""
+    return sorted(path.stem for path in baseline_folder().glob("*.py"))
+
+
+def load_baseline(name: str) -> Baseline:
+    """Load one of our baselines by name, or anybody's by the path of its file.
+
+    Raises
+    ------
+    ValueError
+        If there is no such baseline, or its file has no class `Estimator` with an `update` method.
+    """
+    path = Path(name) if name.endswith(".py") else baseline_folder() / f"{name}.py"
+    if not path.is_file():
+        raise ValueError(f"baseline must be a path to a .py file or one of {', '.join(own_baselines())}; got {name!r}")
+    specification = importlib.util.spec_from_file_location(f"eitbench_baseline_{path.stem}", path)
+    assert specification is not None and specification.loader is not None
+    module = importlib.util.module_from_spec(specification)
+    specification.loader.exec_module(module)
+    estimator = getattr(module, "Estimator", None)
+    if not callable(getattr(estimator, "update", None)):
+        raise ValueError(f"baseline {path} must define a class Estimator with a method update(voltages, currents)")
+    boards = tuple(getattr(estimator, "boards", ("filter",)))
+    if not boards or not set(boards) <= set(BOARDS):
+        raise ValueError(f"baseline {path}: Estimator.boards must be some of {', '.join(BOARDS)}, got {boards!r}")
+    title = re.split(r"[:(.]", (module.__doc__ or path.stem).strip().splitlines()[0])[0].strip()
+    return Baseline(path.stem, title, path, hashlib.sha256(path.read_bytes()).hexdigest(), boards,
+                    dict(getattr(estimator, "parameters", {})), estimator)

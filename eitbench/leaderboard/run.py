@@ -1,0 +1,164 @@
+"""Run baselines on environments over seeds; each episode's result is stored the moment it is done."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+import traceback
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from joblib import Parallel, delayed
+from threadpoolctl import threadpool_limits
+from tqdm import tqdm
+
+from eitbench.envs.estimation import EstimationEnv
+from eitbench.leaderboard.baselines import BOARDS, Baseline, load_baseline
+from eitbench.leaderboard.score import Played, score
+from eitbench.leaderboard.store import EpisodeStore, source_digest
+from eitbench.seeds import name_seed
+from eitbench.task import Estimate
+
+
+class Environment(NamedTuple):
+    """A registered id with keyword arguments: what is made, and what a record names."""
+
+    id: str
+    kwargs: str = "{}"
+    """JSON"""
+
+    def make(self, **extra: Any) -> EstimationEnv:
+        """A fresh environment, without gymnasium's wrappers."""
+        env = gym.make(self.id, disable_env_checker=True, **json.loads(self.kwargs), **extra).unwrapped
+        if not isinstance(env, EstimationEnv):
+            raise ValueError(f"environment {self.id} does not ask for estimates; its class is {type(env).__name__}")
+        return env
+
+
+class Job(NamedTuple):
+    """One baseline on one episode."""
+
+    environment: Environment
+    baseline: str
+    """Name or path."""
+    seed: int
+
+    def identity(self) -> str:
+        """What the outcome depends on; a stored result counts only for the very same."""
+        parts = [*self.environment, load_baseline(self.baseline).sha256, str(self.seed), source_digest()]
+        return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
+
+
+def board_of(env: EstimationEnv) -> str:
+    """Which of `BOARDS` an environment belongs to."""
+    lag = env.task.lag
+    return BOARDS[0] if lag == 0 else BOARDS[2] if lag == env.task.n_steps - 1 else BOARDS[1]
+
+
+def play(env: EstimationEnv, baseline: Baseline, seed: int) -> Iterator[tuple[int, Estimate]]:
+    """Play one episode and yield (t, estimate of the state t ≥ 1). The estimator sees the task and the measurements;
+    rewards and the environment itself stay here."""
+    for t, estimate, _, _ in _play(env, baseline, seed):
+        if estimate is not None and t >= 1:
+            yield t, estimate
+
+
+def _play(env: EstimationEnv, baseline: Baseline, seed: int,
+          ) -> Iterator[tuple[int, Estimate | None, dict[str, np.ndarray], float]]:
+    """(t = i − lag, estimate, measurement i, seconds the estimator took) at each step i."""
+    observation, _ = env.reset(seed=seed)
+    estimator = baseline.estimator(env.task)
+    silence = np.full(env.task.mesh.n_nodes, env.task.expected_concentration)
+    done, t = False, -env.task.lag
+    while not done:
+        t += 1
+        seen = {key: value.copy() for key, value in observation.items()}
+        begin = time.perf_counter()
+        estimate = estimator.update(observation["voltages"], observation["currents"])
+        seconds = time.perf_counter() - begin
+        if estimate is None and t >= 1:
+            raise ValueError(f"Estimator.update must return an Estimate once a state is asked for; at t = {t} it "
+                             "returned None")
+        if estimate is not None and estimate.variance is not None:
+            _checked_variance(estimate.variance, len(silence))
+            env.spread = np.sqrt(estimate.variance)
+        observation, _, done, _, _ = env.step(silence if estimate is None else estimate.mean)
+        yield t, estimate, seen, seconds
+
+
+def _checked_variance(variance: np.ndarray, n: int) -> None:
+    if np.shape(variance) != (n,) or not np.isfinite(variance).all() or (np.asarray(variance) < 0).any():
+        raise ValueError(f"Estimate.variance must be finite, ≥ 0 and of shape ({n},), got shape {np.shape(variance)}")
+
+
+def run_episode(job: Job) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Play and score one episode.
+
+    Returns
+    -------
+    result : dict
+        JSON-ready: status "ok" with scores and the error of every scored step, or "failed" with a message.
+    fields : dict of arrays
+        The estimates' means and standard deviations (float32), empty after a failure.
+    """
+    baseline = load_baseline(job.baseline)
+    env = _environment(job.environment)
+    result: dict[str, Any] = {
+        "identity": job.identity(), "seed": name_seed(job.seed), "baseline": baseline.name, "title": baseline.title,
+        "parameters": baseline.parameters, "baseline_sha256": baseline.sha256, "board": board_of(env),
+        "environment": {"id": job.environment.id, "kwargs": env.spec.kwargs if env.spec else {}},
+        "source": source_digest(), "finished": None,
+    }
+    begin = time.perf_counter()
+    try:
+        with threadpool_limits(1):
+            played = Played.collect(env.task, _play(env, baseline, job.seed))
+            result |= {"status": "ok", **score(env, played)}
+    except Exception as error:                      # whatever a baseline does wrong is its result, not our crash
+        result |= {"status": "failed", "message": f"{type(error).__name__}: {error}",
+                   "traceback": traceback.format_exc(limit=-3)}
+        played = None
+    result["finished"] = datetime.now(UTC).isoformat(timespec="seconds")
+    result["seconds"] = time.perf_counter() - begin
+    return result, {} if played is None else played.fields()
+
+
+def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1) -> None:
+    """Run all jobs that ``store`` does not hold yet, in ``n_jobs`` processes with one BLAS thread each."""
+    todo = [job for job in jobs if not store.holds(job.environment.id, job.baseline, job.seed, job.identity())]
+    if len(todo) < len(jobs):
+        tqdm.write(f"{len(jobs) - len(todo)} of {len(jobs)} episodes are already there")
+    seen: dict[Any, Job] = {}
+    for job in todo:                                # each truth once, before several baselines want it at once
+        seen.setdefault((_environment(job.environment).scenario, job.seed), job)
+    _in_parallel(_simulate_job, [(job,) for job in seen.values()], n_jobs, "simulating truths")
+    _in_parallel(_run_job, [(job, store) for job in todo], n_jobs, "running baselines")
+
+
+def _in_parallel(function: Any, arguments: list[tuple], n_jobs: int, description: str) -> None:
+    n_jobs = max(1, min(n_jobs, len(arguments)))
+    with Parallel(n_jobs=n_jobs, return_as="generator_unordered", batch_size=1, pre_dispatch=n_jobs) as parallel:
+        done = parallel(delayed(function)(*each) for each in arguments)
+        for _ in tqdm(done, total=len(arguments), desc=description, unit="episode", disable=None):
+            pass
+
+
+def _simulate_job(job: Job) -> None:
+    with threadpool_limits(1):
+        _environment(job.environment).reset(seed=job.seed)
+
+
+def _run_job(job: Job, store: EpisodeStore) -> None:
+    result, fields = run_episode(job)
+    store.put(job.environment.id, job.baseline, job.seed, result, fields)
+
+
+@lru_cache(maxsize=4)
+def _environment(environment: Environment) -> EstimationEnv:
+    """Made once a process, so that models and what estimators derive from them are shared by its episodes."""
+    return environment.make()

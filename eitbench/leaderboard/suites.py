@@ -1,0 +1,36 @@
+"""What `eitbench run` runs when it is not told."""
+
+from __future__ import annotations
+
+from eitbench.envs import ENTRY_POINTS
+from eitbench.leaderboard.baselines import load_baseline, own_baselines
+from eitbench.leaderboard.run import Environment, Job, board_of
+
+SEEDS = {"quick": "test:0-3", "full": "test:0-19"}
+# An image at every step: minutes an episode, for what the frame-wise images of the other boards show as well.
+TOO_SLOW_FOR_QUICK = {("filter", "gauss_newton")}
+
+
+def jobs(suite: str, environments: list[str], baselines: list[str], seeds: list[int]) -> list[Job]:
+    """Every named baseline (default: all of ours) on every named environment (default: all) it can play.
+
+    Raises
+    ------
+    ValueError
+        If an environment is not registered, a baseline does not exist, or no pair of them fits.
+    """
+    unknown = set(environments) - set(ENTRY_POINTS)
+    if unknown:
+        raise ValueError(f"env must be one of {', '.join(ENTRY_POINTS)}; got {sorted(unknown)[0]!r}")
+    pairs = []
+    for name in environments or ENTRY_POINTS:
+        environment = Environment(name)
+        board = board_of(environment.make())
+        for baseline in baselines or own_baselines():
+            skipped = suite == "quick" and not baselines and (board, baseline) in TOO_SLOW_FOR_QUICK
+            if board in load_baseline(baseline).boards and not skipped:
+                pairs.append((environment, baseline))
+    if not pairs:
+        raise ValueError(f"none of the baselines {', '.join(baselines)} plays any of the environments "
+                         f"{', '.join(environments or ENTRY_POINTS)}; see `eitbench list`")
+    return [Job(environment, baseline, seed) for seed in seeds for environment, baseline in pairs]

@@ -1,0 +1,130 @@
+"""From records to a table: means over seeds with confidence intervals, best first, board by board."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from scipy.stats import t as student
+
+from eitbench.leaderboard.baselines import BOARDS
+
+COLUMNS = {
+    "error": "ẽ_c", "skill": "skill", "contrast_error": "contrast", "nis": "NIS/m", "crps": "CRPS",
+    "coverage_50": "50 %", "coverage_90": "90 %", "spread_ratio": "var/MSE", "voltage_discrepancy": "ẽ_V",
+    "seconds_per_step": "ms/step",
+}
+EXPLANATIONS = {
+    "ẽ_c": "relative estimation error (5.12), ± half the 95 % confidence interval over seeds; lower is better",
+    "skill": "0 for the homogeneous estimate, 1 for the smoother that knows the true model",
+    "contrast": "error relative to the deviation from the homogeneous estimate; 1 is no better than that",
+    "NIS/m": "normalised innovation squared; 1 when the filter's own uncertainty fits",
+    "CRPS": "continuous ranked probability score, mol/m³",
+    "50 %": "part of the truth inside the claimed 50 % interval",
+    "90 %": "part of the truth inside the claimed 90 % interval",
+    "var/MSE": "claimed variance over squared error; 1 is honest, more is too modest",
+    "ẽ_V": "voltage discrepancy (5.13), mV²; a diagnostic",
+    "ms/step": "time of one update on one core",
+}
+_UNIT = {"seconds_per_step": 1e3, "voltage_discrepancy": 1e6}
+
+
+def mean_and_interval(values: list[float]) -> tuple[float, float]:
+    """Mean, and half the width of its 95 % confidence interval (Student's t); infinite for fewer than two values."""
+    mean = float(np.mean(values))
+    if len(values) < 2:
+        return mean, math.inf
+    return mean, float(student.ppf(0.975, len(values) - 1) * np.std(values, ddof=1) / math.sqrt(len(values)))
+
+
+def rounded(mean: float, half: float) -> str:
+    """``0.0053 ± 0.0004``: the interval to one significant digit (two if that is a 1), the mean to the same place."""
+    if not math.isfinite(half) or half < 1e-9 * abs(mean):
+        return f"{mean:.3g}"
+    place = -math.floor(math.log10(half))
+    if round(half * 10**place) == 1:
+        place += 1
+    place = min(max(place, 0), 5)
+    return f"{mean:.{place}f} ± {half:.{place}f}"
+
+
+def scores_by_seed(record: dict[str, Any], name: str) -> dict[str, float]:
+    """Seed -> score, of the episodes that have it; in the units of the table."""
+    scores = {episode["seed"]: episode["scores"][name] for episode in record["episodes"] if episode["status"] == "ok"}
+    return {seed: value * _UNIT.get(name, 1.0) for seed, value in scores.items() if value is not None}
+
+
+def summary(records: list[dict[str, Any]]) -> pd.DataFrame:
+    """One row a record: board, environment, method, episodes, failed, and (mean, half interval) of each score."""
+    rows = []
+    for record in records:
+        status = [episode["status"] for episode in record["episodes"]]
+        row: dict[str, Any] = {"board": record["board"], "environment": record["environment"]["id"],
+                               "baseline": record["baseline"], "method": record["title"],
+                               "episodes": len(status), "failed": sum(s != "ok" for s in status)}
+        for name in COLUMNS:
+            values = list((_skills(record, records) if name == "skill" else scores_by_seed(record, name)).values())
+            row[name] = mean_and_interval(values) if values else None
+        rows.append(row)
+    table = pd.DataFrame(rows)
+    order = table["error"].map(lambda cell: math.inf if cell is None else cell[0])
+    return table.assign(_board=table["board"].map(BOARDS.index), _error=order).sort_values(
+        ["_board", "environment", "_error"]).drop(columns=["_board", "_error"]).reset_index(drop=True)
+
+
+def _skills(record: dict[str, Any], records: list[dict[str, Any]]) -> dict[str, float]:
+    """(E_bh − E)/(E_bh − E_ref) with the means over the seeds that all three have; one number, or none."""
+    def of(baseline: str, board: str) -> dict[str, float]:
+        found = [r for r in records if r["baseline"] == baseline and r["board"] == board
+                 and _world(r) == _world(record)]
+        return scores_by_seed(found[0], "error") if found else {}
+
+    own, floor = scores_by_seed(record, "error"), of("homogeneous", "smoothing")
+    reference = of("fixed_interval_smoother", "smoothing")
+    shared = own.keys() & floor.keys() & reference.keys()
+    if not shared:
+        return {}
+    e, bh, ref = (float(np.mean([scores[seed] for seed in shared])) for scores in (own, floor, reference))
+    return {"all": (bh - e) / (bh - ref)}
+
+
+def _world(record: dict[str, Any]) -> str:
+    """What the lagged siblings of an environment share."""
+    name = record["environment"]["id"].replace("FixedLag", "").replace("Smoothing", "")
+    kwargs = {key: value for key, value in record["environment"]["kwargs"].items() if key != "lag"}
+    return f"{name} {sorted(kwargs.items())}"
+
+
+def cells(table: pd.DataFrame) -> pd.DataFrame:
+    """The summary as text, with the columns a reader sees."""
+    text = table[["board", "method"]].copy()
+    text["episodes"] = [f"{n - failed} of {n}" if failed else f"{n}"
+                        for n, failed in zip(table["episodes"], table["failed"], strict=True)]
+    for name, heading in COLUMNS.items():
+        text[heading] = [_cell(name, value) for value in table[name]]
+    return text
+
+
+def _cell(name: str, value: tuple[float, float] | None) -> str:
+    if value is None:
+        return "–"
+    return rounded(*value) if name in ("error", "contrast_error") else f"{value[0]:.2g}" if abs(
+        value[0]) < 1 else f"{value[0]:.3g}"
+
+
+def markdown(table: pd.DataFrame) -> str:
+    """The summary as Markdown, also pleasant to read in a terminal."""
+    text = cells(table)
+    lines = [list(text.columns), *text.to_numpy().tolist()]
+    widths = [max(len(str(line[i])) for line in lines) for i in range(len(text.columns))]
+
+    def row(line: list[str]) -> str:
+        padded = [str(cell).ljust(width) if i < 2 else str(cell).rjust(width)
+                  for i, (cell, width) in enumerate(zip(line, widths, strict=True))]
+        return f"| {' | '.join(padded)} |"
+
+    rule = "|" + "|".join("-" * (width + 2) if i < 2 else "-" * (width + 1) + ":"
+                          for i, width in enumerate(widths)) + "|"
+    return "\n".join([row(lines[0]), rule, *map(row, lines[1:])])

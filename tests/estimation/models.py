@@ -1,0 +1,152 @@
+"""Small worlds for the estimators, and the textbook in plain dense matrices to compare them with."""
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from eitbench.estimation import FreeCovariance, KalmanFilter, LinearisedObservations, Observation, table_5_1
+from eitbench.scenarios.pipe2d import Pipe2D
+
+
+class LinearGaussian(NamedTuple):
+    """c⁺ = F c + s + w with w ~ N(0, Q), from c₀ ~ N(mean, covariance)."""
+
+    F: np.ndarray
+    s: np.ndarray
+    Q: np.ndarray
+    mean: np.ndarray
+    covariance: np.ndarray
+
+    def filter(self):
+        """The package's filter of this model."""
+        return KalmanFilter(self.F, self.s, self.mean, FreeCovariance(self.F, self.Q, self.covariance))
+
+
+class Gaussian(NamedTuple):
+    """A mean and a full covariance."""
+
+    mean: np.ndarray
+    covariance: np.ndarray
+
+    @property
+    def variance(self):
+        return self.covariance.diagonal()
+
+
+def random_model(rng, n=14, radius=0.9):
+    """A stable model far from normal (‖F‖ ≈ 1.7, as in the pipe), with noise of less than full rank."""
+    F = rng.normal(size=(n, n))
+    F *= radius / np.abs(np.linalg.eigvals(F)).max()
+    gain, root = rng.normal(size=(n, n // 2)), rng.normal(size=(n, n))
+    return LinearGaussian(F, rng.normal(size=n), gain @ gain.T, rng.normal(size=n), root @ root.T + np.eye(n))
+
+
+def random_design(rng, n, steps, m=3, noise=(50.0, 500.0)):
+    """Another observation matrix (m, n) and other noise variances (m,) at each step.
+
+    By default the noise is about as large as what the state adds to a measurement, so that both count.
+    """
+    return [(rng.normal(size=(m, n)), rng.uniform(*noise, m)) for _ in range(steps)]
+
+
+def draw(model, design, rng):
+    """One truth (T + 1, n) of the model, t = 0 first, and its observations t = 1 … T."""
+    c = rng.multivariate_normal(model.mean, model.covariance)
+    truth, observations = [c], []
+    for H, variance in design:
+        c = model.F @ c + model.s + rng.multivariate_normal(np.zeros(len(c)), model.Q)
+        truth.append(c)
+        observations.append(Observation(H, H @ c + rng.normal(size=len(H)) * np.sqrt(variance), variance))
+    return np.array(truth), observations
+
+
+# -- the textbook -----------------------------------------------------------------------------------------------------
+
+
+def dense_filter(model, observations):
+    """The Kalman recursion with n×n covariances: [(predicted, filtered)] for t = 1 … T."""
+    now, steps = Gaussian(model.mean, model.covariance), []
+    for H, value, variance in observations:
+        predicted = Gaussian(model.F @ now.mean + model.s, model.F @ now.covariance @ model.F.T + model.Q)
+        P = predicted.covariance
+        K = np.linalg.solve(H @ P @ H.T + np.diag(variance), H @ P).T
+        now = Gaussian(predicted.mean + K @ (value - H @ predicted.mean), P - K @ H @ P)
+        steps.append((predicted, now))
+    return steps
+
+
+def rauch_tung_striebel(model, steps):
+    """The smoother that comes back over `dense_filter` with an n×n inverse a step: [smoothed] for t = 1 … T."""
+    smoothed = [steps[-1][1]]
+    for (_, filtered), (predicted, _) in zip(steps[-2::-1], steps[:0:-1], strict=True):
+        G = np.linalg.solve(predicted.covariance, model.F @ filtered.covariance).T
+        last = smoothed[-1]
+        smoothed.append(Gaussian(filtered.mean + G @ (last.mean - predicted.mean),
+                                 filtered.covariance + G @ (last.covariance - predicted.covariance) @ G.T))
+    return smoothed[::-1]
+
+
+def joint_posterior(model, observations):
+    """All states c₁ … c_T given all measurements at once, from their joint Gaussian without any recursion."""
+    n, T = len(model.mean), len(observations)
+    # c = A (offset + w), where A holds the powers of F and w the independent noises, c₀ being the first of them.
+    A = np.linalg.inv(np.eye((T + 1) * n) - np.kron(np.eye(T + 1, k=-1), model.F))
+    noise, H = np.zeros_like(A), []
+    for t in range(T + 1):
+        noise[t * n:(t + 1) * n, t * n:(t + 1) * n] = model.Q if t else model.covariance
+    mean, C = A @ np.concatenate([model.mean] + [model.s] * T), A @ noise @ A.T
+    for t, observation in enumerate(observations, start=1):
+        H.append(np.zeros((len(observation.value), (T + 1) * n)))
+        H[-1][:, t * n:(t + 1) * n] = observation.matrix
+    H = np.concatenate(H)
+    S = H @ C @ H.T + np.diag(np.concatenate([o.noise_variance for o in observations]))
+    K = np.linalg.solve(S, H @ C).T
+    mean, C = mean + K @ (np.concatenate([o.value for o in observations]) - H @ mean), C - K @ H @ C
+    return [Gaussian(mean[i:i + n], C[i:i + n, i:i + n]) for i in range(n, (T + 1) * n, n)]
+
+
+# -- the pipe ---------------------------------------------------------------------------------------------------------
+
+
+@lru_cache(maxsize=1)
+def pipe(steps=5):
+    """The thesis' pipe with n = 1701: its model in full matrices, a maker of its filter, observations, `dense_filter`.
+
+    The full matrices are put together from Table 5.1 here, the filter by ``table_5_1``.
+    """
+    c_bh, rng, scenario = 30.0, np.random.default_rng(11), Pipe2D()
+    transport, observation = scenario.model()
+    evolution = transport.evolution_model()
+    F, Y, H = evolution
+    n, m = len(F), Y.shape[1]
+    model = LinearGaussian(F, Y @ np.full(m, c_bh), evolution.state_noise_covariance((c_bh / 4)**2, (c_bh / 50)**2),
+                           np.full(n, c_bh), (c_bh / 4)**2 * np.eye(n))
+    linearised = LinearisedObservations(observation, scenario.noise, np.full(n, c_bh))
+    c, observations = c_bh * rng.uniform(0.9, 1.1, n), []
+    for t in range(steps):
+        c = F @ c + Y @ (c_bh * rng.uniform(0.8, 1.2, m)) + H @ (c_bh / 50 * rng.normal(size=n))
+        blank = linearised(np.zeros(2 * scenario.electrodes_per_wall), scenario.currents[t])
+        noise = rng.normal(size=len(blank.value)) * np.sqrt(blank.noise_variance)
+        observations.append(blank._replace(value=blank.matrix @ c + noise))
+    return model, lambda: table_5_1(transport, c_bh), observations, dense_filter(model, observations)
+
+
+# -- nonlinear observations -------------------------------------------------------------------------------------------
+
+
+class QuadraticModel:
+    """R(c) I = Σ_j c_j² T_j I with symmetric T_j: a stand-in for ``ObservationModel``, linear in the currents I."""
+
+    def __init__(self, rng, n=6, electrodes=4):
+        T = rng.normal(size=(n, electrodes, electrodes))
+        self.T = T + T.transpose(0, 2, 1)
+        self.calls = 0
+
+    def voltages(self, concentration, currents):
+        return np.einsum("j,jlm,km->kl", concentration**2, self.T, currents)
+
+    def linearise(self, concentration, currents):
+        self.calls += 1
+        return (self.voltages(concentration, currents),
+                np.einsum("j,jlm,km->klj", 2 * concentration, self.T, currents))

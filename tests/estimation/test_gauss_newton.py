@@ -1,0 +1,157 @@
+"""Gauss–Newton and the best homogeneous estimate against closed forms and scipy's minimisers."""
+
+import numpy as np
+import pytest
+import scipy.optimize
+import scipy.sparse as sp
+from models import QuadraticModel
+
+from eitbench.estimation import best_homogeneous, gauss_newton
+from eitbench.physics.cem import CompleteElectrodeModel
+from eitbench.physics.mesh import rectangle_mesh
+from eitbench.physics.observation import KohlrauschConductivity, ObservationModel, VoltageNoise
+
+
+class Linear:
+    """R(c) = J c for any injections."""
+
+    def __init__(self, jacobian):
+        self.jacobian = jacobian
+
+    def voltages(self, concentration, _currents):
+        return self.jacobian @ concentration
+
+    def linearise(self, concentration, currents):
+        return self.voltages(concentration, currents), self.jacobian
+
+
+class Arctangent:
+    """R(c) = arctan c for one number: from c = 3 a full Gauss–Newton step overshoots, and the next one more."""
+
+    def voltages(self, concentration, _currents):
+        return np.arctan(concentration)[None]
+
+    def linearise(self, concentration, currents):
+        return self.voltages(concentration, currents), (1 / (1 + concentration**2))[None, None]
+
+
+def small_tank():
+    """A real observation model with four electrodes, 45 nodes and Kohlrausch's nonlinear conductivity."""
+    eit = rectangle_mesh(np.linspace(0.0, 0.2, 9), np.linspace(-0.05, 0.05, 5))
+    electrodes = [eit.facets_where(lambda p, a=a, y=y: (p[:, 1] == y) & (np.abs(p[:, 0] - a) < 0.026))
+                  for y in (-0.05, 0.05) for a in (0.05, 0.15)]
+    cd = rectangle_mesh(np.linspace(0.0, 0.2, 6), np.linspace(-0.05, 0.05, 4))
+    return cd.n_nodes, ObservationModel(CompleteElectrodeModel(eit, electrodes, 2e-3),
+                                        cd.interpolation_to(eit.points), KohlrauschConductivity(), 0.1)
+
+
+# -- Gauss–Newton -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", [np.asarray, sp.csr_array], ids=["dense", "sparse"])
+def test_linear_model_gives_tikhonovs_solution(kind):
+    """(JᵀWJ + P)⁻¹JᵀWV, from far away and for either kind of penalty matrix, to 1e-8."""
+    rng = np.random.default_rng(0)
+    jacobian, voltages = rng.normal(size=(5, 4, 12)), rng.normal(size=(5, 4))
+    std, root = rng.uniform(0.1, 2.0, (5, 4)), rng.normal(size=(12, 12))
+    J, W, penalty = jacobian.reshape(20, 12), np.diag(1 / std.ravel()**2), root @ root.T
+    expected = np.linalg.solve(J.T @ W @ J + penalty, J.T @ W @ voltages.ravel())
+    found = gauss_newton(Linear(jacobian), voltages, np.zeros((5, 4)), std, kind(penalty),
+                         100 * rng.normal(size=12), tolerance=1e-12)
+    np.testing.assert_allclose(found, expected, atol=1e-8)
+
+
+def test_nonlinear_model_ends_where_the_gradient_vanishes():
+    """The objective's gradient, by central differences, is nothing beside the one at the start; scipy agrees."""
+    rng = np.random.default_rng(1)
+    model, currents, truth = QuadraticModel(rng), rng.normal(size=(3, 4)), rng.uniform(1.0, 2.0, 6)
+    voltages = model.voltages(truth, currents) + 0.3 * rng.normal(size=(3, 4))
+    std, penalty, start = np.full((3, 4), 0.3), 0.5 * np.eye(6), np.full(6, 4.0)
+
+    def objective(c):
+        return (((voltages - model.voltages(c, currents)) / std)**2).sum() + c @ penalty @ c
+
+    def gradient(c, h=1e-5):
+        return np.array([(objective(c + h * e) - objective(c - h * e)) / (2 * h) for e in np.eye(6)])
+
+    found = gauss_newton(model, voltages, currents, std, penalty, start, tolerance=1e-14, max_iterations=100)
+    assert np.abs(gradient(found)).max() < 1e-7 * np.abs(gradient(start)).max()
+    assert objective(found) == pytest.approx(scipy.optimize.minimize(objective, truth, tol=1e-10).fun, rel=1e-8)
+    # The default tolerance stops earlier, but within that part of the minimum.
+    assert objective(gauss_newton(model, voltages, currents, std, penalty, start)) < 1.001 * objective(found)
+
+
+def test_steps_that_overshoot_are_halved():
+    """Newton on arctan from c = 3 diverges; with halving the minimum at zero is found."""
+    found = gauss_newton(Arctangent(), np.zeros((1, 1)), np.zeros((1, 1)), np.ones((1, 1)), np.zeros((1, 1)),
+                         np.array([3.0]), tolerance=1e-12)
+    assert abs(found[0]) < 1e-6
+
+
+def test_start_is_left_alone():
+    """The first guess is an argument, not a workspace."""
+    start = np.full(3, 2.0)
+    gauss_newton(Linear(np.eye(3)[None]), np.ones((1, 3)), np.zeros((1, 3)), np.ones((1, 3)), np.eye(3), start)
+    np.testing.assert_array_equal(start, 2.0)
+
+
+# -- best homogeneous estimate ----------------------------------------------------------------------------------------
+
+
+def quadratic():
+    """Six states seen through a quadratic model."""
+    return 6, QuadraticModel(np.random.default_rng(2))
+
+
+@pytest.mark.parametrize("make", [quadratic, small_tank])
+def test_constant_is_recovered_from_clean_voltages(make):
+    """V = R(30·1), from a third and from three times of it, to 1e-7; injections may repeat."""
+    n, model = make()
+    currents = np.array([[1.0, -1.0, 0.0, 0.0], [0.0, 1.0, 0.0, -1.0], [1.0, -1.0, 0.0, 0.0], [0.0, 0.0, 1.0, -1.0]])
+    voltages = model.voltages(np.full(n, 30.0), currents)
+    for start in (10.0, 90.0):
+        assert best_homogeneous(model, VoltageNoise(), n, voltages, currents, start) == pytest.approx(30.0, rel=1e-7)
+
+
+@pytest.mark.parametrize("make", [quadratic, small_tank])
+def test_noisy_voltages_give_the_weighted_least_squares_minimum(make):
+    """Where scipy finds the minimum of Σ((V − R(c·1))/std)² over one number; the target is not homogeneous."""
+    n, model = make()
+    rng, noise = np.random.default_rng(3), VoltageNoise(0.05, 0.01)
+    currents = np.array([[1.0, -1.0, 0.0, 0.0], [0.0, 1.0, 0.0, -1.0], [1.0, 0.0, -1.0, 0.0], [1.0, -1.0, 0.0, 0.0]])
+    voltages = model.voltages(rng.uniform(20.0, 40.0, n), currents)
+    voltages = voltages + noise.std(voltages) * rng.normal(size=voltages.shape)
+
+    def objective(logarithm):
+        computed = model.voltages(np.full(n, np.exp(logarithm)), currents)
+        return (((voltages - computed) / noise.std(voltages))**2).sum()
+
+    expected = scipy.optimize.minimize_scalar(objective, bounds=np.log([5.0, 100.0]), method="bounded",
+                                              options={"xatol": 1e-10})
+    found = best_homogeneous(model, noise, n, voltages, currents, 30.0)
+    assert np.log(found) == pytest.approx(expected.x, abs=1e-6)
+
+
+def test_repeated_injections_are_computed_once():
+    """The model sees each distinct pattern once an iteration, however long the record."""
+    n, model = quadratic()
+    patterns = np.array([[1.0, -1.0, 0.0, 0.0], [0.0, 1.0, -1.0, 0.0]])
+    seen = []
+
+    class Watched:
+        def linearise(self, concentration, currents):
+            seen.append(len(currents))
+            return model.linearise(concentration, currents)
+
+    currents = np.tile(patterns, (8, 1))
+    best_homogeneous(Watched(), VoltageNoise(), n, model.voltages(np.full(n, 3.0), currents), currents, 2.0)
+    assert set(seen) == {2}
+
+
+def test_not_settling_is_an_error():
+    """One iteration from far away is not enough, and the error says how far it got."""
+    n, model = quadratic()
+    currents = np.array([[1.0, -1.0, 0.0, 0.0]])
+    voltages = model.voltages(np.full(n, 30.0), currents)
+    with pytest.raises(RuntimeError, match=r"did not settle in 1 iterations; last change .* mol/m³"):
+        best_homogeneous(model, VoltageNoise(), n, voltages, currents, 10.0, max_iterations=1)

@@ -1,0 +1,169 @@
+"""From a concentration to voltages and noise: conductivity laws, the chain rule, the floor, the noise formula."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from eitbench.physics.cem import CompleteElectrodeModel
+from eitbench.physics.mesh import rectangle_mesh
+from eitbench.physics.observation import KohlrauschConductivity, LinearConductivity, ObservationModel, VoltageNoise
+
+LAWS = [LinearConductivity(0.011), KohlrauschConductivity()]
+PATTERNS = np.array([[1.0, -1.0, 0.0, 0.0], [0.0, 0.5, -1.5, 1.0], [0.3, 0.3, 0.3, -0.9]])
+FLOOR = 2.0
+
+each_law = pytest.mark.parametrize("law", LAWS, ids=lambda law: type(law).__name__)
+
+
+def observation(law) -> ObservationModel:
+    """Four electrodes on a rectangle; the concentration lives on a mesh that does not conform to the EIT mesh."""
+    eit_mesh = rectangle_mesh(np.linspace(0.0, 1.0, 7), np.linspace(0.0, 0.6, 5))
+    cd_mesh = rectangle_mesh(np.linspace(0.0, 1.0, 5), np.linspace(0.0, 0.6, 4))
+    electrodes = [eit_mesh.facets_where(lambda p, y=y, a=a: (np.abs(p[:, 1] - y) < 1e-9) & (p[:, 0] > a - 1e-9)
+                                        & (p[:, 0] < a + 0.34)) for y in (0.0, 0.6) for a in (0.0, 0.5)]
+    cem = CompleteElectrodeModel(eit_mesh, electrodes, 0.1)
+    return ObservationModel(cem, cd_mesh.interpolation_to(eit_mesh.points), law, FLOOR)
+
+
+def concentration(model: ObservationModel, low: float = 10.0, high: float = 60.0) -> np.ndarray:
+    return np.random.default_rng(5).uniform(low, high, model.interpolation.shape[1])
+
+
+def difference_quotients(model: ObservationModel, c: np.ndarray, step: float = 1e-3) -> np.ndarray:
+    """(K, L, n_cd) central differences of the voltages."""
+    return np.stack([(model.voltages(c + e, PATTERNS) - model.voltages(c - e, PATTERNS)) / (2 * step)
+                     for e in step * np.eye(len(c))], axis=-1)
+
+
+# -- conductivity laws ------------------------------------------------------------------------------------------------
+
+@each_law
+def test_derivative_of_the_law(law):
+    """dσ/dc is that of central differences."""
+    c = np.geomspace(0.5, 500.0, 30)
+    step = 1e-5 * c
+    assert_allclose(law.derivative(c), (law(c + step) - law(c - step)) / (2 * step), rtol=1e-8)
+
+
+def test_linear_law():
+    """σ = Λc."""
+    assert_allclose(LinearConductivity(0.011)(np.array([0.0, 10.0, 30.0])), [0.0, 0.11, 0.33])
+
+
+def test_kohlrausch_law_is_sodium_chloride():
+    """Within 1 % of the molar conductivity tabulated for NaCl at 25 °C up to 0.01 mol/l."""
+    c = np.array([0.5, 1.0, 5.0, 10.0])                                        # mol/m³
+    tabulated = np.array([124.44, 123.68, 120.59, 118.45]) * 1e-4              # S·m²/mol
+    assert_allclose(KohlrauschConductivity()(c) / c, tabulated, rtol=1e-2)
+
+
+def test_kohlrausch_law_without_its_root_is_linear():
+    """K = 0 leaves σ = Λ₀c; with K the conductivity peaks at c = (2Λ₀/3K)²."""
+    c = np.array([1.0, 30.0])
+    assert_allclose(KohlrauschConductivity(0.012, 0.0)(c), LinearConductivity(0.012)(c))
+    law = KohlrauschConductivity(0.012, 3e-4)
+    peak = np.array([(2 * 0.012 / (3 * 3e-4))**2])
+    assert law.derivative(peak) == pytest.approx(0.0, abs=1e-15)
+    assert (law.derivative(0.9 * peak) > 0).all() and (law.derivative(1.1 * peak) < 0).all()
+
+
+@pytest.mark.parametrize(("make", "match"), [
+    (lambda: LinearConductivity(0.0), "molar_conductivity"),
+    (lambda: LinearConductivity(np.nan), "molar_conductivity"),
+    (lambda: KohlrauschConductivity(-0.01), "limiting_molar_conductivity"),
+    (lambda: KohlrauschConductivity(0.01, -1.0), "kohlrausch_coefficient"),
+    (lambda: VoltageNoise(relative=-0.01), "relative"),
+    (lambda: VoltageNoise(of_largest=np.inf), "of_largest"),
+    (lambda: VoltageNoise(floor="low"), "floor")])
+def test_wrong_parameters_are_refused(make, match):
+    """The message names the parameter."""
+    with pytest.raises(ValueError, match=f"^{match} must be"):
+        make()
+
+
+# -- noise ------------------------------------------------------------------------------------------------------------
+
+def test_noise_formula():
+    """std² = (1 % of the reading)² + (0.1 % of the injection's largest voltage)² + floor², each injection by itself."""
+    voltages = np.array([[3.0, -4.0, 0.0], [0.1, 0.0, -0.05]])
+    expected = np.sqrt([[0.03**2 + 0.004**2, 0.04**2 + 0.004**2, 0.004**2],
+                        [0.001**2 + 0.0001**2, 0.0001**2, 0.0005**2 + 0.0001**2]])
+    assert_allclose(VoltageNoise().std(voltages), expected, rtol=1e-14)
+    assert_allclose(VoltageNoise(floor=0.02).std(voltages), np.sqrt(expected**2 + 0.02**2), rtol=1e-14)
+    assert_allclose(VoltageNoise(0.0, 0.0, 0.02).std(voltages), 0.02)
+    assert_allclose(VoltageNoise().std(voltages[0]), expected[0])
+
+
+def test_noise_scales_with_the_current_unless_it_has_a_floor():
+    """Without a floor ten times the current gives ten times the noise: the amplitude buys nothing."""
+    voltages = np.random.default_rng(1).standard_normal((4, 3, 8))
+    assert_allclose(VoltageNoise().std(-10.0 * voltages), 10.0 * VoltageNoise().std(voltages))
+    floored = VoltageNoise(floor=0.01)
+    assert (floored.std(10.0 * voltages) < 10.0 * floored.std(voltages)).all()
+
+
+# -- the observation model --------------------------------------------------------------------------------------------
+
+@each_law
+def test_linearisation_of_the_observation(law):
+    """dV/dc of every reading and node agrees with central differences; the voltages are those of the model."""
+    model = observation(law)
+    c = concentration(model)
+    voltages, jacobian = model.linearise(c, PATTERNS)
+    assert jacobian.shape == (3, 4, len(c))
+    differences = difference_quotients(model, c)
+    assert_allclose(jacobian, differences, atol=1e-6 * np.abs(differences).max(axis=2).min())
+    assert_allclose(voltages, model.voltages(c, PATTERNS), rtol=1e-13)
+    assert_allclose(voltages, PATTERNS @ model.transfer_resistance(c), rtol=1e-12, atol=1e-14)
+
+
+@each_law
+def test_a_uniform_concentration_is_a_uniform_conductivity(law):
+    """No interpolation error in a constant: 𝓡(c) is the electrode model's for σ(c)."""
+    model = observation(law)
+    R = model.transfer_resistance(np.full(model.interpolation.shape[1], 30.0))
+    sigma = np.full(model.cem.mesh.n_nodes, float(law(np.array(30.0))))
+    assert_allclose(R, model.cem.transfer_resistance(sigma), rtol=1e-12)
+
+
+@each_law
+def test_concentration_below_the_floor_counts_as_the_floor(law):
+    """Negative and tiny values leave σ positive and the voltages those of the floor, with the law's slope there."""
+    model = observation(law)
+    c = concentration(model)
+    # A whole cross-section below the floor, so that there are EIT nodes that see nothing else.
+    low, at_floor = c.copy(), c.copy()
+    low[:8], at_floor[:8] = -1e3, FLOOR
+    assert np.isfinite(model.voltages(low, PATTERNS)).all()
+    assert_allclose(model.voltages(np.full_like(c, -5.0), PATTERNS),
+                    model.voltages(np.full_like(c, FLOOR), PATTERNS), rtol=1e-13)
+    _, jacobian = model.linearise(np.full_like(c, -5.0), PATTERNS)
+    _, expected = model.linearise(np.full_like(c, FLOOR), PATTERNS)
+    assert_allclose(jacobian, expected, rtol=1e-12)
+    assert np.abs(jacobian).max() > 0
+    # At EIT nodes that mix both, the mixture is what is floored, so the voltages differ from those of a floored state.
+    assert not np.allclose(model.voltages(low, PATTERNS), model.voltages(at_floor, PATTERNS), rtol=1e-6)
+
+
+def test_wrong_concentrations_are_refused():
+    """Not finite, or not one number a node of the concentration's mesh; a floor must be positive."""
+    model = observation(LAWS[0])
+    c = concentration(model)
+    for bad in (c[:-1], np.where(np.arange(len(c)) == 2, np.nan, c)):
+        for call in (model.transfer_resistance, lambda c: model.voltages(c, PATTERNS),
+                     lambda c: model.linearise(c, PATTERNS)):
+            with pytest.raises(ValueError, match="concentration must"):
+                call(bad)
+    with pytest.raises(ValueError, match="smallest_concentration must be"):
+        ObservationModel(model.cem, model.interpolation, LAWS[0], 0.0)
+
+
+def test_arguments_are_left_alone():
+    """Neither the concentration nor the currents are written to."""
+    model = observation(LAWS[1])
+    c, currents = np.full(model.interpolation.shape[1], -1.0), PATTERNS.copy()
+    model.linearise(c, currents)
+    assert_array_equal(c, -1.0)
+    assert_array_equal(currents, PATTERNS)

@@ -1,0 +1,172 @@
+"""Scores against integrals done by hand, definitions done by quadrature, and chance."""
+
+import numpy as np
+import pytest
+import scipy.integrate
+from scipy.stats import norm
+
+from eitbench.physics.fem import mass_matrix
+from eitbench.physics.mesh import rectangle_mesh
+from eitbench.scoring import (
+    coverage,
+    crps,
+    normalised_innovations,
+    relative_error,
+    skill,
+    spread_ratio,
+    step_errors,
+    voltage_discrepancy,
+)
+
+
+@pytest.fixture(scope="module")
+def square():
+    """An uneven mesh of [0, 2] × [0, 1]: coordinates x and y of its nodes and its mass matrix."""
+    mesh = rectangle_mesh([0.0, 0.3, 1.1, 2.0], [0.0, 0.2, 0.9, 1.0])
+    return *mesh.points.T, mass_matrix(mesh)
+
+
+# -- the relative error -----------------------------------------------------------------------------------------------
+
+
+def test_relative_error_is_squared_without_a_root(square):
+    """Constants: (ĉ − c)²/c² = (0.5/2)², whatever the mesh."""
+    x, _, mass = square
+    truth = np.full((3, len(x)), 2.0)
+    assert relative_error(truth + 0.5, truth, mass) == pytest.approx(0.0625, rel=1e-13)
+
+
+def test_relative_error_integrates_linear_fields_exactly(square):
+    """Truth x, error y on [0, 2] × [0, 1]: ∫y² / ∫x² = (2/3) / (8/3) = ¼."""
+    x, y, mass = square
+    assert relative_error((x + y)[None], x[None], mass) == pytest.approx(0.25, rel=1e-13)
+
+
+def test_relative_error_is_the_mean_of_ratios(square):
+    """(1/T) Σ_t of each step's own ratio: ¼ with the truth x and 1 with the truth y, not the ratio of sums."""
+    x, y, mass = square
+    truth, estimate = np.stack([x, y]), np.stack([x + y, 2 * y])
+    np.testing.assert_allclose(step_errors(estimate, truth, mass), [0.25, 1.0], rtol=1e-13)
+    assert relative_error(estimate, truth, mass) == pytest.approx(0.625, rel=1e-13)
+
+
+def test_contrast_form_measures_against_the_homogeneous_estimate(square):
+    """Truth 5 + x, reference 5: the denominator is ∫x², and the homogeneous estimate itself scores 1."""
+    x, y, mass = square
+    truth = (5.0 + x)[None]
+    assert relative_error(truth + y, truth, mass, reference=5.0) == pytest.approx(0.25, rel=1e-13)
+    assert relative_error(np.full_like(truth, 5.0), truth, mass, reference=5.0) == pytest.approx(1.0, rel=1e-13)
+    assert relative_error(truth + y, truth, mass) < 0.02
+
+
+def test_mass_may_be_dense_or_sparse(square):
+    """Either kind of matrix gives the same number."""
+    x, y, mass = square
+    arguments = (x + y)[None], x[None]
+    assert relative_error(*arguments, mass.toarray()) == pytest.approx(relative_error(*arguments, mass), rel=1e-14)
+
+
+# -- voltages ---------------------------------------------------------------------------------------------------------
+
+
+def test_voltage_discrepancy_is_a_mean_square():
+    """1/(T·N_V) Σ‖V − V̂‖²: (1 + 4 + 0 + 0 + 0 + 4)/(2·3)."""
+    measured = np.array([[1.0, 2.0, 3.0], [0.0, 0.0, 0.0]])
+    computed = np.array([[0.0, 0.0, 3.0], [0.0, 0.0, 2.0]])
+    assert voltage_discrepancy(measured, computed) == pytest.approx(1.5, rel=1e-15)
+
+
+def test_innovations_of_their_own_covariance_average_one():
+    """NIS/m of 4000 correlated Gaussian draws is 1 ± 0.05 (5 sigma); a halved covariance doubles it exactly."""
+    rng = np.random.default_rng(0)
+    T, m = 4000, 5
+    root = rng.normal(size=(T, m, m))
+    covariance = root @ root.transpose(0, 2, 1) + 0.1 * np.eye(m)
+    innovation = (np.linalg.cholesky(covariance) @ rng.normal(size=(T, m, 1)))[..., 0]
+    nis = normalised_innovations(innovation, covariance)
+    assert nis.shape == (T,)
+    assert nis.mean() == pytest.approx(1.0, abs=5 * np.sqrt(2 / (m * T)))
+    np.testing.assert_allclose(normalised_innovations(innovation, covariance / 2), 2 * nis, rtol=1e-9)
+    assert nis[7] == pytest.approx(innovation[7] @ np.linalg.inv(covariance[7]) @ innovation[7] / m, rel=1e-9)
+
+
+# -- calibration ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("mean", "std", "truth"), [(0.0, 1.0, 0.0), (1.0, 0.5, 2.2), (-3.0, 2.0, -9.0)])
+def test_crps_is_the_integral_of_its_definition(mean, std, truth):
+    """∫ (Φ((s − mean)/std) − 1[s ≥ truth])² ds by quadrature on either side of the truth."""
+    below = scipy.integrate.quad(lambda s: norm.cdf(s, mean, std)**2, -np.inf, truth)[0]
+    above = scipy.integrate.quad(lambda s: norm.sf(s, mean, std)**2, truth, np.inf)[0]
+    one = np.ones((1, 1))
+    assert crps(mean * one, std * one, truth * one, np.ones(1)) == pytest.approx(below + above, rel=1e-6)
+
+
+def test_crps_is_the_closed_form_averaged_with_weights():
+    """std·(z(2Φ(z) − 1) + 2φ(z) − 1/√π) from scipy's normal distribution, mean over time, weighted over space."""
+    rng = np.random.default_rng(1)
+    mean, truth, std = rng.normal(size=(6, 4)), rng.normal(size=(6, 4)), rng.uniform(0.1, 2.0, (6, 4))
+    weights = np.array([1.0, 2.0, 0.0, 5.0])
+    z = (truth - mean) / std
+    score = std * (z * (2 * norm.cdf(z) - 1) + 2 * norm.pdf(z) - 1 / np.sqrt(np.pi))
+    assert crps(mean, std, truth, weights) == pytest.approx(score.mean(axis=0) @ weights / 8, rel=1e-12)
+
+
+def test_crps_without_spread_is_the_absolute_error():
+    """A point forecast is charged its absolute error, also beside forecasts with a spread; no warning is raised."""
+    mean, truth = np.array([[1.0, 2.0]]), np.array([[4.0, 2.0]])
+    with np.errstate(all="raise", under="ignore"):
+        assert crps(mean, np.zeros((1, 2)), truth, np.array([3.0, 1.0])) == pytest.approx(2.25, rel=1e-14)
+    tiny = crps(mean, np.full((1, 2), 1e-9), truth, np.array([3.0, 1.0]))
+    assert tiny == pytest.approx(2.25, abs=1e-8)
+
+
+@pytest.mark.parametrize("level", [0.5, 0.9])
+def test_honest_gaussians_are_covered_as_often_as_they_say(level):
+    """Truth drawn from the forecast: coverage is the level within five binomial deviations; twice the std is more."""
+    rng = np.random.default_rng(2)
+    mean, std = rng.normal(size=(200, 300)), rng.uniform(0.5, 2.0, (200, 300))
+    truth, weights = mean + std * rng.normal(size=mean.shape), np.ones(300)
+    deviation = np.sqrt(level * (1 - level) / mean.size)
+    assert coverage(mean, std, truth, weights, level) == pytest.approx(level, abs=5 * deviation)
+    assert coverage(mean, 2 * std, truth, weights, level) == pytest.approx(2 * norm.cdf(2 * norm.ppf((1 + level) / 2))
+                                                                           - 1, abs=5 * deviation)
+
+
+def test_coverage_is_weighted_over_space():
+    """At one node the truth lies inside 90 % of a unit Gaussian (±1.645), at the other outside."""
+    mean, std, truth = np.zeros((1, 2)), np.ones((1, 2)), np.array([[1.64, -1.65]])
+    assert coverage(mean, std, truth, np.array([3.0, 1.0]), 0.9) == pytest.approx(0.75, rel=1e-14)
+
+
+def test_spread_ratio_compares_variance_with_squared_error():
+    """By hand (3·1 + 1·4)/(3·4 + 1·16) = ¼; near one for honest Gaussians, four times that when std is doubled."""
+    mean, std, truth = np.zeros((1, 2)), np.array([[1.0, 2.0]]), np.array([[2.0, 4.0]])
+    assert spread_ratio(mean, std, truth, np.array([3.0, 1.0])) == pytest.approx(0.25, rel=1e-14)
+    rng = np.random.default_rng(3)
+    mean, std = np.zeros((200, 300)), np.full((200, 300), 0.7)
+    truth, weights = 0.7 * rng.normal(size=(200, 300)), np.ones(300)
+    honest = spread_ratio(mean, std, truth, weights)
+    assert honest == pytest.approx(1.0, abs=5 * np.sqrt(2 / mean.size))
+    assert spread_ratio(mean, 2 * std, truth, weights) == pytest.approx(4 * honest, rel=1e-12)
+
+
+def test_skill_runs_from_the_homogeneous_estimate_to_the_reference():
+    """0 at E_bh, 1 at E_ref, linear between, negative beyond the homogeneous estimate."""
+    assert [skill(error, homogeneous=0.02, reference=0.004) for error in (0.02, 0.012, 0.004, 0.036)] == pytest.approx(
+        [0.0, 0.5, 1.0, -1.0])
+
+
+# -- shapes -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("left", "right"), [((3, 4), (3, 5)), ((3, 4), (1, 4)), ((4,), (4,)), ((2, 3, 4), (2, 3, 4))])
+@pytest.mark.parametrize("score", [
+    lambda a, b: relative_error(a, b, np.eye(4)), voltage_discrepancy,
+    lambda a, b: crps(a, np.ones_like(a), b, np.ones(4)), lambda a, b: coverage(a, np.ones_like(a), b, np.ones(4), 0.5),
+    lambda a, b: spread_ratio(a, np.ones_like(a), b, np.ones(4)),
+], ids=["relative_error", "voltage_discrepancy", "crps", "coverage", "spread_ratio"])
+def test_arrays_must_be_a_pair_over_time_and_space(score, left, right):
+    """No broadcasting: both arrays are (T, n), or it is an error that shows both shapes."""
+    with pytest.raises(ValueError, match=r"same shape \(T, n\)"):
+        score(np.ones(left), np.ones(right))
