@@ -35,9 +35,8 @@ class Estimator:
         if self.asked_for < 1:
             return None
         frame = len(self.task.currents)
-        if self.task.lag == 0:
-            end = len(self.voltages)
-        else:
+        end = len(self.voltages)
+        if self.task.lag > 0:
             end = min(-(-self.asked_for // frame) * frame, self.task.n_steps)
         return Estimate(self.image(max(0, end - frame), end))
 

@@ -1,8 +1,8 @@
 """Discretisation error of the forward models in noise standard deviations: `python benchmarks/forward_error.py`.
 
-Voltages of all 16 injections for states of training episodes, given by the truth's CD mesh, against an EIT mesh of 68,000
-unknowns. For the estimators' model the state is first taken at its own CD nodes, so its figure holds all of its error:
-the coarser concentration, the interpolation, and the coarser EIT mesh.
+Voltages of all 16 injections for states of training episodes, as they are on the truth's CD mesh, against an EIT
+mesh of 68,000 unknowns. For the estimators' model the state is first taken at its own CD nodes, so its figure holds
+all of its error: the coarser concentration, the interpolation, and the coarser EIT mesh.
 """
 
 import numpy as np

@@ -17,8 +17,25 @@ Benchmark estimators that see a flow only through voltages on the pipe's wall.
 A first look:  eitbench run  — runs our baselines on four test episodes, prints the table, writes results/index.html.
 """)
 
-Suite = StrEnum("Suite", ["quick", "full"])
-Figure = StrEnum("Figure", {name: name for name in ("fig5.4", "fig5.5", "fig5.6", "fig5.7", "fig5.8")})
+
+
+class Suite(StrEnum):
+    """What to run when not told in detail."""
+
+    quick = "quick"
+    full = "full"
+
+
+class Figure(StrEnum):
+    """A figure of the thesis."""
+
+    FIG5_4 = "fig5.4"
+    FIG5_5 = "fig5.5"
+    FIG5_6 = "fig5.6"
+    FIG5_7 = "fig5.7"
+    FIG5_8 = "fig5.8"
+
+
 Out = Annotated[Path, typer.Option("--out", "-o", help="Folder of the results.")]
 Jobs = Annotated[int, typer.Option("--jobs", "-j", min=1, help="Processes; each takes one core and up to 1.5 GB.")]
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -48,7 +65,7 @@ def run(
     env: Annotated[list[str] | None, typer.Option(help="Environment id; may be repeated. Default: all.")] = None,
     baseline: Annotated[list[str] | None, typer.Option(
         help="Name of one of ours, or the path of your own .py file; may be repeated. Default: all of ours.")] = None,
-    seeds: Annotated[str | None, typer.Option(help="Episodes, such as dev:0-9 or test:3. Default: the suite's.")] = None,
+    seeds: Annotated[str | None, typer.Option(help="Episodes, as in dev:0-9 or test:3. Default: the suite's.")] = None,
     jobs: Jobs = CORES,
     out: Out = Path("results"),
 ) -> None:

@@ -52,7 +52,7 @@ class EstimationEnv(gym.Env[dict[str, np.ndarray], np.ndarray]):
         level = task.expected_concentration
         largest_voltage = 100.0 * np.abs(task.observation.voltages(np.full(n, level), task.currents)).max()
         largest_current = np.abs(task.currents).max()
-        self.observation_space = spaces.Dict({
+        self.observation_space: spaces.Dict = spaces.Dict({  # type: ignore[assignment]
             "voltages": spaces.Box(-largest_voltage, largest_voltage, (n_electrodes,), np.float64),
             "currents": spaces.Box(-largest_current, largest_current, (n_electrodes,), np.float64),
         })
@@ -101,7 +101,7 @@ class EstimationEnv(gym.Env[dict[str, np.ndarray], np.ndarray]):
                           self._currents(t), t * self.task.transport.time_step)
 
     def truth(self) -> np.ndarray:
-        """(T, n_truth) concentration in mol/m³ of the episode being played, t = 1 … T; for scoring, never for agents."""
+        """(T, n_truth) concentration in mol/m³ of this episode, t = 1 … T; for scoring, never for agents."""
         if self._episode is None:
             raise gym.error.ResetNeeded("call reset() before truth()")
         return self._episode.concentration[1:].astype(float)

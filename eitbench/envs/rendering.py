@@ -30,12 +30,12 @@ def draw_field(axes: Axes, mesh: Mesh, values: np.ndarray, low: float, high: flo
     return mappable
 
 
-def draw_electrodes(axes: Axes, task: Task, currents: np.ndarray) -> None:
+def draw_electrodes(axes: Axes, task: Task, currents: np.ndarray, width: float = 5.0) -> None:
     """Electrodes as bars on the wall: the source red, the sink blue, the others grey."""
     cem = task.observation.cem
     for facets, current in zip(cem.electrodes, currents, strict=True):
         colour = IDLE if current == 0 else SOURCE if current > 0 else SINK
-        axes.add_collection(LineCollection(list(100 * cem.mesh.points[facets]), colors=colour, linewidths=5,
+        axes.add_collection(LineCollection(list(100 * cem.mesh.points[facets]), colors=colour, linewidths=width,
                                            antialiased=False, clip_on=False, zorder=3))
 
 

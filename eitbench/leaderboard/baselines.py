@@ -56,7 +56,7 @@ def load_baseline(name: str) -> Baseline:
     module = importlib.util.module_from_spec(specification)
     specification.loader.exec_module(module)
     estimator = getattr(module, "Estimator", None)
-    if not callable(getattr(estimator, "update", None)):
+    if estimator is None or not callable(getattr(estimator, "update", None)):
         raise ValueError(f"baseline {path} must define a class Estimator with a method update(voltages, currents)")
     boards = tuple(getattr(estimator, "boards", ("filter",)))
     if not boards or not set(boards) <= set(BOARDS):

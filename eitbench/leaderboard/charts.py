@@ -22,7 +22,8 @@ class Series(NamedTuple):
 
 def _log_ticks(low: float, high: float) -> list[float]:
     """1, 2, 5 times powers of ten within [low, high]."""
-    ticks = [m * 10.0**e for e in range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1) for m in (1, 2, 5)]
+    decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+    ticks = [m * 10.0**e for e in decades for m in (1, 2, 5)]
     return [tick for tick in ticks if low <= tick <= high]
 
 
@@ -48,8 +49,9 @@ def lines(x: np.ndarray, series: list[Series], x_label: str, y_label: str) -> st
         points = " ".join(f"{px(a):.1f},{py(b):.1f}" for a, b in zip(x, s.values, strict=True))
         parts.append(f'<polyline class="series" style="stroke:var(--c{s.colour})" points="{points}">'
                      f'<title>{escape(s.name)}</title></polyline>')
-    parts.append(f'<text x="{(LEFT + WIDTH - RIGHT) / 2}" y="{HEIGHT - 6}" text-anchor="middle">{escape(x_label)}</text>'
-                 f'<text transform="translate(14 {(HEIGHT - BOTTOM + TOP) / 2}) rotate(-90)" text-anchor="middle">'
+    middle = (LEFT + WIDTH - RIGHT) / 2
+    parts.append(f'<text x="{middle}" y="{HEIGHT - 6}" text-anchor="middle">{escape(x_label)}</text>'
+                 f'<text text-anchor="middle" transform="translate(14 {(HEIGHT - BOTTOM + TOP) / 2}) rotate(-90)">'
                  f'{escape(y_label)}</text></svg>')
     return "".join(parts)
 

@@ -38,7 +38,8 @@ def write_page(store: EpisodeStore, records: list[dict[str, Any]], table: pd.Dat
     html = environment.get_template("page.html.j2").render(
         headings=list(text.columns)[1:], explanations=EXPLANATIONS,
         boards=[(board, rows.iloc[:, 1:].to_numpy().tolist()) for board, rows in text.groupby("board", sort=False)],
-        intervals=_intervals(table), curves=_curves(ordered), legend=_legend(ordered), snapshots=_snapshots(store, records),
+        intervals=_intervals(table), curves=_curves(ordered), legend=_legend(ordered),
+        snapshots=_snapshots(store, records),
         colour_bar=_colour_bar(), record=records[0], commands=sorted({record["command"] for record in records}),
         failures=[(record["title"], episode["seed"], episode["message"]) for record in records
                   for episode in record["episodes"] if episode["status"] != "ok"],
@@ -109,8 +110,8 @@ def _picture(env: EstimationEnv, mesh: Mesh, values: np.ndarray) -> str:
     figure = Figure(figsize=(4.0, 4.0 * extent[1] / extent[0]), dpi=90)
     axes = figure.add_axes((0, 0, 1, 1))
     low, high = colour_range(env.task)
-    axes.tripcolor(Triangulation(*mesh.points.T, mesh.cells), values, shading="gouraud", cmap=FIELD_MAP, vmin=low,
-                   vmax=high)
+    triangles = Triangulation(mesh.points[:, 0], mesh.points[:, 1], mesh.cells)
+    axes.tripcolor(triangles, values, shading="gouraud", cmap=FIELD_MAP, vmin=low, vmax=high)
     axes.set_aspect("equal")
     axes.margins(0)
     axes.axis("off")

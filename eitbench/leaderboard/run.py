@@ -68,6 +68,11 @@ def play(env: EstimationEnv, baseline: Baseline, seed: int) -> Iterator[tuple[in
             yield t, estimate
 
 
+def play_and_collect(env: EstimationEnv, baseline: Baseline, seed: int) -> Played:
+    """Play one whole episode for scoring."""
+    return Played.collect(env.task, _play(env, baseline, seed))
+
+
 def _play(env: EstimationEnv, baseline: Baseline, seed: int,
           ) -> Iterator[tuple[int, Estimate | None, dict[str, np.ndarray], float]]:
     """(t = i − lag, estimate, measurement i, seconds the estimator took) at each step i."""
@@ -117,7 +122,7 @@ def run_episode(job: Job) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     begin = time.perf_counter()
     try:
         with threadpool_limits(1):
-            played = Played.collect(env.task, _play(env, baseline, job.seed))
+            played = play_and_collect(env, baseline, job.seed)
             result |= {"status": "ok", **score(env, played)}
     except Exception as error:                      # whatever a baseline does wrong is its result, not our crash
         result |= {"status": "failed", "message": f"{type(error).__name__}: {error}",

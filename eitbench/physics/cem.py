@@ -258,7 +258,7 @@ def _checked_electrodes(mesh: Mesh, electrodes: Sequence[np.ndarray]) -> list[np
             if owner.get(facet) == number:
                 raise ValueError(f"electrodes[{number}] holds facet {facet} twice")
             if facet in owner:
-                raise ValueError(f"electrodes[{number}] and electrodes[{owner[facet]}] overlap: both hold facet {facet}")
+                raise ValueError(f"electrodes[{number}] and electrodes[{owner[facet]}] overlap in facet {facet}")
             owner[facet] = number
         checked.append(facets)
     return checked

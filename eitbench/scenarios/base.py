@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -20,6 +20,8 @@ class Discretisation(NamedTuple):
 
 class Scenario(Protocol):
     """A frozen dataclass of plain numbers, SI units; its fields identify what is simulated."""
+
+    def __hash__(self) -> int: ...
 
     @property
     def time_step(self) -> float:
@@ -63,8 +65,8 @@ class Scenario(Protocol):
         """The fine one that is simulated; its transport steps ``time_step / truth_steps``."""
         ...
 
-    def model(self, **assumptions: float) -> Discretisation:
-        """The coarser one that estimators are given."""
+    def model(self, *args: Any, **assumptions: Any) -> Discretisation:
+        """The coarser one that estimators are given; ``assumptions`` are what they wrongly believe."""
         ...
 
     def draw_inflow(self, rng: np.random.Generator) -> Callable[[np.ndarray, float], np.ndarray]:
