@@ -204,9 +204,9 @@ def fig5_8(seeds: list[int], jobs: int, out: Path) -> tuple[Path, str]:
     path = out / "fig5.8.png"
     _save(figure, path)
     return path, (
-        f"Minimum at {best['error']:.0f} cm/s for ẽ_c, {best['voltage_discrepancy']:.0f} for ẽ_V, {best['nis']:.0f} for "
-        f"NIS, over {len(seeds)} episodes; the truth is 450.\nAgrees: the error is smallest near the true velocity and "
-        "flat around it, and the voltages alone tell roughly which velocity is right (about 500 in the thesis)."
+        f"Minimum at {best['error']:.0f} cm/s for ẽ_c, {best['voltage_discrepancy']:.0f} for ẽ_V, {best['nis']:.0f} "
+        f"for NIS, over {len(seeds)} episodes; the truth is 450.\nAgrees: the error is smallest near the true velocity "
+        "and flat around it, and the voltages alone tell roughly which velocity is right (about 500 in the thesis)."
         "\nDiffers: NIS, which the thesis does not show, says the same.")
 
 
