@@ -1,17 +1,27 @@
-"""Discretisation error of the forward models in noise standard deviations: `python benchmarks/forward_error.py`.
+"""Discretisation errors, of voltages and of transport: `python benchmarks/forward_error.py`.
 
 Voltages of all 16 injections for states of training episodes, as they are on the truth's CD mesh, against an EIT
 mesh of 68,000 unknowns. For the estimators' model the state is first taken at its own CD nodes, so its figure holds
-all of its error: the coarser concentration, the interpolation, and the coarser EIT mesh.
+all of its error: the coarser concentration, the interpolation, and the coarser EIT mesh. Voltage errors are in noise
+standard deviations.
+
+Transport: the model carries the true inlet values through the pipe until it has forgotten where it began; its error is
+relative to the true deviation from the background.
 """
 
+import itertools
+
 import numpy as np
+import scipy.sparse as sp
+from threadpoolctl import threadpool_limits
 
 from eitbench import simulate
 from eitbench.physics.cem import CompleteElectrodeModel
+from eitbench.physics.fem import mass_matrix
 from eitbench.physics.mesh import graded_pipe_mesh
 from eitbench.physics.observation import ObservationModel
 from eitbench.scenarios import Pipe2D
+from eitbench.scenarios.base import Discretisation
 from eitbench.seeds import parse_seeds
 
 SEEDS, STATES = "train:0-3", range(20, 99, 6)
@@ -32,6 +42,9 @@ def main() -> None:
             std = scenario.noise.std(exact)
             errors["truth"].append((truth.observation.voltages(c, scenario.currents) - exact) / std)
             errors["model"].append((model.observation.voltages(to_model @ c, scenario.currents) - exact) / std)
+    transport = [_transport_error(scenario, model, to_model, simulate(scenario, seed).concentration)
+                 for seed in parse_seeds(SEEDS)]
+    print(f"transport: relative L2 error {np.mean(transport):.3f}, from {min(transport):.3f} to {max(transport):.3f}")
     print(f"reference: {reference.cem.n_unknowns} unknowns, {len(errors['truth'])} states")
     for name, discretisation in (("truth", truth), ("model", model)):
         e = np.array(errors[name])
@@ -40,5 +53,18 @@ def main() -> None:
               f"largest {np.abs(e).max():.3f} noise std")
 
 
+def _transport_error(scenario: Pipe2D, model: Discretisation, to_model: sp.csr_array, truth: np.ndarray) -> float:
+    transport, mass = model.transport, mass_matrix(model.transport.mesh)
+    exact = (to_model @ truth.astype(float).T).T
+    c, inlet = exact[0], transport.inlet
+    errors = []
+    for before, after in itertools.pairwise(exact):
+        c = transport.step(c, before[inlet], after[inlet])
+        difference, deviation = c - after, after - scenario.background
+        errors.append((difference @ mass @ difference) / (deviation @ mass @ deviation))
+    return float(np.sqrt(np.mean(errors[3 * scenario.warm_up:])))
+
+
 if __name__ == "__main__":
-    main()
+    with threadpool_limits(1):
+        main()

@@ -5,6 +5,7 @@ with two values an octave take the α with the smallest mean relative error. Dev
 """
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from eitbench import make_task, simulate
 from eitbench.envs.estimation import truth_operators
@@ -43,4 +44,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with threadpool_limits(1):
+        main()

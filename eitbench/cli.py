@@ -78,8 +78,9 @@ def run(
     from eitbench.leaderboard.store import EpisodeStore
     from eitbench.seeds import parse_seeds
     with _clear_errors():
-        todo = suites.jobs(suite.value, env or [], baseline or [], parse_seeds(seeds or suites.SEEDS[suite.value]))
-        run_jobs(todo, EpisodeStore(out), n_jobs=jobs)
+        todo = suites.jobs(suite.value, env or [], baseline or [],
+                           parse_seeds(suites.SEEDS[suite.value] if seeds is None else seeds))
+    run_jobs(todo, EpisodeStore(out), n_jobs=jobs)
     _report(out)
 
 

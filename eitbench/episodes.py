@@ -9,8 +9,7 @@ import hashlib
 import io
 import json
 import os
-import tempfile
-import zipfile
+import uuid
 from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
@@ -18,6 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
+import skfem
 from tqdm import tqdm
 
 from eitbench import _check
@@ -109,8 +109,10 @@ def cache_folder() -> Path:
 
 def _identity(scenario: Scenario, seed: int) -> str:
     """All that the numbers depend on: scenario, seed, the code that simulates, and the libraries beneath it."""
-    return json.dumps({"scenario": type(scenario).__name__, "fields": asdict(scenario), "seed": seed,   # type: ignore
-                       "code": _code_digest(), "numpy": np.__version__, "scipy": scipy.__version__}, sort_keys=True)
+    kind = type(scenario)
+    return json.dumps({"scenario": f"{kind.__module__}.{kind.__qualname__}", "fields": asdict(scenario),  # type: ignore
+                       "seed": seed, "code": _code_digest(), "numpy": np.__version__, "scipy": scipy.__version__,
+                       "scikit-fem": skfem.__version__}, sort_keys=True)
 
 
 @lru_cache(maxsize=1)
@@ -134,13 +136,12 @@ def _store(path: Path, identity: str, episode: Episode) -> None:
 def write_atomically(path: Path, data: bytes) -> None:
     """Put ``data`` into ``path`` so that nobody ever sees half of it; parent folders are made."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}")  # unlike mkstemp: as the umask allows
     try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
+        temporary.write_bytes(data)
         os.replace(temporary, path)
     except BaseException:
-        Path(temporary).unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
         raise
 
 
@@ -152,7 +153,7 @@ def _load(path: Path, identity: str) -> Episode | None:
             arrays: dict[str, Any] = {name: stored[name] for name in Episode._fields}
             episode = Episode(**arrays)
             return episode if str(stored["checksum"]) == _checksum(episode) else None
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zipfile.error):
+    except Exception:       # a damaged archive may raise anything: zlib.error, NotImplementedError, RuntimeError, …
         return None
 
 

@@ -87,7 +87,9 @@ def make_task(scenario: Scenario, lag: int | str = 0, **assumptions: float) -> T
         raise ValueError(f"lag must be 'all' or an integer from 0 to {last}, got {lag!r}")
     steps = last if lag == "all" else _check.integer("lag", lag, low=0, high=last)
     model = _model(scenario, tuple(sorted(assumptions.items())))
-    return Task(model.transport, model.observation, scenario.noise, scenario.currents, scenario.n_steps,
+    currents = scenario.currents
+    currents.setflags(write=False)                                # shared by all who play this task
+    return Task(model.transport, model.observation, scenario.noise, currents, scenario.n_steps,
                 scenario.warm_up, steps, scenario.background)
 
 

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
+import json
 import re
+import sys
 from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -51,16 +54,30 @@ def load_baseline(name: str) -> Baseline:
     path = Path(name) if name.endswith(".py") else baseline_folder() / f"{name}.py"
     if not path.is_file():
         raise ValueError(f"baseline must be a path to a .py file or one of {', '.join(own_baselines())}; got {name!r}")
+    return _load(path, hashlib.sha256(path.read_bytes()).hexdigest())
+
+
+@lru_cache(maxsize=64)
+def _load(path: Path, sha256: str) -> Baseline:
+    """The file with this content, executed once a process."""
     specification = importlib.util.spec_from_file_location(f"eitbench_baseline_{path.stem}", path)
     assert specification is not None and specification.loader is not None
     module = importlib.util.module_from_spec(specification)
-    specification.loader.exec_module(module)
+    sys.modules[specification.name] = module                       # dataclasses look their module up
+    try:
+        specification.loader.exec_module(module)
+    except Exception as error:
+        raise ValueError(f"baseline {path} cannot be loaded: {type(error).__name__}: {error}") from error
     estimator = getattr(module, "Estimator", None)
     if estimator is None or not callable(getattr(estimator, "update", None)):
         raise ValueError(f"baseline {path} must define a class Estimator with a method update(voltages, currents)")
     boards = tuple(getattr(estimator, "boards", ("filter",)))
     if not boards or not set(boards) <= set(BOARDS):
         raise ValueError(f"baseline {path}: Estimator.boards must be some of {', '.join(BOARDS)}, got {boards!r}")
-    title = re.split(r"[:(.]", (module.__doc__ or path.stem).strip().splitlines()[0])[0].strip()
-    return Baseline(path.stem, title, path, hashlib.sha256(path.read_bytes()).hexdigest(), boards,
-                    dict(getattr(estimator, "parameters", {})), estimator)
+    title = re.split(r"[:(.]", f"{(module.__doc__ or '').strip()}\n".splitlines()[0])[0].strip() or path.stem
+    parameters = dict(getattr(estimator, "parameters", {}))
+    try:
+        json.dumps(parameters, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"baseline {path}: Estimator.parameters must be JSON: {error}") from None
+    return Baseline(path.stem, title, path, sha256, boards, parameters, estimator)

@@ -30,13 +30,14 @@ def _log_ticks(low: float, high: float) -> list[float]:
 def lines(x: np.ndarray, series: list[Series], x_label: str, y_label: str) -> str:
     """Curves over a linear x axis and a logarithmic y axis."""
     values = np.concatenate([s.values for s in series])
-    low, high = values.min() / 1.15, values.max() * 1.15
+    floor = values[values > 0].min(initial=1.0) / 1.15            # where a perfect estimate's zero is drawn
+    low, high, width = floor, max(values.max(), floor) * 1.15, max(x[-1] - x[0], 1)
 
     def px(value: float) -> float:
-        return LEFT + (value - x[0]) / (x[-1] - x[0]) * (WIDTH - LEFT - RIGHT)
+        return LEFT + (value - x[0]) / width * (WIDTH - LEFT - RIGHT)
 
     def py(value: float) -> float:
-        return HEIGHT - BOTTOM - math.log(value / low) / math.log(high / low) * (HEIGHT - TOP - BOTTOM)
+        return HEIGHT - BOTTOM - math.log(max(value, low) / low) / math.log(high / low) * (HEIGHT - TOP - BOTTOM)
 
     parts = [f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(y_label)} over {escape(x_label)}">']
     for tick in _log_ticks(low, high):

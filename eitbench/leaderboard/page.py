@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import json
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,8 @@ from eitbench.leaderboard.summary import EXPLANATIONS, cells
 from eitbench.physics.mesh import Mesh
 from eitbench.seeds import parse_seeds
 
+COLOURS = 12
+"""--c0 … --c11 of the style sheet"""
 SHOWN = (("kalman_filter", "filter"), ("fixed_interval_smoother", "smoothing"), ("gauss_newton", "smoothing"))
 """Beside the truth, in the snapshots: thesis Figs 5.4 and 5.6."""
 
@@ -50,7 +53,7 @@ def write_page(store: EpisodeStore, records: list[dict[str, Any]], table: pd.Dat
 
 def _record_of(records: list[dict[str, Any]], row: pd.Series) -> dict[str, Any]:
     return next(record for record in records
-                if record["baseline"] == row["baseline"] and record["environment"]["id"] == row["environment"])
+                if record["baseline"] == row["baseline"] and record["environment"]["name"] == row["environment"])
 
 
 def _label(record: dict[str, Any] | pd.Series, title: str) -> str:
@@ -58,13 +61,13 @@ def _label(record: dict[str, Any] | pd.Series, title: str) -> str:
 
 
 def _intervals(table: pd.DataFrame) -> str:
-    rows = [charts.Series(_label(row, row["method"]), int(str(i)), np.array(row["error"]))
+    rows = [charts.Series(_label(row, row["method"]), int(str(i)) % COLOURS, np.array(row["error"]))
             for i, row in table.iterrows() if row["error"] is not None]
     return charts.intervals(sorted(rows, key=lambda s: s.values[0]), "ẽ_c") if rows else ""
 
 
 def _legend(ordered: list[dict[str, Any]]) -> list[tuple[int, str]]:
-    return [(i, _label(record, record["title"])) for i, record in enumerate(ordered)]
+    return [(i % COLOURS, _label(record, record["title"])) for i, record in enumerate(ordered)]
 
 
 def _curves(ordered: list[dict[str, Any]]) -> str:
@@ -73,13 +76,14 @@ def _curves(ordered: list[dict[str, Any]]) -> str:
     for i, record in enumerate(ordered):
         errors = [episode["step_errors"] for episode in record["episodes"] if episode["status"] == "ok"]
         if errors:
-            series.append(charts.Series(_label(record, record["title"]), i, np.mean(errors, axis=0)))
+            series.append(charts.Series(_label(record, record["title"]), i % COLOURS, np.mean(errors, axis=0)))
             steps = len(errors[0])
     return charts.lines(np.arange(1, steps + 1), series, "scored injection", "relative error") if series else ""
 
 
 def _snapshots(store: EpisodeStore, records: list[dict[str, Any]]) -> dict[str, Any] | None:
     """Truth and estimates of one episode at four times, as PNG data; None if nothing can be shown."""
+    records = [record for record in records if any(e["status"] == "ok" for e in record["episodes"])]
     chosen = [record for name, board in SHOWN for record in records
               if record["baseline"] == name and record["board"] == board]
     chosen = chosen or records[:3]
@@ -88,9 +92,13 @@ def _snapshots(store: EpisodeStore, records: list[dict[str, Any]]) -> dict[str, 
     if not shared:
         return None
     seed = shared[0]
-    env = Environment(chosen[0]["environment"]["id"]).make()
+    try:
+        fields = [store.fields(record | {"seed": seed})["mean"] for record in chosen]
+    except FileNotFoundError:                                      # only the records were kept
+        return None
+    world = chosen[0]["environment"]
+    env = Environment(world["id"], json.dumps(world["kwargs"])).make()
     env.reset(seed=parse_seeds(seed)[0])
-    fields = [store.fields(record | {"seed": seed})["mean"] for record in chosen]
     task, truth = env.task, env.truth()
     times = task.warm_up + np.linspace(0.12, 0.88, 4) * (task.n_steps - task.warm_up)
     rows = []

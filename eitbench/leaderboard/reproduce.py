@@ -213,8 +213,8 @@ def fig5_8(seeds: list[int], jobs: int, out: Path) -> tuple[Path, str]:
 def _sweep_panel(ax: Axes, mean: np.ndarray, label: str) -> None:
     ax.plot(100 * VELOCITIES, mean, "o-", color="#0b6e75", markersize=4)
     ax.axvline(450, color="0.6", linestyle="--", linewidth=1)
-    ax.text(450, ax.get_ylim()[1], " true", color="0.4", va="top", fontsize=9)
-    ax.set(xlabel="assumed mean velocity / (cm/s)", ylabel=label, yscale="log")
+    ax.set(xlabel="assumed mean velocity / (cm/s)", ylabel=label, ylim=(0.0, 1.08 * mean.max()))
+    ax.text(460, 1.06 * mean.max(), "true", color="0.4", va="top", fontsize=9)
     ax.spines[["top", "right"]].set_visible(False)
 
 

@@ -13,10 +13,12 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
+import scipy
 from joblib import Parallel, delayed
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
+from eitbench import _check
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.leaderboard.baselines import BOARDS, Baseline, load_baseline
 from eitbench.leaderboard.score import Played, score
@@ -31,6 +33,12 @@ class Environment(NamedTuple):
     id: str
     kwargs: str = "{}"
     """JSON"""
+
+    @property
+    def name(self) -> str:
+        """Fit for a folder; other arguments, other name."""
+        digest = hashlib.sha256(self.kwargs.encode()).hexdigest()[:8]
+        return self.id.replace("/", "-") + ("" if self.kwargs == "{}" else f"-{digest}")
 
     def make(self, **extra: Any) -> EstimationEnv:
         """A fresh environment, without gymnasium's wrappers."""
@@ -50,7 +58,8 @@ class Job(NamedTuple):
 
     def identity(self) -> str:
         """What the outcome depends on; a stored result counts only for the very same."""
-        parts = [*self.environment, load_baseline(self.baseline).sha256, str(self.seed), source_digest()]
+        parts = [*self.environment, load_baseline(self.baseline).sha256, str(self.seed), source_digest(),
+                 np.__version__, scipy.__version__]
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
 
 
@@ -89,14 +98,25 @@ def _play(env: EstimationEnv, baseline: Baseline, seed: int,
         if estimate is None and t >= 1:
             raise ValueError(f"Estimator.update must return an Estimate once a state is asked for; at t = {t} it "
                              "returned None")
-        if estimate is not None and estimate.variance is not None:
-            _checked_variance(estimate.variance, len(silence))
-            env.spread = np.sqrt(estimate.variance)
+        if estimate is not None:
+            _check_estimate(estimate, len(silence), len(seen["voltages"]))
+            if estimate.variance is not None:
+                env.spread = np.sqrt(estimate.variance)
         observation, _, done, _, _ = env.step(silence if estimate is None else estimate.mean)
         yield t, estimate, seen, seconds
 
 
-def _checked_variance(variance: np.ndarray, n: int) -> None:
+def _check_estimate(estimate: Estimate, n: int, n_electrodes: int) -> None:
+    if not isinstance(estimate, Estimate):
+        raise ValueError(f"Estimator.update must return an Estimate or None, got {type(estimate).__name__}")
+    _check.array("Estimate.mean", estimate.mean, (n,), units="mol/m³")
+    variance, innovation, covariance = estimate[1:]
+    if innovation is not None:
+        _check.array("Estimate.innovation", innovation, (n_electrodes,), units="V")
+    if covariance is not None:
+        _check.array("Estimate.innovation_covariance", covariance, (n_electrodes, n_electrodes), units="V²")
+    if variance is None:
+        return
     if np.shape(variance) != (n,) or not np.isfinite(variance).all() or (np.asarray(variance) < 0).any():
         raise ValueError(f"Estimate.variance must be finite, ≥ 0 and of shape ({n},), got shape {np.shape(variance)}")
 
@@ -116,26 +136,30 @@ def run_episode(job: Job) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     result: dict[str, Any] = {
         "identity": job.identity(), "seed": name_seed(job.seed), "baseline": baseline.name, "title": baseline.title,
         "parameters": baseline.parameters, "baseline_sha256": baseline.sha256, "board": board_of(env),
-        "environment": {"id": job.environment.id, "kwargs": env.spec.kwargs if env.spec else {}},
+        "environment": {"id": job.environment.id, "name": job.environment.name,
+                         "kwargs": env.spec.kwargs if env.spec else {}},
         "source": source_digest(), "finished": None,
     }
     begin = time.perf_counter()
     try:
         with threadpool_limits(1):
             played = play_and_collect(env, baseline, job.seed)
-            result |= {"status": "ok", **score(env, played)}
-    except Exception as error:                      # whatever a baseline does wrong is its result, not our crash
+            outcome = score(env, played)
+            for name, value in outcome["scores"].items():
+                _check.number(f"score {name}", value or 0.0)
+            result |= {"status": "ok", **outcome}
+    except (Exception, SystemExit) as error:        # whatever a baseline does wrong is its result, not our crash
         result |= {"status": "failed", "message": f"{type(error).__name__}: {error}",
                    "traceback": traceback.format_exc(limit=-3)}
         played = None
-    result["finished"] = datetime.now(UTC).isoformat(timespec="seconds")
+    result["finished"] = datetime.now(UTC).isoformat(timespec="microseconds")
     result["seconds"] = time.perf_counter() - begin
     return result, {} if played is None else played.fields()
 
 
 def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1) -> None:
     """Run all jobs that ``store`` does not hold yet, in ``n_jobs`` processes with one BLAS thread each."""
-    todo = [job for job in jobs if not store.holds(job.environment.id, job.baseline, job.seed, job.identity())]
+    todo = [job for job in jobs if not store.holds(job.environment.name, job.baseline, job.seed, job.identity())]
     if len(todo) < len(jobs):
         tqdm.write(f"{len(jobs) - len(todo)} of {len(jobs)} episodes are already there")
     seen: dict[Any, Job] = {}
@@ -160,7 +184,7 @@ def _simulate_job(job: Job) -> None:
 
 def _run_job(job: Job, store: EpisodeStore) -> None:
     result, fields = run_episode(job)
-    store.put(job.environment.id, job.baseline, job.seed, result, fields)
+    store.put(job.environment.name, job.baseline, job.seed, result, fields)
 
 
 @lru_cache(maxsize=4)

@@ -47,7 +47,8 @@ class Played:
                 if estimate.variance is not None:
                     variances[t - 1] = estimate.variance
             if estimate.innovation is not None and estimate.innovation_covariance is not None:
-                innovations[t + task.lag] = (estimate.innovation, estimate.innovation_covariance)
+                innovations[t + task.lag] = (np.array(estimate.innovation, dtype=float),     # copies, as means are:
+                                             np.array(estimate.innovation_covariance, dtype=float))  # arrays get reused
         voltages, currents = (np.array([m[key] for m in measured[:task.n_steps]]) for key in ("voltages", "currents"))
         claimed = bool(np.isfinite(variances[task.warm_up:]).all())
         return cls(means, variances if claimed else None, voltages, currents, innovations, np.array(seconds))

@@ -20,6 +20,7 @@ from eitbench.episodes import write_atomically
 from eitbench.seeds import name_seed
 
 SCHEMA = 1
+_NEEDED = {"identity", "seed", "baseline", "environment", "source", "baseline_sha256", "finished", "status"}
 
 
 class EpisodeStore:
@@ -29,7 +30,7 @@ class EpisodeStore:
     """
 
     def __init__(self, folder: Path) -> None:
-        self.folder = Path(folder)
+        self.folder = Path(folder).absolute()           # worker processes may stand elsewhere
 
     def put(self, environment: str, baseline: str, seed: int, result: dict[str, Any],
             fields: dict[str, np.ndarray]) -> None:
@@ -48,14 +49,15 @@ class EpisodeStore:
 
     def results(self) -> Iterator[dict[str, Any]]:
         """All stored results; files that cannot be read are passed over."""
-        for path in sorted(self.folder.glob("episodes/*/*/*.json")):
+        paths = self.folder.glob("episodes/*/*/*.json")
+        for path in sorted(paths, key=lambda path: (path.parent, len(path.name), path.name)):   # 9 before 10
             result = _read(path)
             if result is not None:
                 yield result
 
     def fields(self, result: dict[str, Any]) -> dict[str, np.ndarray]:
         """The estimates that belong to a result: ``mean`` and perhaps ``std``, (T, n) in mol/m³."""
-        folder = self.folder / "episodes" / _folder_name(result["environment"]["id"]) / result["baseline"]
+        folder = self.folder / "episodes" / _environment_folder(result) / result["baseline"]
         with np.load(folder / f"{result['seed'].replace(':', '-')}.npz", allow_pickle=False) as stored:
             return dict(stored)
 
@@ -79,8 +81,11 @@ class EpisodeStore:
                               if key not in (*shared, "environment", "baseline")} for result in results],
                 **provenance(),
             }
-            name = f"{_folder_name(record['environment']['id'])}--{baseline}.json"
-            write_atomically(self.folder / "records" / name, json.dumps(record, indent=1, allow_nan=False).encode())
+            path = self.folder / "records" / f"{_environment_folder(record)}--{baseline}.json"
+            before = _read_json(path)
+            if before is not None and before.get("episodes") == record["episodes"]:
+                record |= {key: before[key] for key in ("command", *provenance())}    # nothing new was played
+            write_atomically(path, json.dumps(record, indent=1, allow_nan=False).encode())
             records.append(record)
         return records
 
@@ -90,10 +95,20 @@ class EpisodeStore:
 
 
 def _read(path: Path) -> dict[str, Any] | None:
+    result = _read_json(path)
+    return result if result is not None and result.keys() >= _NEEDED else None
+
+
+def _read_json(path: Path) -> dict[str, Any] | None:
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        result = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
+    return result if isinstance(result, dict) else None
+
+
+def _environment_folder(result: dict[str, Any]) -> str:
+    return _folder_name(result["environment"].get("name", result["environment"]["id"]))
 
 
 def _folder_name(text: str) -> str:
@@ -114,7 +129,7 @@ def provenance() -> dict[str, Any]:
         "versions": {"python": platform.python_version(), **{
             name: _version(name) for name in ("eitbench", "numpy", "scipy", "gymnasium", "scikit-fem")}},
         "blas": np.show_config(mode="dicts")["Build Dependencies"]["blas"]["name"],  # type: ignore[index,call-overload]
-        "commit": _git("rev-parse", "HEAD"), "dirty": bool(_git("status", "--porcelain")),
+        "commit": _git("rev-parse", "HEAD"), "dirty": bool(_git("--no-optional-locks", "status", "--porcelain")),
         "machine": {"processor": _processor(), "cores": os.cpu_count(), "system": platform.system(),
                     "blas_threads": 1},
     }
@@ -128,8 +143,11 @@ def _version(package: str) -> str | None:
 
 
 def _git(*arguments: str) -> str | None:
+    checkout = Path(__file__).parents[2]
+    if not (checkout / ".git").exists():                 # installed: a repository around it is somebody else's
+        return None
     try:
-        done = subprocess.run(["git", *arguments], cwd=Path(__file__).parent, capture_output=True, text=True,
+        done = subprocess.run(["git", *arguments], cwd=checkout, capture_output=True, text=True,
                               timeout=10, check=True)
     except (OSError, subprocess.SubprocessError):
         return None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from eitbench.envs import ENTRY_POINTS
 from eitbench.leaderboard.baselines import load_baseline, own_baselines
 from eitbench.leaderboard.run import Environment, Job, board_of
@@ -22,11 +24,17 @@ def jobs(suite: str, environments: list[str], baselines: list[str], seeds: list[
     unknown = set(environments) - set(ENTRY_POINTS)
     if unknown:
         raise ValueError(f"env must be one of {', '.join(ENTRY_POINTS)}; got {sorted(unknown)[0]!r}")
+    names: dict[str, str] = {}
+    for baseline in baselines:
+        other = names.setdefault(load_baseline(baseline).name, baseline)
+        if other != baseline:
+            raise ValueError(f"baselines {other} and {baseline} have the same name, under which results are kept; "
+                             "rename one")
     pairs = []
     for name in environments or ENTRY_POINTS:
         environment = Environment(name)
         board = board_of(environment.make())
-        for baseline in baselines or own_baselines():
+        for baseline in [_absolute(name) for name in baselines] or own_baselines():
             skipped = suite == "quick" and not baselines and (board, baseline) in TOO_SLOW_FOR_QUICK
             if board in load_baseline(baseline).boards and not skipped:
                 pairs.append((environment, baseline))
@@ -34,3 +42,8 @@ def jobs(suite: str, environments: list[str], baselines: list[str], seeds: list[
         raise ValueError(f"none of the baselines {', '.join(baselines)} plays any of the environments "
                          f"{', '.join(environments or ENTRY_POINTS)}; see `eitbench list`")
     return [Job(environment, baseline, seed) for seed in seeds for environment, baseline in pairs]
+
+
+def _absolute(baseline: str) -> str:
+    """A path that worker processes find too; a name as it is."""
+    return str(Path(baseline).absolute()) if baseline.endswith(".py") else baseline

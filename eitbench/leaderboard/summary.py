@@ -41,7 +41,7 @@ def mean_and_interval(values: list[float]) -> tuple[float, float]:
 
 def rounded(mean: float, half: float) -> str:
     """``0.0053 ± 0.0004``: the interval to one significant digit (two if that is a 1), the mean to the same place."""
-    if not math.isfinite(half) or half < 1e-9 * abs(mean):
+    if not math.isfinite(half) or half < 5e-6:                          # below the last place shown
         return f"{mean:.3g}"
     place = -math.floor(math.log10(half))
     if round(half * 10**place) == 1:
@@ -61,7 +61,7 @@ def summary(records: list[dict[str, Any]]) -> pd.DataFrame:
     rows = []
     for record in records:
         status = [episode["status"] for episode in record["episodes"]]
-        row: dict[str, Any] = {"board": record["board"], "environment": record["environment"]["id"],
+        row: dict[str, Any] = {"board": record["board"], "environment": record["environment"]["name"],
                                "baseline": record["baseline"], "method": record["title"],
                                "episodes": len(status), "failed": sum(s != "ok" for s in status)}
         for name in COLUMNS:
@@ -93,7 +93,8 @@ def _skills(record: dict[str, Any], records: list[dict[str, Any]]) -> dict[str, 
 def _world(record: dict[str, Any]) -> str:
     """What the lagged siblings of an environment share."""
     name = record["environment"]["id"].replace("FixedLag", "").replace("Smoothing", "")
-    kwargs = {key: value for key, value in record["environment"]["kwargs"].items() if key != "lag"}
+    kwargs = {key: value for key, value in record["environment"]["kwargs"].items()
+              if key not in ("lag", "assumed_mean_velocity")}            # what is believed is not the world
     return f"{name} {sorted(kwargs.items())}"
 
 
@@ -117,7 +118,8 @@ def _cell(name: str, value: tuple[float, float] | None) -> str:
 def markdown(table: pd.DataFrame) -> str:
     """The summary as Markdown, also pleasant to read in a terminal."""
     text = cells(table)
-    lines = [list(text.columns), *text.to_numpy().tolist()]
+    lines = [[str(cell).replace("|", "\\|") for cell in line]
+             for line in [list(text.columns), *text.to_numpy().tolist()]]
     widths = [max(len(str(line[i])) for line in lines) for i in range(len(text.columns))]
 
     def row(line: list[str]) -> str:

@@ -1,0 +1,201 @@
+"""The command line, as a newcomer uses it: what it runs, what it writes, and what it says of mistakes."""
+
+import json
+import re
+import runpy
+import sys
+
+import gymnasium as gym
+import pytest
+from typer.testing import CliRunner
+
+from eitbench.cli import app
+from eitbench.envs import ENTRY_POINTS
+from eitbench.episodes import CACHE_VARIABLE
+from eitbench.leaderboard import run, store, suites
+from eitbench.leaderboard.baselines import own_baselines
+from eitbench.seeds import parse_seeds
+
+PIPE, COMMANDS = "eitbench/Pipe2D-v0", ("list", "run", "leaderboard", "render", "reproduce")
+TINY = {"mean_velocity": 45.0, "scored_steps": 3, "electrodes_per_wall": 2, "frame": 2}
+"""A fast fluid flushes the pipe in two steps: an episode of five takes a third of a second."""
+
+MINE = '''"""My method: the expected level everywhere."""
+import numpy as np
+from eitbench import Estimate
+
+class Estimator:
+    def __init__(self, task):
+        self.level = np.full(task.mesh.n_nodes, task.expected_concentration)
+
+    def update(self, voltages, currents):
+        return Estimate(self.level)
+'''
+
+
+@pytest.fixture(autouse=True)
+def tiny_world(monkeypatch, tmp_path, tmp_path_factory):
+    """The registered environments play the tiny world, in an empty folder; git is left alone."""
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path_factory.getbasetemp() / "episodes"))
+    monkeypatch.setattr(store, "_git", lambda *words: None)
+    for name in ENTRY_POINTS:
+        monkeypatch.setitem(gym.registry[name].kwargs, "scenario", TINY)
+    monkeypatch.setitem(gym.registry["eitbench/Pipe2DFixedLag-v0"].kwargs, "lag", 2)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.py").write_text(MINE)
+    run._environment.cache_clear()
+    yield
+    run._environment.cache_clear()
+
+
+def eitbench(*arguments):
+    """What the command does: exit code, standard output, standard error without boxes and line breaks."""
+    done = CliRunner().invoke(app, list(arguments))
+    if done.exception is not None and not isinstance(done.exception, SystemExit):
+        raise done.exception                                           # a user would see a traceback
+    return done.exit_code, done.stdout, re.sub(r"[│╭╮╰╯─\s]+", " ", done.stderr)
+
+
+def run_mine(*more):
+    """`eitbench run` of the file mine.py on the first board."""
+    return eitbench("run", "--env", PIPE, "--baseline", "mine.py", "--seeds", "dev:0-1", "-j", "1", *more)
+
+
+# -- run and leaderboard ----------------------------------------------------------------------------------------------
+
+
+def test_ten_lines_of_ones_own_get_a_table_and_a_page(tmp_path):
+    """A user's file is run, scored and shown beside ours: on the terminal, as Markdown, HTML and JSON."""
+    assert len(MINE.splitlines()) <= 10
+    code, said, _ = run_mine("--baseline", "homogeneous")
+    assert code == 0 and "My method" in said and "Best homogeneous estimate" in said
+    results = tmp_path / "results"
+    table = (results / "leaderboard.md").read_text(encoding="utf-8")
+    assert table.strip() in said and len(table.splitlines()) == 4
+    assert "My method" in (results / "index.html").read_text(encoding="utf-8")
+    assert "wrote results/index.html" in said
+    record = json.loads((results / "records" / "eitbench-Pipe2D-v0--mine.json").read_text(encoding="utf-8"))
+    assert record["seeds"] == ["dev:0", "dev:1"] and record["environment"]["id"] == PIPE
+    assert all(episode["status"] == "ok" for episode in record["episodes"])
+
+
+def test_failing_baseline_is_reported(tmp_path):
+    """A baseline that raises fails its episodes: the reason on standard error, exit code 0, and the table for all."""
+    (tmp_path / "bad.py").write_text(MINE.replace("return Estimate(self.level)", "raise RuntimeError('oh no')"))
+    code, said, complaint = run_mine("--baseline", "bad.py")
+    assert code == 0 and "0 of 2" in said
+    assert "failed: bad on dev:0: RuntimeError: oh no" in complaint and "failed: mine" not in complaint
+
+
+def test_same_command_resumes(tmp_path):
+    """The second time nothing is played; one seed more is one episode more."""
+    assert run_mine()[0] == 0
+    before = sorted(path.stat().st_mtime_ns for path in (tmp_path / "results" / "episodes").rglob("*.json"))
+    _, said, complaint = run_mine()
+    assert "2 of 2 episodes are already there" in said + complaint
+    run_mine("--seeds", "dev:0-2")
+    after = sorted(path.stat().st_mtime_ns for path in (tmp_path / "results" / "episodes").rglob("*.json"))
+    assert len(before) == 2 and len(after) == 3 and after[:2] == before
+
+
+def test_leaderboard_writes_the_same_again(tmp_path):
+    """`leaderboard` needs only the stored episodes."""
+    _, said, _ = run_mine("-o", "mine/results")
+    folder = tmp_path / "mine" / "results"
+    table = (folder / "leaderboard.md").read_bytes()
+    for name in ("leaderboard.md", "index.html"):
+        (folder / name).unlink()
+    assert eitbench("leaderboard", "-o", "mine/results")[:2] == (0, said)
+    assert (folder / "leaderboard.md").read_bytes() == table and (folder / "index.html").exists()
+
+
+def test_every_board_by_default(tmp_path):
+    """Without --env a baseline plays every environment of its boards."""
+    (tmp_path / "mine.py").write_text(MINE.replace("class Estimator:", "class Estimator:\n"
+                                                   "    boards = ('filter', 'fixed-lag', 'smoothing')"))
+    code, said, _ = eitbench("run", "--baseline", "mine.py", "--seeds", "dev:0", "-j", "1")
+    assert code == 0 and [said.count(f"| {board} ") for board in ("filter", "fixed-lag", "smoothing")] == [1, 1, 1]
+
+
+def test_suites():
+    """quick is full with fewer seeds and without the one method that takes minutes an episode."""
+    quick, full = (suites.jobs(suite, [], [], [1]) for suite in ("quick", "full"))
+    assert set(full) - set(quick) == {suites.Job(suites.Environment(PIPE), "gauss_newton", 1)}
+    assert {job.environment.id for job in quick} == set(ENTRY_POINTS)
+    assert {job.baseline for job in quick} == set(own_baselines())
+    assert set(parse_seeds(suites.SEEDS["quick"])) < set(parse_seeds(suites.SEEDS["full"]))
+    assert min(parse_seeds(suites.SEEDS["full"])) == 200_000
+    asked_for = suites.jobs("quick", [PIPE], ["gauss_newton"], [1, 2])
+    assert [job.seed for job in asked_for] == [1, 2]
+
+
+# -- help -------------------------------------------------------------------------------------------------------------
+
+
+def test_list():
+    """Every environment with its board, every baseline with its boards and title."""
+    code, said, _ = eitbench("list")
+    assert code == 0
+    lines = {line.split()[0]: line for line in said.splitlines()}
+    assert lines.keys() >= {*ENTRY_POINTS, *own_baselines()}
+    assert "smoothing" in lines["eitbench/Pipe2DSmoothing-v0"] and "3 scored of 5" in lines[PIPE]
+    assert "filter, smoothing" in lines["gauss_newton"] and "Stationary Gauss–Newton" in lines["gauss_newton"]
+
+
+@pytest.mark.parametrize("command", ["", *COMMANDS])
+@pytest.mark.parametrize("flag", ["--help", "-h"])
+def test_help(command, flag):
+    """Each command explains itself, and every option of it."""
+    code, said, _ = eitbench(*filter(None, [command, flag]))
+    assert code == 0 and "Usage" in said
+    if not command:
+        assert all(name in said for name in COMMANDS)
+    for option in re.findall(r"^ ?│ *\*? *(?:--[\w-]+.*|-\w .*)$", said, flags=re.MULTILINE):
+        assert re.search(r"[A-Za-z]+ [A-Za-z]+", option), option
+
+
+def test_module_can_be_run(monkeypatch, capsys):
+    """`python -m eitbench.cli --help` is the same program."""
+    monkeypatch.setattr(sys, "argv", ["eitbench", "--help"])
+    monkeypatch.delitem(sys.modules, "eitbench.cli")
+    with pytest.raises(SystemExit) as done:
+        runpy.run_module("eitbench.cli", run_name="__main__")
+    assert done.value.code == 0 and "leaderboard" in capsys.readouterr().out
+
+
+# -- mistakes ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("arguments", "message"), [
+    (["run", "--seeds", "exam:1"], "seeds must name one of the splits train, dev, test, got 'exam:1'"),
+    (["run", "--seeds", "dev:1-"], "seeds must look like 'test:0-4'"),
+    (["run", "--seeds", "dev:4-2"], "must increase"),
+    (["run", "--seeds", "", "--baseline", "mine.py", "-j", "1"], "seeds must look like"),
+    (["run", "--env", "eitbench/Pipe3D-v0"], "env must be one of eitbench/Pipe2D-v0"),
+    (["run", "--baseline", "kalman"], "one of extended_kalman_filter"),
+    (["run", "--baseline", "nowhere.py"], "got 'nowhere.py'"),
+    (["run", "--baseline", "mine.py", "--baseline", "other/mine.py", "--seeds", "1", "-j", "1"], "other/mine.py"),
+    (["run", "--baseline", "empty.py"], "empty.py must define a class Estimator with a method update"),
+    (["run", "--baseline", "broken.py"], "broken.py"),
+    (["run", "--baseline", "mine.py", "--env", "eitbench/Pipe2DSmoothing-v0"], "none of the baselines mine.py plays"),
+    (["run", "--suite", "slow"], "quick"),
+    (["run", "-j", "0"], "--jobs"),
+    (["run", "--sedes", "dev:1"], "--seeds"),
+    (["leaderboard", "-o", "nothing"], "no results in nothing; make some with `eitbench run`"),
+    (["render", "--seed", "dev:x"], "seeds must look like"),
+    (["render", "--step", "3"], "out must end in .png with step"),
+    (["render", "--baseline", "fixed_interval_smoother"], "plays smoothing, but eitbench/Pipe2D-v0 is a filter"),
+    (["reproduce", "fig9.9"], "fig5.4"),
+    (["reproduce", "fig5.4", "--seeds", "exam:1"], "seeds must name"),
+    (["rnu"], "No such command"),
+])
+def test_mistakes_are_explained(arguments, message, tmp_path):
+    """Exit code 2 and a sentence that names the argument; no traceback, and nothing is written."""
+    (tmp_path / "empty.py").write_text("")
+    (tmp_path / "broken.py").write_text("class Estimator(:")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "mine.py").write_text(MINE)
+    code, said, complaint = eitbench(*arguments)
+    assert code == 2 and said == ""
+    assert message in complaint and "Traceback" not in complaint
+    assert not (tmp_path / "results").exists() and not (tmp_path / "nothing").exists()
