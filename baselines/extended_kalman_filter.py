@@ -3,11 +3,12 @@
 import numpy as np
 
 from eitbench import Estimate, Task
-from eitbench.estimation import FilterStep, FirstFrame, linearised, table_5_1
+from eitbench.estimation import TABLE_5_1, FilterStep, FirstFrame, linearised, table_5_1
 
 
 class Estimator:
     boards = ("filter",)
+    parameters = TABLE_5_1
 
     def __init__(self, task: Task) -> None:
         self.task = task

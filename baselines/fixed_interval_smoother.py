@@ -3,11 +3,12 @@
 import numpy as np
 
 from eitbench import Estimate, Task
-from eitbench.estimation import FirstFrame, LinearisedObservations, fixed_interval_smoother, table_5_1
+from eitbench.estimation import TABLE_5_1, FirstFrame, LinearisedObservations, fixed_interval_smoother, table_5_1
 
 
 class Estimator:
     boards = ("smoothing",)
+    parameters = TABLE_5_1
 
     def __init__(self, task: Task) -> None:
         self.task = task

@@ -3,11 +3,12 @@
 import numpy as np
 
 from eitbench import Estimate, Task
-from eitbench.estimation import FilterStep, FirstFrame, LinearisedObservations, smoothed_state, table_5_1
+from eitbench.estimation import TABLE_5_1, FilterStep, FirstFrame, LinearisedObservations, smoothed_state, table_5_1
 
 
 class Estimator:
     boards = ("fixed-lag",)
+    parameters = TABLE_5_1
 
     def __init__(self, task: Task) -> None:
         self.task = task
@@ -17,7 +18,7 @@ class Estimator:
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
         self.asked_for += 1
-        if len(self.steps) < self.task.n_steps:                  # else the record has ended, and only the lag shrinks
+        if self.asked_for + self.task.lag <= self.task.n_steps:  # else the record has ended, and the lag shrinks
             if not self.first.complete:
                 if not self.first.add(voltages, currents):
                     return Estimate(self.first.mean)
@@ -28,8 +29,8 @@ class Estimator:
             self.assimilate(voltages, currents)
         if self.asked_for < 1:
             return None
-        return Estimate(*smoothed_state(self.filter, self.steps[self.asked_for - 1:]))
+        return Estimate(*smoothed_state(self.filter, [step for step in self.steps if step.time >= self.asked_for]))
 
     def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> None:
         self.filter.predict()
-        self.steps.append(self.filter.update(self.observations(voltages, currents)))
+        self.steps = [*self.steps[-self.task.lag:], self.filter.update(self.observations(voltages, currents))]

@@ -12,6 +12,8 @@ def number(name: str, value: object, *, low: float = -math.inf, high: float = ma
            units: str = "") -> float:
     """``value`` as a finite float within [low, high] (``open_low``: within (low, high]); else a ``ValueError``."""
     try:
+        if isinstance(value, (str, bool)):
+            raise TypeError
         result = float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError):
         raise ValueError(f"{name} must be a number{_in(units)}, got {value!r}") from None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import sys
 from enum import StrEnum
 from pathlib import Path
@@ -80,7 +81,7 @@ def run(
     with _clear_errors():
         todo = suites.jobs(suite.value, env or [], baseline or [],
                            parse_seeds(suites.SEEDS[suite.value] if seeds is None else seeds))
-    run_jobs(todo, EpisodeStore(out), n_jobs=jobs)
+    run_jobs(todo, EpisodeStore(out), n_jobs=jobs, command=shlex.join(["eitbench", *sys.argv[1:]]))
     _report(out)
 
 
@@ -121,13 +122,12 @@ def reproduce(
 
 
 def _report(out: Path) -> None:
-    from eitbench.episodes import write_atomically
+    from eitbench._files import write_atomically
     from eitbench.leaderboard.page import write_page
     from eitbench.leaderboard.store import EpisodeStore
     from eitbench.leaderboard.summary import markdown, summary
     store = EpisodeStore(out)
-    command = " ".join(["eitbench", *sys.argv[1:]])
-    records = store.write_records(command)
+    records = store.write_records()
     if not records:
         raise typer.BadParameter(f"no results in {out}; make some with `eitbench run`")
     table = summary(records)
@@ -137,7 +137,8 @@ def _report(out: Path) -> None:
         for episode in record["episodes"]:
             if episode["status"] != "ok":
                 typer.echo(f"failed: {record['baseline']} on {episode['seed']}: {episode['message']}", err=True)
-    typer.echo(f"\nwrote {write_page(store, records, table)}")
+    write_page(store, records, table)
+    typer.echo(f"\nwrote {out / 'index.html'}")
 
 
 class _clear_errors:

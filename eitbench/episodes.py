@@ -9,7 +9,7 @@ import hashlib
 import io
 import json
 import os
-import uuid
+import warnings
 from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
@@ -21,6 +21,7 @@ import skfem
 from tqdm import tqdm
 
 from eitbench import _check
+from eitbench._files import write_atomically
 from eitbench.scenarios.base import Discretisation, Scenario
 
 CACHE_VARIABLE = "EITBENCH_CACHE"
@@ -52,7 +53,7 @@ def simulate(scenario: Scenario, seed: int, *, cache: bool = True, progress: boo
         ≥ 0; see `eitbench.seeds` for the public ranges.
     cache : bool
         Read from and write to the cache folder ($EITBENCH_CACHE, by default in the user's cache folder). A file that
-        is damaged or of another version, scenario or seed is replaced.
+        is damaged or of another scenario or seed is replaced; files of other versions stay beside it.
     progress : bool
         Show a progress bar, on a terminal only.
     """
@@ -64,7 +65,11 @@ def simulate(scenario: Scenario, seed: int, *, cache: bool = True, progress: boo
     episode = _load(path, identity)
     if episode is None:
         episode = _simulate(scenario, seed, progress)
-        _store(path, identity, episode)
+        try:
+            _store(path, identity, episode)
+        except OSError as error:
+            warnings.warn(f"episodes cannot be kept in {path.parent} ({error}) and will be simulated again; "
+                          f"${CACHE_VARIABLE} names another folder", stacklevel=2)
     return episode
 
 
@@ -131,18 +136,6 @@ def _store(path: Path, identity: str, episode: Episode) -> None:
     content = io.BytesIO()
     np.savez_compressed(content, identity=identity, checksum=_checksum(episode), **episode._asdict())
     write_atomically(path, content.getvalue())
-
-
-def write_atomically(path: Path, data: bytes) -> None:
-    """Put ``data`` into ``path`` so that nobody ever sees half of it; parent folders are made."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}")  # unlike mkstemp: as the umask allows
-    try:
-        temporary.write_bytes(data)
-        os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
 
 
 def _load(path: Path, identity: str) -> Episode | None:

@@ -90,7 +90,7 @@ def make_task(scenario: Scenario, lag: int | str = 0, **assumptions: float) -> T
     currents = scenario.currents
     currents.setflags(write=False)                                # shared by all who play this task
     return Task(model.transport, model.observation, scenario.noise, currents, scenario.n_steps,
-                scenario.warm_up, steps, scenario.background)
+                scenario.warm_up, steps, scenario.expected_concentration)
 
 
 @lru_cache(maxsize=4)

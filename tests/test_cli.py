@@ -74,7 +74,7 @@ def test_ten_lines_of_ones_own_get_a_table_and_a_page(tmp_path):
     assert table.strip() in said and len(table.splitlines()) == 4
     assert "My method" in (results / "index.html").read_text(encoding="utf-8")
     assert "wrote results/index.html" in said
-    record = json.loads((results / "records" / "eitbench-Pipe2D-v0--mine.json").read_text(encoding="utf-8"))
+    record = json.loads((results / "records" / "eitbench-Pipe2D-v0--mine--dev.json").read_text(encoding="utf-8"))
     assert record["seeds"] == ["dev:0", "dev:1"] and record["environment"]["id"] == PIPE
     assert all(episode["status"] == "ok" for episode in record["episodes"])
 
@@ -83,7 +83,7 @@ def test_failing_baseline_is_reported(tmp_path):
     """A baseline that raises fails its episodes: the reason on standard error, exit code 0, and the table for all."""
     (tmp_path / "bad.py").write_text(MINE.replace("return Estimate(self.level)", "raise RuntimeError('oh no')"))
     code, said, complaint = run_mine("--baseline", "bad.py")
-    assert code == 0 and "0 of 2" in said
+    assert code == 0 and "dev:0-1, 2 failed" in said
     assert "failed: bad on dev:0: RuntimeError: oh no" in complaint and "failed: mine" not in complaint
 
 

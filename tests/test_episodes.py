@@ -16,7 +16,8 @@ import pytest
 from scipy.stats import kstest
 
 from eitbench import episodes
-from eitbench.episodes import CACHE_VARIABLE, Episode, cache_folder, simulate, truth_discretisation, write_atomically
+from eitbench._files import write_atomically
+from eitbench.episodes import CACHE_VARIABLE, Episode, cache_folder, simulate, truth_discretisation
 from eitbench.scenarios import Pipe2D
 from eitbench.scenarios.base import Discretisation
 

@@ -30,9 +30,11 @@ def cache(tmp_path, monkeypatch):
 def test_says_what_the_scenario_says():
     """Times, currents, noise and level are the scenario's; estimates live on the CD mesh of its model."""
     task = make_task(TINY)
-    assert (task.n_steps, task.warm_up, task.lag, task.expected_concentration) == (5, 2, 0, 30.0)
+    assert (task.n_steps, task.warm_up, task.lag, task.expected_concentration) == (5, 2, 0, 25.0)
     np.testing.assert_array_equal(task.currents, TINY.currents)
     assert task.noise == TINY.noise
+    # The rough level is no disguised truth: as an estimate it would beat the homogeneous one.
+    assert Pipe2D().expected_concentration != Pipe2D().background
     assert task.mesh is task.transport.mesh and task.mesh.n_nodes == 1701
 
 

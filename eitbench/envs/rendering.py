@@ -18,7 +18,7 @@ SOURCE, SINK, IDLE = "#d1495b", "#2e86ab", "#5c5c5c"
 
 def colour_range(task: Task) -> tuple[float, float]:
     """One colour scale (mol/m³) for truth and estimates of a task."""
-    return 0.5 * task.expected_concentration, 1.5 * task.expected_concentration
+    return 0.6 * task.expected_concentration, 1.8 * task.expected_concentration
 
 
 def draw_field(axes: Axes, mesh: Mesh, values: np.ndarray, low: float, high: float, colours: str = FIELD_MAP):

@@ -12,11 +12,11 @@ from eitbench.estimation.kalman import (
     kalman_filter,
     linearised,
 )
-from eitbench.estimation.parameters import table_5_1
+from eitbench.estimation.parameters import TABLE_5_1, table_5_1
 from eitbench.estimation.smoother import Smoothed, fixed_interval_smoother, smoothed_state
 
 __all__ = [
-    "FilterStep", "FirstFrame", "FreeCovariance", "KalmanFilter", "LinearisedObservations", "Observation", "Smoothed",
-    "best_homogeneous", "fixed_interval_smoother", "gauss_newton", "kalman_filter", "linearised",
+    "TABLE_5_1", "FilterStep", "FirstFrame", "FreeCovariance", "KalmanFilter", "LinearisedObservations", "Observation",
+    "Smoothed", "best_homogeneous", "fixed_interval_smoother", "gauss_newton", "kalman_filter", "linearised",
     "smoothed_state", "table_5_1",
 ]

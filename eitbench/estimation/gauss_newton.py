@@ -50,12 +50,13 @@ def gauss_newton(model: _ObservationModel, voltages: np.ndarray, currents: np.nd
         gradient = A.T @ residual - dense @ c
         direction = cho_solve(cho_factor(A.T @ A + dense), gradient)
         now = misfit(c, computed)
-        if gradient @ direction < tolerance * now:
-            return c + direction
+        last = gradient @ direction < tolerance * now
         length = 1.0
         while not misfit(c + length * direction, model.voltages(c + length * direction, currents)) <= now:
             length *= 0.5
             if length < 1e-4:
                 return c
         c = c + length * direction
+        if last:
+            break
     return c

@@ -20,6 +20,9 @@ NODAL_STD = 1 / 50
 INITIAL_STD = 1 / 4
 """std of the initial state in parts of ĉ_bh [ours; illegible in the table]"""
 
+TABLE_5_1 = {"inflow_std": INFLOW_STD, "nodal_std": NODAL_STD, "initial_std": INITIAL_STD}
+"""For records."""
+
 
 def table_5_1(transport: ConvectionDiffusion, c_bh: float) -> KalmanFilter:
     """A Kalman filter for c⁺ = F c + Y c_in + w with the parameters of Table 5.1.

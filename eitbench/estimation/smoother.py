@@ -1,4 +1,4 @@
-"""Smoothing without inverses of n×n matrices and without stored covariances (Bryson & Frazier 1963; problem.md §7)."""
+"""Smoothing without inverses of n×n matrices and without storing any (Bryson & Frazier 1963; problem.md §7)."""
 
 from __future__ import annotations
 

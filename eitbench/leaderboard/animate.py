@@ -26,6 +26,9 @@ def animate(environment: str, baseline: str, seed: str, step: int | None, path: 
     suffix = ".gif" if step is None else ".png"
     if path.suffix != suffix:
         raise ValueError(f"out must end in {suffix} {'without' if step is None else 'with'} step, got {path.name}")
+    seeds = parse_seeds(seed)
+    if len(seeds) != 1:
+        raise ValueError(f"seed must name one episode, got {seed!r}")
     loaded, env = load_baseline(baseline), Environment(environment).make(render_mode="rgb_array")
     if board_of(env) not in loaded.boards:
         raise ValueError(f"baseline {loaded.name} plays {', '.join(loaded.boards)}, but {environment} is a "
@@ -35,7 +38,7 @@ def animate(environment: str, baseline: str, seed: str, step: int | None, path: 
         first = last = _check.integer("step", step, low=1, high=env.task.n_steps)
     frames = []
     with threadpool_limits(1):
-        for t, _ in tqdm(play(env, loaded, parse_seeds(seed)[0]), total=env.task.n_steps, desc="drawing", unit="state",
+        for t, _ in tqdm(play(env, loaded, seeds[0]), total=env.task.n_steps, desc="drawing", unit="state",
                          disable=None):
             if first <= t <= last:
                 frames.append(Image.fromarray(np.asarray(env.render())))

@@ -54,6 +54,8 @@ def load_baseline(name: str) -> Baseline:
     path = Path(name) if name.endswith(".py") else baseline_folder() / f"{name}.py"
     if not path.is_file():
         raise ValueError(f"baseline must be a path to a .py file or one of {', '.join(own_baselines())}; got {name!r}")
+    if path.stem in own_baselines() and not path.samefile(baseline_folder() / path.name):
+        raise ValueError(f"baseline {path} has the name of one of ours, under which results are kept; rename it")
     return _load(path, hashlib.sha256(path.read_bytes()).hexdigest())
 
 

@@ -15,13 +15,13 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.tri import Triangulation
 
+from eitbench._files import write_atomically
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.rendering import FIELD_MAP, colour_range
-from eitbench.episodes import write_atomically
 from eitbench.leaderboard import charts
 from eitbench.leaderboard.run import Environment
 from eitbench.leaderboard.store import EpisodeStore
-from eitbench.leaderboard.summary import EXPLANATIONS, cells
+from eitbench.leaderboard.summary import EXPLANATIONS, board_label, cells
 from eitbench.physics.mesh import Mesh
 from eitbench.seeds import parse_seeds
 
@@ -37,27 +37,36 @@ def write_page(store: EpisodeStore, records: list[dict[str, Any]], table: pd.Dat
                                      trim_blocks=True, lstrip_blocks=True)
     text = cells(table)
     ordered = [_record_of(records, row) for _, row in table.iterrows()]
-    path = store.folder / "index.html"
     html = environment.get_template("page.html.j2").render(
         headings=list(text.columns)[1:], explanations=EXPLANATIONS,
         boards=[(board, rows.iloc[:, 1:].to_numpy().tolist()) for board, rows in text.groupby("board", sort=False)],
         intervals=_intervals(table), curves=_curves(ordered), legend=_legend(ordered),
         snapshots=_snapshots(store, records),
-        colour_bar=_colour_bar(), record=records[0], commands=sorted({record["command"] for record in records}),
+        colour_bar=_colour_bar(), runs=_runs(records),
         failures=[(record["title"], episode["seed"], episode["message"]) for record in records
                   for episode in record["episodes"] if episode["status"] != "ok"],
     )
+    path = store.folder / "index.html"
     write_atomically(path, html.encode())
     return path
 
 
+def _runs(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The distinct runs behind the records, each with its command, versions, commit and machine."""
+    runs: list[dict[str, Any]] = []
+    for record in records:
+        runs += [run for run in record["runs"] if run not in runs]
+    return runs
+
+
 def _record_of(records: list[dict[str, Any]], row: pd.Series) -> dict[str, Any]:
     return next(record for record in records
-                if record["baseline"] == row["baseline"] and record["environment"]["name"] == row["environment"])
+                if (record["baseline"], record["environment"]["name"], record["split"])
+                == (row["baseline"], row["environment"], row["split"]))
 
 
 def _label(record: dict[str, Any] | pd.Series, title: str) -> str:
-    return f"{title} · {record['board']}"
+    return f"{title} · {board_label(record)}"
 
 
 def _intervals(table: pd.DataFrame) -> str:

@@ -9,6 +9,7 @@ import traceback
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from functools import lru_cache
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -19,10 +20,12 @@ from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from eitbench import _check
+from eitbench.envs import ENTRY_POINTS
 from eitbench.envs.estimation import EstimationEnv
+from eitbench.episodes import simulate
 from eitbench.leaderboard.baselines import BOARDS, Baseline, load_baseline
 from eitbench.leaderboard.score import Played, score
-from eitbench.leaderboard.store import EpisodeStore, source_digest
+from eitbench.leaderboard.store import EpisodeStore, provenance, source_digest
 from eitbench.seeds import name_seed
 from eitbench.task import Estimate
 
@@ -41,7 +44,9 @@ class Environment(NamedTuple):
         return self.id.replace("/", "-") + ("" if self.kwargs == "{}" else f"-{digest}")
 
     def make(self, **extra: Any) -> EstimationEnv:
-        """A fresh environment, without gymnasium's wrappers."""
+        """A fresh environment, without gymnasium's wrappers; ``ValueError`` if there is none of this id."""
+        if self.id not in ENTRY_POINTS:
+            raise ValueError(f"env must be one of {', '.join(ENTRY_POINTS)}; got {self.id!r}")
         env = gym.make(self.id, disable_env_checker=True, **json.loads(self.kwargs), **extra).unwrapped
         if not isinstance(env, EstimationEnv):
             raise ValueError(f"environment {self.id} does not ask for estimates; its class is {type(env).__name__}")
@@ -86,7 +91,9 @@ def _play(env: EstimationEnv, baseline: Baseline, seed: int,
           ) -> Iterator[tuple[int, Estimate | None, dict[str, np.ndarray], float]]:
     """(t = i − lag, estimate, measurement i, seconds the estimator took) at each step i."""
     observation, _ = env.reset(seed=seed)
+    begin = time.perf_counter()
     estimator = baseline.estimator(env.task)
+    setup = time.perf_counter() - begin
     silence = np.full(env.task.mesh.n_nodes, env.task.expected_concentration)
     done, t = False, -env.task.lag
     while not done:
@@ -94,7 +101,7 @@ def _play(env: EstimationEnv, baseline: Baseline, seed: int,
         seen = {key: value.copy() for key, value in observation.items()}
         begin = time.perf_counter()
         estimate = estimator.update(observation["voltages"], observation["currents"])
-        seconds = time.perf_counter() - begin
+        seconds, setup = time.perf_counter() - begin + setup, 0.0
         if estimate is None and t >= 1:
             raise ValueError(f"Estimator.update must return an Estimate once a state is asked for; at t = {t} it "
                              "returned None")
@@ -150,15 +157,24 @@ def run_episode(job: Job) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
             result |= {"status": "ok", **outcome}
     except (Exception, SystemExit) as error:        # whatever a baseline does wrong is its result, not our crash
         result |= {"status": "failed", "message": f"{type(error).__name__}: {error}",
-                   "traceback": traceback.format_exc(limit=-3)}
+                   "where": _where(error)}
         played = None
     result["finished"] = datetime.now(UTC).isoformat(timespec="microseconds")
     result["seconds"] = time.perf_counter() - begin
     return result, {} if played is None else played.fields()
 
 
-def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1) -> None:
-    """Run all jobs that ``store`` does not hold yet, in ``n_jobs`` processes with one BLAS thread each."""
+def _where(error: BaseException) -> str:
+    """File and line where it was raised, without the folders of this machine."""
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{Path(last.filename).name}:{last.lineno}"
+
+
+def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1, command: str = "") -> None:
+    """Run all jobs that ``store`` does not hold yet, in ``n_jobs`` processes with one BLAS thread each.
+
+    ``command`` is what the results will name as the command that made them.
+    """
     todo = [job for job in jobs if not store.holds(job.environment.name, job.baseline, job.seed, job.identity())]
     if len(todo) < len(jobs):
         tqdm.write(f"{len(jobs) - len(todo)} of {len(jobs)} episodes are already there")
@@ -166,7 +182,7 @@ def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1) -> None:
     for job in todo:                                # each truth once, before several baselines want it at once
         seen.setdefault((_environment(job.environment).scenario, job.seed), job)
     _in_parallel(_simulate_job, [(job,) for job in seen.values()], n_jobs, "simulating truths")
-    _in_parallel(_run_job, [(job, store) for job in todo], n_jobs, "running baselines")
+    _in_parallel(_run_job, [(job, store, command) for job in todo], n_jobs, "running baselines")
 
 
 def _in_parallel(function: Any, arguments: list[tuple], n_jobs: int, description: str) -> None:
@@ -179,12 +195,13 @@ def _in_parallel(function: Any, arguments: list[tuple], n_jobs: int, description
 
 def _simulate_job(job: Job) -> None:
     with threadpool_limits(1):
-        _environment(job.environment).reset(seed=job.seed)
+        simulate(_environment(job.environment).scenario, job.seed, progress=False)
 
 
-def _run_job(job: Job, store: EpisodeStore) -> None:
+def _run_job(job: Job, store: EpisodeStore, command: str) -> None:
     result, fields = run_episode(job)
-    store.put(job.environment.name, job.baseline, job.seed, result, fields)
+    store.put(job.environment.name, job.baseline, job.seed, result | {"run": {"command": command, **provenance()}},
+              fields)
 
 
 @lru_cache(maxsize=4)

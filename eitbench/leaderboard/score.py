@@ -29,7 +29,7 @@ class Played:
     innovations: dict[int, tuple[np.ndarray, np.ndarray]]
     """measurement i -> (ν, S)"""
     seconds: np.ndarray
-    """what each update took"""
+    """what each update took; the first also what the constructor took"""
 
     @classmethod
     def collect(cls, task: Task, played: Iterable[tuple[int, Estimate | None, dict[str, np.ndarray], float]]) -> Played:
@@ -81,7 +81,7 @@ def score(env: EstimationEnv, played: Played) -> dict[str, Any]:
         "contrast_error": scoring.relative_error(mean, c, mass, reference=c_bh),
         "voltage_discrepancy": scoring.voltage_discrepancy(played.voltages[scored], computed),
         "nis": None, "crps": None, "coverage_50": None, "coverage_90": None, "spread_ratio": None,
-        "seconds_per_step": float(played.seconds.mean()),
+        "seconds_per_step": float(played.seconds.sum() / task.n_steps),
     }
     known = [played.innovations[i] for i in range(task.warm_up + 1, task.n_steps + 1) if i in played.innovations]
     if known:

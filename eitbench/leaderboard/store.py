@@ -16,11 +16,12 @@ from typing import Any
 
 import numpy as np
 
-from eitbench.episodes import write_atomically
+from eitbench._files import write_atomically
 from eitbench.seeds import name_seed
 
 SCHEMA = 1
-_NEEDED = {"identity", "seed", "baseline", "environment", "source", "baseline_sha256", "finished", "status"}
+_NEEDED = {"identity", "seed", "baseline", "environment", "source", "baseline_sha256", "finished", "status",
+           "run"}
 
 
 class EpisodeStore:
@@ -61,30 +62,30 @@ class EpisodeStore:
         with np.load(folder / f"{result['seed'].replace(':', '-')}.npz", allow_pickle=False) as stored:
             return dict(stored)
 
-    def write_records(self, command: str) -> list[dict[str, Any]]:
-        """Gather the episodes into one record per environment and baseline, ``records/ENV--BASELINE.json``."""
-        gathered: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    def write_records(self) -> list[dict[str, Any]]:
+        """Gather the episodes into one record per environment, baseline and split of the seeds, in ``records/``."""
+        gathered: dict[tuple[str, str, str], list[dict[str, Any]]] = {}
         for result in self.results():
-            gathered.setdefault((json.dumps(result["environment"], sort_keys=True), result["baseline"]), []).append(
-                result)
+            key = (json.dumps(result["environment"], sort_keys=True), result["baseline"], _split(result["seed"]))
+            gathered.setdefault(key, []).append(result)
         records = []
-        for (environment, baseline), results in gathered.items():
+        for (environment, baseline, split), results in gathered.items():
             # Episodes of different code never stand in one record: those of the latest run's code do.
             latest = max(results, key=lambda result: result["finished"])
             results = [r for r in results if all(r[key] == latest[key] for key in ("source", "baseline_sha256"))]
             shared = ("board", "title", "parameters", "baseline_sha256", "source")
+            runs: list[dict[str, Any]] = []
+            for result in results:
+                if result["run"] not in runs:
+                    runs.append(result["run"])
             record = {
-                "schema": SCHEMA, "environment": json.loads(environment), "baseline": baseline,
-                **{key: results[0][key] for key in shared}, "command": command,
-                "seeds": [result["seed"] for result in results],
+                "schema": SCHEMA, "environment": json.loads(environment), "baseline": baseline, "split": split,
+                **{key: latest[key] for key in shared}, "seeds": [result["seed"] for result in results], "runs": runs,
                 "episodes": [{key: value for key, value in result.items()
-                              if key not in (*shared, "environment", "baseline")} for result in results],
-                **provenance(),
+                              if key not in (*shared, "environment", "baseline", "run")}
+                             | {"run": runs.index(result["run"])} for result in results],
             }
-            path = self.folder / "records" / f"{_environment_folder(record)}--{baseline}.json"
-            before = _read_json(path)
-            if before is not None and before.get("episodes") == record["episodes"]:
-                record |= {key: before[key] for key in ("command", *provenance())}    # nothing new was played
+            path = self.folder / "records" / f"{_environment_folder(record)}--{baseline}--{split}.json"
             write_atomically(path, json.dumps(record, indent=1, allow_nan=False).encode())
             records.append(record)
         return records
@@ -107,6 +108,10 @@ def _read_json(path: Path) -> dict[str, Any] | None:
     return result if isinstance(result, dict) else None
 
 
+def _split(seed: str) -> str:
+    return seed.split(":")[0] if ":" in seed else "own"
+
+
 def _environment_folder(result: dict[str, Any]) -> str:
     return _folder_name(result["environment"].get("name", result["environment"]["id"]))
 
@@ -117,19 +122,23 @@ def _folder_name(text: str) -> str:
 
 @lru_cache(maxsize=1)
 def source_digest() -> str:
-    """Hash of all of eitbench's source: results of other code are not taken for this one's."""
+    """Hash of the source that scores depend on: results of other code are not taken for this one's."""
     folder = Path(__file__).parent.parent
-    files = sorted(path for path in folder.rglob("*.py") if "baselines" not in path.relative_to(folder).parts)
+    rooms = ("physics/*", "scenarios/*", "episodes", "task", "estimation/*", "scoring", "envs/*", "leaderboard/run",
+             "leaderboard/score")
+    files = sorted(path for room in rooms for path in folder.glob(f"{room}.py"))
     return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
 
 
+@lru_cache(maxsize=1)
 def provenance() -> dict[str, Any]:
-    """Versions, commit and machine of this run."""
+    """Versions, commit and machine of this process."""
+    status = _git("--no-optional-locks", "status", "--porcelain")
     return {
         "versions": {"python": platform.python_version(), **{
             name: _version(name) for name in ("eitbench", "numpy", "scipy", "gymnasium", "scikit-fem")}},
         "blas": np.show_config(mode="dicts")["Build Dependencies"]["blas"]["name"],  # type: ignore[index,call-overload]
-        "commit": _git("rev-parse", "HEAD"), "dirty": bool(_git("--no-optional-locks", "status", "--porcelain")),
+        "commit": _git("rev-parse", "HEAD"), "dirty": None if status is None else bool(status),
         "machine": {"processor": _processor(), "cores": os.cpu_count(), "system": platform.system(),
                     "blas_threads": 1},
     }

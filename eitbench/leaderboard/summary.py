@@ -10,6 +10,7 @@ import pandas as pd
 from scipy.stats import t as student
 
 from eitbench.leaderboard.baselines import BOARDS
+from eitbench.scoring import skill
 
 COLUMNS = {
     "error": "ẽ_c", "skill": "skill", "contrast_error": "contrast", "nis": "NIS/m", "crps": "CRPS",
@@ -18,7 +19,7 @@ COLUMNS = {
 }
 EXPLANATIONS = {
     "ẽ_c": "relative estimation error (5.12), ± half the 95 % confidence interval over seeds; lower is better",
-    "skill": "0 for the homogeneous estimate, 1 for the smoother that knows the true model",
+    "skill": "0 for the homogeneous estimate, 1 for the fixed-interval smoother with the true velocity",
     "contrast": "error relative to the deviation from the homogeneous estimate; 1 is no better than that",
     "NIS/m": "normalised innovation squared; 1 when the filter's own uncertainty fits",
     "CRPS": "continuous ranked probability score, mol/m³",
@@ -26,8 +27,10 @@ EXPLANATIONS = {
     "90 %": "part of the truth inside the claimed 90 % interval",
     "var/MSE": "claimed variance over squared error; 1 is honest, more is too modest",
     "ẽ_V": "voltage discrepancy (5.13), mV²; a diagnostic",
-    "ms/step": "time of one update on one core",
+    "ms/step": "time per injection on one core, in the fastest episode: what is done once for a model is left apart",
 }
+SPLITS = ["test", "dev", "train", "own"]
+"""In the order in which boards are shown; the reported seeds first."""
 _UNIT = {"seconds_per_step": 1e3, "voltage_discrepancy": 1e6}
 
 
@@ -61,24 +64,29 @@ def summary(records: list[dict[str, Any]]) -> pd.DataFrame:
     rows = []
     for record in records:
         status = [episode["status"] for episode in record["episodes"]]
-        row: dict[str, Any] = {"board": record["board"], "environment": record["environment"]["name"],
+        row: dict[str, Any] = {"board": record["board"], "split": record["split"],
+                               "environment": record["environment"]["name"],
                                "baseline": record["baseline"], "method": record["title"],
+                               "seeds": seed_ranges(record["seeds"]),
                                "episodes": len(status), "failed": sum(s != "ok" for s in status)}
         for name in COLUMNS:
             values = list((_skills(record, records) if name == "skill" else scores_by_seed(record, name)).values())
             row[name] = mean_and_interval(values) if values else None
+            if name == "seconds_per_step" and values:
+                row[name] = (min(values), math.inf)
         rows.append(row)
     table = pd.DataFrame(rows)
     order = table["error"].map(lambda cell: math.inf if cell is None else cell[0])
-    return table.assign(_board=table["board"].map(BOARDS.index), _error=order).sort_values(
-        ["_board", "environment", "_error"]).drop(columns=["_board", "_error"]).reset_index(drop=True)
+    keys = {"_split": table["split"].map(SPLITS.index), "_board": table["board"].map(BOARDS.index), "_error": order}
+    return table.assign(**keys).sort_values(["_split", "_board", "environment", "_error"]).drop(
+        columns=list(keys)).reset_index(drop=True)
 
 
 def _skills(record: dict[str, Any], records: list[dict[str, Any]]) -> dict[str, float]:
     """(E_bh − E)/(E_bh − E_ref) with the means over the seeds that all three have; one number, or none."""
     def of(baseline: str, board: str) -> dict[str, float]:
         found = [r for r in records if r["baseline"] == baseline and r["board"] == board
-                 and _world(r) == _world(record)]
+                 and all(r[key] == record[key] for key in ("split", "source")) and _world(r) == _world(record)]
         return scores_by_seed(found[0], "error") if found else {}
 
     own, floor = scores_by_seed(record, "error"), of("homogeneous", "smoothing")
@@ -87,7 +95,7 @@ def _skills(record: dict[str, Any], records: list[dict[str, Any]]) -> dict[str, 
     if not shared:
         return {}
     e, bh, ref = (float(np.mean([scores[seed] for seed in shared])) for scores in (own, floor, reference))
-    return {"all": (bh - e) / (bh - ref)}
+    return {"all": skill(e, bh, ref)} if bh != ref else {}
 
 
 def _world(record: dict[str, Any]) -> str:
@@ -100,12 +108,32 @@ def _world(record: dict[str, Any]) -> str:
 
 def cells(table: pd.DataFrame) -> pd.DataFrame:
     """The summary as text, with the columns a reader sees."""
-    text = table[["board", "method"]].copy()
-    text["episodes"] = [f"{n - failed} of {n}" if failed else f"{n}"
-                        for n, failed in zip(table["episodes"], table["failed"], strict=True)]
+    text = table[["board", "method", "seeds"]].copy()
+    text["board"] = [board_label(row) for _, row in table.iterrows()]
+    text["seeds"] = [f"{seeds}, {failed} failed" if failed else seeds
+                     for seeds, failed in zip(table["seeds"], table["failed"], strict=True)]
     for name, heading in COLUMNS.items():
         text[heading] = [_cell(name, value) for value in table[name]]
     return text
+
+
+def board_label(row: Any) -> str:
+    """Name of the board; scores of other seeds than the reported ones say so."""
+    return row["board"] if row["split"] == "test" else f"{row['board']} ({row['split']} seeds)"
+
+
+def seed_ranges(seeds: list[str]) -> str:
+    """``test:0-3,7`` for test:0, test:1, test:2, test:3 and test:7."""
+    split = seeds[0].rpartition(":")[0]
+    numbers = sorted(int(seed.rpartition(":")[2]) for seed in seeds)
+    ranges: list[list[int]] = []
+    for number in numbers:
+        if ranges and number == ranges[-1][1] + 1:
+            ranges[-1][1] = number
+        else:
+            ranges.append([number, number])
+    text = ",".join(f"{a}" if a == b else f"{a}-{b}" for a, b in ranges)
+    return f"{split}:{text}" if split else text
 
 
 def _cell(name: str, value: tuple[float, float] | None) -> str:
@@ -123,10 +151,10 @@ def markdown(table: pd.DataFrame) -> str:
     widths = [max(len(str(line[i])) for line in lines) for i in range(len(text.columns))]
 
     def row(line: list[str]) -> str:
-        padded = [str(cell).ljust(width) if i < 2 else str(cell).rjust(width)
+        padded = [str(cell).ljust(width) if i < 3 else str(cell).rjust(width)
                   for i, (cell, width) in enumerate(zip(line, widths, strict=True))]
         return f"| {' | '.join(padded)} |"
 
-    rule = "|" + "|".join("-" * (width + 2) if i < 2 else "-" * (width + 1) + ":"
+    rule = "|" + "|".join("-" * (width + 2) if i < 3 else "-" * (width + 1) + ":"
                           for i, width in enumerate(widths)) + "|"
     return "\n".join([row(lines[0]), rule, *map(row, lines[1:])])

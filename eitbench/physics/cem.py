@@ -51,7 +51,9 @@ class CompleteElectrodeModel:
         self.electrodes = _checked_electrodes(mesh, electrodes)
         self.n_electrodes = n_electrodes = len(self.electrodes)
         z = np.full(n_electrodes, contact_impedance) if np.ndim(contact_impedance) == 0 else contact_impedance
-        self.contact_impedance = _check.array("contact_impedance", z, (n_electrodes,), units="Ω·m²", positive=True)
+        z = _check.array("contact_impedance", z, (n_electrodes,), units="Ω·m²", positive=True)
+        self.contact_impedance = z.copy()
+        self.contact_impedance.setflags(write=False)
 
         basis = skfem.Basis(to_skfem(mesh), element(mesh.dim, order), intorder=2 * order - 1)
         n = basis.N

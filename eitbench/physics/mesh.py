@@ -51,8 +51,9 @@ class Mesh:
         unused = np.setdiff1d(np.arange(len(points)), cells)
         if unused.size:
             raise ValueError(f"points must all belong to a cell; {unused.size} do not, the first is node {unused[0]}")
-        object.__setattr__(self, "points", points.copy())
-        object.__setattr__(self, "cells", cells)
+        for name, value in (("points", points.copy()), ("cells", cells)):
+            value.setflags(write=False)                   # meshes are shared, and much is derived from them
+            object.__setattr__(self, name, value)
         size = np.ptp(points, axis=0).max()
         flat = np.flatnonzero(self.volumes <= 1e-14 * size**d)
         if flat.size:

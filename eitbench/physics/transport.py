@@ -120,6 +120,8 @@ class ConvectionDiffusion:
         F = self._advance(identity, identity[self.inlet], np.zeros((m, n)))
         Y = self._advance(np.zeros((n, m)), np.zeros((m, m)), np.eye(m))
         H = self._advance(np.zeros((n, n)), np.zeros((m, n)), np.zeros((m, n)), source=identity / self.time_step)
+        for matrix in (F, Y, H):
+            matrix.setflags(write=False)                  # shared by all who use this model
         return EvolutionModel(F, Y, H)
 
     def _advance(self, c: np.ndarray, before: np.ndarray, after: np.ndarray,

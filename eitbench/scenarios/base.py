@@ -49,6 +49,11 @@ class Scenario(Protocol):
         ...
 
     @property
+    def expected_concentration(self) -> float:
+        """Rough level in mol/m³ that an operator would expect; not the background."""
+        ...
+
+    @property
     def noise(self) -> VoltageNoise: ...
 
     @property

@@ -176,7 +176,7 @@ def test_wrong_arguments_are_named(change, message):
 
 @pytest.mark.parametrize(("action", "message"), [
     (np.zeros(5), r"action must have shape \(1701,\), got \(5,\)"), (np.full(1701, np.nan), "action must be finite"),
-    (np.full(1701, 1e4), "action must lie within ±300 mol/m³"), ("thirty", "action must be an array"),
+    (np.full(1701, 1e4), "action must lie within ±250 mol/m³"), ("thirty", "action must be an array"),
 ])
 def test_wrong_actions_are_named(action, message):
     """An estimate that is none is refused with what came and what was expected."""

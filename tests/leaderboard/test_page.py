@@ -69,8 +69,9 @@ def made(tmp_path_factory):
         store = EpisodeStore(folder)
         pairs = [(Environment(environment.id), baseline) for environment in (FILTER, SMOOTHING)
                  for baseline in ("homogeneous", evil)] + [(Environment(SMOOTHING.id), failing)]
-        run_jobs([Job(*pair, seed) for pair in pairs for seed in (1, 2)], store)
-        records = store.write_records("eitbench run --baseline <script>")
+        run_jobs([Job(*pair, seed) for pair in pairs for seed in (1, 2)], store,
+                 command="eitbench run --baseline <script>")
+        records = store.write_records()
         path = page.write_page(store, records, summary(records))
     run._environment.cache_clear()                                     # made with the patched registry
     return folder, records, path.read_text(encoding="utf-8")
@@ -113,9 +114,9 @@ def test_every_method_score_and_failure_is_there(made):
     """Titles, boards, number of episodes, reasons of failures, explanations of the columns, how it was made."""
     _, records, html = made
     text = " ".join(Page(html).text)
-    for expected in ("Best homogeneous estimate", "Evil <script>alert", "Failing", "filter", "smoothing", "0 of 2",
+    for expected in ("Best homogeneous estimate", "Evil <script>alert", "Failing", "filter", "smoothing", "2 failed",
                      "RuntimeError: <b>&lt;", "eitbench run --baseline <script>", *EXPLANATIONS.values(),
-                     records[0]["versions"]["numpy"], records[0]["machine"]["processor"]):
+                     records[0]["runs"][0]["versions"]["numpy"], records[0]["runs"][0]["machine"]["processor"]):
         assert expected in text, expected
 
 
@@ -155,7 +156,7 @@ def test_a_page_of_failures_only(made):
     folder, records, _ = made
     failed = [record for record in records if record["baseline"] == "surely_failing"]
     html = page.write_page(EpisodeStore(folder / "failed"), failed, summary(failed)).read_text(encoding="utf-8")
-    assert "0 of 2" in html and svgs(html) == [] and "RuntimeError: <b>&lt;" in " ".join(Page(html).text)
+    assert "2 failed" in html and svgs(html) == [] and "RuntimeError: <b>&lt;" in " ".join(Page(html).text)
 
 
 def test_a_failure_does_not_take_the_snapshots_of_others(made, monkeypatch):

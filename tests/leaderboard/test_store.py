@@ -3,6 +3,7 @@
 import json
 import math
 import platform
+import re
 import threading
 
 import numpy as np
@@ -23,6 +24,9 @@ def surroundings(tmp_path_factory, monkeypatch):
     """One cache of episodes for the session, and a commit that doesn't depend on where the tests run."""
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path_factory.getbasetemp() / "episodes"))
     monkeypatch.setattr(store_module, "_git", lambda *words: "c0ffee" if "rev-parse" in words else "")
+    provenance.cache_clear()
+    yield
+    provenance.cache_clear()
 
 
 @pytest.fixture
@@ -35,7 +39,7 @@ def result(seed=1, baseline="mine", **changes):
     return {"identity": "abc", "seed": name_seed(seed), "baseline": baseline, "title": "Mine", "parameters": {},
             "baseline_sha256": "5ha", "board": "filter", "environment": {"id": ENV, "kwargs": {}}, "source": "code",
             "finished": "2025-01-01T00:00:00+00:00", "status": "ok", "scores": {"error": 0.1}, "step_errors": [0.1],
-            "seconds": 1.0} | changes
+            "seconds": 1.0, "run": {"command": COMMAND}} | changes
 
 
 def put(store, made, fields=None):
@@ -79,7 +83,7 @@ def test_damaged_results_are_passed_over(content, store):
     damaged.write_bytes(content)
     assert [r["seed"] for r in store.results()] == ["train:2"]
     assert not store.holds(ENV, "mine", 1, "abc")
-    assert [record["seeds"] for record in store.write_records(COMMAND)] == [["train:2"]]
+    assert [record["seeds"] for record in store.write_records()] == [["train:2"]]
 
 
 @pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
@@ -103,7 +107,7 @@ def test_writers_at_once_lose_nothing(store):
     def read():
         together.wait()
         for _ in range(20):
-            seen.extend(len(record["episodes"]) for record in store.write_records(COMMAND))
+            seen.extend(len(record["episodes"]) for record in store.write_records())
 
     threads = [threading.Thread(target=write, args=(worker,)) for worker in range(8)] + [threading.Thread(target=read)]
     for thread in threads:
@@ -111,7 +115,7 @@ def test_writers_at_once_lose_nothing(store):
     for thread in threads:
         thread.join()
     assert len(list(store.results())) == 64 and max(seen, default=0) <= 32
-    assert [len(record["episodes"]) for record in store.write_records(COMMAND)] == [32, 32]
+    assert [len(record["episodes"]) for record in store.write_records()] == [32, 32]
     assert not [path for path in store.folder.rglob(".*") if path.is_file()]
 
 
@@ -122,34 +126,39 @@ def test_writers_at_once_lose_nothing(store):
 def played(tmp_path_factory):
     """A folder in which one baseline has played two episodes, and failed in a third."""
     folder = tmp_path_factory.mktemp("played")
+    provenance.cache_clear()
     update = "assert voltages[0] != 0 or Path('x').exists(), 'silent'\n        return Estimate(self.level)"
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(CACHE_VARIABLE, str(folder / "cache"))
+        patch.setattr(store_module, "_git", lambda *words: "c0ffee" if "rev-parse" in words else "")
         mine = write_baseline(folder, update=update, parameters="{'alpha': 0.5, 'order': [1, 2]}")
         bad = write_baseline(folder, "bad", update="raise RuntimeError('no')")
-        run_jobs([Job(FILTER, path, seed) for path in (mine, bad) for seed in (1, 2)], EpisodeStore(folder))
+        run_jobs([Job(FILTER, path, seed) for path in (mine, bad) for seed in (1, 2)], EpisodeStore(folder),
+                 command=COMMAND)
     return EpisodeStore(folder)
 
 
 def test_record_says_how_to_repeat_it(played):
     """Environment with arguments, baseline with parameters and hash, command, seeds, versions, commit, machine."""
-    bad, mine = sorted(played.write_records(COMMAND), key=lambda record: record["baseline"])
+    bad, mine = sorted(played.write_records(), key=lambda record: record["baseline"])
     assert mine["environment"]["id"] == ENV and mine["environment"]["kwargs"]["scenario"] == SCENARIO
     assert (mine["baseline"], mine["title"], mine["board"]) == ("mine", "Mine", "filter")
     assert mine["parameters"] == {"alpha": 0.5, "order": [1, 2]}
     assert len(mine["baseline_sha256"]) == 64 and mine["baseline_sha256"] != bad["baseline_sha256"]
     assert mine["source"] == source_digest() and mine["schema"] == store_module.SCHEMA
-    assert mine["command"] == COMMAND and mine["seeds"] == ["train:1", "train:2"]
-    assert mine["commit"] == "c0ffee" and mine["dirty"] is False
-    assert mine["versions"]["numpy"] == np.__version__ and mine["versions"]["python"] == platform.python_version()
-    assert {"eitbench", "scipy", "gymnasium", "scikit-fem"} <= mine["versions"].keys()
-    assert None not in mine["versions"].values()
-    assert mine["machine"]["processor"] and mine["machine"]["cores"] >= 1 and mine["machine"]["blas_threads"] == 1
+    assert mine["seeds"] == ["train:1", "train:2"] and mine["split"] == "train"
+    (run,) = mine["runs"]
+    assert run["command"] == COMMAND and [episode["run"] for episode in mine["episodes"]] == [0, 0]
+    assert run["commit"] == "c0ffee" and run["dirty"] is False
+    assert run["versions"]["numpy"] == np.__version__ and run["versions"]["python"] == platform.python_version()
+    assert {"eitbench", "scipy", "gymnasium", "scikit-fem"} <= run["versions"].keys()
+    assert None not in run["versions"].values()
+    assert run["machine"]["processor"] and run["machine"]["cores"] >= 1 and run["machine"]["blas_threads"] == 1
 
 
 def test_record_holds_every_episode(played):
     """Scores, the error of each scored step, and time; or the reason of a failure."""
-    bad, mine = sorted(played.write_records(COMMAND), key=lambda record: record["baseline"])
+    bad, mine = sorted(played.write_records(), key=lambda record: record["baseline"])
     for episode in mine["episodes"]:
         assert episode["status"] == "ok" and episode["seconds"] > 0 and episode["finished"]
         assert {"error", "contrast_error", "voltage_discrepancy", "nis", "crps", "coverage_50", "coverage_90",
@@ -157,26 +166,35 @@ def test_record_holds_every_episode(played):
         assert len(episode["step_errors"]) == 3
         assert episode["scores"]["error"] == pytest.approx(np.mean(episode["step_errors"]), rel=1e-12)
     assert [episode["message"] for episode in bad["episodes"]] == 2 * ["RuntimeError: no"]
-    assert all("bad.py" in episode["traceback"] and "scores" not in episode for episode in bad["episodes"])
+    # where it went wrong, but not in whose folder
+    assert all(re.fullmatch(r"bad\.py:\d+", episode["where"]) for episode in bad["episodes"])
+    assert not any("scores" in episode for episode in bad["episodes"])
 
 
 def test_every_file_is_strict_json(played):
     """What lies on disk is what was returned, without NaN or Infinity, so that any language can read it."""
-    records = played.write_records(COMMAND)
+    records = played.write_records()
     on_disk = [strict(path.read_text()) for path in sorted((played.folder / "records").iterdir())]
     assert sorted(records, key=lambda record: record["baseline"]) == on_disk and len(on_disk) == 2
     assert len([strict(path.read_text()) for path in played.folder.glob("episodes/*/*/*.json")]) == 4
 
 
-def test_reporting_again_keeps_what_made_the_record(played, monkeypatch):
-    """A page rendered elsewhere, later, does not change where, with what and by which command episodes were played."""
-    before = {record["baseline"]: record for record in played.write_records(COMMAND)}
-    monkeypatch.setattr(store_module, "_git", lambda *words: "another commit")
-    monkeypatch.setattr(store_module, "_processor", lambda: "another machine")
-    for record in played.write_records("eitbench leaderboard"):
-        assert record["command"] == before[record["baseline"]]["command"]
-        assert record["commit"] == before[record["baseline"]]["commit"]
-        assert record["machine"] == before[record["baseline"]]["machine"]
+def test_each_episode_keeps_the_run_that_made_it(store):
+    """Episodes of several runs stand in one record, which names every run and says which made which."""
+    put(store, result(1))
+    put(store, result(2, run={"command": "later"}))
+    put(store, result(3))
+    (record,) = store.write_records()
+    assert record["runs"] == [{"command": COMMAND}, {"command": "later"}]
+    assert [episode["run"] for episode in record["episodes"]] == [0, 1, 0]
+
+
+def test_splits_are_not_mixed(store):
+    """Development and training seeds never enter the record of another split."""
+    put(store, result(1))
+    dev = name_seed(100_001)
+    store.put(ENV, "mine", 100_001, result(1) | {"seed": dev}, {})
+    assert sorted(tuple(record["seeds"]) for record in store.write_records()) == [("dev:1",), ("train:1",)]
 
 
 @pytest.mark.parametrize("what", ["source", "baseline_sha256"])
@@ -185,17 +203,17 @@ def test_versions_of_code_are_not_mixed(what, store):
     for seed in (1, 2, 3):
         put(store, result(seed, **{what: "old"}))
     put(store, result(2, **{what: "new"}, finished="2025-01-02T00:00:00+00:00"))
-    (record,) = store.write_records(COMMAND)
+    (record,) = store.write_records()
     assert record[what] == "new" and record["seeds"] == ["train:2"]
     put(store, result(1, **{what: "new"}, finished="2025-01-02T00:01:00+00:00"))
-    assert [record["seeds"] for record in store.write_records(COMMAND)] == [["train:1", "train:2"]]
+    assert [record["seeds"] for record in store.write_records()] == [["train:1", "train:2"]]
 
 
 def test_seeds_are_in_numerical_order(store):
     """train:9 comes before train:10."""
     for seed in (10, 9, 100):
         put(store, result(seed))
-    assert [record["seeds"] for record in store.write_records(COMMAND)] == [["train:9", "train:10", "train:100"]]
+    assert [record["seeds"] for record in store.write_records()] == [["train:9", "train:10", "train:100"]]
 
 
 def test_arguments_of_an_environment_make_other_records(store, tmp_path):
@@ -203,7 +221,7 @@ def test_arguments_of_an_environment_make_other_records(store, tmp_path):
     path = write_baseline(tmp_path)
     wider = Environment(FILTER.id, json.dumps({"scenario": SCENARIO | {"noise_relative": 0.02}}))
     run_jobs([Job(environment, path, 1) for environment in (FILTER, wider, FIXED_LAG)], store)
-    records = store.write_records(COMMAND)
+    records = store.write_records()
     noise = [record["environment"]["kwargs"]["scenario"].get("noise_relative") for record in records]
     assert sorted(noise, key=str) == [0.02, None, None]
     assert len(list((store.folder / "records").iterdir())) == 3
@@ -213,4 +231,6 @@ def test_provenance_without_git(monkeypatch):
     """Outside a repository there is no commit to name, and that is no error."""
     monkeypatch.undo()
     monkeypatch.setenv("PATH", "")
-    assert (provenance()["commit"], provenance()["dirty"]) == (None, False)
+    provenance.cache_clear()
+    assert (provenance()["commit"], provenance()["dirty"]) == (None, None)
+    provenance.cache_clear()

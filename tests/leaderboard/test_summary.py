@@ -17,6 +17,7 @@ from eitbench.leaderboard.summary import (
     mean_and_interval,
     rounded,
     scores_by_seed,
+    seed_ranges,
     summary,
 )
 
@@ -33,8 +34,10 @@ def record(baseline, board, errors, *, failed=(), kwargs=None, **scores):
             return {"seed": f"test:{i}", "status": "failed", "message": "oh"}
         return {"seed": f"test:{i}", "status": "ok", "scores": dict.fromkeys(COLUMNS) | {"error": error} | scores}
 
-    return {"baseline": baseline, "title": baseline.replace("_", " "), "board": board,
-            "environment": {"id": BOARD_IDS[board], "kwargs": LAGS[board] | (kwargs or {})},
+    return {"baseline": baseline, "title": baseline.replace("_", " "), "board": board, "split": "test",
+            "source": "code", "seeds": [f"test:{i}" for i in range(len(errors))],
+            "environment": {"id": BOARD_IDS[board], "name": f"{board}-v0",
+                            "kwargs": LAGS[board] | (kwargs or {})},
             "episodes": [one(i, error) for i, error in enumerate(errors)]}
 
 
@@ -149,7 +152,7 @@ def test_failures_are_counted_not_averaged():
     assert scores_by_seed(records[0], "error") == {"test:0": 0.1, "test:1": 0.2}
     assert row(records, "mine", "filter")["error"][0] == pytest.approx(0.15)
     text = cells(summary(records))
-    assert list(text["episodes"]) == ["2 of 3", "0 of 1"] and text["ẽ_c"][1] == "–"
+    assert list(text["seeds"]) == ["test:0-2, 1 failed", "test:0, 1 failed"] and text["ẽ_c"][1] == "–"
 
 
 def test_units_of_the_table():
@@ -166,3 +169,19 @@ def test_markdown_is_a_table():
     assert len(lines) == 5 and re.fullmatch(r"[|:-]+", lines[1])
     assert len({len(line) for line in lines}) == 1
     assert len({len(re.findall(r"(?<!\\)\|", line)) for line in lines}) == 1
+
+
+def test_seeds_are_named_by_their_ranges():
+    """A reader sees which episodes a score stands for."""
+    assert seed_ranges(["test:0", "test:1", "test:2", "test:7"]) == "test:0-2,7"
+    assert seed_ranges(["dev:10", "dev:9"]) == "dev:9-10" and seed_ranges(["300001"]) == "300001"
+
+
+def test_other_seeds_and_other_code_have_boards_of_their_own():
+    """Dev scores stand under their own heading, and neither they nor old code lend anchors for skill."""
+    mine = record("mine", "filter", FLOOR) | {"split": "dev"}
+    table = summary([*ANCHORS, mine])
+    assert list(table["split"]) == ["test", "test", "dev"] and cells(table)["board"].iloc[-1] == "filter (dev seeds)"
+    assert row([*ANCHORS, mine], "mine", "filter")["skill"] is None
+    old = record("mine", "filter", FLOOR) | {"source": "old"}
+    assert row([*ANCHORS, old], "mine", "filter")["skill"] is None
