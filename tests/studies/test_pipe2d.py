@@ -47,6 +47,12 @@ def test_order_of_the_methods(errors):
     assert 0.015 < mean["homogeneous"] < 0.04                # the contrast the scenario promises
 
 
+def test_scores_have_not_moved(errors):
+    """The scores of dev:0 are those of version 0.1.0 to 1 %; a change of physics or estimators shows here."""
+    golden = {"homogeneous": 0.020354, "filter": 0.0046947, "smoother": 0.0019687, "stationary": 0.032892}
+    assert {method: values[0] for method, values in errors.items()} == pytest.approx(golden, rel=0.01)
+
+
 def test_stationary_method_works_on_a_stationary_target():
     """The same Gauss–Newton, with the same α, beats the homogeneous estimate threefold when the target stands still."""
     scenario = Pipe2D()
