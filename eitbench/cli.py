@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, context_settings={
+app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, context_settings={
     "help_option_names": ["-h", "--help"]}, help="""
 Benchmark estimators that see a flow only through voltages on the pipe's wall.
 
@@ -38,7 +38,7 @@ class Figure(StrEnum):
 
 
 Out = Annotated[Path, typer.Option("--out", "-o", help="Folder of the results.")]
-Jobs = Annotated[int, typer.Option("--jobs", "-j", min=1, help="Processes; each takes one core and up to 1.5 GB.")]
+Jobs = Annotated[int, typer.Option("--jobs", "-j", min=1, help="Processes; each takes one core and about 1 GB.")]
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

@@ -5,11 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from matplotlib import colormaps
+from matplotlib.colors import to_rgb
 from PIL import Image
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from eitbench import _check
+from eitbench.envs.rendering import FIELD_MAP, IDLE, SINK, SOURCE, SPREAD_MAP
 from eitbench.leaderboard.baselines import load_baseline
 from eitbench.leaderboard.run import Environment, board_of, play
 from eitbench.seeds import parse_seeds
@@ -45,11 +48,22 @@ def animate(environment: str, baseline: str, seed: str, step: int | None, path: 
             if t == last:
                 break
     path.parent.mkdir(parents=True, exist_ok=True)
-    # One palette for all frames keeps colours steady and the file small.
-    palette = frames[len(frames) // 2].quantize(255)
     if step is None:
+        palette = _palette()
         small = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
         small[0].save(path, save_all=True, append_images=small[1:], duration=1000 // env.metadata["render_fps"], loop=0)
     else:
         frames[0].save(path)
     return path
+
+
+def _palette() -> Image.Image:
+    """The 256 colours of a frame: both colour maps, greys, and the electrodes; one for all frames keeps them steady."""
+    colours = [colormaps[name](np.linspace(0, 1, n))[:, :3] for name, n in ((FIELD_MAP, 120), (SPREAD_MAP, 100))]
+    greys = np.linspace(0, 1, 27)[:, None].repeat(3, axis=1)
+    pairs = [to_rgb(colour) for colour in (SOURCE, SINK, IDLE)]
+    halves = [tuple(0.5 + 0.5 * c for c in colour) for colour in pairs]              # at the edges of the bars
+    table = np.concatenate([*colours, greys, pairs, halves, halves])[:256]
+    image = Image.new("P", (1, 1))
+    image.putpalette((255 * table).round().astype(np.uint8).tobytes())
+    return image
