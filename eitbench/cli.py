@@ -117,8 +117,9 @@ def reproduce(
     from eitbench.leaderboard.reproduce import FIGURES
     from eitbench.seeds import parse_seeds
     with _clear_errors():
-        path, remark = FIGURES[name.value](parse_seeds(seeds), jobs, out)
-        typer.echo(f"wrote {path}\n{remark}")
+        numbers = parse_seeds(seeds)
+    path, remark = FIGURES[name.value](numbers, jobs, out)
+    typer.echo(f"wrote {path}\n{remark}")
 
 
 def _report(out: Path) -> None:

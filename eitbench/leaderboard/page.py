@@ -41,7 +41,7 @@ def write_page(store: EpisodeStore, records: list[dict[str, Any]], table: pd.Dat
         headings=list(text.columns)[1:], explanations=EXPLANATIONS,
         boards=[(board, rows.iloc[:, 1:].to_numpy().tolist()) for board, rows in text.groupby("board", sort=False)],
         intervals=_intervals(table), curves=_curves(ordered), legend=_legend(ordered),
-        snapshots=_snapshots(store, records),
+        snapshots=_snapshots(store, ordered),
         colour_bar=_colour_bar(), runs=_runs(records),
         failures=[(record["title"], episode["seed"], episode["message"]) for record in records
                   for episode in record["episodes"] if episode["status"] != "ok"],
@@ -91,8 +91,12 @@ def _curves(ordered: list[dict[str, Any]]) -> str:
 
 
 def _snapshots(store: EpisodeStore, records: list[dict[str, Any]]) -> dict[str, Any] | None:
-    """Truth and estimates of one episode at four times, as PNG data; None if nothing can be shown."""
+    """Truth and estimates of one episode at four times, as PNG data; None if nothing can be shown.
+
+    The episode is of the split that comes first in the table: methods that played other seeds share none with it.
+    """
     records = [record for record in records if any(e["status"] == "ok" for e in record["episodes"])]
+    records = [record for record in records if record["split"] == records[0]["split"]]
     chosen = [record for name, board in SHOWN for record in records
               if record["baseline"] == name and record["board"] == board]
     chosen = chosen or records[:3]

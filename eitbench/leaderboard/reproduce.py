@@ -150,7 +150,7 @@ def fig5_6(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
         for ax in row:
             draw_electrodes(ax, env.task, np.zeros(env.task.currents.shape[1]), width=3)
             ax.label_outer()
-        row[0].set_ylabel(f"{_milliseconds(env, begin + 1)} – {_milliseconds(env, begin + frame)}\ny / cm", fontsize=9)
+        row[0].set_ylabel(f"until {_milliseconds(env, begin + frame)}\ny / cm", fontsize=9)
     figure.colorbar(mappable, ax=axes, label="concentration / (mol/m³)", extend="both", aspect=40)
     path = out / "fig5.6.png"
     _save(figure, path)

@@ -208,3 +208,13 @@ def test_intervals_of_one_episode_and_wide_ones():
     chart = ElementTree.fromstring(charts.intervals(rows, "ẽ_c"))
     one, wide = [line for line in chart.findall("line") if line.get("style")]
     assert one.get("x1") == one.get("x2") and float(wide.get("x2")) > float(wide.get("x1")) >= 300
+
+
+def test_other_seeds_do_not_take_the_snapshots_away(made):
+    """A method played on dev seeds beside ours on others, as README suggests: the pictures are still there."""
+    folder, records, html = made
+    others = [record | {"split": "own", "seeds": ["300001"],
+                        "episodes": [episode | {"seed": "300001"} for episode in record["episodes"][:1]]}
+              for record in records]
+    mixed = page.write_page(EpisodeStore(folder), records + others, summary(records + others))
+    assert mixed.read_text(encoding="utf-8").count("<img") == html.count("<img") > 1
