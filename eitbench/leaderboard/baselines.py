@@ -56,18 +56,18 @@ def load_baseline(name: str) -> Baseline:
         raise ValueError(f"baseline must be a path to a .py file or one of {', '.join(own_baselines())}; got {name!r}")
     if path.stem in own_baselines() and not path.samefile(baseline_folder() / path.name):
         raise ValueError(f"baseline {path} has the name of one of ours, under which results are kept; rename it")
-    return _load(path, hashlib.sha256(path.read_bytes()).hexdigest())
+    return _load(path, path.read_bytes())
 
 
 @lru_cache(maxsize=64)
-def _load(path: Path, sha256: str) -> Baseline:
+def _load(path: Path, source: bytes) -> Baseline:
     """The file with this content, executed once a process."""
     specification = importlib.util.spec_from_file_location(f"eitbench_baseline_{path.stem}", path)
-    assert specification is not None and specification.loader is not None
+    assert specification is not None
     module = importlib.util.module_from_spec(specification)
     sys.modules[specification.name] = module                       # dataclasses look their module up
     try:
-        specification.loader.exec_module(module)
+        exec(compile(source, path, "exec"), module.__dict__)  # a cached .pyc may lag behind an edit by a second
     except Exception as error:
         raise ValueError(f"baseline {path} cannot be loaded: {type(error).__name__}: {error}") from error
     estimator = getattr(module, "Estimator", None)
@@ -82,4 +82,4 @@ def _load(path: Path, sha256: str) -> Baseline:
         json.dumps(parameters, allow_nan=False)
     except (TypeError, ValueError) as error:
         raise ValueError(f"baseline {path}: Estimator.parameters must be JSON: {error}") from None
-    return Baseline(path.stem, title, path, sha256, boards, parameters, estimator)
+    return Baseline(path.stem, title, path, hashlib.sha256(source).hexdigest(), boards, parameters, estimator)
