@@ -22,6 +22,7 @@ from tqdm import tqdm
 
 from eitbench import _check
 from eitbench._files import write_atomically
+from eitbench.physics.condensation import backend_version
 from eitbench.scenarios.base import Discretisation, Scenario
 
 CACHE_VARIABLE = "EITBENCH_CACHE"
@@ -116,7 +117,8 @@ def _identity(scenario: Scenario, seed: int) -> str:
     """All that the numbers depend on: scenario, seed, the code that simulates, and the libraries beneath it."""
     kind = type(scenario)
     return json.dumps({"scenario": f"{kind.__module__}.{kind.__qualname__}", "fields": asdict(scenario),  # type: ignore
-                       "seed": seed, "code": _code_digest(), "numpy": np.__version__, "scipy": scipy.__version__,
+                       "seed": seed, "code": _code_digest(), "factorisation": backend_version(),
+                       "numpy": np.__version__, "scipy": scipy.__version__,
                        "scikit-fem": skfem.__version__}, sort_keys=True)
 
 

@@ -11,19 +11,20 @@ import numpy as np
 import scipy.sparse as sp
 import skfem
 from scipy.sparse.csgraph import connected_components
-from scipy.sparse.linalg import SuperLU, splu
 from skfem.helpers import dot, grad
 
 from eitbench import _check
+from eitbench.physics.condensation import Backend, condensation
 from eitbench.physics.fem import element, to_skfem
 from eitbench.physics.mesh import Mesh
+from eitbench.physics.sensitivity import Sensitivity
 
 
 class CompleteElectrodeModel:
     """Electrode voltages, and their derivatives, for a nodal conductivity.
 
     Voltages are linear in the currents, so for one conductivity everything is in one symmetric L×L matrix,
-    U = 𝓡 I with 𝓡1 = 0: one sparse factorisation and L − 1 right-hand sides serve every injection.
+    U = 𝓡 I with 𝓡1 = 0: one sparse factorisation serves every injection.
 
     Parameters
     ----------
@@ -36,6 +37,8 @@ class CompleteElectrodeModel:
     order : int
         1 or 2: polynomial order of the potential. First order is wrong by several noise standard deviations on meshes
         of a few thousand unknowns.
+    backend : "auto", "compiled" or "scipy"
+        What factorises; see `eitbench.physics.condensation`.
 
     Raises
     ------
@@ -45,7 +48,7 @@ class CompleteElectrodeModel:
     """
 
     def __init__(self, mesh: Mesh, electrodes: Sequence[np.ndarray], contact_impedance: float | np.ndarray,
-                 order: int = 2) -> None:
+                 order: int = 2, backend: Backend = "auto") -> None:
         self.mesh = mesh
         self.order = order
         self.electrodes = _checked_electrodes(mesh, electrodes)
@@ -56,24 +59,20 @@ class CompleteElectrodeModel:
         self.contact_impedance.setflags(write=False)
 
         basis = skfem.Basis(to_skfem(mesh), element(mesh.dim, order), intorder=2 * order - 1)
-        n = basis.N
-        self.n_unknowns = n + n_electrodes - 1
         contact, rows, columns, derivatives = self._contact_terms(basis), *_conduction(basis)
         # The last electrode is grounded: without its row and column the system is symmetric positive definite.
         pattern = sp.coo_array((np.ones(len(rows)), (rows, columns)), shape=contact.shape).tocsc()
-        pattern = (pattern + abs(contact))[:-1, :-1].tocsc()
-        place = splu(sp.csc_matrix(_diagonally_dominant(pattern)), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
-                      options={"SymmetricMode": True}).perm_c
-        self._place = place.astype(np.int64)                             # position of an unknown in the solver's order
-        self._assemble_into(pattern, contact[:-1, :-1].tocoo(), rows, columns, derivatives)
-
-        loads = np.zeros((self.n_unknowns, n_electrodes - 1))
-        loads[self._place[n:], np.arange(n_electrodes - 1)] = 1.0
-        self._loads = loads
+        system = condensation((pattern + abs(contact))[:-1, :-1].tocsc(), n_electrodes - 1, backend)
+        self._system = system
+        self.n_unknowns = system.n
+        # K(σ) = constant + D σ, for the entries that the solver keeps, in its order
+        n = system.n + 1
+        kept = sp.csr_array((np.arange(len(rows)) + 1, (rows, columns)), shape=(n, n))[system.rows, system.columns]
+        self._derivatives = sp.vstack([sp.csr_array((1, mesh.n_nodes)), derivatives], format="csr")[kept]
+        self._constant = contact[system.rows, system.columns]
         # Mean-free currents and potentials: P = I − 11ᵀ/L on both sides of the grounded solution.
-        self._centre = np.eye(n_electrodes) - 1.0 / n_electrodes
-        self._gradient, self._test = _field_operators(basis)
-        self._n_potential = n
+        self._centre = (np.eye(n_electrodes) - 1.0 / n_electrodes)[:, :-1]
+        self._sensitivity = Sensitivity(basis, compiled=self._system.compiled)
 
     # -- public ---------------------------------------------------------------------------------------------------
 
@@ -90,10 +89,13 @@ class CompleteElectrodeModel:
         (..., L, L) array in Ω (Ω·m in 2D, where currents are per metre of depth); symmetric, rows sum to zero.
         """
         sigma = self._checked_conductivity(conductivity, batched=True)
+        if sigma.ndim == 1:
+            return self._centred(self._system.port_inverse(self._assemble(sigma)))
         flat = sigma.reshape(-1, self.mesh.n_nodes)
         result = np.empty((len(flat), self.n_electrodes, self.n_electrodes))
-        for one, resistance in zip(flat, result, strict=True):
-            resistance[:] = self._resistance(self._solve(one))
+        for first in range(0, len(flat), self._system.batch):
+            some = slice(first, first + self._system.batch)
+            result[some] = self._centred(self._system.port_inverse(self._assemble(flat[some].T)))
         return result.reshape(*sigma.shape[:-1], self.n_electrodes, self.n_electrodes)
 
     def voltages(self, conductivity: np.ndarray, currents: np.ndarray) -> np.ndarray:
@@ -108,17 +110,28 @@ class CompleteElectrodeModel:
     def linearise(self, conductivity: np.ndarray, currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """`voltages` and `jacobian` together, from one factorisation."""
         currents = self._checked_currents(currents)
-        solution = self._solve(self._checked_conductivity(conductivity))
-        voltages = currents @ self._resistance(solution)
-        potential = solution[self._place[:self._n_potential]]
-        # The field of unit current at electrode m, taken out evenly at all: column m of W; u = W I needs no new solve.
-        fields = np.concatenate([potential, np.zeros((len(potential), 1))], axis=1) @ self._centre
-        E = (self._gradient @ fields).reshape(self.mesh.dim, -1, self.n_electrodes)
-        jacobian = np.empty((len(currents), self.n_electrodes, self.mesh.n_nodes))
-        for k, current in enumerate(currents):
-            product = np.einsum("dqm,dq->qm", E, E @ current)
-            jacobian[k] = -(self._test @ product).T
-        return voltages, jacobian
+        resistance, table = self.transfer_resistance_derivatives(conductivity)
+        return currents @ resistance, np.ascontiguousarray(np.moveaxis(table @ currents.T, (2, 1), (0, 1)))
+
+    def transfer_resistance_derivatives(self, conductivity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """𝓡 and its derivatives by the nodal conductivity, from one factorisation; they serve every injection.
+
+        The field of any injection is a combination of the L fields w_m of unit currents, taken out evenly at all
+        electrodes, so that ∂𝓡_ml/∂σ_j = −∫ φ_j ∇w_m·∇w_l.
+
+        Parameters
+        ----------
+        conductivity : (n_nodes,) float
+            In S/m, > 0.
+
+        Returns
+        -------
+        𝓡 : (L, L) in Ω (Ω·m in 2D)
+        table : (n_nodes, L, L) in Ω·m/S (Ω·m²/S in 2D)
+        """
+        columns = self._system.port_columns(self._assemble(self._checked_conductivity(conductivity)))
+        fields, grounded = np.split(columns, [-self._system.n_ports])
+        return self._centred(grounded), -self._sensitivity.products(fields @ self._centre.T)
 
     # -- the linear system ------------------------------------------------------------------------------------------
 
@@ -136,39 +149,14 @@ class CompleteElectrodeModel:
         load = sp.csr_array(np.stack(loads, axis=1))
         return sp.block_array([[mass, -load], [-load.T, sp.diags_array(load.sum(axis=0))]], format="csr")
 
-    def _assemble_into(self, pattern: sp.csc_array, contact: sp.coo_array, rows: np.ndarray, columns: np.ndarray,
-                       derivatives: sp.csr_array) -> None:
-        """Prepare K(σ).data = constant + D σ on the fixed, reordered sparsity pattern."""
-        coo = pattern.tocoo()
-        permuted = sp.csc_array((np.ones(coo.nnz), (self._place[coo.row], self._place[coo.col])), shape=pattern.shape)
-        permuted.sort_indices()
-        self._indices, self._indptr = permuted.indices, permuted.indptr
-        n = pattern.shape[0]
-        positions = (np.repeat(np.arange(n), np.diff(permuted.indptr)) * n + permuted.indices).astype(np.int64)
+    def _assemble(self, conductivity: np.ndarray) -> np.ndarray:
+        """The solver's entries of K, (k,) or (k, b) for conductivity (n_nodes,) or (n_nodes, b)."""
+        values = self._derivatives @ conductivity
+        return values + (self._constant if values.ndim == 1 else self._constant[:, None])
 
-        def slot(row: np.ndarray, column: np.ndarray) -> np.ndarray:
-            return np.searchsorted(positions, self._place[column].astype(np.int64) * n + self._place[row])
-
-        gather = sp.csr_array((np.ones(len(rows)), (slot(rows, columns), np.arange(len(rows)))),
-                              shape=(permuted.nnz, len(rows)))
-        self._derivatives = (gather @ derivatives).tocsr()
-        self._constant = np.zeros(permuted.nnz)
-        np.add.at(self._constant, slot(contact.row, contact.col), contact.data)
-
-    def _factorise(self, conductivity: np.ndarray) -> SuperLU:
-        data = self._constant + self._derivatives @ conductivity
-        matrix = sp.csc_matrix((data, self._indices, self._indptr), shape=(self.n_unknowns, self.n_unknowns))
-        return splu(matrix, permc_spec="NATURAL", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-
-    def _solve(self, conductivity: np.ndarray) -> np.ndarray:
-        """Potentials, in the solver's order, for a unit current in at each electrode and out at the last one."""
-        return self._factorise(conductivity).solve(self._loads)
-
-    def _resistance(self, solution: np.ndarray) -> np.ndarray:
-        grounded = np.zeros((self.n_electrodes, self.n_electrodes))
-        grounded[:-1, :-1] = solution[self._place[self._n_potential:]]
-        resistance = self._centre @ grounded @ self._centre
-        return 0.5 * (resistance + resistance.T)
+    def _centred(self, grounded: np.ndarray) -> np.ndarray:
+        resistance = self._centre @ grounded @ self._centre.T
+        return 0.5 * (resistance + np.swapaxes(resistance, -1, -2))
 
     # -- checks -----------------------------------------------------------------------------------------------------
 
@@ -210,31 +198,6 @@ def _conduction(basis: skfem.CellBasis) -> tuple[np.ndarray, np.ndarray, sp.csr_
     key, slot = np.unique(i * basis.N + j, return_inverse=True)
     derivatives = sp.csr_array((tensor.data, (slot, k)), shape=(len(key), sigma.N))
     return key // basis.N, key % basis.N, derivatives
-
-
-def _field_operators(basis: skfem.CellBasis) -> tuple[sp.csr_array, sp.csr_array]:
-    """∇ at all quadrature points, (d·Q, N), and the weighted P1 tests ∫φ_j · , (n_nodes, Q)."""
-    quadrature = skfem.Basis(basis.mesh, basis.elem, intorder=2 * (basis.elem.maxdeg - 1) + 1)
-    d, n_cells, n_points = np.asarray(quadrature.global_coordinates()).shape
-    size = n_cells * n_points
-    point = np.arange(size)
-    gradient = sum(
-        sp.csr_array((phi[0].grad.reshape(d * size), (np.arange(d * size), np.tile(np.repeat(dofs, n_points), d))),
-                     shape=(d * size, basis.N))
-        for phi, dofs in zip(quadrature.basis, quadrature.element_dofs, strict=True))
-    sigma = quadrature.with_element(element(basis.mesh.dim(), 1))
-    test = sum(
-        sp.csr_array(((np.broadcast_to(np.asarray(phi[0]), (n_cells, n_points)) * quadrature.dx).ravel(),
-                      (np.repeat(dofs, n_points), point)), shape=(sigma.N, size))
-        for phi, dofs in zip(sigma.basis, sigma.element_dofs, strict=True))
-    return gradient.tocsr(), test.tocsr()
-
-
-def _diagonally_dominant(pattern: sp.csc_array) -> sp.csc_array:
-    """A matrix with this symmetric pattern that any ordering factorises."""
-    ones = pattern.copy()
-    ones.data = np.full(pattern.nnz, -1.0)
-    return (ones + sp.diags_array(2.0 + np.diff(pattern.indptr).astype(float))).tocsc()
 
 
 def _checked_electrodes(mesh: Mesh, electrodes: Sequence[np.ndarray]) -> list[np.ndarray]:

@@ -1,0 +1,210 @@
+"""Sparse symmetric positive definite systems, seen from their last few unknowns.
+
+Of K = [[A, B], [Bᵀ, C]] the electrodes ask only for (C − Bᵀ A⁻¹ B)⁻¹, the block of K⁻¹ that belongs to them. With
+their unknowns ordered last, the Schur complement is what a Cholesky factorisation has left when it comes to them: no
+substitution is needed, and every injection is served at the price of one factorisation.
+
+Two ways to the same numbers: compiled kernels (numba), 4 to 8 times as fast, and scipy's SuperLU wherever numba is
+not installed. Both order the unknowns once, by minimum degree, for a fixed pattern.
+"""
+
+from __future__ import annotations
+
+import threading
+from importlib.metadata import version
+from importlib.util import find_spec
+from typing import Any, Literal
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.sparse.linalg import SuperLU, splu
+
+Backend = Literal["auto", "compiled", "scipy"]
+
+
+def condensation(pattern: sp.csc_array, n_ports: int, backend: Backend = "auto") -> Condensation | CompiledCondensation:
+    """The fastest installed way to condense matrices of this pattern onto their last ``n_ports`` unknowns.
+
+    Parameters
+    ----------
+    pattern : (n, n) sparse
+        Symmetric, with a full diagonal.
+    n_ports : int
+    backend : "auto", "compiled" or "scipy"
+    """
+    if backend not in ("auto", "compiled", "scipy"):
+        raise ValueError(f"backend must be 'auto', 'compiled' or 'scipy', got {backend!r}")
+    installed = find_spec("numba") is not None
+    if backend == "compiled" and not installed:
+        raise ValueError("backend 'compiled' needs numba, which is not installed: pip install 'eitbench[fast]'")
+    return (CompiledCondensation if installed and backend != "scipy" else Condensation)(pattern, n_ports)
+
+
+def backend_version() -> str:
+    """What `condensation` uses here, for records: results agree between backends to rounding only."""
+    return f"numba {version('numba')}" if find_spec("numba") is not None else "scipy"
+
+
+class Condensation:
+    """Condensation by scipy's SuperLU.
+
+    Attributes
+    ----------
+    rows, columns : (k,) int
+        Where the values belong that the methods take: the entries of K, in this order.
+    batch : int
+        How many matrices are best given at once.
+    """
+
+    compiled = False
+    batch = 1
+
+    def __init__(self, pattern: sp.csc_array, n_ports: int) -> None:
+        self.n, self.n_ports = pattern.shape[0], n_ports
+        self._place = np.append(_minimum_degree(pattern[:-n_ports, :-n_ports]), np.arange(self.n - n_ports, self.n))
+        self._order = np.argsort(self._place)
+        permuted = _permuted(pattern, self._place)
+        self._indices, self._indptr = permuted.indices, permuted.indptr
+        self.rows = self._order[permuted.indices]
+        self.columns = self._order[np.repeat(np.arange(self.n), np.diff(permuted.indptr))]
+        self._loads = np.eye(self.n, n_ports, -(self.n - n_ports))
+
+    def port_inverse(self, values: np.ndarray) -> np.ndarray:
+        """The ports' block of K⁻¹: (m, m) for values (k,), (b, m, m) for values (k, b)."""
+        if values.ndim == 1:
+            return self._factorised(values).solve(self._loads)[-self.n_ports:]
+        return np.stack([self.port_inverse(column) for column in values.T])
+
+    def port_columns(self, values: np.ndarray) -> np.ndarray:
+        """The ports' columns of K⁻¹, (n, m), for values (k,)."""
+        return self._factorised(values).solve(self._loads)[self._place]
+
+    def _factorised(self, values: np.ndarray) -> SuperLU:
+        matrix = sp.csc_matrix((values, self._indices, self._indptr), shape=(self.n, self.n))
+        return splu(matrix, permc_spec="NATURAL", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+
+
+class CompiledCondensation:
+    """Condensation by compiled supernodal Cholesky kernels; attributes and methods as in `Condensation`."""
+
+    compiled = True
+    batch = 8
+
+    def __init__(self, pattern: sp.csc_array, n_ports: int) -> None:
+        self.n, self.n_ports = pattern.shape[0], n_ports
+        place = np.append(_minimum_degree(pattern[:-n_ports, :-n_ports]), np.arange(self.n - n_ports, self.n))
+        permuted = _permuted(pattern, place)
+        self._place = place
+        self._symbolic = _supernodes(permuted, n_ports)
+        start, first_row, rows, panel, owner = self._symbolic
+        lower = sp.tril(permuted, format="coo")
+        key = np.repeat(np.arange(len(panel) - 1), np.diff(first_row)) * self.n + rows
+        home = owner[lower.col]
+        within = np.searchsorted(key, home * self.n + lower.row) - first_row[home]
+        slot = panel[home] + (lower.col - start[home]) * np.diff(first_row)[home] + within
+        by_slot = np.argsort(slot)
+        self._slot = slot[by_slot]
+        self._first_entry = np.searchsorted(self._slot, panel)
+        order = np.argsort(place)
+        self.rows, self.columns = order[lower.row[by_slot]], order[lower.col[by_slot]]
+
+    def port_inverse(self, values: np.ndarray) -> np.ndarray:
+        """The ports' block of K⁻¹: (m, m) for values (k,), (b, m, m) for values (k, b); b is padded to eights."""
+        if values.ndim == 1:
+            return np.linalg.inv(self._schur(self._factorise(values)))
+        b = values.shape[1]
+        result = np.empty((b, self.n_ports, self.n_ports))
+        factor = _scratch(self._symbolic[3][-1] * self.batch)
+        for first in range(0, b, self.batch):
+            block = values[:, first:first + self.batch]
+            eight = np.concatenate([block, np.repeat(block[:, -1:], self.batch - block.shape[1], axis=1)], axis=1)
+            self._kernels.factorise_lanes(*self._symbolic, self._first_entry, self._slot, eight.ravel(),
+                                          factor)
+            schur = self._schur(factor.reshape(-1, self.batch).T)
+            result[first:first + self.batch] = np.linalg.inv(schur[:block.shape[1]])
+        return result
+
+    def port_columns(self, values: np.ndarray) -> np.ndarray:
+        """The ports' columns of K⁻¹, (n, m), for values (k,)."""
+        factor = self._factorise(values)
+        solution = np.zeros((self.n, -(-self.n_ports // 8) * 8))
+        solution[-self.n_ports:, :self.n_ports] = np.linalg.inv(self._schur(factor))
+        start, first_row, rows, panel, _ = self._symbolic
+        self._kernels.substitute_back(start, first_row, rows, panel, factor, solution)
+        return solution[self._place, :self.n_ports]
+
+    def _factorise(self, values: np.ndarray) -> np.ndarray:
+        factor = _scratch(self._symbolic[3][-1] + self.batch)      # the kernel reads a few numbers beyond the end
+        self._kernels.factorise(*self._symbolic, self._first_entry, self._slot, values, factor)
+        return factor
+
+    def _schur(self, factor: np.ndarray) -> np.ndarray:
+        """(…, m, m), from the lower triangle in the last panel."""
+        m, panel = self.n_ports, self._symbolic[3]
+        block = factor[..., panel[-2]:panel[-1]].reshape(*factor.shape[:-1], m, m)
+        return np.triu(block) + np.swapaxes(np.triu(block, 1), -1, -2)
+
+    @property
+    def _kernels(self) -> Any:
+        from eitbench.physics import _kernels  # numba is loaded when something is factorised, not before
+        return _kernels
+
+
+def _supernodes(pattern: sp.csc_array, n_last: int) -> tuple[np.ndarray, ...]:
+    """start, first_row, rows, panel, owner as in `_kernels`; the ``n_last`` last columns are one supernode.
+
+    The pattern of the factor comes from SuperLU, of a matrix on which nothing cancels.
+    """
+    n = pattern.shape[0]
+    factors = splu(sp.csc_matrix(_diagonally_dominant(pattern)), permc_spec="NATURAL", diag_pivot_thresh=0.0,
+                   options={"SymmetricMode": True})
+    assert (factors.perm_c == np.arange(n)).all(), "an order by minimum degree is a postorder, and stays as it is"
+    L = factors.L.tocsc()
+    L.sort_indices()
+    count = np.diff(L.indptr)
+    parent = np.where(count > 1, L.indices[np.minimum(L.indptr[:-1] + 1, L.nnz - 1)], -1)
+    begins = np.ones(n, dtype=bool)
+    begins[1:] = (parent[:-1] != np.arange(1, n)) | (count[:-1] != count[1:] + 1)
+    begins[n - n_last:] = np.arange(n_last) == 0
+    start = np.append(np.flatnonzero(begins), n).astype(np.int64)
+    width = np.diff(start)
+    height = np.append(count[start[:-2]], n_last).astype(np.int64)
+    first_row = np.append(0, np.cumsum(height))
+    within = np.arange(first_row[-2]) - np.repeat(first_row[:-2], height[:-1])
+    rows = np.append(L.indices[np.repeat(L.indptr[start[:-2]], height[:-1]) + within], np.arange(n - n_last, n))
+    panel = np.append(0, np.cumsum(height * width))
+    return start, first_row, rows.astype(np.int64), panel, np.repeat(np.arange(len(width)), width)
+
+
+def _minimum_degree(pattern: sp.csc_array) -> np.ndarray:
+    """Position of each unknown in a fill-reducing order."""
+    return splu(sp.csc_matrix(_diagonally_dominant(pattern)), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
+                options={"SymmetricMode": True}).perm_c.astype(np.int64)
+
+
+def _permuted(pattern: sp.csc_array, place: np.ndarray) -> sp.csc_array:
+    coo = pattern.tocoo()
+    permuted = sp.csc_array((np.ones(coo.nnz), (place[coo.row], place[coo.col])), shape=pattern.shape)
+    permuted.sort_indices()
+    return permuted
+
+
+def _diagonally_dominant(pattern: sp.csc_array) -> sp.csc_array:
+    """A matrix with this symmetric pattern that any ordering factorises."""
+    ones = pattern.copy()
+    ones.data = np.full(pattern.nnz, -1.0)
+    return (ones + sp.diags_array(2.0 + np.diff(pattern.indptr).astype(float))).tocsc()
+
+
+_memory = threading.local()
+
+
+def _scratch(size: int) -> np.ndarray:
+    """(size,) doubles of this thread, good until the next call, kept because fresh memory is slow to touch.
+
+    They begin a cache line: vectors across two lines cost up to twice as much.
+    """
+    if getattr(_memory, "doubles", np.empty(0)).size < size + 8:
+        _memory.doubles = np.zeros(size + 8)
+    skip = -(_memory.doubles.ctypes.data // 8) % 8
+    return _memory.doubles[skip:skip + size]

@@ -1,0 +1,54 @@
+"""∫ φ_j ∇w_m·∇w_l for all nodes j and all pairs of fields: what a conductivity at node j changes in every voltage."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse as sp
+import skfem
+
+
+class Sensitivity:
+    """The products of the gradients of several potentials, tested with the mesh's hat functions; exact.
+
+    The gradient of a potential of first or second order is linear on a simplex, so its values at the vertices hold all
+    of it, and the integrals of products of three hat functions are known: with w = |T|/((d+1)(d+2)(d+3)),
+    ∫ λ_j λ_v λ_v' = w (1 + [j=v] + [j=v'] + [v=v'] + 2[j=v=v']). With G_v the gradient at vertex v and S = Σ_v G_v,
+    ∫ φ_j ∇w_m·∇w_l = w ((S + G_j)_m·(S + G_j)_l + Σ_v G_vm·G_vl + G_jm·G_jl).
+
+    Parameters
+    ----------
+    basis : skfem.CellBasis
+        Of the potential.
+    compiled : bool
+        Use the numba kernel.
+    """
+
+    def __init__(self, basis: skfem.CellBasis, *, compiled: bool) -> None:
+        dim, n_cells = basis.mesh.dim(), basis.mesh.nelements
+        self.compiled = compiled
+        self._cells = np.ascontiguousarray(basis.mesh.t.T.astype(np.int64))
+        self._weight = basis.dx.sum(axis=1) / ((dim + 1) * (dim + 2) * (dim + 3))
+        corners = np.hstack([np.zeros((dim, 1)), np.eye(dim)])
+        at_corners = skfem.Basis(basis.mesh, basis.elem, quadrature=(corners, np.full(dim + 1, 1.0 / (dim + 1))))
+        row = np.arange(n_cells * (dim + 1) * dim)
+        gradient = sum(
+            sp.csr_array((phi[0].grad.transpose(1, 2, 0).ravel(), (row, np.repeat(dofs, (dim + 1) * dim))),
+                         shape=(len(row), basis.N))
+            for phi, dofs in zip(at_corners.basis, at_corners.element_dofs, strict=True))
+        self._gradient = gradient.tocsr()
+
+    def products(self, fields: np.ndarray) -> np.ndarray:
+        """(n_nodes, k, k) for potentials (n_potential, k)."""
+        n_cells, n_vertices = self._cells.shape
+        k = fields.shape[1]
+        gradients = (self._gradient @ fields).reshape(n_cells, n_vertices, n_vertices - 1, k)
+        table = np.zeros((self._cells.max() + 1, k, k))
+        if self.compiled:
+            from eitbench.physics._kernels import products_of_gradients
+            products_of_gradients(self._cells, self._weight, gradients, table)
+            return table
+        shifted = gradients + gradients.sum(axis=1, keepdims=True)
+        own = np.swapaxes(gradients, 2, 3) @ gradients
+        local = np.swapaxes(shifted, 2, 3) @ shifted + own + own.sum(axis=1, keepdims=True)
+        gather = sp.csr_array((np.repeat(self._weight, n_vertices), (self._cells.ravel(), np.arange(self._cells.size))))
+        return (gather @ local.reshape(-1, k * k)).reshape(table.shape)
