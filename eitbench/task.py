@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from eitbench import _check
-from eitbench.physics.mesh import Mesh
-from eitbench.physics.observation import ObservationModel, VoltageNoise
-from eitbench.physics.transport import ConvectionDiffusion, EvolutionModel
 from eitbench.scenarios.base import Discretisation, Scenario
+
+if TYPE_CHECKING:
+    from eitbench.physics.mesh import Mesh
+    from eitbench.physics.observation import ObservationModel, VoltageNoise
+    from eitbench.physics.transport import ConvectionDiffusion, EvolutionModel
 
 
 class Estimate(NamedTuple):
@@ -82,15 +84,20 @@ def make_task(scenario: Scenario, lag: int | str = 0, **assumptions: float) -> T
     assumptions
         Passed to ``scenario.model``: what the estimator wrongly believes, such as ``mean_velocity``.
     """
-    last = scenario.n_steps - 1
-    if isinstance(lag, str) and lag != "all":
-        raise ValueError(f"lag must be 'all' or an integer from 0 to {last}, got {lag!r}")
-    steps = last if lag == "all" else _check.integer("lag", lag, low=0, high=last)
+    steps = lag_steps(scenario, lag)
     model = _model(scenario, tuple(sorted(assumptions.items())))
     currents = scenario.currents
     currents.setflags(write=False)                                # shared by all who play this task
     return Task(model.transport, model.observation, scenario.noise, currents, scenario.n_steps,
                 scenario.warm_up, steps, scenario.expected_concentration)
+
+
+def lag_steps(scenario: Scenario, lag: int | str) -> int:
+    """``lag`` of `make_task` as a number; `ValueError` if it does not fit the scenario."""
+    last = scenario.n_steps - 1
+    if isinstance(lag, str) and lag != "all":
+        raise ValueError(f"lag must be 'all' or an integer from 0 to {last}, got {lag!r}")
+    return last if lag == "all" else _check.integer("lag", lag, low=0, high=last)
 
 
 @lru_cache(maxsize=4)

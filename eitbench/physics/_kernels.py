@@ -169,3 +169,34 @@ def products_of_gradients(cells, weight, gradients, table):
                     first, second = weight[c] * shifted[k, m], weight[c] * G[j, k, m]
                     for l in range(n_fields):
                         table[node, m, l] += first * shifted[k, l] + second * G[j, k, l]
+
+
+@njit(cache=True)
+def solve_lu(row_place, column_place, lower_pointer, lower_index, lower, upper_pointer, upper_index, upper, scale,
+             right, work, solution):
+    """Solve A x = b for eight right-hand sides (n, 8), with L and U by rows, their diagonals 1 and 1/``scale``."""
+    n = len(scale)
+    for i in range(n):
+        store(work, row_place[i] * WIDTH, load(right, i * WIDTH))
+    for i in range(n):
+        total = load(work, i * WIDTH)
+        for e in range(lower_pointer[i], lower_pointer[i + 1]):
+            total = subtract_product(total, splat(lower[e]), load(work, lower_index[e] * WIDTH))
+        store(work, i * WIDTH, total)
+    for i in range(n - 1, -1, -1):
+        total = load(work, i * WIDTH)
+        for e in range(upper_pointer[i], upper_pointer[i + 1]):
+            total = subtract_product(total, splat(upper[e]), load(work, upper_index[e] * WIDTH))
+        store(work, i * WIDTH, times(total, splat(scale[i])))
+    for i in range(n):
+        store(solution, i * WIDTH, load(work, column_place[i] * WIDTH))
+
+
+@njit(cache=True)
+def sparse_product(pointer, index, data, x, result):
+    """result = A x for A by rows, and x and result (n, 8)."""
+    for i in range(len(pointer) - 1):
+        total = splat(0.0)
+        for e in range(pointer[i], pointer[i + 1]):
+            total = subtract_product(total, splat(-data[e]), load(x, index[e] * WIDTH))
+        store(result, i * WIDTH, total)

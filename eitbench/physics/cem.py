@@ -14,7 +14,8 @@ from scipy.sparse.csgraph import connected_components
 from skfem.helpers import dot, grad
 
 from eitbench import _check
-from eitbench.physics.condensation import Backend, condensation
+from eitbench.physics._backend import Backend
+from eitbench.physics.condensation import condensation
 from eitbench.physics.fem import element, to_skfem
 from eitbench.physics.mesh import Mesh
 from eitbench.physics.sensitivity import Sensitivity

@@ -10,16 +10,13 @@ not installed. Both order the unknowns once, by minimum degree, for a fixed patt
 
 from __future__ import annotations
 
-import threading
-from importlib.metadata import version
-from importlib.util import find_spec
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import SuperLU, splu
 
-Backend = Literal["auto", "compiled", "scipy"]
+from eitbench.physics._backend import Backend, scratch, use_compiled
 
 
 def condensation(pattern: sp.csc_array, n_ports: int, backend: Backend = "auto") -> Condensation | CompiledCondensation:
@@ -32,17 +29,7 @@ def condensation(pattern: sp.csc_array, n_ports: int, backend: Backend = "auto")
     n_ports : int
     backend : "auto", "compiled" or "scipy"
     """
-    if backend not in ("auto", "compiled", "scipy"):
-        raise ValueError(f"backend must be 'auto', 'compiled' or 'scipy', got {backend!r}")
-    installed = find_spec("numba") is not None
-    if backend == "compiled" and not installed:
-        raise ValueError("backend 'compiled' needs numba, which is not installed: pip install 'eitbench[fast]'")
-    return (CompiledCondensation if installed and backend != "scipy" else Condensation)(pattern, n_ports)
-
-
-def backend_version() -> str:
-    """What `condensation` uses here, for records: results agree between backends to rounding only."""
-    return f"numba {version('numba')}" if find_spec("numba") is not None else "scipy"
+    return (CompiledCondensation if use_compiled(backend) else Condensation)(pattern, n_ports)
 
 
 class Condensation:
@@ -114,7 +101,7 @@ class CompiledCondensation:
             return np.linalg.inv(self._schur(self._factorise(values)))
         b = values.shape[1]
         result = np.empty((b, self.n_ports, self.n_ports))
-        factor = _scratch(self._symbolic[3][-1] * self.batch)
+        factor = scratch(self._symbolic[3][-1] * self.batch)
         for first in range(0, b, self.batch):
             block = values[:, first:first + self.batch]
             eight = np.concatenate([block, np.repeat(block[:, -1:], self.batch - block.shape[1], axis=1)], axis=1)
@@ -134,7 +121,7 @@ class CompiledCondensation:
         return solution[self._place, :self.n_ports]
 
     def _factorise(self, values: np.ndarray) -> np.ndarray:
-        factor = _scratch(self._symbolic[3][-1] + self.batch)      # the kernel reads a few numbers beyond the end
+        factor = scratch(self._symbolic[3][-1] + self.batch)      # the kernel reads a few numbers beyond the end
         self._kernels.factorise(*self._symbolic, self._first_entry, self._slot, values, factor)
         return factor
 
@@ -194,17 +181,3 @@ def _diagonally_dominant(pattern: sp.csc_array) -> sp.csc_array:
     ones = pattern.copy()
     ones.data = np.full(pattern.nnz, -1.0)
     return (ones + sp.diags_array(2.0 + np.diff(pattern.indptr).astype(float))).tocsc()
-
-
-_memory = threading.local()
-
-
-def _scratch(size: int) -> np.ndarray:
-    """(size,) doubles of this thread, good until the next call, kept because fresh memory is slow to touch.
-
-    They begin a cache line: vectors across two lines cost up to twice as much.
-    """
-    if getattr(_memory, "doubles", np.empty(0)).size < size + 8:
-        _memory.doubles = np.zeros(size + 8)
-    skip = -(_memory.doubles.ctypes.data // 8) % 8
-    return _memory.doubles[skip:skip + size]

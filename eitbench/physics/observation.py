@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
-import scipy.sparse as sp
 
 from eitbench import _check
-from eitbench.physics.cem import CompleteElectrodeModel
+
+if TYPE_CHECKING:
+    import scipy.sparse as sp
+
+    from eitbench.physics.cem import CompleteElectrodeModel
 
 
 class ConductivityLaw(Protocol):
@@ -130,7 +133,7 @@ class ObservationModel:
                                                     open_low=True, units="mol/m³")
 
     def transfer_resistance(self, concentration: np.ndarray) -> np.ndarray:
-        """𝓡 (L, L) in Ω (Ω·m in 2D) for nodal ``concentration`` (n_cd,) in mol/m³."""
+        """𝓡 (..., L, L) in Ω (Ω·m in 2D) for nodal ``concentration`` (..., n_cd) in mol/m³."""
         return self.cem.transfer_resistance(self.conductivity(self._at_eit_nodes(concentration)))
 
     def voltages(self, concentration: np.ndarray, currents: np.ndarray) -> np.ndarray:
@@ -145,5 +148,7 @@ class ObservationModel:
         return voltages, (by_node @ self.interpolation).reshape(*voltages.shape, -1)
 
     def _at_eit_nodes(self, concentration: np.ndarray) -> np.ndarray:
-        concentration = _check.array("concentration", concentration, (self.interpolation.shape[1],), units="mol/m³")
-        return np.maximum(self.interpolation @ concentration, self.smallest_concentration)
+        c = _check.array("concentration", concentration, (*np.shape(concentration)[:-1], self.interpolation.shape[1]),
+                         units="mol/m³")
+        there = (self.interpolation @ c.reshape(-1, c.shape[-1]).T).T.reshape(*c.shape[:-1], -1)
+        return np.maximum(there, self.smallest_concentration)

@@ -9,12 +9,13 @@ from typing import NamedTuple
 import numpy as np
 import scipy.sparse as sp
 import skfem
-from scipy.sparse.linalg import splu
 from skfem.helpers import dot, grad
 
 from eitbench import _check
+from eitbench.physics._backend import Backend
 from eitbench.physics.fem import element, to_skfem
 from eitbench.physics.mesh import Mesh
+from eitbench.physics.sparse_lu import SparseLU
 
 VelocityField = Callable[[np.ndarray], np.ndarray]
 
@@ -58,6 +59,8 @@ class ConvectionDiffusion:
         Crank–Nicolson steps per time step, ≥ 1.
     inlet : (n_inlet,) int, optional
         Nodes where the concentration is given; default: nodes of the boundary facets through which fluid enters.
+    backend : "auto", "compiled" or "scipy"
+        What solves; see `eitbench.physics.sparse_lu`.
 
     Raises
     ------
@@ -66,7 +69,7 @@ class ConvectionDiffusion:
     """
 
     def __init__(self, mesh: Mesh, velocity: VelocityField, diffusivity: float, time_step: float, *,
-                 substeps: int = 8, inlet: np.ndarray | None = None) -> None:
+                 substeps: int = 8, inlet: np.ndarray | None = None, backend: Backend = "auto") -> None:
         self.mesh = mesh
         self.diffusivity = _check.number("diffusivity", diffusivity, low=0.0, open_low=True, units="m²/s")
         self.time_step = _check.number("time_step", time_step, low=0.0, open_low=True, units="s")
@@ -81,8 +84,7 @@ class ConvectionDiffusion:
         implicit, explicit = mass / dt + 0.5 * transport, mass / dt - 0.5 * transport
         self._free = np.setdiff1d(np.arange(mesh.n_nodes), self.inlet)
         free, inlet_ = self._free, self.inlet
-        # Along a structured pipe the nodes are numbered by cross-section, and the factor stays within the band.
-        self._solver = splu(sp.csc_matrix(implicit[free][:, free]), permc_spec="COLAMD")
+        self._solver = SparseLU(implicit[free][:, free], backend)
         self._explicit = sp.csr_matrix(explicit[free])
         self._implicit_inlet = sp.csr_matrix(implicit[free][:, inlet_])
         self._mass = sp.csr_matrix(mass[free])

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
-from eitbench.physics.observation import ObservationModel, VoltageNoise
-from eitbench.physics.transport import ConvectionDiffusion
+if TYPE_CHECKING:
+    from eitbench.physics.observation import ObservationModel, VoltageNoise
+    from eitbench.physics.transport import ConvectionDiffusion
 
 
 class Discretisation(NamedTuple):

@@ -5,16 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from eitbench import _check
-from eitbench.physics.cem import CompleteElectrodeModel
 from eitbench.physics.flow import PlaneChannelFlow
-from eitbench.physics.mesh import Mesh, graded_pipe_mesh, rectangle_mesh
 from eitbench.physics.observation import LinearConductivity, ObservationModel, VoltageNoise
-from eitbench.physics.transport import ConvectionDiffusion
 from eitbench.scenarios.base import Discretisation
+
+if TYPE_CHECKING:
+    from eitbench.physics.mesh import Mesh
 
 
 @dataclass(frozen=True)
@@ -181,6 +182,9 @@ class Pipe2D:
 
     def _discretise(self, *, cells: tuple[int, int], substeps: int, time_step: float, cells_at_electrodes: int,
                     cells_across: int, mean_velocity: float) -> Discretisation:
+        from eitbench.physics.cem import CompleteElectrodeModel  # finite elements: not needed to play recordings
+        from eitbench.physics.mesh import graded_pipe_mesh, rectangle_mesh
+        from eitbench.physics.transport import ConvectionDiffusion
         R = self.half_width
         cd_mesh = rectangle_mesh(np.linspace(0.0, self.length, cells[0] + 1), np.linspace(-R, R, cells[1] + 1))
         inlet = np.arange(cells[1] + 1)

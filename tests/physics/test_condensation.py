@@ -118,7 +118,7 @@ find = importlib.util.find_spec
 importlib.util.find_spec = lambda name, *rest: None if name == "numba" else find(name, *rest)
 sys.modules["numba"] = None
 import numpy as np
-from eitbench.physics.condensation import backend_version
+from eitbench.physics._backend import backend_version
 from eitbench.scenarios import Pipe2D
 from eitbench.task import make_task
 task = make_task(Pipe2D())

@@ -1,0 +1,41 @@
+"""Which of the two linear-algebra backends is used: compiled kernels (numba), or scipy wherever numba is missing."""
+
+from __future__ import annotations
+
+import threading
+from importlib.metadata import version
+from importlib.util import find_spec
+from typing import Literal
+
+import numpy as np
+
+Backend = Literal["auto", "compiled", "scipy"]
+
+
+def use_compiled(backend: Backend) -> bool:
+    """Whether to use the kernels; `ValueError` for an unknown backend or one that is not installed."""
+    if backend not in ("auto", "compiled", "scipy"):
+        raise ValueError(f"backend must be 'auto', 'compiled' or 'scipy', got {backend!r}")
+    installed = find_spec("numba") is not None
+    if backend == "compiled" and not installed:
+        raise ValueError("backend 'compiled' needs numba, which is not installed: pip install 'eitbench[fast]'")
+    return installed and backend != "scipy"
+
+
+def backend_version() -> str:
+    """What "auto" means here, for records: results agree between backends to rounding only."""
+    return f"numba {version('numba')}" if use_compiled("auto") else "scipy"
+
+
+_memory = threading.local()
+
+
+def scratch(size: int) -> np.ndarray:
+    """(size,) doubles of this thread, good until the next call, kept because fresh memory is slow to touch.
+
+    They begin a cache line: vectors across two lines cost up to twice as much.
+    """
+    if getattr(_memory, "doubles", np.empty(0)).size < size + 8:
+        _memory.doubles = np.zeros(size + 8)
+    skip = -(_memory.doubles.ctypes.data // 8) % 8
+    return _memory.doubles[skip:skip + size]
