@@ -8,9 +8,9 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from eitbench import make_task, simulate
-from eitbench.envs.estimation import truth_operators
 from eitbench.estimation import best_homogeneous, gauss_newton
 from eitbench.physics.fem import stiffness_matrix
+from eitbench.recordings import score_operators
 from eitbench.scenarios import Pipe2D
 from eitbench.scoring import relative_error
 from eitbench.seeds import parse_seeds
@@ -23,7 +23,7 @@ def main() -> None:
     scenario = Pipe2D()
     task = make_task(scenario)
     stiffness = stiffness_matrix(task.mesh)
-    interpolation, mass = truth_operators(scenario, task)
+    interpolation, mass = score_operators(scenario)
     errors: dict[float, list[float]] = {alpha: [] for alpha in [0.0, *ALPHAS]}
     for seed in parse_seeds(SEEDS):
         episode = simulate(scenario, seed)

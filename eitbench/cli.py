@@ -1,4 +1,4 @@
-"""The command line: `eitbench list | run | leaderboard | render | reproduce`."""
+"""The command line: `eitbench list | run | bank | leaderboard | render | reproduce`."""
 
 from __future__ import annotations
 
@@ -83,6 +83,33 @@ def run(
                            parse_seeds(suites.SEEDS[suite.value] if seeds is None else seeds))
     run_jobs(todo, EpisodeStore(out), n_jobs=jobs, command=shlex.join(["eitbench", *sys.argv[1:]]))
     _report(out)
+
+
+@app.command()
+def bank(
+    env: Annotated[str, typer.Option(help="Environment id.")] = "eitbench/Pipe2D-v0",
+    seeds: Annotated[str, typer.Option(help="Episodes, such as train:0-999.")] = "train:0-99",
+    jobs: Jobs = CORES,
+) -> None:
+    """Simulate many episodes ahead of training and keep what an environment needs of them.
+
+    They lie, memory-mapped, in the cache folder ($EITBENCH_CACHE). The same command again resumes.
+    """
+    import shutil
+
+    from eitbench.bank import fill, recording_bytes
+    from eitbench.episodes import folder
+    from eitbench.leaderboard.run import Environment
+    from eitbench.seeds import parse_seeds
+    with _clear_errors():
+        numbers, scenario = parse_seeds(seeds), Environment(env).make().scenario
+    size, place = len(numbers) * recording_bytes(scenario), folder(scenario)
+    free = shutil.disk_usage(place).free
+    typer.echo(f"{len(numbers)} episodes, {size / 1e6:.0f} MB in {place}")
+    if size > free:
+        raise typer.BadParameter(f"seeds need up to {size / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free")
+    made = fill(scenario, numbers, n_jobs=jobs)
+    typer.echo(f"{made} simulated, {len(numbers) - made} were there")
 
 
 @app.command()

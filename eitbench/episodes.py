@@ -67,16 +67,15 @@ def simulate(scenario: Scenario, seed: int, *, cache: bool = True, progress: boo
     seed = _check.integer("seed", seed, low=0)
     if not cache:
         return _simulate(scenario, seed, progress)
-    identity = _identity(scenario, seed)
-    path = cache_folder() / f"{type(scenario).__name__}-{_digest(identity.encode())[:16]}-{seed}.npz"
-    episode = _load(path, identity)
+    whole = _identity(scenario, seed)
+    path = folder(scenario) / f"{seed}.truth.npz"
+    episode = _load(path, whole)
     if episode is None:
         episode = _simulate(scenario, seed, progress)
         try:
-            _store(path, identity, episode)
+            _store(path, whole, episode)
         except OSError as error:
-            warnings.warn(f"episodes cannot be kept in {path.parent} ({error}) and will be simulated again; "
-                          f"${CACHE_VARIABLE} names another folder", stacklevel=2)
+            warn_not_kept(path.parent, error)
     return episode
 
 
@@ -135,37 +134,56 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "eitbench"
 
 
-def _identity(scenario: Scenario, seed: int) -> str:
-    """All that the numbers depend on: scenario, seed, the code that simulates, and the libraries beneath it."""
+def folder(scenario: Scenario) -> Path:
+    """Where the episodes of a scenario, as this version simulates them, are kept."""
+    return cache_folder() / f"{type(scenario).__name__}-{_version(scenario)}"
+
+
+@lru_cache(maxsize=64)
+def _version(scenario: Scenario) -> str:
+    return _digest(json.dumps(identity(scenario), sort_keys=True).encode())[:16]
+
+
+def warn_not_kept(place: Path, error: OSError) -> None:
+    """Say once that the cache cannot be written."""
+    warnings.warn(f"episodes cannot be kept in {place} ({error}) and will be simulated again; "
+                  f"${CACHE_VARIABLE} names another folder", stacklevel=3)
+
+
+def identity(scenario: Scenario) -> dict[str, Any]:
+    """All that the numbers depend on but the seed: scenario, the code that simulates, and the libraries beneath it."""
     kind = type(scenario)
-    return json.dumps({"scenario": f"{kind.__module__}.{kind.__qualname__}", "fields": asdict(scenario),  # type: ignore
-                       "seed": seed, "code": _code_digest(), "factorisation": backend_version(),
-                       "numpy": np.__version__, "scipy": scipy.__version__,
-                       "scikit-fem": version("scikit-fem")}, sort_keys=True)
-
-
-@lru_cache(maxsize=1)
-def _code_digest() -> str:
-    here = Path(__file__).parent
-    files = sorted([*here.glob("physics/*.py"), *here.glob("scenarios/*.py"), Path(__file__)])
-    return _digest(b"".join(file.read_bytes() for file in files))
+    return {"scenario": f"{kind.__module__}.{kind.__qualname__}", "fields": asdict(scenario),  # type: ignore
+            "code": _code_digest(), "factorisation": backend_version(), "numpy": np.__version__,
+            "scipy": scipy.__version__, "scikit-fem": version("scikit-fem")}
 
 
 def _digest(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
-def _store(path: Path, identity: str, episode: Episode) -> None:
+def _identity(scenario: Scenario, seed: int) -> str:
+    return json.dumps(identity(scenario) | {"seed": seed}, sort_keys=True)
+
+
+@lru_cache(maxsize=1)
+def _code_digest() -> str:
+    here = Path(__file__).parent
+    files = sorted([*here.glob("physics/*.py"), *here.glob("scenarios/*.py"), here / "recordings.py", Path(__file__)])
+    return _digest(b"".join(file.read_bytes() for file in files))
+
+
+def _store(path: Path, whole: str, episode: Episode) -> None:
     """Written beside its place and moved there, so that a reader sees a whole file or none."""
     content = io.BytesIO()
-    np.savez_compressed(content, identity=identity, checksum=_checksum(episode), **episode._asdict())
+    np.savez_compressed(content, identity=whole, checksum=_checksum(episode), **episode._asdict())
     write_atomically(path, content.getvalue())
 
 
-def _load(path: Path, identity: str) -> Episode | None:
+def _load(path: Path, whole: str) -> Episode | None:
     try:
         with np.load(path, allow_pickle=False) as stored:
-            if str(stored["identity"]) != identity:
+            if str(stored["identity"]) != whole:
                 return None
             arrays: dict[str, Any] = {name: stored[name] for name in Episode._fields}
             episode = Episode(**arrays)

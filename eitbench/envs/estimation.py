@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
-from typing import Any
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
 from eitbench import _check
-from eitbench.episodes import Episode, simulate, truth_discretisation
-from eitbench.physics.fem import mass_matrix
-from eitbench.physics.mesh import Mesh
-from eitbench.scenarios.base import Scenario
-from eitbench.scoring import step_errors
-from eitbench.task import Task
+from eitbench.recordings import cycle_voltages, outline, recording, step_error
+from eitbench.task import Task, lag_steps, make_task
+
+if TYPE_CHECKING:
+    from eitbench.physics.mesh import Mesh
+    from eitbench.scenarios.base import Scenario
+
+Observation = dict[str, np.ndarray]
 
 
-class EstimationEnv(gym.Env[dict[str, np.ndarray], np.ndarray]):
+class EstimationEnv(gym.Env[Observation, np.ndarray]):
     """One episode of a scenario, seen through its voltages; the action is the estimate.
 
     At step i = 1, 2, … the agent has seen the measurements up to min(i, T) and says what it thinks of the state
@@ -29,8 +31,10 @@ class EstimationEnv(gym.Env[dict[str, np.ndarray], np.ndarray]):
     Parameters
     ----------
     scenario : Scenario
-    task : Task
-        What the agent may know; `lag` is taken from it.
+    lag : int or "all"
+        See `Task`.
+    assumptions : dict, optional
+        What the task's model wrongly believes; see `make_task`.
     episodes : int
         How many training episodes an unseeded ``reset`` draws from.
     render_mode : None or "rgb_array"
@@ -38,104 +42,120 @@ class EstimationEnv(gym.Env[dict[str, np.ndarray], np.ndarray]):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 8}  # noqa: RUF012 (gymnasium's own form)
 
-    def __init__(self, scenario: Scenario, task: Task, *, episodes: int = 1000, render_mode: str | None = None) -> None:
+    def __init__(self, scenario: Scenario, *, lag: int | str = 0, assumptions: dict[str, float] | None = None,
+                 episodes: int = 1000, render_mode: str | None = None) -> None:
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode must be None or one of {self.metadata['render_modes']}, got {render_mode!r}")
-        self.task = task
         self.render_mode = render_mode
         self.episodes = _check.integer("episodes", episodes, low=1)
         self.spread: np.ndarray | None = None
         """(n,) standard deviation in mol/m³ to draw beside the estimate, for whoever has one."""
         self.scenario = scenario
         """The world played; estimators are given `task` instead."""
-        n, n_electrodes = task.mesh.n_nodes, task.observation.cem.n_electrodes
-        level = task.expected_concentration
-        largest_voltage = 100.0 * np.abs(task.observation.voltages(np.full(n, level), task.currents)).max()
-        largest_current = np.abs(task.currents).max()
-        self.observation_space: spaces.Dict = spaces.Dict({  # type: ignore[assignment]
-            "voltages": spaces.Box(-largest_voltage, largest_voltage, (n_electrodes,), np.float64),
-            "currents": spaces.Box(-largest_current, largest_current, (n_electrodes,), np.float64),
-        })
-        self.action_space = spaces.Box(-10.0 * level, 10.0 * level, (n,), np.float64)
-        self._episode: Episode | None = None
+        self._lag = lag_steps(scenario, lag)
+        self._assumptions = assumptions or {}
+        self._currents = cycle_currents(scenario, self._lag)
+        self.observation_space: spaces.Dict  # type: ignore[assignment]
+        self.observation_space, self.action_space = estimation_spaces(scenario)
+        self._limit = 10.0 * scenario.expected_concentration
+        self._seed: int | None = None
         self._step = 0
 
+    @cached_property
+    def task(self) -> Task:
+        """What the agent may know; its models are built on first use, since playing needs none of them."""
+        return make_task(self.scenario, self._lag, **self._assumptions)
+
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None,
-              ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+              ) -> tuple[Observation, dict[str, Any]]:
         """Begin the episode with this seed (see `eitbench.seeds`), or without one a random training episode."""
         super().reset(seed=seed)
-        if seed is None:
-            seed = int(self.np_random.integers(self.episodes))
-        self._episode = simulate(self.scenario, seed)
+        self._seed = int(self.np_random.integers(self.episodes)) if seed is None else seed
+        self._entries = recording(self.scenario, self._seed)
+        self._moments = self._entries["moment"]
+        self._voltages = np.zeros_like(self._currents)
+        self._voltages[:self.scenario.n_steps] = cycle_voltages(self.scenario, self._entries)
         self._step = 1
         self.spread = None
-        self._last = np.full(self.task.mesh.n_nodes, self.task.expected_concentration)
-        return self._observe(), self._info()
+        self._last: np.ndarray | None = None
+        return self._observe(), {"step": 1}
 
-    def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
+    def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Take the estimate (n,) in mol/m³ of the state asked for; ``ValueError`` if it is not in the action space."""
-        episode, task = self._episode, self.task
-        if episode is None or self._step > task.n_steps + task.lag:
+        last_step = self.scenario.n_steps + self._lag
+        if self._seed is None or self._step > last_step:
             raise gym.error.ResetNeeded("call reset() before step(), and again when an episode has ended")
-        estimate = _check.array("action", action, self.action_space.shape or (), units="mol/m³")
-        if not (np.abs(estimate) <= self.action_space.high).all():  # type: ignore[attr-defined]
-            raise ValueError(f"action must lie within ±{self.action_space.high[0]:g} mol/m³, "  # type: ignore
-                             f"got {np.abs(estimate).max():g}")
-        t = self._step - task.lag
-        self._last = estimate if t >= 1 else self._last
-        reward = -self._step_error(estimate, episode, t) if t > task.warm_up else 0.0
+        estimate = checked_estimates(action, self.action_space.shape, self._limit)  # type: ignore[arg-type]
+        t = self._step - self._lag
+        reward = 0.0
+        if t >= 1:
+            self._last = estimate
+        if t > self.scenario.warm_up:
+            entry = self._entries[t - 1]
+            reward = -float(step_error(outline(self.scenario).mass, estimate - self.scenario.background,
+                                       self._moments[t - 1], entry["deviation"], entry["square"]))
         self._step += 1
-        return self._observe(), reward, self._step > task.n_steps + task.lag, False, self._info()
+        return self._observe(), reward, self._step > last_step, False, {"step": self._step}
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
         """(height, width, 3) uint8: truth, the last estimate, its spread, the electrodes and the active pair."""
         if self.render_mode is None:
             gym.logger.warn("render() needs gym.make(..., render_mode='rgb_array')")
             return None
-        if self._episode is None:
-            raise gym.error.ResetNeeded("call reset() before render()")
         from eitbench.envs.rendering import draw_frame
-        t = min(max(self._step - 1 - self.task.lag, 0), self.task.n_steps)
-        truth = truth_discretisation(self.scenario)
-        return draw_frame(self.task, truth.transport.mesh, self._episode.concentration[t], self._last, self.spread,
-                          self._currents(t), t * self.task.transport.time_step)
+        t = min(max(self._step - 1 - self._lag, 0), self.scenario.n_steps)
+        concentration = self._concentration("render")[t]
+        level = np.full(self.task.mesh.n_nodes, self.task.expected_concentration)
+        return draw_frame(self.task, self.truth_mesh(), concentration, level if self._last is None else self._last,
+                          self.spread, self._currents[t - 1] if t else np.zeros_like(self._currents[0]),
+                          t * self.scenario.time_step)
 
     def truth(self) -> np.ndarray:
         """(T, n_truth) concentration in mol/m³ of this episode, t = 1 … T; for scoring, never for agents."""
-        if self._episode is None:
-            raise gym.error.ResetNeeded("call reset() before truth()")
-        return self._episode.concentration[1:].astype(float)
+        return self._concentration("truth")[1:].astype(float)
 
     def truth_mesh(self) -> Mesh:
         """The mesh of `truth`."""
+        from eitbench.episodes import truth_discretisation
         return truth_discretisation(self.scenario).transport.mesh
 
-    def _currents(self, i: int) -> np.ndarray:
-        """Currents of measurement i; none outside 1 … T."""
-        cycle = self.task.currents
-        return cycle[(i - 1) % len(cycle)].copy() if 1 <= i <= self.task.n_steps else np.zeros(cycle.shape[1])
+    def _concentration(self, asked_by: str) -> np.ndarray:
+        from eitbench.episodes import simulate
+        if self._seed is None:
+            raise gym.error.ResetNeeded(f"call reset() before {asked_by}()")
+        return simulate(self.scenario, self._seed).concentration
 
-    def _observe(self) -> dict[str, np.ndarray]:
-        assert self._episode is not None
-        currents = self._currents(self._step)
-        voltages = (self._episode.voltages(self._step, currents, self.scenario)
-                    if self._step <= self.task.n_steps else np.zeros_like(currents))
-        return {"voltages": voltages, "currents": currents}
-
-    def _info(self) -> dict[str, Any]:
-        return {"step": self._step}
-
-    def _step_error(self, estimate: np.ndarray, episode: Episode, t: int) -> float:
-        interpolation, mass = truth_operators(self.scenario, self.task)
-        truth = episode.concentration[t][None].astype(float)
-        return float(step_errors((interpolation @ estimate)[None], truth, mass)[0])
+    def _observe(self) -> Observation:
+        if self._step > len(self._voltages):
+            return {"voltages": np.zeros_like(self._voltages[0]), "currents": np.zeros_like(self._voltages[0])}
+        return {"voltages": self._voltages[self._step - 1].copy(), "currents": self._currents[self._step - 1].copy()}
 
 
-@lru_cache(maxsize=2)
-def _operators(mesh: Mesh, truth_mesh: Mesh) -> tuple[Any, Any]:
-    return mesh.interpolation_to(truth_mesh.points), mass_matrix(truth_mesh)
+def estimation_spaces(scenario: Scenario) -> tuple[spaces.Dict, spaces.Box]:
+    """What one environment shows and takes."""
+    stage, level = outline(scenario), scenario.expected_concentration
+    largest_voltage, largest_current = 100.0 * stage.largest_voltage, np.abs(scenario.currents).max()
+    shape = scenario.currents.shape[1:]
+    observed = spaces.Dict({"voltages": spaces.Box(-largest_voltage, largest_voltage, shape, np.float64),
+                            "currents": spaces.Box(-largest_current, largest_current, shape, np.float64)})
+    return observed, spaces.Box(-10.0 * level, 10.0 * level, (stage.mass.shape[0],), np.float64)
 
 
-def truth_operators(scenario: Scenario, task: Task) -> tuple[Any, Any]:
-    """(interpolation from the task's mesh to the truth's, the truth's mass matrix), for scoring; built once."""
-    return _operators(task.mesh, truth_discretisation(scenario).transport.mesh)
+def cycle_currents(scenario: Scenario, lag: int) -> np.ndarray:
+    """(T + lag, L) currents of every step: the cycle, then none."""
+    cycle = scenario.currents
+    currents = np.zeros((scenario.n_steps + lag, cycle.shape[1]))
+    currents[:scenario.n_steps] = cycle[np.arange(scenario.n_steps) % len(cycle)]
+    return currents
+
+
+def checked_estimates(action: np.ndarray, shape: tuple[int, ...], limit: float) -> np.ndarray:
+    """``action`` as float64, finite and within ±``limit``; else a ``ValueError`` that says what is wrong with it."""
+    plain = type(action) is np.ndarray and action.shape == shape and action.dtype == np.float64
+    if plain and np.abs(action).max() <= limit:                    # false for NaN too
+        return action
+    estimates = _check.array("action", action, shape, units="mol/m³")
+    largest = np.abs(estimates).max()
+    if largest > limit:
+        raise ValueError(f"action must lie within ±{limit:g} mol/m³, got {largest:g}")
+    return estimates

@@ -7,9 +7,10 @@ from typing import Any
 
 from gymnasium.utils import EzPickle
 
+from eitbench import _check
 from eitbench.envs.estimation import EstimationEnv
+from eitbench.envs.estimation_vector import EstimationVectorEnv
 from eitbench.scenarios import Pipe2D
-from eitbench.task import make_task
 
 
 class Pipe2DEnv(EstimationEnv, EzPickle):
@@ -54,7 +55,7 @@ class Pipe2DEnv(EstimationEnv, EzPickle):
 
     The fluid has been flowing for one flush time. `reset(seed=s)` plays episode s (`eitbench.seeds`: train, dev and
     test ranges); without a seed a random one of the first `episodes` training episodes. The first use of a seed
-    simulates its truth (about 10 s), which is then kept on disk.
+    simulates its truth (about 2 s), which is then kept on disk; `eitbench bank` does so for many seeds ahead of time.
 
     ## Episode end
 
@@ -79,9 +80,24 @@ class Pipe2DEnv(EstimationEnv, EzPickle):
                  scenario: dict[str, Any] | None = None, episodes: int = 1000, render_mode: str | None = None) -> None:
         EzPickle.__init__(self, lag=lag, assumed_mean_velocity=assumed_mean_velocity, scenario=scenario,
                           episodes=episodes, render_mode=render_mode)
-        world = _with_fields(scenario)
-        assumptions = {} if assumed_mean_velocity is None else {"mean_velocity": assumed_mean_velocity}
-        super().__init__(world, make_task(world, lag, **assumptions), episodes=episodes, render_mode=render_mode)
+        super().__init__(_with_fields(scenario), lag=lag, assumptions=_assumptions(assumed_mean_velocity),
+                         episodes=episodes, render_mode=render_mode)
+
+
+class Pipe2DVectorEnv(EstimationVectorEnv):
+    """`Pipe2DEnv`, many times: ``gym.make_vec("eitbench/Pipe2D-v0", num_envs=64)``; arguments as there."""
+
+    def __init__(self, *, num_envs: int = 1, lag: int | str = 0, assumed_mean_velocity: float | None = None,
+                 scenario: dict[str, Any] | None = None, episodes: int = 1000) -> None:
+        _assumptions(assumed_mean_velocity)              # what estimators believe changes nothing here
+        super().__init__(_with_fields(scenario), num_envs, lag=lag, episodes=episodes)
+
+
+def _assumptions(mean_velocity: float | None) -> dict[str, float]:
+    if mean_velocity is None:
+        return {}
+    return {"mean_velocity": _check.number("assumed_mean_velocity", mean_velocity, low=0.0, open_low=True,
+                                           units="m/s")}
 
 
 def _with_fields(changes: dict[str, Any] | None) -> Pipe2D:

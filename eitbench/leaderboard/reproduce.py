@@ -14,12 +14,13 @@ from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from eitbench import scoring
-from eitbench.envs.estimation import EstimationEnv, truth_operators
+from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.pipe2d import Pipe2DEnv
 from eitbench.envs.rendering import SPREAD_MAP, colour_range, draw_electrodes, draw_field
 from eitbench.leaderboard.baselines import load_baseline
 from eitbench.leaderboard.run import play, play_and_collect
 from eitbench.leaderboard.score import score
+from eitbench.recordings import score_operators
 from eitbench.task import Estimate
 
 VELOCITIES = np.arange(0.0, 9.01, 0.5)
@@ -40,7 +41,7 @@ def _estimates(env: EstimationEnv, baseline: str, seed: int) -> list[Estimate]:
 
 def _error(env: EstimationEnv, estimates: list[Estimate]) -> float:
     """ẽ_c of the episode ``env`` has just played."""
-    interpolation, mass = truth_operators(env.scenario, env.task)
+    interpolation, mass = score_operators(env.scenario)
     scored = slice(env.task.warm_up, None)
     means = np.array([estimate.mean for estimate in estimates])
     return scoring.relative_error((interpolation @ means[scored].T).T, env.truth()[scored], mass)
@@ -154,7 +155,7 @@ def fig5_6(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
     figure.colorbar(mappable, ax=axes, label="concentration / (mol/m³)", extend="both", aspect=40)
     path = out / "fig5.6.png"
     _save(figure, path)
-    interpolation, mass = truth_operators(env.scenario, env.task)
+    interpolation, mass = score_operators(env.scenario)
     of_average = scoring.relative_error(np.array([interpolation @ images[b].mean for b in begins]),
                                         np.array(averages), mass)
     error, constant = _error(env, images), _error(env, _estimates(env, "homogeneous", seeds[0]))

@@ -15,11 +15,11 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 import scipy
-from joblib import Parallel, delayed
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from eitbench import _check
+from eitbench._parallel import in_parallel
 from eitbench.envs import ENTRY_POINTS
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.episodes import simulate
@@ -181,21 +181,14 @@ def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1, command: 
     seen: dict[Any, Job] = {}
     for job in todo:                                # each truth once, before several baselines want it at once
         seen.setdefault((_environment(job.environment).scenario, job.seed), job)
-    _in_parallel(_simulate_job, [(job,) for job in seen.values()], n_jobs, "simulating truths")
-    _in_parallel(_run_job, [(job, store, command) for job in todo], n_jobs, "running baselines")
-
-
-def _in_parallel(function: Any, arguments: list[tuple], n_jobs: int, description: str) -> None:
-    n_jobs = max(1, min(n_jobs, len(arguments)))
-    with Parallel(n_jobs=n_jobs, return_as="generator_unordered", batch_size=1, pre_dispatch=n_jobs) as parallel:
-        done = parallel(delayed(function)(*each) for each in arguments)
-        for _ in tqdm(done, total=len(arguments), desc=description, unit="episode", disable=None):
+    for function, work, label in ((_simulate_job, [(job,) for job in seen.values()], "simulating truths"),
+                                  (_run_job, [(job, store, command) for job in todo], "running baselines")):
+        for _ in tqdm(in_parallel(function, work, n_jobs), total=len(work), desc=label, unit="episode", disable=None):
             pass
 
 
 def _simulate_job(job: Job) -> None:
-    with threadpool_limits(1):
-        simulate(_environment(job.environment).scenario, job.seed, progress=False)
+    simulate(_environment(job.environment).scenario, job.seed, progress=False)
 
 
 def _run_job(job: Job, store: EpisodeStore, command: str) -> None:

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from eitbench import scoring
-from eitbench.envs.estimation import EstimationEnv, truth_operators
+from eitbench.envs.estimation import EstimationEnv
 from eitbench.estimation import best_homogeneous
+from eitbench.recordings import score_operators
 from eitbench.task import Estimate, Task
 
 
@@ -67,7 +68,7 @@ def score(env: EstimationEnv, played: Played) -> dict[str, Any]:
     ``error`` is ẽ_c (5.12); a score that needs a claimed variance or innovation is None without one.
     """
     task, truth = env.task, env.truth()
-    interpolation, mass = truth_operators(env.scenario, task)
+    interpolation, mass = score_operators(env.scenario)
     scored = slice(task.warm_up, None)
     c = truth[scored]
     mean = (interpolation @ played.means[scored].T).T

@@ -227,14 +227,14 @@ def test_scores_can_be_recomputed_from_what_is_stored(tilted):
 
 
 def test_minus_the_mean_reward_is_the_error(tilted):
-    """What the environment pays for the stored estimates is what the leaderboard reports."""
+    """What the environment pays, from moments in single precision, is what the leaderboard reports."""
     result, means, _ = tilted
     env = FILTER.make()
     env.reset(seed=4)
     rewards = [env.step(mean)[1] for mean in means]
     assert rewards[:2] == [0.0, 0.0]
-    assert -np.mean(rewards[2:]) == pytest.approx(result["scores"]["error"], rel=1e-12)
-    np.testing.assert_allclose(result["step_errors"], -np.array(rewards[2:]), rtol=1e-12)
+    assert -np.mean(rewards[2:]) == pytest.approx(result["scores"]["error"], rel=1e-7)
+    np.testing.assert_allclose(result["step_errors"], -np.array(rewards[2:]), rtol=1e-7)
 
 
 # -- resuming ---------------------------------------------------------------------------------------------------------

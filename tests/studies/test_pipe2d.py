@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from eitbench import make_task, simulate
-from eitbench.envs.estimation import truth_operators
 from eitbench.estimation import best_homogeneous, gauss_newton
 from eitbench.leaderboard.baselines import load_baseline
 from eitbench.leaderboard.reproduce import VELOCITIES, velocity_sweep
 from eitbench.leaderboard.run import Environment, Job, run_episode
 from eitbench.physics.fem import stiffness_matrix
+from eitbench.recordings import score_operators
 from eitbench.scenarios import Pipe2D
 from eitbench.scoring import relative_error
 from eitbench.seeds import parse_seeds
@@ -50,7 +50,7 @@ def test_stationary_method_works_on_a_stationary_target():
     """The same Gauss–Newton, with the same α, beats the homogeneous estimate threefold when the target stands still."""
     scenario = Pipe2D()
     task = make_task(scenario)
-    interpolation, mass = truth_operators(scenario, task)
+    interpolation, mass = score_operators(scenario)
     penalty = load_baseline("gauss_newton").parameters["alpha"]**2 * stiffness_matrix(task.mesh)
     images, constants, truths = [], [], []
     for seed in SEEDS[:3]:

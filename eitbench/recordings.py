@@ -1,0 +1,182 @@
+"""Recordings: what an environment plays and scores an episode from, without any mesh of the truth.
+
+The score (5.12) needs of the truth only two integrals a step and one vector on the estimator's nodes. With P the
+interpolation to the truth's nodes, M its mass matrix, and everything counted from the scenario's background,
+    ∫(ĉ − c)² = ĉᵀ M̃ ĉ − 2 ĉᵀ b_t + d_t,      M̃ = Pᵀ M P,   b_t = Pᵀ M c_t,   d_t = c_tᵀ M c_t.
+"""
+
+from __future__ import annotations
+
+import io
+import zlib
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from eitbench import _check
+from eitbench._files import write_atomically
+from eitbench.episodes import Episode, folder, simulate, truth_discretisation, warn_not_kept
+
+if TYPE_CHECKING:
+    import scipy.sparse as sp
+
+    from eitbench.scenarios.base import Scenario
+
+
+class Outline(NamedTuple):
+    """What all episodes of a scenario have in common, as far as playing and scoring need it."""
+
+    mass: sp.csr_array
+    """(n, n) upper triangle of M̃ in m² (m³ in 3D), entries beside the diagonal doubled: ĉᵀ·mass·ĉ = ĉᵀ M̃ ĉ."""
+    largest_voltage: float
+    """V, of the cycle's injections into liquid of the expected concentration."""
+
+
+def recording(scenario: Scenario, seed: int) -> np.ndarray:
+    """The recording of an episode, from the cache if it is there; else it is simulated.
+
+    Returns
+    -------
+    (T,) structured array, read-only and memory-mapped, one entry for each t = 1 … T:
+
+    ``transfer_resistance``  (L, L) 𝓡 in Ω (Ω·m in 2D)
+    ``noise``                (L,) standard normal draws
+    ``moment``               (n,) float32, b_t
+    ``deviation``            ∫(c_t − background)²
+    ``square``               ∫c_t²
+    ``checksum``             of all these bytes
+    """
+    seed = _check.integer("seed", seed, low=0)
+    path = recording_path(scenario, seed)
+    stored = _load(path)
+    if stored is None:
+        stored = make_recording(scenario, simulate(scenario, seed))
+        try:
+            store_recording(path, stored)
+        except OSError as error:
+            warn_not_kept(path.parent, error)
+    return stored
+
+
+def recording_path(scenario: Scenario, seed: int) -> Path:
+    """Where the recording of an episode is kept."""
+    return folder(scenario) / f"{seed}.npy"
+
+
+def is_recorded(scenario: Scenario, seed: int) -> bool:
+    """Whether a sound recording is there."""
+    return _load(recording_path(scenario, seed)) is not None
+
+
+def make_recording(scenario: Scenario, episode: Episode) -> np.ndarray:
+    """The recording of ``episode``."""
+    interpolation, mass = score_operators(scenario)
+    c = episode.concentration[1:].astype(float)
+    deviation = c - scenario.background
+    weighted = mass @ deviation.T
+    n_steps, n_electrodes = episode.noise.shape
+    entries = np.zeros(n_steps, recording_type(interpolation.shape[1], n_electrodes))
+    entries["transfer_resistance"], entries["noise"] = episode.transfer_resistance, episode.noise
+    entries["moment"] = (interpolation.T @ weighted).T
+    entries["deviation"] = np.einsum("tn,nt->t", deviation, weighted)
+    entries["square"] = np.einsum("tn,nt->t", c, mass @ c.T)
+    entries["checksum"] = _checksums(entries)
+    return entries
+
+
+def store_recording(path: Path, entries: np.ndarray) -> None:
+    """Write a recording where `recording` finds it."""
+    content = io.BytesIO()
+    np.save(content, entries)
+    write_atomically(path, content.getvalue())
+
+
+def recording_type(n_nodes: int, n_electrodes: int) -> np.dtype:
+    """Of one step of a recording."""
+    return np.dtype([("transfer_resistance", "<f8", (n_electrodes, n_electrodes)), ("noise", "<f8", (n_electrodes,)),
+                     ("moment", "<f4", (n_nodes,)), ("deviation", "<f8"), ("square", "<f8"), ("checksum", "<u4")])
+
+
+@lru_cache(maxsize=4)
+def outline(scenario: Scenario) -> Outline:
+    """The outline of a scenario, from the cache if it is there."""
+    import scipy.sparse as sp
+    path = folder(scenario) / "outline.npz"
+    stored = _load_outline(path)
+    if stored is None:
+        interpolation, mass = score_operators(scenario)
+        full = sp.csr_array(interpolation.T @ mass @ interpolation)
+        half = sp.csr_array(sp.triu(full) + sp.triu(full, 1))
+        n_nodes, model = full.shape[0], scenario.model()
+        level = np.full(n_nodes, scenario.expected_concentration)
+        largest = np.abs(model.observation.voltages(level, scenario.currents)).max()
+        arrays = (half.data, half.indices, half.indptr, np.array(largest))
+        content = io.BytesIO()
+        np.savez(content, *arrays, checksum=zlib.crc32(b"".join(array.tobytes() for array in arrays)))
+        try:
+            write_atomically(path, content.getvalue())
+        except OSError as error:
+            warn_not_kept(path.parent, error)
+        stored = half.data, half.indices, half.indptr, largest
+    data, indices, indptr, largest = stored
+    return Outline(sp.csr_array((data, indices, indptr), shape=(len(indptr) - 1,) * 2), float(largest))
+
+
+@lru_cache(maxsize=2)
+def score_operators(scenario: Scenario) -> tuple[sp.csr_array, sp.csr_array]:
+    """(interpolation from the model's CD mesh to the truth's, the truth's mass matrix)."""
+    from eitbench.physics.fem import mass_matrix
+    truth = truth_discretisation(scenario).transport.mesh
+    return scenario.model().transport.mesh.interpolation_to(truth.points), mass_matrix(truth)
+
+
+def cycle_voltages(scenario: Scenario, entries: np.ndarray) -> np.ndarray:
+    """(T, L) noisy voltages in V of the scenario's injection cycle."""
+    cycle = scenario.currents
+    currents = cycle[np.arange(len(entries)) % len(cycle)]
+    clean = np.einsum("tml,tl->tm", entries["transfer_resistance"], currents)
+    return clean + scenario.noise.std(clean) * entries["noise"]
+
+
+def step_error(mass: sp.csr_array, estimate: np.ndarray, moment: np.ndarray, deviation: np.ndarray | float,
+               square: np.ndarray | float) -> np.ndarray:
+    """∫(ĉ_t − c_t)² / ∫c_t² for ``estimate`` (..., n) less the background, with the entries of recordings."""
+    quadratic = np.einsum("...n,...n->...", estimate, (mass @ estimate.T).T)
+    return (quadratic - 2.0 * np.einsum("...n,...n->...", estimate, moment) + deviation) / square
+
+
+_sound: dict[Path, tuple[int, int, int, np.dtype, int]] = {}
+"""Files this process has read whole and found in order: size, time of change, and how to map them at once."""
+
+
+def _load(path: Path) -> np.ndarray | None:
+    try:
+        status = path.stat()
+        size, changed, offset, kind, length = _sound.get(path, (-1, -1, 0, np.dtype(float), 0))
+        if (status.st_size, status.st_mtime_ns) == (size, changed):
+            return np.asarray(np.memmap(path, kind, "r", offset, (length,)))
+        mapped = np.load(path, mmap_mode="r", allow_pickle=False)
+        entries = np.asarray(mapped)
+        if not np.array_equal(entries["checksum"], _checksums(entries)):
+            return None
+        _sound[path] = status.st_size, status.st_mtime_ns, mapped.offset, entries.dtype, len(entries)
+        return entries
+    except (OSError, ValueError, EOFError, IndexError, SyntaxError):        # missing, damaged, cut short
+        return None
+
+
+def _checksums(entries: np.ndarray) -> np.ndarray:
+    raw = np.ascontiguousarray(entries).view(np.uint8).reshape(len(entries), -1)[:, :-4]
+    return np.array([zlib.crc32(row.data) for row in raw], dtype=np.uint32)
+
+
+def _load_outline(path: Path) -> tuple | None:
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            arrays = tuple(stored[f"arr_{k}"] for k in range(4))
+            sound = int(stored["checksum"]) == zlib.crc32(b"".join(array.tobytes() for array in arrays))
+            return arrays if sound else None
+    except Exception:       # a damaged archive may raise anything
+        return None
