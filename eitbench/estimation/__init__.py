@@ -2,6 +2,7 @@
 
 from eitbench.estimation.covariance import FreeCovariance
 from eitbench.estimation.first_frame import FirstFrame
+from eitbench.estimation.gains import GainSequence, gain_sequence
 from eitbench.estimation.gauss_newton import gauss_newton
 from eitbench.estimation.homogeneous import best_homogeneous
 from eitbench.estimation.kalman import (
@@ -16,7 +17,7 @@ from eitbench.estimation.parameters import TABLE_5_1, table_5_1
 from eitbench.estimation.smoother import Smoothed, fixed_interval_smoother, smoothed_state
 
 __all__ = [
-    "TABLE_5_1", "FilterStep", "FirstFrame", "FreeCovariance", "KalmanFilter", "LinearisedObservations", "Observation",
-    "Smoothed", "best_homogeneous", "fixed_interval_smoother", "gauss_newton", "kalman_filter", "linearised",
-    "smoothed_state", "table_5_1",
+    "TABLE_5_1", "FilterStep", "FirstFrame", "FreeCovariance", "GainSequence", "KalmanFilter",
+    "LinearisedObservations", "Observation", "Smoothed", "best_homogeneous", "fixed_interval_smoother",
+    "gain_sequence", "gauss_newton", "kalman_filter", "linearised", "smoothed_state", "table_5_1",
 ]

@@ -33,6 +33,7 @@ class FreeCovariance:
                  tolerance: float = 1e-14) -> None:
         self.scale = 1.0
         self.transition = transition
+        self._noise = noise
         self.limit = _stationary(transition, noise)
         self._threshold = tolerance * np.abs(self.limit).max()
         self._transients = [_signed_factor(initial - self.limit, self._threshold)]        # (U, D) at t = 0, 1, …
@@ -47,6 +48,10 @@ class FreeCovariance:
         """Π_t X for X (n, k)."""
         U, signs = self._transient(t)
         return self.scale * (self.limit @ X + U @ (signs[:, None] * (U.T @ X)))
+
+    def apply_noise(self, X: np.ndarray) -> np.ndarray:
+        """Γ_w X for X (n,) or (n, k)."""
+        return self.scale * (self._noise @ X)
 
     def diagonal(self, t: int) -> np.ndarray:
         """The variances Π_t holds, (n,)."""
