@@ -45,14 +45,20 @@ CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os
 @app.command("list")
 def list_() -> None:
     """Show the environments and the baselines, and which board each plays on."""
-    from eitbench.envs import ENTRY_POINTS
+    import gymnasium as gym
+
+    from eitbench.envs import ESTIMATION, INJECTION
     from eitbench.leaderboard.baselines import load_baseline, own_baselines
     from eitbench.leaderboard.run import Environment, board_of
     typer.echo("environments")
-    for name in ENTRY_POINTS:
+    for name in ESTIMATION:
         env = Environment(name).make()
         typer.echo(f"  {name:30} {board_of(env):10}  lag {env.task.lag}, {env.task.n_steps - env.task.warm_up} scored "
                    f"of {env.task.n_steps} states, {env.task.mesh.n_nodes} nodes")
+    for name in INJECTION:
+        chooser = gym.make(name).unwrapped
+        typer.echo(f"  {name:30} injection   {chooser.action_space.n} electrode pairs, "  # type: ignore[attr-defined]
+                   f"{chooser.scenario.n_steps} injections")  # type: ignore[attr-defined]
     typer.echo("baselines")
     for name in own_baselines():
         baseline = load_baseline(name)
@@ -98,11 +104,11 @@ def bank(
     import shutil
 
     from eitbench.bank import fill, recording_bytes
+    from eitbench.envs import scenario_of
     from eitbench.episodes import folder
-    from eitbench.leaderboard.run import Environment
     from eitbench.seeds import parse_seeds
     with _clear_errors():
-        numbers, scenario = parse_seeds(seeds), Environment(env).make().scenario
+        numbers, scenario = parse_seeds(seeds), scenario_of(env)
     size, place = len(numbers) * recording_bytes(scenario), folder(scenario)
     free = shutil.disk_usage(place).free
     typer.echo(f"{len(numbers)} episodes, {size / 1e6:.0f} MB in {place}")

@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from eitbench.cli import app
-from eitbench.envs import ENTRY_POINTS
+from eitbench.envs import ENTRY_POINTS, ESTIMATION
 from eitbench.episodes import CACHE_VARIABLE
 from eitbench.leaderboard import run, store, suites
 from eitbench.leaderboard.baselines import own_baselines
@@ -121,7 +121,7 @@ def test_suites():
     """quick is full with fewer seeds and without the one method that takes minutes an episode."""
     quick, full = (suites.jobs(suite, [], [], [1]) for suite in ("quick", "full"))
     assert set(full) - set(quick) == {suites.Job(suites.Environment(PIPE), "gauss_newton", 1)}
-    assert {job.environment.id for job in quick} == set(ENTRY_POINTS)
+    assert {job.environment.id for job in quick} == set(ESTIMATION)
     assert {job.baseline for job in quick} == set(own_baselines())
     assert set(parse_seeds(suites.SEEDS["quick"])) < set(parse_seeds(suites.SEEDS["full"]))
     assert min(parse_seeds(suites.SEEDS["full"])) == 200_000

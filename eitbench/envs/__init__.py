@@ -1,16 +1,32 @@
 """Floor 4: the Gymnasium environments and their registration."""
 
+from typing import Any
+
 import gymnasium as gym
 
-ENTRY_POINTS: dict[str, tuple[str, dict]] = {
+ESTIMATION: dict[str, tuple[str, dict]] = {
     "eitbench/Pipe2D-v0": ("eitbench.envs.pipe2d:Pipe2D", {}),
     "eitbench/Pipe2DFixedLag-v0": ("eitbench.envs.pipe2d:Pipe2D", {"lag": 4}),
     "eitbench/Pipe2DSmoothing-v0": ("eitbench.envs.pipe2d:Pipe2D", {"lag": "all"}),
 }
-"""Environments by id: where the classes …Env and …VectorEnv lie, and what they are given."""
+"""Environments that ask for estimates: where the classes …Env and …VectorEnv lie, and what they are given."""
+
+INJECTION: dict[str, tuple[str, dict]] = {
+    "eitbench/Pipe2DInjection-v0": ("eitbench.envs.pipe2d_injection:Pipe2DInjection", {}),
+}
+"""Environments that ask for injections."""
+
+ENTRY_POINTS = ESTIMATION | INJECTION
 
 
 def register_all() -> None:
     """Register every environment by its string entry points, one at a time and vectorised."""
     for name, (entry_point, kwargs) in ENTRY_POINTS.items():
         gym.register(name, entry_point=f"{entry_point}Env", vector_entry_point=f"{entry_point}VectorEnv", kwargs=kwargs)
+
+
+def scenario_of(name: str) -> Any:
+    """The scenario that an environment plays; ``ValueError`` if there is none of this id."""
+    if name not in ENTRY_POINTS:
+        raise ValueError(f"env must be one of {', '.join(ENTRY_POINTS)}; got {name!r}")
+    return gym.make(name, disable_env_checker=True).unwrapped.scenario  # type: ignore[attr-defined]

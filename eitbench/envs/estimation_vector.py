@@ -2,94 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import gymnasium as gym
 import numpy as np
-from gymnasium.utils import seeding
-from gymnasium.vector import AutoresetMode
-from gymnasium.vector.utils import batch_space
 
-from eitbench import _check
 from eitbench.envs.estimation import Observation, checked_estimates, cycle_currents, estimation_spaces
+from eitbench.envs.lockstep import LockstepVectorEnv
 from eitbench.recordings import cycle_voltages, outline, recording, step_error
 from eitbench.task import lag_steps
 
 if TYPE_CHECKING:
     from eitbench.scenarios.base import Scenario
-
-
-class LockstepVectorEnv(gym.vector.VectorEnv[Observation, np.ndarray, np.ndarray]):
-    """Environments whose episodes all have the same length, so that they begin and end together.
-
-    Observations equal those of ``SyncVectorEnv`` over the scalar environment, bit for bit: ``reset(seed=s)`` plays
-    episode s + k in environment k, and the step after an episode's end begins the next one (``NEXT_STEP``).
-
-    Parameters
-    ----------
-    num_envs : int
-    episodes : int
-        How many training episodes an unseeded reset draws from.
-    """
-
-    metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012 (gymnasium's own form)
-
-    def __init__(self, num_envs: int, episodes: int, observation_space: gym.Space, action_space: gym.Space) -> None:
-        self.num_envs = _check.integer("num_envs", num_envs, low=1)
-        self.episodes = _check.integer("episodes", episodes, low=1)
-        self.single_observation_space, self.single_action_space = observation_space, action_space
-        self.observation_space = batch_space(observation_space, num_envs)
-        self.action_space = batch_space(action_space, num_envs)
-        self._randoms: list[np.random.Generator | None] = [None] * num_envs
-        self._step, self._ended = 0, False
-
-    def reset(self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None,
-              ) -> tuple[Observation, dict[str, Any]]:
-        """Begin episodes seed, seed + 1, …, or those of a list; without a seed random training episodes."""
-        if options and "reset_mask" in options:
-            raise ValueError("options must not hold 'reset_mask': all environments begin and end together")
-        seeds = [None if seed is None else seed + k for k in range(self.num_envs)] if not isinstance(
-            seed, (list, tuple, np.ndarray)) else list(seed)
-        if len(seeds) != self.num_envs:
-            raise ValueError(f"seed must be an integer or a list of {self.num_envs}, got {len(seeds)} entries")
-        chosen = []
-        for k, one in enumerate(seeds):
-            if one is not None or self._randoms[k] is None:
-                self._randoms[k] = seeding.np_random(None if one is None else int(one))[0]
-            random = self._randoms[k]
-            chosen.append(int(random.integers(self.episodes)) if one is None else int(one))  # type: ignore[union-attr]
-        self._begin(chosen)
-        self._step, self._ended = 1, False
-        return self._observe(), self._info()
-
-    def step(self, actions: np.ndarray) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """One step of every environment; after an episode's end the actions are ignored and the next one begins."""
-        if self._step == 0:
-            raise gym.error.ResetNeeded("call reset() before step()")
-        nothing = np.zeros(self.num_envs, dtype=bool)
-        if self._ended:
-            observation, info = self.reset()
-            return observation, np.zeros(self.num_envs), nothing, nothing.copy(), info
-        rewards = self._act(actions)
-        self._step += 1
-        self._ended = self._step > self._length
-        return self._observe(), rewards, np.full(self.num_envs, self._ended), nothing, self._info()
-
-    def _info(self) -> dict[str, Any]:
-        everyone = np.ones(self.num_envs, dtype=bool)
-        return {"step": np.full(self.num_envs, self._step), "_step": everyone}
-
-    _length: int
-    """Steps in an episode."""
-
-    def _begin(self, seeds: list[int]) -> None:
-        raise NotImplementedError
-
-    def _act(self, actions: np.ndarray) -> np.ndarray:
-        raise NotImplementedError
-
-    def _observe(self) -> Observation:
-        raise NotImplementedError
 
 
 class EstimationVectorEnv(LockstepVectorEnv):

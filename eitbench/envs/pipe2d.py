@@ -80,7 +80,7 @@ class Pipe2DEnv(EstimationEnv, EzPickle):
                  scenario: dict[str, Any] | None = None, episodes: int = 1000, render_mode: str | None = None) -> None:
         EzPickle.__init__(self, lag=lag, assumed_mean_velocity=assumed_mean_velocity, scenario=scenario,
                           episodes=episodes, render_mode=render_mode)
-        super().__init__(_with_fields(scenario), lag=lag, assumptions=_assumptions(assumed_mean_velocity),
+        super().__init__(with_fields(scenario), lag=lag, assumptions=_assumptions(assumed_mean_velocity),
                          episodes=episodes, render_mode=render_mode)
 
 
@@ -90,7 +90,7 @@ class Pipe2DVectorEnv(EstimationVectorEnv):
     def __init__(self, *, num_envs: int = 1, lag: int | str = 0, assumed_mean_velocity: float | None = None,
                  scenario: dict[str, Any] | None = None, episodes: int = 1000) -> None:
         _assumptions(assumed_mean_velocity)              # what estimators believe changes nothing here
-        super().__init__(_with_fields(scenario), num_envs, lag=lag, episodes=episodes)
+        super().__init__(with_fields(scenario), num_envs, lag=lag, episodes=episodes)
 
 
 def _assumptions(mean_velocity: float | None) -> dict[str, float]:
@@ -100,7 +100,7 @@ def _assumptions(mean_velocity: float | None) -> dict[str, float]:
                                            units="m/s")}
 
 
-def _with_fields(changes: dict[str, Any] | None) -> Pipe2D:
+def with_fields(changes: dict[str, Any] | None) -> Pipe2D:
     """Pipe2D with some fields changed; lists become tuples, since kwargs come from JSON."""
     changes = {name: tuple(value) if isinstance(value, list) else value for name, value in (changes or {}).items()}
     unknown = changes.keys() - Pipe2D.__dataclass_fields__.keys()

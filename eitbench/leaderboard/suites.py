@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from eitbench.envs import ENTRY_POINTS
+from eitbench.envs import ESTIMATION
 from eitbench.leaderboard.baselines import load_baseline, own_baselines
 from eitbench.leaderboard.run import Environment, Job, board_of
 
@@ -14,7 +14,7 @@ TOO_SLOW_FOR_QUICK = {("filter", "gauss_newton")}
 
 
 def jobs(suite: str, environments: list[str], baselines: list[str], seeds: list[int]) -> list[Job]:
-    """Every named baseline (default: all of ours) on every named environment (default: all) it can play.
+    """Every named baseline (default: all of ours) on every named environment (default: all that ask for estimates).
 
     Raises
     ------
@@ -28,7 +28,7 @@ def jobs(suite: str, environments: list[str], baselines: list[str], seeds: list[
             raise ValueError(f"baselines {other} and {baseline} have the same name, under which results are kept; "
                              "rename one")
     pairs = []
-    for name in environments or ENTRY_POINTS:
+    for name in environments or ESTIMATION:
         environment = Environment(name)
         board = board_of(environment.make())
         for baseline in [_absolute(name) for name in baselines] or own_baselines():
@@ -37,7 +37,7 @@ def jobs(suite: str, environments: list[str], baselines: list[str], seeds: list[
                 pairs.append((environment, baseline))
     if not pairs:
         raise ValueError(f"none of the baselines {', '.join(baselines)} plays any of the environments "
-                         f"{', '.join(environments or ENTRY_POINTS)}; see `eitbench list`")
+                         f"{', '.join(environments or ESTIMATION)}; see `eitbench list`")
     return [Job(environment, baseline, seed) for seed in seeds for environment, baseline in pairs]
 
 

@@ -140,6 +140,17 @@ class ObservationModel:
         """Noise-free voltages (K, L) in V for currents (K, L) in A (A/m in 2D)."""
         return self.cem.voltages(self.conductivity(self._at_eit_nodes(concentration)), currents)
 
+    def resistance_derivatives(self, concentration: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """𝓡 (L, L) in Ω (Ω·m in 2D) and its derivatives by the nodal concentration, (n_cd, L, L) per mol/m³.
+
+        They hold `linearise` for every injection: V = 𝓡 I, dV/dc_j = table[j] I.
+        """
+        c = self._at_eit_nodes(_check.array("concentration", concentration, (self.interpolation.shape[1],)))
+        resistance, table = self.cem.transfer_resistance_derivatives(self.conductivity(c))
+        table *= self.conductivity.derivative(c)[:, None, None]
+        by_node = self.interpolation.T @ table.reshape(len(c), -1)
+        return resistance, by_node.reshape(-1, *resistance.shape)
+
     def linearise(self, concentration: np.ndarray, currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Voltages (K, L) and their derivative by the nodal concentration, (K, L, n_cd) in V·m³/mol (thesis 5.2)."""
         c = self._at_eit_nodes(concentration)

@@ -1,0 +1,110 @@
+"""A Kalman filter in few coordinates, for very many records at once.
+
+The filter's mean moves away from the prior mean only within the span of Z (P = Π − Z Zᵀ). The directions that carry
+most of Z Zᵀ, as measured by the mass matrix, are therefore the best coordinates for its estimates; Galerkin's
+projection onto them gives a model of the same form with about a hundred states.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+
+from eitbench.estimation.kalman import KalmanFilter, Observation
+
+
+class ReducedModel(NamedTuple):
+    """a⁺ = A a + w for deviations c − s = Φ a from what the deterministic input alone would give."""
+
+    basis: np.ndarray
+    """(n, r) Φ, with Φᵀ M Φ = I"""
+    transition: np.ndarray
+    """(r, r) A = Φᵀ M F Φ, upper triangular but for 2×2 blocks on its diagonal"""
+    noise: np.ndarray
+    """(r, r) covariance of w"""
+    initial: np.ndarray
+    """(r, r) covariance of a at t = 0"""
+
+
+def reduced_model(start: KalmanFilter, mass: np.ndarray, observations: Iterable[Observation], rank: int, *,
+                  skip: int = 20) -> ReducedModel:
+    """The model of ``start`` in the ``rank`` directions in which it learns most.
+
+    Parameters
+    ----------
+    start : KalmanFilter
+        At t = 0; it is run over the record.
+    mass : (n, n)
+        Mass matrix M in m² (m³ in 3D).
+    observations
+        A record with injections as they will be used; the values do not matter.
+    rank : int
+        r.
+    skip : int
+        Steps at the beginning that do not count, since the initial uncertainty is not typical.
+    """
+    learnt = np.zeros_like(mass)
+    for t, observation in enumerate(observations):
+        start.predict()
+        start.update(observation)
+        if t >= skip:
+            learnt += start.known @ start.known.T
+    root = np.linalg.cholesky(mass)
+    n = len(mass)
+    _, vectors = scipy.linalg.eigh(root.T @ learnt @ root, subset_by_index=[n - rank, n - 1])
+    basis = scipy.linalg.solve_triangular(root.T, vectors[:, ::-1], lower=False)
+    transition, rotation = scipy.linalg.schur(basis.T @ mass @ start.transition @ basis)
+    basis = basis @ rotation
+    weighted, covariance = mass @ basis, start.covariance
+    return ReducedModel(basis, transition, weighted.T @ covariance.apply_noise(weighted),
+                        weighted.T @ covariance.apply(0, weighted))
+
+
+class ReducedFilter:
+    """The textbook's Kalman filter for B records side by side, each with its own injections.
+
+    A record's numbers do not depend on what is filtered beside it, to the bit.
+
+    Parameters
+    ----------
+    model : ReducedModel
+    mean, covariance : (B, r), (B, r, r)
+        Of the present states.
+    """
+
+    def __init__(self, model: ReducedModel, mean: np.ndarray, covariance: np.ndarray) -> None:
+        self.model, self.mean, self.covariance = model, mean, covariance.copy()
+        self._half, self._next = np.empty_like(covariance), np.empty_like(covariance)
+        A, r = model.transition, len(model.transition)
+        splits = [k for k in range(1, r) if A[k, k - 1] == 0.0]
+        self._edges = [0, *sorted({min(splits, key=lambda k: abs(k - third)) for third in (r // 3, 2 * r // 3)}), r]
+
+    def predict(self) -> None:
+        """One time step on."""
+        A, P, AP, APA = self.model.transition, self.covariance, self._half, self._next
+        self.mean = (A @ self.mean[..., None])[..., 0]
+        for begin, end in pairwise(self._edges):                     # below its blocks A is zero
+            np.matmul(A[begin:end, begin:], P[:, begin:], out=AP[:, begin:end])
+        for begin, end in pairwise(self._edges):
+            np.matmul(AP[:, :, begin:], A[begin:end, begin:].T, out=APA[:, :, begin:end])
+        APA += self.model.noise
+        self.covariance, self._next = APA, P
+
+    def update(self, matrix: np.ndarray, residual: np.ndarray, noise_variance: np.ndarray,
+               ) -> tuple[np.ndarray, np.ndarray]:
+        """Take in residual = matrix·a + v: (B, m, r), (B, m), (B, m); return innovations (B, m) and S (B, m, m)."""
+        P, transposed, m = self.covariance, np.swapaxes(matrix, -1, -2), matrix.shape[1]
+        cross = matrix @ P                                                                  # H P
+        S = cross @ transposed
+        S[:, np.arange(m), np.arange(m)] += noise_variance
+        innovation = residual - (matrix @ self.mean[..., None])[..., 0]
+        inverse_root = np.linalg.inv(np.linalg.cholesky(S))
+        W = inverse_root @ cross
+        whitened = inverse_root @ innovation[..., None]
+        self.mean = self.mean + (np.swapaxes(W, -1, -2) @ whitened)[..., 0]
+        P -= np.swapaxes(W, -1, -2) @ W
+        return innovation, S

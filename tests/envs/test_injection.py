@@ -1,0 +1,207 @@
+"""Environments in which the agent chooses the injection: what they show, what they pay, alone and side by side."""
+
+import pickle
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from stable_baselines3.common.env_checker import check_env as check_env_sb3
+
+import eitbench
+from eitbench import make_task
+from eitbench.envs import INJECTION
+from eitbench.envs.operator import electrode_pairs
+from eitbench.estimation import FirstFrame, LinearisedObservations, kalman_filter, table_5_1
+from eitbench.recordings import cycle_voltages, recording, score_operators
+
+NAME = "eitbench/Pipe2DInjection-v0"
+# Sixteen electrodes and a short record; fewer electrodes would leave too little to learn from.
+SHORT = {"scored_steps": 4, "mean_velocity": 16.0}
+both = pytest.mark.parametrize("estimator", ["reduced", "none"])
+
+
+def make(estimator: str = "none", **kwargs) -> gym.Env:
+    return gym.make(NAME, estimator=estimator, scenario=SHORT, **kwargs)
+
+
+def play(env: gym.Env, seed: int, actions: np.ndarray) -> list[tuple]:
+    """(observation, reward, terminated, truncated, info) of the whole episode under the given actions."""
+    observation, info = env.reset(seed=seed)
+    steps = [(observation, 0.0, False, False, info)]
+    while not steps[-1][2]:
+        steps.append(env.step(int(actions[len(steps) - 1])))
+    return steps
+
+
+def some_pairs(steps: int = 120, envs: int = 1, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).integers(120, size=(steps, envs)).squeeze()
+
+
+@both
+@pytest.mark.filterwarnings("ignore")
+def test_checkers_pass(estimator):
+    """Gymnasium's and stable-baselines3's."""
+    check_env(make(estimator).unwrapped, skip_render_check=True)
+    check_env_sb3(make(estimator).unwrapped)
+
+
+@both
+def test_contract(estimator):
+    """Lengths, types, fresh arrays, spaces; pickled it plays the same; its spec travels as JSON."""
+    env = make(estimator)
+    steps = play(env, 1, some_pairs())
+    scenario = env.unwrapped.scenario
+    assert len(steps) - 1 == scenario.n_steps - (16 if estimator == "reduced" else 0)
+    arrays = [array for step in steps for array in step[0].values()]
+    assert len({array.__array_interface__["data"][0] for array in arrays}) == len(arrays)
+    for observation, reward, terminated, truncated, info in steps:
+        assert type(reward) is float and type(terminated) is bool and type(truncated) is bool
+        assert env.observation_space.contains(observation) and all(np.isscalar(value) for value in info.values())
+    with pytest.raises(gym.error.ResetNeeded):
+        env.unwrapped.step(0)
+    again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
+    for other in (pickle.loads(pickle.dumps(env)), again):
+        for a, b in zip(steps, play(other, 1, some_pairs()), strict=True):
+            assert all((a[0][key] == b[0][key]).all() for key in a[0]) and a[1:] == b[1:]
+
+
+def test_voltages_are_those_of_the_pair():
+    """Pair (i, j) drives its current in at i and out at j: V = 𝓡 I plus this step's noise, scaled to the readings."""
+    env = make()
+    actions = some_pairs()
+    steps = play(env, 3, actions)
+    scenario, entries = env.unwrapped.scenario, recording(env.unwrapped.scenario, 3)
+    for t, (observation, *_) in enumerate(steps[1:]):
+        i, j = electrode_pairs(16)[actions[t]]
+        currents = np.zeros(16)
+        currents[[i, j]] = 0.1, -0.1
+        clean = entries["transfer_resistance"][t] @ currents
+        std = np.sqrt((0.01 * clean)**2 + (0.001 * np.abs(clean).max())**2)
+        np.testing.assert_array_equal(observation["currents"], currents)
+        np.testing.assert_allclose(observation["voltages"], clean + std * entries["noise"][t], rtol=1e-12)
+    assert scenario.n_steps == len(steps) - 1 and all(step[1] == 0.0 for step in steps)
+
+
+def test_first_frame_is_the_scenarios_own():
+    """With an estimator the agent takes over after a frame of the cycle, whose last measurement it sees first."""
+    env = make("reduced")
+    observation, _ = env.reset(seed=3)
+    scenario, entries = env.unwrapped.scenario, recording(env.unwrapped.scenario, 3)
+    np.testing.assert_array_equal(observation["voltages"], cycle_voltages(scenario, entries)[15])
+    np.testing.assert_array_equal(observation["currents"], scenario.currents[15])
+
+
+def test_reward_is_minus_the_error_of_the_estimate_inside():
+    """The pay equals −∫(ĉ − c)²/∫c² of the estimate at the nodes, integrated on the truth's mesh."""
+    env = make("reduced")
+    base, actions = env.unwrapped, some_pairs()
+    env.reset(seed=3)
+    scenario = base.scenario
+    interpolation, mass = score_operators(scenario)
+    truth = eitbench.simulate(scenario, 3).concentration.astype(float)
+    paid = 0
+    for k in range(scenario.n_steps - 16):
+        reward = env.step(int(actions[k]))[1]
+        t = 17 + k
+        if t <= scenario.warm_up:
+            assert reward == 0.0
+            continue
+        error = interpolation @ base._core._operator.means()[0] - truth[t]
+        assert reward == pytest.approx(-(error @ mass @ error) / (truth[t] @ mass @ truth[t]), rel=1e-5)
+        paid += 1
+    assert paid == 4
+
+
+def test_grid_shows_the_estimate():
+    """Patch means are averages of the nodal estimate, whose spread is positive and shrinks below the prior's."""
+    env = make("reduced")
+    base = env.unwrapped
+    first, _ = env.reset(seed=3)
+    for action in some_pairs()[:3]:
+        observation = env.step(int(action))[0]
+    points, mean = base.task.mesh.points, base._core._operator.means()[0]
+    for row, column in ((0, 0), (1, 5), (2, 11)):
+        inside = ((points[:, 0] >= 0.4 * column / 12) & (points[:, 0] <= 0.4 * (column + 1) / 12)
+                  & (points[:, 1] >= -0.05 + row / 30) & (points[:, 1] <= -0.05 + (row + 1) / 30))
+        shown = observation["mean"][row * 12 + column]
+        assert mean[inside].min() <= shown <= mean[inside].max()
+        assert shown == pytest.approx(mean[inside].mean(), abs=0.5 * np.ptp(mean[inside]) + 0.02)
+    assert (observation["std"] > 0).all() and (observation["std"] < 0.25 * 30).all() and first["std"].shape == (36,)
+
+
+def test_estimator_is_the_kalman_filter_of_the_baselines():
+    """On the scenario's own cycle it comes within 1 mol/m³ (rms) of the full filter's estimate at every scored step."""
+    env = make("reduced")
+    scenario = env.unwrapped.scenario
+    task, pairs = make_task(scenario), electrode_pairs(16).tolist()
+    voltages = cycle_voltages(scenario, recording(scenario, 5))
+    first = FirstFrame(task)
+    for k in range(16):
+        first.add(voltages[k], scenario.currents[k])
+    start = table_5_1(task.transport, first.c_bh)
+    linear = LinearisedObservations(task.observation, task.noise, start.mean)
+    full = kalman_filter(start, [linear(v, scenario.currents[t % 16]) for t, v in enumerate(voltages)])
+    env.reset(seed=5)
+    operator = env.unwrapped._core._operator
+    assert operator.concentration[0] == pytest.approx(first.c_bh, rel=0.011)
+    for t in range(16, scenario.n_steps):
+        current = scenario.currents[t % 16]
+        env.step(pairs.index([int(current.argmax()), int(current.argmin())]))
+        difference = operator.means()[0] - full[t].mean
+        assert np.sqrt((difference**2).mean()) < 1.0 < np.abs(full[t].mean - first.c_bh).max()
+
+
+@both
+def test_side_by_side_as_one_by_one(estimator):
+    """18 environments at once show, to the bit, what 18 alone show, over episodes' ends; threads change nothing."""
+    kwargs = {"num_envs": 18, "estimator": estimator, "scenario": SHORT, "episodes": 3}
+    sync = gym.make_vec(NAME, vectorization_mode="sync", **kwargs)
+    ours = [gym.make_vec(NAME, vectorization_mode="vector_entry_point", threads=threads, **kwargs)
+            for threads in (1, 2)]
+    seeds = [k % 4 for k in range(18)]
+    steps = [[env.reset(seed=seeds)] for env in (sync, *ours)]
+    for actions in some_pairs(30, 18):
+        for env, seen in zip((sync, *ours), steps, strict=True):
+            seen.append(env.step(actions))
+    for reference, *others in zip(*steps, strict=True):
+        for other in others:
+            for key, array in reference[0].items():
+                np.testing.assert_array_equal(other[0][key], array, err_msg=key)
+            for a, b in zip(other[1:-1], reference[1:-1], strict=True):
+                np.testing.assert_array_equal(a, b)
+            assert (other[-1]["step"] == reference[-1]["step"]).all()
+    assert sum(int(step[-1]["step"][0]) == 1 for step in steps[0]) >= 2          # another episode was begun
+
+
+@pytest.mark.parametrize(("change", "message"), [
+    ({"estimator": "full"}, "estimator must be one of reduced, none, got 'full'"), ({"episodes": 0}, "episodes must"),
+    ({"scenario": {"colour": 1}}, "scenario has no field 'colour'"), ({"render_mode": "tv"}, "render_mode must be"),
+])
+@pytest.mark.filterwarnings("ignore")
+def test_wrong_arguments_are_named(change, message):
+    """A wrong argument is named before anything is computed."""
+    with pytest.raises(ValueError, match=message):
+        gym.make(NAME, **change)
+
+
+def test_wrong_actions_are_named():
+    """There are 120 pairs, and only they can be injected."""
+    env = make().unwrapped
+    env.reset(seed=1)
+    for action in (-1, 120, 1.5, True, "first"):
+        with pytest.raises(ValueError, match="action must be an integer of at least 0 and at most 119"):
+            env.step(action)
+    many = gym.make_vec(NAME, num_envs=2, vectorization_mode="vector_entry_point", estimator="none", scenario=SHORT)
+    many.reset(seed=1)
+    with pytest.raises(ValueError, match=r"actions must be integers of shape \(2,\), got float64 of shape \(2,\)"):
+        many.step(np.zeros(2))
+    with pytest.raises(ValueError, match=r"actions must lie in \[0, 119\], got 0 … 120"):
+        many.step(np.array([0, 120]))
+
+
+def test_registry():
+    """Every id of this kind is the one tested here."""
+    assert list(INJECTION) == [NAME]
+    pairs = electrode_pairs(16)
+    assert len(pairs) == 120 and (pairs[:, 0] < pairs[:, 1]).all() and pairs[0].tolist() == [0, 1]

@@ -1,0 +1,99 @@
+"""The reduced filter against the textbook, and against the full filter when nothing is left out."""
+
+import numpy as np
+import pytest
+import scipy.linalg
+from models import LinearGaussian, dense_filter, draw, random_design, random_model
+
+from eitbench.estimation import Observation, kalman_filter
+from eitbench.estimation.reduced import ReducedFilter, ReducedModel, reduced_model
+
+
+@pytest.fixture
+def world():
+    """A model around zero in Schur form with 14 states, and three records under three designs."""
+    rng = np.random.default_rng(12)
+    model = random_model(rng)
+    F, rotation = scipy.linalg.schur(model.F)
+    zero = np.zeros(14)
+    model = LinearGaussian(F, zero, rotation.T @ model.Q @ rotation, zero, rotation.T @ model.covariance @ rotation)
+    return model, [draw(model, random_design(rng, 14, 9), rng)[1] for _ in range(3)]
+
+
+def run(filter_: ReducedFilter, records: list[list[Observation]]):
+    """Means (T, B, r), covariances, innovations and S of records side by side."""
+    steps = []
+    for t in range(len(records[0])):
+        matrix, value, variance = (np.stack([record[t][part] for record in records]) for part in range(3))
+        filter_.predict()
+        innovation, S = filter_.update(matrix, value, variance)
+        steps.append((filter_.mean.copy(), filter_.covariance.copy(), innovation, S))
+    return [np.array(part) for part in zip(*steps, strict=True)]
+
+
+def started(model: LinearGaussian, count: int) -> ReducedFilter:
+    reduced = ReducedModel(np.eye(14), model.F, model.Q, model.covariance)
+    return ReducedFilter(reduced, np.zeros((count, 14)), np.repeat(model.covariance[None], count, axis=0))
+
+
+def assert_close(ours, theirs, tolerance):
+    np.testing.assert_allclose(ours, theirs, rtol=0, atol=tolerance * np.abs(theirs).max())
+
+
+def test_three_records_side_by_side_are_the_textbook(world):
+    """Means and covariances of each record equal the dense recursion's, whose designs differ, to 1e-10."""
+    model, records = world
+    means, covariances, innovations, S = run(started(model, 3), records)
+    for b, record in enumerate(records):
+        for t, (predicted, now) in enumerate(dense_filter(model, record)):
+            assert_close(means[t, b], now.mean, 1e-10)
+            assert_close(covariances[t, b], now.covariance, 1e-10)
+            H, value, variance = record[t]
+            assert_close(innovations[t, b], value - H @ predicted.mean, 1e-10)
+            assert_close(S[t, b], H @ predicted.covariance @ H.T + np.diag(variance), 1e-10)
+
+
+def test_a_record_keeps_its_bits_beside_others(world):
+    """What is filtered beside it changes nothing."""
+    model, records = world
+    together, alone = run(started(model, 3), records), run(started(model, 1), records[1:2])
+    for ours, theirs in zip(together, alone, strict=True):
+        np.testing.assert_array_equal(ours[:, 1:2], theirs)
+
+
+def test_in_all_directions_it_is_the_full_filter(world):
+    """With as many coordinates as states nothing is lost: Φ a and Φ P Φᵀ are the full filter's, in any metric."""
+    rng = np.random.default_rng(3)
+    plain = random_model(rng)
+    model = plain._replace(s=np.zeros(14), mean=np.zeros(14))
+    record = draw(model, random_design(rng, 14, 9), rng)[1]
+    root = rng.normal(size=(14, 14))
+    mass = root @ root.T + np.eye(14)
+    reduced = reduced_model(model.filter(), mass, record, 14, skip=0)
+    basis = reduced.basis
+    assert_close(basis.T @ mass @ basis, np.eye(14), 1e-10)
+    assert np.abs(np.tril(reduced.transition, -2)).max() == 0.0
+    filter_ = ReducedFilter(reduced, np.zeros((1, 14)), reduced.initial[None])
+    projected = [Observation(H @ basis, value, variance) for H, value, variance in record]
+    means, covariances, _, _ = run(filter_, [projected])
+    for t, step in enumerate(kalman_filter(model.filter(), record)):
+        assert_close(basis @ means[t, 0], step.mean, 1e-8)
+        assert_close((basis @ covariances[t, 0] @ basis.T).diagonal(), step.variance, 1e-8)
+
+
+def test_the_directions_are_those_in_which_the_filter_learns(world):
+    """The basis holds more of Σ Z Zᵀ than any other of its size tried: no random subspace comes near."""
+    model, records = world
+    learnt, filter_ = 0.0, model.filter()
+    for observation in records[0]:
+        filter_.predict()
+        filter_.update(observation)
+        learnt = learnt + filter_.known @ filter_.known.T
+    basis = reduced_model(model.filter(), np.eye(14), records[0], 5, skip=0).basis
+    held = np.trace(basis.T @ learnt @ basis)
+    assert held == pytest.approx(np.linalg.eigvalsh(learnt)[-5:].sum(), rel=1e-8)
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        other = np.linalg.qr(rng.normal(size=(14, 5)))[0]
+        assert np.trace(other.T @ learnt @ other) < held
+
