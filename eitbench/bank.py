@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
+from eitbench import _check
 from eitbench._parallel import in_parallel
 from eitbench.episodes import simulate_together
 from eitbench.recordings import is_recorded, make_recording, outline, recording_path, recording_type, store_recording
@@ -30,16 +32,25 @@ def fill(scenario: Scenario, seeds: Sequence[int], *, n_jobs: int = 1) -> int:
     Each is stored as soon as it is done; after an interruption the same call goes on where it was. Only what an
     environment needs is kept: the truth, five times as large, is simulated anew should anybody ask for it.
     """
-    missing = [seed for seed in dict.fromkeys(seeds) if not is_recorded(scenario, seed)]
+    n_jobs, missing = _check.integer("n_jobs", n_jobs, low=1), missing_seeds(scenario, seeds)
     together = max(1, min(TOGETHER, -(-len(missing) // n_jobs)))
-    groups = [(scenario, missing[k:k + together]) for k in range(0, len(missing), together)]
+    # The folder is found out here: a worker may live in another environment than its parent does by now.
+    groups = [(scenario, group, [recording_path(scenario, seed) for seed in group])
+              for group in (missing[k:k + together] for k in range(0, len(missing), together))]
     with tqdm(total=len(missing), desc="recording", unit="episode", disable=None) as bar:
         for done in in_parallel(_record, groups, n_jobs):
             bar.update(done)
     return len(missing)
 
 
-def _record(scenario: Scenario, seeds: Sequence[int]) -> int:
-    for seed, episode in zip(seeds, simulate_together(scenario, seeds, progress=False), strict=True):
-        store_recording(recording_path(scenario, seed), make_recording(scenario, episode))
+def missing_seeds(scenario: Scenario, seeds: Sequence[int]) -> list[int]:
+    """Those of ``seeds`` without a sound recording."""
+    checked = [_check.integer("seeds", seed, low=0) for seed in seeds]
+    return [seed for seed in dict.fromkeys(checked) if not is_recorded(scenario, seed)]
+
+
+def _record(scenario: Scenario, seeds: Sequence[int], paths: Sequence[Path]) -> int:
+    episodes = simulate_together(scenario, seeds, progress=False)
+    for seed, path, episode in zip(seeds, paths, episodes, strict=True):
+        store_recording(path, make_recording(scenario, seed, episode))
     return len(seeds)

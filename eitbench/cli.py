@@ -103,17 +103,22 @@ def bank(
     """
     import shutil
 
-    from eitbench.bank import fill, recording_bytes
+    from eitbench.bank import fill, missing_seeds, recording_bytes
     from eitbench.envs import scenario_of
     from eitbench.episodes import folder
     from eitbench.seeds import parse_seeds
     with _clear_errors():
         numbers, scenario = parse_seeds(seeds), scenario_of(env)
-    size, place = len(numbers) * recording_bytes(scenario), folder(scenario)
+    place, each = folder(scenario), recording_bytes(scenario)
+    try:
+        place.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise typer.BadParameter(f"recordings cannot be kept in {place}: {error}") from error
+    missing = len(missing_seeds(scenario, numbers))
+    typer.echo(f"{len(numbers)} episodes, {len(numbers) * each / 1e6:.0f} MB in {place}; {missing} to simulate")
     free = shutil.disk_usage(place).free
-    typer.echo(f"{len(numbers)} episodes, {size / 1e6:.0f} MB in {place}")
-    if size > free:
-        raise typer.BadParameter(f"seeds need up to {size / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free")
+    if missing * each > free:
+        raise typer.BadParameter(f"seeds need {missing * each / 1e9:.1f} GB more, and {free / 1e9:.1f} GB are free")
     made = fill(scenario, numbers, n_jobs=jobs)
     typer.echo(f"{made} simulated, {len(numbers) - made} were there")
 

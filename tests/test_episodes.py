@@ -90,6 +90,14 @@ def test_other_processes_same_bits_and_share_one_file(fresh, cache):
     assert bits(episodes._load(path, episodes._identity(TINY, 7))) == bits(fresh)
 
 
+def test_simulated_together_same_bits(fresh):
+    """Flows carried on side by side are the flows that each seed has alone, in the order of the seeds."""
+    seeds = [7, 8, 9]
+    together = [bits(episode) for episode in episodes.simulate_together(TINY, seeds)]
+    assert together[0] == bits(fresh)
+    assert together == [bits(simulate(TINY, seed, cache=False)) for seed in seeds]
+
+
 def test_cached_equals_fresh(fresh, monkeypatch):
     """The second call reads what the first one stored, bit for bit, and simulates nothing."""
     first = simulate(TINY, 7)

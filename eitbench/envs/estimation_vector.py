@@ -19,9 +19,10 @@ class EstimationVectorEnv(LockstepVectorEnv):
     """`EstimationEnv`, many times; parameters as there and in `LockstepVectorEnv`."""
 
     def __init__(self, scenario: Scenario, num_envs: int, *, lag: int | str = 0, episodes: int = 1000) -> None:
-        super().__init__(num_envs, episodes, *estimation_spaces(scenario))
+        super().__init__(num_envs, episodes)
         self.scenario = scenario
         self._lag = lag_steps(scenario, lag)
+        self._show(*estimation_spaces(scenario))
         self._length = scenario.n_steps + self._lag
         self._currents = cycle_currents(scenario, self._lag)
         self._limit = 10.0 * scenario.expected_concentration

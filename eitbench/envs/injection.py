@@ -171,8 +171,9 @@ class InjectionVectorEnv(LockstepVectorEnv):
 
     def __init__(self, scenario: Scenario, num_envs: int, *, estimator: str = "reduced", episodes: int = 1000,
                  threads: int = 1) -> None:
+        super().__init__(num_envs, episodes)
         core, threads = InjectionCore(scenario, estimator), _check.integer("threads", threads, low=1)
-        super().__init__(num_envs, episodes, *core.spaces())
+        self._show(*core.spaces())
         self.scenario = scenario
         self._length, self._n_pairs = core.length, len(core.pairs)
         # The covariances of sixteen filters stay within a core's own memory.

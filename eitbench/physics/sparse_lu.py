@@ -40,11 +40,13 @@ class SparseLU:
 
     def solve(self, right: np.ndarray) -> np.ndarray:
         """A⁻¹ b for (n, k)."""
-        if self.batch == 1:
-            return np.stack([self._solve(column) for column in right.T], axis=1)    # together they lose their bits
-        from eitbench.physics._kernels import solve_lu
         n, k = right.shape
         result = np.empty((n, k))
+        if self.batch == 1:
+            for column in range(k):                       # SuperLU's bits depend on how many are solved together
+                result[:, column] = self._solve(right[:, column])
+            return result
+        from eitbench.physics._kernels import solve_lu
         eight, work, solution = scratch(3 * 8 * n).reshape(3, -1)
         for first in range(0, k, 8):
             block = right[:, first:first + 8]

@@ -1,0 +1,296 @@
+"""Many environments at once are the same environments, one beside the other."""
+
+import pickle
+from itertools import combinations
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.vector import AutoresetMode
+
+import eitbench  # noqa: F401 (registers)
+from eitbench.envs import ENTRY_POINTS, estimation
+from eitbench.envs.pipe2d import Pipe2DVectorEnv
+from eitbench.episodes import CACHE_VARIABLE, simulate
+from eitbench.scenarios import Pipe2D
+
+IDS = [name for name, (entry_point, _) in ENTRY_POINTS.items() if entry_point.endswith(":Pipe2D")]
+PIPE = IDS[0]
+FIELDS = {"mean_velocity": 45.0, "scored_steps": 5, "electrodes_per_wall": 2, "frame": 2}
+TINY = Pipe2D(**FIELDS)
+"""A fast fluid flushes the pipe in two steps: seven measurements, of which five are scored."""
+
+
+@pytest.fixture(autouse=True, scope="module")
+def cache(tmp_path_factory):
+    """One cache folder for all tests of this file."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(CACHE_VARIABLE, str(tmp_path_factory.mktemp("episodes")))
+        yield
+
+
+def make(name=PIPE, num_envs=3, mode="vector_entry_point", **kwargs):
+    """The vectorised environment on the tiny scenario, with three training episodes."""
+    return gym.make_vec(name, num_envs=num_envs, vectorization_mode=mode,
+                        **{"scenario": FIELDS, "episodes": 3} | kwargs)
+
+
+def actions_for(envs, steps, seed=0):
+    """Meaningless estimates: near the background, at it, and anywhere in the action space."""
+    rng = np.random.default_rng(seed)
+    shape = envs.action_space.shape
+    near, anywhere = 30.0 + rng.normal(size=(steps, *shape)), rng.uniform(-250.0, 250.0, (steps, *shape))
+    return np.choose(rng.integers(0, 3, (steps, shape[0], 1)), [near, np.full((steps, *shape), 30.0), anywhere])
+
+
+def play(envs, actions, **how):
+    """(observation, rewards, terminations, truncations, infos) of a reset and of every step after it."""
+    observation, info = envs.reset(**how)
+    nothing = np.zeros(envs.num_envs)
+    return [(observation, nothing, nothing != 0, nothing != 0, info), *(envs.step(action) for action in actions)]
+
+
+def assert_same_array(one, other):
+    """Equal in type, shape and every bit."""
+    assert type(one) is type(other) is np.ndarray
+    assert (one.dtype, one.shape, one.tobytes()) == (other.dtype, other.shape, other.tobytes())
+
+
+def assert_same_play(one, other):
+    """All equal to the bit, but for rewards, which are sums in another order."""
+    assert len(one) == len(other)
+    for mine, theirs in zip(one, other, strict=True):
+        for a, b in ((mine[0], theirs[0]), (mine[4], theirs[4])):
+            assert a.keys() == b.keys()
+            for key in a:
+                assert_same_array(a[key], b[key])
+        np.testing.assert_allclose(mine[1], theirs[1], rtol=1e-12)
+        assert mine[1].dtype == theirs[1].dtype and mine[1].shape == theirs[1].shape
+        for k in (2, 3):
+            assert_same_array(mine[k], theirs[k])
+
+
+@pytest.mark.parametrize("num_envs", [1, 5])
+@pytest.mark.parametrize("name", IDS)
+def test_same_as_so_many_scalar_environments(name, num_envs):
+    """Over three whole episodes, of which the last two begin by themselves, it is gymnasium's SyncVectorEnv."""
+    mine, sync = make(name, num_envs), make(name, num_envs, "sync")
+    assert type(mine.unwrapped) is Pipe2DVectorEnv
+    assert mine.single_observation_space == sync.single_observation_space
+    assert mine.single_action_space == sync.single_action_space
+    assert mine.observation_space == sync.observation_space and mine.action_space == sync.action_space
+    assert mine.metadata["autoreset_mode"] == sync.metadata["autoreset_mode"] == AutoresetMode.NEXT_STEP
+    length = TINY.n_steps + sync.envs[0].unwrapped.task.lag
+    actions = actions_for(mine, 3 * (length + 1) + 2)
+    ours, theirs = play(mine, actions, seed=1), play(sync, actions, seed=1)
+    assert_same_play(ours, theirs)
+    ends = [i for i, step in enumerate(ours) if step[2].all()]
+    assert ends == [length, 2 * length + 1, 3 * length + 2] and sum(step[2].any() for step in ours) == 3
+    scored = [i for i, step in enumerate(ours) if step[1].all()]
+    assert len(scored) == 3 * TINY.scored_steps and max(step[1].max() for step in ours) == 0.0
+    assert num_envs == 1 or len({step[0]["voltages"][0, 0] for step in ours}) > TINY.n_steps     # other episodes
+
+
+@pytest.mark.parametrize("name", IDS)
+def test_later_resets_are_those_of_scalar_environments(name):
+    """Sequences of seeds of any kind, with gaps that are drawn, resets in mid-episode, and resets by no seed."""
+    mine, sync = make(name), make(name, mode="sync")
+    for k, seed in enumerate(([4, 0, 9], None, [None, 7, None], 2, None, (1, 1, None), np.int64(5))):
+        actions = actions_for(mine, 2 + 9 * (k % 2), seed=k)
+        theirs = int(seed) if isinstance(seed, np.int64) else seed
+        assert_same_play(play(mine, actions, seed=seed), play(sync, actions, seed=theirs))
+
+
+def test_seed_names_the_episode():
+    """Environment k plays episode s + k, or that of the list."""
+    envs = make()
+    for seed, episodes in ((4, [4, 5, 6]), ([8, 1, 8], [8, 1, 8])):
+        observation, _ = envs.reset(seed=seed)
+        for k, number in enumerate(episodes):
+            expected = simulate(TINY, number).voltages(1, TINY.currents[0], TINY)
+            np.testing.assert_allclose(observation["voltages"][k], expected, rtol=1e-12)
+            np.testing.assert_array_equal(observation["currents"][k], TINY.currents[0])
+
+
+def test_without_a_seed_training_episodes_are_drawn():
+    """Never anything but the first ``episodes`` ones, each of them at some time, environments apart from each other."""
+    envs = make(num_envs=4)
+    first = [simulate(TINY, number).voltages(1, TINY.currents[0], TINY) for number in range(3)]
+    drawn = []
+    for _ in range(12):
+        voltages = envs.reset()[0]["voltages"]
+        near = [[np.allclose(row, one, rtol=1e-12) for one in first] for row in voltages]
+        assert np.sum(near) == 4
+        drawn.append([row.index(True) for row in near])
+    assert {number for row in drawn for number in row} == {0, 1, 2}     # missed by chance once in 10⁸ runs
+    assert len(set(zip(*drawn, strict=True))) > 1
+
+
+@pytest.mark.parametrize("name", IDS)
+def test_observations_are_fresh_and_within_their_space(name):
+    """Whoever scribbles over what he was given changes nothing of what comes later."""
+    envs = make(name)
+    actions = actions_for(envs, 30)
+    untouched = play(envs, actions, seed=1)
+    given = [array for step in untouched[1:] for array in (*step[0].values(), *step[1:4], *step[4].values())]
+    given += [*untouched[0][0].values(), *untouched[0][4].values()]
+    assert not any(np.shares_memory(*pair) for pair in combinations(given, 2))
+    for step in untouched:
+        assert envs.observation_space.contains(step[0])
+        for k in range(3):
+            assert envs.single_observation_space.contains({key: array[k] for key, array in step[0].items()})
+    step = envs.reset(seed=1)
+    for action, expected in zip(actions, untouched[1:], strict=True):
+        for array in (*step[0].values(), *step[1:-1], *step[-1].values()):
+            array[...] = True
+        step = envs.step(action)
+        assert_same_play([step], [expected])
+
+
+def test_actions_are_left_alone():
+    """Neither changed nor kept: they may be overwritten as soon as the step is done."""
+    one, other = make(), make()
+    actions = actions_for(one, 7)
+    plain = play(one, actions, seed=1)
+    other.reset(seed=1)
+    buffer = np.empty_like(actions[0])
+    for action, expected in zip(actions, plain[1:], strict=True):
+        buffer[...] = action
+        rewards = other.step(buffer)[1]
+        np.testing.assert_array_equal(buffer, action)
+        np.testing.assert_array_equal(rewards, expected[1])
+        buffer[...] = 0.0
+
+
+@pytest.mark.parametrize("name", IDS)
+def test_made_again_from_its_specification(name):
+    """From its own EnvSpec, through JSON, from that of the scalar environment, or pickled: the same play."""
+    envs = make(name)
+    actions = actions_for(envs, 20)
+    played = play(envs, actions, seed=3)
+    scalar = gym.make(name, scenario=FIELDS, episodes=3).spec
+    copies = [gym.make_vec(envs.spec), gym.make_vec(EnvSpec.from_json(envs.spec.to_json())),
+              gym.make_vec(scalar, num_envs=3), pickle.loads(pickle.dumps(envs))]
+    for again in copies:
+        assert type(again.unwrapped) is Pipe2DVectorEnv and again.num_envs == 3
+        assert_same_play(play(again, actions, seed=3), played)
+
+
+def test_pickled_in_mid_episode_goes_on():
+    """A copy made between two steps, and the next episodes that it draws, are those of the original."""
+    envs = make()
+    actions = actions_for(envs, 24)
+    play(envs, actions[:3], seed=3)
+    copy = pickle.loads(pickle.dumps(envs))
+    assert_same_play([copy.step(action) for action in actions[3:]], [envs.step(action) for action in actions[3:]])
+
+
+# -- mistakes ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("change", "message"), [
+    ({"num_envs": 0}, "num_envs must be an integer of at least 1, got 0"), ({"num_envs": 2.0}, "num_envs must be"),
+    ({"episodes": 0}, "episodes must be"), ({"lag": 7}, "lag must be an integer of at least 0 and at most 6, got 7"),
+    ({"lag": "some"}, "lag must be 'all' or"), ({"assumed_mean_velocity": -1.0}, "assumed_mean_velocity must be"),
+    ({"assumed_mean_velocity": "fast"}, "assumed_mean_velocity must be a number in m/s, got 'fast'"),
+    ({"scenario": {"colour": 1}}, "scenario has no field 'colour'"), ({"scenario": {"frame": 0}}, "frame must be"),
+])
+def test_wrong_arguments_are_named(change, message):
+    """What the scalar environment refuses is refused here, and a number of environments that is none."""
+    with pytest.raises(ValueError, match=message):
+        make(**change)
+
+
+def test_what_estimators_believe_changes_nothing():
+    """A sensible ``assumed_mean_velocity`` is taken, and the play is the same."""
+    one, other = make(), make(assumed_mean_velocity=40.0)
+    actions = actions_for(one, 7)
+    assert_same_play(play(one, actions, seed=1), play(other, actions, seed=1))
+
+
+@pytest.mark.parametrize("seed", [[], [1, 2], [1, 2, 3, 4], np.arange(2)])
+def test_wrong_number_of_seeds_is_named(seed):
+    """One for each environment, or one integer for all; the episode that was being played goes on."""
+    envs = make()
+    actions = actions_for(envs, 3)
+    played = play(envs, actions, seed=1)
+    envs.reset(seed=1)
+    with pytest.raises(ValueError, match=rf"seed must be an integer or a list of 3, got {len(seed)} entries"):
+        envs.reset(seed=seed)
+    assert_same_play([envs.step(action) for action in actions], played[1:])
+
+
+def test_reset_of_some_is_refused():
+    """All begin and end together; other options are none of its business."""
+    envs = make()
+    actions = actions_for(envs, 2)
+    played = play(envs, actions, seed=1, options={})
+    envs.reset(seed=1, options={"other": 1})
+    with pytest.raises(ValueError, match="options must not hold 'reset_mask'"):
+        envs.reset(options={"reset_mask": np.array([True, False, True])})
+    assert_same_play([envs.step(action) for action in actions], played[1:])
+
+
+def test_step_needs_a_reset():
+    """Before the first one nothing is played."""
+    envs = make()
+    with pytest.raises(gym.error.ResetNeeded, match=r"call reset\(\) before step\(\)"):
+        envs.step(actions_for(envs, 1)[0])
+
+
+BAD = np.full((3, 1701), 30.0)
+BAD[1, 5] = np.nan
+LARGE = np.full((3, 1701), 30.0)
+LARGE[2, 7] = -250.1
+
+
+@pytest.mark.parametrize(("action", "message"), [
+    (np.zeros(1701), r"action must have shape \(3, 1701\), got \(1701,\)"),
+    (np.zeros((2, 1701)), r"action must have shape \(3, 1701\), got \(2, 1701\)"),
+    (np.zeros((1701, 3)), r"action must have shape \(3, 1701\), got \(1701, 3\)"),
+    (BAD, r"action must be finite in mol/m³, got 1 entries that are not, the first at index \(1, 5\)"),
+    (LARGE, "action must lie within ±250 mol/m³, got 250.1"), (-np.inf * np.ones((3, 1701)), "action must be finite"),
+    ("thirty", "action must be an array of numbers"), (None, "action must have shape"),
+])
+def test_wrong_actions_are_named_and_change_nothing(action, message):
+    """Refused with what came and what was expected; the step can then be taken with a better one."""
+    envs = make()
+    actions = actions_for(envs, 7)
+    played = play(envs, actions, seed=1)
+    steps = []
+    envs.reset(seed=1)
+    for good in actions:
+        with pytest.raises(ValueError, match=message):
+            envs.step(action)
+        steps.append(envs.step(good))
+    assert_same_play(steps, played[1:])
+
+
+@pytest.mark.parametrize("kind", ["float32", "list", "Fortran", "read-only"])
+def test_actions_of_any_kind_of_number_count(kind):
+    """A network's single precision, lists and any memory layout are the same estimates."""
+    envs = make()
+    estimates = np.random.default_rng(5).uniform(20.0, 40.0, (3, 1701)).astype(np.float32).astype(float)
+    given = {"float32": estimates.astype(np.float32), "list": estimates.tolist(),
+             "Fortran": np.asfortranarray(estimates), "read-only": estimates.copy()}[kind]
+    if kind == "read-only":
+        given.setflags(write=False)
+    plain, same = (play(envs, [action] * 7, seed=1) for action in (estimates, given))
+    assert_same_play(same, plain)
+    assert plain[-1][1].all()
+
+
+@pytest.mark.parametrize("seed", [1.5, True, [1.7, 2, 3], [True, False, True], np.array([1.5, 2.0, 3.0]), "ab"])
+def test_seeds_that_would_be_cast_are_refused(seed):
+    """As the scalar environment refuses them."""
+    with pytest.raises(ValueError, match="seed must be"):
+        make().reset(seed=seed)
+
+
+@pytest.mark.parametrize("change", [{"num_envs": 0}, {"episodes": 0}, {"lag": 99}, {"lag": "x"}])
+def test_wrong_arguments_are_named_before_anything_is_computed(change, monkeypatch):
+    """No mesh is built to find out that lag is wrong."""
+    monkeypatch.setattr(estimation, "outline", None)
+    with pytest.raises(ValueError, match=f"{next(iter(change))} must be"):
+        gym.make_vec("eitbench/Pipe2D-v0", **{"num_envs": 2, "scenario": {"mean_velocity": 44.0}} | change)
