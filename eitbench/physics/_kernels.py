@@ -21,7 +21,7 @@ def factorise(start, first_row, rows, panel, owner, first_entry, slot, values, f
     n_super = len(start) - 1
     head, after, done = np.full(n_super, -1), np.full(n_super, -1), np.zeros(n_super, np.int64)
     place, target = np.empty(len(owner), np.int64), np.empty(len(owner), np.int64)
-    column = np.empty(len(owner) + WIDTH)
+    column, second = np.empty(len(owner) + WIDTH), np.empty(len(owner) + WIDTH)
     for s in range(n_super):
         width, height, here = start[s + 1] - start[s], first_row[s + 1] - first_row[s], panel[s]
         for i in range(height):
@@ -39,74 +39,48 @@ def factorise(start, first_row, rows, panel, owner, first_entry, slot, values, f
                 target[a] = place[rows[rows_d + a]]
                 if rows[rows_d + a] < start[s + 1]:
                     end = a + 1
-            for b in range(begin, end):
+            width_d = start[d + 1] - start[d]
+            for b in range(begin, end, 2):             # two columns at a time: what is loaded serves both
+                twin = min(b + 1, end - 1)
                 for a in range(b, height_d, WIDTH):    # may read beyond the panel, into numbers that are not used
                     total = splat(0.0)
-                    for k in range(there, there + (start[d + 1] - start[d]) * height_d, height_d):
-                        total = subtract_product(total, load(factor, k + a), splat(factor[k + b]))
+                    other = splat(0.0)
+                    k = there
+                    for _ in range(width_d):
+                        rows_here = load(factor, k + a)
+                        total = subtract_product(total, rows_here, splat(factor[k + b]))
+                        other = subtract_product(other, rows_here, splat(factor[k + twin]))
+                        k += height_d
                     store(column, a, total)
+                    store(second, a, other)
+                to = here + target[b] * height
                 for a in range(b, height_d):
-                    factor[here + target[b] * height + target[a]] += column[a]
+                    factor[to + target[a]] += column[a]
+                if twin > b:
+                    to = here + target[twin] * height
+                    for a in range(twin, height_d):
+                        factor[to + target[a]] += second[a]
             _enlist(d, end, rows_d, height_d, rows, owner, head, after, done)
             d = following
         if s == n_super - 1:
             break
-        for j in range(here, here + width * height, height):
-            p = (j - here) // height
-            for k in range(here, j, height):
-                pivot = factor[k + p]
-                for i in range(p, height):
-                    factor[j + i] -= factor[k + i] * pivot
+        for p in range(width):
+            j = here + p * height
+            for i in range(p, height, WIDTH):
+                total = load(factor, j + i)
+                k = here
+                for _ in range(p):
+                    total = subtract_product(total, load(factor, k + i), splat(factor[k + p]))
+                    k += height
+                if i + WIDTH <= height:
+                    store(factor, j + i, total)
+                else:
+                    store(column, 0, total)
+                    for r in range(i, height):
+                        factor[j + r] = column[r - i]
             scale = 1.0 / math.sqrt(factor[j + p])
             for i in range(p, height):
                 factor[j + i] *= scale
-        _enlist(s, width, first_row[s], height, rows, owner, head, after, done)
-
-
-@njit(cache=True)
-def factorise_lanes(start, first_row, rows, panel, owner, first_entry, slot, values, factor):
-    """`factorise` for eight matrices side by side: their values lie next to each other, in and out."""
-    n_super = len(start) - 1
-    head, after, done = np.full(n_super, -1), np.full(n_super, -1), np.zeros(n_super, np.int64)
-    place, target = np.empty(len(owner), np.int64), np.empty(len(owner), np.int64)
-    for s in range(n_super):
-        width, height, here = start[s + 1] - start[s], first_row[s + 1] - first_row[s], panel[s]
-        for i in range(height):
-            place[rows[first_row[s] + i]] = i
-        for i in range(here, here + height * width):
-            store(factor, i * WIDTH, splat(0.0))
-        for e in range(first_entry[s], first_entry[s + 1]):
-            store(factor, slot[e] * WIDTH, load(values, e * WIDTH))
-        d = head[s]
-        while d >= 0:
-            following = after[d]
-            rows_d, height_d, there = first_row[d], first_row[d + 1] - first_row[d], panel[d]
-            begin = end = done[d]
-            for a in range(begin, height_d):
-                target[a] = place[rows[rows_d + a]]
-                if rows[rows_d + a] < start[s + 1]:
-                    end = a + 1
-            for b in range(begin, end):
-                for a in range(b, height_d):
-                    i = (here + target[b] * height + target[a]) * WIDTH
-                    total = load(factor, i)
-                    for k in range(there, there + (start[d + 1] - start[d]) * height_d, height_d):
-                        total = subtract_product(total, load(factor, (k + a) * WIDTH), load(factor, (k + b) * WIDTH))
-                    store(factor, i, total)
-            _enlist(d, end, rows_d, height_d, rows, owner, head, after, done)
-            d = following
-        if s == n_super - 1:
-            break
-        for j in range(here, here + width * height, height):
-            p = (j - here) // height
-            for k in range(here, j, height):
-                pivot = load(factor, (k + p) * WIDTH)
-                for i in range(p, height):
-                    to = (j + i) * WIDTH
-                    store(factor, to, subtract_product(load(factor, to), load(factor, (k + i) * WIDTH), pivot))
-            scale = inverse_root(load(factor, (j + p) * WIDTH))
-            for i in range(p, height):
-                store(factor, (j + i) * WIDTH, times(load(factor, (j + i) * WIDTH), scale))
         _enlist(s, width, first_row[s], height, rows, owner, head, after, done)
 
 
@@ -118,6 +92,71 @@ def _enlist(s, end, rows_s, height, rows, owner, head, after, done):
         next_one = owner[rows[rows_s + end]]
         after[s] = head[next_one]
         head[next_one] = s
+
+
+@njit(cache=True)
+def condense_lanes(start, first_row, rows, panel, children, first_entry, slot, values, front, stack):
+    """The Schur complements of eight matrices side by side, whose values lie next to each other; left in ``front``.
+
+    Multifrontal: the factor itself is not kept. What a supernode leaves to its ancestors waits on a stack until its
+    parent takes it, so that all work is done in memory that the caches hold.
+    """
+    n_super = len(start) - 1
+    place, target = np.empty(start[-1], np.int64), np.empty(start[-1], np.int64)
+    begins, waiting = np.zeros(n_super + 1, np.int64), np.zeros(n_super, np.int64)
+    depth = 0
+    for s in range(n_super):
+        width, height = start[s + 1] - start[s], first_row[s + 1] - first_row[s]
+        for i in range(height):
+            place[rows[first_row[s] + i]] = i
+        for j in range(height):
+            for i in range(j * height + j, (j + 1) * height):
+                store(front, i * WIDTH, splat(0.0))
+        for e in range(first_entry[s], first_entry[s + 1]):
+            store(front, (slot[e] - panel[s]) * WIDTH, load(values, e * WIDTH))
+        for _ in range(children[s]):
+            depth -= 1
+            d, at = waiting[depth], begins[depth]
+            left = first_row[d] + start[d + 1] - start[d]
+            size = first_row[d + 1] - left
+            for i in range(size):
+                target[i] = place[rows[left + i]]
+            for j in range(size):
+                for i in range(j, size):
+                    to = (target[j] * height + target[i]) * WIDTH
+                    store(front, to, subtract_product(load(front, to), splat(-1.0), load(stack, at * WIDTH)))
+                    at += 1
+        if s == n_super - 1:
+            break
+        for p in range(width):
+            j = p * height
+            for i in range(p, height):
+                total = load(front, (j + i) * WIDTH)
+                k = 0
+                for _ in range(p):
+                    total = subtract_product(total, load(front, (k + i) * WIDTH), load(front, (k + p) * WIDTH))
+                    k += height
+                store(front, (j + i) * WIDTH, total)
+            scale = inverse_root(load(front, (j + p) * WIDTH))
+            for i in range(p, height):
+                store(front, (j + i) * WIDTH, times(load(front, (j + i) * WIDTH), scale))
+        at = begins[depth]
+        waiting[depth] = s
+        for j in range(width, height):
+            for i in range(j, height, 2):                # two rows at a time: what is loaded serves both
+                twin = min(i + 1, height - 1)
+                total, other = load(front, (j * height + i) * WIDTH), load(front, (j * height + twin) * WIDTH)
+                k = 0
+                for _ in range(width):
+                    pivot = load(front, (k + j) * WIDTH)
+                    total = subtract_product(total, load(front, (k + i) * WIDTH), pivot)
+                    other = subtract_product(other, load(front, (k + twin) * WIDTH), pivot)
+                    k += height
+                store(stack, at * WIDTH, total)
+                store(stack, (at + 1) * WIDTH, other)    # if there is none it is overwritten
+                at += 2 if twin > i else 1
+        depth += 1
+        begins[depth] = at
 
 
 @njit(cache=True)
@@ -139,36 +178,40 @@ def substitute_back(start, first_row, rows, panel, factor, solution):
                 store(flat, (start[s] + p) * width + lane, times(total, scale))
 
 
-@njit(cache=True, fastmath={"contract"})
-def products_of_gradients(cells, weight, gradients, table):
-    """Add `Sensitivity.products` to ``table``, cell by cell; gradients (cells, vertices, dim, fields)."""
-    n_cells, n_vertices, dim, n_fields = gradients.shape
-    everywhere = np.empty((n_fields, n_fields))
-    shifted = np.empty((dim, n_fields))
+@njit(cache=True)
+def subtract_gradient_products(cells, weight, gradients, table):
+    """Subtract `Sensitivity`'s integrals from ``table``, cell by cell.
+
+    Gradients (cells, vertices, dim, fields) and table (nodes, fields, fields), with fields in multiples of eight.
+    """
+    n_cells, n_vertices, dim, width = gradients.shape
+    G, out = gradients.reshape(-1), table.reshape(-1)
+    size = dim * width                                           # numbers a vertex
+    shifted = np.empty(n_vertices * size)
     for c in range(n_cells):
-        G = gradients[c]
-        everywhere[:] = 0.0
-        for v in range(n_vertices):
-            for k in range(dim):
-                for m in range(n_fields):
-                    left = weight[c] * G[v, k, m]
-                    for l in range(n_fields):
-                        everywhere[m, l] += left * G[v, k, l]
-        for j in range(n_vertices):
-            node = cells[c, j]
-            for k in range(dim):
-                for m in range(n_fields):
-                    total = G[j, k, m]
-                    for v in range(n_vertices):
-                        total += G[v, k, m]
-                    shifted[k, m] = total
-            for m in range(n_fields):
-                for l in range(n_fields):
-                    table[node, m, l] += everywhere[m, l]
-                for k in range(dim):
-                    first, second = weight[c] * shifted[k, m], weight[c] * G[j, k, m]
-                    for l in range(n_fields):
-                        table[node, m, l] += first * shifted[k, l] + second * G[j, k, l]
+        first = c * n_vertices * size
+        for i in range(0, size, WIDTH):
+            total = splat(0.0)
+            for v in range(n_vertices):
+                total = subtract_product(total, splat(-1.0), load(G, first + v * size + i))
+            for j in range(n_vertices):
+                store(shifted, j * size + i, subtract_product(total, splat(-1.0), load(G, first + j * size + i)))
+        for m in range(width):
+            for l in range(0, width, WIDTH):
+                everywhere = splat(0.0)
+                i = first
+                for _ in range(n_vertices * dim):
+                    everywhere = subtract_product(everywhere, splat(weight[c] * G[i + m]), load(G, i + l))
+                    i += width
+                for j in range(n_vertices):
+                    to = (cells[c, j] * width + m) * width + l
+                    total = subtract_product(load(out, to), splat(-1.0), everywhere)
+                    i = j * size
+                    for _ in range(dim):
+                        total = subtract_product(total, splat(weight[c] * shifted[i + m]), load(shifted, i + l))
+                        total = subtract_product(total, splat(weight[c] * G[first + i + m]), load(G, first + i + l))
+                        i += width
+                    store(out, to, total)
 
 
 @njit(cache=True)

@@ -112,7 +112,9 @@ class CompleteElectrodeModel:
         """`voltages` and `jacobian` together, from one factorisation."""
         currents = self._checked_currents(currents)
         resistance, table = self.transfer_resistance_derivatives(conductivity)
-        return currents @ resistance, np.ascontiguousarray(np.moveaxis(table @ currents.T, (2, 1), (0, 1)))
+        # (L, L·n_nodes): then one product gives every Jacobian in its final place
+        by_node = np.ascontiguousarray(table.reshape(len(table), -1).T).reshape(self.n_electrodes, -1)
+        return currents @ resistance, (currents @ by_node).reshape(*currents.shape, -1)
 
     def transfer_resistance_derivatives(self, conductivity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """𝓡 and its derivatives by the nodal conductivity, from one factorisation; they serve every injection.
@@ -132,7 +134,7 @@ class CompleteElectrodeModel:
         """
         columns = self._system.port_columns(self._assemble(self._checked_conductivity(conductivity)))
         fields, grounded = np.split(columns, [-self._system.n_ports])
-        return self._centred(grounded), -self._sensitivity.products(fields @ self._centre.T)
+        return self._centred(grounded), self._sensitivity(fields @ self._centre.T)
 
     # -- the linear system ------------------------------------------------------------------------------------------
 

@@ -80,9 +80,12 @@ class CompiledCondensation:
     def __init__(self, pattern: sp.csc_array, n_ports: int) -> None:
         self.n, self.n_ports = pattern.shape[0], n_ports
         place = np.append(_minimum_degree(pattern[:-n_ports, :-n_ports]), np.arange(self.n - n_ports, self.n))
+        filled = _filled(_permuted(pattern, place))
+        rank = _postorder(_parents(filled), n_ports)
+        place, filled = rank[place], _permuted(filled, rank)
         permuted = _permuted(pattern, place)
         self._place = place
-        self._symbolic = _supernodes(permuted, n_ports)
+        self._symbolic = _supernodes(filled, n_ports)
         start, first_row, rows, panel, owner = self._symbolic
         lower = sp.tril(permuted, format="coo")
         key = np.repeat(np.arange(len(panel) - 1), np.diff(first_row)) * self.n + rows
@@ -94,6 +97,7 @@ class CompiledCondensation:
         self._first_entry = np.searchsorted(self._slot, panel)
         order = np.argsort(place)
         self.rows, self.columns = order[lower.row[by_slot]], order[lower.col[by_slot]]
+        self._children, self._front_size, self._stack_size = _multifrontal_sizes(*self._symbolic)
 
     def port_inverse(self, values: np.ndarray) -> np.ndarray:
         """The ports' block of K⁻¹: (m, m) for values (k,), (b, m, m) for values (k, b); b is padded to eights."""
@@ -101,13 +105,16 @@ class CompiledCondensation:
             return np.linalg.inv(self._schur(self._factorise(values)))
         b = values.shape[1]
         result = np.empty((b, self.n_ports, self.n_ports))
-        factor = scratch(self._symbolic[3][-1] * self.batch)
+        start, first_row, rows, panel, _ = self._symbolic
+        memory = scratch((self._front_size + self._stack_size) * self.batch)
+        front, stack = np.split(memory, [self._front_size * self.batch])
         for first in range(0, b, self.batch):
             block = values[:, first:first + self.batch]
-            eight = np.concatenate([block, np.repeat(block[:, -1:], self.batch - block.shape[1], axis=1)], axis=1)
-            self._kernels.factorise_lanes(*self._symbolic, self._first_entry, self._slot, eight.ravel(),
-                                          factor)
-            schur = self._schur(factor.reshape(-1, self.batch).T)
+            padding = np.repeat(block[:, -1:], self.batch - block.shape[1], axis=1)
+            eight = np.ascontiguousarray(np.concatenate([block, padding], axis=1) if padding.size else block)
+            self._kernels.condense_lanes(start, first_row, rows, panel, self._children, self._first_entry, self._slot,
+                                         eight.ravel(), front, stack)
+            schur = self._symmetric(front[:self.n_ports**2 * self.batch].reshape(-1, self.batch).T)
             result[first:first + self.batch] = np.linalg.inv(schur[:block.shape[1]])
         return result
 
@@ -126,9 +133,12 @@ class CompiledCondensation:
         return factor
 
     def _schur(self, factor: np.ndarray) -> np.ndarray:
-        """(…, m, m), from the lower triangle in the last panel."""
-        m, panel = self.n_ports, self._symbolic[3]
-        block = factor[..., panel[-2]:panel[-1]].reshape(*factor.shape[:-1], m, m)
+        panel = self._symbolic[3]
+        return self._symmetric(factor[panel[-2]:panel[-1]])
+
+    def _symmetric(self, columns: np.ndarray) -> np.ndarray:
+        """(..., m, m) from (..., m·m) with the lower triangle by columns."""
+        block = columns.reshape(*columns.shape[:-1], self.n_ports, self.n_ports)
         return np.triu(block) + np.swapaxes(np.triu(block, 1), -1, -2)
 
     @property
@@ -137,30 +147,72 @@ class CompiledCondensation:
         return _kernels
 
 
-def _supernodes(pattern: sp.csc_array, n_last: int) -> tuple[np.ndarray, ...]:
-    """start, first_row, rows, panel, owner as in `_kernels`; the ``n_last`` last columns are one supernode.
-
-    The pattern of the factor comes from SuperLU, of a matrix on which nothing cancels.
-    """
-    n = pattern.shape[0]
+def _filled(pattern: sp.csc_array) -> sp.csc_array:
+    """The pattern of the Cholesky factor, as SuperLU finds it for a matrix on which nothing cancels."""
     factors = splu(sp.csc_matrix(_diagonally_dominant(pattern)), permc_spec="NATURAL", diag_pivot_thresh=0.0,
                    options={"SymmetricMode": True})
-    assert (factors.perm_c == np.arange(n)).all(), "an order by minimum degree is a postorder, and stays as it is"
-    L = factors.L.tocsc()
-    L.sort_indices()
-    count = np.diff(L.indptr)
-    parent = np.where(count > 1, L.indices[np.minimum(L.indptr[:-1] + 1, L.nnz - 1)], -1)
+    back = np.argsort(factors.perm_c)             # SuperLU may have postordered the elimination tree
+    lower = factors.L.tocoo()
+    i, j = back[lower.row], back[lower.col]
+    filled = sp.csc_array((np.ones(lower.nnz), (np.maximum(i, j), np.minimum(i, j))), shape=pattern.shape)
+    filled.sort_indices()
+    return filled
+
+
+def _parents(filled: sp.csc_array) -> np.ndarray:
+    """The elimination tree: the first row below the diagonal of each column, or −1."""
+    last = filled.indptr[1:] - filled.indptr[:-1] == 1
+    return np.where(last, -1, filled.indices[np.minimum(filled.indptr[:-1] + 1, filled.nnz - 1)])
+
+
+def _postorder(parents: np.ndarray, n_last: int) -> np.ndarray:
+    """New position of each column, such that every subtree is consecutive; the ``n_last`` last columns stay."""
+    n = len(parents) - n_last
+    parent = [p if 0 <= p < n else n for p in parents[:n].tolist()]
+    size = [1] * n + [0]
+    for j in range(n):
+        size[parent[j]] += size[j]
+    rank, begin = list(range(len(parents))), [0] * (n + 1)
+    for j in reversed(range(n)):                  # a column's place is the end of its subtree's
+        begin[j] = begin[parent[j]]
+        begin[parent[j]] += size[j]
+        rank[j] = begin[j] + size[j] - 1
+    return np.array(rank)
+
+
+def _supernodes(filled: sp.csc_array, n_last: int) -> tuple[np.ndarray, ...]:
+    """start, first_row, rows, panel, owner as in `_kernels`; the ``n_last`` last columns are one supernode."""
+    n, count = filled.shape[0], np.diff(filled.indptr)
     begins = np.ones(n, dtype=bool)
-    begins[1:] = (parent[:-1] != np.arange(1, n)) | (count[:-1] != count[1:] + 1)
+    begins[1:] = (_parents(filled)[:-1] != np.arange(1, n)) | (count[:-1] != count[1:] + 1)
     begins[n - n_last:] = np.arange(n_last) == 0
     start = np.append(np.flatnonzero(begins), n).astype(np.int64)
     width = np.diff(start)
     height = np.append(count[start[:-2]], n_last).astype(np.int64)
     first_row = np.append(0, np.cumsum(height))
     within = np.arange(first_row[-2]) - np.repeat(first_row[:-2], height[:-1])
-    rows = np.append(L.indices[np.repeat(L.indptr[start[:-2]], height[:-1]) + within], np.arange(n - n_last, n))
+    below = filled.indices[np.repeat(filled.indptr[start[:-2]], height[:-1]) + within]
+    rows = np.append(below, np.arange(n - n_last, n)).astype(np.int64)
     panel = np.append(0, np.cumsum(height * width))
-    return start, first_row, rows.astype(np.int64), panel, np.repeat(np.arange(len(width)), width)
+    return start, first_row, rows, panel, np.repeat(np.arange(len(width)), width)
+
+
+def _multifrontal_sizes(start: np.ndarray, first_row: np.ndarray, rows: np.ndarray, _panel: np.ndarray,
+                        owner: np.ndarray) -> tuple[np.ndarray, int, int]:
+    """Children of each supernode in the elimination tree, entries of the largest front, and of the fullest stack."""
+    width, height = np.diff(start), np.diff(first_row)
+    parent = owner[rows[first_row[:-2] + width[:-1]]]               # the owner of the first row below
+    children = np.bincount(parent, minlength=len(width))
+    left = (height - width) * (height - width + 1) // 2
+    waiting: list[int] = []
+    fullest = total = 0
+    for own, count in zip(left.tolist(), children.tolist(), strict=True):
+        total -= sum(waiting[len(waiting) - count:])
+        del waiting[len(waiting) - count:]
+        waiting.append(own)
+        total += own
+        fullest = max(fullest, total)
+    return children, int(height.max()**2), fullest + 1
 
 
 def _minimum_degree(pattern: sp.csc_array) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""∫ φ_j ∇w_m·∇w_l for all nodes j and all pairs of fields: what a conductivity at node j changes in every voltage."""
+"""−∫ φ_j ∇w_m·∇w_l for all nodes j and all pairs of fields: what a conductivity at node j changes in every voltage."""
 
 from __future__ import annotations
 
@@ -37,18 +37,22 @@ class Sensitivity:
             for phi, dofs in zip(at_corners.basis, at_corners.element_dofs, strict=True))
         self._gradient = gradient.tocsr()
 
-    def products(self, fields: np.ndarray) -> np.ndarray:
-        """(n_nodes, k, k) for potentials (n_potential, k)."""
+    def __call__(self, fields: np.ndarray) -> np.ndarray:
+        """−∫ φ_j ∇w_m·∇w_l as (n_nodes, k, k), for potentials w (n_potential, k)."""
         n_cells, n_vertices = self._cells.shape
-        k = fields.shape[1]
-        gradients = (self._gradient @ fields).reshape(n_cells, n_vertices, n_vertices - 1, k)
-        table = np.zeros((self._cells.max() + 1, k, k))
+        k, n_nodes = fields.shape[1], self._cells.max() + 1
         if self.compiled:
-            from eitbench.physics._kernels import products_of_gradients
-            products_of_gradients(self._cells, self._weight, gradients, table)
-            return table
+            from eitbench.physics._kernels import subtract_gradient_products
+            width = -(-k // 8) * 8
+            padded = np.pad(fields, ((0, 0), (0, width - k)))
+            gradients = (self._gradient @ padded).reshape(n_cells, n_vertices, n_vertices - 1, width)
+            table = np.zeros((n_nodes, width, width))
+            subtract_gradient_products(self._cells, self._weight, gradients, table)
+            return table[:, :k, :k]
+        gradients = (self._gradient @ fields).reshape(n_cells, n_vertices, n_vertices - 1, k)
         shifted = gradients + gradients.sum(axis=1, keepdims=True)
         own = np.swapaxes(gradients, 2, 3) @ gradients
         local = np.swapaxes(shifted, 2, 3) @ shifted + own + own.sum(axis=1, keepdims=True)
-        gather = sp.csr_array((np.repeat(self._weight, n_vertices), (self._cells.ravel(), np.arange(self._cells.size))))
-        return (gather @ local.reshape(-1, k * k)).reshape(table.shape)
+        corner = np.arange(self._cells.size)
+        gather = sp.csr_array((np.repeat(-self._weight, n_vertices), (self._cells.ravel(), corner)))
+        return (gather @ local.reshape(-1, k * k)).reshape(n_nodes, k, k)
