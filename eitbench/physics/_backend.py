@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from importlib.metadata import version
 from importlib.util import find_spec
@@ -27,15 +28,19 @@ def backend_version() -> str:
     return f"numba {version('numba')}" if use_compiled("auto") else "scipy"
 
 
+def aligned_zeros(shape: tuple[int, ...]) -> np.ndarray:
+    """Fresh doubles that begin a cache line: vectors across two lines cost up to twice as much."""
+    size = math.prod(shape)
+    memory = np.zeros(size + 8)
+    skip = -(memory.ctypes.data // 8) % 8
+    return memory[skip:skip + size].reshape(shape)
+
+
 _memory = threading.local()
 
 
 def scratch(size: int) -> np.ndarray:
-    """(size,) doubles of this thread, good until the next call, kept because fresh memory is slow to touch.
-
-    They begin a cache line: vectors across two lines cost up to twice as much.
-    """
-    if getattr(_memory, "doubles", np.empty(0)).size < size + 8:
-        _memory.doubles = np.zeros(size + 8)
-    skip = -(_memory.doubles.ctypes.data // 8) % 8
-    return _memory.doubles[skip:skip + size]
+    """(size,) aligned doubles of this thread, good until the next call; kept, since fresh memory is slow to touch."""
+    if getattr(_memory, "doubles", np.empty(0)).size < size:
+        _memory.doubles = aligned_zeros((size,))
+    return _memory.doubles[:size]

@@ -179,39 +179,55 @@ def substitute_back(start, first_row, rows, panel, factor, solution):
 
 
 @njit(cache=True)
-def subtract_gradient_products(cells, weight, gradients, table):
+def subtract_gradient_products(cells, unknowns, gradient, fields, table, G):
     """Subtract `Sensitivity`'s integrals from ``table``, cell by cell.
 
-    Gradients (cells, vertices, dim, fields) and table (nodes, fields, fields), with fields in multiples of eight.
+    Weighted gradients by a cell's unknowns (cells, vertices·dim, unknowns a cell); fields (unknowns, width) and table
+    (nodes, width, width), with width in multiples of eight; ``G`` is room for twice (vertices, dim, width).
     """
-    n_cells, n_vertices, dim, width = gradients.shape
-    G, out = gradients.reshape(-1), table.reshape(-1)
+    n_cells, n_vertices = cells.shape
+    n_rows, n_local = gradient.shape[1:]
+    dim, width = n_rows // n_vertices, fields.shape[1]
+    u, out = fields.reshape(-1), table.reshape(-1)
     size = dim * width                                           # numbers a vertex
-    shifted = np.empty(n_vertices * size)
+    shifted = n_vertices * size                                  # where S + G_j begins, behind the G_j
     for c in range(n_cells):
-        first = c * n_vertices * size
+        for r in range(n_rows):
+            for i in range(0, width, WIDTH):
+                total = splat(0.0)
+                for k in range(n_local):
+                    total = subtract_product(total, splat(-gradient[c, r, k]), load(u, unknowns[c, k] * width + i))
+                store(G, r * width + i, total)
         for i in range(0, size, WIDTH):
             total = splat(0.0)
             for v in range(n_vertices):
-                total = subtract_product(total, splat(-1.0), load(G, first + v * size + i))
+                total = subtract_product(total, splat(-1.0), load(G, v * size + i))
             for j in range(n_vertices):
-                store(shifted, j * size + i, subtract_product(total, splat(-1.0), load(G, first + j * size + i)))
+                to = j * size + i
+                store(G, shifted + to, subtract_product(total, splat(-1.0), load(G, to)))
         for m in range(width):
-            for l in range(0, width, WIDTH):
-                everywhere = splat(0.0)
-                i = first
-                for _ in range(n_vertices * dim):
-                    everywhere = subtract_product(everywhere, splat(weight[c] * G[i + m]), load(G, i + l))
+            for l in range(0, width, 2 * WIDTH):                 # sixteen at a time, if there are so many
+                twin = min(l + WIDTH, width - WIDTH)
+                everywhere, everywhere_twin = splat(0.0), splat(0.0)
+                i = 0
+                for _ in range(n_rows):
+                    left = splat(G[i + m])
+                    everywhere = subtract_product(everywhere, left, load(G, i + l))
+                    everywhere_twin = subtract_product(everywhere_twin, left, load(G, i + twin))
                     i += width
                 for j in range(n_vertices):
-                    to = (cells[c, j] * width + m) * width + l
-                    total = subtract_product(load(out, to), splat(-1.0), everywhere)
+                    to = (cells[c, j] * width + m) * width
+                    total = subtract_product(load(out, to + l), splat(-1.0), everywhere)
+                    other = subtract_product(load(out, to + twin), splat(-1.0), everywhere_twin)
                     i = j * size
                     for _ in range(dim):
-                        total = subtract_product(total, splat(weight[c] * shifted[i + m]), load(shifted, i + l))
-                        total = subtract_product(total, splat(weight[c] * G[first + i + m]), load(G, first + i + l))
+                        for part in (i, shifted + i):
+                            left = splat(G[part + m])
+                            total = subtract_product(total, left, load(G, part + l))
+                            other = subtract_product(other, left, load(G, part + twin))
                         i += width
-                    store(out, to, total)
+                    store(out, to + l, total)
+                    store(out, to + twin, other)
 
 
 @njit(cache=True)

@@ -6,6 +6,8 @@ import numpy as np
 import scipy.sparse as sp
 import skfem
 
+from eitbench.physics._backend import aligned_zeros, scratch
+
 
 class Sensitivity:
     """The products of the gradients of several potentials, tested with the mesh's hat functions; exact.
@@ -27,15 +29,13 @@ class Sensitivity:
         dim, n_cells = basis.mesh.dim(), basis.mesh.nelements
         self.compiled = compiled
         self._cells = np.ascontiguousarray(basis.mesh.t.T.astype(np.int64))
-        self._weight = basis.dx.sum(axis=1) / ((dim + 1) * (dim + 2) * (dim + 3))
+        self._unknowns = np.ascontiguousarray(basis.element_dofs.T.astype(np.int64))
         corners = np.hstack([np.zeros((dim, 1)), np.eye(dim)])
         at_corners = skfem.Basis(basis.mesh, basis.elem, quadrature=(corners, np.full(dim + 1, 1.0 / (dim + 1))))
-        row = np.arange(n_cells * (dim + 1) * dim)
-        gradient = sum(
-            sp.csr_array((phi[0].grad.transpose(1, 2, 0).ravel(), (row, np.repeat(dofs, (dim + 1) * dim))),
-                         shape=(len(row), basis.N))
-            for phi, dofs in zip(at_corners.basis, at_corners.element_dofs, strict=True))
-        self._gradient = gradient.tocsr()
+        gradient = np.stack([phi[0].grad.transpose(1, 2, 0) for phi in at_corners.basis], axis=-1)
+        weight = basis.dx.sum(axis=1) / ((dim + 1) * (dim + 2) * (dim + 3))
+        # (cells, vertices·dim, unknowns a cell), times √w
+        self._gradient = np.sqrt(weight)[:, None, None] * gradient.reshape(n_cells, -1, gradient.shape[-1])
 
     def __call__(self, fields: np.ndarray) -> np.ndarray:
         """−∫ φ_j ∇w_m·∇w_l as (n_nodes, k, k), for potentials w (n_potential, k)."""
@@ -44,15 +44,15 @@ class Sensitivity:
         if self.compiled:
             from eitbench.physics._kernels import subtract_gradient_products
             width = -(-k // 8) * 8
-            padded = np.pad(fields, ((0, 0), (0, width - k)))
-            gradients = (self._gradient @ padded).reshape(n_cells, n_vertices, n_vertices - 1, width)
-            table = np.zeros((n_nodes, width, width))
-            subtract_gradient_products(self._cells, self._weight, gradients, table)
+            padded, table = aligned_zeros((len(fields), width)), aligned_zeros((n_nodes, width, width))
+            padded[:, :k] = fields
+            room = scratch(2 * self._gradient.shape[1] * width)
+            subtract_gradient_products(self._cells, self._unknowns, self._gradient, padded, table, room)
             return table[:, :k, :k]
-        gradients = (self._gradient @ fields).reshape(n_cells, n_vertices, n_vertices - 1, k)
+        gradients = (self._gradient @ fields[self._unknowns]).reshape(n_cells, n_vertices, n_vertices - 1, k)
         shifted = gradients + gradients.sum(axis=1, keepdims=True)
         own = np.swapaxes(gradients, 2, 3) @ gradients
         local = np.swapaxes(shifted, 2, 3) @ shifted + own + own.sum(axis=1, keepdims=True)
         corner = np.arange(self._cells.size)
-        gather = sp.csr_array((np.repeat(-self._weight, n_vertices), (self._cells.ravel(), corner)))
+        gather = sp.csr_array((np.full(self._cells.size, -1.0), (self._cells.ravel(), corner)))
         return (gather @ local.reshape(-1, k * k)).reshape(n_nodes, k, k)

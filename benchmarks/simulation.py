@@ -1,0 +1,66 @@
+"""Speed of simulating new episodes: `python benchmarks/run.py simulation`."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import scipy.sparse as sp
+from common import Row, compare, quantity
+from solvers import refactorisations
+
+from eitbench.bank import recording_bytes
+from eitbench.episodes import simulate, simulate_together, truth_discretisation
+from eitbench.physics.cem import CompleteElectrodeModel
+from eitbench.physics.flow import PlaneChannelFlow
+from eitbench.physics.transport import ConvectionDiffusion
+from eitbench.scenarios import Pipe2D
+
+SCENARIO = Pipe2D()
+BANK = 32
+
+
+def rows() -> Iterator[Row]:
+    transport, observation = truth_discretisation(SCENARIO)
+    cem = observation.cem
+    n, n_steps = transport.mesh.n_nodes, SCENARIO.n_steps
+    plain = CompleteElectrodeModel(cem.mesh, cem.electrodes, cem.contact_impedance, backend="scipy")
+    entries = plain._assemble(np.full(cem.mesh.n_nodes, 0.3)), (plain._system.rows, plain._system.columns)
+    peers, _ = refactorisations(sp.csc_matrix(entries, shape=(plain.n_unknowns, plain.n_unknowns)))
+    flow = ConvectionDiffusion(transport.mesh, PlaneChannelFlow(SCENARIO.mean_velocity, SCENARIO.half_width),
+                               SCENARIO.diffusivity, transport.time_step, substeps=transport.substeps,
+                               inlet=transport.inlet, backend="scipy")
+    right = np.ones(n - len(transport.inlet))
+    times = compare({**peers, "solve": lambda: flow._solver._solve(right)}, 5)
+    solve = times.pop("solve")
+    name = min(times, key=lambda peer: times[peer])
+    n_solves = (n_steps + SCENARIO.lead_in) * SCENARIO.truth_steps * (transport.substeps + 1)
+    bare = n_steps * times[name] + n_solves * solve
+    against = (f"{n_steps} bare refactorisations by {name}, {cem.n_unknowns:,} unknowns, {quantity(times[name], 's')} "
+               f"each, and {n_solves:,} bare solves by scipy's splu, {n:,} nodes, {quantity(solve, 's')} each")
+    alone = compare({"": lambda: simulate(SCENARIO, 0, cache=False, progress=False)}, 3)[""]
+    yield Row("simulation", f"a new episode, T = {n_steps}", against, alone, bare, "≤ 1.5×",
+              "bytes: the flow's factors are read at every sub-step")
+    begin = time.perf_counter()
+    for _ in simulate_together(SCENARIO, range(8), progress=False):
+        pass
+    yield Row("simulation", "each of eight new episodes simulated together", "one alone",
+              (time.perf_counter() - begin) / 8, alone, "", "flops and bytes; eight flows share what is read")
+    one, two = (bank(jobs) for jobs in (1, 2))
+    yield Row("simulation", f"`eitbench bank`, {BANK} episodes, two processes", "one process", two, one,
+              "≥ 1.8× faster", "both cores; each process imports, and builds the truth's meshes",
+              f"{quantity(two / BANK, 's')} and {recording_bytes(SCENARIO) / 1e6:.2f} MB an episode")
+
+
+def bank(jobs: int) -> float:
+    """Seconds that the command takes for a bank in an empty cache, its start included."""
+    with tempfile.TemporaryDirectory() as empty:
+        begin = time.perf_counter()
+        command = [sys.executable, "-m", "eitbench.cli", "bank", "--seeds", f"train:0-{BANK - 1}", "-j", str(jobs)]
+        subprocess.run(command, env=os.environ | {"EITBENCH_CACHE": empty}, check=True, capture_output=True)
+        return time.perf_counter() - begin
