@@ -96,8 +96,7 @@ class Pipe2DVectorEnv(EstimationVectorEnv):
 def _assumptions(mean_velocity: float | None) -> dict[str, float]:
     if mean_velocity is None:
         return {}
-    return {"mean_velocity": _check.number("assumed_mean_velocity", mean_velocity, low=0.0, open_low=True,
-                                           units="m/s")}
+    return {"mean_velocity": _check.number("assumed_mean_velocity", mean_velocity, low=0.0, units="m/s")}
 
 
 def with_fields(changes: dict[str, Any] | None) -> Pipe2D:
