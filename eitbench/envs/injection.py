@@ -13,7 +13,7 @@ from gymnasium import spaces
 from eitbench import _check
 from eitbench.envs.estimation import Observation
 from eitbench.envs.lockstep import LockstepVectorEnv
-from eitbench.envs.operator import GRID, ReducedOperator, electrode_pairs, project
+from eitbench.envs.operator import GRID, ReducedOperator, electrode_pairs, pair_currents, project
 from eitbench.recordings import cycle_voltages, outline, recording
 from eitbench.task import Task, make_task
 
@@ -39,6 +39,7 @@ class InjectionCore:
         self.scenario, self.estimator = scenario, estimator
         self.pairs = electrode_pairs(scenario.currents.shape[1])
         self.amplitude = float(np.abs(scenario.currents).max())
+        self._every_current = pair_currents(scenario)
         self.first = len(scenario.currents) if estimator == "reduced" else 0
         """Injections of the scenario's cycle before the agent's first."""
         self.length = scenario.n_steps - self.first
@@ -76,18 +77,16 @@ class InjectionCore:
 
     def act(self, actions: np.ndarray) -> np.ndarray:
         """Inject pairs (B,) and return the rewards (B,)."""
-        pairs = self.pairs[actions]
-        source, sink = pairs.T
+        source, sink = self.pairs[actions].T
         resistance, every = self._resistance[self._t], self._every
         # 𝓡 is symmetric: its rows are its columns, and they lie together
         clean = self.amplitude * (resistance[every, source] - resistance[every, sink])
         self._voltages = clean + self.scenario.noise.std(clean) * self._noise[self._t]
-        self._currents = np.zeros_like(clean)
-        self._currents[every, source], self._currents[every, sink] = self.amplitude, -self.amplitude
+        self._currents = self._every_current[actions]
         self._t += 1
         if self.estimator == "none":
             return np.zeros(len(every))
-        self._innovations = self._operator.assimilate(self._voltages, pairs, self.amplitude)
+        self._innovations = self._operator.assimilate(self._voltages, actions)
         if self._t <= self.scenario.warm_up:
             return np.zeros(len(every))
         k = self._t - 1

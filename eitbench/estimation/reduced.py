@@ -73,7 +73,7 @@ class ReducedFilter:
     ----------
     model : ReducedModel
     mean, covariance : (B, r), (B, r, r)
-        Of the present states.
+        Of the present states; the filter works in the precision that these and the model have.
     """
 
     def __init__(self, model: ReducedModel, mean: np.ndarray, covariance: np.ndarray) -> None:
