@@ -61,7 +61,7 @@ class Settled:
 
 
 def rows() -> Iterator[Row]:
-    import gains                                         # which takes its problem from here
+    import gains  # which takes its problem from here
     for cells in CELLS:
         settled = settle(problem(cells))
         yield against_textbook(settled)

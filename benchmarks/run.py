@@ -18,8 +18,9 @@ from common import COLUMNS, Row, ceilings, in_fresh_process, machine, quantity
 from eitbench._files import write_atomically
 
 HERE = Path(__file__).parent
-SECTIONS = {"forward": "Complete electrode model", "filtering": "Kalman filter and smoother",
-            "stepping": "Environments", "simulation": "Simulation of new episodes", "scaling": "Growth with size"}
+SECTIONS = {"forward": "Complete electrode model", "kernels": "What the compiled kernels buy",
+            "filtering": "Kalman filter and smoother", "stepping": "Environments",
+            "simulation": "Simulation of new episodes", "scaling": "Growth with size"}
 """name of a module here, with `rows()` or `curves()` → heading"""
 
 INTRODUCTION = """# Speed

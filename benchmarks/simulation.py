@@ -22,7 +22,7 @@ from eitbench.physics.transport import ConvectionDiffusion
 from eitbench.scenarios import Pipe2D
 
 SCENARIO = Pipe2D()
-BANK = 32
+BANK = 256
 
 
 def rows() -> Iterator[Row]:

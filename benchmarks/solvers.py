@@ -88,3 +88,16 @@ def entry_by_entry(K: sp.csc_matrix, n_ports: int, integrate: Callable[[np.ndarr
         forward[n - n_ports + l] = adjoint[n - n_ports + m] = 1.0
         entries[m, l] = entries[l, m] = -integrate(factors.solve(forward), factors.solve(adjoint))
     return np.stack([entries[m, l] for m, l in np.ndindex(n_ports, n_ports)], axis=1).reshape(-1, n_ports, n_ports)
+
+
+def pair_by_pair(K: sp.csc_matrix, currents: np.ndarray, integrate: Callable[[np.ndarray, np.ndarray], np.ndarray]
+                 ) -> np.ndarray:
+    """Derivatives of the ports' voltages, (patterns, m, n_nodes), for currents (patterns, m): two solutions a row."""
+    n, n_ports = K.shape[0], currents.shape[1]
+    factors = splu(K, permc_spec="MMD_AT_PLUS_A", **SYMMETRIC)
+    rows = []
+    for current, m in itertools.product(currents, range(n_ports)):
+        forward, adjoint = np.zeros((2, n))
+        forward[n - n_ports:], adjoint[n - n_ports + m] = current, 1.0
+        rows.append(-integrate(factors.solve(forward), factors.solve(adjoint)))
+    return np.array(rows).reshape(*currents.shape, -1)

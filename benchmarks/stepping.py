@@ -135,7 +135,7 @@ def growth(kind: str, count: int) -> tuple[float, float]:
 
     def play() -> None:
         made.append(gym.make_vec(name, num_envs=count, vectorization_mode="vector_entry_point", **kwargs))
-        made[0].reset(seed=0)
+        made[0].reset(seed=[k % EPISODES for k in range(count)])
         made[0].step(choose())
 
     memory = peak_growth(play)

@@ -8,6 +8,7 @@ interpolation to the truth's nodes, M its mass matrix, and everything counted fr
 from __future__ import annotations
 
 import io
+import os
 import zlib
 from functools import lru_cache
 from pathlib import Path
@@ -153,12 +154,10 @@ _sound: dict[Path, tuple[int, int]] = {}
 
 
 def _load(scenario: Scenario, seed: int) -> np.ndarray | None:
-    path = recording_path(scenario, seed)
-    kind = recording_type(outline(scenario).mass.shape[0], scenario.currents.shape[1])
-    header = _header(kind, scenario.n_steps)
+    path, (kind, header, length) = recording_path(scenario, seed), _layout(scenario)
     try:
-        status = path.stat()
-        entries = np.asarray(np.memmap(path, kind, "r", len(header), (scenario.n_steps,)))
+        status = os.stat(path)
+        entries = np.asarray(np.memmap(path, kind, "r", len(header), (length,)))
         if _sound.get(path) != (status.st_size, status.st_mtime_ns):
             with path.open("rb") as file:
                 if file.read(len(header)) != header or (entries["checksum"] != _checksums(entries, seed)).any():
@@ -170,11 +169,11 @@ def _load(scenario: Scenario, seed: int) -> np.ndarray | None:
 
 
 @lru_cache(maxsize=16)
-def _header(kind: np.dtype, length: int) -> bytes:
-    """How numpy begins a file of so many steps."""
-    content = io.BytesIO()
-    np.save(content, np.zeros(length, kind))
-    return content.getvalue()[:-length * kind.itemsize]
+def _layout(scenario: Scenario) -> tuple[np.dtype, bytes, int]:
+    """Of a recording's file: the type of a step, what numpy writes before the first, and their number."""
+    kind, content = recording_type(outline(scenario).mass.shape[0], scenario.currents.shape[1]), io.BytesIO()
+    np.save(content, np.zeros(scenario.n_steps, kind))
+    return kind, content.getvalue()[:-scenario.n_steps * kind.itemsize], scenario.n_steps
 
 
 def _checksums(entries: np.ndarray, seed: int) -> np.ndarray:
