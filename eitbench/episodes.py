@@ -168,8 +168,13 @@ def _identity(scenario: Scenario, seed: int) -> str:
 
 @lru_cache(maxsize=1)
 def _code_digest() -> str:
+    return code_digest("physics/*.py", "scenarios/*.py", "recordings.py", "episodes.py")
+
+
+def code_digest(*patterns: str) -> str:
+    """SHA-256 of the package's files that match: what is computed by other code is not taken for the same."""
     here = Path(__file__).parent
-    files = sorted([*here.glob("physics/*.py"), *here.glob("scenarios/*.py"), here / "recordings.py", Path(__file__)])
+    files = sorted(file for pattern in patterns for file in here.glob(pattern))
     return _digest(b"".join(file.read_bytes() for file in files))
 
 

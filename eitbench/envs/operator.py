@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from eitbench._files import write_atomically
-from eitbench.episodes import folder, warn_not_kept
+from eitbench.episodes import code_digest, folder, warn_not_kept
 from eitbench.estimation.reduced import ReducedFilter, ReducedModel, reduced_model
 from eitbench.recordings import outline
 from eitbench.task import make_task
@@ -178,7 +178,7 @@ def _shared(scenario: Scenario) -> _Shared:
 
 def _stored_model(scenario: Scenario) -> ReducedModel:
     """The reduced model, from the cache if it is there: making it takes half a minute."""
-    path = folder(scenario) / f"reduced-{RANK}.npz"
+    path = folder(scenario) / f"reduced-{code_digest('estimation/*.py', 'envs/operator.py')[:16]}.npz"
     try:
         with np.load(path, allow_pickle=False) as stored:
             model = ReducedModel(*(stored[name] for name in ReducedModel._fields))

@@ -249,13 +249,3 @@ def solve_lu(row_place, column_place, lower_pointer, lower_index, lower, upper_p
         store(work, i * WIDTH, times(total, splat(scale[i])))
     for i in range(n):
         store(solution, i * WIDTH, load(work, column_place[i] * WIDTH))
-
-
-@njit(cache=True)
-def sparse_product(pointer, index, data, x, result):
-    """result = A x for A by rows, and x and result (n, 8)."""
-    for i in range(len(pointer) - 1):
-        total = splat(0.0)
-        for e in range(pointer[i], pointer[i + 1]):
-            total = subtract_product(total, splat(-data[e]), load(x, index[e] * WIDTH))
-        store(result, i * WIDTH, total)

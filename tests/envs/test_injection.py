@@ -10,10 +10,13 @@ from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 import eitbench
 from eitbench import make_task
-from eitbench.envs import INJECTION
+from eitbench.envs import INJECTION, operator
 from eitbench.envs.operator import electrode_pairs
+from eitbench.episodes import CACHE_VARIABLE
 from eitbench.estimation import FirstFrame, LinearisedObservations, kalman_filter, table_5_1
+from eitbench.estimation.reduced import ReducedModel
 from eitbench.recordings import cycle_voltages, recording, score_operators
+from eitbench.scenarios import Pipe2D
 
 NAME = "eitbench/Pipe2DInjection-v0"
 # Sixteen electrodes and a short record; fewer electrodes would leave too little to learn from.
@@ -198,6 +201,25 @@ def test_wrong_actions_are_named():
         many.step(np.zeros(2))
     with pytest.raises(ValueError, match=r"actions must lie in \[0, 119\], got 0 … 120"):
         many.step(np.array([0, 120]))
+
+
+def test_stored_reduced_model_is_kept_and_damage_is_noticed(monkeypatch, tmp_path):
+    """Made once, read after that, to the bit; a damaged file is made anew."""
+    made = []
+    rng = np.random.default_rng(0)
+    model = ReducedModel(rng.normal(size=(9, 3)), *rng.normal(size=(3, 3, 3)))
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
+    monkeypatch.setattr(operator, "_make_model", lambda scenario: made.append(scenario) or model)
+    for _ in range(2):
+        stored = operator._stored_model(Pipe2D())
+        assert all((a == b).all() for a, b in zip(stored, model, strict=True))
+    assert len(made) == 1
+    path, = tmp_path.rglob("reduced-*.npz")
+    data = path.read_bytes()
+    for damaged in (data[:-9], data[:200] + bytes([data[200] ^ 1]) + data[201:], b""):
+        path.write_bytes(damaged)
+        assert all((a == b).all() for a, b in zip(operator._stored_model(Pipe2D()), model, strict=True))
+    assert len(made) == 4
 
 
 def test_registry():
