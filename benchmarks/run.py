@@ -107,9 +107,11 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 
 def growth(record: dict[str, Any]) -> str:
-    lines = [f"- {curve['column']}, {curve['y_label']}: exponent {curve['exponent']:.2f}; from "
-             f"{curve['y'][0]:,.1f} at {curve['x'][0]:,} {curve['x_label']} to {curve['y'][-1]:,.1f} at "
-             f"{curve['x'][-1]:,}" for curve in record["curves"]]
+    lines = ["| what | measured | from | to | exponent |", "| --- | --- | ---: | ---: | ---: |"]
+    for curve in record["curves"]:
+        ends = [f"{curve['y'][k]:,.3g} at {curve['x'][k]:,.0f} {curve['x_label']}" for k in (0, -1)]
+        lines.append(f"| {curve['column']}: {curve['label']} | {curve['y_label']} | {ends[0]} | {ends[1]} | "
+                     f"{curve['exponent']:.2f} |")
     return "![Time and memory against size](scaling.png)\n\n" + "\n".join(lines) + "\n"
 
 

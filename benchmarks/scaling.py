@@ -52,8 +52,8 @@ def curves() -> Iterator[Curve]:
         yield Curve(column, "with the model, peak", x_label, "memory in MB", x, [1e-6 * value for value in memory])
     for kind, rates, memory in environments():
         counts = [float(count) for count in COUNTS]
-        yield Curve("Environments", kind, "number of environments", "steps per second", counts, rates)
-        yield Curve("Environments", kind, "number of environments", "memory in MB", counts,
+        yield Curve("Environments", kind, "environments", "steps per second", counts, rates)
+        yield Curve("Environments", kind, "environments", "memory in MB", counts,
                     [1e-6 * value for value in memory])
 
 
@@ -106,6 +106,8 @@ def draw(curves: list[Curve], path: Path) -> None:
                 level = np.exp(np.log(y).mean() - curve.exponent * np.log(x).mean())
                 ax.loglog(x, level * x**curve.exponent, color=f"C{number}", linewidth=1, alpha=0.5)
                 ax.loglog(x, y, "o", color=f"C{number}", label=f"{curve.label}, exponent {curve.exponent:.2f}")
+            if len(drawn) > 1:                                # room for the legend
+                ax.set_ylim(top=4 * max(max(curve.y) for curve in drawn) * len(drawn))
             ax.set_xlabel(drawn[0].x_label)
             ax.set_ylabel(y_label)
             ax.set_xticks(x, [f"{value:,.0f}" for value in x], fontsize=8)

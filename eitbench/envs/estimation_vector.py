@@ -15,6 +15,10 @@ if TYPE_CHECKING:
     from eitbench.scenarios.base import Scenario
 
 
+TOGETHER = 16
+"""Environments whose estimates are weighed at once; more would not fit a core's own memory."""
+
+
 class EstimationVectorEnv(LockstepVectorEnv):
     """`EstimationEnv`, many times; parameters as there and in `LockstepVectorEnv`."""
 
@@ -41,9 +45,13 @@ class EstimationVectorEnv(LockstepVectorEnv):
         t = self._step - self._lag
         if t <= self.scenario.warm_up:
             return np.zeros(self.num_envs)
-        moments = np.stack([moments[t - 1] for moments in self._moments])
-        return -step_error(outline(self.scenario).mass, estimates - self.scenario.background, moments,
-                           self._deviations[t - 1], self._squares[t - 1])
+        rewards, scenario = np.empty(self.num_envs), self.scenario
+        for first in range(0, self.num_envs, TOGETHER):
+            part = slice(first, first + TOGETHER)
+            moments = np.stack([moments[t - 1] for moments in self._moments[part]])
+            rewards[part] = -step_error(outline(scenario).mass, estimates[part] - scenario.background, moments,
+                                        self._deviations[t - 1, part], self._squares[t - 1, part])
+        return rewards
 
     def _observe(self) -> Observation:
         if self._step > self._length:
