@@ -109,7 +109,8 @@ def table(rows: list[dict[str, Any]]) -> str:
 def growth(record: dict[str, Any]) -> str:
     lines = ["| what | measured | from | to | exponent |", "| --- | --- | ---: | ---: | ---: |"]
     for curve in record["curves"]:
-        ends = [f"{curve['y'][k]:,.3g} at {curve['x'][k]:,.0f} {curve['x_label']}" for k in (0, -1)]
+        ends = [f"{f'{y:,.0f}' if y >= 100 else f'{y:.3g}'} at {x:,.0f} {curve['x_label']}"
+                for x, y in list(zip(curve["x"], curve["y"], strict=True))[::len(curve["x"]) - 1]]
         lines.append(f"| {curve['column']}: {curve['label']} | {curve['y_label']} | {ends[0]} | {ends[1]} | "
                      f"{curve['exponent']:.2f} |")
     return "![Time and memory against size](scaling.png)\n\n" + "\n".join(lines) + "\n"
