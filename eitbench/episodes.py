@@ -6,6 +6,7 @@ Currents do not move the fluid, so an episode's whole measurement content is one
 from __future__ import annotations
 
 import hashlib
+import inspect
 import io
 import json
 import os
@@ -154,8 +155,8 @@ def identity(scenario: Scenario) -> dict[str, Any]:
     """All that the numbers depend on but the seed: scenario, the code that simulates, and the libraries beneath it."""
     kind = type(scenario)
     return {"scenario": f"{kind.__module__}.{kind.__qualname__}", "fields": asdict(scenario),  # type: ignore
-            "code": _code_digest(), "factorisation": backend_version(), "numpy": np.__version__,
-            "scipy": scipy.__version__, "scikit-fem": version("scikit-fem")}
+            "code": _code_digest(), "world": _source_digest(kind), "factorisation": backend_version(),
+            "numpy": np.__version__, "scipy": scipy.__version__, "scikit-fem": version("scikit-fem")}
 
 
 def _digest(data: bytes) -> str:
@@ -169,6 +170,15 @@ def _identity(scenario: Scenario, seed: int) -> str:
 @lru_cache(maxsize=1)
 def _code_digest() -> str:
     return code_digest("physics/*.py", "scenarios/*.py", "recordings.py", "episodes.py")
+
+
+@lru_cache(maxsize=64)
+def _source_digest(kind: type) -> str:
+    """Of the file of a scenario that is not the package's own; a class typed into a session has none."""
+    try:
+        return _digest(Path(inspect.getfile(kind)).read_bytes())
+    except (OSError, TypeError):
+        return ""
 
 
 def code_digest(*patterns: str) -> str:

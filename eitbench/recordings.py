@@ -123,6 +123,7 @@ def outline(scenario: Scenario) -> Outline:
             warn_not_kept(path.parent, error)
         stored = half.data, half.indices, half.indptr, largest
     data, indices, indptr, largest = stored
+    data.setflags(write=False)                             # shared by all environments
     return Outline(sp.csr_array((data, indices, indptr), shape=(len(indptr) - 1,) * 2), float(largest))
 
 
@@ -164,7 +165,7 @@ def _load(scenario: Scenario, seed: int) -> np.ndarray | None:
                     return None
             _sound[path] = status.st_size, status.st_mtime_ns
         return entries
-    except (OSError, ValueError):        # missing, cut short
+    except (FileNotFoundError, ValueError):        # missing, cut short
         return None
 
 

@@ -376,3 +376,16 @@ def test_recording_under_another_name_is_not_believed(counted):
     recording(TINY, 7)
     recording_path(TINY, 7).rename(recording_path(TINY, 8))
     assert not is_recorded(TINY, 8)
+
+
+def test_file_that_cannot_be_opened_is_not_a_missing_one(monkeypatch, counted):
+    """With too many files open, the error says so; nothing is simulated in its stead."""
+    recording(TINY, 7)
+
+    def refuse(*_):
+        raise OSError(24, "Too many open files")
+
+    monkeypatch.setattr(recordings.np, "memmap", refuse)
+    with pytest.raises(OSError, match="Too many open files"):
+        recording(TINY, 7)
+    assert len(counted.calls) == 1

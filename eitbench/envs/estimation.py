@@ -89,7 +89,7 @@ class EstimationEnv(gym.Env[Observation, np.ndarray]):
         t = self._step - self._lag
         reward = 0.0
         if t >= 1:
-            self._last = estimate
+            self._last = estimate.copy()
         if t > self.scenario.warm_up:
             entry = self._entries[t - 1]
             reward = -float(step_error(outline(self.scenario).mass, estimate - self.scenario.background,

@@ -1,4 +1,4 @@
-"""Many estimation episodes side by side: the same numbers as so many `EstimationEnv`, in a few array operations."""
+"""Many estimation episodes side by side, in a few array operations."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ TOGETHER = 16
 
 
 class EstimationVectorEnv(LockstepVectorEnv):
-    """`EstimationEnv`, many times; parameters as there and in `LockstepVectorEnv`."""
+    """`EstimationEnv`, many times; parameters as there and in `LockstepVectorEnv`. Rewards agree to rounding."""
 
     def __init__(self, scenario: Scenario, num_envs: int, *, lag: int | str = 0, episodes: int = 1000) -> None:
         super().__init__(num_envs, episodes)
@@ -32,13 +32,15 @@ class EstimationVectorEnv(LockstepVectorEnv):
         self._limit = 10.0 * scenario.expected_concentration
 
     def _begin(self, seeds: list[int]) -> None:
-        played = [recording(self.scenario, seed) for seed in seeds]
+        scenario = self.scenario
         self._voltages = np.zeros((self._length, self.num_envs, self._currents.shape[1]))
-        for k, entries in enumerate(played):
-            self._voltages[:self.scenario.n_steps, k] = cycle_voltages(self.scenario, entries)
-        self._moments = [entries["moment"] for entries in played]
-        self._deviations = np.stack([entries["deviation"] for entries in played], axis=1)
-        self._squares = np.stack([entries["square"] for entries in played], axis=1)
+        self._deviations, self._squares = np.empty((2, scenario.n_steps, self.num_envs))
+        self._moments = []
+        for k, seed in enumerate(seeds):     # all is copied: a mapped file is open, and there may be more than may be
+            entries = recording(scenario, seed)
+            self._voltages[:scenario.n_steps, k] = cycle_voltages(scenario, entries)
+            self._deviations[:, k], self._squares[:, k] = entries["deviation"], entries["square"]
+            self._moments.append(entries["moment"][scenario.warm_up:].copy())
 
     def _act(self, actions: np.ndarray) -> np.ndarray:
         estimates = checked_estimates(actions, self.action_space.shape, self._limit)  # type: ignore[arg-type]
@@ -48,7 +50,7 @@ class EstimationVectorEnv(LockstepVectorEnv):
         rewards, scenario = np.empty(self.num_envs), self.scenario
         for first in range(0, self.num_envs, TOGETHER):
             part = slice(first, first + TOGETHER)
-            moments = np.stack([moments[t - 1] for moments in self._moments[part]])
+            moments = np.stack([moments[t - 1 - scenario.warm_up] for moments in self._moments[part]])
             rewards[part] = -step_error(outline(scenario).mass, estimates[part] - scenario.background, moments,
                                         self._deviations[t - 1, part], self._squares[t - 1, part])
         return rewards

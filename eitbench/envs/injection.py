@@ -60,20 +60,23 @@ class InjectionCore:
 
     def begin(self, seeds: list[int]) -> None:
         """Play these episodes up to the agent's first injection."""
-        played = [recording(self.scenario, seed) for seed in seeds]
-        B, L = len(seeds), self.scenario.currents.shape[1]
+        scenario, B, L = self.scenario, len(seeds), self.scenario.currents.shape[1]
         self._every, self._t = np.arange(B), self.first
-        self._resistance = np.stack([entries["transfer_resistance"] for entries in played], axis=1)
-        self._noise = np.stack([entries["noise"] for entries in played], axis=1)
+        self._resistance, self._noise = np.empty((scenario.n_steps, B, L, L)), np.empty((scenario.n_steps, B, L))
+        self._deviations, self._squares = np.empty((2, B, scenario.n_steps))
         self._voltages, self._currents, self._innovations = np.zeros((3, B, L))
+        frames, moments = np.empty((B, self.first, L)), []
+        for k, seed in enumerate(seeds):     # all is copied: a mapped file is open, and there may be more than may be
+            entries = recording(scenario, seed)
+            self._resistance[:, k], self._noise[:, k] = entries["transfer_resistance"], entries["noise"]
+            if self.estimator == "reduced":
+                frames[k] = cycle_voltages(scenario, entries[:self.first])
+                self._deviations[k], self._squares[k] = entries["deviation"], entries["square"]
+                moments.append(project(scenario, entries["moment"]))
         if self.estimator == "reduced":
-            frames = np.stack([cycle_voltages(self.scenario, entries[:self.first]) for entries in played])
-            self._operator = ReducedOperator(self.scenario, frames)
-            self._moments = project(self.scenario, [entries["moment"] for entries in played])
-            self._deviations = np.stack([entries["deviation"] for entries in played])
-            self._squares = np.stack([entries["square"] for entries in played])
+            self._operator, self._moments = ReducedOperator(scenario, frames), np.array(moments)
             self._voltages = frames[:, -1].copy()
-            self._currents = np.repeat(self.scenario.currents[-1:], B, axis=0)
+            self._currents = np.repeat(scenario.currents[-1:], B, axis=0)
 
     def act(self, actions: np.ndarray) -> np.ndarray:
         """Inject pairs (B,) and return the rewards (B,)."""
@@ -171,15 +174,20 @@ class InjectionVectorEnv(LockstepVectorEnv):
     def __init__(self, scenario: Scenario, num_envs: int, *, estimator: str = "reduced", episodes: int = 1000,
                  threads: int = 1) -> None:
         super().__init__(num_envs, episodes)
-        core, threads = InjectionCore(scenario, estimator), _check.integer("threads", threads, low=1)
-        self._show(*core.spaces())
-        self.scenario = scenario
-        self._length, self._n_pairs = core.length, len(core.pairs)
+        self.scenario, threads = scenario, _check.integer("threads", threads, low=1)
         # The covariances of sixteen filters stay within a core's own memory.
         size = max(1, min(16, -(-num_envs // threads))) if estimator == "reduced" else num_envs
         self._parts = [slice(first, first + size) for first in range(0, num_envs, size)]
         self._cores = [InjectionCore(scenario, estimator) for _ in self._parts]
-        self._map = map if threads == 1 else ThreadPoolExecutor(threads).map
+        self._length, self._n_pairs = self._cores[0].length, len(self._cores[0].pairs)
+        self._show(*self._cores[0].spaces())
+        self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
+        self._map = self._pool.map if self._pool else map
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Let the threads go."""
+        if self._pool:
+            self._pool.shutdown()
 
     def _begin(self, seeds: list[int]) -> None:
         for core, part in zip(self._cores, self._parts, strict=True):

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import io
 import zlib
-from collections.abc import Sequence
 from functools import cache, lru_cache
 from itertools import combinations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from eitbench._files import write_atomically
 from eitbench.episodes import code_digest, folder, warn_not_kept
@@ -116,10 +116,9 @@ class ReducedOperator:
         return self.concentration[:, None] * (1.0 + self._filter.mean @ self._shared.model.basis.T)
 
 
-def project(scenario: Scenario, moments: Sequence[np.ndarray]) -> np.ndarray:
-    """(B, T, 1 + r) moments of recordings, B times (T, n), in the reduced coordinates."""
-    basis = _shared(scenario).basis
-    return np.stack([moment @ basis for moment in moments]).astype(float)
+def project(scenario: Scenario, moment: np.ndarray) -> np.ndarray:
+    """(T, 1 + r) moments of a recording, (T, n), in the reduced coordinates."""
+    return (moment @ _shared(scenario).basis).astype(float)
 
 
 class _Shared:
@@ -166,7 +165,8 @@ class _Shared:
             mean[:, k * L:(k + 1) * L] += gain
         currents = pair_currents(scenario)
         computed, matrices = currents @ resistance, np.tensordot(currents, derivative, axes=(1, 0))
-        std = scenario.noise.std(computed)
+        # Readings near zero may have next to no noise; what the model leaves out would then count for knowledge.
+        std = np.maximum(scenario.noise.std(computed), 1e-3 * np.abs(computed).max(axis=1, keepdims=True))
         return _Level(c, resistance, computed, std, (matrices / std[..., None]).astype(np.float32),
                       (mean, filter_.covariance[0].astype(np.float32)))
 
@@ -178,7 +178,7 @@ def _shared(scenario: Scenario) -> _Shared:
 
 def _stored_model(scenario: Scenario) -> ReducedModel:
     """The reduced model, from the cache if it is there: making it takes half a minute."""
-    path = folder(scenario) / f"reduced-{code_digest('estimation/*.py', 'envs/operator.py')[:16]}.npz"
+    path = folder(scenario) / f"reduced-{code_digest('estimation/*.py', 'envs/operator.py', 'task.py')[:16]}.npz"
     try:
         with np.load(path, allow_pickle=False) as stored:
             model = ReducedModel(*(stored[name] for name in ReducedModel._fields))
@@ -186,7 +186,8 @@ def _stored_model(scenario: Scenario) -> ReducedModel:
                 return model
     except Exception:       # missing or damaged: an archive may raise anything
         pass
-    model = _make_model(scenario)
+    with threadpool_limits(1):                             # as many threads as here, the same bits
+        model = _make_model(scenario)
     content = io.BytesIO()
     np.savez(content, checksum=_checksum(model), **model._asdict())
     try:
@@ -209,7 +210,7 @@ def _make_model(scenario: Scenario) -> ReducedModel:
     for current in currents:                               # the state is counted in parts of the level
         seen = linear(np.zeros(current.shape), current)
         record.append(seen._replace(matrix=level * seen.matrix))
-    return reduced_model(start, mass_matrix(task.mesh).toarray(), record, RANK)
+    return reduced_model(start, mass_matrix(task.mesh).toarray(), record, min(RANK, task.mesh.n_nodes))
 
 
 def _patches(mesh: Mesh) -> np.ndarray:
@@ -220,6 +221,8 @@ def _patches(mesh: Mesh) -> np.ndarray:
     column, row = np.minimum((points - low) / (high - low) * GRID, np.array(GRID) - 1).astype(int).T
     averages = np.zeros((GRID[0] * GRID[1], len(points)))
     averages[row * GRID[0] + column, np.arange(len(points))] = mass_matrix(mesh).sum(axis=0)
+    if not averages.any(axis=1).all():
+        raise ValueError(f"the task's mesh must have a node in each of {GRID[0]} × {GRID[1]} patches of the vessel")
     return averages / averages.sum(axis=1, keepdims=True)
 
 

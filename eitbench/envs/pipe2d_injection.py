@@ -57,6 +57,8 @@ class Pipe2DInjectionEnv(InjectionEnv, EzPickle):
     | `estimator` | "reduced" | "reduced": a Kalman filter with 120 states; "none": no estimator |
     | `scenario` | None | dict of `Pipe2D` fields to change |
     | `episodes` | 1000 | number of training episodes for unseeded resets |
+    | `render_mode` | None | none yet |
+    | `threads` | 1 | vectorised only: cores that the filters may use; give BLAS one thread then |
 
     The first use of a scenario makes the reduced model (half a minute), which is then kept on disk.
 

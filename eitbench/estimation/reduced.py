@@ -81,7 +81,8 @@ class ReducedFilter:
         self._half, self._next = np.empty_like(covariance), np.empty_like(covariance)
         A, r = model.transition, len(model.transition)
         splits = [k for k in range(1, r) if A[k, k - 1] == 0.0]
-        self._edges = [0, *sorted({min(splits, key=lambda k: abs(k - third)) for third in (r // 3, 2 * r // 3)}), r]
+        thirds = {min(splits, key=lambda k: abs(k - third)) for third in (r // 3, 2 * r // 3)} if splits else set()
+        self._edges = [0, *sorted(thirds), r]
 
     def predict(self) -> None:
         """One time step on."""

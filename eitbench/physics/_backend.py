@@ -6,7 +6,7 @@ import math
 import threading
 from importlib.metadata import version
 from importlib.util import find_spec
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -26,6 +26,22 @@ def use_compiled(backend: Backend) -> bool:
 def backend_version() -> str:
     """What "auto" means here, for records: results agree between backends to rounding only."""
     return f"numba {version('numba')}" if use_compiled("auto") else "scipy"
+
+
+def kernels() -> Any:
+    """The compiled kernels; numba is loaded here, when something is factorised, and not before.
+
+    Raises
+    ------
+    RuntimeError
+        If numba is installed but does not work.
+    """
+    try:
+        from eitbench.physics import _kernels
+    except Exception as error:      # ImportError beside a numpy that is too new, RuntimeError without a cache folder
+        raise RuntimeError(f"numba {version('numba')} is installed but cannot be used ({error}); uninstall it to "
+                           "compute with scipy, or name a writable folder in $NUMBA_CACHE_DIR") from error
+    return _kernels
 
 
 def aligned_zeros(shape: tuple[int, ...]) -> np.ndarray:

@@ -10,13 +10,11 @@ not installed. Both order the unknowns once, by minimum degree, for a fixed patt
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import SuperLU, splu
 
-from eitbench.physics._backend import Backend, scratch, use_compiled
+from eitbench.physics._backend import Backend, kernels, scratch, use_compiled
 
 
 def condensation(pattern: sp.csc_array, n_ports: int, backend: Backend = "auto") -> Condensation | CompiledCondensation:
@@ -112,7 +110,7 @@ class CompiledCondensation:
             block = values[:, first:first + self.batch]
             padding = np.repeat(block[:, -1:], self.batch - block.shape[1], axis=1)
             eight = np.ascontiguousarray(np.concatenate([block, padding], axis=1) if padding.size else block)
-            self._kernels.condense_lanes(start, first_row, rows, panel, self._children, self._first_entry, self._slot,
+            kernels().condense_lanes(start, first_row, rows, panel, self._children, self._first_entry, self._slot,
                                          eight.ravel(), front, stack)
             schur = self._symmetric(front[:self.n_ports**2 * self.batch].reshape(-1, self.batch).T)
             result[first:first + self.batch] = np.linalg.inv(schur[:block.shape[1]])
@@ -124,12 +122,12 @@ class CompiledCondensation:
         solution = np.zeros((self.n, -(-self.n_ports // 8) * 8))
         solution[-self.n_ports:, :self.n_ports] = np.linalg.inv(self._schur(factor))
         start, first_row, rows, panel, _ = self._symbolic
-        self._kernels.substitute_back(start, first_row, rows, panel, factor, solution)
+        kernels().substitute_back(start, first_row, rows, panel, factor, solution)
         return solution[self._place, :self.n_ports]
 
     def _factorise(self, values: np.ndarray) -> np.ndarray:
         factor = scratch(self._symbolic[3][-1] + self.batch)      # the kernel reads a few numbers beyond the end
-        self._kernels.factorise(*self._symbolic, self._first_entry, self._slot, values, factor)
+        kernels().factorise(*self._symbolic, self._first_entry, self._slot, values, factor)
         return factor
 
     def _schur(self, factor: np.ndarray) -> np.ndarray:
@@ -140,11 +138,6 @@ class CompiledCondensation:
         """(..., m, m) from (..., m·m) with the lower triangle by columns."""
         block = columns.reshape(*columns.shape[:-1], self.n_ports, self.n_ports)
         return np.triu(block) + np.swapaxes(np.triu(block, 1), -1, -2)
-
-    @property
-    def _kernels(self) -> Any:
-        from eitbench.physics import _kernels  # numba is loaded when something is factorised, not before
-        return _kernels
 
 
 def _filled(pattern: sp.csc_array) -> sp.csc_array:

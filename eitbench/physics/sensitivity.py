@@ -6,7 +6,7 @@ import numpy as np
 import scipy.sparse as sp
 import skfem
 
-from eitbench.physics._backend import aligned_zeros, scratch
+from eitbench.physics._backend import aligned_zeros, kernels, scratch
 
 
 class Sensitivity:
@@ -42,12 +42,11 @@ class Sensitivity:
         n_cells, n_vertices = self._cells.shape
         k, n_nodes = fields.shape[1], self._cells.max() + 1
         if self.compiled:
-            from eitbench.physics._kernels import subtract_gradient_products
             width = -(-k // 8) * 8
             padded, table = aligned_zeros((len(fields), width)), aligned_zeros((n_nodes, width, width))
             padded[:, :k] = fields
             room = scratch(2 * self._gradient.shape[1] * width)
-            subtract_gradient_products(self._cells, self._unknowns, self._gradient, padded, table, room)
+            kernels().subtract_gradient_products(self._cells, self._unknowns, self._gradient, padded, table, room)
             return table[:, :k, :k]
         gradients = (self._gradient @ fields[self._unknowns]).reshape(n_cells, n_vertices, n_vertices - 1, k)
         shifted = gradients + gradients.sum(axis=1, keepdims=True)

@@ -6,7 +6,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
-from eitbench.physics._backend import Backend, scratch, use_compiled
+from eitbench.physics._backend import Backend, kernels, scratch, use_compiled
 
 
 class SparseLU:
@@ -46,11 +46,10 @@ class SparseLU:
             for column in range(k):                       # SuperLU's bits depend on how many are solved together
                 result[:, column] = self._solve(right[:, column])
             return result
-        from eitbench.physics._kernels import solve_lu
         eight, work, solution = scratch(3 * 8 * n).reshape(3, -1)
         for first in range(0, k, 8):
             block = right[:, first:first + 8]
             eight.reshape(n, 8)[:, :block.shape[1]] = block
-            solve_lu(*self._arrays, eight, work, solution)
+            kernels().solve_lu(*self._arrays, eight, work, solution)
             result[:, first:first + 8] = solution.reshape(n, 8)[:, :block.shape[1]]
         return result

@@ -1,7 +1,9 @@
 """Many environments at once are the same environments, one beside the other."""
 
+import os
 import pickle
 from itertools import combinations
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -294,3 +296,12 @@ def test_wrong_arguments_are_named_before_anything_is_computed(change, monkeypat
     monkeypatch.setattr(estimation, "outline", None)
     with pytest.raises(ValueError, match=f"{next(iter(change))} must be"):
         gym.make_vec("eitbench/Pipe2D-v0", **{"num_envs": 2, "scenario": {"mean_velocity": 44.0}} | change)
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="counts open files where Linux lists them")
+def test_environments_keep_no_files_open():
+    """There may be more environments than files that a process may open."""
+    envs = gym.make_vec("eitbench/Pipe2D-v0", num_envs=12, scenario=FIELDS)
+    before = len(os.listdir("/proc/self/fd"))
+    envs.reset(seed=1)
+    assert len(os.listdir("/proc/self/fd")) == before

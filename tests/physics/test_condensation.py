@@ -137,3 +137,12 @@ except ValueError as error:
 def test_unknown_backend():
     with pytest.raises(ValueError, match="backend must be 'auto', 'compiled' or 'scipy', got 'pardiso'"):
         condensation(random_pattern(30, 2, seed=0), 2, "pardiso")  # type: ignore[arg-type]
+
+
+def test_numba_that_does_not_work_is_named(monkeypatch):
+    """Installed, but beside a numpy that is too new, say: no silent change of numbers, but a way out."""
+    system = condensation(random_pattern(30, 2, seed=0), 2, "compiled")
+    monkeypatch.setitem(sys.modules, "eitbench.physics._kernels", None)
+    monkeypatch.delattr("eitbench.physics._kernels", raising=False)
+    with pytest.raises(RuntimeError, match=r"numba [\d.]+ is installed but cannot be used .* uninstall it to compute"):
+        system.port_inverse(np.ones(len(system.rows)))
