@@ -3,12 +3,11 @@
 import numpy as np
 
 from eitbench import Estimate, Task
-from eitbench.estimation import TABLE_5_1, FirstFrame, LinearisedObservations, fixed_interval_smoother, table_5_1
+from eitbench.estimation import FirstFrame, LinearisedObservations, fixed_interval_smoother, table_5_1
 
 
 class Estimator:
     boards = ("smoothing",)
-    parameters = TABLE_5_1
 
     def __init__(self, task: Task) -> None:
         self.task = task
@@ -29,6 +28,6 @@ class Estimator:
         first = FirstFrame(self.task)
         for measurement in self.record[:first.length]:
             first.add(*measurement)
-        start = table_5_1(self.task.transport, first.c_bh)
+        start = table_5_1(self.task.transport, self.task.prior, first.c_bh)
         observations = LinearisedObservations(self.task.observation, self.task.noise, start.mean)
         return fixed_interval_smoother(start, [observations(*measurement) for measurement in self.record])

@@ -3,12 +3,11 @@
 import numpy as np
 
 from eitbench import Estimate, Task
-from eitbench.estimation import TABLE_5_1, FilterStep, FirstFrame, LinearisedObservations, smoothed_state, table_5_1
+from eitbench.estimation import FilterStep, FirstFrame, LinearisedObservations, smoothed_state, table_5_1
 
 
 class Estimator:
     boards = ("fixed-lag",)
-    parameters = TABLE_5_1
 
     def __init__(self, task: Task) -> None:
         self.task = task
@@ -22,7 +21,7 @@ class Estimator:
             if not self.first.complete:
                 if not self.first.add(voltages, currents):
                     return Estimate(self.first.mean)
-                self.filter = table_5_1(self.task.transport, self.first.c_bh)
+                self.filter = table_5_1(self.task.transport, self.task.prior, self.first.c_bh)
                 self.observations = LinearisedObservations(self.task.observation, self.task.noise, self.filter.mean)
                 for earlier in self.first.measurements[:-1]:
                     self.assimilate(*earlier)

@@ -3,12 +3,11 @@
 import numpy as np
 
 from eitbench import Estimate, Task
-from eitbench.estimation import TABLE_5_1, FilterStep, FirstFrame, LinearisedObservations, table_5_1
+from eitbench.estimation import Filtered, FilterStep, FirstFrame, LinearisedObservations, starting_filter
 
 
 class Estimator:
     boards = ("filter",)
-    parameters = TABLE_5_1
 
     def __init__(self, task: Task) -> None:
         self.task = task
@@ -18,13 +17,13 @@ class Estimator:
         if not self.first.complete:
             if not self.first.add(voltages, currents):
                 return Estimate(self.first.mean)
-            self.filter = table_5_1(self.task.transport, self.first.c_bh)
+            self.filter = starting_filter(self.task.transport, self.task.prior, self.first.c_bh)
             self.observations = LinearisedObservations(self.task.observation, self.task.noise, self.filter.mean)
             for earlier in self.first.measurements[:-1]:
                 self.assimilate(*earlier)
         step = self.assimilate(voltages, currents)
         return Estimate(step.mean, step.variance, step.innovation, step.innovation_covariance)
 
-    def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> FilterStep:
+    def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> FilterStep | Filtered:
         self.filter.predict()
         return self.filter.update(self.observations(voltages, currents))

@@ -17,8 +17,9 @@ import numpy as np
 from common import Row, compare, in_fresh_process, of_flops, peak_growth, peer, quantity
 
 from eitbench.estimation.kalman import KalmanFilter, LinearisedObservations, Observation, kalman_filter
-from eitbench.estimation.parameters import INFLOW_STD, NODAL_STD, table_5_1
+from eitbench.estimation.parameters import table_5_1
 from eitbench.estimation.smoother import _backwards, fixed_interval_smoother
+from eitbench.physics.flow import PlaneChannelFlow
 from eitbench.scenarios import Pipe2D
 
 CELLS = ((44, 10), (62, 15), (80, 20))
@@ -78,10 +79,10 @@ def rows() -> Iterator[Row]:
 def problem(cells: tuple[int, int], steps: int = WARM_UP + STEPS) -> Problem:
     """The model on a mesh of so many cells; states and measurements are drawn from it."""
     model = SCENARIO._discretise(cells=cells, substeps=8, time_step=SCENARIO.time_step, cells_at_electrodes=5,
-                                 cells_across=14, mean_velocity=SCENARIO.mean_velocity)
+                                 cells_across=14, velocity=PlaneChannelFlow(SCENARIO.mean_velocity, 0.05))
     transport, level = model.transport, SCENARIO.expected_concentration
     evolution = transport.evolution_model()
-    start = table_5_1(transport, level)
+    start = table_5_1(transport, SCENARIO.prior, level)
     rng = np.random.default_rng(0)
     inflow, at_inlet = SCENARIO.draw_inflow(rng), transport.mesh.points[transport.inlet]
     linearised = LinearisedObservations(model.observation, SCENARIO.noise, start.mean)
@@ -90,7 +91,7 @@ def problem(cells: tuple[int, int], steps: int = WARM_UP + STEPS) -> Problem:
         state = evolution.F @ state + evolution.Y @ inflow(at_inlet, t * SCENARIO.time_step)
         H, _, variance = linearised(np.zeros(16), SCENARIO.currents[t % SCENARIO.frame])
         observations.append(Observation(H, H @ state + np.sqrt(variance) * rng.standard_normal(len(H)), variance))
-    noise = level**2 * evolution.state_noise_covariance(INFLOW_STD**2, NODAL_STD**2)
+    noise = level**2 * evolution.state_noise_covariance(SCENARIO.prior.inflow_std**2, SCENARIO.prior.nodal_std**2)
     return Problem(start, noise, observations)
 
 

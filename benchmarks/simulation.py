@@ -39,7 +39,7 @@ def rows() -> Iterator[Row]:
     times = compare({**peers, "solve": lambda: flow._solver._solve(right)}, 5)
     solve = times.pop("solve")
     name = min(times, key=lambda peer: times[peer])
-    n_solves = (n_steps + SCENARIO.lead_in) * SCENARIO.truth_steps * (transport.substeps + 1)
+    n_solves = (n_steps + SCENARIO.lead_in) * round(SCENARIO.time_step / transport.time_step) * (transport.substeps + 1)
     bare = n_steps * times[name] + n_solves * solve
     against = (f"{n_steps} bare refactorisations by {name}, {cem.n_unknowns:,} unknowns, {quantity(times[name], 's')} "
                f"each, and {n_solves:,} bare solves by scipy's splu, {n:,} nodes, {quantity(solve, 's')} each")

@@ -22,8 +22,7 @@ TOGETHER = 8
 
 def recording_bytes(scenario: Scenario) -> int:
     """Size of one recording on disk, but for its header of a few hundred bytes."""
-    n_nodes = outline(scenario).mass.shape[0]
-    return scenario.n_steps * recording_type(n_nodes, scenario.currents.shape[1]).itemsize
+    return scenario.n_steps * recording_type(scenario, outline(scenario).mass.shape[0]).itemsize
 
 
 def fill(scenario: Scenario, seeds: Sequence[int], *, n_jobs: int = 1) -> int:

@@ -11,12 +11,12 @@ import io
 import json
 import os
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
@@ -25,12 +25,7 @@ from tqdm import tqdm
 from eitbench import _check
 from eitbench._files import write_atomically
 from eitbench.physics._backend import backend_version
-from eitbench.scenarios.base import Discretisation, Scenario
-
-if TYPE_CHECKING:
-    from eitbench.physics.transport import ConvectionDiffusion
-
-    InflowFunction = Callable[[np.ndarray, float], np.ndarray]
+from eitbench.scenarios.base import Discretisation, Randomness, Scenario
 
 CACHE_VARIABLE = "EITBENCH_CACHE"
 
@@ -44,6 +39,8 @@ class Episode(NamedTuple):
     """(T, L, L) 𝓡 at t = 1 … T in Ω (Ω·m in 2D)."""
     noise: np.ndarray
     """(T, L) standard normal draws, one a reading."""
+    velocity: np.ndarray
+    """(T, p) m/s at `VelocityModel.points`, t = 1 … T; p = 0 where nobody is asked for the flow."""
 
     def voltages(self, step: int, currents: np.ndarray, scenario: Scenario) -> np.ndarray:
         """Noisy voltages (L,) in V when ``currents`` (L,) in A (A/m in 2D) are injected at step 1 … T."""
@@ -93,36 +90,19 @@ def _simulate(scenario: Scenario, seed: int, progress: bool) -> Episode:
 def simulate_together(scenario: Scenario, seeds: Sequence[int], progress: bool = True) -> Iterator[Episode]:
     """The episodes of several seeds, bit for bit as `simulate` gives them and without the cache.
 
-    Eight flows are carried on together in the time of two, and eight conductivities are solved for at once.
+    Eight concentrations in one flow are carried on together in the time of two, and eight conductivities are solved
+    for at once.
     """
     truth = truth_discretisation(scenario)
     label = f"simulating {type(scenario).__name__}, seed {', '.join(map(str, seeds))}"
-    with tqdm(total=scenario.n_steps + scenario.lead_in + scenario.n_steps * len(seeds), desc=label, unit="step",
-              leave=False, disable=None if progress else True) as bar:
-        generators = [[np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(2)] for seed in seeds]
-        flows = _flow(scenario, truth.transport, [scenario.draw_inflow(flow) for flow, _ in generators], bar)
-        for states, (_, noise_rng) in zip(flows, generators, strict=True):
-            noise = noise_rng.standard_normal((scenario.n_steps, truth.observation.cem.n_electrodes))
-            resistance = truth.observation.transfer_resistance(states[1:])
+    with tqdm(total=(scenario.lead_in + 2 * scenario.n_steps) * len(seeds), desc=label, unit="step", leave=False,
+              disable=None if progress else True) as bar:
+        episodes = [Randomness(*map(np.random.default_rng, np.random.SeedSequence(seed).spawn(3))) for seed in seeds]
+        for history, random in zip(scenario.evolve(episodes, truth, bar.update), episodes, strict=True):
+            noise = random.noise.standard_normal((scenario.n_steps, truth.observation.cem.n_electrodes))
+            resistance = truth.observation.transfer_resistance(history.concentration[1:])
             bar.update(scenario.n_steps)
-            yield Episode(states.astype(np.float32), resistance, noise)
-
-
-def _flow(scenario: Scenario, transport: ConvectionDiffusion, inflows: Sequence[InflowFunction],
-          bar: tqdm) -> Iterator[np.ndarray]:
-    """Concentrations (T + 1, n) of each inflow."""
-    inlet, dt = transport.mesh.points[transport.inlet], transport.time_step
-    states = np.empty((len(inflows), scenario.n_steps + 1, transport.mesh.n_nodes))
-    c = np.full((transport.mesh.n_nodes, len(inflows)), scenario.background)
-    for t in range(-scenario.lead_in + 1, scenario.n_steps + 1):
-        for k in range(scenario.truth_steps):
-            before = (t - 1) * scenario.time_step + k * dt
-            c = transport.step(c, *(np.stack([inflow(inlet, time) for inflow in inflows], axis=1)
-                                    for time in (before, before + dt)))
-        if t >= 0:
-            states[:, t] = c.T
-        bar.update()
-    yield from states
+            yield Episode(history.concentration.astype(np.float32), resistance, noise, history.velocity)
 
 
 # -- cache ------------------------------------------------------------------------------------------------------------

@@ -23,6 +23,7 @@ from eitbench.episodes import Episode, folder, simulate, truth_discretisation, w
 if TYPE_CHECKING:
     import scipy.sparse as sp
 
+    from eitbench.physics.profiles import VelocityModel
     from eitbench.scenarios.base import Scenario
 
 
@@ -47,6 +48,8 @@ def recording(scenario: Scenario, seed: int) -> np.ndarray:
     ``moment``               (n,) float32, b_t: scores are exact to 2e-10
     ``deviation``            ∫(c_t − background)²
     ``square``               ∫c_t²
+    ``velocity_moment``      (k,) ∫φ_k v_t across the pipe; this and the next only where the flow is asked for too
+    ``velocity_square``      ∫v_t²
     ``checksum``             of all these bytes
     """
     seed = _check.integer("seed", seed, low=0)
@@ -77,12 +80,16 @@ def make_recording(scenario: Scenario, seed: int, episode: Episode) -> np.ndarra
     c = episode.concentration[1:].astype(float)
     deviation = c - scenario.background
     weighted = mass @ deviation.T
-    n_steps, n_electrodes = episode.noise.shape
-    entries = np.zeros(n_steps, recording_type(interpolation.shape[1], n_electrodes))
+    n_steps = len(episode.noise)
+    velocity = scenario.velocity_model
+    entries = np.zeros(n_steps, recording_type(scenario, interpolation.shape[1]))
     entries["transfer_resistance"], entries["noise"] = episode.transfer_resistance, episode.noise
     entries["moment"] = (interpolation.T @ weighted).T
     entries["deviation"] = np.einsum("tn,nt->t", deviation, weighted)
     entries["square"] = np.einsum("tn,nt->t", c, mass @ c.T)
+    if velocity is not None:
+        entries["velocity_moment"] = (episode.velocity * velocity.weights) @ velocity.profiles
+        entries["velocity_square"] = episode.velocity**2 @ velocity.weights
     entries["checksum"] = _checksums(entries, seed)
     entries.setflags(write=False)
     return entries
@@ -95,10 +102,13 @@ def store_recording(path: Path, entries: np.ndarray) -> None:
     write_atomically(path, content.getvalue())
 
 
-def recording_type(n_nodes: int, n_electrodes: int) -> np.dtype:
-    """Of one step of a recording."""
+def recording_type(scenario: Scenario, n_nodes: int) -> np.dtype:
+    """Of one step of a recording with so many nodes in the estimators' mesh."""
+    n_electrodes, velocity = scenario.currents.shape[1], scenario.velocity_model
+    flow = [] if velocity is None else [("velocity_moment", "<f8", (velocity.size,)), ("velocity_square", "<f8")]
     return np.dtype([("transfer_resistance", "<f8", (n_electrodes, n_electrodes)), ("noise", "<f8", (n_electrodes,)),
-                     ("moment", "<f4", (n_nodes,)), ("deviation", "<f8"), ("square", "<f8"), ("checksum", "<u4")])
+                     ("moment", "<f4", (n_nodes,)), ("deviation", "<f8"), ("square", "<f8"), *flow,
+                     ("checksum", "<u4")])
 
 
 @lru_cache(maxsize=4)
@@ -150,6 +160,14 @@ def step_error(mass: sp.csr_array, estimate: np.ndarray, moment: np.ndarray, dev
     return (quadratic - 2.0 * np.einsum("...n,...n->...", estimate, moment) + deviation) / square
 
 
+def velocity_error(velocity: VelocityModel, parameters: np.ndarray, moment: np.ndarray, square: np.ndarray | float,
+                   ) -> np.ndarray:
+    """∫(v̂_t − v_t)² / ∫v_t² across the pipe for ``parameters`` (..., k) in m/s, with the entries of recordings."""
+    gram = velocity.profiles.T @ (velocity.weights[:, None] * velocity.profiles)
+    quadratic = np.einsum("...k,kl,...l->...", parameters, gram, parameters)
+    return (quadratic - 2.0 * np.einsum("...k,...k->...", parameters, moment) + square) / square
+
+
 _sound: dict[Path, tuple[int, int]] = {}
 """Files this process has read whole and found in order: size and time of change."""
 
@@ -172,7 +190,7 @@ def _load(scenario: Scenario, seed: int) -> np.ndarray | None:
 @lru_cache(maxsize=16)
 def _layout(scenario: Scenario) -> tuple[np.dtype, bytes, int]:
     """Of a recording's file: the type of a step, what numpy writes before the first, and their number."""
-    kind, content = recording_type(outline(scenario).mass.shape[0], scenario.currents.shape[1]), io.BytesIO()
+    kind, content = recording_type(scenario, outline(scenario).mass.shape[0]), io.BytesIO()
     np.save(content, np.zeros(scenario.n_steps, kind))
     return kind, content.getvalue()[:-scenario.n_steps * kind.itemsize], scenario.n_steps
 

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from eitbench import _check
-from eitbench.scenarios.base import Discretisation, Scenario
+from eitbench.scenarios.base import Discretisation, Prior, Scenario
 
 if TYPE_CHECKING:
     from eitbench.physics.mesh import Mesh
     from eitbench.physics.observation import ObservationModel, VoltageNoise
+    from eitbench.physics.profiles import VelocityModel
     from eitbench.physics.transport import ConvectionDiffusion, EvolutionModel
 
 
@@ -28,6 +29,10 @@ class Estimate(NamedTuple):
     """(L,) measured minus predicted voltages, V, before this measurement was used; for NIS."""
     innovation_covariance: np.ndarray | None = None
     """(L, L) its covariance, V²."""
+    velocity: np.ndarray | None = None
+    """(k,) parameters of the flow in m/s where `Task.velocity` asks for them; None: what is believed at first."""
+    velocity_variance: np.ndarray | None = None
+    """(k,) their error variance, m²/s²."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +56,12 @@ class Task:
         At measurement t the state t − lag is asked for: 0 filters, n_steps − 1 smooths over the whole record.
     expected_concentration : float
         Rough level in mol/m³, where the search for the best homogeneous estimate begins.
+    calibration : int
+        First injections, all but always within the warm-up, from which the best homogeneous estimate is found.
+    prior : Prior
+        What is believed of the target, in parts of the best homogeneous estimate (thesis Table 5.1).
+    velocity : VelocityModel or None
+        How the flow may be written where it is asked for too; ``transport`` then has the flow believed at first.
     """
 
     transport: ConvectionDiffusion
@@ -61,6 +72,9 @@ class Task:
     warm_up: int
     lag: int
     expected_concentration: float
+    calibration: int
+    prior: Prior
+    velocity: VelocityModel | None = None
 
     @property
     def mesh(self) -> Mesh:
@@ -73,7 +87,7 @@ class Task:
         return self.transport.evolution_model()
 
 
-def make_task(scenario: Scenario, lag: int | str = 0, **assumptions: float) -> Task:
+def make_task(scenario: Scenario, lag: int | str = 0, **assumptions: Any) -> Task:
     """The task of ``scenario``.
 
     Parameters
@@ -89,7 +103,8 @@ def make_task(scenario: Scenario, lag: int | str = 0, **assumptions: float) -> T
     currents = scenario.currents
     currents.setflags(write=False)                                # shared by all who play this task
     return Task(model.transport, model.observation, scenario.noise, currents, scenario.n_steps,
-                scenario.warm_up, steps, scenario.expected_concentration)
+                scenario.warm_up, steps, scenario.expected_concentration, scenario.calibration, scenario.prior,
+                scenario.velocity_model)
 
 
 def lag_steps(scenario: Scenario, lag: int | str) -> int:
@@ -101,6 +116,6 @@ def lag_steps(scenario: Scenario, lag: int | str) -> int:
 
 
 @lru_cache(maxsize=4)
-def _model(scenario: Scenario, assumptions: tuple[tuple[str, float], ...]) -> Discretisation:
+def _model(scenario: Scenario, assumptions: tuple[tuple[str, Any], ...]) -> Discretisation:
     """Built once a process; estimators keep what they derive from it with it."""
     return scenario.model(**dict(assumptions))

@@ -42,7 +42,8 @@ def fresh():
 def counted(monkeypatch):
     """`_simulate` replaced by one that returns a small episode of random numbers, and counts its calls."""
     rng = np.random.default_rng(3)
-    episode = Episode(rng.normal(size=(3, 20)).astype(np.float32), rng.normal(size=(2, 4, 4)), rng.normal(size=(2, 4)))
+    episode = Episode(rng.normal(size=(3, 20)).astype(np.float32), rng.normal(size=(2, 4, 4)), rng.normal(size=(2, 4)),
+                      rng.normal(size=(2, 3)))
     calls = []
     monkeypatch.setattr(episodes, "_simulate", lambda *arguments: calls.append(arguments) or episode)
     return SimpleNamespace(episode=episode, calls=calls)
@@ -62,10 +63,10 @@ def files(folder):
 
 
 def test_shapes_are_those_of_the_docstring(fresh):
-    """(T + 1, n_truth) float32, (T, L, L) and (T, L), all finite."""
+    """(T + 1, n_truth) float32, (T, L, L) and (T, L), all finite; no velocity where nobody asks for it."""
     n_truth = truth_discretisation(TINY).transport.mesh.n_nodes
-    assert [array.shape for array in fresh] == [(6, n_truth), (5, 4, 4), (5, 4)]
-    assert [array.dtype for array in fresh] == [np.float32, np.float64, np.float64]
+    assert [array.shape for array in fresh] == [(6, n_truth), (5, 4, 4), (5, 4), (5, 0)]
+    assert [array.dtype for array in fresh] == [np.float32, np.float64, np.float64, np.float64]
     assert all(np.isfinite(array).all() for array in fresh)
 
 
@@ -108,7 +109,7 @@ def test_cached_equals_fresh(fresh, monkeypatch):
 def test_seeds_differ_in_flow_and_noise(fresh):
     """Another seed is another inflow, hence other voltages, and other noise."""
     other = simulate(TINY, 8, cache=False)
-    assert all((mine != theirs).mean() > 0.9 for mine, theirs in zip(fresh, other, strict=True))
+    assert all((mine != theirs).mean() > 0.9 for mine, theirs in zip(fresh[:3], other[:3], strict=True))
 
 
 def test_numbers_depend_on_the_scenario_not_on_the_cache(counted, cache):

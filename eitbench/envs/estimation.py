@@ -10,10 +10,11 @@ import numpy as np
 from gymnasium import spaces
 
 from eitbench import _check
-from eitbench.recordings import cycle_voltages, outline, recording, step_error
+from eitbench.recordings import cycle_voltages, outline, recording, step_error, velocity_error
 from eitbench.task import Task, lag_steps, make_task
 
 if TYPE_CHECKING:
+    from eitbench.episodes import Episode
     from eitbench.physics.mesh import Mesh
     from eitbench.scenarios.base import Scenario
 
@@ -26,7 +27,9 @@ class EstimationEnv(gym.Env[Observation, np.ndarray]):
     At step i = 1, 2, … the agent has seen the measurements up to min(i, T) and says what it thinks of the state
     t = i − lag. Steps with t < 1 ask for nothing (the action is ignored); after the T-th measurement voltages and
     currents are zero until every state has been asked for. The reward is −∫(ĉ_t − c_t)² / ∫c_t² for scored states,
-    zero otherwise, so that minus its mean over the scored states is ẽ_c (thesis 5.12).
+    zero otherwise, so that minus its mean over the scored states is ẽ_c (thesis 5.12). Where the flow is asked for too
+    (`Task.velocity`), its k parameters follow the nodal estimate in the action, and −∫(v̂_t − v_t)² / ∫v_t² across the
+    pipe is added to the reward.
 
     Parameters
     ----------
@@ -42,7 +45,7 @@ class EstimationEnv(gym.Env[Observation, np.ndarray]):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 8}  # noqa: RUF012 (gymnasium's own form)
 
-    def __init__(self, scenario: Scenario, *, lag: int | str = 0, assumptions: dict[str, float] | None = None,
+    def __init__(self, scenario: Scenario, *, lag: int | str = 0, assumptions: dict[str, Any] | None = None,
                  episodes: int = 1000, render_mode: str | None = None) -> None:
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode must be None or one of {self.metadata['render_modes']}, got {render_mode!r}")
@@ -57,7 +60,7 @@ class EstimationEnv(gym.Env[Observation, np.ndarray]):
         self._currents = cycle_currents(scenario, self._lag)
         self.observation_space: spaces.Dict  # type: ignore[assignment]
         self.observation_space, self.action_space = estimation_spaces(scenario)
-        self._limit = 10.0 * scenario.expected_concentration
+        self._n_nodes = outline(scenario).mass.shape[0]
         self._seed: int | None = None
         self._step = 0
 
@@ -81,19 +84,26 @@ class EstimationEnv(gym.Env[Observation, np.ndarray]):
         return self._observe(), {"step": 1}
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Take the estimate (n,) in mol/m³ of the state asked for; ``ValueError`` if it is not in the action space."""
+        """Take the estimate (n,) in mol/m³ of the state asked for, and the flow's (k,) in m/s where it is asked for.
+
+        ``ValueError`` if it is not in the action space.
+        """
         last_step = self.scenario.n_steps + self._lag
         if self._seed is None or self._step > last_step:
             raise gym.error.ResetNeeded("call reset() before step(), and again when an episode has ended")
-        estimate = checked_estimates(action, self.action_space.shape, self._limit)  # type: ignore[arg-type]
+        action = checked_actions(action, self.action_space)  # type: ignore[arg-type]
+        estimate, parameters = np.split(action, [self._n_nodes])
         t = self._step - self._lag
         reward = 0.0
         if t >= 1:
             self._last = estimate.copy()
         if t > self.scenario.warm_up:
-            entry = self._entries[t - 1]
+            entry, velocity = self._entries[t - 1], self.scenario.velocity_model
             reward = -float(step_error(outline(self.scenario).mass, estimate - self.scenario.background,
                                        self._moments[t - 1], entry["deviation"], entry["square"]))
+            if velocity is not None:
+                reward -= float(velocity_error(velocity, parameters, entry["velocity_moment"],
+                                               entry["velocity_square"]))
         self._step += 1
         return self._observe(), reward, self._step > last_step, False, {"step": self._step}
 
@@ -104,7 +114,7 @@ class EstimationEnv(gym.Env[Observation, np.ndarray]):
             return None
         from eitbench.envs.rendering import draw_frame
         t = min(max(self._step - 1 - self._lag, 0), self.scenario.n_steps)
-        concentration = self._concentration("render")[t]
+        concentration = self._episode("render").concentration[t]
         level = np.full(self.task.mesh.n_nodes, self.task.expected_concentration)
         return draw_frame(self.task, self.truth_mesh(), concentration, level if self._last is None else self._last,
                           self.spread, self._currents[t - 1] if t else np.zeros_like(self._currents[0]),
@@ -112,18 +122,22 @@ class EstimationEnv(gym.Env[Observation, np.ndarray]):
 
     def truth(self) -> np.ndarray:
         """(T, n_truth) concentration in mol/m³ of this episode, t = 1 … T; for scoring, never for agents."""
-        return self._concentration("truth")[1:].astype(float)
+        return self._episode("truth").concentration[1:].astype(float)
+
+    def true_velocity(self) -> np.ndarray:
+        """(T, p) axial velocity in m/s at `VelocityModel.points` of this episode; for scoring, never for agents."""
+        return self._episode("true_velocity").velocity
 
     def truth_mesh(self) -> Mesh:
         """The mesh of `truth`."""
         from eitbench.episodes import truth_discretisation
         return truth_discretisation(self.scenario).transport.mesh
 
-    def _concentration(self, asked_by: str) -> np.ndarray:
+    def _episode(self, asked_by: str) -> Episode:
         from eitbench.episodes import simulate
         if self._seed is None:
             raise gym.error.ResetNeeded(f"call reset() before {asked_by}()")
-        return simulate(self.scenario, self._seed).concentration
+        return simulate(self.scenario, self._seed)
 
     def _observe(self) -> Observation:
         if self._step > len(self._voltages):
@@ -138,7 +152,10 @@ def estimation_spaces(scenario: Scenario) -> tuple[spaces.Dict, spaces.Box]:
     shape = scenario.currents.shape[1:]
     observed = spaces.Dict({"voltages": spaces.Box(-largest_voltage, largest_voltage, shape, np.float64),
                             "currents": spaces.Box(-largest_current, largest_current, shape, np.float64)})
-    return observed, spaces.Box(-10.0 * level, 10.0 * level, (stage.mass.shape[0],), np.float64)
+    limit, velocity = np.full(stage.mass.shape[0], 10.0 * level), scenario.velocity_model
+    if velocity is not None:
+        limit = np.append(limit, np.full(velocity.size, 10.0 * max(velocity.nominal)))
+    return observed, spaces.Box(-limit, limit, dtype=np.float64)
 
 
 def cycle_currents(scenario: Scenario, lag: int) -> np.ndarray:
@@ -149,13 +166,15 @@ def cycle_currents(scenario: Scenario, lag: int) -> np.ndarray:
     return currents
 
 
-def checked_estimates(action: np.ndarray, shape: tuple[int, ...], limit: float) -> np.ndarray:
-    """``action`` as float64, finite and within ±``limit``; else a ``ValueError`` that says what is wrong with it."""
-    plain = type(action) is np.ndarray and action.shape == shape and action.dtype == np.float64
-    if plain and np.abs(action).max() <= limit:                    # false for NaN too
-        return action
-    estimates = _check.array("action", action, shape, units="mol/m³")
-    largest = np.abs(estimates).max()
-    if largest > limit:
-        raise ValueError(f"action must lie within ±{limit:g} mol/m³, got {largest:g}")
-    return estimates
+def checked_actions(actions: np.ndarray, space: spaces.Box) -> np.ndarray:
+    """``actions`` as float64, finite and in ``space``; else a ``ValueError`` that says what is wrong with them."""
+    plain = type(actions) is np.ndarray and actions.shape == space.shape and actions.dtype == np.float64
+    if plain and (np.abs(actions) <= space.high).all():             # false for NaN too
+        return actions
+    checked = _check.array("action", actions, space.shape, units="mol/m³")
+    outside = np.argwhere(np.abs(checked) > space.high)
+    if len(outside):
+        place = tuple(outside[0])
+        units = "mol/m³" if space.high[place] == space.high.flat[0] else "m/s"
+        raise ValueError(f"action must lie within ±{space.high[place]:g} {units}, got {abs(checked[place]):g}")
+    return checked

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from eitbench.envs.estimation import Observation, checked_estimates, cycle_currents, estimation_spaces
+from eitbench.envs.estimation import Observation, checked_actions, cycle_currents, estimation_spaces
 from eitbench.envs.lockstep import LockstepVectorEnv
-from eitbench.recordings import cycle_voltages, outline, recording, step_error
+from eitbench.recordings import cycle_voltages, outline, recording, step_error, velocity_error
 from eitbench.task import lag_steps
 
 if TYPE_CHECKING:
@@ -29,21 +29,25 @@ class EstimationVectorEnv(LockstepVectorEnv):
         self._show(*estimation_spaces(scenario))
         self._length = scenario.n_steps + self._lag
         self._currents = cycle_currents(scenario, self._lag)
-        self._limit = 10.0 * scenario.expected_concentration
+        self._n_nodes = outline(scenario).mass.shape[0]
 
     def _begin(self, seeds: list[int]) -> None:
         scenario = self.scenario
         self._voltages = np.zeros((self._length, self.num_envs, self._currents.shape[1]))
         self._deviations, self._squares = np.empty((2, scenario.n_steps, self.num_envs))
-        self._moments = []
+        self._moments: list[np.ndarray] = []
+        self._flows: list[tuple[np.ndarray, np.ndarray]] = []
         for k, seed in enumerate(seeds):     # all is copied: a mapped file is open, and there may be more than may be
             entries = recording(scenario, seed)
             self._voltages[:scenario.n_steps, k] = cycle_voltages(scenario, entries)
             self._deviations[:, k], self._squares[:, k] = entries["deviation"], entries["square"]
             self._moments.append(entries["moment"][scenario.warm_up:].copy())
+            if scenario.velocity_model is not None:
+                self._flows.append((entries["velocity_moment"].copy(), entries["velocity_square"].copy()))
 
     def _act(self, actions: np.ndarray) -> np.ndarray:
-        estimates = checked_estimates(actions, self.action_space.shape, self._limit)  # type: ignore[arg-type]
+        checked = checked_actions(actions, self.action_space)  # type: ignore[arg-type]
+        estimates, parameters = checked[:, :self._n_nodes], checked[:, self._n_nodes:]
         t = self._step - self._lag
         if t <= self.scenario.warm_up:
             return np.zeros(self.num_envs)
@@ -53,6 +57,9 @@ class EstimationVectorEnv(LockstepVectorEnv):
             moments = np.stack([moments[t - 1 - scenario.warm_up] for moments in self._moments[part]])
             rewards[part] = -step_error(outline(scenario).mass, estimates[part] - scenario.background, moments,
                                         self._deviations[t - 1, part], self._squares[t - 1, part])
+        if scenario.velocity_model is not None:
+            moments, squares = (np.stack([flow[i][t - 1] for flow in self._flows]) for i in range(2))
+            rewards -= velocity_error(scenario.velocity_model, parameters, moments, squares)
         return rewards
 
     def _observe(self) -> Observation:

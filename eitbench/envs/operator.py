@@ -203,7 +203,7 @@ def _make_model(scenario: Scenario) -> ReducedModel:
     task = make_task(scenario)
     every = pair_currents(scenario)
     currents = every[np.random.default_rng(0).integers(len(every), size=90)]
-    start = table_5_1(task.transport, 1.0)
+    start = table_5_1(task.transport, task.prior, 1.0)
     level = scenario.expected_concentration
     linear = LinearisedObservations(task.observation, task.noise, np.full(task.mesh.n_nodes, level))
     record = []

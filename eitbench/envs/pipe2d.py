@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 from gymnasium.utils import EzPickle
 
-from eitbench import _check
+from eitbench.envs.arguments import assumed_flow, with_fields
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.estimation_vector import EstimationVectorEnv
 from eitbench.scenarios import Pipe2D
@@ -80,7 +79,7 @@ class Pipe2DEnv(EstimationEnv, EzPickle):
                  scenario: dict[str, Any] | None = None, episodes: int = 1000, render_mode: str | None = None) -> None:
         EzPickle.__init__(self, lag=lag, assumed_mean_velocity=assumed_mean_velocity, scenario=scenario,
                           episodes=episodes, render_mode=render_mode)
-        super().__init__(with_fields(scenario), lag=lag, assumptions=_assumptions(assumed_mean_velocity),
+        super().__init__(with_fields(Pipe2D, scenario), lag=lag, assumptions=assumed_flow(assumed_mean_velocity),
                          episodes=episodes, render_mode=render_mode)
 
 
@@ -89,21 +88,5 @@ class Pipe2DVectorEnv(EstimationVectorEnv):
 
     def __init__(self, *, num_envs: int = 1, lag: int | str = 0, assumed_mean_velocity: float | None = None,
                  scenario: dict[str, Any] | None = None, episodes: int = 1000) -> None:
-        _assumptions(assumed_mean_velocity)              # what estimators believe changes nothing here
-        super().__init__(with_fields(scenario), num_envs, lag=lag, episodes=episodes)
-
-
-def _assumptions(mean_velocity: float | None) -> dict[str, float]:
-    if mean_velocity is None:
-        return {}
-    return {"mean_velocity": _check.number("assumed_mean_velocity", mean_velocity, low=0.0, units="m/s")}
-
-
-def with_fields(changes: dict[str, Any] | None) -> Pipe2D:
-    """Pipe2D with some fields changed; lists become tuples, since kwargs come from JSON."""
-    changes = {name: tuple(value) if isinstance(value, list) else value for name, value in (changes or {}).items()}
-    unknown = changes.keys() - Pipe2D.__dataclass_fields__.keys()
-    if unknown:
-        raise ValueError(f"scenario has no field {sorted(unknown)[0]!r}; there are "
-                         f"{', '.join(Pipe2D.__dataclass_fields__)}")
-    return replace(Pipe2D(), **changes)
+        assumed_flow(assumed_mean_velocity)              # what estimators believe changes nothing here
+        super().__init__(with_fields(Pipe2D, scenario), num_envs, lag=lag, episodes=episodes)

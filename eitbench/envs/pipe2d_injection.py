@@ -6,8 +6,9 @@ from typing import Any
 
 from gymnasium.utils import EzPickle
 
+from eitbench.envs.arguments import with_fields
 from eitbench.envs.injection import InjectionEnv, InjectionVectorEnv
-from eitbench.envs.pipe2d import with_fields
+from eitbench.scenarios import Pipe2D
 
 
 class Pipe2DInjectionEnv(InjectionEnv, EzPickle):
@@ -70,7 +71,7 @@ class Pipe2DInjectionEnv(InjectionEnv, EzPickle):
     def __init__(self, *, estimator: str = "reduced", scenario: dict[str, Any] | None = None, episodes: int = 1000,
                  render_mode: str | None = None) -> None:
         EzPickle.__init__(self, estimator=estimator, scenario=scenario, episodes=episodes, render_mode=render_mode)
-        super().__init__(with_fields(scenario), estimator=estimator, episodes=episodes, render_mode=render_mode)
+        super().__init__(with_fields(Pipe2D, scenario), estimator=estimator, episodes=episodes, render_mode=render_mode)
 
 
 class Pipe2DInjectionVectorEnv(InjectionVectorEnv):
@@ -78,4 +79,5 @@ class Pipe2DInjectionVectorEnv(InjectionVectorEnv):
 
     def __init__(self, *, num_envs: int = 1, estimator: str = "reduced", scenario: dict[str, Any] | None = None,
                  episodes: int = 1000, threads: int = 1) -> None:
-        super().__init__(with_fields(scenario), num_envs, estimator=estimator, episodes=episodes, threads=threads)
+        super().__init__(with_fields(Pipe2D, scenario), num_envs, estimator=estimator, episodes=episodes,
+                         threads=threads)

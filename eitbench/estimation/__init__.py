@@ -1,6 +1,7 @@
 """Floor 3: estimators; matrices in, estimates out."""
 
 from eitbench.estimation.covariance import FreeCovariance
+from eitbench.estimation.dense import DenseKalmanFilter, Filtered
 from eitbench.estimation.first_frame import FirstFrame
 from eitbench.estimation.gains import GainSequence, gain_sequence
 from eitbench.estimation.gauss_newton import gauss_newton
@@ -13,11 +14,13 @@ from eitbench.estimation.kalman import (
     kalman_filter,
     linearised,
 )
-from eitbench.estimation.parameters import TABLE_5_1, table_5_1
+from eitbench.estimation.parameters import initial_covariance, starting_filter, table_5_1
 from eitbench.estimation.smoother import Smoothed, fixed_interval_smoother, smoothed_state
+from eitbench.estimation.smoothness import smoothness_covariance
 
 __all__ = [
-    "TABLE_5_1", "FilterStep", "FirstFrame", "FreeCovariance", "GainSequence", "KalmanFilter",
+    "DenseKalmanFilter", "FilterStep", "Filtered", "FirstFrame", "FreeCovariance", "GainSequence", "KalmanFilter",
     "LinearisedObservations", "Observation", "Smoothed", "best_homogeneous", "fixed_interval_smoother",
-    "gain_sequence", "gauss_newton", "kalman_filter", "linearised", "smoothed_state", "table_5_1",
+    "gain_sequence", "gauss_newton", "initial_covariance", "kalman_filter", "linearised", "smoothed_state",
+    "smoothness_covariance", "starting_filter", "table_5_1",
 ]

@@ -20,7 +20,7 @@ class FirstFrame:
 
     def __init__(self, task: Task) -> None:
         self.task = task
-        self.length = len(task.currents)
+        self.length = task.calibration
         self.measurements: list[tuple[np.ndarray, np.ndarray]] = []
         self.c_bh = task.expected_concentration
         """mol/m³; the task's rough level until the frame is complete, then ĉ_bh"""

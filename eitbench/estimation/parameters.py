@@ -8,41 +8,89 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from eitbench.estimation.covariance import FreeCovariance
+from eitbench.estimation.dense import DenseKalmanFilter
 from eitbench.estimation.kalman import KalmanFilter
+from eitbench.estimation.smoothness import smoothness_covariance
+from eitbench.physics.rest import AtRest
 
 if TYPE_CHECKING:
+    from eitbench.physics.mesh import Mesh
     from eitbench.physics.transport import ConvectionDiffusion
-
-INFLOW_STD = 1 / 4
-"""std of the inflow noise η in parts of ĉ_bh [T]"""
-NODAL_STD = 1 / 50
-"""std of the nodal noise e in parts of ĉ_bh [ours; illegible in the table]"""
-INITIAL_STD = 1 / 4
-"""std of the initial state in parts of ĉ_bh [ours; illegible in the table]"""
-
-TABLE_5_1 = {"inflow_std": INFLOW_STD, "nodal_std": NODAL_STD, "initial_std": INITIAL_STD}
-"""For records."""
+    from eitbench.scenarios.base import Prior
 
 
-def table_5_1(transport: ConvectionDiffusion, c_bh: float) -> KalmanFilter:
-    """A Kalman filter for c⁺ = F c + Y c_in + w with the parameters of Table 5.1.
+def starting_filter(transport: ConvectionDiffusion | AtRest, prior: Prior, c_bh: float,
+                    ) -> KalmanFilter | ClosedVesselFilter:
+    """A Kalman filter for the target's motion at t = 0, with the parameters of Table 5.1.
 
-    Inflow and initial state have mean ĉ_bh; Γ_η, Γ_e and Γ_{0|0} are diagonal. As all of them scale with ĉ_bh², the
-    covariance without data is computed once for a transport model and serves every episode.
+    Where the fluid flows through the vessel it is `table_5_1`'s. Where nothing flows in, the covariance without data
+    has no limit, and the filter keeps its covariance as a full matrix.
 
     Parameters
     ----------
-    transport : ConvectionDiffusion
+    transport
+        The evolution model; `Task.transport`.
+    prior : Prior
+        `Task.prior`.
     c_bh : float
         Best homogeneous estimate in mol/m³.
     """
+    if len(transport.inlet) and not isinstance(transport, AtRest):
+        return table_5_1(transport, prior, c_bh)
+    mean = np.full(transport.mesh.n_nodes, c_bh)
+    initial = initial_covariance(transport.mesh, prior)
+    if isinstance(transport, AtRest):
+        return ClosedVesselFilter(mean, c_bh**2 * initial, None, None)
+    noise = c_bh**2 * _state_noise(transport, prior)
+    return ClosedVesselFilter(mean, c_bh**2 * initial, transport.evolution_model().F, noise)
+
+
+def table_5_1(transport: ConvectionDiffusion, prior: Prior, c_bh: float) -> KalmanFilter:
+    """The Kalman filter of c⁺ = F c + Y c_in + w, where the fluid flows through; arguments as in `starting_filter`.
+
+    Inflow and initial state have mean ĉ_bh; Γ_η and Γ_e are diagonal, Γ_{0|0} is diagonal or smooth. As all of them
+    scale with ĉ_bh², the covariance without data is computed once for a transport model and serves every episode.
+    """
     F, Y, _ = transport.evolution_model()
-    n = len(F)
-    return KalmanFilter(F, Y.sum(axis=1) * c_bh, np.full(n, c_bh), _unit_covariance(transport).scaled(c_bh**2))
+    mean = np.full(len(F), c_bh)
+    return KalmanFilter(F, Y.sum(axis=1) * c_bh, mean, _free_covariance(transport, prior).scaled(c_bh**2))
 
 
-@lru_cache(maxsize=1)
-def _unit_covariance(transport: ConvectionDiffusion) -> FreeCovariance:
-    evolution = transport.evolution_model()
-    return FreeCovariance(evolution.F, evolution.state_noise_covariance(INFLOW_STD**2, NODAL_STD**2),
-                          INITIAL_STD**2 * np.eye(len(evolution.F)))
+class ClosedVesselFilter(DenseKalmanFilter):
+    """The Kalman filter of c⁺ = F c + w in a vessel that nothing enters; without F and Γ_w it all stands still."""
+
+    def __init__(self, mean: np.ndarray, covariance: np.ndarray, transition: np.ndarray | None,
+                 noise: np.ndarray | None) -> None:
+        super().__init__(mean, covariance)
+        self._transition, self._noise = transition, noise
+
+    def predict(self) -> None:  # type: ignore[override]
+        """Move one time step on."""
+        super().predict(self._transition, None, self._noise)
+
+
+def initial_covariance(mesh: Mesh, prior: Prior) -> np.ndarray:
+    """Γ_{0|0} (n, n) for ĉ_bh = 1: diagonal, or smooth over `Prior.initial_length`; read-only."""
+    if not prior.initial_length:
+        return prior.initial_std**2 * np.eye(mesh.n_nodes)
+    return _smooth(mesh, prior.initial_length, prior.initial_std)
+
+
+@lru_cache(maxsize=4)
+def _smooth(mesh: Mesh, length: float, std: float) -> np.ndarray:
+    from eitbench.physics.fem import mass_matrix, stiffness_matrix
+    covariance = smoothness_covariance(mass_matrix(mesh), stiffness_matrix(mesh), length, std)
+    covariance.setflags(write=False)
+    return covariance
+
+
+@lru_cache(maxsize=12)
+def _free_covariance(transport: ConvectionDiffusion, prior: Prior) -> FreeCovariance:
+    return FreeCovariance(transport.evolution_model().F, _state_noise(transport, prior),
+                          initial_covariance(transport.mesh, prior))
+
+
+@lru_cache(maxsize=4)
+def _state_noise(transport: ConvectionDiffusion, prior: Prior) -> np.ndarray:
+    """Γ_w (5.16) for ĉ_bh = 1."""
+    return transport.evolution_model().state_noise_covariance(prior.inflow_std**2, prior.nodal_std**2)

@@ -27,7 +27,7 @@ from eitbench.leaderboard.baselines import BOARDS, Baseline, load_baseline
 from eitbench.leaderboard.score import Played, score
 from eitbench.leaderboard.store import EpisodeStore, provenance, source_digest
 from eitbench.seeds import name_seed
-from eitbench.task import Estimate
+from eitbench.task import Estimate, Task
 
 
 class Environment(NamedTuple):
@@ -106,18 +106,33 @@ def _play(env: EstimationEnv, baseline: Baseline, seed: int,
             raise ValueError(f"Estimator.update must return an Estimate once a state is asked for; at t = {t} it "
                              "returned None")
         if estimate is not None:
-            _check_estimate(estimate, len(silence), len(seen["voltages"]))
+            _check_estimate(estimate, env.task)
             if estimate.variance is not None:
                 env.spread = np.sqrt(estimate.variance)
-        observation, _, done, _, _ = env.step(silence if estimate is None else estimate.mean)
+        observation, _, done, _, _ = env.step(_action(env.task, estimate, silence))
         yield t, estimate, seen, seconds
 
 
-def _check_estimate(estimate: Estimate, n: int, n_electrodes: int) -> None:
+def _action(task: Task, estimate: Estimate | None, silence: np.ndarray) -> np.ndarray:
+    """What the environment is told; the flow believed at first where an estimator says nothing of it."""
+    mean = silence if estimate is None else estimate.mean
+    if task.velocity is None:
+        return mean
+    said = None if estimate is None else estimate.velocity
+    return np.concatenate([mean, task.velocity.nominal if said is None else said])
+
+
+def _check_estimate(estimate: Estimate, task: Task) -> None:
+    n, n_electrodes = task.mesh.n_nodes, task.currents.shape[1]
     if not isinstance(estimate, Estimate):
         raise ValueError(f"Estimator.update must return an Estimate or None, got {type(estimate).__name__}")
     _check.array("Estimate.mean", estimate.mean, (n,), units="mol/m³")
-    variance, innovation, covariance = estimate[1:]
+    variance, innovation, covariance, velocity, velocity_variance = estimate[1:]
+    for name, value in (("velocity", velocity), ("velocity_variance", velocity_variance)):
+        if value is not None:
+            if task.velocity is None:
+                raise ValueError(f"Estimate.{name} must be None where the flow is not asked for, got {value!r}")
+            _check.array(f"Estimate.{name}", value, (task.velocity.size,))
     if innovation is not None:
         _check.array("Estimate.innovation", innovation, (n_electrodes,), units="V")
     if covariance is not None:

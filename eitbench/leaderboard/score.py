@@ -31,12 +31,15 @@ class Played:
     """measurement i -> (ν, S)"""
     seconds: np.ndarray
     """what each update took; the first also what the constructor took"""
+    velocities: np.ndarray
+    """(T, k) parameters of the flow in m/s; k = 0 where it is not asked for"""
 
     @classmethod
     def collect(cls, task: Task, played: Iterable[tuple[int, Estimate | None, dict[str, np.ndarray], float]]) -> Played:
         """Take in (t, estimate, measurement, seconds) step by step."""
         means = np.full((task.n_steps, task.mesh.n_nodes), np.nan)
         variances = means.copy()
+        velocities = np.tile(task.velocity.nominal if task.velocity else (), (task.n_steps, 1))
         measured, innovations, seconds = [], {}, []
         for t, estimate, measurement, elapsed in played:
             measured.append(measurement)
@@ -47,18 +50,23 @@ class Played:
                 means[t - 1] = estimate.mean
                 if estimate.variance is not None:
                     variances[t - 1] = estimate.variance
+                if estimate.velocity is not None:
+                    velocities[t - 1] = estimate.velocity
             if estimate.innovation is not None and estimate.innovation_covariance is not None:
                 innovations[t + task.lag] = (np.array(estimate.innovation, dtype=float),     # copies, as means are:
                                              np.array(estimate.innovation_covariance, dtype=float))  # arrays get reused
         voltages, currents = (np.array([m[key] for m in measured[:task.n_steps]]) for key in ("voltages", "currents"))
         claimed = bool(np.isfinite(variances[task.warm_up:]).all())
-        return cls(means, variances if claimed else None, voltages, currents, innovations, np.array(seconds))
+        return cls(means, variances if claimed else None, voltages, currents, innovations, np.array(seconds),
+                   velocities)
 
     def fields(self) -> dict[str, np.ndarray]:
         """Means and standard deviations as float32, for pictures."""
         fields = {"mean": self.means.astype(np.float32)}
         if self.variances is not None:
             fields["std"] = np.sqrt(self.variances).astype(np.float32)
+        if self.velocities.size:
+            fields["velocity"] = self.velocities.astype(np.float32)
         return fields
 
 
@@ -81,9 +89,14 @@ def score(env: EstimationEnv, played: Played) -> dict[str, Any]:
         "error": float(errors.mean()),
         "contrast_error": scoring.relative_error(mean, c, mass, reference=c_bh),
         "voltage_discrepancy": scoring.voltage_discrepancy(played.voltages[scored], computed),
-        "nis": None, "crps": None, "coverage_50": None, "coverage_90": None, "spread_ratio": None,
+        "velocity_error": None, "nis": None, "crps": None, "coverage_50": None, "coverage_90": None,
+        "spread_ratio": None,
         "seconds_per_step": float(played.seconds.sum() / task.n_steps),
     }
+    if task.velocity is not None:
+        true = env.true_velocity()[scored]
+        estimated = played.velocities[scored] @ task.velocity.profiles.T
+        scores["velocity_error"] = scoring.relative_error(estimated, true, np.diag(task.velocity.weights))
     known = [played.innovations[i] for i in range(task.warm_up + 1, task.n_steps + 1) if i in played.innovations]
     if known:
         nu, S = (np.array(part) for part in zip(*known, strict=True))

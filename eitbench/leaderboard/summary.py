@@ -14,7 +14,8 @@ from eitbench.scoring import skill
 
 COLUMNS = {
     "error": "ẽ_c", "skill": "skill", "contrast_error": "contrast", "nis": "NIS/m", "crps": "CRPS",
-    "coverage_50": "50 %", "coverage_90": "90 %", "spread_ratio": "var/MSE", "voltage_discrepancy": "ẽ_V",
+    "velocity_error": "ẽ_v", "coverage_50": "50 %", "coverage_90": "90 %", "spread_ratio": "var/MSE",
+    "voltage_discrepancy": "ẽ_V",
     "seconds_per_step": "ms/step",
 }
 EXPLANATIONS = {
@@ -23,6 +24,7 @@ EXPLANATIONS = {
     "contrast": "error relative to the deviation from the homogeneous estimate; 1 is no better than that",
     "NIS/m": "normalised innovation squared; 1 when the filter's own uncertainty fits",
     "CRPS": "continuous ranked probability score, mol/m³",
+    "ẽ_v": "relative error of the flow, ∫(v̂ − v)²/∫v² across the pipe, where it is asked for too",
     "50 %": "part of the truth inside the claimed 50 % interval",
     "90 %": "part of the truth inside the claimed 90 % interval",
     "var/MSE": "claimed variance over squared error; 1 is honest, more is too modest",

@@ -32,3 +32,84 @@ class PlaneChannelFlow:
         velocity = np.zeros_like(points, dtype=float)
         velocity[:, 0] = 1.5 * self.mean_velocity * (1.0 - (points[:, 1] / self.half_width)**2)
         return velocity
+
+
+@dataclass(frozen=True)
+class PowerLawFlow:
+    """Turbulent mean flow between parallel walls: v(y) = (1 + n)·v̄·(1 − |y|/R)ⁿ along x.
+
+    With n = 1/7 this is the power law of Prandtl and von Kármán for moderate Reynolds numbers (Schlichting,
+    *Boundary-Layer Theory*, ch. XX).
+
+    Parameters
+    ----------
+    mean_velocity : float
+        v̄ in m/s, ≥ 0.
+    half_width : float
+        R in m, > 0.
+    exponent : float
+        n, > 0; 1/7 by default.
+    """
+
+    mean_velocity: float
+    half_width: float
+    exponent: float = 1.0 / 7.0
+
+    def __post_init__(self) -> None:
+        _check.number("mean_velocity", self.mean_velocity, low=0.0, units="m/s")
+        _check.number("half_width", self.half_width, low=0.0, open_low=True, units="m")
+        _check.number("exponent", self.exponent, low=0.0, open_low=True)
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        velocity = np.zeros_like(points, dtype=float)
+        # a wall node may lie outside by rounding, where the power has no value
+        from_wall = np.maximum(1.0 - np.abs(points[:, 1]) / self.half_width, 0.0)
+        velocity[:, 0] = (1.0 + self.exponent) * self.mean_velocity * from_wall**self.exponent
+        return velocity
+
+
+@dataclass(frozen=True)
+class PlugFlow:
+    """The same velocity everywhere, v̄ along x: the limit of strong mixing, or of a fluid without friction.
+
+    Parameters
+    ----------
+    mean_velocity : float
+        v̄ in m/s, ≥ 0.
+    """
+
+    mean_velocity: float
+
+    def __post_init__(self) -> None:
+        _check.number("mean_velocity", self.mean_velocity, low=0.0, units="m/s")
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        velocity = np.zeros_like(points, dtype=float)
+        velocity[:, 0] = self.mean_velocity
+        return velocity
+
+
+@dataclass(frozen=True)
+class RoundPipeFlow:
+    """Laminar flow in a round pipe, after Hagen and Poiseuille: v(r) = 2·v̄·(1 − (r/R)²) along z, r² = x² + y².
+
+    Parameters
+    ----------
+    mean_velocity : float
+        v̄ in m/s, ≥ 0.
+    radius : float
+        R in m, > 0.
+    """
+
+    mean_velocity: float
+    radius: float
+
+    def __post_init__(self) -> None:
+        _check.number("mean_velocity", self.mean_velocity, low=0.0, units="m/s")
+        _check.number("radius", self.radius, low=0.0, open_low=True, units="m")
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        velocity = np.zeros_like(points, dtype=float)
+        squared = (points[:, :2]**2).sum(axis=1) / self.radius**2
+        velocity[:, 2] = 2.0 * self.mean_velocity * np.maximum(1.0 - squared, 0.0)       # by rounding r may exceed R
+        return velocity

@@ -79,10 +79,15 @@ class Mesh:
     @cached_property
     def boundary_facets(self) -> np.ndarray:
         """(n_facets, d) node numbers, sorted within each row, of the facets that belong to one cell only."""
+        return self._boundary[0]
+
+    @cached_property
+    def _boundary(self) -> tuple[np.ndarray, np.ndarray]:
+        """The boundary facets (n_facets, d) and the cell (n_facets,) that each belongs to."""
         d = self.dim
         facets = np.concatenate([np.delete(self.cells, i, axis=1) for i in range(d + 1)])
-        facets, count = np.unique(np.sort(facets, axis=1), axis=0, return_counts=True)
-        return facets[count == 1]
+        facets, first, count = np.unique(np.sort(facets, axis=1), axis=0, return_index=True, return_counts=True)
+        return facets[count == 1], first[count == 1] % len(self.cells)
 
     def facets_where(self, predicate: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
         """The boundary facets all of whose nodes satisfy ``predicate(points (k, d)) -> bool (k,)``; (n_facets, d)."""
@@ -93,20 +98,28 @@ class Mesh:
     def _centroid_tree(self) -> cKDTree:
         return cKDTree(self.points[self.cells].mean(axis=1))
 
-    def interpolation_to(self, points: np.ndarray, candidates: int = 32) -> sp.csr_array:
-        """Matrix of linear interpolation from nodal values here to ``points``.
+    def locate(self, points: np.ndarray, candidates: int = 32) -> tuple[np.ndarray, np.ndarray]:
+        """The cell that holds each of ``points``, and the point's barycentric coordinates there.
 
         Parameters
         ----------
         points : (k, d) float
-            Where to interpolate, in m. A point outside the mesh (by rounding, or because a curved wall is a polygon
-            here) takes the value at the nearest point of the boundary.
+            In m. A point outside the mesh (by rounding, or because a curved wall is a polygon here) is moved to the
+            nearest point of the boundary (in 3D, where that is on an edge of a facet, to one nearly as near).
         candidates : int
             How many cells, nearest by centroid, are searched first; points found in none are searched in all cells.
 
         Returns
         -------
-        (k, n_nodes) sparse array with rows that sum to one.
+        cells : (k,) int
+            Cell numbers; for a point outside, the cell that the nearest boundary facet belongs to.
+        barycentric : (k, d + 1) float
+            Weights of the cell's nodes, in the order of ``cells``: not negative, with rows that sum to one.
+
+        Raises
+        ------
+        ValueError
+            If ``points`` has the wrong shape or is not finite.
         """
         points = _check.array("points", points, (None, self.dim), units="m")
         k = min(candidates, len(self.cells))
@@ -117,28 +130,45 @@ class Mesh:
             everywhere = np.broadcast_to(np.arange(len(self.cells)), (1, len(self.cells)))
             for i in lost:
                 best[i:i + 1], weights[i:i + 1] = self._best_cell(points[i:i + 1], everywhere)
-        nodes = self.cells[best]
         for i in np.flatnonzero(weights.min(axis=1) < -1e-9):
             # The cell with the least negative coordinate may be a large one far inside: take the nearest wall instead.
-            nodes[i, :-1], weights[i, :-1] = self._nearest_facet(points[i])
-            weights[i, -1] = 0.0
+            best[i], weights[i] = self._nearest_wall(points[i])
         weights = np.clip(weights, 0.0, None)
         weights /= weights.sum(axis=1, keepdims=True)
-        rows = np.repeat(np.arange(len(points)), self.dim + 1)
-        matrix = sp.csr_array((weights.ravel(), (rows, nodes.ravel())), shape=(len(points), self.n_nodes))
+        return best, weights
+
+    def interpolation_to(self, points: np.ndarray, candidates: int = 32) -> sp.csr_array:
+        """Matrix of linear interpolation from nodal values here to ``points``.
+
+        Parameters
+        ----------
+        points : (k, d) float
+            Where to interpolate, in m. A point outside the mesh takes the value at the nearest point of the boundary.
+        candidates : int
+            See `locate`.
+
+        Returns
+        -------
+        (k, n_nodes) sparse array with rows that sum to one.
+        """
+        cells, weights = self.locate(points, candidates)
+        rows = np.repeat(np.arange(len(cells)), self.dim + 1)
+        matrix = sp.csr_array((weights.ravel(), (rows, self.cells[cells].ravel())), shape=(len(cells), self.n_nodes))
         matrix.eliminate_zeros()
         return matrix
 
-    def _nearest_facet(self, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes of the boundary facet nearest to ``point``, and the barycentric coordinates of its projection there."""
-        corner = self.points[self.boundary_facets]                                     # (f, d, d)
+    def _nearest_wall(self, point: np.ndarray) -> tuple[int, np.ndarray]:
+        """The cell of the boundary facet nearest to ``point``, and the barycentric coordinates of its projection."""
+        facets, cells = self._boundary
+        corner = self.points[facets]                                                   # (f, d, d)
         edges = corner[:, 1:] - corner[:, :1]
         gram = edges @ np.swapaxes(edges, 1, 2)
         local = np.linalg.solve(gram, edges @ (point - corner[:, 0])[:, :, None])[..., 0]
         weights = np.clip(np.concatenate([1.0 - local.sum(axis=1, keepdims=True), local], axis=1), 0.0, None)
         weights /= weights.sum(axis=1, keepdims=True)
         nearest = np.linalg.norm(np.einsum("fi,fid->fd", weights, corner) - point, axis=1).argmin()
-        return self.boundary_facets[nearest], weights[nearest]
+        same_node = self.cells[cells[nearest]][:, None] == facets[nearest]              # (d + 1, d)
+        return int(cells[nearest]), same_node @ weights[nearest]
 
     def _best_cell(self, points: np.ndarray, candidates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Among each point's candidate cells the one that contains it best, with its barycentric coordinates."""

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
 if TYPE_CHECKING:
     from eitbench.physics.observation import ObservationModel, VoltageNoise
+    from eitbench.physics.profiles import VelocityModel
     from eitbench.physics.transport import ConvectionDiffusion
 
 
@@ -17,6 +18,36 @@ class Discretisation(NamedTuple):
 
     transport: ConvectionDiffusion
     observation: ObservationModel
+
+
+class Prior(NamedTuple):
+    """What is believed before anything is measured; standard deviations in parts of ĉ_bh (thesis Table 5.1)."""
+
+    inflow_std: float = 1 / 4
+    """of the inflow noise η [T]"""
+    nodal_std: float = 1 / 50
+    """of the nodal noise e [ours; illegible in the table]"""
+    initial_std: float = 1 / 4
+    """of the initial state [ours; illegible in the table]"""
+    initial_length: float = 0.0
+    """m over which the initial state is smooth; 0: nodes are independent"""
+
+
+class Randomness(NamedTuple):
+    """The independent streams that an episode's seed gives."""
+
+    inflow: np.random.Generator
+    noise: np.random.Generator
+    flow: np.random.Generator
+
+
+class History(NamedTuple):
+    """What moved in one episode."""
+
+    concentration: np.ndarray
+    """(T + 1, n) mol/m³ at the nodes of the truth's CD mesh, t = 0 … T"""
+    velocity: np.ndarray
+    """(T, p) m/s at `VelocityModel.points`, t = 1 … T; p = 0 where nobody is asked for the flow"""
 
 
 class Scenario(Protocol):
@@ -40,9 +71,14 @@ class Scenario(Protocol):
         ...
 
     @property
+    def calibration(self) -> int:
+        """First injections, from which an estimator finds ĉ_bh: by default one turn of the cycle."""
+        return len(self.currents)
+
+    @property
     def lead_in(self) -> int:
         """Time steps that the fluid flows before t = 0."""
-        ...
+        return 0
 
     @property
     def background(self) -> float:
@@ -55,6 +91,16 @@ class Scenario(Protocol):
         ...
 
     @property
+    def prior(self) -> Prior:
+        """What is believed of the target."""
+        return Prior()
+
+    @property
+    def velocity_model(self) -> VelocityModel | None:
+        """How the flow may be written where it is to be estimated too."""
+        return None
+
+    @property
     def noise(self) -> VoltageNoise: ...
 
     @property
@@ -62,19 +108,18 @@ class Scenario(Protocol):
         """(K, L) injection cycle in A (A/m in 2D); injection t uses row (t − 1) mod K."""
         ...
 
-    @property
-    def truth_steps(self) -> int:
-        """Steps of the truth's transport per injection."""
-        ...
-
     def truth(self) -> Discretisation:
-        """The fine one that is simulated; its transport steps ``time_step / truth_steps``."""
+        """The fine one that is simulated."""
         ...
 
     def model(self, *args: Any, **assumptions: Any) -> Discretisation:
         """The coarser one that estimators are given; ``assumptions`` are what they wrongly believe."""
         ...
 
-    def draw_inflow(self, rng: np.random.Generator) -> Callable[[np.ndarray, float], np.ndarray]:
-        """A random inflow: (points (k, d) in m, time in s) -> concentration (k,) in mol/m³."""
+    def evolve(self, episodes: Sequence[Randomness], truth: Discretisation, tick: Callable[[int], object],
+               ) -> Iterator[History]:
+        """What moves in each episode. Its numbers do not depend on the others beside it, to the bit.
+
+        ``tick(k)`` is called when k more steps of one episode are done, ``lead_in + n_steps`` an episode in all.
+        """
         ...

@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from eitbench import _check
-from eitbench.physics.flow import PlaneChannelFlow
+from eitbench.physics.flow import PlaneChannelFlow, PlugFlow, PowerLawFlow
 from eitbench.physics.observation import LinearConductivity, ObservationModel, VoltageNoise
-from eitbench.scenarios.base import Discretisation
+from eitbench.scenarios.base import Discretisation, History, Randomness, Scenario
+from eitbench.scenarios.carried import Inflow, carry
 
 if TYPE_CHECKING:
     from eitbench.physics.mesh import Mesh
+    from eitbench.physics.transport import VelocityField
+
+PROFILES = ("parabolic", "plug", "power-law")
+"""Shapes of the velocity profile that a model may assume."""
 
 
 @dataclass(frozen=True)
-class Pipe2D:
+class Pipe2D(Scenario):
     """A straight plane channel with laminar flow (thesis 5.1.1, Figs 5.1–5.6).
 
     [T]: the thesis' number; [ours]: our choice.
@@ -149,7 +154,13 @@ class Pipe2D:
 
     # -- the fluid --
 
-    def draw_inflow(self, rng: np.random.Generator) -> Callable[[np.ndarray, float], np.ndarray]:
+    def evolve(self, episodes: Sequence[Randomness], truth: Discretisation, tick: Callable[[int], object],
+               ) -> Iterator[History]:
+        inflows = [self.draw_inflow(episode.inflow) for episode in episodes]
+        for concentration in carry(self, lambda t: truth.transport, inflows, tick):
+            yield History(concentration, np.empty((self.n_steps, 0)))
+
+    def draw_inflow(self, rng: np.random.Generator) -> Inflow:
         """Slugs of both signs, Gaussian across the pipe and in time: c_in = background·exp(Σ ±a·g(y)·g(t))."""
         begin, end = -self.lead_in * self.time_step - 0.05, self.n_steps * self.time_step + 0.05
         n = math.ceil((end - begin) / self.slug_interval)
@@ -169,26 +180,32 @@ class Pipe2D:
     def truth(self) -> Discretisation:
         """10,251 CD nodes, 32 sub-steps an injection; about 18,000 EIT unknowns."""
         return self._discretise(cells=(200, 50), substeps=16, time_step=self.time_step / self.truth_steps,
-                                cells_at_electrodes=10, cells_across=28, mean_velocity=self.mean_velocity)
+                                cells_at_electrodes=10, cells_across=28,
+                                velocity=PlaneChannelFlow(self.mean_velocity, self.half_width))
 
-    def model(self, mean_velocity: float | None = None) -> Discretisation:
+    def model(self, mean_velocity: float | None = None, profile: str = "parabolic") -> Discretisation:
         """1,701 CD nodes, 8 sub-steps an injection; about 4,600 EIT unknowns.
 
-        ``mean_velocity`` (m/s) is what the estimator assumes, by default the truth.
+        ``mean_velocity`` (m/s) is what the estimator assumes, by default the truth; ``profile``, one of `PROFILES`,
+        the shape that it assumes.
         """
-        velocity = self.mean_velocity if mean_velocity is None else mean_velocity
+        mean = self.mean_velocity if mean_velocity is None else mean_velocity
+        flows: dict[str, VelocityField] = {"parabolic": PlaneChannelFlow(mean, self.half_width), "plug": PlugFlow(mean),
+                                           "power-law": PowerLawFlow(mean, self.half_width)}
+        if profile not in flows:
+            raise ValueError(f"profile must be one of {', '.join(PROFILES)}, got {profile!r}")
         return self._discretise(cells=(80, 20), substeps=8, time_step=self.time_step,
-                                cells_at_electrodes=5, cells_across=14, mean_velocity=velocity)
+                                cells_at_electrodes=5, cells_across=14, velocity=flows[profile])
 
     def _discretise(self, *, cells: tuple[int, int], substeps: int, time_step: float, cells_at_electrodes: int,
-                    cells_across: int, mean_velocity: float) -> Discretisation:
+                    cells_across: int, velocity: VelocityField) -> Discretisation:
         from eitbench.physics.cem import CompleteElectrodeModel  # finite elements: not needed to play recordings
         from eitbench.physics.mesh import graded_pipe_mesh, rectangle_mesh
         from eitbench.physics.transport import ConvectionDiffusion
         R = self.half_width
         cd_mesh = rectangle_mesh(np.linspace(0.0, self.length, cells[0] + 1), np.linspace(-R, R, cells[1] + 1))
         inlet = np.arange(cells[1] + 1)
-        transport = ConvectionDiffusion(cd_mesh, PlaneChannelFlow(mean_velocity, R), self.diffusivity, time_step,
+        transport = ConvectionDiffusion(cd_mesh, velocity, self.diffusivity, time_step,
                                         substeps=substeps, inlet=inlet)
         eit_mesh = graded_pipe_mesh(self.length, R, self.electrode_spans, cells_at_electrodes, cells_across)
         cem = CompleteElectrodeModel(eit_mesh, self.electrodes(eit_mesh), self.contact_impedance)

@@ -142,7 +142,7 @@ def test_estimator_is_the_kalman_filter_of_the_baselines():
     first = FirstFrame(task)
     for k in range(16):
         first.add(voltages[k], scenario.currents[k])
-    start = table_5_1(task.transport, first.c_bh)
+    start = table_5_1(task.transport, task.prior, first.c_bh)
     linear = LinearisedObservations(task.observation, task.noise, start.mean)
     full = kalman_filter(start, [linear(v, scenario.currents[t % 16]) for t, v in enumerate(voltages)])
     env.reset(seed=5)

@@ -145,6 +145,44 @@ def test_points_behind_a_polygonal_wall_take_the_value_at_the_wall():
     assert moved.max() < 1.5 * sagitta
 
 
+@in_both_dimensions
+@pytest.mark.parametrize("candidates", [1, 4, 32])
+def test_located_points_are_where_their_coordinates_say(dim, candidates):
+    """Inside, the barycentric coordinates are those of the point in the cell found, however few are tried first."""
+    mesh = MESHES[dim]
+    points = np.random.default_rng(3).uniform(size=(200, dim)) * SIZE[:dim]
+    cells, barycentric = mesh.locate(points, candidates)
+    assert cells.shape == (200,) and barycentric.shape == (200, dim + 1) and np.issubdtype(cells.dtype, np.integer)
+    assert barycentric.min() >= 0
+    assert_allclose(barycentric.sum(axis=1), 1.0, atol=1e-14)
+    assert_allclose(np.einsum("ki,kid->kd", barycentric, mesh.points[mesh.cells[cells]]), points, atol=1e-12)
+
+
+@in_both_dimensions
+def test_points_outside_are_located_at_the_nearest_wall(dim):
+    """Far outside a box the nearest point is the one with clipped coordinates, and the cell found has it on a facet."""
+    mesh, size = MESHES[dim], SIZE[:dim]
+    points = np.random.default_rng(4).uniform(-1.0, 2.0, size=(300, dim)) * size
+    out = ((points < 0) | (points > size)).sum(axis=1)
+    points = points[(out == 1) | ((out == 2) & (dim == 2))]      # beyond an edge in 3D it is only nearly the nearest
+    cells, barycentric = mesh.locate(points)
+    assert_allclose(np.einsum("ki,kid->kd", barycentric, mesh.points[mesh.cells[cells]]), np.clip(points, 0.0, size),
+                    atol=1e-12)
+    walls = {tuple(facet) for facet in mesh.boundary_facets}
+    for cell, weights in zip(mesh.cells[cells], barycentric, strict=True):
+        assert any(weights[i] == 0 and tuple(np.sort(np.delete(cell, i))) in walls for i in range(dim + 1))
+
+
+def test_interpolation_weighs_the_located_nodes():
+    """Inside and outside, the matrix holds the barycentric coordinates of `locate` at the nodes of its cells."""
+    mesh = MESHES[2]
+    points = np.random.default_rng(5).uniform(-0.5, 1.5, size=(100, 2))
+    cells, barycentric = mesh.locate(points)
+    expected = np.zeros((100, mesh.n_nodes))
+    np.put_along_axis(expected, mesh.cells[cells], barycentric, axis=1)
+    assert_array_equal(mesh.interpolation_to(points).toarray(), expected)
+
+
 # -- structured meshes ------------------------------------------------------------------------------------------------
 
 def test_rectangle_mesh_is_numbered_by_cross_section():
@@ -249,3 +287,5 @@ def test_wrong_coordinates_are_refused():
         MESHES[2].interpolation_to(np.zeros((1, 3)))
     with pytest.raises(ValueError, match="points must be finite"):
         MESHES[2].interpolation_to(np.array([[np.nan, 0.0]]))
+    with pytest.raises(ValueError, match=r"points must have shape \(any, 3\)"):
+        MESHES[3].locate(np.zeros((1, 2)))

@@ -1,0 +1,123 @@
+"""Kalman filtering with the n×n covariance kept as it is: for transitions that change with time, and for F = I."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import blas, cho_factor, cho_solve, solve_triangular
+
+from eitbench import _check
+from eitbench.estimation.kalman import Observation
+
+_BLOCK = 128
+"""columns copied at once when a triangle is mirrored: small enough for the processor's cache"""
+
+
+class Filtered(NamedTuple):
+    """What one measurement left behind."""
+
+    mean: np.ndarray
+    """(n,) c_{t|t}"""
+    variance: np.ndarray
+    """(n,) diagonal of Γ_{t|t}, never negative"""
+    innovation: np.ndarray
+    """(m,) ν"""
+    innovation_covariance: np.ndarray
+    """(m, m) S"""
+
+
+class DenseKalmanFilter:
+    """The Kalman filter of c⁺ = F c + s + w with any F at each step, in about 3n³ operations a prediction.
+
+    `KalmanFilter` is far cheaper, but wants a constant F and a covariance with a limit. Where F = I (a target at rest,
+    a closed vessel) a prediction costs next to nothing here; an update costs O(n² m) in any case. The covariance stays
+    symmetric to the bit and its diagonal is kept from falling below zero.
+
+    Parameters
+    ----------
+    mean : (n,)
+        c_{0|0}.
+    covariance : (n, n)
+        Γ_{0|0}.
+
+    Attributes
+    ----------
+    mean : (n,)
+        Of the present state.
+    covariance : (n, n)
+        Of the present state; written in place.
+
+    Raises
+    ------
+    ValueError
+        Naming the argument, if it is of the wrong shape or not finite.
+    """
+
+    def __init__(self, mean: np.ndarray, covariance: np.ndarray) -> None:
+        self.mean = np.array(_check.array("mean", mean, (None,)))
+        n = len(self.mean)
+        covariance = _check.array("covariance", covariance, (n, n))
+        self.covariance = np.ascontiguousarray(0.5 * (covariance + covariance.T))
+        self._work = np.empty((n, n))
+
+    def predict(self, transition: np.ndarray | None = None, forcing: np.ndarray | None = None,
+                noise: np.ndarray | None = None, *, mean: np.ndarray | None = None) -> None:
+        """Move one time step on.
+
+        Parameters
+        ----------
+        transition : (n, n), optional
+            F; by default I.
+        forcing : (n,), optional
+            s, by default 0.
+        noise : (n, n), optional
+            Γ_w, symmetric; by default 0.
+        mean : (n,), optional
+            The predicted mean in place of F c + s, for a transition that is the derivative of something nonlinear.
+        """
+        if mean is not None and forcing is not None:
+            raise ValueError("forcing must not be given beside mean, which is what the state becomes")
+        n = len(self.mean)
+        for name, value, shape in (("transition", transition, (n, n)), ("forcing", forcing, (n,)),
+                                   ("noise", noise, (n, n)), ("mean", mean, (n,))):
+            if value is not None and np.shape(value) != shape:
+                raise ValueError(f"{name} must have shape {shape}, got {np.shape(value)}")
+        if mean is None:
+            mean = (self.mean if transition is None else transition @ self.mean) + (0.0 if forcing is None else forcing)
+        self.mean = np.array(mean, dtype=float)
+        if transition is not None:
+            self._transform(transition)
+        if noise is not None:
+            self.covariance += noise
+
+    def update(self, observation: Observation) -> Filtered:
+        """Take in one measurement of the present state."""
+        H, value, noise_variance = observation
+        cross = self.covariance @ H.T
+        S = H @ cross
+        S = 0.5 * (S + S.T) + np.diag(noise_variance)
+        innovation = value - H @ self.mean
+        factor = cho_factor(S, lower=True)
+        self.mean = self.mean + cross @ cho_solve(factor, innovation)
+        gained = solve_triangular(factor[0], cross.T, lower=True).T                      # Γ Hᵀ L⁻ᵀ
+        self.covariance -= np.matmul(gained, gained.T, out=self._work)
+        diagonal = np.einsum("ii->i", self.covariance)                                   # a view
+        np.maximum(diagonal, 0.0, out=diagonal)                   # precise measurements leave rounding of either sign
+        return Filtered(self.mean, diagonal.copy(), innovation, S)
+
+    def _transform(self, F: np.ndarray) -> None:
+        """P ← F P Fᵀ by triangles: with P = L + Lᵀ and B = F L it is B Fᵀ + F Bᵀ, of which one half is computed."""
+        P, B = self.covariance, self._work
+        diagonal = np.einsum("ii->i", P)
+        diagonal *= 0.5
+        np.copyto(B, F)
+        # BLAS thinks in columns and sees each array transposed: Lᵀ Fᵀ, from the lower triangle of Pᵀ.
+        blas.dtrmm(1.0, P.T, B.T, lower=1, trans_a=1, overwrite_b=1)
+        blas.dsyr2k(1.0, np.asfortranarray(F.T), B.T, beta=0.0, c=P.T, trans=1, lower=1, overwrite_c=1)
+        edges = [*range(0, len(P), _BLOCK), len(P)]
+        for begin, end in pairwise(edges):                        # the lower triangle of Pᵀ is the upper one of P
+            P[begin:end, :begin] = P[:begin, begin:end].T
+            corner = np.triu(P[begin:end, begin:end])
+            P[begin:end, begin:end] = corner + np.triu(corner, 1).T

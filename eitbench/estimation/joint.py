@@ -1,0 +1,152 @@
+"""Concentration and velocity estimated together by an extended Kalman filter (thesis ch. 6)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from eitbench import _check
+from eitbench.estimation.dense import DenseKalmanFilter
+from eitbench.estimation.kalman import Observation
+
+VelocityField = Callable[[np.ndarray], np.ndarray]
+
+
+class _Transport(Protocol):
+    inlet: np.ndarray
+
+    def transition(self) -> tuple[np.ndarray, np.ndarray]: ...
+
+    def velocity_derivatives(self, c: np.ndarray, inflow_before: np.ndarray | float, inflow_after: np.ndarray | float,
+                             directions: Sequence[VelocityField]) -> tuple[np.ndarray, np.ndarray]: ...
+
+
+class JointStep(NamedTuple):
+    """What one measurement left behind."""
+
+    mean: np.ndarray
+    """(n,) concentration c_{t|t}, mol/m³"""
+    variance: np.ndarray
+    """(n,) its variance, (mol/m³)²"""
+    parameters: np.ndarray
+    """(k,) θ_{t|t}"""
+    parameter_covariance: np.ndarray
+    """(k, k)"""
+    innovation: np.ndarray
+    """(m,) ν"""
+    innovation_covariance: np.ndarray
+    """(m, m) S"""
+
+
+class JointFilter:
+    """The extended Kalman filter of c⁺ = F(θ) c + Y(θ) c_in + w, θ⁺ = θ + ω: velocity v = Σ θ_k v_k, θ unknown.
+
+    Each step is linearised at the present estimate: the covariance of (c, θ) moves with [[F, ∂c⁺/∂θ], [0, I]], where F,
+    Y and the derivative are those of the discrete step at θ̂. The noise is Γ_w = Y(θ̂) Γ_η Y(θ̂)ᵀ + H Γ_e Hᵀ, of which
+    only the nodal part H Γ_e Hᵀ is frozen at the nominal velocity: H would cost as much as F, and the part is small.
+
+    The velocity stays physical: after each measurement it must lie within ``bounds`` at all points of ``profiles``.
+    Where it does not, θ is moved back along the line towards its start θ_0, just as far as needed; concentration and
+    covariance stay what they are.
+
+    Parameters
+    ----------
+    transport_at : callable
+        θ (k,) -> the transport model with that velocity, such as a `ConvectionDiffusion`; all with the same inlet.
+    directions : k callables
+        v_k, each points (p, d) in m -> velocity (p, d) in m/s for θ_k = 1.
+    mean, covariance : (n,), (n, n)
+        Of the concentration at t = 0, in mol/m³ and its square.
+    parameters, parameter_covariance : (k,), (k, k)
+        Of θ at t = 0, in m/s and its square if the v_k have no unit.
+    walk_std : (k,)
+        Standard deviations of ω, the steps of the random walk; zero for a velocity that is constant.
+    inflow, inflow_std : float
+        c_in and the standard deviation of η in mol/m³; ĉ_bh and ĉ_bh/4 in the thesis.
+    nodal_noise : (n, n)
+        H Γ_e Hᵀ at the nominal velocity, (mol/m³)².
+    profiles : (p, k)
+        Axial velocity of each v_k at p points across the flow, where it is not zero: not on the walls.
+    bounds : (float, float)
+        Least and largest axial velocity in m/s there, the least > 0; θ_0 must keep to them.
+
+    Raises
+    ------
+    ValueError
+        Naming the argument, if it is out of range, of the wrong shape, or not finite.
+    """
+
+    def __init__(self, transport_at: Callable[[np.ndarray], _Transport], directions: Sequence[VelocityField], *,
+                 mean: np.ndarray, covariance: np.ndarray, parameters: np.ndarray, parameter_covariance: np.ndarray,
+                 walk_std: np.ndarray, inflow: float, inflow_std: float, nodal_noise: np.ndarray,
+                 profiles: np.ndarray, bounds: tuple[float, float]) -> None:
+        self.transport_at, self.directions = transport_at, directions
+        k = len(directions)
+        c = _check.array("mean", mean, (None,), units="mol/m³")
+        n = self._n = len(c)
+        self._start = _check.array("parameters", parameters, (k,))
+        walk = _check.array("walk_std", walk_std, (k,))
+        self._inflow = _check.number("inflow", inflow, units="mol/m³")
+        self._inflow_std = _check.number("inflow_std", inflow_std, low=0.0, units="mol/m³")
+        self._nodal_noise = _check.array("nodal_noise", nodal_noise, (n, n))
+        self._profiles = _check.array("profiles", profiles, (None, k))
+        low, high = self._bounds = _check.array("bounds", bounds, (2,), units="m/s", positive=True)
+        nominal = self._profiles @ self._start
+        if not ((low <= nominal) & (nominal <= high)).all():
+            raise ValueError(f"bounds must hold the velocity that parameters give, {nominal.min():g} to "
+                             f"{nominal.max():g} m/s, got {bounds!r}")
+        joint = np.zeros((n + k, n + k))
+        joint[:n, :n] = _check.array("covariance", covariance, (n, n))
+        joint[n:, n:] = _check.array("parameter_covariance", parameter_covariance, (k, k))
+        self._filter = DenseKalmanFilter(np.concatenate([c, self._start]), joint)
+        self._transition, self._noise = np.eye(n + k), np.zeros((n + k, n + k))
+        self._noise[n:, n:] = np.diag(walk**2)
+
+    @property
+    def concentration(self) -> np.ndarray:
+        """(n,) present mean of the concentration: where the next observation is to be linearised."""
+        return self._filter.mean[:self._n]
+
+    @property
+    def parameters(self) -> np.ndarray:
+        """(k,) present mean of θ."""
+        return self._filter.mean[self._n:]
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """(n + k, n + k) present covariance of (c, θ)."""
+        return self._filter.covariance
+
+    def predict(self) -> None:
+        """Move one time step on with the velocity estimated so far."""
+        n, c, theta = self._n, self.concentration, self.parameters
+        transport = self.transport_at(theta)
+        # k is small: as one matrix the whole costs hardly more than F alone.
+        self._transition[:n, :n], Y = transport.transition()
+        after, self._transition[:n, n:] = transport.velocity_derivatives(c, c[transport.inlet], self._inflow,
+                                                                         self.directions)
+        Y = self._inflow_std * Y
+        np.matmul(Y, Y.T, out=self._noise[:n, :n])
+        self._noise[:n, :n] += self._nodal_noise
+        self._filter.predict(self._transition, noise=self._noise, mean=np.concatenate([after, theta]))
+
+    def update(self, observation: Observation) -> JointStep:
+        """Take in one measurement of the present concentration, linearised at `concentration` (see `linearised`)."""
+        n, (matrix, value, noise_variance) = self._n, observation
+        blind = np.zeros((len(matrix), len(self._start)))                                # θ itself is not seen
+        step = self._filter.update(Observation(np.hstack([matrix, blind]), value, noise_variance))
+        step.mean[n:] = self._physical(step.mean[n:])                                    # the filter's own array
+        return JointStep(step.mean[:n].copy(), step.variance[:n], step.mean[n:].copy(), self.covariance[n:, n:].copy(),
+                         step.innovation, step.innovation_covariance)
+
+    def _physical(self, parameters: np.ndarray) -> np.ndarray:
+        """``parameters``, or the point nearest to them on the line towards θ_0 that keeps to the bounds."""
+        nominal, change = self._profiles @ self._start, self._profiles @ (parameters - self._start)
+        limit = np.where(change < 0, *self._bounds)
+        beyond = np.abs(change) > np.abs(limit - nominal)
+        if not beyond.any():
+            return parameters
+        part = ((limit - nominal)[beyond] / change[beyond]).min()
+        return self._start + part * (parameters - self._start)

@@ -1,0 +1,286 @@
+"""Steady incompressible flow in 2D: v·∇v − ν∆v + ∇p = f, ∇·v = 0, with Taylor–Hood elements (P2 for v, P1 for p)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import scipy.sparse as sp
+import skfem
+from scipy.sparse.linalg import splu
+from skfem.helpers import dot, grad
+
+from eitbench import _check
+from eitbench.physics.fem import element, to_skfem
+from eitbench.physics.mesh import Mesh
+from eitbench.physics.transport import VelocityField
+
+_EDGES = np.array([[0, 1], [1, 2], [2, 0]])               # of a triangle; their middles are its nodes 3, 4 and 5
+_NEWTON_STEPS = 15
+_TOLERANCE = 1e-9                                         # of the last step, relative; what is left is about its square
+
+
+@dataclass(frozen=True, eq=False)
+class SteadyFlow:
+    """A velocity field on a mesh: points (k, 2) in m -> velocity (k, 2) in m/s; made by `steady_flow`.
+
+    Points outside the mesh take the velocity at the nearest point of the boundary.
+    """
+
+    mesh: Mesh
+    cell_velocity: np.ndarray
+    """(n_cells, 6, 2) velocity in m/s at the three nodes of each cell and at the middles of its edges 01, 12 and 20."""
+    pressure: np.ndarray
+    """(n_nodes,) kinematic pressure (pressure over density) in m²/s²."""
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        cells, b = self.mesh.locate(points)
+        shape = np.concatenate([b * (2.0 * b - 1.0), 4.0 * b[:, _EDGES].prod(axis=2)], axis=1)
+        return np.einsum("ki,kid->kd", shape, self.cell_velocity[cells])
+
+
+def steady_flow(mesh: Mesh, viscosity: float, walls: Sequence[tuple[np.ndarray, VelocityField]], *,
+                force: VelocityField | None = None) -> SteadyFlow:
+    """A steady flow, by Newton's method from the Stokes flow and, where that fails, by continuation in viscosity.
+
+    The error is of third order in the cell size for the velocity and of second for the pressure (L2 norms). Nothing is
+    upwinded: a mesh too coarse for the Reynolds number gives wiggles, or no solution. Where there are several steady
+    flows one of them is found, be it stable or not.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        2D.
+    viscosity : float
+        Kinematic viscosity ν in m²/s, > 0.
+    walls : sequence of (facets, velocity)
+        Boundary facets, (k, 2) node numbers as from `Mesh.facets_where`, and the velocity imposed on them: points
+        (k, 2) in m -> velocity (k, 2) in m/s, asked at the ends and the middle of each facet. A node that several
+        entries share takes the value of the last: of a moving lid and walls at rest, or an inlet and walls, the walls
+        should come last. All other boundary facets are outflow, ν∂v/∂n − pn = 0; without any, the pressure has mean
+        zero.
+    force : callable, optional
+        Force per mass, points (k, 2) in m -> acceleration (k, 2) in m/s²; default: none.
+
+    Raises
+    ------
+    ValueError
+        Naming the argument, if the mesh is not 2D, if a value is out of range, of the wrong shape or not finite, if a
+        facet is not on the boundary, or if walls all round let more fluid in than out: by more than 10⁻⁴ of the
+        largest speed times the perimeter. (Less is the error of interpolation, and spread as a uniform divergence.)
+    RuntimeError
+        If no steady flow was found.
+    """
+    if mesh.dim != 2:
+        raise ValueError(f"mesh must be 2D, got {mesh.dim}D")
+    viscosity = _check.number("viscosity", viscosity, low=0.0, open_low=True, units="m²/s")
+    equations = _discretise(mesh, walls, force)
+    found = _continuation(equations, viscosity)
+    velocity, pressure = found[:-mesh.n_nodes].reshape(2, -1).T, found[-mesh.n_nodes:]
+    if equations.closed:
+        pressure = pressure - equations.weights @ pressure / equations.weights.sum()
+    return SteadyFlow(mesh, velocity[equations.cell_dofs], pressure)
+
+
+# -- equations --------------------------------------------------------------------------------------------------------
+
+class _Equations(NamedTuple):
+    """(νL + C(v)) v − Bᵀp = load and −Bv = source, for x = (v₁, v₂, p) with the wall values of v given."""
+
+    basis: skfem.Basis
+    """Scalar P2, n unknowns."""
+    laplace: sp.csr_array
+    """(n, n) ∫∇φᵢ·∇φⱼ."""
+    divergence: sp.csr_array
+    """(n_nodes, 2n) B, ∫ψᵢ ∇·v."""
+    load: np.ndarray
+    """(2n,) ∫φᵢ f."""
+    source: np.ndarray
+    """(n_nodes,) zero, but for what walls all round let out by errors of interpolation, spread evenly."""
+    given: np.ndarray
+    """(2n + n_nodes,) wall values, zero elsewhere."""
+    free: np.ndarray
+    """Numbers of the unknowns that are not given."""
+    weights: np.ndarray
+    """(n_nodes,) ∫ψᵢ."""
+    closed: bool
+    """Whether all of the boundary is walls; then only the pressure's gradient matters, and one value is given."""
+    cell_dofs: np.ndarray
+    """(n_cells, 6) numbers of the scalar unknowns at the nodes and edge middles of each cell."""
+
+
+@skfem.BilinearForm
+def _laplace(u, v, _w):
+    return dot(grad(u), grad(v))
+
+
+@skfem.BilinearForm
+def _slope_x(u, v, _w):
+    return grad(u)[0] * v
+
+
+@skfem.BilinearForm
+def _slope_y(u, v, _w):
+    return grad(u)[1] * v
+
+
+@skfem.BilinearForm
+def _convection(u, v, w):
+    return (w["x"] * grad(u)[0] + w["y"] * grad(u)[1]) * v
+
+
+@skfem.BilinearForm
+def _reaction(u, v, w):
+    return w["rate"] * u * v
+
+
+@skfem.LinearForm
+def _load(v, w):
+    return w["force"] * v
+
+
+@skfem.LinearForm
+def _integral(v, _w):
+    return v
+
+
+def _discretise(mesh: Mesh, walls: Sequence[tuple[np.ndarray, VelocityField]],
+                force: VelocityField | None) -> _Equations:
+    basis = skfem.Basis(to_skfem(mesh), element(2, 2), intorder=5)                      # exact for v·∇v
+    linear = skfem.Basis(basis.mesh, element(2, 1), intorder=5)
+    n = basis.N
+    value, on_wall, closed = _wall_values(mesh, basis, walls)
+    divergence = sp.csr_array(sp.hstack([form.assemble(basis, linear) for form in (_slope_x, _slope_y)]))
+    weights = _integral.assemble(linear)
+    load, source, given = np.zeros(2 * n), np.zeros(mesh.n_nodes), np.zeros(2 * n + mesh.n_nodes)
+    given[:2 * n] = value.T.ravel()
+    if force is not None:
+        x = np.asarray(basis.global_coordinates())
+        f = _sample("force", force, x.reshape(2, -1).T).T.reshape(x.shape)
+        load = np.concatenate([_load.assemble(basis, force=component) for component in f])
+    fixed = [on_wall, n + on_wall]
+    if closed:
+        net = (divergence @ given[:2 * n]).sum()
+        ends = mesh.points[mesh.boundary_facets]
+        scale = np.linalg.norm(value, axis=1).max() * np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).sum()
+        if abs(net) > 1e-4 * scale:
+            raise ValueError(f"walls must let as much fluid in as out, as they are all round, got a net outflow of "
+                             f"{net:g} m²/s")
+        source = -net / weights.sum() * weights
+        fixed.append(np.array([2 * n]))
+    free = np.setdiff1d(np.arange(len(given)), np.concatenate(fixed))
+    cell_dofs = np.concatenate([basis.nodal_dofs[0][mesh.cells], _middle_dofs(basis, mesh.cells[:, _EDGES])], axis=1)
+    return _Equations(basis, sp.csr_array(_laplace.assemble(basis)), divergence, load, source, given, free, weights,
+                      closed, cell_dofs)
+
+
+def _wall_values(mesh: Mesh, basis: skfem.Basis, walls: Sequence[tuple[np.ndarray, VelocityField]],
+                 ) -> tuple[np.ndarray, np.ndarray, bool]:
+    """Velocity (n, 2) on the walls, the numbers of the unknowns there, and whether the walls are all round."""
+    if not len(walls):
+        raise ValueError("walls must hold at least one pair of facets and velocity")
+    value, on_wall = np.zeros((basis.N, 2)), np.zeros(basis.N, dtype=bool)
+    boundary = {tuple(facet) for facet in mesh.boundary_facets.tolist()}
+    rest = set(boundary)
+    for i, (facets, velocity) in enumerate(walls):
+        facets = np.asarray(facets)
+        if facets.ndim != 2 or facets.shape[1] != 2 or not len(facets) or not np.issubdtype(facets.dtype, np.integer):
+            raise ValueError(f"walls[{i}] must begin with facets, integers of shape (k, 2) with k ≥ 1, "
+                             f"got {facets.dtype} of shape {facets.shape}")
+        here = {tuple(facet) for facet in np.sort(facets, axis=1).tolist()}
+        if here - boundary:
+            raise ValueError(f"walls[{i}] must hold facets of the boundary, got {min(here - boundary)}")
+        rest -= here
+        dofs = np.concatenate([basis.nodal_dofs[0][facets].ravel(), _middle_dofs(basis, facets)])
+        points = np.concatenate([mesh.points[facets].reshape(-1, 2), mesh.points[facets].mean(axis=1)])
+        value[dofs] = _sample(f"walls[{i}] velocity", velocity, points)
+        on_wall[dofs] = True
+    return value, np.flatnonzero(on_wall), not rest
+
+
+def _middle_dofs(basis: skfem.Basis, edges: np.ndarray) -> np.ndarray:
+    """Numbers of the P2 unknowns at the middles of ``edges`` (..., 2), given by their node numbers."""
+    known, wanted = np.sort(basis.mesh.facets.astype(np.int64), axis=0), np.sort(edges.astype(np.int64), axis=-1)
+    n = basis.mesh.nvertices
+    key = known[0] * n + known[1]
+    order = np.argsort(key)
+    return basis.facet_dofs[0][order[np.searchsorted(key, wanted[..., 0] * n + wanted[..., 1], sorter=order)]]
+
+
+def _sample(name: str, field: VelocityField, points: np.ndarray) -> np.ndarray:
+    return _check.array(f"{name}(points)", field(points), points.shape)
+
+
+# -- solution ---------------------------------------------------------------------------------------------------------
+
+def _continuation(equations: _Equations, viscosity: float) -> np.ndarray:
+    """The solution x at this viscosity, if need be by way of higher ones."""
+    at, ratio = viscosity, 4.0
+    found = _newton(equations, at)
+    while found is None and at < 1e12 * viscosity:
+        at *= ratio
+        found = _newton(equations, at)
+    if found is None:
+        raise RuntimeError("no steady flow was found at any viscosity: the mesh may be too coarse near its corners")
+    while at > viscosity:
+        lower = max(viscosity, at / ratio)
+        result = _newton(equations, lower, found)
+        if result is not None:
+            found, at = result, lower
+        elif ratio > 1.02:
+            ratio = math.sqrt(ratio)
+        else:
+            raise RuntimeError(f"no steady flow was found at a viscosity of {viscosity:g} m²/s, only down to {at:g}: "
+                               "the mesh may be too coarse, or the flow not steady")
+    return found
+
+
+def _newton(equations: _Equations, viscosity: float, start: np.ndarray | None = None) -> np.ndarray | None:
+    """The solution x that Newton's method finds from ``start``, by default the Stokes flow; none if it diverges."""
+    x = _linear_solution(equations, viscosity, None) if start is None else start
+    last = math.inf
+    for k in range(_NEWTON_STEPS):
+        if x is None:
+            return None
+        before, x = x, _linear_solution(equations, viscosity, x)
+        if x is not None:
+            velocity, pressure = np.split(x, [len(equations.load)])
+            step = np.abs(velocity - before[:len(velocity)]).max()
+            # √p is the speed that the pressure could make: where a fluid rests under pressure v is mere rounding.
+            if step <= _TOLERANCE * max(np.abs(velocity).max(), math.sqrt(np.abs(pressure).max())):
+                return x
+            if k > 1 and step > last:                     # the second step may well be larger than the first
+                return None
+            last = step
+    return None
+
+
+def _linear_solution(equations: _Equations, viscosity: float, around: np.ndarray | None) -> np.ndarray | None:
+    """x of the equations linearised about ``around``, by default about rest; none if they are singular."""
+    basis, n, free = equations.basis, equations.basis.N, equations.free
+    viscous = viscosity * equations.laplace
+    momentum: list[list[sp.csr_array | None]] = [[viscous, None], [None, viscous]]
+    load = equations.load
+    if around is not None:
+        # v·∇v ≈ w·∇v + v·∇w − w·∇w for v near w
+        w = around[:2 * n].reshape(2, n)
+        field = [basis.interpolate(component) for component in w]
+        convection = sp.csr_array(_convection.assemble(basis, x=np.asarray(field[0]), y=np.asarray(field[1])))
+        reaction = [[sp.csr_array(_reaction.assemble(basis, rate=field[i].grad[j])) for j in range(2)]
+                    for i in range(2)]
+        momentum = [[viscous + convection + reaction[0][0], reaction[0][1]],
+                    [reaction[1][0], viscous + convection + reaction[1][1]]]
+        load = load + (convection @ w.T).T.ravel()
+    matrix = sp.csc_array(sp.block_array([[sp.block_array(momentum), -equations.divergence.T],
+                                          [-equations.divergence, None]]))
+    x = equations.given.copy()
+    right = np.concatenate([load, equations.source]) - matrix @ x
+    try:
+        # Diagonal pivots where they are not too small: a third less fill than with partial pivoting, and as accurate.
+        x[free] = splu(matrix[free][:, free], diag_pivot_thresh=0.1).solve(right[free])
+    except RuntimeError:                                  # exactly singular
+        return None
+    return x if np.isfinite(x).all() else None

@@ -1,0 +1,37 @@
+"""A target that stands still: the evolution model of stationary tomography, c⁺ = c (thesis 7.2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from eitbench.physics.mesh import Mesh
+
+
+@dataclass(frozen=True, eq=False)
+class AtRest:
+    """Stands where a scenario else has a `ConvectionDiffusion`: nothing flows, spreads or enters.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        Where the concentration lives.
+    time_step : float
+        s between two injections.
+    """
+
+    mesh: Mesh
+    time_step: float
+
+    @property
+    def inlet(self) -> np.ndarray:
+        """No node."""
+        return np.empty(0, dtype=np.int64)
+
+    def step(self, c: np.ndarray, inflow_before: np.ndarray | float = 0.0, inflow_after: np.ndarray | float = 0.0,
+             ) -> np.ndarray:
+        """The same concentration; there is no inlet for an inflow to enter by."""
+        return np.array(c, dtype=float)

@@ -1,0 +1,212 @@
+"""The joint filter of concentration and velocity against the textbook, differences, and a known truth."""
+
+import numpy as np
+import pytest
+from models import LinearGaussian, dense_filter
+
+from eitbench.estimation.joint import JointFilter
+from eitbench.estimation.kalman import Observation
+from eitbench.physics.mesh import rectangle_mesh
+from eitbench.physics.transport import ConvectionDiffusion
+
+# -- a coarse pipe of 147 nodes, seen by local averages ---------------------------------------------------------------
+
+R, C_BH, N = 0.05, 30.0, 147
+MESH = rectangle_mesh(np.linspace(0.0, 0.4, 21), np.linspace(-R, R, 7))
+PROFILES = [lambda eta: 1.5 * (1 - eta**2), lambda eta: 1.5 * eta * (1 - eta**2),
+            lambda eta: 1.5 * (1 - eta**2) * (5 * eta**2 - 1)]
+HEIGHTS = np.linspace(-0.9, 0.9, 13)
+NOMINAL, STD = np.array([4.5, 0.0, 0.0]), np.array([1.0, 2.0, 0.5])
+
+
+def directions(k):
+    return [lambda points, profile=profile: np.column_stack([profile(points[:, 1] / R), np.zeros(len(points))])
+            for profile in PROFILES[:k]]
+
+
+def transport_at(theta):
+    """v = Σ θ_k v_k in the coarse pipe; fluid of mean speed 4.5 m/s passes it in 18 steps."""
+    fields = directions(len(theta))
+    return ConvectionDiffusion(MESH, lambda points: sum(t * v(points) for t, v in zip(theta, fields, strict=True)),
+                               2e-3, 5e-3, substeps=4, inlet=np.arange(7))
+
+
+def shapes(k):
+    return np.stack([profile(HEIGHTS) for profile in PROFILES[:k]], axis=1)
+
+
+def nodal_noise():
+    root = np.random.default_rng(0).normal(size=(N, 20))
+    return 0.01 * root @ root.T
+
+
+def joint_filter(k=1, **changes):
+    settings = {"mean": np.full(N, C_BH), "covariance": 50.0 * np.eye(N), "parameters": NOMINAL[:k],
+                "parameter_covariance": np.diag(STD[:k]**2), "walk_std": np.full(k, 0.02), "inflow": C_BH,
+                "inflow_std": C_BH / 4, "nodal_noise": nodal_noise(), "profiles": shapes(k),
+                "bounds": (0.02, 20.0)} | changes
+    return JointFilter(transport_at, directions(k), **settings)
+
+
+def sensors(rng, m=16):
+    """(m, N) averages about m random places, a little wider than a cell."""
+    places = rng.uniform([0.0, -R], [0.4, R], (m, 2))
+    weights = np.exp(-0.5 * (((MESH.points - places[:, None]) / [0.02, 0.015])**2).sum(axis=2))
+    return weights / weights.sum(axis=1, keepdims=True)
+
+
+def started(rng, k=3):
+    """A filter some steps on its way, so that concentration and velocity are correlated, and what it sees next."""
+    filter_ = joint_filter(k)
+    for _ in range(3):
+        filter_.predict()
+        H = sensors(rng)
+        filter_.update(Observation(H, C_BH + rng.normal(size=16), np.full(16, 0.1)))
+    return filter_, Observation(sensors(rng), C_BH + rng.normal(size=16), np.full(16, 0.1))
+
+
+def textbook_update(mean, P, observation, k):
+    """The unconstrained update of (c, θ), where θ is not seen."""
+    H = np.hstack([observation.matrix, np.zeros((len(observation.value), k))])
+    S = H @ P @ H.T + np.diag(observation.noise_variance)
+    K = np.linalg.solve(S, H @ P).T
+    return mean + K @ (observation.value - H @ mean), P - K @ H @ P, S
+
+
+# -- against the textbook ---------------------------------------------------------------------------------------------
+
+
+def test_a_known_velocity_gives_the_kalman_filter():
+    """Γ_θ = 0 and no walk: twenty steps equal those of the textbook's linear filter to 1e-10, and θ stays."""
+    rng, theta = np.random.default_rng(1), np.array([4.0, 0.5, -0.3])
+    F, Y = transport_at(theta).transition()
+    model = LinearGaussian(F, Y.sum(axis=1) * C_BH, (C_BH / 4)**2 * Y @ Y.T + nodal_noise(), np.full(N, C_BH),
+                           50.0 * np.eye(N))
+    observations = [Observation(sensors(rng), C_BH + 5 * rng.normal(size=16), rng.uniform(0.01, 1.0, 16))
+                    for _ in range(20)]
+    filter_ = joint_filter(3, parameters=theta, parameter_covariance=np.zeros((3, 3)), walk_std=np.zeros(3))
+    for observation, (predicted, filtered) in zip(observations, dense_filter(model, observations), strict=True):
+        filter_.predict()
+        step = filter_.update(observation)
+        np.testing.assert_allclose(step.mean, filtered.mean, atol=1e-10 * C_BH)
+        np.testing.assert_allclose(step.variance, filtered.variance, atol=1e-10 * 50)
+        np.testing.assert_allclose(step.innovation, observation.value - observation.matrix @ predicted.mean,
+                                   atol=1e-10 * C_BH)
+        np.testing.assert_array_equal(step.parameters, theta)
+        np.testing.assert_array_equal(step.parameter_covariance, 0.0)
+
+
+def test_one_step_is_that_of_the_textbook():
+    """Predict and update with full matrices [[F, ∂c⁺/∂θ], [0, I]] put together here: mean and covariance to 1e-10."""
+    filter_, observation = started(np.random.default_rng(2))
+    c, theta, P = filter_.concentration.copy(), filter_.parameters.copy(), filter_.covariance.copy()
+    transport = transport_at(theta)
+    F, Y = transport.transition()
+    after, by_theta = transport.velocity_derivatives(c, c[:7], C_BH, directions(3))
+    A = np.block([[F, by_theta], [np.zeros((3, N)), np.eye(3)]])
+    noise = np.zeros((N + 3, N + 3))
+    noise[:N, :N] = (C_BH / 4)**2 * Y @ Y.T + nodal_noise()
+    noise[N:, N:] = 0.02**2 * np.eye(3)
+    mean, P = np.concatenate([after, theta]), A @ P @ A.T + noise
+
+    filter_.predict()
+    np.testing.assert_allclose(filter_.concentration, F @ c + Y @ np.full(7, C_BH), atol=1e-10 * C_BH)
+    np.testing.assert_array_equal(filter_.parameters, theta)
+    np.testing.assert_allclose(filter_.covariance, P, atol=1e-10 * P.max())
+
+    mean, P, S = textbook_update(mean, P, observation, 3)
+    assert 0.02 < (shapes(3) @ mean[N:]).min() < (shapes(3) @ mean[N:]).max() < 20.0     # nothing to be held back
+    step = filter_.update(observation)
+    np.testing.assert_allclose(np.concatenate([step.mean, step.parameters]), mean, atol=1e-10 * C_BH)
+    np.testing.assert_allclose(filter_.covariance, P, atol=1e-10 * P.max())
+    np.testing.assert_allclose(step.variance, P.diagonal()[:N], atol=1e-10 * P.max())
+    np.testing.assert_allclose(step.parameter_covariance, P[N:, N:], atol=1e-10 * P.max())
+    np.testing.assert_allclose(step.innovation_covariance, S, atol=1e-10 * S.max())
+
+
+def test_covariance_moves_with_the_derivative_of_the_prediction():
+    """Without noise the covariance becomes A Γ Aᵀ, A the differences of what `predict` makes of (c, θ)."""
+    rng, k, h = np.random.default_rng(3), 3, 1e-4
+    c, theta = C_BH + 3 * rng.normal(size=N), np.array([4.0, 1.0, 0.4])
+    quiet = {"nodal_noise": np.zeros((N, N)), "inflow_std": 0.0, "walk_std": np.zeros(k)}
+
+    def predicted(state):
+        filter_ = joint_filter(k, mean=state[:N], parameters=state[N:], **quiet)
+        filter_.predict()
+        return np.concatenate([filter_.concentration, filter_.parameters])
+
+    start = np.concatenate([c, theta])
+    A = np.stack([(predicted(start + e) - predicted(start - e)) / (2 * h) for e in h * np.eye(N + k)], axis=1)
+    root, spread = rng.normal(size=(N, N)), np.diag([1.0, 0.5, 0.2])
+    filter_ = joint_filter(k, mean=c, parameters=theta, covariance=root @ root.T / N, parameter_covariance=spread,
+                           **quiet)
+    before = filter_.covariance.copy()
+    filter_.predict()
+    expected = A @ before @ A.T
+    assert np.abs(expected[:N, N:]).max() > 0.1                                         # the velocity shows
+    np.testing.assert_allclose(filter_.covariance, expected, atol=1e-7 * np.abs(expected).max())
+
+
+# -- against a truth --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("truth", [[3.2], [5.8], [4.0, 1.2, 0.4]], ids=["slow", "fast", "skew"])
+def test_velocity_is_found(truth):
+    """A truth of the filter's own model, started one to two σ off: θ within its 3σ, and the profile to 5 %."""
+    rng, truth = np.random.default_rng(4), np.array(truth)
+    k, transport = len(truth), transport_at(truth)
+    filter_ = joint_filter(k, walk_std=np.zeros(k), nodal_noise=1e-4 * np.eye(N))
+    c = transport.step(np.full(N, C_BH), C_BH, C_BH)
+    for _ in range(80):
+        c = transport.step(c, c[:7], C_BH + C_BH / 4 * rng.normal(size=7))
+        H = sensors(rng)
+        filter_.predict()
+        step = filter_.update(Observation(H, H @ c + 0.3 * rng.normal(size=16), np.full(16, 0.09)))
+    miss, std = step.parameters - truth, np.sqrt(step.parameter_covariance.diagonal())
+    assert (np.abs(miss) < 3 * std).all()
+    assert (std < 0.1).all()
+    assert np.linalg.norm(shapes(k) @ miss) < 0.05 * np.linalg.norm(shapes(k) @ truth)
+
+
+@pytest.mark.parametrize(("k", "far"), [(1, -8.0), (1, 40.0), (3, -8.0), (3, 40.0)],
+                         ids=["backwards", "too fast", "skew backwards", "skew too fast"])
+def test_velocity_stays_within_its_bounds(k, far):
+    """Where a measurement says otherwise, θ stops at the bound on the line from θ_0; c moves as if there were none."""
+    filter_, observation = started(np.random.default_rng(5), k)
+    filter_.predict()
+    mean, P = np.concatenate([filter_.concentration, filter_.parameters]), filter_.covariance.copy()
+    # What must be measured so that the mean velocity would become ``far``.
+    expected, push = observation.matrix @ mean[:N], observation.matrix @ P[:N, N]
+    gained = textbook_update(mean, P, observation._replace(value=expected + push), k)[0][N] - mean[N]
+    observation = observation._replace(value=expected + push * (far - mean[N]) / gained)
+    free = textbook_update(mean, P, observation, k)[0]
+    assert free[N] == pytest.approx(far)
+    step = filter_.update(observation)
+    speed = shapes(k) @ step.parameters
+    assert min(abs(speed.min() - 0.02), abs(speed.max() - 20.0)) < 1e-9                 # at one of the bounds
+    assert speed.min() > 0.02 - 1e-9
+    assert speed.max() < 20.0 + 1e-9
+    part = (step.parameters - NOMINAL[:k]) @ (free[N:] - NOMINAL[:k]) / ((free[N:] - NOMINAL[:k])**2).sum()
+    assert 0.0 < part < 1.0
+    np.testing.assert_allclose(step.parameters, NOMINAL[:k] + part * (free[N:] - NOMINAL[:k]), atol=1e-9)
+    np.testing.assert_allclose(step.mean, free[:N], atol=1e-9 * np.abs(free).max())
+    np.testing.assert_array_equal(filter_.parameters, step.parameters)
+    filter_.predict()                                                                   # it goes on from there
+    assert np.isfinite(filter_.concentration).all()
+
+
+# -- arguments --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("changes", "name"), [
+    ({"mean": np.zeros((N, 1))}, "^mean"), ({"covariance": np.eye(N - 1)}, "^covariance"),
+    ({"parameters": np.array([4.5, 0.0])}, "^parameters"), ({"parameters": np.array([np.nan])}, "^parameters"),
+    ({"parameter_covariance": np.eye(2)}, "^parameter_covariance"), ({"walk_std": 0.1}, "^walk_std"),
+    ({"inflow_std": -1.0}, "^inflow_std"), ({"nodal_noise": np.ones(N)}, "^nodal_noise"),
+    ({"profiles": np.ones((5, 2))}, "^profiles"), ({"bounds": (0.0, 5.0)}, "^bounds"),
+    ({"bounds": (0.1, 5.0)}, "^bounds"), ({"bounds": (3.0, 20.0)}, "^bounds"),
+])
+def test_errors_name_the_argument(changes, name):
+    """What does not fit, and bounds that the first velocity breaks, are refused by name."""
+    with pytest.raises(ValueError, match=name):
+        joint_filter(**changes)

@@ -1,0 +1,192 @@
+"""Derivatives of the discrete step by the velocity, against steps of freshly built models."""
+
+from itertools import permutations
+
+import numpy as np
+import pytest
+
+from eitbench.physics.flow import PlaneChannelFlow
+from eitbench.physics.mesh import Mesh, rectangle_mesh
+from eitbench.physics.transport import ConvectionDiffusion
+
+# -- helpers ----------------------------------------------------------------------------------------------------------
+
+CHANNEL = rectangle_mesh(np.linspace(0.0, 1.0, 13), np.linspace(-0.25, 0.25, 7))
+INLET = np.arange(7)
+
+
+def box():
+    """The unit cube in tetrahedra, six to a small cube; 60 nodes, bent so that no cell's side follows an axis."""
+    shape = [4, 5, 3]
+    grid = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1).reshape(-1, 3)
+    corner = grid[(grid < np.array(shape) - 1).all(axis=1)]
+    paths = [np.cumsum([[0, 0, 0], *np.eye(3, dtype=int)[list(order)]], axis=0) for order in permutations(range(3))]
+    cells = np.concatenate([np.ravel_multi_index((corner[:, None] + path).transpose(2, 0, 1), shape)
+                            for path in paths])
+    points = grid / (np.array(shape) - 1.0)
+    return Mesh(points + 0.05 * np.sin(3 * points[:, [1, 2, 0]]), cells)
+
+
+def along_x(profile):
+    """The field profile(y/R) along x in the channel, R = 0.25 m."""
+    return lambda points: np.column_stack([profile(points[:, 1] / 0.25), np.zeros(len(points))])
+
+
+PARABOLA, SKEW, FLAT = (along_x(profile) for profile in (
+    lambda eta: 1.5 * (1 - eta**2), lambda eta: eta * (1 - eta**2), lambda eta: (1 - eta**2) * (5 * eta**2 - 1)))
+
+
+def eddy(points):
+    """Swirls with a component across the channel, without divergence and zero nowhere along a line of cells."""
+    x, y = points.T
+    return np.column_stack([np.sin(3 * x + 1) * np.cos(7 * y + 0.3) + 0.3, -3 / 7 * np.cos(3 * x + 1)
+                            * np.sin(7 * y + 0.3) - 0.2])
+
+
+def still(points):
+    return np.zeros_like(points)
+
+
+def half(points):
+    """Flow in the first half of the channel only; cells end where it does."""
+    return PARABOLA(points) * (points[:, :1] < 0.5)
+
+
+def moved(velocity, direction, theta):
+    return lambda points: velocity(points) + theta * direction(points)
+
+
+def build(velocity, mesh=CHANNEL, inlet=INLET, **changes):
+    settings = {"diffusivity": 4e-3, "time_step": 0.2, "substeps": 4} | changes
+    return ConvectionDiffusion(mesh, velocity, inlet=inlet, **settings)
+
+
+def by_differences(velocity, direction, state, h=1e-4, **settings):
+    """∂step/∂θ by differences of steps of models built anew, with errors of fourth order in h."""
+    def slope(h):
+        ahead, behind = (build(moved(velocity, direction, theta), **settings).step(*state) for theta in (h, -h))
+        return (ahead - behind) / (2 * h)
+    return (4 * slope(h) - slope(2 * h)) / 3
+
+
+def random_state(rng, n=91, inlet=7):
+    return rng.normal(size=n), rng.normal(size=inlet), rng.normal(size=inlet)
+
+
+def assert_derivatives(velocity, directions, state, tolerance=1e-8, **settings):
+    """Step and derivatives are those of `step`, relative to the largest derivative."""
+    after, derivatives = build(velocity, **settings).velocity_derivatives(*state, directions)
+    np.testing.assert_array_equal(after, build(velocity, **settings).step(*state))
+    assert derivatives.shape == (len(after), len(directions))
+    for derivative, direction in zip(derivatives.T, directions, strict=True):
+        reference = by_differences(velocity, direction, state, **settings)
+        assert np.abs(reference).max() > 1e-3
+        np.testing.assert_allclose(derivative, reference, atol=tolerance * np.abs(reference).max())
+
+
+# -- against differences ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("speed", "changes"), [
+    (1.0, {}), (1.0, {"substeps": 1}), (1.0, {"diffusivity": 1e-9}), (1.0, {"diffusivity": 0.5}),
+    (1e-3, {"diffusivity": 0.5}),
+], ids=["mild", "one sub-step", "convective", "diffusive", "creeping"])
+def test_derivatives_in_the_channel(speed, changes):
+    """Along three axial profiles, not all symmetric, from a skew base flow: central differences to 1e-8.
+
+    Cell Péclet numbers go up to 17, to 7e7, and to 0.1 and 1e-4 where diffusion rules.
+    """
+    base = moved(PlaneChannelFlow(speed, 0.25), SKEW, 0.7 * speed)
+    assert_derivatives(base, [PARABOLA, SKEW, FLAT], random_state(np.random.default_rng(0)), **changes)
+
+
+def test_derivatives_in_a_flow_of_any_direction():
+    """With flow and directions oblique to all cells the upwinding turns too: central differences to 1e-8."""
+    flow = moved(lambda points: np.full_like(points, [1.0, 0.37]), eddy, 0.1)
+    assert_derivatives(flow, [eddy, PARABOLA], random_state(np.random.default_rng(1)))
+
+
+def test_derivatives_on_tetrahedra():
+    """The same in a bent cube, in three dimensions."""
+    mesh = box()
+    inlet = np.flatnonzero(np.arange(60) < 15)
+    flow, other = (lambda points, a=a, b=b: np.array(a) + np.sin(points[:, [1, 2, 0]]) * b
+                   for a, b in (([1.0, 0.3, 0.2], 0.2), ([0.2, -0.5, 0.4], 1.0)))
+    assert_derivatives(flow, [other], random_state(np.random.default_rng(2), 60, 15), mesh=mesh, inlet=inlet)
+
+
+def test_derivatives_where_the_fluid_stands_still():
+    """No flow in half of the channel, or nowhere at all: there the scheme is followed along each direction."""
+    state = random_state(np.random.default_rng(3))
+    for flow, directions in ((half, [half, PARABOLA, SKEW]), (still, [half, PARABOLA, eddy])):
+        assert_derivatives(flow, directions, state, tolerance=1e-6)
+
+
+def test_a_kink_counts_half_from_either_side():
+    """Fluid along the sides of cells, moved across them: the derivative is the mean of both one-sided ones."""
+    flow, state = PlaneChannelFlow(1.0, 0.25), random_state(np.random.default_rng(4))
+
+    def across(points):
+        return np.column_stack([np.zeros(len(points)), 0.5 + points[:, 0]])
+
+    derivative = build(flow).velocity_derivatives(*state, [across])[1][:, 0]
+    now, h = build(flow).step(*state), 1e-6
+    up, down = ((build(moved(flow, across, theta)).step(*state) - now) / theta for theta in (h, -h))
+    scale = np.abs(derivative).max()
+    assert np.abs(up - down).max() > 1e-2 * scale
+    np.testing.assert_allclose(derivative, 0.5 * (up + down), atol=1e-4 * scale)
+
+
+# -- laws -------------------------------------------------------------------------------------------------------------
+
+
+def test_derivatives_are_linear_in_the_direction():
+    """Along 2 v₁ − 3 v₂ the derivative is that combination, also where there is no flow but along the axis."""
+    rng = np.random.default_rng(5)
+    for flow, pair in ((eddy, (PARABOLA, lambda points: points[:, ::-1] + 0.1)), (still, (PARABOLA, SKEW))):
+        first, second = pair
+        _, derivatives = build(flow).velocity_derivatives(*random_state(rng), [
+            first, second, lambda points, a=first, b=second: 2 * a(points) - 3 * b(points)])
+        np.testing.assert_allclose(derivatives[:, 2], derivatives[:, :2] @ [2, -3],
+                                   atol=1e-12 * np.abs(derivatives).max())
+
+
+def test_a_uniform_fluid_does_not_show_its_motion():
+    """The derivative of a constant state with constant inflow is zero, to rounding."""
+    _, derivatives = build(eddy).velocity_derivatives(np.full(91, 30.0), 30.0, 30.0, [PARABOLA, eddy])
+    np.testing.assert_allclose(derivatives, 0.0, atol=1e-12 * 30)
+
+
+def test_derivatives_at_the_inlet_are_zero():
+    """What flows in is given, whatever the velocity; what c holds there does not matter."""
+    cd, (c, before, after) = build(eddy), random_state(np.random.default_rng(6))
+    _, derivatives = cd.velocity_derivatives(c, before, after, [PARABOLA])
+    np.testing.assert_array_equal(derivatives[INLET], 0.0)
+    assert (derivatives[7:] != 0.0).all()
+    c[INLET] = 1e3
+    np.testing.assert_array_equal(cd.velocity_derivatives(c, before, after, [PARABOLA])[1], derivatives)
+
+
+def test_transition_is_that_of_the_evolution_model():
+    """F and Y come out the same with and without H, whichever is asked for first."""
+    first, second = build(eddy), build(eddy)
+    F, Y = first.transition()
+    for model in (first.evolution_model(), second.evolution_model()):
+        np.testing.assert_array_equal(model.F, F)
+        np.testing.assert_array_equal(model.Y, Y)
+    np.testing.assert_array_equal(second.transition()[0], F)
+    assert first.evolution_model().F is F
+
+
+@pytest.mark.parametrize(("c", "before", "after", "directions", "name"), [
+    (np.zeros(90), 0.0, 0.0, [PARABOLA], "^c "), (np.zeros((91, 2)), 0.0, 0.0, [PARABOLA], "^c "),
+    (np.full(91, np.nan), 0.0, 0.0, [PARABOLA], "^c "), (np.zeros(91), np.zeros(6), 0.0, [PARABOLA], "inflow_before"),
+    (np.zeros(91), 0.0, np.zeros((7, 2)), [PARABOLA], "inflow_after"),
+    (np.zeros(91), 0.0, 0.0, [PARABOLA, lambda points: points[:, 0]], r"directions\[1\]"),
+    (np.zeros(91), 0.0, 0.0, [lambda points: points * np.nan], r"directions\[0\]"),
+    (np.zeros(91), 0.0, 0.0, [], "^directions"),
+])
+def test_errors_name_the_argument(c, before, after, directions, name):
+    """States, inflows and directions of the wrong shape, or not finite, are refused by name."""
+    with pytest.raises(ValueError, match=name):
+        build(eddy).velocity_derivatives(c, before, after, directions)
