@@ -8,6 +8,13 @@ ESTIMATION: dict[str, tuple[str, dict]] = {
     "eitbench/Pipe2D-v0": ("eitbench.envs.pipe2d:Pipe2D", {}),
     "eitbench/Pipe2DFixedLag-v0": ("eitbench.envs.pipe2d:Pipe2D", {"lag": 4}),
     "eitbench/Pipe2DSmoothing-v0": ("eitbench.envs.pipe2d:Pipe2D", {"lag": "all"}),
+    "eitbench/Pipe2DBiasedVelocity-v0": ("eitbench.envs.pipe2d_biased:Pipe2DBiasedVelocity", {}),
+    "eitbench/Pipe2DUnknownVelocity-v0": ("eitbench.envs.pipe2d_velocity:Pipe2DVelocity", {"flow": "unknown"}),
+    "eitbench/Pipe2DTimeVaryingVelocity-v0": ("eitbench.envs.pipe2d_velocity:Pipe2DVelocity", {"flow": "time-varying"}),
+    "eitbench/Pipe2DSkewedVelocity-v0": ("eitbench.envs.pipe2d_velocity:Pipe2DVelocity", {"flow": "skewed"}),
+    "eitbench/Pipe2DObstacle-v0": ("eitbench.envs.pipe2d_obstacle:Pipe2DObstacle", {}),
+    "eitbench/RotatingTank2D-v0": ("eitbench.envs.rotating_tank:RotatingTank2D", {}),
+    "eitbench/StationaryTank2D-v0": ("eitbench.envs.stationary_tank:StationaryTank2D", {}),
 }
 """Environments that ask for estimates: where the classes …Env and …VectorEnv lie, and what they are given."""
 

@@ -6,6 +6,7 @@ from eitbench.estimation.first_frame import FirstFrame
 from eitbench.estimation.gains import GainSequence, gain_sequence
 from eitbench.estimation.gauss_newton import gauss_newton
 from eitbench.estimation.homogeneous import best_homogeneous
+from eitbench.estimation.joint import JointFilter, JointStep
 from eitbench.estimation.kalman import (
     FilterStep,
     KalmanFilter,
@@ -19,7 +20,7 @@ from eitbench.estimation.smoother import Smoothed, fixed_interval_smoother, smoo
 from eitbench.estimation.smoothness import smoothness_covariance
 
 __all__ = [
-    "DenseKalmanFilter", "FilterStep", "Filtered", "FirstFrame", "FreeCovariance", "GainSequence", "KalmanFilter",
+    "DenseKalmanFilter", "FilterStep", "Filtered", "FirstFrame", "FreeCovariance", "GainSequence", "JointFilter", "JointStep", "KalmanFilter",
     "LinearisedObservations", "Observation", "Smoothed", "best_homogeneous", "fixed_interval_smoother",
     "gain_sequence", "gauss_newton", "initial_covariance", "kalman_filter", "linearised", "smoothed_state",
     "smoothness_covariance", "starting_filter", "table_5_1",

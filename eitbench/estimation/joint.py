@@ -47,9 +47,9 @@ class JointFilter:
     Y and the derivative are those of the discrete step at θ̂. The noise is Γ_w = Y(θ̂) Γ_η Y(θ̂)ᵀ + H Γ_e Hᵀ, of which
     only the nodal part H Γ_e Hᵀ is frozen at the nominal velocity: H would cost as much as F, and the part is small.
 
-    The velocity stays physical: after each measurement it must lie within ``bounds`` at all points of ``profiles``.
-    Where it does not, θ is moved back along the line towards its start θ_0, just as far as needed; concentration and
-    covariance stay what they are.
+    The velocity stays physical: after each measurement it must have the sign that it had at the start, and a size
+    within ``bounds``, at all points of ``profiles``. Where it does not, θ is moved back along the line towards its
+    start θ_0, just as far as needed; concentration and covariance stay what they are.
 
     Parameters
     ----------
@@ -68,9 +68,10 @@ class JointFilter:
     nodal_noise : (n, n)
         H Γ_e Hᵀ at the nominal velocity, (mol/m³)².
     profiles : (p, k)
-        Axial velocity of each v_k at p points across the flow, where it is not zero: not on the walls.
+        Axial velocity of each v_k at p points across the flow, not on the walls; that of θ_0 must be positive.
     bounds : (float, float)
-        Least and largest axial velocity in m/s there, the least > 0; θ_0 must keep to them.
+        Least and largest axial velocity at each point in parts of what θ_0 gives there, so that points close to a wall
+        bind no more than others; 0 < least < 1 < largest.
 
     Raises
     ------
@@ -91,12 +92,14 @@ class JointFilter:
         self._inflow = _check.number("inflow", inflow, units="mol/m³")
         self._inflow_std = _check.number("inflow_std", inflow_std, low=0.0, units="mol/m³")
         self._nodal_noise = _check.array("nodal_noise", nodal_noise, (n, n))
-        self._profiles = _check.array("profiles", profiles, (None, k))
-        low, high = self._bounds = _check.array("bounds", bounds, (2,), units="m/s", positive=True)
-        nominal = self._profiles @ self._start
-        if not ((low <= nominal) & (nominal <= high)).all():
-            raise ValueError(f"bounds must hold the velocity that parameters give, {nominal.min():g} to "
-                             f"{nominal.max():g} m/s, got {bounds!r}")
+        shapes = _check.array("profiles", profiles, (None, k))
+        nominal = shapes @ self._start
+        if not (nominal > 0).all():
+            raise ValueError(f"profiles must give a positive velocity with parameters, got {nominal.min():g} m/s")
+        self._profiles = shapes / nominal[:, None]
+        low, high = self._bounds = _check.array("bounds", bounds, (2,))
+        if not 0 < low < 1 < high:
+            raise ValueError(f"bounds must be a range 0 < least < 1 < largest, got {bounds!r}")
         joint = np.zeros((n + k, n + k))
         joint[:n, :n] = _check.array("covariance", covariance, (n, n))
         joint[n:, n:] = _check.array("parameter_covariance", parameter_covariance, (k, k))
@@ -143,10 +146,9 @@ class JointFilter:
 
     def _physical(self, parameters: np.ndarray) -> np.ndarray:
         """``parameters``, or the point nearest to them on the line towards θ_0 that keeps to the bounds."""
-        nominal, change = self._profiles @ self._start, self._profiles @ (parameters - self._start)
-        limit = np.where(change < 0, *self._bounds)
-        beyond = np.abs(change) > np.abs(limit - nominal)
+        change = self._profiles @ (parameters - self._start)                             # in parts of the start
+        room = np.where(change < 0, *self._bounds) - 1.0
+        beyond = np.abs(change) > np.abs(room)
         if not beyond.any():
             return parameters
-        part = ((limit - nominal)[beyond] / change[beyond]).min()
-        return self._start + part * (parameters - self._start)
+        return self._start + (room[beyond] / change[beyond]).min() * (parameters - self._start)

@@ -10,7 +10,10 @@ import sys
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+if TYPE_CHECKING:
+    from eitbench.task import Task
 
 BOARDS = ("filter", "fixed-lag", "smoothing")
 
@@ -29,6 +32,11 @@ class Baseline(NamedTuple):
     parameters: dict[str, Any]
     estimator: Callable[..., Any]
     """Estimator(task), with update(voltages, currents) -> Estimate or None."""
+
+    def suits(self, task: Task) -> bool:
+        """Whether it can play a task of its boards; an estimator without a word on that suits all."""
+        judge = getattr(self.estimator, "suits", None)
+        return judge is None or bool(judge(task))
 
 
 def baseline_folder() -> Path:

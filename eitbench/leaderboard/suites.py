@@ -30,10 +30,12 @@ def jobs(suite: str, environments: list[str], baselines: list[str], seeds: list[
     pairs = []
     for name in environments or ESTIMATION:
         environment = Environment(name)
-        board = board_of(environment.make())
+        env = environment.make()
+        board = board_of(env)
         for baseline in [_absolute(name) for name in baselines] or own_baselines():
             skipped = suite == "quick" and not baselines and (board, baseline) in TOO_SLOW_FOR_QUICK
-            if board in load_baseline(baseline).boards and not skipped:
+            loaded = load_baseline(baseline)
+            if board in loaded.boards and not skipped and loaded.suits(env.task):
                 pairs.append((environment, baseline))
     if not pairs:
         raise ValueError(f"none of the baselines {', '.join(baselines)} plays any of the environments "

@@ -279,7 +279,7 @@ def _linear_solution(equations: _Equations, viscosity: float, around: np.ndarray
     x = equations.given.copy()
     right = np.concatenate([load, equations.source]) - matrix @ x
     try:
-        # Diagonal pivots where they are not too small: a third less fill than with partial pivoting, and as accurate.
+        # Diagonal pivots where they are not too small: 10–30 % less fill than with partial pivoting, and as accurate.
         x[free] = splu(matrix[free][:, free], diag_pivot_thresh=0.1).solve(right[free])
     except RuntimeError:                                  # exactly singular
         return None

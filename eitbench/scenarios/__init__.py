@@ -7,6 +7,9 @@ from eitbench.scenarios.pipe2d_flows import (
     Pipe2DTimeVaryingVelocity,
     Pipe2DUnknownVelocity,
 )
+from eitbench.scenarios.pipe2d_obstacle import Pipe2DObstacle
+from eitbench.scenarios.rotating_tank import RotatingTank2D
+from eitbench.scenarios.stationary_tank import StationaryTank2D
 
-__all__ = ["Pipe2D", "Pipe2DBiasedVelocity", "Pipe2DSkewedVelocity", "Pipe2DTimeVaryingVelocity",
-           "Pipe2DUnknownVelocity"]
+__all__ = ["Pipe2D", "Pipe2DBiasedVelocity", "Pipe2DObstacle", "Pipe2DSkewedVelocity",
+           "Pipe2DTimeVaryingVelocity", "Pipe2DUnknownVelocity", "RotatingTank2D", "StationaryTank2D"]

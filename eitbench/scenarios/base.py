@@ -17,6 +17,7 @@ class Discretisation(NamedTuple):
     """A scenario on meshes: how the concentration moves and how it is seen."""
 
     transport: ConvectionDiffusion
+    """or `AtRest`, which stands in where nothing moves by convection and diffusion"""
     observation: ObservationModel
 
 

@@ -131,7 +131,7 @@ class Pipe2D(Scenario):
         return centres[:, None] + 0.5 * self.electrode_cover * pitch * np.array([-1.0, 1.0])
 
     def electrodes(self, mesh: Mesh) -> list[np.ndarray]:
-        """Boundary facets of each electrode on an EIT mesh whose nodes include the electrodes' edges."""
+        """Boundary facets of each electrode on an EIT mesh of the straight pipe with nodes at the electrodes' edges."""
         tiny = 1e-9 * self.length
         return [mesh.facets_where(lambda p, y=y, a=a, b=b: (np.abs(p[:, 1] - y) < tiny)  # type: ignore[misc]
                                   & (p[:, 0] > a - tiny) & (p[:, 0] < b + tiny))
@@ -197,18 +197,24 @@ class Pipe2D(Scenario):
         return self._discretise(cells=(80, 20), substeps=8, time_step=self.time_step,
                                 cells_at_electrodes=5, cells_across=14, velocity=flows[profile])
 
+    def shaped(self, mesh: Mesh) -> Mesh:
+        """A mesh of the straight pipe, bent to this pipe's walls."""
+        return mesh
+
     def _discretise(self, *, cells: tuple[int, int], substeps: int, time_step: float, cells_at_electrodes: int,
                     cells_across: int, velocity: VelocityField) -> Discretisation:
         from eitbench.physics.cem import CompleteElectrodeModel  # finite elements: not needed to play recordings
         from eitbench.physics.mesh import graded_pipe_mesh, rectangle_mesh
         from eitbench.physics.transport import ConvectionDiffusion
         R = self.half_width
-        cd_mesh = rectangle_mesh(np.linspace(0.0, self.length, cells[0] + 1), np.linspace(-R, R, cells[1] + 1))
+        cd_mesh = self.shaped(rectangle_mesh(np.linspace(0.0, self.length, cells[0] + 1),
+                                             np.linspace(-R, R, cells[1] + 1)))
         inlet = np.arange(cells[1] + 1)
         transport = ConvectionDiffusion(cd_mesh, velocity, self.diffusivity, time_step,
                                         substeps=substeps, inlet=inlet)
-        eit_mesh = graded_pipe_mesh(self.length, R, self.electrode_spans, cells_at_electrodes, cells_across)
-        cem = CompleteElectrodeModel(eit_mesh, self.electrodes(eit_mesh), self.contact_impedance)
+        straight = graded_pipe_mesh(self.length, R, self.electrode_spans, cells_at_electrodes, cells_across)
+        eit_mesh = self.shaped(straight)
+        cem = CompleteElectrodeModel(eit_mesh, self.electrodes(straight), self.contact_impedance)
         observation = ObservationModel(cem, cd_mesh.interpolation_to(eit_mesh.points),
                                        LinearConductivity(self.molar_conductivity), 1e-2 * self.expected_concentration)
         return Discretisation(transport, observation)

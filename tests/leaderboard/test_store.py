@@ -161,8 +161,8 @@ def test_record_holds_every_episode(played):
     bad, mine = sorted(played.write_records(), key=lambda record: record["baseline"])
     for episode in mine["episodes"]:
         assert episode["status"] == "ok" and episode["seconds"] > 0 and episode["finished"]
-        assert {"error", "contrast_error", "voltage_discrepancy", "velocity_error", "nis", "crps", "coverage_50", "coverage_90",
-                "spread_ratio", "seconds_per_step"} == episode["scores"].keys()
+        assert {"error", "contrast_error", "voltage_discrepancy", "velocity_error", "nis", "crps", "coverage_50",
+                "coverage_90", "spread_ratio", "seconds_per_step"} == episode["scores"].keys()
         assert len(episode["step_errors"]) == 3
         assert episode["scores"]["error"] == pytest.approx(np.mean(episode["step_errors"]), rel=1e-12)
     assert [episode["message"] for episode in bad["episodes"]] == 2 * ["RuntimeError: no"]
