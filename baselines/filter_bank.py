@@ -47,9 +47,10 @@ class Estimator:
         self.misfits.append(np.array([step.innovation @ np.linalg.solve(step.innovation_covariance, step.innovation)
                                       for step in steps]))
         best = int(np.sum(self.misfits[-WINDOW:], axis=0).argmin())
-        step = steps[best]
+        step, flow = steps[best], self.task.velocity
+        assert flow is not None
         return Estimate(step.mean, step.variance, step.innovation, step.innovation_covariance,
-                        FACTORS[best] * np.array(self.task.velocity.nominal))
+                        FACTORS[best] * np.array(flow.nominal))
 
 
 @lru_cache(maxsize=2)

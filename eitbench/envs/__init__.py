@@ -13,6 +13,8 @@ ESTIMATION: dict[str, tuple[str, dict]] = {
     "eitbench/Pipe2DTimeVaryingVelocity-v0": ("eitbench.envs.pipe2d_velocity:Pipe2DVelocity", {"flow": "time-varying"}),
     "eitbench/Pipe2DSkewedVelocity-v0": ("eitbench.envs.pipe2d_velocity:Pipe2DVelocity", {"flow": "skewed"}),
     "eitbench/Pipe2DObstacle-v0": ("eitbench.envs.pipe2d_obstacle:Pipe2DObstacle", {}),
+    "eitbench/Pipe3D-v0": ("eitbench.envs.pipe3d:Pipe3D", {}),
+    "eitbench/Pipe3DSmoothing-v0": ("eitbench.envs.pipe3d:Pipe3D", {"lag": "all"}),
     "eitbench/RotatingTank2D-v0": ("eitbench.envs.rotating_tank:RotatingTank2D", {}),
     "eitbench/StationaryTank2D-v0": ("eitbench.envs.stationary_tank:StationaryTank2D", {}),
 }

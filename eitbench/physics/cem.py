@@ -63,7 +63,8 @@ class CompleteElectrodeModel:
         contact, rows, columns, derivatives = self._contact_terms(basis), *_conduction(basis)
         # The last electrode is grounded: without its row and column the system is symmetric positive definite.
         pattern = sp.coo_array((np.ones(len(rows)), (rows, columns)), shape=contact.shape).tocsc()
-        system = condensation((pattern + abs(contact))[:-1, :-1].tocsc(), n_electrodes - 1, backend)
+        system = condensation((pattern + abs(contact))[:-1, :-1].tocsc(), n_electrodes - 1, backend,
+                              places=basis.doflocs.T if mesh.dim == 3 else None)
         self._system = system
         self.n_unknowns = system.n
         # K(σ) = constant + D σ, for the entries that the solver keeps, in its order

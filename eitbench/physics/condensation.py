@@ -5,7 +5,7 @@ their unknowns ordered last, the Schur complement is what a Cholesky factorisati
 substitution is needed, and every injection is served at the price of one factorisation.
 
 Two ways to the same numbers: compiled kernels (numba), 4 to 8 times as fast, and scipy's SuperLU wherever numba is
-not installed. Both order the unknowns once, by minimum degree, for a fixed pattern.
+not installed. Both order the unknowns once for a fixed pattern: by minimum degree, or in 3D by nested dissection.
 """
 
 from __future__ import annotations
@@ -16,8 +16,14 @@ from scipy.sparse.linalg import SuperLU, splu
 
 from eitbench.physics._backend import Backend, kernels, scratch, use_compiled
 
+_LEAF = 200
+"""Unknowns of a part of the body that is not cut any more."""
+_WIDEST = 1200
+"""Rows of a front up to which eight matrices side by side stay in the processor's own memory."""
 
-def condensation(pattern: sp.csc_array, n_ports: int, backend: Backend = "auto") -> Condensation | CompiledCondensation:
+
+def condensation(pattern: sp.csc_array, n_ports: int, backend: Backend = "auto",
+                 places: np.ndarray | None = None) -> Condensation | CompiledCondensation:
     """The fastest installed way to condense matrices of this pattern onto their last ``n_ports`` unknowns.
 
     Parameters
@@ -26,8 +32,11 @@ def condensation(pattern: sp.csc_array, n_ports: int, backend: Backend = "auto")
         Symmetric, with a full diagonal.
     n_ports : int
     backend : "auto", "compiled" or "scipy"
+    places : (n − n_ports, d), optional
+        Where the unknowns lie; if given, they are ordered by nested dissection. In 3D that takes a half of the
+        operations of minimum degree, and less on large meshes; in 2D minimum degree is better.
     """
-    return (CompiledCondensation if use_compiled(backend) else Condensation)(pattern, n_ports)
+    return (CompiledCondensation if use_compiled(backend) else Condensation)(pattern, n_ports, places)
 
 
 class Condensation:
@@ -44,9 +53,9 @@ class Condensation:
     compiled = False
     batch = 1
 
-    def __init__(self, pattern: sp.csc_array, n_ports: int) -> None:
+    def __init__(self, pattern: sp.csc_array, n_ports: int, places: np.ndarray | None = None) -> None:
         self.n, self.n_ports = pattern.shape[0], n_ports
-        self._place = np.append(_minimum_degree(pattern[:-n_ports, :-n_ports]), np.arange(self.n - n_ports, self.n))
+        self._place = _ordered(pattern, n_ports, places)
         self._order = np.argsort(self._place)
         permuted = _permuted(pattern, self._place)
         self._indices, self._indptr = permuted.indices, permuted.indptr
@@ -73,11 +82,10 @@ class CompiledCondensation:
     """Condensation by compiled supernodal Cholesky kernels; attributes and methods as in `Condensation`."""
 
     compiled = True
-    batch = 8
 
-    def __init__(self, pattern: sp.csc_array, n_ports: int) -> None:
+    def __init__(self, pattern: sp.csc_array, n_ports: int, places: np.ndarray | None = None) -> None:
         self.n, self.n_ports = pattern.shape[0], n_ports
-        place = np.append(_minimum_degree(pattern[:-n_ports, :-n_ports]), np.arange(self.n - n_ports, self.n))
+        place = _ordered(pattern, n_ports, places)
         filled = _filled(_permuted(pattern, place))
         rank = _postorder(_parents(filled), n_ports)
         place, filled = rank[place], _permuted(filled, rank)
@@ -96,11 +104,14 @@ class CompiledCondensation:
         order = np.argsort(place)
         self.rows, self.columns = order[lower.row[by_slot]], order[lower.col[by_slot]]
         self._children, self._front_size, self._stack_size = _multifrontal_sizes(*self._symbolic)
+        self.batch = 8 if self._front_size <= _WIDEST**2 else 1
 
     def port_inverse(self, values: np.ndarray) -> np.ndarray:
         """The ports' block of K⁻¹: (m, m) for values (k,), (b, m, m) for values (k, b); b is padded to eights."""
         if values.ndim == 1:
             return np.linalg.inv(self._schur(self._factorise(values)))
+        if self.batch == 1:
+            return np.stack([self.port_inverse(column) for column in np.ascontiguousarray(values.T)])
         b = values.shape[1]
         result = np.empty((b, self.n_ports, self.n_ports))
         start, first_row, rows, panel, _ = self._symbolic
@@ -126,7 +137,7 @@ class CompiledCondensation:
         return solution[self._place, :self.n_ports]
 
     def _factorise(self, values: np.ndarray) -> np.ndarray:
-        factor = scratch(self._symbolic[3][-1] + self.batch)      # the kernel reads a few numbers beyond the end
+        factor = scratch(self._symbolic[3][-1] + 8)               # the kernel reads a few numbers beyond the end
         kernels().factorise(*self._symbolic, self._first_entry, self._slot, values, factor)
         return factor
 
@@ -206,6 +217,46 @@ def _multifrontal_sizes(start: np.ndarray, first_row: np.ndarray, rows: np.ndarr
         total += own
         fullest = max(fullest, total)
     return children, int(height.max()**2), fullest + 1
+
+
+def _ordered(pattern: sp.csc_array, n_ports: int, places: np.ndarray | None) -> np.ndarray:
+    """Position of each unknown, the ports last."""
+    n, inner = pattern.shape[0], pattern[:-n_ports, :-n_ports]
+    place = _minimum_degree(inner) if places is None else _nested_dissection(inner, places)
+    return np.append(place, np.arange(n - n_ports, n))
+
+
+def _nested_dissection(pattern: sp.csc_array, places: np.ndarray) -> np.ndarray:
+    """Position of each unknown when a body is cut in two again and again, and every cut comes after its two sides.
+
+    Each cut is the smallest of some across the axes of ``places`` (n, d).
+    """
+    graph = sp.csr_array(pattern)
+    order: list[np.ndarray] = []
+    waiting = [(np.arange(len(places)), False)]
+    while waiting:
+        part, done = waiting.pop()
+        within = graph[part][:, part]
+        if done or len(part) <= _LEAF:
+            order.append(part[np.argsort(_minimum_degree(sp.csc_array(within)))])
+            continue
+        best, smallest = None, np.inf
+        for along in places[part].T:
+            for share in (0.4, 0.45, 0.5, 0.55, 0.6):
+                low = along <= np.quantile(along, share) + 1e-9 * np.ptp(along)
+                for side in (low, ~low):
+                    cut = side & ((within @ (~side).astype(float)) > 0)
+                    rest = np.array([(low & ~cut).sum(), (~low & ~cut).sum()])
+                    cost = cut.sum() * (2 * rest.max() / len(part))                # small, and in the middle
+                    if rest.min() > 0 and cost < smallest:
+                        best, smallest = (part[low & ~cut], part[~low & ~cut], part[cut]), cost
+        if best is None:
+            waiting.append((part, True))
+        else:
+            waiting += [(best[2], True), (best[1], False), (best[0], False)]
+    place = np.empty(len(places), np.int64)
+    place[np.concatenate(order)] = np.arange(len(places))
+    return place
 
 
 def _minimum_degree(pattern: sp.csc_array) -> np.ndarray:

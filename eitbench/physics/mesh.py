@@ -98,6 +98,19 @@ class Mesh:
     def _centroid_tree(self) -> cKDTree:
         return cKDTree(self.points[self.cells].mean(axis=1))
 
+    @cached_property
+    def _reach(self) -> float:
+        """How far from a cell's centroid its points may lie, m."""
+        corner = self.points[self.cells]
+        return (1.0 + 1e-9) * float(np.linalg.norm(corner - corner.mean(axis=1, keepdims=True), axis=2).max())
+
+    @cached_property
+    def _wall_tree(self) -> tuple[cKDTree, float]:
+        """Centroids of the boundary facets, and how far from them their points may lie, m."""
+        corner = self.points[self.boundary_facets]
+        middle = corner.mean(axis=1)
+        return cKDTree(middle), float(np.linalg.norm(corner - middle[:, None], axis=2).max())
+
     def locate(self, points: np.ndarray, candidates: int = 32) -> tuple[np.ndarray, np.ndarray]:
         """The cell that holds each of ``points``, and the point's barycentric coordinates there.
 
@@ -107,7 +120,8 @@ class Mesh:
             In m. A point outside the mesh (by rounding, or because a curved wall is a polygon here) is moved to the
             nearest point of the boundary (in 3D, where that is on an edge of a facet, to one nearly as near).
         candidates : int
-            How many cells, nearest by centroid, are searched first; points found in none are searched in all cells.
+            How many cells, nearest by centroid, are searched first; points found in none are searched in all cells
+            whose centroid is near enough.
 
         Returns
         -------
@@ -127,9 +141,10 @@ class Mesh:
         best, weights = self._best_cell(points, near)
         lost = np.flatnonzero(weights.min(axis=1) < -1e-9)
         if lost.size and k < len(self.cells):
-            everywhere = np.broadcast_to(np.arange(len(self.cells)), (1, len(self.cells)))
-            for i in lost:
-                best[i:i + 1], weights[i:i + 1] = self._best_cell(points[i:i + 1], everywhere)
+            around = self._centroid_tree.query_ball_point(points[lost], self._reach, return_sorted=True)
+            for i, cells in zip(lost, around, strict=True):
+                if cells:
+                    best[i:i + 1], weights[i:i + 1] = self._best_cell(points[i:i + 1], np.array([cells]))
         for i in np.flatnonzero(weights.min(axis=1) < -1e-9):
             # The cell with the least negative coordinate may be a large one far inside: take the nearest wall instead.
             best[i], weights[i] = self._nearest_wall(points[i])
@@ -159,7 +174,10 @@ class Mesh:
 
     def _nearest_wall(self, point: np.ndarray) -> tuple[int, np.ndarray]:
         """The cell of the boundary facet nearest to ``point``, and the barycentric coordinates of its projection."""
-        facets, cells = self._boundary
+        tree, reach = self._wall_tree
+        distance = np.sqrt(((self.points[np.unique(self.boundary_facets)] - point)**2).sum(axis=1).min())
+        near = tree.query_ball_point(point, (1.0 + 1e-9) * (distance + reach), return_sorted=True)
+        facets, cells = (array[near] for array in self._boundary)
         corner = self.points[facets]                                                   # (f, d, d)
         edges = corner[:, 1:] - corner[:, :1]
         gram = edges @ np.swapaxes(edges, 1, 2)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -11,9 +9,9 @@ import numpy as np
 
 from eitbench import _check
 from eitbench.physics.flow import PlaneChannelFlow, PlugFlow, PowerLawFlow
-from eitbench.physics.observation import LinearConductivity, ObservationModel, VoltageNoise
-from eitbench.scenarios.base import Discretisation, History, Randomness, Scenario
-from eitbench.scenarios.carried import Inflow, carry
+from eitbench.physics.observation import LinearConductivity, ObservationModel
+from eitbench.scenarios.base import Discretisation
+from eitbench.scenarios.pipe import StraightPipe
 
 if TYPE_CHECKING:
     from eitbench.physics.mesh import Mesh
@@ -24,104 +22,27 @@ PROFILES = ("parabolic", "plug", "power-law")
 
 
 @dataclass(frozen=True)
-class Pipe2D(Scenario):
+class Pipe2D(StraightPipe):
     """A straight plane channel with laminar flow (thesis 5.1.1, Figs 5.1–5.6).
 
-    [T]: the thesis' number; [ours]: our choice.
+    [T]: the thesis' number; [ours]: our choice; see also `StraightPipe`.
 
     One injection a time step; in the 16 injections of a frame the fluid moves 36 cm on average, almost the whole
     pipe. The homogeneous estimate scores about 0.02 in ẽ_c here, a Kalman filter 0.0045; all
     methods are in ``docs/pipe2d.md``.
     """
 
-    length: float = 0.40
-    """m [T]"""
     half_width: float = 0.05
     """R in m [T]"""
-    mean_velocity: float = 4.5
-    """v̄ in m/s [T]"""
-    diffusivity: float = 5e-4
-    """κ in m²/s [ours]: small, yet resolved by the model's mesh"""
-    time_step: float = 5e-3
-    """s between two injections [T]"""
-    scored_steps: int = 80
-    """injections scored: five frames [ours]"""
-    frame: int = 16
-    """injections a frame [T]"""
-
-    background: float = 30.0
-    """mol/m³, about 0.3 S/m: weak saline [ours]"""
-    expected_concentration: float = 25.0
-    """mol/m³; what estimators are told to expect, deliberately not the background [ours]"""
-    molar_conductivity: float = 0.01
-    """Λ in S·m²/mol; σ = Λc is linear [T], the slope is about that of NaCl [ours]"""
     electrodes_per_wall: int = 8
     """16 in all, on both walls [ours]"""
-    electrode_cover: float = 0.5
-    """part of the wall that electrodes cover, evenly spaced [ours]"""
-    contact_impedance: float = 2e-3
-    """z in Ω·m² [ours]"""
-    current: float = 0.1
-    """A/m; with relative noise the amplitude does not matter [ours]"""
-    noise_relative: float = 0.01
-    """std in parts of the reading [T]"""
-    noise_of_largest: float = 0.001
-    """std in parts of the largest voltage [T]"""
-
-    slug_interval: float = 0.020
-    """s; one slug arrives at random in each such interval [ours]"""
-    slug_strength: tuple[float, float] = (0.22, 0.40)
-    """|ln(c/background)| at a slug's centre, either sign [ours]"""
-    slug_duration: tuple[float, float] = (6e-3, 14e-3)
-    """s, standard deviation in time of a slug's Gaussian [ours]"""
-    slug_width: tuple[float, float] = (0.010, 0.025)
-    """m, standard deviation across the pipe [ours]"""
 
     def __post_init__(self) -> None:
-        for name, units in (("length", "m"), ("half_width", "m"), ("diffusivity", "m²/s"), ("time_step", "s"),
-                            ("background", "mol/m³"), ("expected_concentration", "mol/m³"),
-                            ("molar_conductivity", "S·m²/mol"), ("mean_velocity", "m/s"),
-                            ("contact_impedance", "Ω·m²"), ("current", "A/m"), ("slug_interval", "s")):
-            _check.number(name, getattr(self, name), low=0.0, open_low=True, units=units)
-        _check.number("electrode_cover", self.electrode_cover, low=0.0, high=0.95, open_low=True)
+        super().__post_init__()
+        _check.number("half_width", self.half_width, low=0.0, open_low=True, units="m")
         _check.integer("electrodes_per_wall", self.electrodes_per_wall, low=2)
-        _check.integer("scored_steps", self.scored_steps, low=1)
-        _check.integer("frame", self.frame, low=1)
-        for name in ("noise_relative", "noise_of_largest"):
-            _check.number(name, getattr(self, name), low=0.0)
-        for name, units in (("slug_strength", ""), ("slug_duration", "s"), ("slug_width", "m")):
-            low, high = _check.array(name, getattr(self, name), (2,), units=units)
-            if not 0 < low <= high:
-                raise ValueError(f"{name} must be a range 0 < low ≤ high, got {getattr(self, name)!r}")
-
-    # -- time --
-
-    @property
-    def warm_up(self) -> int:
-        """Injections before scoring starts: the mean flow flushes the pipe once, and there is a whole frame."""
-        return max(self.flush_steps, self.frame)
-
-    @property
-    def flush_steps(self) -> int:
-        """Time steps in which the mean flow passes through the pipe."""
-        return math.ceil(self.length / (self.mean_velocity * self.time_step))
-
-    @property
-    def n_steps(self) -> int:
-        return self.warm_up + self.scored_steps
-
-    @property
-    def lead_in(self) -> int:
-        """The fluid has flushed the pipe once before t = 0."""
-        return self.flush_steps
-
-    truth_steps = 2
 
     # -- electrodes and injections --
-
-    @property
-    def noise(self) -> VoltageNoise:
-        return VoltageNoise(self.noise_relative, self.noise_of_largest)
 
     @property
     def electrode_spans(self) -> np.ndarray:
@@ -154,26 +75,11 @@ class Pipe2D(Scenario):
 
     # -- the fluid --
 
-    def evolve(self, episodes: Sequence[Randomness], truth: Discretisation, tick: Callable[[int], object],
-               ) -> Iterator[History]:
-        inflows = [self.draw_inflow(episode.inflow) for episode in episodes]
-        for concentration in carry(self, lambda t: truth.transport, inflows, tick):
-            yield History(concentration, np.empty((self.n_steps, 0)))
+    def draw_slug_places(self, rng: np.random.Generator, n: int) -> np.ndarray:
+        return rng.uniform(-0.7, 0.7, n)[:, None] * self.half_width
 
-    def draw_inflow(self, rng: np.random.Generator) -> Inflow:
-        """Slugs of both signs, Gaussian across the pipe and in time: c_in = background·exp(Σ ±a·g(y)·g(t))."""
-        begin, end = -self.lead_in * self.time_step - 0.05, self.n_steps * self.time_step + 0.05
-        n = math.ceil((end - begin) / self.slug_interval)
-        when = begin + (np.arange(n) + rng.uniform(0.0, 1.0, n)) * self.slug_interval
-        where = rng.uniform(-0.7, 0.7, n) * self.half_width
-        strength = rng.choice([-1.0, 1.0], n) * rng.uniform(*self.slug_strength, n)
-        duration, width = rng.uniform(*self.slug_duration, n), rng.uniform(*self.slug_width, n)
-
-        def inflow(points: np.ndarray, time: float) -> np.ndarray:
-            across = np.exp(-0.5 * ((points[:, 1:2] - where) / width)**2)
-            return self.background * np.exp(across @ (strength * np.exp(-0.5 * ((time - when) / duration)**2)))
-
-        return inflow
+    def across(self, points: np.ndarray) -> np.ndarray:
+        return points[:, 1:2]
 
     # -- discretisations --
 

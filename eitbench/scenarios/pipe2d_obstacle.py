@@ -28,9 +28,9 @@ class Pipe2DObstacle(Pipe2D):
     """The 2D pipe past an obstruction: better fluid models are what the thesis names as its next step (5.1.1).
 
     The lower wall bulges into the pipe, electrodes and all: y = −R + h·exp(−((x − x₀)/w)²). The true velocity solves
-    the steady Navier–Stokes equations; behind the bulge it recirculates over more than half of the pipe. Estimators know
-    the walls, but of the flow only that it is parabolic between them at each x, unless they are given the real one.
-    All numbers are ours.
+    the steady Navier–Stokes equations; behind the bulge it recirculates over more than half of the pipe. Estimators
+    know the walls, but of the flow only that it is parabolic between them at each x, unless they are given the real
+    one. All numbers are ours.
     """
 
     obstacle_height: float = 0.02

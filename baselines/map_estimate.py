@@ -1,0 +1,49 @@
+"""Maximum a posteriori: nonlinear Gauss–Newton over all injections so far, with the Kalman filter's own prior.
+
+For targets that stand still: what the linearised filter approximates, and is to be compared with (thesis 7.2).
+"""
+
+import numpy as np
+
+from eitbench import Estimate, Task
+from eitbench.estimation import FirstFrame, gauss_newton, initial_covariance
+from eitbench.physics.rest import AtRest
+
+
+class Estimator:
+    boards = ("filter",)
+
+    def __init__(self, task: Task) -> None:
+        self.task = task
+        self.first = FirstFrame(task)
+        self.measurements: list[tuple[np.ndarray, np.ndarray]] = []
+
+    @staticmethod
+    def suits(task: Task) -> bool:
+        return isinstance(task.transport, AtRest)
+
+    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate:
+        task = self.task
+        self.measurements.append((voltages, currents))
+        if not self.first.complete:
+            if not self.first.add(voltages, currents):
+                return Estimate(self.first.mean)
+            self.penalty = np.linalg.inv(self.first.c_bh**2 * initial_covariance(task.mesh, task.prior))
+            self.deviation = np.zeros(task.mesh.n_nodes)
+        V, I = (np.array(part) for part in zip(*self.measurements, strict=True))
+        model = Deviations(task.observation, self.first.mean)
+        self.deviation = gauss_newton(model, V, I, task.noise.std(V), self.penalty, self.deviation)
+        return Estimate(self.first.mean + self.deviation)
+
+
+class Deviations:
+    """Voltages by the deviation from the prior's mean, since `gauss_newton` draws its unknown towards zero."""
+
+    def __init__(self, observation, mean: np.ndarray) -> None:
+        self.observation, self.mean = observation, mean
+
+    def voltages(self, deviation: np.ndarray, currents: np.ndarray) -> np.ndarray:
+        return self.observation.voltages(self.mean + deviation, currents)
+
+    def linearise(self, deviation: np.ndarray, currents: np.ndarray):
+        return self.observation.linearise(self.mean + deviation, currents)
