@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shlex
 import sys
 from enum import StrEnum
@@ -10,6 +11,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from eitbench.leaderboard.figures import FIGURES  # names only; matplotlib comes when one is drawn
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, context_settings={
     "help_option_names": ["-h", "--help"]}, help="""
@@ -27,14 +30,7 @@ class Suite(StrEnum):
     full = "full"
 
 
-class Figure(StrEnum):
-    """A figure of the thesis."""
-
-    FIG5_4 = "fig5.4"
-    FIG5_5 = "fig5.5"
-    FIG5_6 = "fig5.6"
-    FIG5_7 = "fig5.7"
-    FIG5_8 = "fig5.8"
+Figure = StrEnum("Figure", {re.sub(r"\W", "_", name).upper(): name for name in FIGURES})  # type: ignore[misc]
 
 
 Out = Annotated[Path, typer.Option("--out", "-o", help="Folder of the results.")]
@@ -53,23 +49,24 @@ def list_() -> None:
     typer.echo("environments")
     for name in ESTIMATION:
         env = Environment(name).make()
-        typer.echo(f"  {name:30} {board_of(env):10}  lag {env.task.lag}, {env.task.n_steps - env.task.warm_up} scored "
-                   f"of {env.task.n_steps} states, {env.task.mesh.n_nodes} nodes")
+        scenario = env.scenario
+        typer.echo(f"  {name:40} {board_of(env):10}  lag {env.lag}, {scenario.n_steps - scenario.warm_up} scored of "
+                   f"{scenario.n_steps} states, {env.action_space.shape[0]} numbers each")  # type: ignore[index]
     for name in INJECTION:
         chooser = gym.make(name).unwrapped
-        typer.echo(f"  {name:30} injection   {chooser.action_space.n} electrode pairs, "  # type: ignore[attr-defined]
+        typer.echo(f"  {name:40} injection   {chooser.action_space.n} electrode pairs, "  # type: ignore[attr-defined]
                    f"{chooser.scenario.n_steps} injections")  # type: ignore[attr-defined]
     typer.echo("baselines")
     for name in own_baselines():
         baseline = load_baseline(name)
-        typer.echo(f"  {name:30} {', '.join(baseline.boards):30}  {baseline.title}")
+        typer.echo(f"  {name:40} {', '.join(baseline.boards):30}  {baseline.title}")
 
 
 @app.command()
 def run(
-    suite: Annotated[Suite, typer.Option(help="quick: test:0-3, two minutes on two cores; full: test:0-19, and "
-                                              "methods that take long.")] = Suite.quick,
-    env: Annotated[list[str] | None, typer.Option(help="Environment id; may be repeated. Default: all.")] = None,
+    suite: Annotated[Suite, typer.Option(help="quick: the 2D pipe, test:0-3, two minutes on two cores; full: every "
+                                              "environment, more seeds, methods that take long.")] = Suite.quick,
+    env: Annotated[list[str] | None, typer.Option(help="Environment id; may be repeated. Default: suite's.")] = None,
     baseline: Annotated[list[str] | None, typer.Option(
         help="Name of one of ours, or the path of your own .py file; may be repeated. Default: all of ours.")] = None,
     seeds: Annotated[str | None, typer.Option(help="Episodes, as in dev:0-9 or test:3. Default: the suite's.")] = None,
@@ -85,8 +82,7 @@ def run(
     from eitbench.leaderboard.store import EpisodeStore
     from eitbench.seeds import parse_seeds
     with _clear_errors():
-        todo = suites.jobs(suite.value, env or [], baseline or [],
-                           parse_seeds(suites.SEEDS[suite.value] if seeds is None else seeds))
+        todo = suites.jobs(suite.value, env or [], baseline or [], None if seeds is None else parse_seeds(seeds))
     run_jobs(todo, EpisodeStore(out), n_jobs=jobs, command=shlex.join(["eitbench", *sys.argv[1:]]))
     _report(out)
 
@@ -146,13 +142,12 @@ def render(
 
 @app.command()
 def reproduce(
-    name: Annotated[Figure, typer.Argument(help="The figure of the thesis.")],
+    name: Annotated[Figure, typer.Argument(help="Figure or table of the thesis, or a study beside it.")],
     seeds: Annotated[str, typer.Option(help="Episodes; pictures show the first, sweeps average over all.")] = "dev:0-1",
     jobs: Jobs = CORES,
     out: Out = Path("results/figures"),
 ) -> None:
     """Draw a figure of the thesis from our data, and say what agrees and what differs."""
-    from eitbench.leaderboard.reproduce import FIGURES
     from eitbench.seeds import parse_seeds
     with _clear_errors():
         numbers = parse_seeds(seeds)

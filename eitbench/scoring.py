@@ -79,6 +79,25 @@ def skill(error: float, homogeneous: float, reference: float) -> float:
     return (homogeneous - error) / (homogeneous - reference)
 
 
+def deficit_centre(values: np.ndarray, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Where a field lies lowest: (d,) centroid in m of the deficit median − value, where above half its maximum.
+
+    Parameters
+    ----------
+    values : (n,)
+        Nodal values; those above the median do not count.
+    points : (n, d) m
+    weights : (n,)
+        Area of each node: row sums of the mass matrix.
+    """
+    deficit = np.median(values) - values
+    counted = weights * np.where(deficit > 0.5 * deficit.max(), deficit, 0.0)
+    if not counted.any():                                     # the same everywhere: no place is lower than another
+        counted = weights
+    centre: np.ndarray = counted @ points / counted.sum()
+    return centre
+
+
 def _pair(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
     if a.shape != b.shape or a.ndim != 2:

@@ -7,13 +7,13 @@ from types import SimpleNamespace
 import gymnasium as gym
 import pytest
 from joblib.externals.loky import get_reusable_executor
+from short import PLAIN
 from typer.testing import CliRunner
 
 import eitbench  # noqa: F401 (registers)
 from eitbench import bank, recordings
 from eitbench.bank import fill, recording_bytes
 from eitbench.cli import app
-from eitbench.envs import ENTRY_POINTS
 from eitbench.episodes import CACHE_VARIABLE, folder, simulate, simulate_together
 from eitbench.recordings import is_recorded, make_recording, recording, recording_path
 from eitbench.scenarios import Pipe2D
@@ -27,9 +27,9 @@ SEEDS = range(10)
 
 @pytest.fixture(autouse=True)
 def place(tmp_path, monkeypatch):
-    """The registered environments play the tiny world; recordings lie in a folder of this test's own."""
+    """The environments of the plain pipe play the tiny world; recordings lie in a folder of this test's own."""
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
-    for name in ENTRY_POINTS:
+    for name in PLAIN:
         monkeypatch.setitem(gym.registry[name].kwargs, "scenario", FIELDS)
     forget()
     yield folder(TINY)
@@ -225,7 +225,7 @@ def test_full_disk_is_refused_before_anything_is_simulated(place, asked, monkeyp
     (["--seeds", "train:0-100000"], "stay below 100000"),
     (["--seeds", "-1"], "seeds must look like"),
     (["--seeds", ""], "seeds must look like"),
-    (["--env", "eitbench/Pipe3D-v0"], "env must be one of eitbench/Pipe2D-v0"),
+    (["--env", "eitbench/Pipe4D-v0"], "env must be one of eitbench/Pipe2D-v0"),
     (["-j", "0"], "--jobs"),
 ])
 def test_mistakes_are_explained(arguments, message, place, asked):

@@ -7,6 +7,7 @@ import sys
 
 import gymnasium as gym
 import pytest
+from short import FIELDS, PLAIN, kind
 from typer.testing import CliRunner
 
 from eitbench.cli import app
@@ -35,11 +36,11 @@ class Estimator:
 
 @pytest.fixture(autouse=True)
 def tiny_world(monkeypatch, tmp_path, tmp_path_factory):
-    """The registered environments play the tiny world, in an empty folder; git is left alone."""
+    """The registered environments play tiny worlds, in an empty folder; git is left alone."""
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path_factory.getbasetemp() / "episodes"))
     monkeypatch.setattr(store, "_git", lambda *words: None)
     for name in ENTRY_POINTS:
-        monkeypatch.setitem(gym.registry[name].kwargs, "scenario", TINY)
+        monkeypatch.setitem(gym.registry[name].kwargs, "scenario", TINY if name in PLAIN else FIELDS[kind(name)])
     monkeypatch.setitem(gym.registry["eitbench/Pipe2DFixedLag-v0"].kwargs, "lag", 2)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.py").write_text(MINE)
@@ -110,7 +111,7 @@ def test_leaderboard_writes_the_same_again(tmp_path):
 
 
 def test_every_board_by_default(tmp_path):
-    """Without --env a baseline plays every environment of its boards."""
+    """Without --env a baseline plays every environment of the quick suite that is of its boards."""
     (tmp_path / "mine.py").write_text(MINE.replace("class Estimator:", "class Estimator:\n"
                                                    "    boards = ('filter', 'fixed-lag', 'smoothing')"))
     code, said, _ = eitbench("run", "--baseline", "mine.py", "--seeds", "dev:0", "-j", "1")
@@ -118,11 +119,14 @@ def test_every_board_by_default(tmp_path):
 
 
 def test_suites():
-    """quick is full with fewer seeds and without the one method that takes minutes an episode."""
+    """full is every environment; quick the plain pipe on fewer seeds, but for the one method that takes minutes."""
     quick, full = (suites.jobs(suite, [], [], [1]) for suite in ("quick", "full"))
-    assert set(full) - set(quick) == {suites.Job(suites.Environment(PIPE), "gauss_newton", 1)}
-    assert {job.environment.id for job in quick} == set(ESTIMATION)
-    assert {job.baseline for job in quick} == set(own_baselines())
+    plain = set(PLAIN) & set(ESTIMATION)
+    assert {job.environment.id for job in quick} == plain and len(plain) == 3
+    assert {job.environment.id for job in full} == set(ESTIMATION)
+    missing = {job for job in full if job.environment.id in plain} - set(quick)
+    assert missing == {suites.Job(suites.Environment(PIPE), "gauss_newton", 1)} and set(quick) < set(full)
+    assert {job.baseline for job in full} == set(own_baselines())
     assert set(parse_seeds(suites.SEEDS["quick"])) < set(parse_seeds(suites.SEEDS["full"]))
     assert min(parse_seeds(suites.SEEDS["full"])) == 200_000
     asked_for = suites.jobs("quick", [PIPE], ["gauss_newton"], [1, 2])
@@ -171,7 +175,7 @@ def test_module_can_be_run(monkeypatch, capsys):
     (["run", "--seeds", "dev:1-"], "seeds must look like 'test:0-4'"),
     (["run", "--seeds", "dev:4-2"], "must increase"),
     (["run", "--seeds", "", "--baseline", "mine.py", "-j", "1"], "seeds must look like"),
-    (["run", "--env", "eitbench/Pipe3D-v0"], "env must be one of eitbench/Pipe2D-v0"),
+    (["run", "--env", "eitbench/Pipe4D-v0"], "env must be one of eitbench/Pipe2D-v0"),
     (["run", "--baseline", "kalman"], "one of extended_kalman_filter"),
     (["run", "--baseline", "nowhere.py"], "got 'nowhere.py'"),
     (["run", "--baseline", "mine.py", "--baseline", "other/mine.py", "--seeds", "1", "-j", "1"], "other/mine.py"),

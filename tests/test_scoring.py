@@ -10,6 +10,7 @@ from eitbench.physics.mesh import rectangle_mesh
 from eitbench.scoring import (
     coverage,
     crps,
+    deficit_centre,
     normalised_innovations,
     relative_error,
     skill,
@@ -170,3 +171,40 @@ def test_arrays_must_be_a_pair_over_time_and_space(score, left, right):
     """No broadcasting: both arrays are (T, n), or it is an error that shows both shapes."""
     with pytest.raises(ValueError, match=r"same shape \(T, n\)"):
         score(np.ones(left), np.ones(right))
+
+
+# -- places -----------------------------------------------------------------------------------------------------------
+
+
+def plate():
+    """An uneven mesh of [0, 2] × [0, 1] fine enough for a disc: points and the area of each node."""
+    mesh = rectangle_mesh(2.0 * np.linspace(0.0, 1.0, 81)**1.2, np.linspace(0.0, 1.0, 51))
+    return mesh.points, mass_matrix(mesh).sum(axis=1)
+
+
+@pytest.mark.parametrize("centre", [(0.6, 0.5), (1.3, 0.3)])
+def test_deficit_lies_in_the_middle_of_a_disc(centre):
+    """A low disc of radius 0.2 in a level of 30, its nodes unevenly spaced: the centroid is its centre to a cell."""
+    points, weights = plate()
+    inside = np.hypot(*(points - centre).T) < 0.2
+    found = deficit_centre(30.0 - 10.0 * inside, points, weights)
+    assert found.shape == (2,) and np.hypot(*(found - centre)) < 0.01
+    unweighted = deficit_centre(30.0 - 10.0 * inside, points, np.ones(len(points)))
+    assert np.hypot(*(found - centre)) < np.hypot(*(unweighted - centre))       # dense nodes must not pull
+
+
+def test_deficit_counts_only_what_is_lower_than_half():
+    """A cone and far from it a shallower hollow and a heap: only the cone's inner half counts, at its tip."""
+    points, weights = plate()
+
+    def cone(tip, depth):
+        return depth * np.maximum(0.0, 1.0 - np.hypot(*(points - tip).T) / 0.25)
+
+    values = 30.0 - cone((0.5, 0.5), 10.0) + cone((1.5, 0.7), 20.0) - cone((1.5, 0.3), 4.5)
+    np.testing.assert_allclose(deficit_centre(values, points, weights), (0.5, 0.5), atol=0.01)
+
+
+def test_flat_field_is_lowest_in_its_middle():
+    """Where nothing is lower than the rest, the centroid of the whole domain; not a division by zero."""
+    points, weights = plate()
+    np.testing.assert_allclose(deficit_centre(np.full(len(points), 3.0), points, weights), (1.0, 0.5), rtol=1e-12)

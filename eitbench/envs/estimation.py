@@ -55,9 +55,10 @@ class EstimationEnv(gym.Env[Observation, np.ndarray]):
         """(n,) standard deviation in mol/m³ to draw beside the estimate, for whoever has one."""
         self.scenario = scenario
         """The world played; estimators are given `task` instead."""
-        self._lag = lag_steps(scenario, lag)
+        self.lag = lag_steps(scenario, lag)
+        """See `Task`."""
         self._assumptions = assumptions or {}
-        self._currents = cycle_currents(scenario, self._lag)
+        self._currents = cycle_currents(scenario, self.lag)
         self.observation_space: spaces.Dict  # type: ignore[assignment]
         self.observation_space, self.action_space = estimation_spaces(scenario)
         self._n_nodes = outline(scenario).mass.shape[0]
@@ -67,7 +68,7 @@ class EstimationEnv(gym.Env[Observation, np.ndarray]):
     @cached_property
     def task(self) -> Task:
         """What the agent may know; its models are built on first use, since playing needs none of them."""
-        return make_task(self.scenario, self._lag, **self._assumptions)
+        return make_task(self.scenario, self.lag, **self._assumptions)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None,
               ) -> tuple[Observation, dict[str, Any]]:
@@ -88,12 +89,12 @@ class EstimationEnv(gym.Env[Observation, np.ndarray]):
 
         ``ValueError`` if it is not in the action space.
         """
-        last_step = self.scenario.n_steps + self._lag
+        last_step = self.scenario.n_steps + self.lag
         if self._seed is None or self._step > last_step:
             raise gym.error.ResetNeeded("call reset() before step(), and again when an episode has ended")
         action = checked_actions(action, self.action_space)  # type: ignore[arg-type]
         estimate, parameters = np.split(action, [self._n_nodes])
-        t = self._step - self._lag
+        t = self._step - self.lag
         reward = 0.0
         if t >= 1:
             self._last = estimate.copy()
@@ -113,7 +114,7 @@ class EstimationEnv(gym.Env[Observation, np.ndarray]):
             gym.logger.warn("render() needs gym.make(..., render_mode='rgb_array')")
             return None
         from eitbench.envs.rendering import draw_frame
-        t = min(max(self._step - 1 - self._lag, 0), self.scenario.n_steps)
+        t = min(max(self._step - 1 - self.lag, 0), self.scenario.n_steps)
         concentration = self._episode("render").concentration[t]
         level = np.full(self.task.mesh.n_nodes, self.task.expected_concentration)
         return draw_frame(self.task, self.truth_mesh(), concentration, level if self._last is None else self._last,

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
+import scipy.sparse as sp
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from matplotlib.gridspec import GridSpec
 from matplotlib.tri import Triangulation
 
-from eitbench.physics.mesh import Mesh
+from eitbench.physics.mesh import Mesh, rectangle_mesh
 from eitbench.task import Task
 
 FIELD_MAP, SPREAD_MAP = "viridis", "magma"
@@ -22,7 +26,13 @@ def colour_range(task: Task) -> tuple[float, float]:
 
 
 def draw_field(axes: Axes, mesh: Mesh, values: np.ndarray, low: float, high: float, colours: str = FIELD_MAP):
-    """Nodal ``values`` as smooth colours with equal aspect, axes in cm; returns the mappable for a colour bar."""
+    """Nodal ``values`` as smooth colours with equal aspect, axes in cm; returns the mappable for a colour bar.
+
+    In 3D the slice x = 0 is drawn, z to the right.
+    """
+    if mesh.dim == 3:
+        mesh, onto = _slice(mesh)
+        values = onto @ values
     triangles = Triangulation(100 * mesh.points[:, 0], 100 * mesh.points[:, 1], mesh.cells)
     mappable = axes.tripcolor(triangles, values, shading="gouraud", cmap=colours, vmin=low, vmax=high)
     axes.set_aspect("equal")
@@ -30,18 +40,34 @@ def draw_field(axes: Axes, mesh: Mesh, values: np.ndarray, low: float, high: flo
     return mappable
 
 
+@lru_cache(maxsize=8)
+def _slice(mesh: Mesh) -> tuple[Mesh, sp.csr_array]:
+    """The slice x = 0 of a pipe along z as a mesh in (z, y), and the interpolation onto it."""
+    (_, low, begin), (_, high, end) = mesh.points.min(axis=0), mesh.points.max(axis=0)
+    flat = rectangle_mesh(np.linspace(begin, end, 161), np.linspace(low, high, 41))
+    return flat, mesh.interpolation_to(np.column_stack([np.zeros(flat.n_nodes), flat.points[:, 1], flat.points[:, 0]]))
+
+
 def draw_electrodes(axes: Axes, task: Task, currents: np.ndarray, width: float = 5.0) -> None:
-    """Electrodes as bars on the wall: the source red, the sink blue, the others grey."""
+    """Electrodes as bars on the wall: the source red, the sink blue, the others grey; in 3D those at the slice."""
     cem = task.observation.cem
     for facets, current in zip(cem.electrodes, currents, strict=True):
         colour = IDLE if current == 0 else SOURCE if current > 0 else SINK
-        axes.add_collection(LineCollection(list(100 * cem.mesh.points[facets]), colors=colour, linewidths=width,
-                                           antialiased=False, clip_on=False, zorder=3))
+        bars = 100 * cem.mesh.points[facets]
+        if cem.mesh.dim == 3:
+            x, y, z = bars.reshape(-1, 3).T
+            if x.min() > -1e-6 or x.max() < 1e-6:
+                continue
+            bars = np.array([[[z.min(), y[np.abs(y).argmax()]], [z.max(), y[np.abs(y).argmax()]]]])
+        axes.add_collection(LineCollection(list(bars), colors=colour, linewidths=width, antialiased=False,
+                                           clip_on=False, zorder=3))
 
 
 def draw_frame(task: Task, truth_mesh: Mesh, truth: np.ndarray, estimate: np.ndarray, spread: np.ndarray | None,
                currents: np.ndarray, time: float) -> np.ndarray:
     """(height, width, 3) uint8 picture: truth and estimate in one colour scale, the estimate's spread, electrodes.
+
+    Pipes lie one below the other, in 3D with isosurfaces beside them; tanks stand side by side.
 
     Parameters
     ----------
@@ -53,23 +79,56 @@ def draw_frame(task: Task, truth_mesh: Mesh, truth: np.ndarray, estimate: np.nda
     time : float, s
     """
     low, high = colour_range(task)
-    spread_high = 0.25 * task.expected_concentration
-    figure = Figure(figsize=(8.0, 6.4), dpi=100, layout="constrained")
+    spread_high = max(0.25, task.prior.initial_std) * task.expected_concentration
+    size = np.ptp(task.mesh.points, axis=0)
+    solid, tank = task.mesh.dim == 3, size[0] < 2 * size[1] and task.mesh.dim == 2
+    figure = Figure(figsize=(12.0, 4.4) if tank else (12.0, 6.4) if solid else (8.0, 6.4), dpi=100,
+                    layout="constrained")
     canvas = FigureCanvasAgg(figure)
-    top, middle, bottom = figure.subplots(3, 1, sharex=True)
-    draw_field(top, truth_mesh, truth, low, high)
-    field = draw_field(middle, task.mesh, estimate, low, high)
-    figure.colorbar(field, ax=[top, middle], label="concentration / (mol/m³)", extend="both", aspect=30)
+    grid = figure.add_gridspec(1, 3) if tank else figure.add_gridspec(3, 2 if solid else 1)
+    first = figure.add_subplot(grid[0, 0])
+    places = [grid[0, k] if tank else grid[k, 0] for k in (1, 2)]
+    panels = [first, *(figure.add_subplot(place, sharex=first, sharey=first) for place in places)]
+    draw_field(panels[0], truth_mesh, truth, low, high)
+    field = draw_field(panels[1], task.mesh, estimate, low, high)
+    where = {"location": "bottom", "aspect": 40} if tank else {"aspect": 30}
+    figure.colorbar(field, ax=panels[:2], label="concentration / (mol/m³)", extend="both", **where)
     if spread is None:
-        bottom.text(0.5, 0.5, "no spread claimed", transform=bottom.transAxes, ha="center", va="center")
-        draw = draw_field(bottom, task.mesh, np.zeros(task.mesh.n_nodes), 0.0, spread_high, "Greys")
+        panels[2].text(0.5, 0.5, "no spread claimed", transform=panels[2].transAxes, ha="center", va="center")
+        draw = draw_field(panels[2], task.mesh, np.zeros(task.mesh.n_nodes), 0.0, spread_high, "Greys")
+        label = ""
     else:
-        draw = draw_field(bottom, task.mesh, spread, 0.0, spread_high, SPREAD_MAP)
-        figure.colorbar(draw, ax=bottom, label="std / (mol/m³)", extend="max", aspect=12)
-    for axes, title in ((top, f"truth, t = {1e3 * time:.0f} ms"), (middle, "estimate"),
-                        (bottom, "standard deviation of the estimate")):
+        draw = draw_field(panels[2], task.mesh, spread, 0.0, spread_high, SPREAD_MAP)
+        label = "std / (mol/m³)"
+    if spread is not None or tank:                       # tanks keep their size beside each other
+        where = {"location": "bottom", "aspect": 20} if tank else {"aspect": 12}
+        figure.colorbar(draw, ax=panels[2], label=label, extend="max", **where)
+    for axes, title in zip(panels, (f"truth, t = {1e3 * time:.0f} ms", "estimate",
+                                    "standard deviation of the estimate"), strict=True):
         axes.set_title(title, loc="left", fontsize=10)
         draw_electrodes(axes, task, currents)
-    bottom.set_xlabel("x / cm    (flow →;   current enters at the red electrode and leaves at the blue one)")
+    current = "current enters at the red electrode and leaves at the blue one"
+    if tank:
+        for axes in panels:
+            axes.set_xlabel("x / cm")
+        figure.suptitle(current, fontsize=10)
+    else:
+        panels[2].set_xlabel(f"{'z' if solid else 'x'} / cm    (flow →;   {current})")
+    if solid:
+        level = task.expected_concentration
+        draw_solids(figure, grid, task, [(truth_mesh, truth), (task.mesh, estimate)], (1.08 * level, 1.36 * level),
+                    currents)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def draw_solids(figure: Figure, grid: GridSpec, task: Task, fields: list[tuple[Mesh, np.ndarray]],
+                levels: tuple[float, float], currents: np.ndarray) -> None:
+    """Isosurfaces of truth and estimate in the second column of ``grid``, and below them the injecting electrodes."""
+    from eitbench.envs.isosurface import draw_electrodes_in_space, draw_isosurfaces
+    for row, (mesh, values) in enumerate(fields):
+        axes = figure.add_subplot(grid[row, 1])
+        draw_isosurfaces(axes, mesh, values, *levels)
+        axes.set_title(f"{levels[0]:.0f} (blue) and {levels[1]:.0f} (orange) mol/m³", fontsize=10)
+    draw_electrodes_in_space(figure.add_subplot(grid[2, 1]), task.observation.cem, currents,
+                             (SOURCE, SINK, IDLE))

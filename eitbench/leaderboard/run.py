@@ -70,8 +70,7 @@ class Job(NamedTuple):
 
 def board_of(env: EstimationEnv) -> str:
     """Which of `BOARDS` an environment belongs to."""
-    lag = env.task.lag
-    return BOARDS[0] if lag == 0 else BOARDS[2] if lag == env.task.n_steps - 1 else BOARDS[1]
+    return BOARDS[0] if env.lag == 0 else BOARDS[2] if env.lag == env.scenario.n_steps - 1 else BOARDS[1]
 
 
 def play(env: EstimationEnv, baseline: Baseline, seed: int) -> Iterator[tuple[int, Estimate]]:

@@ -9,7 +9,7 @@ import pytest
 from eitbench import make_task, simulate
 from eitbench.estimation import best_homogeneous, gauss_newton
 from eitbench.leaderboard.baselines import load_baseline
-from eitbench.leaderboard.reproduce import VELOCITIES, velocity_sweep
+from eitbench.leaderboard.figures.pipe2d import VELOCITIES, velocity_sweep
 from eitbench.leaderboard.run import Environment, Job, run_episode
 from eitbench.physics.fem import stiffness_matrix
 from eitbench.recordings import score_operators

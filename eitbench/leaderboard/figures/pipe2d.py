@@ -1,14 +1,12 @@
-"""Figures of the thesis, drawn from our data."""
+"""Figures 5.4 to 5.8 of the thesis: the 2D pipe, its flow known or assumed wrongly."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from joblib import Parallel, delayed
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
@@ -16,12 +14,23 @@ from tqdm import tqdm
 from eitbench import scoring
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.pipe2d import Pipe2DEnv
-from eitbench.envs.rendering import SPREAD_MAP, colour_range, draw_electrodes, draw_field
+from eitbench.envs.rendering import SPREAD_MAP, colour_range, draw_field
 from eitbench.leaderboard.baselines import load_baseline
-from eitbench.leaderboard.run import play, play_and_collect
+from eitbench.leaderboard.figures.common import (
+    bare,
+    comparison,
+    error_of,
+    estimates_of,
+    idle_electrodes,
+    milliseconds,
+    pipe_grid,
+    save,
+    shown_times,
+    verdict,
+)
+from eitbench.leaderboard.run import play_and_collect
 from eitbench.leaderboard.score import score
 from eitbench.recordings import score_operators
-from eitbench.task import Estimate
 
 VELOCITIES = np.arange(0.0, 9.01, 0.5)
 """Assumed mean velocities in m/s of Fig. 5.8."""
@@ -31,117 +40,55 @@ def _env(lag: int | str = 0, mean_velocity: float | None = None) -> EstimationEn
     return Pipe2DEnv(lag=lag, assumed_mean_velocity=mean_velocity)
 
 
-def _estimates(env: EstimationEnv, baseline: str, seed: int) -> list[Estimate]:
-    """What a baseline says of t = 1 … T."""
-    steps = play(env, load_baseline(baseline), seed)
-    with threadpool_limits(1):
-        return [estimate for _, estimate in tqdm(steps, total=env.task.n_steps, desc=baseline, unit="state",
-                                                 disable=None, leave=False)]
-
-
-def _error(env: EstimationEnv, estimates: list[Estimate]) -> float:
-    """ẽ_c of the episode ``env`` has just played."""
-    interpolation, mass = score_operators(env.scenario)
-    scored = slice(env.task.warm_up, None)
-    means = np.array([estimate.mean for estimate in estimates])
-    return scoring.relative_error((interpolation @ means[scored].T).T, env.truth()[scored], mass)
-
-
-def _grid(rows: int, columns: int, titles: list[str]) -> tuple[Figure, np.ndarray]:
-    figure = Figure(figsize=(3.6 * columns, 0.95 * rows + 0.7), dpi=130, layout="constrained")
-    axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
-    for column, title in enumerate(titles):
-        axes[0, column].set_title(title, fontsize=10)
-        axes[-1, column].set_xlabel("x / cm")
-    return figure, axes
-
-
-def _times(env: EstimationEnv, rows: int = 5) -> list[int]:
-    first = env.task.warm_up + 6
-    return list(range(first, first + 5 * rows, 5))
-
-
-def _comparison(path: Path, env: EstimationEnv, columns: dict[str, list[Estimate]]) -> None:
-    """Truth in the first column, estimates beside it, one state a row, one colour scale."""
-    times = _times(env)
-    figure, axes = _grid(len(times), 1 + len(columns), ["truth", *columns])
-    truth, (low, high) = env.truth(), colour_range(env.task)
-    for row, t in enumerate(times):
-        fields = [(env.truth_mesh(), truth[t - 1])]
-        fields += [(env.task.mesh, estimates[t - 1].mean) for estimates in columns.values()]
-        for ax, (mesh, values) in zip(axes[row], fields, strict=True):
-            mappable = draw_field(ax, mesh, values, low, high)
-            draw_electrodes(ax, env.task, np.zeros(env.task.currents.shape[1]), width=3)
-            ax.label_outer()
-        axes[row, 0].set_ylabel(f"{_milliseconds(env, t)}\ny / cm", fontsize=9)
-    figure.colorbar(mappable, ax=axes, label="concentration / (mol/m³)", extend="both", aspect=40)
-    _save(figure, path)
-
-
-def _verdict(claim: str, holds: bool) -> str:
-    """A line on what the thesis shows: whether our data show it too is computed, not written down."""
-    return f"{'Agrees' if holds else 'DIFFERS'}: {claim}"
-
-
-def _milliseconds(env: EstimationEnv, t: int) -> str:
-    return f"{1e3 * t * env.task.transport.time_step:.0f} ms"
-
-
-def _save(figure: Figure, path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    FigureCanvasAgg(figure)
-    figure.savefig(path)
-
-
 def fig5_4(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
     """True concentration, Kalman filter and fixed-interval smoother estimates."""
     filter_env, smoothing_env = _env(), _env("all")
-    filtered = _estimates(filter_env, "kalman_filter", seeds[0])
-    smoothed = _estimates(smoothing_env, "fixed_interval_smoother", seeds[0])
+    filtered = estimates_of(filter_env, "kalman_filter", seeds[0])
+    smoothed = estimates_of(smoothing_env, "fixed_interval_smoother", seeds[0])
     path = out / "fig5.4.png"
-    _comparison(path, filter_env, {"Kalman filter": filtered, "fixed-interval smoother": smoothed})
-    by_filter, by_smoother = _error(filter_env, filtered), _error(smoothing_env, smoothed)
+    comparison(path, filter_env, {"Kalman filter": filtered, "fixed-interval smoother": smoothed})
+    by_filter, by_smoother = error_of(filter_env, filtered), error_of(smoothing_env, smoothed)
     return path, "\n".join([
         f"ẽ_c is {by_filter:.4f} for the filter and {by_smoother:.4f} for the smoother.",
-        _verdict("the smoother is better than the filter", by_smoother < by_filter),
+        verdict("the smoother is better than the filter", by_smoother < by_filter),
         "By choice: inflow, electrodes and injections are ours, so no slug stands where the thesis has one."])
 
 
 def fig5_5(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
     """Variances of the estimation error of filter and smoother."""
     env = _env()
-    filtered = _estimates(env, "kalman_filter", seeds[0])
-    smoothed = _estimates(_env("all"), "fixed_interval_smoother", seeds[0])
-    t = _times(env)[-1]
+    filtered = estimates_of(env, "kalman_filter", seeds[0])
+    smoothed = estimates_of(_env("all"), "fixed_interval_smoother", seeds[0])
+    t = shown_times(env)[-1]
     figure = Figure(figsize=(11.0, 2.4), dpi=130, layout="constrained")
     axes = figure.subplots(1, 2, sharey=True)
     variances = [estimates[t - 1].variance for estimates in (filtered, smoothed)]
     top = float(np.quantile(np.asarray(variances[0]), 0.995))
     for ax, variance, title in zip(axes, variances, ("Kalman filter", "fixed-interval smoother"), strict=True):
         mappable = draw_field(ax, env.task.mesh, np.asarray(variance), 0.0, top, SPREAD_MAP)
-        draw_electrodes(ax, env.task, np.zeros(env.task.currents.shape[1]), width=3)
-        ax.set(title=f"{title}, {_milliseconds(env, t)}", xlabel="x / cm")
+        idle_electrodes(ax, env.task)
+        ax.set(title=f"{title}, {milliseconds(env, t)}", xlabel="x / cm")
     figure.colorbar(mappable, ax=axes, label="variance / (mol/m³)²", extend="max")
     path = out / "fig5.5.png"
-    _save(figure, path)
+    save(figure, path)
     by_filter, by_smoother = (np.asarray(variance) for variance in variances)
     x, third = env.task.mesh.points[:, 0], np.ptp(env.task.mesh.points[:, 0]) / 3
     along = [by_filter[(x >= k * third) & (x <= (k + 1) * third)].mean() for k in range(3)]
     return path, "\n".join([
         f"Mean variance {by_filter.mean():.2f} (mol/m³)² for the filter, {by_smoother.mean():.2f} for the smoother.",
-        _verdict("the variance is largest at the inlet, where uncertainty enters, and falls along the flow",
+        verdict("the variance is largest at the inlet, where uncertainty enters, and falls along the flow",
                  bool(along[0] > along[1] > along[2] and x[by_filter.argmax()] < third)),
-        _verdict("the smoother's variance is smaller everywhere", bool((by_smoother <= by_filter + 1e-9).all())),
+        verdict("the smoother's variance is smaller everywhere", bool((by_smoother <= by_filter + 1e-9).all())),
         "By choice: the scale depends on our inflow noise and electrodes."])
 
 
 def fig5_6(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
     """Stationary reconstructions of four frames of the moving target."""
     env = _env("all")
-    images = _estimates(env, "gauss_newton", seeds[0])
+    images = estimates_of(env, "gauss_newton", seeds[0])
     frame, truth = len(env.task.currents), env.truth()
     begins = [frame * k for k in range(1, 5)]
-    figure, axes = _grid(len(begins), 2, ["true average over the frame", "stationary Gauss–Newton"])
+    figure, axes = pipe_grid(len(begins), 2, ["true average over the frame", "stationary Gauss–Newton"])
     low, high = colour_range(env.task)
     averages = []
     for row, begin in zip(axes, begins, strict=True):
@@ -149,21 +96,21 @@ def fig5_6(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
         draw_field(row[0], env.truth_mesh(), averages[-1], low, high)
         mappable = draw_field(row[1], env.task.mesh, images[begin].mean, low, high)
         for ax in row:
-            draw_electrodes(ax, env.task, np.zeros(env.task.currents.shape[1]), width=3)
+            idle_electrodes(ax, env.task)
             ax.label_outer()
-        row[0].set_ylabel(f"until {_milliseconds(env, begin + frame)}\ny / cm", fontsize=9)
+        row[0].set_ylabel(f"until {milliseconds(env, begin + frame)}\ny / cm", fontsize=9)
     figure.colorbar(mappable, ax=axes, label="concentration / (mol/m³)", extend="both", aspect=40)
     path = out / "fig5.6.png"
-    _save(figure, path)
+    save(figure, path)
     interpolation, mass = score_operators(env.scenario)
     of_average = scoring.relative_error(np.array([interpolation @ images[b].mean for b in begins]),
                                         np.array(averages), mass)
-    error, constant = _error(env, images), _error(env, _estimates(env, "homogeneous", seeds[0]))
+    error, constant = error_of(env, images), error_of(env, estimates_of(env, "homogeneous", seeds[0]))
     return path, "\n".join([
         f"ẽ_c is {error:.4f}, of the homogeneous estimate {constant:.4f}; against the true average of its frame an "
         f"image errs by {of_average:.4f}.",
-        _verdict("the images are of no use: worse than a constant", error > constant),
-        _verdict("they are not temporal averages of the target either", of_average > 0.5 * error),
+        verdict("the images are of no use: worse than a constant", error > constant),
+        verdict("they are not temporal averages of the target either", of_average > 0.5 * error),
         "By choice: the artefacts depend on the order of our injections."])
 
 
@@ -172,19 +119,19 @@ def fig5_7(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
     columns, errors = {}, []
     for velocity in (2.0, 7.0):
         env = _env(mean_velocity=velocity)
-        estimates = _estimates(env, "kalman_filter", seeds[0])
+        estimates = estimates_of(env, "kalman_filter", seeds[0])
         columns[f"filter, assumed {100 * velocity:.0f} cm/s"] = estimates
-        errors.append(_error(env, estimates))
+        errors.append(error_of(env, estimates))
     right = _env()
-    error = _error(right, _estimates(right, "kalman_filter", seeds[0]))
+    error = error_of(right, estimates_of(right, "kalman_filter", seeds[0]))
     path = out / "fig5.7.png"
-    _comparison(path, env, columns)
-    constant = _error(right, _estimates(right, "homogeneous", seeds[0]))
+    comparison(path, env, columns)
+    constant = error_of(right, estimates_of(right, "homogeneous", seeds[0]))
     return path, "\n".join([
         f"ẽ_c is {errors[0]:.4f} with 200 cm/s and {errors[1]:.4f} with 700 cm/s, {error:.4f} with the true 450 cm/s "
         f"and {constant:.4f} for the homogeneous estimate.",
-        _verdict("a wrong velocity costs accuracy", min(errors) > error),
-        _verdict("yet the estimates are still of use: better than a constant", max(errors) < constant)])
+        verdict("a wrong velocity costs accuracy", min(errors) > error),
+        verdict("yet the estimates are still of use: better than a constant", max(errors) < constant)])
 
 
 def velocity_sweep(seeds: list[int], jobs: int, velocities: np.ndarray = VELOCITIES) -> dict[str, np.ndarray]:
@@ -217,12 +164,12 @@ def fig5_8(seeds: list[int], jobs: int, out: Path) -> tuple[Path, str]:
         best[key] = 100 * VELOCITIES[mean.argmin()]
         _sweep_panel(ax, mean, label)
     path = out / "fig5.8.png"
-    _save(figure, path)
+    save(figure, path)
     return path, "\n".join([
         f"Minimum at {best['error']:.0f} cm/s for ẽ_c, {best['voltage_discrepancy']:.0f} for ẽ_V, {best['nis']:.0f} "
         f"for NIS, over {len(seeds)} episodes; the truth is 450.",
-        _verdict("the error is smallest near the true velocity", 400 <= best["error"] <= 500),
-        _verdict("the voltages alone tell roughly which velocity is right (500 in the thesis)",
+        verdict("the error is smallest near the true velocity", 400 <= best["error"] <= 500),
+        verdict("the voltages alone tell roughly which velocity is right (500 in the thesis)",
                  400 <= best["voltage_discrepancy"] <= 550),
         "Beyond the thesis: NIS, the innovations against the filter's own expectation."])
 
@@ -232,9 +179,4 @@ def _sweep_panel(ax: Axes, mean: np.ndarray, label: str) -> None:
     ax.axvline(450, color="0.6", linestyle="--", linewidth=1)
     ax.set(xlabel="assumed mean velocity / (cm/s)", ylabel=label, ylim=(0.0, 1.08 * mean.max()))
     ax.text(460, 1.06 * mean.max(), "true", color="0.4", va="top", fontsize=9)
-    ax.spines[["top", "right"]].set_visible(False)
-
-
-FIGURES: dict[str, Callable[[list[int], int, Path], tuple[Path, str]]] = {
-    "fig5.4": fig5_4, "fig5.5": fig5_5, "fig5.6": fig5_6, "fig5.7": fig5_7, "fig5.8": fig5_8,
-}
+    bare(ax)
