@@ -92,7 +92,7 @@ class EstimationEnv(gym.Env[Observation, np.ndarray]):
         last_step = self.scenario.n_steps + self.lag
         if self._seed is None or self._step > last_step:
             raise gym.error.ResetNeeded("call reset() before step(), and again when an episode has ended")
-        action = checked_actions(action, self.action_space)  # type: ignore[arg-type]
+        action = checked_actions(action, self.action_space, self._n_nodes)  # type: ignore[arg-type]
         estimate, parameters = np.split(action, [self._n_nodes])
         t = self._step - self.lag
         reward = 0.0
@@ -167,8 +167,11 @@ def cycle_currents(scenario: Scenario, lag: int) -> np.ndarray:
     return currents
 
 
-def checked_actions(actions: np.ndarray, space: spaces.Box) -> np.ndarray:
-    """``actions`` as float64, finite and in ``space``; else a ``ValueError`` that says what is wrong with them."""
+def checked_actions(actions: np.ndarray, space: spaces.Box, n_nodes: int) -> np.ndarray:
+    """``actions`` as float64, finite and in ``space``; else a ``ValueError`` that says what is wrong with them.
+
+    The first ``n_nodes`` numbers are concentrations, the others velocities.
+    """
     plain = type(actions) is np.ndarray and actions.shape == space.shape and actions.dtype == np.float64
     if plain and (np.abs(actions) <= space.high).all():             # false for NaN too
         return actions
@@ -176,6 +179,6 @@ def checked_actions(actions: np.ndarray, space: spaces.Box) -> np.ndarray:
     outside = np.argwhere(np.abs(checked) > space.high)
     if len(outside):
         place = tuple(outside[0])
-        units = "mol/m³" if space.high[place] == space.high.flat[0] else "m/s"
+        units = "mol/m³" if place[-1] < n_nodes else "m/s"
         raise ValueError(f"action must lie within ±{space.high[place]:g} {units}, got {abs(checked[place]):g}")
     return checked

@@ -46,7 +46,7 @@ class EstimationVectorEnv(LockstepVectorEnv):
                 self._flows.append((entries["velocity_moment"].copy(), entries["velocity_square"].copy()))
 
     def _act(self, actions: np.ndarray) -> np.ndarray:
-        checked = checked_actions(actions, self.action_space)  # type: ignore[arg-type]
+        checked = checked_actions(actions, self.action_space, self._n_nodes)  # type: ignore[arg-type]
         estimates, parameters = checked[:, :self._n_nodes], checked[:, self._n_nodes:]
         t = self._step - self._lag
         if t <= self.scenario.warm_up:

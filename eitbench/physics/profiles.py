@@ -89,8 +89,12 @@ class VelocityModel:
 
     def __post_init__(self) -> None:
         _check.number("half_width", self.half_width, low=0.0, open_low=True, units="m")
+        if not self.basis or not all(self.basis):
+            raise ValueError(f"basis must hold at least one profile, each with a coefficient, got {self.basis!r}")
         for name in ("nominal", "initial_std", "walk_std"):
-            _check.array(name, getattr(self, name), (len(self.basis),), units="m/s")
+            numbers = _check.array(name, getattr(self, name), (len(self.basis),), units="m/s")
+            if name != "nominal" and (numbers < 0).any():
+                raise ValueError(f"{name} must be ≥ 0 in m/s, got {getattr(self, name)!r}")
 
     @property
     def size(self) -> int:

@@ -106,6 +106,11 @@ class Pipe2DUnknownVelocity(Pipe2DBiasedVelocity):
     velocity_walk: float = 0.02
     """m/s a time step, standard deviation of the believed random walk [ours]"""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check.number("velocity_std", self.velocity_std, low=0.0, units="m/s")
+        _check.number("velocity_walk", self.velocity_walk, low=0.0, units="m/s")
+
     @property
     def velocity_model(self) -> VelocityModel:
         return parabola(self.half_width, self.mean_velocity, self.velocity_std, self.velocity_walk)
@@ -135,6 +140,8 @@ class Pipe2DSkewedVelocity(Pipe2DUnknownVelocity):
     """m/s [ours]"""
     skewness_range: tuple[float, float] = (0.6, 1.0)
     """|k|: the fastest fluid is 0.28 R to 0.41 R off the axis [ours]"""
+    velocity_walk: float = 0.005
+    """m/s a time step: the flow is steady, and three numbers are to be told apart [ours]"""
 
     @property
     def velocity_model(self) -> VelocityModel:

@@ -54,8 +54,7 @@ class Pipe2DObstacle(Pipe2D):
 
     def lower_wall(self, x: np.ndarray) -> np.ndarray:
         """y of the lower wall in m at ``x`` in m."""
-        bulge = np.exp(-((x - self.obstacle_position) / self.obstacle_width)**2)
-        return -self.half_width + self.obstacle_height * bulge
+        return _bulge(x, self.obstacle_height, self.obstacle_position, self.obstacle_width) - self.half_width
 
     def shaped(self, mesh: Mesh) -> Mesh:
         x, y = mesh.points.T
@@ -66,6 +65,12 @@ class Pipe2DObstacle(Pipe2D):
         """The velocity field, on a mesh with so many cells along and across the pipe; computed once a process."""
         return _past_obstacle(self, cells)
 
+    @property
+    def parabolic_flow(self) -> LocalParabola:
+        """The velocity field of those who know the walls only."""
+        return LocalParabola(self.mean_velocity, self.half_width, self.obstacle_height, self.obstacle_position,
+                             self.obstacle_width)
+
     def truth(self) -> Discretisation:
         """10,251 CD nodes, 32 sub-steps an injection; about 18,000 EIT unknowns; flow on 96 × 24 cells."""
         return self._discretise(cells=(200, 50), substeps=16, time_step=self.time_step / self.truth_steps,
@@ -75,7 +80,7 @@ class Pipe2DObstacle(Pipe2D):
         """1,701 CD nodes, 8 sub-steps an injection; about 4,600 EIT unknowns; ``flow`` is one of `FLOWS`."""
         if flow not in FLOWS:
             raise ValueError(f"flow must be one of {', '.join(FLOWS)}, got {flow!r}")
-        velocity: VelocityField = self.real_flow((64, 16)) if flow == "real" else LocalParabola(self)
+        velocity: VelocityField = self.real_flow((64, 16)) if flow == "real" else self.parabolic_flow
         return self._discretise(cells=(80, 20), substeps=8, time_step=self.time_step,
                                 cells_at_electrodes=5, cells_across=14, velocity=velocity)
 
@@ -84,19 +89,28 @@ class Pipe2DObstacle(Pipe2D):
 class LocalParabola:
     """The flow with the stream function 1.5·v̄·R·(η − η³/3), η from −1 at the lower wall to 1 at the upper one.
 
-    At each x a parabola along the pipe, with the fluid following the walls; without divergence.
+    At each x a parabola along the pipe, with the fluid following the walls; without divergence. Fields as in
+    `Pipe2DObstacle`: an estimator is given this, and through it nothing else of the scenario.
     """
 
-    pipe: Pipe2DObstacle
+    mean_velocity: float
+    half_width: float
+    height: float
+    position: float
+    width: float
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
-        (x, y), pipe = np.asarray(points, dtype=float).T, self.pipe
-        low = pipe.lower_wall(x)
-        slope = -2.0 * (x - pipe.obstacle_position) / pipe.obstacle_width**2 * (low + pipe.half_width)
-        gap = pipe.half_width - low
-        part = (y - low) / gap
-        by_eta = 1.5 * pipe.mean_velocity * pipe.half_width * (1.0 - (2.0 * part - 1.0)**2)          # ∂ψ/∂η
+        x, y = np.asarray(points, dtype=float).T
+        bulge = _bulge(x, self.height, self.position, self.width)
+        slope = -2.0 * (x - self.position) / self.width**2 * bulge
+        gap = 2.0 * self.half_width - bulge
+        part = (y + self.half_width - bulge) / gap
+        by_eta = 1.5 * self.mean_velocity * self.half_width * (1.0 - (2.0 * part - 1.0)**2)          # ∂ψ/∂η
         return np.stack([by_eta * 2.0 / gap, by_eta * 2.0 * slope / gap * (1.0 - part)], axis=1)
+
+
+def _bulge(x: np.ndarray, height: float, position: float, width: float) -> np.ndarray:
+    return height * np.exp(-((x - position) / width)**2)
 
 
 @lru_cache(maxsize=4)

@@ -74,6 +74,7 @@ class RotatingTank2D(Tank2D):
             _check.number(name, getattr(self, name), low=0.0, open_low=True, units=units)
         _check.integer("warm_up", self.warm_up, low=0)
         _check.integer("scored_steps", self.scored_steps, low=1)
+        _check.array("stirrer_position", self.stirrer_position, (2,), units="m")
         low, high = _check.array("start_radius", self.start_radius, (2,))
         if not 0 <= low <= high or high * self.radius + self.ball_radius > self.radius:
             raise ValueError("start_radius must be a range 0 ≤ low ≤ high that keeps the ball inside the tank, got "
@@ -105,7 +106,7 @@ class RotatingTank2D(Tank2D):
         furthest, dt = self.radius - self.ball_radius, self.time_step / PATH_SUBSTEPS
 
         def velocity(place: np.ndarray) -> np.ndarray:
-            return flow(place + ball).mean(axis=0)
+            return _BALL_WEIGHTS @ flow(place + ball)
 
         for step in range(self.n_steps * PATH_SUBSTEPS + 1):
             if step % PATH_SUBSTEPS == 0:
@@ -144,8 +145,9 @@ class RotatingTank2D(Tank2D):
 
 _BALL_POINTS = np.concatenate([np.zeros((1, 2)), np.sqrt(2 / 3) * np.stack(
     [np.cos(np.arange(6) * np.pi / 3), np.sin(np.arange(6) * np.pi / 3)], axis=1)])
-"""Where the flow is averaged over a ball of radius one; a rule with weights 1/4 and 1/8 would be exact to fourth order,
-equal weights are to the second that a moving field needs."""
+"""Where the flow is averaged over a disc of radius one, …"""
+_BALL_WEIGHTS = np.array([1 / 4, *[1 / 8] * 6])
+"""… and with which weights: exact for polynomials of the fifth degree (Abramowitz & Stegun 25.4.61)."""
 
 
 @lru_cache(maxsize=4)

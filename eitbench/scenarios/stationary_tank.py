@@ -24,9 +24,9 @@ class StationaryTank2D(Tank2D):
     from that injection alone.
     """
 
-    large_radius: tuple[float, float] = (0.024, 0.032)
+    large_radius: tuple[float, float] = (0.026, 0.032)
     """m; the larger cylinder [T: one is larger; ours: the sizes]"""
-    small_radius: tuple[float, float] = (0.014, 0.020)
+    small_radius: tuple[float, float] = (0.018, 0.022)
     """m; the smaller one [ours]"""
     furthest: float = 0.7
     """how far from the middle a cylinder's centre may stand, in parts of the tank's radius [ours]"""
@@ -58,9 +58,15 @@ class StationaryTank2D(Tank2D):
             if not 0 < low <= high < 0.3 * self.radius:
                 raise ValueError(f"{name} must be a range 0 < low ≤ high < 0.3·radius in m, got "
                                  f"{getattr(self, name)!r}")
+        _check.integer("n_electrodes", self.n_electrodes, low=8)
+        if self.small_radius[1] > self.large_radius[1]:
+            raise ValueError(f"small_radius must not reach beyond large_radius, got {self.small_radius!r} and "
+                             f"{self.large_radius!r} m")
         _check.number("furthest", self.furthest, low=0.5, high=1.0 - self.large_radius[1] / self.radius)
-        if self.gap > 0.5 * self.radius:
-            raise ValueError(f"gap must be at most half the tank's radius, got {self.gap!r} m")
+        apart = self.large_radius[1] + self.small_radius[1] + self.gap
+        if apart > 1.6 * self.furthest * self.radius:                  # else places would be drawn again and again
+            raise ValueError(f"gap must leave room for both cylinders: with it their centres are {apart:g} m apart, "
+                             f"of {1.6 * self.furthest * self.radius:g} m that furthest allows; got {self.gap!r} m")
 
     @property
     def n_steps(self) -> int:

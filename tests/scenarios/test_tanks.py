@@ -290,7 +290,7 @@ def test_estimate_is_asked_for_from_the_first_injection_on():
     (RotatingTank2D, {"start_radius": (0.5, 0.9)}, "start_radius must be a range .* keeps the ball inside the tank"),
     (RotatingTank2D, {"ball_radius": 0.1}, "start_radius must be"), (RotatingTank2D, {"current": "big"}, "current"),
     (RotatingTank2D, {"stirrer_position": (np.nan, 0.0)}, "stirrer_position must be"),
-    (StationaryTank2D, {"gap": 0.08}, "gap must be at most half"), (StationaryTank2D, {"metal": 0.0}, "metal must be"),
+    (StationaryTank2D, {"gap": 0.12}, "gap must leave room"), (StationaryTank2D, {"metal": 0.0}, "metal must be"),
     (StationaryTank2D, {"scored_steps": 0}, "scored_steps"), (StationaryTank2D, {"furthest": 0.8}, "furthest must be"),
     (StationaryTank2D, {"large_radius": (0.03, 0.02)}, "large_radius must be a range"),
     (StationaryTank2D, {"small_radius": (0.01, 0.05)}, "small_radius must be a range"),

@@ -58,7 +58,7 @@ def profiles(seeds: list[int], jobs: int, out: Path) -> tuple[Path, str]:
     right.set(xticks=range(len(PROFILES)), xlim=(-0.6, len(PROFILES) - 0.4), ylim=(0, 1.15 * max(
         values.max() for values in errors.values())), ylabel="ẽ$_c$", xlabel="assumed profile")
     right.set_xticklabels(PROFILES)
-    right.legend(frameon=False, fontsize=9, loc="upper left")
+    right.legend(frameon=False, fontsize=9, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)
     for ax in (left, right):
         bare(ax)
     path = out / "profiles.png"
