@@ -129,7 +129,8 @@ def pipe(steps=5):
         blank = linearised(np.zeros(2 * scenario.electrodes_per_wall), scenario.currents[t])
         noise = rng.normal(size=len(blank.value)) * np.sqrt(blank.noise_variance)
         observations.append(blank._replace(value=blank.matrix @ c + noise))
-    return model, lambda: table_5_1(transport, scenario.prior, c_bh, rank_tolerance=1e-6), observations, dense_filter(model, observations)
+    exact = dense_filter(model, observations)
+    return model, lambda: table_5_1(transport, scenario.prior, c_bh, rank_tolerance=1e-6), observations, exact
 
 
 # -- nonlinear observations -------------------------------------------------------------------------------------------

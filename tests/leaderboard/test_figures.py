@@ -2,6 +2,7 @@
 
 import importlib
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -89,8 +90,8 @@ def draw(monkeypatch, name, folder, estimator):
     return remark
 
 
-DRAWN = [name for name in FIGURES if name != "fig5.8"]
-"""fig5.8 is played in earnest in tests/studies."""
+DRAWN = [name for name in FIGURES if name not in ("fig5.8", "fig5.10")]
+"""fig5.8 is played in earnest in tests/studies; fig5.10 is in 3D, where even a made-up estimate takes minutes."""
 
 
 @pytest.mark.parametrize("name", DRAWN)
@@ -112,11 +113,10 @@ def test_words_follow_from_the_data(name, monkeypatch, tmp_path):
 
 def test_names():
     """Each name leads to a function of its own."""
-    assert len(FIGURES) == 17
+    modules = [importlib.import_module(f"eitbench.leaderboard.figures.{path.stem}")
+               for path in Path(pipe2d.__file__).parent.glob("[!_]*.py")]
     for name in FIGURES:
-        module = {"5": pipe2d, "6": velocity, "7": tanks}.get(name[3:4]) if name.startswith("fig") else (
-            parameters if name.startswith("table") else importlib.import_module(f"eitbench.leaderboard.figures.{name}"))
-        assert callable(getattr(module, name.replace(".", "_")))
+        assert sum(callable(getattr(module, name.replace(".", "_"), None)) for module in modules) == 1, name
 
 
 def test_one_run_serves_several_figures(monkeypatch, tmp_path):
