@@ -17,7 +17,7 @@ WINDOW = 16  # injections
 
 class Estimator:
     boards = ("filter",)
-    parameters = {"factors": FACTORS, "window": WINDOW}  # noqa: RUF012 (a plain dict is what a record stores)
+    parameters = {"factors": list(FACTORS), "window": WINDOW}  # noqa: RUF012 (a plain dict is what a record stores)
 
     def __init__(self, task: Task) -> None:
         self.task = task

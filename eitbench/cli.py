@@ -34,7 +34,7 @@ Figure = StrEnum("Figure", {re.sub(r"\W", "_", name).upper(): name for name in F
 
 
 Out = Annotated[Path, typer.Option("--out", "-o", help="Folder of the results.")]
-Jobs = Annotated[int, typer.Option("--jobs", "-j", min=1, help="Processes; each takes a core and 1 GB, in 3D and for filter banks 4.")]
+Jobs = Annotated[int, typer.Option("--jobs", "-j", min=1, help="Processes; each takes a core and 1 to 4 GB.")]
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

@@ -21,14 +21,18 @@ class Series(NamedTuple):
 
 
 def _log_ticks(low: float, high: float) -> list[float]:
-    """1, 2, 5 times powers of ten within [low, high]."""
+    """1, 2, 5 times powers of ten within [low, high]; finer ones where fewer than two of them are."""
     decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-    ticks = [m * 10.0**e for e in decades for m in (1, 2, 5)]
-    return [tick for tick in ticks if low <= tick <= high]
+    ticks: list[float] = []
+    for multiples in ([1, 2, 5], range(1, 10), np.arange(10, 100) / 10):
+        ticks = [m * 10.0**e for e in decades for m in multiples if low <= m * 10.0**e <= high]
+        if len(ticks) > 1:
+            break
+    return ticks
 
 
 def lines(x: np.ndarray, series: list[Series], x_label: str, y_label: str) -> str:
-    """Curves over a linear x axis and a logarithmic y axis."""
+    """Curves over a linear x axis and a logarithmic y axis; a series may end before ``x`` does."""
     values = np.concatenate([s.values for s in series])
     floor = values[values > 0].min(initial=1.0) / 1.15            # where a perfect estimate's zero is drawn
     low, high, width = floor, max(values.max(), floor) * 1.15, max(x[-1] - x[0], 1)
@@ -47,7 +51,7 @@ def lines(x: np.ndarray, series: list[Series], x_label: str, y_label: str) -> st
     for tick in range(math.ceil(x[0] / step) * step, int(x[-1]) + 1, step):
         parts.append(f'<text x="{px(tick):.1f}" y="{HEIGHT - BOTTOM + 18}" text-anchor="middle">{tick}</text>')
     for s in series:
-        points = " ".join(f"{px(a):.1f},{py(b):.1f}" for a, b in zip(x, s.values, strict=True))
+        points = " ".join(f"{px(a):.1f},{py(b):.1f}" for a, b in zip(x, s.values, strict=False))
         parts.append(f'<polyline class="series" style="stroke:var(--c{s.colour})" points="{points}">'
                      f'<title>{escape(s.name)}</title></polyline>')
     middle = (LEFT + WIDTH - RIGHT) / 2
@@ -59,7 +63,7 @@ def lines(x: np.ndarray, series: list[Series], x_label: str, y_label: str) -> st
 
 def intervals(rows: list[Series], x_label: str) -> str:
     """A dot and its interval a row, ``values`` = (mean, half width), over a logarithmic axis."""
-    row_height, label = 28, 300
+    row_height, label = 28, min(max(300.0, 24 + 6.5 * max(len(s.name) for s in rows)), 520.0)
     height = TOP + row_height * len(rows) + BOTTOM
     ends = [(mean - (half if math.isfinite(half) else 0), mean + (half if math.isfinite(half) else 0))
             for mean, half in (s.values for s in rows)]

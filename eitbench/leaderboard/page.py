@@ -1,4 +1,4 @@
-"""One self-contained HTML page: table, intervals, error over time, snapshots."""
+"""One self-contained HTML page: table, intervals, error over time and snapshots of each world."""
 
 from __future__ import annotations
 
@@ -13,42 +13,52 @@ import numpy as np
 import pandas as pd
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.tri import Triangulation
 
 from eitbench._files import write_atomically
-from eitbench.envs.estimation import EstimationEnv
-from eitbench.envs.rendering import FIELD_MAP, colour_range
+from eitbench.envs.rendering import FIELD_MAP, colour_range, draw_field
 from eitbench.leaderboard import charts
 from eitbench.leaderboard.run import Environment
 from eitbench.leaderboard.store import EpisodeStore
-from eitbench.leaderboard.summary import EXPLANATIONS, board_label, cells
+from eitbench.leaderboard.summary import EXPLANATIONS, board_label, cells, method
 from eitbench.physics.mesh import Mesh
 from eitbench.seeds import parse_seeds
+from eitbench.task import Task
 
 COLOURS = 12
 """--c0 … --c11 of the style sheet"""
-SHOWN = (("kalman_filter", "filter"), ("fixed_interval_smoother", "smoothing"), ("gauss_newton", "smoothing"))
-"""Beside the truth, in the snapshots: thesis Figs 5.4 and 5.6."""
+SHOWN = (("kalman_filter", "filter"), ("joint_extended_kalman_filter", "filter"),
+         ("fixed_interval_smoother", "smoothing"), ("gauss_newton", "smoothing"))
+"""Beside the truth, in the snapshots: thesis Figs 5.4 and 5.6, and who estimates the flow too where it is asked for."""
 
 
 def write_page(store: EpisodeStore, records: list[dict[str, Any]], table: pd.DataFrame) -> Path:
     """Write ``index.html`` into the store's folder and return its path; it needs no other file and no network."""
     environment = jinja2.Environment(loader=jinja2.PackageLoader("eitbench.leaderboard", "."), autoescape=True,
                                      trim_blocks=True, lstrip_blocks=True)
-    text = cells(table)
-    ordered = [_record_of(records, row) for _, row in table.iterrows()]
+    sections = [_section(store, records, str(name), rows.reset_index(drop=True))
+                for name, rows in table.groupby("world", sort=False)]
+    shown = {heading for section in sections for heading in section["headings"]}
     html = environment.get_template("page.html.j2").render(
-        headings=list(text.columns)[1:], explanations=EXPLANATIONS,
-        boards=[(board, rows.iloc[:, 1:].to_numpy().tolist()) for board, rows in text.groupby("board", sort=False)],
-        intervals=_intervals(table), curves=_curves(ordered), legend=_legend(ordered),
-        snapshots=_snapshots(store, ordered),
+        sections=sections, explanations={heading: text for heading, text in EXPLANATIONS.items() if heading in shown},
         colour_bar=_colour_bar(), runs=_runs(records),
-        failures=[(record["title"], episode["seed"], episode["message"]) for record in records
-                  for episode in record["episodes"] if episode["status"] != "ok"],
     )
     path = store.folder / "index.html"
     write_atomically(path, html.encode())
     return path
+
+
+def _section(store: EpisodeStore, records: list[dict[str, Any]], name: str, table: pd.DataFrame) -> dict[str, Any]:
+    """What the page shows of one world; ``table`` has its rows, numbered from 0, which choose the colours."""
+    text = cells(table)
+    ordered = [_record_of(records, row) for _, row in table.iterrows()]
+    return {
+        "name": name, "headings": list(text.columns)[1:],
+        "boards": [(board, rows.iloc[:, 1:].to_numpy().tolist()) for board, rows in text.groupby("board", sort=False)],
+        "intervals": _intervals(table), "curves": _curves(ordered), "legend": _legend(ordered),
+        "snapshots": _snapshots(store, ordered),
+        "failures": [(method(record), episode["seed"], episode["message"]) for record in ordered
+                     for episode in record["episodes"] if episode["status"] != "ok"],
+    }
 
 
 def _runs(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -76,7 +86,7 @@ def _intervals(table: pd.DataFrame) -> str:
 
 
 def _legend(ordered: list[dict[str, Any]]) -> list[tuple[int, str]]:
-    return [(i % COLOURS, _label(record, record["title"])) for i, record in enumerate(ordered)]
+    return [(i % COLOURS, _label(record, method(record))) for i, record in enumerate(ordered)]
 
 
 def _curves(ordered: list[dict[str, Any]]) -> str:
@@ -85,14 +95,15 @@ def _curves(ordered: list[dict[str, Any]]) -> str:
     for i, record in enumerate(ordered):
         errors = [episode["step_errors"] for episode in record["episodes"] if episode["status"] == "ok"]
         if errors:
-            series.append(charts.Series(_label(record, record["title"]), i % COLOURS, np.mean(errors, axis=0)))
-            steps = len(errors[0])
+            series.append(charts.Series(_label(record, method(record)), i % COLOURS, np.mean(errors, axis=0)))
+            steps = max(steps, len(errors[0]))
     return charts.lines(np.arange(1, steps + 1), series, "scored injection", "relative error") if series else ""
 
 
 def _snapshots(store: EpisodeStore, records: list[dict[str, Any]]) -> dict[str, Any] | None:
     """Truth and estimates of one episode at four times, as PNG data; None if nothing can be shown.
 
+    The records are of one world, which has one mesh and one time step.
     The episode is of the split that comes first in the table: methods that played other seeds share none with it.
     """
     records = [record for record in records if any(e["status"] == "ok" for e in record["episodes"])]
@@ -115,26 +126,37 @@ def _snapshots(store: EpisodeStore, records: list[dict[str, Any]]) -> dict[str, 
     task, truth = env.task, env.truth()
     times = task.warm_up + np.linspace(0.12, 0.88, 4) * (task.n_steps - task.warm_up)
     rows = []
-    for t in times.astype(int):
-        pictures = [_picture(env, env.truth_mesh(), truth[t - 1])]
-        pictures += [_picture(env, task.mesh, field[t - 1]) for field in fields]
+    for t in np.maximum(times.astype(int), task.warm_up + 1):
+        pictures = [_picture(task, env.truth_mesh(), truth[t - 1])]
+        pictures += [_picture(task, task.mesh, field[t - 1]) for field in fields]
         rows.append((f"t = {1e3 * t * task.transport.time_step:.0f} ms", pictures))
     low, high = colour_range(task)
-    length, width = 100 * np.ptp(task.mesh.points, axis=0)
-    return {"seed": seed, "columns": ["Truth", *(record["title"] for record in chosen)], "rows": rows,
-            "low": f"{low:g}", "high": f"{high:g}", "size": f"{length:g} cm × {width:g} cm"}
+    return {"seed": seed, "columns": ["Truth", *(method(record) for record in chosen)], "rows": rows,
+            "low": f"{low:g}", "high": f"{high:g}", "size": _size(task), "tank": _is_tank(task)}
 
 
-def _picture(env: EstimationEnv, mesh: Mesh, values: np.ndarray) -> str:
-    """The field without axes, transparent outside, as a data URI."""
+def _is_tank(task: Task) -> bool:
+    """Pipes are long, and something flows through them; tanks are as wide as they are long."""
+    length, width = np.ptp(task.mesh.points, axis=0)[:2]
+    return task.mesh.dim == 2 and bool(length < 2 * width)
+
+
+def _size(task: Task) -> str:
+    """What is to be seen: how large it is, and in 3D which part."""
+    size = [f"{length:.3g} cm" for length in 100 * np.ptp(task.mesh.points, axis=0)]
+    if task.mesh.dim == 3:
+        return f"{size[2]} long, {size[0]} across, cut along the axis; flow from left to right"
+    return f"{size[0]} across" if _is_tank(task) else f"{size[0]} × {size[1]}; flow from left to right"
+
+
+def _picture(task: Task, mesh: Mesh, values: np.ndarray) -> str:
+    """The field without axes, transparent outside, as a data URI; in 3D the slice along the axis."""
     extent = np.ptp(mesh.points, axis=0)
-    figure = Figure(figsize=(4.0, 4.0 * extent[1] / extent[0]), dpi=90)
+    length, height = (extent[2], extent[1]) if mesh.dim == 3 else extent
+    width = 2.6 if _is_tank(task) else 4.0                     # inches; the style sheet keeps tanks small too
+    figure = Figure(figsize=(width, width * height / length), dpi=90)
     axes = figure.add_axes((0, 0, 1, 1))
-    low, high = colour_range(env.task)
-    triangles = Triangulation(mesh.points[:, 0], mesh.points[:, 1], mesh.cells)
-    axes.tripcolor(triangles, values, shading="gouraud", cmap=FIELD_MAP, vmin=low, vmax=high)
-    axes.set_aspect("equal")
-    axes.margins(0)
+    draw_field(axes, mesh, values, *colour_range(task))
     axes.axis("off")
     return _data_uri(figure)
 

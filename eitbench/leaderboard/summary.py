@@ -1,14 +1,17 @@
-"""From records to a table: means over seeds with confidence intervals, best first, board by board."""
+"""From records to a table: means over seeds with confidence intervals, world by world and board by board."""
 
 from __future__ import annotations
 
+import json
 import math
+import re
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from scipy.stats import t as student
 
+from eitbench.envs import ESTIMATION
 from eitbench.leaderboard.baselines import BOARDS
 from eitbench.scoring import skill
 
@@ -33,6 +36,10 @@ EXPLANATIONS = {
 }
 SPLITS = ["test", "dev", "train", "own"]
 """In the order in which boards are shown; the reported seeds first."""
+_TEXT = ("environment", "board", "method", "seeds")
+"""Columns of words; the others are numbers."""
+_NOT_THE_WORLD = ("lag", "episodes", "render_mode")
+"""Arguments of an environment that its episodes do not depend on, beside those of what is believed."""
 _UNIT = {"seconds_per_step": 1e3, "voltage_discrepancy": 1e6}
 
 
@@ -57,18 +64,19 @@ def rounded(mean: float, half: float) -> str:
 
 def scores_by_seed(record: dict[str, Any], name: str) -> dict[str, float]:
     """Seed -> score, of the episodes that have it; in the units of the table."""
-    scores = {episode["seed"]: episode["scores"][name] for episode in record["episodes"] if episode["status"] == "ok"}
+    scores = {episode["seed"]: episode["scores"].get(name)              # records of older code have fewer scores
+              for episode in record["episodes"] if episode["status"] == "ok"}
     return {seed: value * _UNIT.get(name, 1.0) for seed, value in scores.items() if value is not None}
 
 
 def summary(records: list[dict[str, Any]]) -> pd.DataFrame:
-    """One row a record: board, environment, method, episodes, failed, and (mean, half interval) of each score."""
+    """One row a record: world, board, environment, method, episodes, failed, (mean, half interval) of each score."""
     rows = []
     for record in records:
         status = [episode["status"] for episode in record["episodes"]]
-        row: dict[str, Any] = {"board": record["board"], "split": record["split"],
+        row: dict[str, Any] = {"world": world(record), "board": record["board"], "split": record["split"],
                                "environment": record["environment"]["name"],
-                               "baseline": record["baseline"], "method": record["title"],
+                               "baseline": record["baseline"], "method": method(record),
                                "seeds": seed_ranges(record["seeds"]),
                                "episodes": len(status), "failed": sum(s != "ok" for s in status)}
         for name in COLUMNS:
@@ -79,17 +87,60 @@ def summary(records: list[dict[str, Any]]) -> pd.DataFrame:
         rows.append(row)
     table = pd.DataFrame(rows)
     order = table["error"].map(lambda cell: math.inf if cell is None else cell[0])
-    keys = {"_split": table["split"].map(SPLITS.index), "_board": table["board"].map(BOARDS.index), "_error": order}
-    return table.assign(**keys).sort_values(["_split", "_board", "environment", "_error"]).drop(
+    worlds = sorted(set(table["world"]), key=_place)
+    keys = {"_split": table["split"].map(SPLITS.index), "_world": table["world"].map(worlds.index),
+            "_board": table["board"].map(BOARDS.index), "_error": order}
+    return table.assign(**keys).sort_values(["_split", "_world", "_board", "environment", "_error"]).drop(
         columns=list(keys)).reset_index(drop=True)
+
+
+def world(record: dict[str, Any]) -> str:
+    """What the lagged siblings of an environment share, whatever is believed of it: ``Pipe2D (scored_steps=3)``."""
+    environment = record["environment"]
+    registered = ESTIMATION.get(environment["id"], ("", {}))[1]
+    changed = {key: value for key, value in environment["kwargs"].items()
+               if value is not None and value != registered.get(key)
+               and key not in _NOT_THE_WORLD and not key.startswith("assumed_")}
+    changed |= changed.pop("scenario", {})
+    return _kind(environment["id"]) + (f" ({_arguments(changed)})" if changed else "")
+
+
+def method(record: dict[str, Any]) -> str:
+    """The baseline's title, and what it was made to believe: ``Linearised Kalman filter, assumed_flow=real``."""
+    return ", ".join([record["title"], *filter(None, [_arguments(_beliefs(record))])])
+
+
+def _kind(environment: str) -> str:
+    """``eitbench/Pipe2DSmoothing-v0`` -> ``Pipe2D``."""
+    name = re.sub(r"(FixedLag|Smoothing)(?=(-v\d+)?$)", "", environment)
+    return name.removeprefix("eitbench/").removesuffix("-v0")
+
+
+def _place(name: str) -> tuple[int, str]:
+    """Where a world stands: as the ids were registered, and after them what is not ours."""
+    kinds = [_kind(environment) for environment in ESTIMATION]
+    kind = name.split(" (")[0]
+    return kinds.index(kind) if kind in kinds else len(kinds), name
+
+
+def _beliefs(record: dict[str, Any]) -> dict[str, Any]:
+    """Arguments that change the task's model and leave the truth as it is."""
+    return {key: value for key, value in record["environment"]["kwargs"].items()
+            if key.startswith("assumed_") and value is not None}
+
+
+def _arguments(arguments: dict[str, Any]) -> str:
+    return ", ".join(f"{key}={value if isinstance(value, str) else json.dumps(value)}"
+                     for key, value in sorted(arguments.items()))
 
 
 def _skills(record: dict[str, Any], records: list[dict[str, Any]]) -> dict[str, float]:
     """(E_bh − E)/(E_bh − E_ref) with the means over the seeds that all three have; one number, or none."""
     def of(baseline: str, board: str) -> dict[str, float]:
         found = [r for r in records if r["baseline"] == baseline and r["board"] == board
-                 and all(r[key] == record[key] for key in ("split", "source")) and _world(r) == _world(record)]
-        return scores_by_seed(found[0], "error") if found else {}
+                 and all(r[key] == record[key] for key in ("split", "source")) and world(r) == world(record)
+                 and _beliefs(r) in ({}, {"assumed_flow": "real"})]      # an anchor is not led astray
+        return scores_by_seed(max(found, key=lambda r: len(_beliefs(r))), "error") if found else {}
 
     own, floor = scores_by_seed(record, "error"), of("homogeneous", "smoothing")
     reference = of("fixed_interval_smoother", "smoothing")
@@ -100,22 +151,18 @@ def _skills(record: dict[str, Any], records: list[dict[str, Any]]) -> dict[str, 
     return {"all": skill(e, bh, ref)} if bh != ref else {}
 
 
-def _world(record: dict[str, Any]) -> str:
-    """What the lagged siblings of an environment share."""
-    name = record["environment"]["id"].replace("FixedLag", "").replace("Smoothing", "")
-    kwargs = {key: value for key, value in record["environment"]["kwargs"].items()
-              if key not in ("lag", "assumed_mean_velocity")}            # what is believed is not the world
-    return f"{name} {sorted(kwargs.items())}"
-
-
 def cells(table: pd.DataFrame) -> pd.DataFrame:
-    """The summary as text, with the columns a reader sees."""
-    text = table[["board", "method", "seeds"]].copy()
+    """The summary as text, with the columns a reader sees: the environment where there are several worlds, the error
+    of the flow where it was asked for."""
+    text = table[["world", "board", "method", "seeds"]].rename(columns={"world": "environment"})
+    if table["world"].nunique() < 2:
+        text = text.drop(columns="environment")
     text["board"] = [board_label(row) for _, row in table.iterrows()]
     text["seeds"] = [f"{seeds}, {failed} failed" if failed else seeds
                      for seeds, failed in zip(table["seeds"], table["failed"], strict=True)]
     for name, heading in COLUMNS.items():
-        text[heading] = [_cell(name, value) for value in table[name]]
+        if name != "velocity_error" or table[name].notna().any():
+            text[heading] = [_cell(name, value) for value in table[name]]
     return text
 
 
@@ -150,13 +197,14 @@ def markdown(table: pd.DataFrame) -> str:
     text = cells(table)
     lines = [[str(cell).replace("|", "\\|") for cell in line]
              for line in [list(text.columns), *text.to_numpy().tolist()]]
+    words = sum(heading in _TEXT for heading in text.columns)            # they come first
     widths = [max(len(str(line[i])) for line in lines) for i in range(len(text.columns))]
 
     def row(line: list[str]) -> str:
-        padded = [str(cell).ljust(width) if i < 3 else str(cell).rjust(width)
+        padded = [str(cell).ljust(width) if i < words else str(cell).rjust(width)
                   for i, (cell, width) in enumerate(zip(line, widths, strict=True))]
         return f"| {' | '.join(padded)} |"
 
-    rule = "|" + "|".join("-" * (width + 2) if i < 3 else "-" * (width + 1) + ":"
+    rule = "|" + "|".join("-" * (width + 2) if i < words else "-" * (width + 1) + ":"
                           for i, width in enumerate(widths)) + "|"
     return "\n".join([row(lines[0]), rule, *map(row, lines[1:])])

@@ -27,7 +27,7 @@ BOARD_IDS = {"filter": "eitbench/Pipe2D-v0", "fixed-lag": "eitbench/Pipe2DFixedL
 LAGS = {"filter": {}, "fixed-lag": {"lag": 4}, "smoothing": {"lag": "all"}}
 
 
-def record(baseline, board, errors, *, failed=(), kwargs=None, **scores):
+def record(baseline, board, errors, *, failed=(), kwargs=None, id=None, **scores):
     """A record whose episode test:i has ``errors[i]``."""
     def one(i, error):
         if i in failed:
@@ -36,7 +36,7 @@ def record(baseline, board, errors, *, failed=(), kwargs=None, **scores):
 
     return {"baseline": baseline, "title": baseline.replace("_", " "), "board": board, "split": "test",
             "source": "code", "seeds": [f"test:{i}" for i in range(len(errors))],
-            "environment": {"id": BOARD_IDS[board], "name": f"{board}-v0",
+            "environment": {"id": id or BOARD_IDS[board], "name": f"{board}-v0",
                             "kwargs": LAGS[board] | (kwargs or {})},
             "episodes": [one(i, error) for i, error in enumerate(errors)]}
 
@@ -134,6 +134,77 @@ def test_skill_of_a_wrong_belief():
     assert row([*ANCHORS, wrong], "mine", "filter")["skill"][0] == pytest.approx(0.0)
 
 
+@pytest.mark.parametrize("first", [True, False])
+def test_anchors_are_not_led_astray(first):
+    """A smoother that was made to believe a wrong velocity is no anchor, whichever comes first."""
+    wrong = record("fixed_interval_smoother", "smoothing", [0.5, 0.5, 0.5], kwargs={"assumed_mean_velocity": 7.0})
+    mine, records = record("mine", "filter", REFERENCE), [wrong, *ANCHORS] if first else [*ANCHORS, wrong]
+    assert row([*records, mine], "mine", "filter")["skill"][0] == pytest.approx(1.0)
+    assert row([ANCHORS[0], wrong, mine], "mine", "filter")["skill"] is None
+
+
+def test_the_smoother_with_the_real_flow_is_the_anchor():
+    """Past the obstacle, 1 is the smoother that was given the flow as it is, not the one that believes in parabolas."""
+    obstacle, real = "eitbench/Pipe2DObstacle-v0", {"assumed_flow": "real"}
+    records = [record("homogeneous", "smoothing", FLOOR, id=obstacle),
+               record("fixed_interval_smoother", "smoothing", [0.01, 0.01, 0.01], id=obstacle),
+               record("fixed_interval_smoother", "smoothing", REFERENCE, id=obstacle, kwargs=real)]
+    assert sorted(skill[0] for skill in summary(records)["skill"]) == pytest.approx([0.0, 12 / 19, 1.0])
+
+
+# -- worlds -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("id", "kwargs", "world"), [
+    ("eitbench/Pipe2DFixedLag-v0", {"lag": 4}, "Pipe2D"),
+    ("eitbench/Pipe3DSmoothing-v0", {"lag": "all", "scenario": None}, "Pipe3D"),
+    ("eitbench/Pipe2D-v0", {"scenario": {"scored_steps": 3}}, "Pipe2D (scored_steps=3)"),
+    ("eitbench/Pipe2DSmoothing-v0", {"scenario": {"scored_steps": 3, "frame": 2}}, "Pipe2D (frame=2, scored_steps=3)"),
+    ("eitbench/Pipe2DUnknownVelocity-v0", {"flow": "unknown"}, "Pipe2DUnknownVelocity"),
+    ("eitbench/Pipe2DUnknownVelocity-v0", {"flow": "skewed"}, "Pipe2DUnknownVelocity (flow=skewed)"),
+    ("eitbench/Pipe2DBiasedVelocity-v0", {"true_mean_velocity": 4.5, "assumed_profile": "plug", "episodes": 2},
+     "Pipe2DBiasedVelocity (true_mean_velocity=4.5)"),
+    ("theirs/Tank-v1", {"size": (1.0, 2.0)}, "theirs/Tank-v1 (size=[1.0, 2.0])"),
+])
+def test_worlds_are_named(id, kwargs, world):
+    """By the id without its lag, and by what was changed of the world; not by what is believed of it."""
+    mine = record("mine", "filter", [0.1])
+    mine["environment"] = {"id": id, "name": "x", "kwargs": kwargs}
+    assert list(summary([mine])["world"]) == [world]
+
+
+def test_beliefs_stand_beside_the_method():
+    """Two rows of the same method and world are told apart by what it was made to believe."""
+    rows = [record("mine", "filter", [0.1], kwargs={"assumed_flow": "real", "assumed_mean_velocity": None}),
+            record("mine", "filter", [0.2])]
+    assert list(summary(rows)["method"]) == ["mine, assumed_flow=real", "mine"]
+
+
+def several():
+    """Records of three worlds, one of them not ours, and dev seeds; shuffled."""
+    return [record("d", "filter", [0.1], id="theirs/Tank-v0"), record("c", "filter", [0.1], id="eitbench/Pipe3D-v0"),
+            record("b", "smoothing", [0.2]), record("e", "filter", [0.1]) | {"split": "dev"},
+            record("a", "filter", [0.3])]
+
+
+def test_world_by_world():
+    """Reported seeds first, then the worlds as they were registered, then boards; what is not ours comes last."""
+    assert list(summary(several())["baseline"]) == ["a", "b", "c", "d", "e"]
+
+
+def test_the_environment_is_named_where_there_are_several():
+    """The first column says which, in words as the next ones; with one world there is no such column."""
+    text = cells(summary(several()))
+    assert list(text.columns)[:4] == ["environment", "board", "method", "seeds"]
+    assert list(text["environment"]) == ["Pipe2D", "Pipe2D", "Pipe3D", "theirs/Tank", "Pipe2D"]
+    lines = markdown(summary(several())).splitlines()
+    assert lines[2].startswith("| Pipe2D      | filter") and lines[4].startswith("| Pipe3D      | filter")
+    assert [cell.endswith(":") for cell in lines[1].strip("|").split("|")][:5] == [False] * 4 + [True]
+    alone = markdown(summary(ANCHORS)).splitlines()
+    assert re.match(r"\| board +\| method +\| seeds +\| +ẽ_c \|", alone[0])
+    assert [cell.endswith(":") for cell in alone[1].strip("|").split("|")][:4] == [False] * 3 + [True]
+
+
 # -- table ------------------------------------------------------------------------------------------------------------
 
 
@@ -159,7 +230,17 @@ def test_units_of_the_table():
     """Time in ms, voltage discrepancy in mV²; what is not claimed is a dash."""
     text = cells(summary([record("mine", "filter", [0.1], seconds_per_step=0.0025, voltage_discrepancy=4e-6)]))
     assert (text["ms/step"][0], text["ẽ_V"][0], text["CRPS"][0]) == ("2.5", "4", "–")
-    assert set(EXPLANATIONS) == set(COLUMNS.values()) <= set(text.columns)
+    assert set(EXPLANATIONS) == set(COLUMNS.values())
+    assert list(text.columns) == ["board", "method", "seeds", *(name for name in COLUMNS.values() if name != "ẽ_v")]
+
+
+def test_the_error_of_the_flow_stands_where_it_was_asked_for():
+    """Its column is there if anybody has it, and a dash for all others, also for those who were scored before it."""
+    old = record("old", "filter", [0.3])
+    del old["episodes"][0]["scores"]["velocity_error"]
+    rows = [record("mine", "filter", [0.1], velocity_error=0.02), record("theirs", "filter", [0.2]), old]
+    text = cells(summary(rows))
+    assert list(text["ẽ_v"]) == ["0.02", "–", "–"]
 
 
 def test_markdown_is_a_table():
