@@ -10,6 +10,7 @@ import pytest
 import scipy.sparse as sp
 from numpy.testing import assert_allclose, assert_array_equal
 
+from eitbench.physics import condensation as condensation_module
 from eitbench.physics.condensation import condensation
 
 both = pytest.mark.parametrize("backend", ["compiled", "scipy"])
@@ -58,6 +59,52 @@ def test_dense_inverse(backend, n, n_ports):
     for column, inverse in zip(values.T, exact, strict=True):
         assert_allclose(system.port_inverse(column), inverse[-n_ports:, -n_ports:], rtol=0, atol=1e-12 * exact.max())
         assert_allclose(system.port_columns(column), inverse[:, -n_ports:], rtol=0, atol=1e-12 * exact.max())
+
+
+def box_pattern(shape, n_ports):
+    """A 3D grid with 27-point stencils and its places; the last unknowns, the ports, touch the end of the grid."""
+    places = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1).reshape(-1, 3).astype(float)
+    n = len(places)
+    near = np.abs(places[:, None] - places).max(axis=2) <= 1
+    full = np.zeros((n + n_ports, n + n_ports))
+    full[:n, :n], full[n:, n:] = near, 1.0
+    full[n:, n - 2 * n_ports:n] = full[n - 2 * n_ports:n, n:] = 1.0
+    return sp.csc_array(full), places
+
+
+@both
+@pytest.mark.parametrize("shape", [(4, 4, 30), (9, 9, 9), (1, 1, 5)])
+def test_nested_dissection(backend, shape):
+    """Ordered by where the unknowns lie, the ports' block and columns are those of the dense inverse as well."""
+    pattern, places = box_pattern(shape, 2)
+    system = condensation(pattern, 2, backend, places)
+    (matrix,) = random_matrices(pattern, 1, seed=1)
+    exact, values = np.linalg.inv(matrix), matrix[system.rows, system.columns]
+    assert_allclose(system.port_inverse(values), exact[-2:, -2:], rtol=0, atol=1e-12 * exact.max())
+    assert_allclose(system.port_columns(values), exact[:, -2:], rtol=0, atol=1e-12 * exact.max())
+
+
+def test_nested_dissection_pays_in_a_box():
+    """The Cholesky factor of a cube's grid takes fewer operations than by minimum degree."""
+    pattern, places = box_pattern((14, 14, 14), 2)
+    work = []
+    for where in (None, places):
+        place = condensation_module._ordered(pattern, 2, where)
+        filled = condensation_module._filled(condensation_module._permuted(pattern, place))
+        work.append(np.square(np.diff(filled.indptr).astype(float)).sum())
+    assert work[1] < 0.9 * work[0]
+
+
+def test_wide_fronts_are_taken_one_by_one(monkeypatch):
+    """Where eight matrices would not fit side by side, each is factorised alone, to the same numbers."""
+    pattern = random_pattern(180, 7, seed=2)
+    values = np.stack([K[condensation(pattern, 7).rows, condensation(pattern, 7).columns]
+                       for K in random_matrices(pattern, 3, seed=5)], axis=1)
+    together = condensation(pattern, 7).port_inverse(values)
+    monkeypatch.setattr(condensation_module, "_WIDEST", 0)
+    alone = condensation(pattern, 7)
+    assert alone.batch == 1
+    assert_allclose(alone.port_inverse(values), together, rtol=1e-12, atol=0)
 
 
 @both

@@ -23,9 +23,9 @@ def fig5_10(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
     times = list(range(first, first + 20, 5))
     truth, (low, high), level = env.truth(), colour_range(env.task), env.task.expected_concentration
     poor, rich = 1.08 * level, 1.32 * level
-    figure = Figure(figsize=(17.0, 6.6), dpi=120, layout="constrained")
+    figure = Figure(figsize=(17.0, 4.9), dpi=120, layout="constrained")
     axes = figure.subplots(len(times), 6)
-    for row, t in zip(axes, times, strict=True):
+    for number, (row, t) in enumerate(zip(axes, times, strict=True), start=1):
         fields = [(env.truth_mesh(), truth[t - 1]), (env.task.mesh, filtered[t - 1].mean),
                   (env.task.mesh, smoothed[t - 1].mean)]
         for k, (mesh, values) in enumerate(fields):
@@ -33,8 +33,8 @@ def fig5_10(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
             mappable = draw_field(row[3 + k], mesh, values, low, high)
             idle_electrodes(row[3 + k], env.task)
             row[3 + k].set_ylabel("y / cm" if k == 0 else "")
-            row[3 + k].tick_params(labelbottom=row is axes[-1], labelleft=k == 0)
-        row[0].set_title(milliseconds(env, t), loc="left", fontsize=10)
+            row[3 + k].tick_params(labelbottom=number == len(times), labelleft=k == 0)
+        row[0].text(-0.02, 0.5, milliseconds(env, t), transform=row[0].transAxes, ha="right", va="center", fontsize=10)
     for k, title in enumerate(("truth", "Kalman filter", "fixed-interval smoother")):
         axes[0, k].set_title(title, fontsize=11)
         axes[0, 3 + k].set_title(f"{title}, slice x = 0", fontsize=11)
