@@ -11,11 +11,11 @@ import numpy as np
 
 from eitbench import _check
 from eitbench.physics.flow import PlaneChannelFlow
-from eitbench.physics.mesh import Mesh, rectangle_mesh
 from eitbench.scenarios.base import Discretisation
 from eitbench.scenarios.pipe2d import Pipe2D
 
 if TYPE_CHECKING:
+    from eitbench.physics.mesh import Mesh
     from eitbench.physics.navier_stokes import SteadyFlow
     from eitbench.physics.transport import VelocityField
 
@@ -57,6 +57,7 @@ class Pipe2DObstacle(Pipe2D):
         return _bulge(x, self.obstacle_height, self.obstacle_position, self.obstacle_width) - self.half_width
 
     def shaped(self, mesh: Mesh) -> Mesh:
+        from eitbench.physics.mesh import Mesh
         x, y = mesh.points.T
         low, R = self.lower_wall(x), self.half_width
         return Mesh(np.stack([x, low + (y + R) * (R - low) / (2.0 * R)], axis=1), mesh.cells)
@@ -116,6 +117,7 @@ def _bulge(x: np.ndarray, height: float, position: float, width: float) -> np.nd
 @lru_cache(maxsize=4)
 def _past_obstacle(pipe: Pipe2DObstacle, cells: tuple[int, int]) -> SteadyFlow:
     """On a pipe 1.75 times as long, so that the outlet, where the fluid leaves freely, does not shorten the eddy."""
+    from eitbench.physics.mesh import rectangle_mesh
     from eitbench.physics.navier_stokes import steady_flow
     along, R, length = math.ceil(1.75 * cells[0]), pipe.half_width, 1.75 * pipe.length
     straight = rectangle_mesh(np.linspace(0.0, length, along + 1), np.linspace(-R, R, cells[1] + 1))

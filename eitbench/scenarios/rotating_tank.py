@@ -11,7 +11,6 @@ import numpy as np
 
 from eitbench import _check
 from eitbench.physics.rest import AtRest
-from eitbench.physics.round import uniform_disc
 from eitbench.scenarios.base import Discretisation, History, Prior, Randomness
 from eitbench.scenarios.tank2d import Tank2D, disc_indicator
 
@@ -130,14 +129,14 @@ class RotatingTank2D(Tank2D):
 
     def truth(self) -> Discretisation:
         """4,921 nodes for the ball, about 9,300 EIT unknowns. Nothing is transported: the ball has its own path."""
-        mesh = uniform_disc(self.radius, 40)
+        mesh = self.disc(40)
         at_rest: Any = AtRest(mesh, self.time_step)
         return Discretisation(at_rest, self.observe(mesh, cells_at_electrodes=8, rings=22))
 
     def model(self) -> Discretisation:
         """1,261 CD nodes, 8 sub-steps an injection; about 3,100 EIT unknowns."""
         from eitbench.physics.transport import ConvectionDiffusion  # finite elements: not needed to play recordings
-        mesh = uniform_disc(self.radius, 20)
+        mesh = self.disc(20)
         transport = ConvectionDiffusion(mesh, self.flow(16), self.diffusivity, self.time_step, substeps=8,
                                         inlet=np.empty(0, dtype=int))
         return Discretisation(transport, self.observe(mesh, cells_at_electrodes=4, rings=13))
@@ -155,6 +154,7 @@ def _stirred(radius: float, viscosity: float, position: tuple[float, float], swe
              rings: int) -> SteadyFlow:
     """Flow at rest on the wall, driven along the circle that a stirrer sweeps: force·exp(−((d − swept)/width)²/2)."""
     from eitbench.physics.navier_stokes import steady_flow
+    from eitbench.physics.round import uniform_disc
     mesh = uniform_disc(radius, rings)
 
     def stirrer(points: np.ndarray) -> np.ndarray:

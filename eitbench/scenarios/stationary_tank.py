@@ -10,7 +10,6 @@ import numpy as np
 
 from eitbench import _check
 from eitbench.physics.rest import AtRest
-from eitbench.physics.round import uniform_disc
 from eitbench.scenarios.base import Discretisation, History, Prior, Randomness
 from eitbench.scenarios.tank2d import Tank2D, disc_indicator
 
@@ -106,12 +105,12 @@ class StationaryTank2D(Tank2D):
 
     def truth(self) -> Discretisation:
         """4,921 nodes for the target, about 9,300 EIT unknowns."""
-        mesh = uniform_disc(self.radius, 40)
+        mesh = self.disc(40)
         at_rest: Any = AtRest(mesh, self.time_step)
         return Discretisation(at_rest, self.observe(mesh, cells_at_electrodes=8, rings=22))
 
     def model(self) -> Discretisation:
         """1,261 nodes for the target, about 3,100 EIT unknowns."""
-        mesh = uniform_disc(self.radius, 20)
+        mesh = self.disc(20)
         at_rest: Any = AtRest(mesh, self.time_step)
         return Discretisation(at_rest, self.observe(mesh, cells_at_electrodes=4, rings=13))

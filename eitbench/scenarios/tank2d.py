@@ -78,6 +78,11 @@ class Tank2D(Scenario):
             facets.append(mesh.facets_where(lambda points, inside=inside: inside))  # type: ignore[misc]
         return facets
 
+    def disc(self, rings: int) -> Mesh:
+        """The tank's bottom in evenly sized triangles, so many rings of them."""
+        from eitbench.physics.round import uniform_disc  # not needed to play recordings
+        return uniform_disc(self.radius, rings)
+
     def observe(self, mesh: Mesh, cells_at_electrodes: int, rings: int) -> ObservationModel:
         """Voltages for concentrations on ``mesh``, with an EIT mesh of this fineness (see `electrode_disc`)."""
         from eitbench.physics.cem import CompleteElectrodeModel  # finite elements: not needed to play recordings

@@ -303,7 +303,7 @@ def test_frames_show_truth_estimate_and_spread(name):
     (VELOCITY[0], {"flow": "turbulent"}, "flow must be one of unknown, time-varying, skewed"),
     (VELOCITY[0], {"scenario": {"velocity_range": [5.0, 4.0]}}, "velocity_range must be a range"),
     ("eitbench/RotatingTank2D-v0", {"scenario": {"warm_up": -1}}, "warm_up must be"),
-    ("eitbench/StationaryTank2D-v0", {"scenario": {"gap": 1.0}}, "gap must be"),
+    ("eitbench/StationaryTank2D-v0", {"scenario": {"gap": 1.0}}, "gap must leave room"),
 ])
 def test_wrong_arguments_are_named(id, change, message):
     """A wrong argument is named before anything is computed."""
