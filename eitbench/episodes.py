@@ -149,16 +149,23 @@ def _identity(scenario: Scenario, seed: int) -> str:
 
 @lru_cache(maxsize=1)
 def _code_digest() -> str:
-    return code_digest("physics/*.py", "scenarios/*.py", "recordings.py", "episodes.py")
+    return code_digest("physics/*.py", "scenarios/base.py", "scenarios/carried.py", "recordings.py", "episodes.py")
 
 
 @lru_cache(maxsize=64)
 def _source_digest(kind: type) -> str:
-    """Of the file of a scenario that is not the package's own; a class typed into a session has none."""
-    try:
-        return _digest(Path(inspect.getfile(kind)).read_bytes())
-    except (OSError, TypeError):
-        return ""
+    """Of the files of a scenario and of those it descends from; a class typed into a session has none.
+
+    Other scenarios' files may change, or come, without a simulated episode being lost.
+    """
+    files = []
+    for part in kind.__mro__:
+        if part.__module__ not in ("builtins", "typing"):
+            try:
+                files.append(Path(inspect.getfile(part)))
+            except (OSError, TypeError):
+                continue
+    return _digest(b"".join(file.read_bytes() for file in dict.fromkeys(files)))
 
 
 def code_digest(*patterns: str) -> str:

@@ -1,6 +1,8 @@
 """Episodes: the truth is reproducible to the last bit, finer than the model, and a damaged cache is never believed."""
 
 import hashlib
+import importlib
+import inspect
 import io
 import itertools
 import subprocess
@@ -199,6 +201,21 @@ def test_file_of_something_else_is_rebuilt(other, counted, cache, monkeypatch):
     (stranger,) = files(cache)
     stranger.rename(path)
     assert_rebuilt(path, counted)
+
+
+@pytest.mark.parametrize(("file", "counts"), [("parent", True), ("child", True), ("stranger", False)])
+def test_files_of_a_scenario_and_its_ancestors_count(file, counts, tmp_path, monkeypatch):
+    """Episodes are others when the scenario's own file has changed or an ancestor's, and no others."""
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "parent.py").write_text("class Parent: ...\n")
+    (tmp_path / "child.py").write_text("from parent import Parent\nclass Child(Parent): ...\n")
+    (tmp_path / "stranger.py").write_text("class Stranger: ...\n")
+    with monkeypatch.context() as patch:
+        patch.setattr(sys, "modules", dict(sys.modules))                  # forgets both afterwards
+        child, digest = importlib.import_module("child").Child, inspect.unwrap(episodes._source_digest)
+        before = digest(child)
+        (tmp_path / f"{file}.py").write_text("# changed\n")
+        assert (digest(child) != before) == counts
 
 
 def test_array_that_does_not_fit_the_checksum_is_rebuilt(counted, cache):
