@@ -22,6 +22,10 @@ ESTIMATION: dict[str, tuple[str, dict]] = {
 
 INJECTION: dict[str, tuple[str, dict]] = {
     "eitbench/Pipe2DInjection-v0": ("eitbench.envs.pipe2d_injection:Pipe2DInjection", {}),
+    "eitbench/Pipe2DInjectionCurrents-v0": (
+        "eitbench.envs.pipe2d_injection:Pipe2DInjection", {"limit": "Linf", "noise_floor": 2e-4}),
+    "eitbench/Pipe2DInjectionFaults-v0": ("eitbench.envs.pipe2d_injection_faults:Pipe2DInjectionFaults", {}),
+    "eitbench/Pipe2DInjectionBudget-v0": ("eitbench.envs.pipe2d_injection_budget:Pipe2DInjectionBudget", {}),
 }
 """Environments that ask for injections."""
 

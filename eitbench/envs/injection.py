@@ -11,155 +11,113 @@ import numpy as np
 from gymnasium import spaces
 
 from eitbench import _check
-from eitbench.envs.estimation import Observation
+from eitbench.envs.injection_core import FURTHEST, InjectionCore, Rules, scaled
 from eitbench.envs.lockstep import LockstepVectorEnv
-from eitbench.envs.operator import GRID, ReducedOperator, electrode_pairs, pair_currents, project
-from eitbench.recordings import cycle_voltages, outline, recording
 from eitbench.task import Task, make_task
 
 if TYPE_CHECKING:
-    from eitbench.scenarios.base import Scenario
+    from eitbench.envs.estimation import Observation
 
-ESTIMATORS = ("reduced", "none")
-
-
-class InjectionCore:
-    """B episodes at the same step: pairs in, noisy voltages out, and the estimator's error as the (negative) reward.
-
-    Parameters
-    ----------
-    scenario : Scenario
-    estimator : "reduced" or "none"
-        See `InjectionEnv`.
-    """
-
-    def __init__(self, scenario: Scenario, estimator: str) -> None:
-        if estimator not in ESTIMATORS:
-            raise ValueError(f"estimator must be one of {', '.join(ESTIMATORS)}, got {estimator!r}")
-        self.scenario, self.estimator = scenario, estimator
-        self.pairs = electrode_pairs(scenario.currents.shape[1])
-        self.amplitude = float(np.abs(scenario.currents).max())
-        self._every_current = pair_currents(scenario)
-        self.first = len(scenario.currents) if estimator == "reduced" else 0
-        """Injections of the scenario's cycle before the agent's first."""
-        self.length = scenario.n_steps - self.first
-
-    def spaces(self) -> tuple[spaces.Dict, spaces.Discrete]:
-        """What one environment shows and takes."""
-        shape, level = self.scenario.currents.shape[1:], self.scenario.expected_concentration
-        largest = 1e3 * outline(self.scenario).largest_voltage
-        shown: dict[str, gym.Space] = {
-            "voltages": spaces.Box(-largest, largest, shape, np.float64),
-            "currents": spaces.Box(-self.amplitude, self.amplitude, shape, np.float64)}
-        if self.estimator == "reduced":
-            patches = (GRID[0] * GRID[1],)
-            shown |= {"innovations": spaces.Box(-1e6, 1e6, shape, np.float64),
-                      "mean": spaces.Box(-1e3 * level, 1e3 * level, patches, np.float64),
-                      "std": spaces.Box(0.0, 1e3 * level, patches, np.float64)}
-        return spaces.Dict(shown), spaces.Discrete(len(self.pairs))
-
-    def begin(self, seeds: list[int]) -> None:
-        """Play these episodes up to the agent's first injection."""
-        scenario, B, L = self.scenario, len(seeds), self.scenario.currents.shape[1]
-        self._every, self._t = np.arange(B), self.first
-        self._resistance, self._noise = np.empty((scenario.n_steps, B, L, L)), np.empty((scenario.n_steps, B, L))
-        self._deviations, self._squares = np.empty((2, B, scenario.n_steps))
-        self._voltages, self._currents, self._innovations = np.zeros((3, B, L))
-        frames, moments = np.empty((B, self.first, L)), []
-        for k, seed in enumerate(seeds):     # all is copied: a mapped file is open, and there may be more than may be
-            entries = recording(scenario, seed)
-            self._resistance[:, k], self._noise[:, k] = entries["transfer_resistance"], entries["noise"]
-            if self.estimator == "reduced":
-                frames[k] = cycle_voltages(scenario, entries[:self.first])
-                self._deviations[k], self._squares[k] = entries["deviation"], entries["square"]
-                moments.append(project(scenario, entries["moment"]))
-        if self.estimator == "reduced":
-            self._operator, self._moments = ReducedOperator(scenario, frames), np.array(moments)
-            self._voltages = frames[:, -1].copy()
-            self._currents = np.repeat(scenario.currents[-1:], B, axis=0)
-
-    def act(self, actions: np.ndarray) -> np.ndarray:
-        """Inject pairs (B,) and return the rewards (B,)."""
-        source, sink = self.pairs[actions].T
-        resistance, every = self._resistance[self._t], self._every
-        # 𝓡 is symmetric: its rows are its columns, and they lie together
-        clean = self.amplitude * (resistance[every, source] - resistance[every, sink])
-        self._voltages = clean + self.scenario.noise.std(clean) * self._noise[self._t]
-        self._currents = self._every_current[actions]
-        self._t += 1
-        if self.estimator == "none":
-            return np.zeros(len(every))
-        self._innovations = self._operator.assimilate(self._voltages, actions)
-        if self._t <= self.scenario.warm_up:
-            return np.zeros(len(every))
-        k = self._t - 1
-        return -self._operator.errors(self._moments[:, k], self._deviations[:, k], self._squares[:, k])
-
-    def observe(self) -> Observation:
-        """The last measurement and, if there is an estimator, its innovations and estimate; arrays (B, …)."""
-        shown = {"voltages": self._voltages.copy(), "currents": self._currents.copy()}
-        if self.estimator == "reduced":
-            mean, std = self._operator.grid()
-            shown |= {"innovations": self._innovations.copy(), "mean": mean, "std": std}
-        return shown
+OBSERVATIONS = ("scaled", "raw")
 
 
-class InjectionEnv(gym.Env[Observation, int]):
+class InjectionEnv(gym.Env[Any, Any]):
     """One episode in which the agent chooses every injection.
 
-    The reward is −∫(ĉ_t − c_t)² / ∫c_t² of the estimator inside for scored states, else 0, so that minus its sum over
-    an episode, divided by the number of scored states, is ẽ_c (thesis 5.12).
+    The reward is, for scored states, by how much the estimate's relative error ∫(ĉ_t − c_t)² / ∫c_t² lies below that of
+    ĉ_bh; its sum over an episode is greatest where ẽ_c (thesis 5.12), the mean of these errors, is least.
 
     Parameters
     ----------
-    scenario : Scenario
-    estimator : "reduced" or "none"
-        "reduced": a Kalman filter of reduced order. The first frame is measured with the scenario's own cycle, from
-        which ĉ_bh and the filter's parameters follow; the agent takes over after it. "none": the agent chooses all
-        injections, sees noisy voltages, and is paid nothing: for estimators and rewards of one's own.
+    rules : Rules
+    estimator : "reduced", "full" or "none"
+        "reduced": a Kalman filter of reduced order, for training. "full": the exact one, for scores. The first frame
+        is measured with the scenario's own cycle, from which ĉ_bh and the filter's parameters follow; the agent takes
+        over after it. "none": the agent chooses all injections, sees noisy voltages, and is paid nothing: for
+        estimators and rewards of one's own.
+    observation : "scaled" or "raw"
+        One array with entries of about −1 to 1 (`scaled`), or a dict in SI units.
     episodes : int
         How many training episodes an unseeded ``reset`` draws from.
-    render_mode : None
+    render_mode : "rgb_array" or None
     """
 
-    metadata = {"render_modes": []}  # noqa: RUF012 (gymnasium's own form)
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 8}  # noqa: RUF012 (gymnasium's own form)
 
-    def __init__(self, scenario: Scenario, *, estimator: str = "reduced", episodes: int = 1000,
+    def __init__(self, rules: Rules, *, estimator: str = "reduced", observation: str = "scaled", episodes: int = 1000,
                  render_mode: str | None = None) -> None:
-        if render_mode is not None:
-            raise ValueError(f"render_mode must be None, got {render_mode!r}")
-        self.render_mode = None
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"render_mode must be 'rgb_array' or None, got {render_mode!r}")
+        self.render_mode = render_mode
         self.episodes = _check.integer("episodes", episodes, low=1)
-        self.scenario = scenario
-        self._core = InjectionCore(scenario, estimator)
-        self.observation_space: spaces.Dict  # type: ignore[assignment]
-        self.observation_space, self.action_space = self._core.spaces()  # type: ignore[assignment]
-        self._step = 0
+        self.rules, self.scenario = rules, rules.scenario
+        self._core = InjectionCore(rules, estimator)
+        self._scaled = check_observation(observation, estimator)
+        self.observation_space, self.action_space = spaces_of(self._core, self._scaled)
+        self._step, self._seed = 0, -1
 
     @cached_property
     def task(self) -> Task:
         """What an estimator of one's own may know; built on first use."""
         return make_task(self.scenario)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None,
-              ) -> tuple[Observation, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin the episode with this seed (see `eitbench.seeds`), or without one a random training episode."""
         super().reset(seed=seed)
-        self._core.begin([int(self.np_random.integers(self.episodes)) if seed is None else seed])
+        self._seed = int(self.np_random.integers(self.episodes)) if seed is None else seed
+        self._core.begin([self._seed])
         self._step = 1
         return self._observe(), {"step": 1}
 
-    def step(self, action: int) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Inject the pair with this number and measure; ``ValueError`` if there is no such pair."""
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Inject what the action asks for and measure; ``ValueError`` if there is no such action."""
         if not 1 <= self._step <= self._core.length:
             raise gym.error.ResetNeeded("call reset() before step(), and again when an episode has ended")
-        number = _check.integer("action", action, low=0, high=len(self._core.pairs) - 1)
-        reward = float(self._core.act(np.array([number]))[0])
+        if isinstance(self.action_space, spaces.Discrete):
+            chosen = np.array([_check.integer("action", action, low=0, high=int(self.action_space.n) - 1)])
+        else:
+            chosen = _check.array("action", action, self.action_space.shape)[None]  # type: ignore[arg-type]
+        reward = float(self._core.act(chosen)[0])
         self._step += 1
         return self._observe(), reward, self._step > self._core.length, False, {"step": self._step}
 
-    def _observe(self) -> Observation:
-        return {name: array[0] for name, array in self._core.observe().items()}
+    def render(self) -> np.ndarray | None:  # type: ignore[override]
+        """(height, width, 3) uint8 picture of truth, estimate, spread and the last injection; None without a mode."""
+        if self.render_mode is None:
+            gym.logger.warn("render() needs gym.make(..., render_mode='rgb_array')")
+            return None
+        if self._step == 0:
+            raise gym.error.ResetNeeded("call reset() before render()")
+        from eitbench.envs.rendering import draw_frame
+        from eitbench.episodes import simulate, truth_discretisation
+        mean, spread, t = *self._core.estimate(), self._core.first + self._step - 1
+        truth = simulate(self.scenario, self._seed).concentration[t].astype(float)
+        return draw_frame(self.task, truth_discretisation(self.scenario).transport.mesh, truth, mean[0], spread[0],
+                          self._core.last_currents[0], t * self.scenario.time_step)
+
+    def action_masks(self) -> np.ndarray:
+        """(actions,) which numbered actions do something: with the budget spent only the last, no injection."""
+        return self._core.action_masks()[0]
+
+    def _observe(self) -> Any:
+        seen = {name: array[0] for name, array in self._core.observe().items()}
+        return scaled(self.rules, seen) if self._scaled else seen
+
+
+def check_observation(observation: str, estimator: str) -> bool:
+    """Whether observations are to be scaled; without an estimator they are raw."""
+    if observation not in OBSERVATIONS:
+        raise ValueError(f"observation must be one of {', '.join(OBSERVATIONS)}, got {observation!r}")
+    return observation == "scaled" and estimator != "none"
+
+
+def spaces_of(core: InjectionCore, is_scaled: bool) -> tuple[spaces.Space, spaces.Space]:
+    """What one environment shows and takes."""
+    shown: spaces.Space = core.space()
+    if is_scaled:
+        zeros: Observation = {name: np.zeros(space.shape or ()) for name, space in core.space().items()}
+        shown = spaces.Box(-FURTHEST, FURTHEST, scaled(core.rules, zeros).shape, np.float32)
+    return shown, core.rules.action_space
 
 
 class InjectionVectorEnv(LockstepVectorEnv):
@@ -171,16 +129,16 @@ class InjectionVectorEnv(LockstepVectorEnv):
         How many cores the estimators may use; give BLAS one thread then. The numbers do not depend on it.
     """
 
-    def __init__(self, scenario: Scenario, num_envs: int, *, estimator: str = "reduced", episodes: int = 1000,
-                 threads: int = 1) -> None:
+    def __init__(self, rules: Rules, num_envs: int, *, estimator: str = "reduced", observation: str = "scaled",
+                 episodes: int = 1000, threads: int = 1) -> None:
         super().__init__(num_envs, episodes)
-        self.scenario, threads = scenario, _check.integer("threads", threads, low=1)
+        self.rules, self.scenario, threads = rules, rules.scenario, _check.integer("threads", threads, low=1)
         # The covariances of sixteen filters stay within a core's own memory.
-        size = max(1, min(16, -(-num_envs // threads))) if estimator == "reduced" else num_envs
+        size = num_envs if estimator == "none" else max(1, min(16, -(-num_envs // threads)))
         self._parts = [slice(first, first + size) for first in range(0, num_envs, size)]
-        self._cores = [InjectionCore(scenario, estimator) for _ in self._parts]
-        self._length, self._n_pairs = self._cores[0].length, len(self._cores[0].pairs)
-        self._show(*self._cores[0].spaces())
+        self._cores = [InjectionCore(rules, estimator) for _ in self._parts]
+        self._length, self._scaled = self._cores[0].length, check_observation(observation, estimator)
+        self._show(*spaces_of(self._cores[0], self._scaled))
         self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
         self._map = self._pool.map if self._pool else map
 
@@ -189,19 +147,28 @@ class InjectionVectorEnv(LockstepVectorEnv):
         if self._pool:
             self._pool.shutdown()
 
+    def action_masks(self) -> np.ndarray:
+        """(num_envs, actions) as in `InjectionEnv`."""
+        return np.concatenate([core.action_masks() for core in self._cores])
+
     def _begin(self, seeds: list[int]) -> None:
         for core, part in zip(self._cores, self._parts, strict=True):
             core.begin(seeds[part])
 
     def _act(self, actions: np.ndarray) -> np.ndarray:
-        chosen = np.asarray(actions)
-        if chosen.shape != (self.num_envs,) or not np.issubdtype(chosen.dtype, np.integer):
-            raise ValueError(f"actions must be integers of shape ({self.num_envs},), got {chosen.dtype} of shape "
-                             f"{chosen.shape}")
-        if chosen.min() < 0 or chosen.max() >= self._n_pairs:
-            raise ValueError(f"actions must lie in [0, {self._n_pairs - 1}], got {chosen.min()} … {chosen.max()}")
+        chosen, space = np.asarray(actions), self.single_action_space
+        if isinstance(space, spaces.Box):
+            chosen = _check.array("actions", chosen, (self.num_envs, *space.shape))
+        else:
+            assert isinstance(space, spaces.Discrete)
+            if chosen.shape != (self.num_envs,) or not np.issubdtype(chosen.dtype, np.integer):
+                raise ValueError(f"actions must be integers of shape ({self.num_envs},), got {chosen.dtype} of shape "
+                                 f"{chosen.shape}")
+            if chosen.min() < 0 or chosen.max() >= space.n:
+                raise ValueError(f"actions must lie in [0, {space.n - 1}], got {chosen.min()} … {chosen.max()}")
         return np.concatenate(list(self._map(InjectionCore.act, self._cores, [chosen[part] for part in self._parts])))
 
-    def _observe(self) -> Observation:
+    def _observe(self) -> Any:
         shown = list(self._map(InjectionCore.observe, self._cores))
-        return {name: np.concatenate([part[name] for part in shown]) for name in shown[0]}
+        seen: Observation = {name: np.concatenate([part[name] for part in shown]) for name in shown[0]}
+        return scaled(self.rules, seen) if self._scaled else seen

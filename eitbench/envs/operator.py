@@ -1,33 +1,35 @@
-"""The estimator that runs inside an injection environment, in reduced order, for many episodes at once."""
+"""What the estimators inside injection environments have in common: levels, linearisation, patches; and the full one.
+
+`eitbench.envs.reduced_operator` holds the one of reduced order, which training runs on.
+"""
 
 from __future__ import annotations
 
-import io
-import zlib
-from functools import cache, lru_cache
+import math
+from functools import lru_cache
 from itertools import combinations
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
-from eitbench._files import write_atomically
-from eitbench.episodes import code_digest, folder, warn_not_kept
-from eitbench.estimation.reduced import ReducedFilter, ReducedModel, reduced_model
-from eitbench.recordings import outline
+from eitbench.estimation import Observation, starting_filter
+from eitbench.estimation.gate import gated_update
+from eitbench.recordings import outline, step_error
 from eitbench.task import make_task
 
 if TYPE_CHECKING:
     from eitbench.physics.mesh import Mesh
     from eitbench.scenarios.base import Scenario
 
-RANK = 120
 LEVEL_STEP = 0.02
 """ĉ_bh is rounded to steps of 2 %, so that what is linearised there serves many episodes."""
 LEVELS = np.arange(-50, 51)
 """Numbers of steps from the expected concentration: from a third of it to three times as much."""
 GRID = (12, 3)
 """Along and across the vessel: patches on which an agent sees the estimate."""
+BROKEN = 30.0
+"""Standard deviations from a homogeneous liquid's voltage beyond which a reading says nothing of the level, where
+the instrument may be faulty."""
 
 
 def electrode_pairs(n_electrodes: int) -> np.ndarray:
@@ -36,7 +38,7 @@ def electrode_pairs(n_electrodes: int) -> np.ndarray:
 
 
 def pair_currents(scenario: Scenario) -> np.ndarray:
-    """(pairs, L) currents in A (A/m in 2D) of every action, as large as the scenario's largest."""
+    """(pairs, L) currents in A (A/m in 2D) of every pair, as large as the scenario's largest."""
     pairs = electrode_pairs(scenario.currents.shape[1])
     currents = np.zeros((len(pairs), scenario.currents.shape[1]))
     currents[np.arange(len(pairs)), pairs[:, 0]] = np.abs(scenario.currents).max()
@@ -44,176 +46,151 @@ def pair_currents(scenario: Scenario) -> np.ndarray:
     return currents
 
 
-class _Level(NamedTuple):
-    """All that depends on the concentration about which the voltages are linearised."""
+class Operator(Protocol):
+    """Estimators of B episodes. The parameters are those of Table 5.1, as in the Kalman filter baseline, with the ĉ_bh
+    of the first frame, in which they start from t = 0."""
 
-    concentration: float
-    resistance: np.ndarray
-    """(L, L) 𝓡 of the homogeneous liquid"""
-    computed: np.ndarray
-    """(pairs, L) its voltages when a pair is injected"""
-    std: np.ndarray
-    """(pairs, L) of their noise"""
-    matrices: np.ndarray
-    """(pairs, L, r) derivatives of the voltages by the reduced state, in parts of std; single precision"""
-    after_frame: tuple[np.ndarray, np.ndarray]
-    """(r, K·L) from the residuals of the first frame to the mean after it, and (r, r) the covariance after it"""
+    concentration: np.ndarray
+    """(B,) ĉ_bh in mol/m³"""
 
+    def __init__(self, scenario: Scenario, frames: np.ndarray, *, gate: float, noise_floor: float) -> None:
+        """Take in the first frame, voltages (B, K, L) in V of the scenario's cycle."""
+        ...
 
-class ReducedOperator:
-    """Kalman filters for B episodes whose injections differ, in single precision, which halves the time.
-
-    The first frame is measured with the scenario's cycle. From it ĉ_bh is found, and with it all parameters of
-    Table 5.1, as in the Kalman filter baseline; the filter then starts from t = 0.
-
-    Parameters
-    ----------
-    scenario : Scenario
-    frames : (B, K, L)
-        Voltages of the first frame, V.
-    """
-
-    def __init__(self, scenario: Scenario, frames: np.ndarray) -> None:
-        self._shared = shared = _shared(scenario)
-        self._levels = levels = [shared.level(shared.best_level(frame)) for frame in frames]
-        self.concentration = np.array([level.concentration for level in levels])
-        """(B,) ĉ_bh in mol/m³"""
-        cycle = scenario.currents
-        means = []
-        for level, frame in zip(levels, frames, strict=True):
-            means.append(level.after_frame[0] @ (frame - cycle @ level.resistance).ravel())
-        covariances = np.stack([level.after_frame[1] for level in levels])
-        self._filter = ReducedFilter(shared.single, np.array(means, dtype=np.float32), covariances)
-
-    def assimilate(self, voltages: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        """One time step on, with voltages (B, L) of pairs (B,) by number; returns the whitened innovations (B, L)."""
-        chosen = list(zip(self._levels, actions.tolist(), strict=True))
-        computed = np.array([level.computed[k] for level, k in chosen])
-        std = np.array([level.std[k] for level, k in chosen])
-        matrix = np.array([level.matrices[k] for level, k in chosen])
-        residual = ((voltages - computed) / std).astype(np.float32)
-        self._filter.predict()
-        innovation, S = self._filter.update(matrix, residual, np.ones_like(residual))
-        return (innovation / np.sqrt(S.diagonal(axis1=1, axis2=2))).astype(float)
+    def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """One time step on, with voltages (B, L) in V for currents (B, L), all zero where nothing was injected; returns
+        the innovations in predicted standard deviations and which readings were believed, both (B, L)."""
+        ...
 
     def grid(self) -> tuple[np.ndarray, np.ndarray]:
         """Mean and standard deviation (B, patches) in mol/m³ on the coarse grid."""
-        patches = self._shared.patches
-        mean = 1.0 + (patches @ self._filter.mean[..., None])[..., 0]
-        variance = ((patches @ self._filter.covariance) * patches).sum(axis=2, dtype=float)
-        return self.concentration[:, None] * mean, self.concentration[:, None] * np.sqrt(variance)
+        ...
 
     def errors(self, moments: np.ndarray, deviations: np.ndarray, squares: np.ndarray) -> np.ndarray:
-        """Relative errors (5.12) of the present means, from `project`\\ ed moments (B, 1 + r)."""
-        shared = self._shared
-        state = np.concatenate([self.concentration[:, None] - shared.background,
-                                self.concentration[:, None] * self._filter.mean], axis=1)
-        quadratic = (state * (shared.mass @ state[..., None])[..., 0]).sum(axis=1)
-        return (quadratic - 2.0 * (state * moments).sum(axis=1) + deviations) / squares
+        """Relative errors (5.12) of the present means, from what `project` makes of recorded moments (B, …)."""
+        ...
 
     def means(self) -> np.ndarray:
         """(B, n) estimates in mol/m³ on the task's mesh."""
-        return self.concentration[:, None] * (1.0 + self._filter.mean @ self._shared.model.basis.T)
+        ...
+
+    def spreads(self) -> np.ndarray:
+        """(B, n) their standard deviations in mol/m³."""
+        ...
+
+    @staticmethod
+    def project(scenario: Scenario, moment: np.ndarray) -> np.ndarray:
+        """Moments of a recording (T, n) as `errors` wants them."""
+        ...
 
 
-def project(scenario: Scenario, moment: np.ndarray) -> np.ndarray:
-    """(T, 1 + r) moments of a recording, (T, n), in the reduced coordinates."""
-    return (moment @ _shared(scenario).basis).astype(float)
+class Linearisation(NamedTuple):
+    """The voltages about one level; the state counts in parts of it, from it."""
+
+    concentration: float
+    """mol/m³"""
+    resistance: np.ndarray
+    """(L, L) 𝓡 of the homogeneous liquid"""
+    derivative: np.ndarray
+    """(L, L, k) of 𝓡 by the state"""
+
+    def observe(self, currents: np.ndarray, noise_std: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Computed voltages (L,), their noise (L,) and their derivatives (L, k) in parts of the noise.
+
+        Without a current the reading says nothing.
+        """
+        driven = np.flatnonzero(currents)
+        computed = currents @ self.resistance
+        if not len(driven):
+            return computed, np.ones_like(computed), np.zeros(self.derivative.shape[1:], self.derivative.dtype)
+        L, k = self.derivative.shape[1:]
+        matrix = (currents[driven].astype(self.derivative.dtype) @ self.derivative[driven].reshape(len(driven), -1))
+        return computed, noise_std, matrix.reshape(L, k) / noise_std[:, None].astype(matrix.dtype)
 
 
-class _Shared:
-    """What all episodes of a scenario share."""
+class Levels:
+    """The homogeneous liquids in which a scenario's episodes may begin; shared by all of them."""
 
     def __init__(self, scenario: Scenario) -> None:
-        self.scenario, self.background = scenario, scenario.background
-        self.model = _stored_model(scenario)
-        basis = np.column_stack([np.ones(len(self.model.basis)), self.model.basis])
-        half = outline(scenario).mass
-        self.mass = 0.5 * (basis.T @ (half @ basis) + basis.T @ (half.T @ basis))
-        self.basis = basis.astype(np.float32)
-        self.single = ReducedModel(*(array.astype(np.float32) for array in self.model))
-        task = make_task(scenario)
-        self.patches = (_patches(task.mesh) @ self.model.basis).astype(np.float32)
-        self.level = cache(self._level)
-        self._observation = task.observation
+        self.scenario, self.task = scenario, make_task(scenario)
         levels = scenario.expected_concentration * np.exp(LEVEL_STEP * LEVELS)
-        homogeneous = np.repeat(levels[:, None], task.mesh.n_nodes, axis=1)
-        self._homogeneous = scenario.currents @ task.observation.transfer_resistance(homogeneous)
+        homogeneous = np.repeat(levels[:, None], self.task.mesh.n_nodes, axis=1)
+        self._homogeneous = scenario.currents @ self.task.observation.transfer_resistance(homogeneous)
+        self.linearised = lru_cache(maxsize=64)(self._linearised)
+        """number of a level -> (its concentration, 𝓡, derivatives (L, L, n) by the state); the last 64 are kept"""
 
-    def best_level(self, frame: np.ndarray) -> int:
-        """Number of the level that fits the voltages (K, L) best, weighted as in `best_homogeneous`."""
-        weighted = (frame - self._homogeneous) / self.scenario.noise.std(frame)
-        return int(LEVELS[np.argmin((weighted**2).sum(axis=(1, 2)))])
+    def best(self, frame: np.ndarray, broken: float) -> int:
+        """Number of the level that fits the voltages (K, L) best, weighted as in `best_homogeneous`; readings further
+        than ``broken`` standard deviations away count as that far."""
+        off = (frame - self._homogeneous) / self.scenario.noise.std(frame if math.isinf(broken) else self._homogeneous)
+        return int(LEVELS[np.argmin(np.minimum(off**2, broken**2).sum(axis=(1, 2)))])
 
-    def _level(self, number: int) -> _Level:
-        scenario, model = self.scenario, self.model
-        c = scenario.expected_concentration * float(np.exp(LEVEL_STEP * number))
-        resistance, table = self._observation.resistance_derivatives(np.full(len(model.basis), c))
-        L = len(resistance)
-        derivative = c * (table.reshape(-1, L * L).T @ model.basis).reshape(L, L, -1)
-        cycle = scenario.currents
-        filter_ = ReducedFilter(model, np.zeros((1, len(model.transition))), model.initial[None])
-        mean = np.zeros((len(model.transition), len(cycle) * L))
-        for k, currents in enumerate(cycle):
-            matrix = np.tensordot(currents, derivative, axes=(0, 0))[None]
-            filter_.predict()
-            predicted = filter_.covariance[0].copy()
-            _, S = filter_.update(matrix, np.zeros((1, L)), scenario.noise.std(currents @ resistance)[None]**2)
-            gain = np.linalg.solve(S[0], matrix[0] @ predicted).T
-            mean = model.transition @ mean
-            mean -= gain @ (matrix[0] @ mean)
-            mean[:, k * L:(k + 1) * L] += gain
-        currents = pair_currents(scenario)
-        computed, matrices = currents @ resistance, np.tensordot(currents, derivative, axes=(1, 0))
-        # Readings near zero may have next to no noise; what the model leaves out would then count for knowledge.
-        std = np.maximum(scenario.noise.std(computed), 1e-3 * np.abs(computed).max(axis=1, keepdims=True))
-        return _Level(c, resistance, computed, std, (matrices / std[..., None]).astype(np.float32),
-                      (mean, filter_.covariance[0].astype(np.float32)))
+    def noise_std(self, computed: np.ndarray, floor: float) -> np.ndarray:
+        """What the estimators take for the noise (V) of computed voltages (L,).
+
+        Readings near zero may have next to no noise; what the model leaves out would then count for knowledge.
+        """
+        return np.hypot(np.maximum(self.scenario.noise.std(computed), 1e-3 * np.abs(computed).max()), floor)
+
+    def _linearised(self, number: int) -> Linearisation:
+        c = self.scenario.expected_concentration * float(np.exp(LEVEL_STEP * number))
+        resistance, table = self.task.observation.resistance_derivatives(np.full(self.task.mesh.n_nodes, c))
+        return Linearisation(c, resistance, c * np.ascontiguousarray(np.moveaxis(table, 0, 2)))
 
 
 @lru_cache(maxsize=2)
-def _shared(scenario: Scenario) -> _Shared:
-    return _Shared(scenario)
+def levels_of(scenario: Scenario) -> Levels:
+    """Made once a process."""
+    return Levels(scenario)
 
 
-def _stored_model(scenario: Scenario) -> ReducedModel:
-    """The reduced model, from the cache if it is there: making it takes half a minute."""
-    path = folder(scenario) / f"reduced-{code_digest('estimation/*.py', 'envs/operator.py', 'task.py')[:16]}.npz"
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            model = ReducedModel(*(stored[name] for name in ReducedModel._fields))
-            if int(stored["checksum"]) == _checksum(model):
-                return model
-    except Exception:       # missing or damaged: an archive may raise anything
-        pass
-    with threadpool_limits(1):                             # as many threads as here, the same bits
-        model = _make_model(scenario)
-    content = io.BytesIO()
-    np.savez(content, checksum=_checksum(model), **model._asdict())
-    try:
-        write_atomically(path, content.getvalue())
-    except OSError as error:
-        warn_not_kept(path.parent, error)
-    return model
+class FullOperator:
+    """The Kalman filter of the baselines with its exact covariance: what scored runs use."""
+
+    def __init__(self, scenario: Scenario, frames: np.ndarray, *, gate: float, noise_floor: float) -> None:
+        self._scenario, self._gate, self._floor = scenario, gate, noise_floor
+        self._shared = levels = levels_of(scenario)
+        broken = BROKEN if math.isfinite(gate) else math.inf
+        self._levels = [levels.linearised(levels.best(frame, broken)) for frame in frames]
+        self.concentration = np.array([level.concentration for level in self._levels])
+        task = levels.task
+        self._filters = [starting_filter(task.transport, task.prior, 1.0) for _ in frames]
+        self._patches = patch_averages(task.mesh)
+        for k, currents in enumerate(scenario.currents):
+            self.assimilate(frames[:, k], np.repeat(currents[None], len(frames), axis=0))
+
+    def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        innovations, kept = np.zeros_like(voltages), np.ones(voltages.shape, dtype=bool)
+        for b, (filter_, level) in enumerate(zip(self._filters, self._levels, strict=True)):
+            filter_.predict()
+            if not currents[b].any():
+                continue
+            std = self._shared.noise_std(currents[b] @ level.resistance, self._floor)
+            computed, std, matrix = level.observe(currents[b], std)
+            value = (voltages[b] - computed) / std + matrix.sum(axis=1)      # the state is 1 where nothing deviates
+            innovations[b], kept[b] = gated_update(filter_, Observation(matrix, value, np.ones(len(value))), self._gate)
+        return innovations, kept
+
+    def grid(self) -> tuple[np.ndarray, np.ndarray]:
+        spread = np.array([np.sqrt(filter_.variance_of(self._patches)) for filter_ in self._filters])
+        return self.means() @ self._patches.T, self.concentration[:, None] * spread
+
+    def errors(self, moments: np.ndarray, deviations: np.ndarray, squares: np.ndarray) -> np.ndarray:
+        estimate = self.means() - self._scenario.background
+        return step_error(outline(self._scenario).mass, estimate, moments, deviations, squares)
+
+    def means(self) -> np.ndarray:
+        return self.concentration[:, None] * np.array([filter_.mean for filter_ in self._filters])
+
+    def spreads(self) -> np.ndarray:
+        return self.concentration[:, None] * np.sqrt([filter_.variances() for filter_ in self._filters])
+
+    @staticmethod
+    def project(scenario: Scenario, moment: np.ndarray) -> np.ndarray:
+        return np.asarray(moment)
 
 
-def _make_model(scenario: Scenario) -> ReducedModel:
-    from eitbench.estimation import LinearisedObservations, table_5_1
-    from eitbench.physics.fem import mass_matrix
-    task = make_task(scenario)
-    every = pair_currents(scenario)
-    currents = every[np.random.default_rng(0).integers(len(every), size=90)]
-    start = table_5_1(task.transport, task.prior, 1.0)
-    level = scenario.expected_concentration
-    linear = LinearisedObservations(task.observation, task.noise, np.full(task.mesh.n_nodes, level))
-    record = []
-    for current in currents:                               # the state is counted in parts of the level
-        seen = linear(np.zeros(current.shape), current)
-        record.append(seen._replace(matrix=level * seen.matrix))
-    return reduced_model(start, mass_matrix(task.mesh).toarray(), record, min(RANK, task.mesh.n_nodes))
-
-
-def _patches(mesh: Mesh) -> np.ndarray:
+def patch_averages(mesh: Mesh) -> np.ndarray:
     """(patches, n) averages over the boxes of the grid; a node counts by its share of the mass matrix."""
     from eitbench.physics.fem import mass_matrix
     points = mesh.points[:, :2]
@@ -224,7 +201,3 @@ def _patches(mesh: Mesh) -> np.ndarray:
     if not averages.any(axis=1).all():
         raise ValueError(f"the task's mesh must have a node in each of {GRID[0]} × {GRID[1]} patches of the vessel")
     return averages / averages.sum(axis=1, keepdims=True)
-
-
-def _checksum(model: ReducedModel) -> int:
-    return zlib.crc32(b"".join(np.ascontiguousarray(array).tobytes() for array in model))

@@ -1,4 +1,4 @@
-"""`eitbench/Pipe2DInjection-v0`."""
+"""`eitbench/Pipe2DInjection-v0` and `eitbench/Pipe2DInjectionCurrents-v0`."""
 
 from __future__ import annotations
 
@@ -6,18 +6,32 @@ from typing import Any
 
 from gymnasium.utils import EzPickle
 
+from eitbench import _check
 from eitbench.envs.arguments import with_fields
 from eitbench.envs.injection import InjectionEnv, InjectionVectorEnv
+from eitbench.envs.injection_core import Rules
 from eitbench.scenarios import Pipe2D
+from eitbench.scenarios.instrument import Instrument
+
+
+def _rules(scenario: dict[str, Any] | None, limit: str | None, noise_floor: float) -> Rules:
+    floor = _check.number("noise_floor", noise_floor, low=0.0, units="V")
+    return Rules(with_fields(Pipe2D, scenario), Instrument(noise_floor=floor), limit)
 
 
 class Pipe2DInjectionEnv(InjectionEnv, EzPickle):
     """
     ## Description
 
-    The pipe of `eitbench/Pipe2D-v0`; here the agent chooses at every step between which two of the sixteen electrodes
-    the current flows. A Kalman filter inside takes in the voltages and estimates the concentration; it is the same
-    for every agent, so that agents differ only in what they inject.
+    The pipe of `eitbench/Pipe2D-v0`; here the agent chooses at every step how the current flows. A Kalman filter inside
+    takes in the voltages and estimates the concentration; it is the same for every agent, so that agents differ only in
+    what they inject.
+
+    This is the reference case, not a competition: one pair near the inlet, injected for ever, is as good as anything
+    (what is known at the inlet the flow carries through the whole pipe), and what to inject does not
+    depend on what is measured.
+
+    `eitbench/Pipe2DInjectionCurrents-v0` is the same world with a current of its own for each electrode.
 
     ## Action space
 
@@ -25,22 +39,34 @@ class Pipe2DInjectionEnv(InjectionEnv, EzPickle):
     (`eitbench.envs.operator.electrode_pairs`); current enters at the first and leaves at the second. Electrodes 0 … 7
     lie on the lower wall, 8 … 15 on the upper one, both along the flow.
 
+    With `limit`: `Box(-1, 1, (16,), float32)`, currents in parts of the instrument's 0.1 A/m. Their mean is taken away
+    (Σ I = 0); if they then exceed the limit, they are scaled down to it. The limit is the norm of a pair: Σ|I| ≤ 2
+    ("L1", a total current), Σ I² ≤ 2 ("L2", a power) or |I| ≤ 1 ("Linf", a source for each electrode).
+
     ## Observation space
 
-    | key | space | meaning |
-    |---|---|---|
-    | `voltages` | `Box((16,), float64)` | last measured potentials against their mean, V, with noise |
-    | `currents` | `Box((16,), float64)` | currents injected then, A per metre of depth |
-    | `innovations` | `Box((16,), float64)` | measured less predicted, in predicted standard deviations |
-    | `mean` | `Box((36,), float64)` | estimate on 12 × 3 patches, along the flow first, mol/m³ |
-    | `std` | `Box((36,), float64)` | its standard deviation, mol/m³ |
+    `Box(-5, 5, (201,), float32)`, about between −1 and 1 (`eitbench.envs.injection_core.scaled`); with
+    `observation="raw"` a dict in SI units, `float64`:
 
-    With `estimator="none"` the first two only.
+    | key | shape | meaning |
+    |---|---|---|
+    | `voltages` | (16,) | last measured potentials against their mean, V, with noise |
+    | `currents` | (16,) | currents asked for then, A per metre of depth |
+    | `recent` | (4, 16) | the last four of these, the last first |
+    | `frame` | (16, 16) | voltages of the first frame; not in the scaled observation |
+    | `innovations` | (16,) | measured less predicted, in predicted standard deviations |
+    | `mean` | (36,) | estimate on 12 × 3 patches, along the flow first, mol/m³ |
+    | `std` | (36,) | its standard deviation, mol/m³ |
+    | `doubt` | (2, 16) | how often lately an electrode's readings were not believed, and injections it drove |
+    | `left` | (1,) | steps left |
+
+    With `estimator="none"` `voltages`, `currents` and `left` only, raw.
 
     ## Reward
 
-    −∫(ĉ_t − c_t)² dΩ / ∫c_t² dΩ for the 80 scored states, else 0: minus its sum, divided by 80, is ẽ_c (thesis 5.12).
-    With `estimator="none"` always 0.
+    For the 80 scored states, else 0: ∫(ĉ_bh − c_t)² dΩ / ∫c_t² dΩ − ∫(ĉ_t − c_t)² dΩ / ∫c_t² dΩ, by how much the error
+    lies below that of the homogeneous estimate, which no injection can change. The score is ẽ_c (thesis 5.12), the mean
+    of the second term. With `estimator="none"` the reward is always 0.
 
     ## Starting state
 
@@ -55,10 +81,13 @@ class Pipe2DInjectionEnv(InjectionEnv, EzPickle):
 
     | name | default | meaning |
     |---|---|---|
-    | `estimator` | "reduced" | "reduced": a Kalman filter with 120 states; "none": no estimator |
+    | `estimator` | "reduced" | "reduced": a filter with 120 states, for training; "full": the exact one; "none" |
+    | `observation` | "scaled" | or "raw" |
+    | `limit` | None | "L1", "L2" or "Linf": actions are currents |
+    | `noise_floor` | 0 | V; std of an absolute noise, 2e-4 in the variant with currents |
     | `scenario` | None | dict of `Pipe2D` fields to change |
     | `episodes` | 1000 | number of training episodes for unseeded resets |
-    | `render_mode` | None | none yet |
+    | `render_mode` | None | "rgb_array": truth, estimate, spread, injection |
     | `threads` | 1 | vectorised only: cores that the filters may use; give BLAS one thread then |
 
     The first use of a scenario makes the reduced model (half a minute), which is then kept on disk.
@@ -68,16 +97,20 @@ class Pipe2DInjectionEnv(InjectionEnv, EzPickle):
     * v0: first version.
     """
 
-    def __init__(self, *, estimator: str = "reduced", scenario: dict[str, Any] | None = None, episodes: int = 1000,
+    def __init__(self, *, estimator: str = "reduced", observation: str = "scaled", limit: str | None = None,
+                 noise_floor: float = 0.0, scenario: dict[str, Any] | None = None, episodes: int = 1000,
                  render_mode: str | None = None) -> None:
-        EzPickle.__init__(self, estimator=estimator, scenario=scenario, episodes=episodes, render_mode=render_mode)
-        super().__init__(with_fields(Pipe2D, scenario), estimator=estimator, episodes=episodes, render_mode=render_mode)
+        EzPickle.__init__(self, estimator=estimator, observation=observation, limit=limit, noise_floor=noise_floor,
+                          scenario=scenario, episodes=episodes, render_mode=render_mode)
+        super().__init__(_rules(scenario, limit, noise_floor), estimator=estimator, observation=observation,
+                         episodes=episodes, render_mode=render_mode)
 
 
 class Pipe2DInjectionVectorEnv(InjectionVectorEnv):
     """`Pipe2DInjectionEnv`, many times: ``gym.make_vec("eitbench/Pipe2DInjection-v0", num_envs=64)``."""
 
-    def __init__(self, *, num_envs: int = 1, estimator: str = "reduced", scenario: dict[str, Any] | None = None,
+    def __init__(self, *, num_envs: int = 1, estimator: str = "reduced", observation: str = "scaled",
+                 limit: str | None = None, noise_floor: float = 0.0, scenario: dict[str, Any] | None = None,
                  episodes: int = 1000, threads: int = 1) -> None:
-        super().__init__(with_fields(Pipe2D, scenario), num_envs, estimator=estimator, episodes=episodes,
-                         threads=threads)
+        super().__init__(_rules(scenario, limit, noise_floor), num_envs, estimator=estimator, observation=observation,
+                         episodes=episodes, threads=threads)

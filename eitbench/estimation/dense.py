@@ -9,7 +9,7 @@ import numpy as np
 from scipy.linalg import blas, cho_factor, cho_solve, solve_triangular
 
 from eitbench import _check
-from eitbench.estimation.kalman import Observation
+from eitbench.estimation.kalman import Expected, Observation, expected
 
 _BLOCK = 128
 """columns copied at once when a triangle is mirrored: small enough for the processor's cache"""
@@ -94,11 +94,14 @@ class DenseKalmanFilter:
 
     def update(self, observation: Observation) -> Filtered:
         """Take in one measurement of the present state."""
-        H, value, noise_variance = observation
-        cross = self.covariance @ H.T
-        S = H @ cross
-        S = 0.5 * (S + S.T) + np.diag(noise_variance)
-        innovation = value - H @ self.mean
+        return self.take_in(observation.matrix, *self.expect(observation))
+
+    def expect(self, observation: Observation) -> Expected:
+        """How a measurement of the present state compares with what is known before it."""
+        return expected(observation, self.mean, self.covariance @ observation.matrix.T)
+
+    def take_in(self, H: np.ndarray, cross: np.ndarray, innovation: np.ndarray, S: np.ndarray) -> Filtered:
+        """Take in readings of the present state, with matrix (m, n) and what `expect` says of them."""
         factor = cho_factor(S, lower=True)
         self.mean = self.mean + cross @ cho_solve(factor, innovation)
         gained = solve_triangular(factor[0], cross.T, lower=True).T                      # Γ Hᵀ L⁻ᵀ
@@ -106,6 +109,14 @@ class DenseKalmanFilter:
         diagonal = np.einsum("ii->i", self.covariance)                                   # a view
         np.maximum(diagonal, 0.0, out=diagonal)                   # precise measurements leave rounding of either sign
         return Filtered(self.mean, diagonal.copy(), innovation, S)
+
+    def variances(self) -> np.ndarray:
+        """Diagonal (n,) of the present state's covariance."""
+        return self.covariance.diagonal().copy()
+
+    def variance_of(self, functionals: np.ndarray) -> np.ndarray:
+        """Present variances (k,) of linear functionals of the state, (k, n)."""
+        return ((functionals @ self.covariance) * functionals).sum(axis=1)
 
     def _transform(self, F: np.ndarray) -> None:
         """P ← F P Fᵀ by triangles: with P = L + Lᵀ and B = F L it is B Fᵀ + F Bᵀ, of which one half is computed."""

@@ -22,6 +22,17 @@ class Observation(NamedTuple):
     """(m,)"""
 
 
+class Expected(NamedTuple):
+    """How a measurement compares with what was known before it."""
+
+    cross_covariance: np.ndarray
+    """(n, m) Γ Hᵀ"""
+    innovation: np.ndarray
+    """(m,) ν, measured less predicted"""
+    innovation_covariance: np.ndarray
+    """(m, m) S"""
+
+
 class FilterStep(NamedTuple):
     """One step of the filter: what a smoother needs to come back over it."""
 
@@ -80,18 +91,38 @@ class KalmanFilter:
 
     def update(self, observation: Observation) -> FilterStep:
         """Take in one measurement of the present state."""
-        H, value, noise_variance = observation
+        return self.take_in(observation.matrix, *self.expect(observation))
+
+    def expect(self, observation: Observation) -> Expected:
+        """How a measurement of the present state compares with what is known before it."""
+        H = observation.matrix
+        return expected(observation, self.mean,
+                        self.covariance.apply(self.time, H.T) - self.known @ (self.known.T @ H.T))
+
+    def take_in(self, H: np.ndarray, cross: np.ndarray, innovation: np.ndarray, S: np.ndarray) -> FilterStep:
+        """Take in readings of the present state, with matrix (m, n) and what `expect` says of them."""
         before, known = self.mean, self.known
-        cross = self.covariance.apply(self.time, H.T) - known @ (known.T @ H.T)
-        S = H @ cross
-        S = 0.5 * (S + S.T) + np.diag(noise_variance)
-        innovation = value - H @ before
         factor = cho_factor(S, lower=True)
         self.mean = before + cross @ cho_solve(factor, innovation)
         gained = solve_triangular(factor[0], cross.T, lower=True).T                      # Γ Hᵀ L⁻ᵀ
         self.known = compressed(np.hstack([known, gained]), self.rank_tolerance)
-        variance = self.covariance.diagonal(self.time) - (self.known**2).sum(axis=1)
-        return FilterStep(self.time, before, known, self.mean, variance, H, cross, innovation, S)
+        return FilterStep(self.time, before, known, self.mean, self.variances(), H, cross, innovation, S)
+
+    def variances(self) -> np.ndarray:
+        """Diagonal (n,) of the present state's covariance."""
+        return self.covariance.diagonal(self.time) - (self.known**2).sum(axis=1)
+
+    def variance_of(self, functionals: np.ndarray) -> np.ndarray:
+        """Present variances (k,) of linear functionals of the state, (k, n)."""
+        free = (functionals * self.covariance.apply(self.time, functionals.T).T).sum(axis=1)
+        return free - ((functionals @ self.known)**2).sum(axis=1)
+
+
+def expected(observation: Observation, mean: np.ndarray, cross: np.ndarray) -> Expected:
+    """`Expected` for a state with this mean (n,), whose covariance with what is seen is ``cross`` (n, m)."""
+    S = observation.matrix @ cross
+    return Expected(cross, observation.value - observation.matrix @ mean,
+                    0.5 * (S + S.T) + np.diag(observation.noise_variance))
 
 
 def compressed(Z: np.ndarray, tolerance: float) -> np.ndarray:

@@ -7,6 +7,7 @@ projection onto them gives a model of the same form with about a hundred states.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from itertools import pairwise
 from typing import NamedTuple
@@ -14,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 
+from eitbench.estimation.gate import believable
 from eitbench.estimation.kalman import KalmanFilter, Observation
 
 
@@ -95,17 +97,26 @@ class ReducedFilter:
         APA += self.model.noise
         self.covariance, self._next = APA, P
 
-    def update(self, matrix: np.ndarray, residual: np.ndarray, noise_variance: np.ndarray,
-               ) -> tuple[np.ndarray, np.ndarray]:
-        """Take in residual = matrix·a + v: (B, m, r), (B, m), (B, m); return innovations (B, m) and S (B, m, m)."""
+    def update(self, matrix: np.ndarray, residual: np.ndarray, noise_variance: np.ndarray, *,
+               gate: float = math.inf) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Take in residual = matrix·a + v: (B, m, r), (B, m), (B, m).
+
+        Readings are left out that `believable` does not believe with this ``gate``. Returns innovations (B, m), their
+        predicted variances (B, m) and which were taken in (B, m), all of them before any was left out.
+        """
         P, transposed, m = self.covariance, np.swapaxes(matrix, -1, -2), matrix.shape[1]
         cross = matrix @ P                                                                  # H P
         S = cross @ transposed
         S[:, np.arange(m), np.arange(m)] += noise_variance
-        innovation = residual - (matrix @ self.mean[..., None])[..., 0]
+        innovation, variance = residual - (matrix @ self.mean[..., None])[..., 0], S.diagonal(axis1=1, axis2=2).copy()
+        kept, taken = believable(innovation, variance, gate), innovation
+        if not kept.all():                                  # a reading left out is one without a word on the state
+            cross, taken = cross * kept[..., None], innovation * kept
+            S *= kept[:, :, None] & kept[:, None, :]
+            S[:, np.arange(m), np.arange(m)] += ~kept
         inverse_root = np.linalg.inv(np.linalg.cholesky(S))
         W = inverse_root @ cross
-        whitened = inverse_root @ innovation[..., None]
+        whitened = inverse_root @ taken[..., None]
         self.mean = self.mean + (np.swapaxes(W, -1, -2) @ whitened)[..., 0]
         P -= np.swapaxes(W, -1, -2) @ W
-        return innovation, S
+        return innovation, variance, kept

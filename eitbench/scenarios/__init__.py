@@ -7,10 +7,11 @@ from eitbench.scenarios.pipe2d_flows import (
     Pipe2DTimeVaryingVelocity,
     Pipe2DUnknownVelocity,
 )
+from eitbench.scenarios.pipe2d_intermittent import Pipe2DIntermittent
 from eitbench.scenarios.pipe2d_obstacle import Pipe2DObstacle
 from eitbench.scenarios.pipe3d import Pipe3D
 from eitbench.scenarios.rotating_tank import RotatingTank2D
 from eitbench.scenarios.stationary_tank import StationaryTank2D
 
-__all__ = ["Pipe2D", "Pipe2DBiasedVelocity", "Pipe2DObstacle", "Pipe2DSkewedVelocity",
+__all__ = ["Pipe2D", "Pipe2DBiasedVelocity", "Pipe2DIntermittent", "Pipe2DObstacle", "Pipe2DSkewedVelocity",
            "Pipe2DTimeVaryingVelocity", "Pipe2DUnknownVelocity", "Pipe3D", "RotatingTank2D", "StationaryTank2D"]

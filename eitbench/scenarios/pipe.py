@@ -112,8 +112,8 @@ class StraightPipe(Scenario):
     def draw_inflow(self, rng: np.random.Generator) -> Inflow:
         """Slugs of both signs, Gaussian across the pipe and in time: c_in = background·exp(Σ ±a·g(r)·g(t))."""
         begin, end = -self.lead_in * self.time_step - 0.05, self.n_steps * self.time_step + 0.05
-        n = math.ceil((end - begin) / self.slug_interval)
-        when = begin + (np.arange(n) + rng.uniform(0.0, 1.0, n)) * self.slug_interval
+        when = self.draw_arrivals(rng, begin, end)
+        n = len(when)
         where = self.draw_slug_places(rng, n)
         strength = rng.choice([-1.0, 1.0], n) * rng.uniform(*self.slug_strength, n)
         duration, width = rng.uniform(*self.slug_duration, n), rng.uniform(*self.slug_width, n)
@@ -124,6 +124,11 @@ class StraightPipe(Scenario):
             return self.background * np.exp(bell @ (strength * np.exp(-0.5 * ((time - when) / duration)**2)))
 
         return inflow
+
+    def draw_arrivals(self, rng: np.random.Generator, begin: float, end: float) -> np.ndarray:
+        """Times in s at which slugs' centres pass the inlet."""
+        n = math.ceil((end - begin) / self.slug_interval)
+        return begin + (np.arange(n) + rng.uniform(0.0, 1.0, n)) * self.slug_interval
 
     def draw_slug_places(self, rng: np.random.Generator, n: int) -> np.ndarray:
         """(n, d − 1) centres of slugs on the inlet in m."""

@@ -21,13 +21,14 @@ def world():
 
 
 def run(filter_: ReducedFilter, records: list[list[Observation]]):
-    """Means (T, B, r), covariances, innovations and S of records side by side."""
+    """Means (T, B, r), covariances, innovations and their variances of records side by side."""
     steps = []
     for t in range(len(records[0])):
         matrix, value, variance = (np.stack([record[t][part] for record in records]) for part in range(3))
         filter_.predict()
-        innovation, S = filter_.update(matrix, value, variance)
-        steps.append((filter_.mean.copy(), filter_.covariance.copy(), innovation, S))
+        innovation, expected, kept = filter_.update(matrix, value, variance)
+        assert kept.all()
+        steps.append((filter_.mean.copy(), filter_.covariance.copy(), innovation, expected))
     return [np.array(part) for part in zip(*steps, strict=True)]
 
 
@@ -50,7 +51,7 @@ def test_three_records_side_by_side_are_the_textbook(world):
             assert_close(covariances[t, b], now.covariance, 1e-10)
             H, value, variance = record[t]
             assert_close(innovations[t, b], value - H @ predicted.mean, 1e-10)
-            assert_close(S[t, b], H @ predicted.covariance @ H.T + np.diag(variance), 1e-10)
+            assert_close(S[t, b], (H @ predicted.covariance @ H.T).diagonal() + variance, 1e-10)
 
 
 def test_a_record_keeps_its_bits_beside_others(world):

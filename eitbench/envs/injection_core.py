@@ -1,0 +1,255 @@
+"""The core of every injection environment: B episodes at the same step."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from gymnasium import spaces
+
+from eitbench import _check
+from eitbench.envs.operator import GRID, FullOperator, Operator, electrode_pairs, pair_currents
+from eitbench.envs.reduced_operator import ReducedOperator
+from eitbench.recordings import outline, recording
+from eitbench.scenarios.instrument import Faults, Instrument
+
+if TYPE_CHECKING:
+    from eitbench.envs.estimation import Observation
+    from eitbench.scenarios.base import Scenario
+
+FURTHEST = 5.0
+"""Largest entry of a scaled observation."""
+OPERATORS: dict[str, type[Operator] | None] = {"reduced": ReducedOperator, "full": FullOperator, "none": None}
+LIMITS = ("L1", "L2", "Linf")
+"""Norms that may bound the currents."""
+RECENT = 4
+"""Injections that an observation remembers."""
+DOUBT = 0.2
+"""Weight of the last injection in the running share of readings that were not believed."""
+
+
+@dataclass(frozen=True)
+class Rules:
+    """What may be injected, by whom the outcome is estimated, and with which instrument.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    instrument : Instrument
+    limit : str or None
+        None: an action is the number of an electrode pair. "L1", "L2" or "Linf": it is L currents in parts of the
+        scenario's, of which the mean is taken away, and which are scaled down to the norm of a pair if they exceed it.
+    budget : int or None
+        How many injections the agent may make in an episode, where it may also inject nothing.
+    gate : float
+        The estimator leaves out readings further from the prediction than this many standard deviations.
+    """
+
+    scenario: Scenario
+    instrument: Instrument = field(default_factory=Instrument)
+    limit: str | None = None
+    budget: int | None = None
+    gate: float = np.inf
+
+    def __post_init__(self) -> None:
+        if self.limit is not None and self.limit not in LIMITS:
+            raise ValueError(f"limit must be one of {', '.join(LIMITS)}, got {self.limit!r}")
+        if self.budget is not None:
+            _check.integer("budget", self.budget, low=0)
+        _check.number("gate", min(self.gate, 1e300), low=0.0, open_low=True)
+
+    @property
+    def pairs(self) -> np.ndarray:
+        """(pairs, 2) electrodes where the current of each numbered action enters and leaves."""
+        return electrode_pairs(self.scenario.currents.shape[1])
+
+    @property
+    def amplitude(self) -> float:
+        """A (A/m in 2D); of a pair's current."""
+        return float(np.abs(self.scenario.currents).max())
+
+    @property
+    def table(self) -> np.ndarray:
+        """(actions, L) currents of each numbered action; the last is no current, where there is a budget."""
+        pairs = pair_currents(self.scenario)
+        return pairs if self.budget is None else np.concatenate([pairs, np.zeros((1, pairs.shape[1]))])
+
+    @property
+    def action_space(self) -> spaces.Discrete | spaces.Box:
+        if self.limit is None:
+            return spaces.Discrete(len(self.pairs) + (self.budget is not None))
+        return spaces.Box(-1.0, 1.0, self.scenario.currents.shape[1:], np.float32)
+
+    def currents(self, actions: np.ndarray) -> np.ndarray:
+        """(B, L) currents in A (A/m in 2D) of actions (B,) or (B, L)."""
+        if self.limit is None:
+            return self.table[actions]
+        free = np.asarray(actions, dtype=float)
+        free = free - free.mean(axis=1, keepdims=True)
+        order = {"L1": 1, "L2": 2, "Linf": np.inf}[self.limit]
+        pair = np.linalg.norm([1.0, -1.0], order)
+        size = np.linalg.norm(free, order, axis=1, keepdims=True)
+        return self.amplitude * free * (pair / np.maximum(size, pair))
+
+
+def scaled(rules: Rules, observation: Observation) -> np.ndarray:
+    """An observation as one array (..., d), float32, each entry about between −1 and 1 and never beyond ±5.
+
+    In this order: voltages, recent currents, innovations, mean and std on the grid, doubt, what is left; all as in the
+    raw observation but for the scale, the first frame left out.
+    """
+    scenario, level = rules.scenario, rules.scenario.expected_concentration
+    left = np.array([scenario.n_steps, rules.budget or 1][:observation["left"].shape[-1]])
+    parts = [observation["voltages"] / outline(scenario).largest_voltage, observation["recent"] / rules.amplitude,
+             observation["innovations"] / 3.0, 2.0 * (observation["mean"] / level - 1.0),
+             observation["std"] / (scenario.prior.inflow_std * level), observation["doubt"], observation["left"] / left]
+    batch = observation["voltages"].shape[:-1]
+    flat = np.concatenate([part.reshape(*batch, -1) for part in parts], axis=-1)
+    return np.clip(flat, -FURTHEST, FURTHEST).astype(np.float32)
+
+
+class InjectionCore:
+    """B episodes: actions in, noisy voltages out, and by how much the estimator's error lies below the homogeneous one.
+
+    Parameters
+    ----------
+    rules : Rules
+    estimator : str
+        One of `OPERATORS`.
+    """
+
+    def __init__(self, rules: Rules, estimator: str) -> None:
+        if estimator not in OPERATORS:
+            raise ValueError(f"estimator must be one of {', '.join(OPERATORS)}, got {estimator!r}")
+        self.rules, self.scenario = rules, rules.scenario
+        self._operator_type = OPERATORS[estimator]
+        self._table = rules.table if rules.limit is None else None
+        self.first = len(self.scenario.currents) if self._operator_type else 0
+        """Injections of the scenario's cycle before the agent's first."""
+        self.length = self.scenario.n_steps - self.first
+
+    def space(self) -> spaces.Dict:
+        """What one environment shows, in SI units."""
+        scenario, rules = self.scenario, self.rules
+        L, level = scenario.currents.shape[1], scenario.expected_concentration
+        largest, current = 1e3 * outline(scenario).largest_voltage, 1.5 * rules.amplitude      # "L2" goes up to √2
+        shown: dict[str, spaces.Space] = {"voltages": spaces.Box(-largest, largest, (L,), np.float64),
+                                          "currents": spaces.Box(-current, current, (L,), np.float64)}
+        if self._operator_type:
+            patches = (GRID[0] * GRID[1],)
+            shown |= {"recent": spaces.Box(-current, current, (RECENT, L), np.float64),
+                      "frame": spaces.Box(-largest, largest, (self.first, L), np.float64),
+                      "innovations": spaces.Box(-1e6, 1e6, (L,), np.float64),
+                      "mean": spaces.Box(-1e3 * level, 1e3 * level, patches, np.float64),
+                      "std": spaces.Box(0.0, 1e3 * level, patches, np.float64),
+                      "doubt": spaces.Box(0.0, 1.0, (2, L), np.float64)}
+        left = [scenario.n_steps] if rules.budget is None else [scenario.n_steps, rules.budget]
+        shown["left"] = spaces.Box(np.zeros(len(left)), np.array(left, dtype=float), dtype=np.float64)
+        return spaces.Dict(shown)
+
+    def begin(self, seeds: Sequence[int]) -> None:
+        """Play these episodes up to the agent's first injection."""
+        scenario, rules, B, L = self.scenario, self.rules, len(seeds), self.scenario.currents.shape[1]
+        T = scenario.n_steps
+        self._t, self._spent = self.first, np.zeros(B, dtype=int)
+        self._resistance, self._draws = np.empty((T, B, L, L)), np.empty((T, B, L))
+        self._deviations, self._squares, totals = np.empty((3, B, T))
+        self._voltages, self._currents, self._innovations = np.zeros((3, B, L))
+        self._recent, self._doubt = np.zeros((B, RECENT, L)), np.zeros((B, 2, L))
+        moments, faults = [], []
+        for k, seed in enumerate(seeds):     # all is copied: a mapped file is open, and there may be more than may be
+            entries = recording(scenario, seed)
+            self._resistance[:, k], self._draws[:, k] = entries["transfer_resistance"], entries["noise"]
+            self._deviations[k], self._squares[k] = entries["deviation"], entries["square"]
+            totals[k] = entries["moment"].sum(axis=1, dtype=float)
+            # The fourth of an episode's streams; the first three made the recording.
+            faults.append(rules.instrument.draw(np.random.default_rng(np.random.SeedSequence(seed).spawn(4)[3]), L, T))
+            if self._operator_type:
+                moments.append(self._operator_type.project(scenario, entries["moment"]))
+        self._faults = Faults(*(np.array(part) for part in zip(*faults, strict=True)))
+        if not self._operator_type:
+            return
+        self._moments = np.array(moments)
+        self._frames = np.stack([self._measure(k, np.repeat(cycle[None], B, axis=0))
+                                 for k, cycle in enumerate(scenario.currents)], axis=1)
+        self._operator = self._operator_type(scenario, self._frames, gate=rules.gate,
+                                             noise_floor=rules.instrument.noise_floor)
+        self._voltages = self._frames[:, -1].copy()
+        self._currents = np.repeat(scenario.currents[-1:], B, axis=0)
+        for k in range(RECENT):
+            self._recent[:, k] = scenario.currents[-1 - k]
+        level = self._operator.concentration[:, None] - scenario.background
+        area = outline(scenario).mass.sum()
+        self._homogeneous = (area * level**2 - 2.0 * level * totals + self._deviations) / self._squares
+
+    def _measure(self, k: int, currents: np.ndarray) -> np.ndarray:
+        """(B, L) voltages of injection t = k + 1."""
+        return self.rules.instrument.measure(self._faults, k + 1, self.scenario.noise, self._resistance[k], currents,
+                                             self._draws[k])
+
+    def act(self, actions: np.ndarray) -> np.ndarray:
+        """Inject what actions (B,) or (B, L) ask for and return the rewards (B,)."""
+        currents = self.rules.currents(actions) if self._table is None else self._table[actions]
+        if self.rules.budget is not None:
+            currents = currents * (self._spent < self.rules.budget)[:, None]
+            self._spent += currents.any(axis=1)
+        self._currents, self._voltages = currents, self._measure(self._t, currents)
+        self._recent = np.concatenate([currents[:, None], self._recent[:, :-1]], axis=1)
+        self._t += 1
+        if not self._operator_type:
+            return np.zeros(len(currents))
+        self._innovations, believed = self._operator.assimilate(self._voltages, currents)
+        self._remember(currents, believed)
+        k = self._t - 1
+        if k < self.scenario.warm_up:
+            return np.zeros(len(currents))
+        return self._homogeneous[:, k] - self.errors()
+
+    def errors(self) -> np.ndarray:
+        """(B,) relative errors (5.12) of the present estimates."""
+        k = self._t - 1
+        return self._operator.errors(self._moments[:, k], self._deviations[:, k], self._squares[:, k])
+
+    def estimate(self) -> tuple[np.ndarray, np.ndarray]:
+        """Present means and standard deviations (B, n) in mol/m³; without an estimator the expected level and zero."""
+        if not self._operator_type:
+            n, level = outline(self.scenario).mass.shape[0], self.scenario.expected_concentration
+            return np.full((len(self._spent), n), level), np.zeros((len(self._spent), n))
+        return self._operator.means(), self._operator.spreads()
+
+    @property
+    def last_currents(self) -> np.ndarray:
+        """(B, L) A (A/m in 2D) that were asked for last."""
+        return self._currents
+
+    def action_masks(self) -> np.ndarray:
+        """(B, actions) which numbered actions do something: with the budget spent only the last, no injection."""
+        if self._table is None:
+            raise ValueError("action_masks is for environments whose actions are numbers; here they are currents")
+        masks = np.ones((len(self._spent), len(self._table)), dtype=bool)
+        if self.rules.budget is not None:
+            masks[self._spent >= self.rules.budget, :-1] = False
+        return masks
+
+    def _remember(self, currents: np.ndarray, believed: np.ndarray) -> None:
+        """Of each electrode: how often lately its own reading was not believed, and the injections that it drove."""
+        reading, driving = self._doubt[:, 0], self._doubt[:, 1]
+        injected, drives = currents.any(axis=1, keepdims=True), currents != 0.0
+        failed = ~believed.any(axis=1, keepdims=True)
+        # A failed injection says nothing of the electrodes that only listened.
+        reading += DOUBT * (injected & ~failed) * (~believed - reading)
+        driving += DOUBT * drives * (failed - driving)
+
+    def observe(self) -> Observation:
+        """The last measurement and, if there is an estimator, what an operator makes of it; arrays (B, …)."""
+        shown = {"voltages": self._voltages.copy(), "currents": self._currents.copy()}
+        if self._operator_type:
+            mean, std = self._operator.grid()
+            shown |= {"recent": self._recent.copy(), "frame": self._frames.copy(),
+                      "innovations": self._innovations.copy(), "mean": mean, "std": std, "doubt": self._doubt.copy()}
+        left = [np.full(len(self._spent), float(self.scenario.n_steps - self._t))]
+        if self.rules.budget is not None:
+            left.append(self.rules.budget - self._spent.astype(float))
+        return shown | {"left": np.stack(left, axis=1)}

@@ -1,0 +1,47 @@
+"""Which injection teaches most: criteria of optimal design for a Gaussian state, over all electrode pairs at once.
+
+The voltages are bilinear in the pair that drives and the electrode that is read, so one table of products of the
+covariance serves every pair (problem.md §7).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def pair_gains(covariance_of: np.ndarray, weighted: np.ndarray, pairs: np.ndarray, noise_variance: np.ndarray,
+               ) -> tuple[np.ndarray, np.ndarray]:
+    """What each pair would teach if it were injected now.
+
+    With D the derivatives of the voltages under a current into one electrode, (L, L, n) for n states, read as L² rows:
+
+    Parameters
+    ----------
+    covariance_of : (L, L, L, L)
+        D P Dᵀ, P the state's covariance just before the measurement.
+    weighted : (L, L, L, L)
+        D P W P Dᵀ, W the weight of the states' errors.
+    pairs : (p, 2)
+        Where the current enters and leaves.
+    noise_variance : (p, L)
+        Of the voltages of each pair, per current squared; infinite for readings that will not be believed.
+
+    Returns
+    -------
+    (p,), (p,)
+        By how much tr(W P) falls (A-optimality), and ½ ln of the ratio in which det P falls (D-optimality).
+    """
+    i, j = pairs.T
+    L = covariance_of.shape[0]
+
+    def between(table: np.ndarray) -> np.ndarray:
+        return table[i, :, i] - table[i, :, j] - table[j, :, i] + table[j, :, j]
+
+    # In parts of the noise; a reading without end to its noise has no part in it.
+    root = 1.0 / np.sqrt(noise_variance)
+    S = between(covariance_of) * root[:, :, None] * root[:, None, :]
+    S[:, np.arange(L), np.arange(L)] += 1.0
+    factor = np.linalg.cholesky(S)
+    learnt = between(weighted) * root[:, :, None] * root[:, None, :]
+    gains = np.linalg.solve(S, learnt).trace(axis1=1, axis2=2)
+    return gains, np.log(factor.diagonal(axis1=1, axis2=2)).sum(axis=1)

@@ -1,0 +1,100 @@
+"""The instrument between what is asked for and what is read: wires break, contacts come loose, amplifiers are noisy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from eitbench import _check
+from eitbench.physics.observation import VoltageNoise
+
+
+class Faults(NamedTuple):
+    """What is wrong in one episode; nobody announces it."""
+
+    broken_from: np.ndarray
+    """(L,) first t at which an electrode's wire is broken; never, if beyond the episode's end"""
+    resistance: np.ndarray
+    """(L,) Ω (Ω·m in 2D) between the instrument and the electrode"""
+    noise_factor: np.ndarray
+    """(L,) by which an electrode's noise exceeds a sound one's"""
+
+
+@dataclass(frozen=True)
+class Instrument:
+    """Current sources and voltmeters; by default sound ones. All numbers are ours.
+
+    A broken wire leaves the electrode in place, so the field is that of an electrode without net current: the transfer
+    resistances of the episode stay exact. A current that would have to pass a broken wire does not flow at all, and
+    the electrode's reading is what the open input picks up. A loose contact is a resistance in the wire; it shows only
+    while current flows through it, and it is noisy.
+    """
+
+    noise_floor: float = 0.0
+    """V; std of an absolute noise beside the relative one"""
+    dead: tuple[int, int] = (0, 0)
+    """least and most electrodes whose wire is broken from the beginning"""
+    failing: tuple[int, int] = (0, 0)
+    """least and most electrodes whose wire breaks on the way"""
+    loose: tuple[int, int] = (0, 0)
+    """least and most electrodes with a bad contact"""
+    loose_resistance: tuple[float, float] = (0.5, 2.0)
+    """Ω (Ω·m in 2D); a sound contact of the 2D pipe has 0.08"""
+    loose_noise: float = 5.0
+    """factor of a bad contact's noise"""
+    interference: float = 0.1
+    """V; std of what a broken wire reads"""
+
+    def __post_init__(self) -> None:
+        for name, units in (("noise_floor", "V"), ("interference", "V")):
+            _check.number(name, getattr(self, name), low=0.0, units=units)
+        _check.number("loose_noise", self.loose_noise, low=1.0)
+        for name in ("dead", "failing", "loose"):
+            if len(getattr(self, name)) != 2:
+                raise ValueError(f"{name} must be a range (least, most), got {getattr(self, name)!r}")
+            low, high = (_check.integer(name, value, low=0) for value in getattr(self, name))
+            if low > high:
+                raise ValueError(f"{name} must be a range least ≤ most, got {getattr(self, name)!r}")
+        low, high = _check.array("loose_resistance", self.loose_resistance, (2,), units="Ω")
+        if not 0 <= low <= high:
+            raise ValueError(f"loose_resistance must be a range 0 ≤ low ≤ high, got {self.loose_resistance!r} Ω")
+        if self.most > 14:
+            raise ValueError(f"dead, failing and loose must leave two electrodes sound, got up to {self.most} of 16")
+
+    @property
+    def most(self) -> int:
+        """The most electrodes that have a fault."""
+        return self.dead[1] + self.failing[1] + self.loose[1]
+
+    def draw(self, random: np.random.Generator, n_electrodes: int, n_steps: int) -> Faults:
+        """The faults of one episode: which electrodes, and when in t = 1 … n_steps wires break."""
+        order = random.permutation(n_electrodes)
+        dead, failing, loose = (int(random.integers(low, high + 1)) for low, high in
+                                (self.dead, self.failing, self.loose))
+        broken = np.full(n_electrodes, n_steps + 1)
+        broken[order[:dead]] = 0
+        broken[order[dead:dead + failing]] = random.integers(1, n_steps + 1, failing)
+        shaky = order[dead + failing:dead + failing + loose]
+        resistance, factor = np.zeros(n_electrodes), np.ones(n_electrodes)
+        resistance[shaky], factor[shaky] = random.uniform(*self.loose_resistance, loose), self.loose_noise
+        return Faults(broken, resistance, factor)
+
+    def measure(self, faults: Faults, t: int, noise: VoltageNoise, transfer_resistance: np.ndarray,
+                currents: np.ndarray, draws: np.ndarray) -> np.ndarray:
+        """Voltages (B, L) in V at step t of B episodes.
+
+        Parameters
+        ----------
+        faults : Faults
+            Its arrays stacked, (B, L).
+        transfer_resistance, currents, draws : (B, L, L), (B, L), (B, L)
+            𝓡, the currents asked for in A (A/m in 2D), and standard normal numbers.
+        """
+        broken = t >= faults.broken_from
+        flows = ~(broken & (currents != 0.0)).any(axis=1, keepdims=True)
+        driven = currents * flows
+        clean = (transfer_resistance @ driven[..., None])[..., 0] + faults.resistance * driven
+        std = np.hypot(noise.std(clean) * faults.noise_factor, self.noise_floor)
+        return np.where(broken, self.interference * draws, clean + std * draws)
