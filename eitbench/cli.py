@@ -53,9 +53,10 @@ def list_() -> None:
         typer.echo(f"  {name:40} {board_of(env):10}  lag {env.lag}, {scenario.n_steps - scenario.warm_up} scored of "
                    f"{scenario.n_steps} states, {env.action_space.shape[0]} numbers each")  # type: ignore[index]
     for name in INJECTION:
-        chooser = gym.make(name).unwrapped
-        typer.echo(f"  {name:40} injection   {chooser.action_space.n} electrode pairs, "  # type: ignore[attr-defined]
-                   f"{chooser.scenario.n_steps} injections")  # type: ignore[attr-defined]
+        rules = gym.make(name).unwrapped.rules  # type: ignore[attr-defined]
+        what = f"{len(rules.pairs)} electrode pairs" if rules.limit is None else f"{rules.limit} currents"
+        allowed = "" if rules.budget is None else f", {rules.budget} of them allowed"
+        typer.echo(f"  {name:40} injection   {what}, {rules.scenario.n_steps} injections{allowed}")
     typer.echo("baselines")
     for name in own_baselines():
         baseline = load_baseline(name)

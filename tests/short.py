@@ -1,6 +1,6 @@
-"""A short world for every id that asks for estimates: what is promised does not depend on the length of a record."""
+"""A short world for every id: what is promised does not depend on the length of a record."""
 
-from eitbench.envs import ENTRY_POINTS, ESTIMATION
+from eitbench.envs import ENTRY_POINTS
 
 PLAIN = [name for name, (classes, _) in ENTRY_POINTS.items() if classes.endswith((":Pipe2D", ":Pipe2DInjection"))]
 """Ids that play the thesis' pipe as it is, `Pipe2D`."""
@@ -10,6 +10,9 @@ FLOW = PIPE | {"velocity_range": (40.0, 50.0)}
 
 FIELDS = {
     "Pipe2D": PIPE,
+    "Pipe2DInjection": PIPE,
+    "Pipe2DInjectionFaults": PIPE,
+    "Pipe2DInjectionBudget": PIPE,
     "Pipe2DBiasedVelocity": FLOW,
     "Pipe2DVelocity": FLOW,
     "Pipe2DObstacle": PIPE | {"viscosity": 0.04, "obstacle_height": 0.01},
@@ -23,7 +26,7 @@ FIELDS = {
 
 def kind(name: str) -> str:
     """What the classes of an id are called, without …Env."""
-    return ESTIMATION[name][0].split(":")[1]
+    return ENTRY_POINTS[name][0].split(":")[1]
 
 
 def short(name: str) -> dict:
