@@ -99,6 +99,16 @@ class InjectionEnv(gym.Env[Any, Any]):
         """(actions,) which numbered actions do something: with the budget spent only the last, no injection."""
         return self._core.action_masks()[0]
 
+    @property
+    def core(self) -> InjectionCore:
+        """What plays the episode; it knows the truth."""
+        return self._core
+
+    @property
+    def error(self) -> float | None:
+        """Relative error (5.12) of the present estimate; None if this state is not scored."""
+        return float(self._core.errors()[0]) if self._core.t > self.scenario.warm_up else None
+
     def _observe(self) -> Any:
         seen = {name: array[0] for name, array in self._core.observe().items()}
         return scaled(self.rules, seen) if self._scaled else seen
@@ -150,6 +160,11 @@ class InjectionVectorEnv(LockstepVectorEnv):
     def action_masks(self) -> np.ndarray:
         """(num_envs, actions) as in `InjectionEnv`."""
         return np.concatenate([core.action_masks() for core in self._cores])
+
+    def errors(self) -> np.ndarray:
+        """(num_envs,) relative errors (5.12) of the present estimates, not a number where the state is not scored; for
+        scoring, never for agents."""
+        return np.concatenate([core.errors() for core in self._cores])
 
     def _begin(self, seeds: list[int]) -> None:
         for core, part in zip(self._cores, self._parts, strict=True):

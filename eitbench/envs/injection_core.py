@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium import spaces
@@ -82,6 +82,34 @@ class Rules:
             return spaces.Discrete(len(self.pairs) + (self.budget is not None))
         return spaces.Box(-1.0, 1.0, self.scenario.currents.shape[1:], np.float32)
 
+    @property
+    def world(self) -> str:
+        """What was found by search is kept under: the scenario's name, and whether there are faults or a budget."""
+        faults, budget = " with faults" * (self.instrument.most > 0), " with a budget" * (self.budget is not None)
+        return type(self.scenario).__name__ + faults + budget
+
+    def action(self, pair: int | None) -> Any:
+        """The action that injects the pair of this number, or nothing (None, which needs a budget or currents)."""
+        if self.limit is not None:
+            currents = np.zeros(self.scenario.currents.shape[1], dtype=np.float32)
+            if pair is not None:
+                currents[self.pairs[pair]] = 1.0, -1.0
+            return currents
+        if pair is None and self.budget is None:
+            raise ValueError("pair must be a number: in a world without a budget each step injects")
+        return len(self.pairs) if pair is None else int(pair)
+
+    def spaced(self, left: np.ndarray) -> bool:
+        """Whether a budget that is spread evenly is spent at this step; ``left`` as observed. Always without a budget.
+
+        The first frame has just been measured, so that the first injection comes at the end of its interval.
+        """
+        if self.budget is None:
+            return True
+        steps = self.scenario.n_steps - len(self.scenario.currents)
+        k = steps - int(left[0])
+        return (k + 1) * self.budget // steps > k * self.budget // steps
+
     def currents(self, actions: np.ndarray) -> np.ndarray:
         """(B, L) currents in A (A/m in 2D) of actions (B,) or (B, L)."""
         if self.limit is None:
@@ -153,7 +181,7 @@ class InjectionCore:
         """Play these episodes up to the agent's first injection."""
         scenario, rules, B, L = self.scenario, self.rules, len(seeds), self.scenario.currents.shape[1]
         T = scenario.n_steps
-        self._t, self._spent = self.first, np.zeros(B, dtype=int)
+        self.seeds, self._t, self._spent = tuple(seeds), self.first, np.zeros(B, dtype=int)
         self._resistance, self._draws = np.empty((T, B, L, L)), np.empty((T, B, L))
         self._deviations, self._squares, totals = np.empty((3, B, T))
         self._voltages, self._currents, self._innovations = np.zeros((3, B, L))
@@ -203,12 +231,12 @@ class InjectionCore:
         self._innovations, believed = self._operator.assimilate(self._voltages, currents)
         self._remember(currents, believed)
         k = self._t - 1
-        if k < self.scenario.warm_up:
-            return np.zeros(len(currents))
-        return self._homogeneous[:, k] - self.errors()
+        return np.nan_to_num(self._homogeneous[:, k] - self.errors())
 
     def errors(self) -> np.ndarray:
-        """(B,) relative errors (5.12) of the present estimates."""
+        """(B,) relative errors (5.12) of the present estimates, not a number where the state is not scored."""
+        if self._t <= self.scenario.warm_up:
+            return np.full(len(self._spent), np.nan)
         k = self._t - 1
         return self._operator.errors(self._moments[:, k], self._deviations[:, k], self._squares[:, k])
 
@@ -218,6 +246,21 @@ class InjectionCore:
             n, level = outline(self.scenario).mass.shape[0], self.scenario.expected_concentration
             return np.full((len(self._spent), n), level), np.zeros((len(self._spent), n))
         return self._operator.means(), self._operator.spreads()
+
+    @property
+    def t(self) -> int:
+        """Injections so far, those of the first frame among them."""
+        return self._t
+
+    @property
+    def spent(self) -> np.ndarray:
+        """(B,) injections that the agents have made of a budget."""
+        return self._spent.copy()
+
+    @property
+    def faults(self) -> Faults:
+        """What is wrong in these episodes, (B, L) each."""
+        return self._faults
 
     @property
     def last_currents(self) -> np.ndarray:

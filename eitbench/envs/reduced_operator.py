@@ -32,8 +32,8 @@ class ReducedOperator:
         self._shared = shared = _shared(scenario)
         self._gate, self._floor = gate, noise_floor
         broken = BROKEN if math.isfinite(gate) else math.inf
-        self._levels = [shared.level(shared.levels.best(frame, broken)) for frame in frames]
-        self.concentration = np.array([level.concentration for level in self._levels])
+        self.levels = [shared.level(shared.levels.best(frame, broken)) for frame in frames]
+        self.concentration = np.array([level.concentration for level in self.levels])
         r = len(shared.single.transition)
         self._filter = ReducedFilter(shared.single, np.zeros((len(frames), r), dtype=np.float32),
                                      np.repeat(shared.single.initial[None], len(frames), axis=0))
@@ -43,12 +43,22 @@ class ReducedOperator:
     def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         noise_std = self._shared.levels.noise_std
         observed = [level.observe(current, noise_std(current @ level.resistance, self._floor))
-                    for level, current in zip(self._levels, currents, strict=True)]
+                    for level, current in zip(self.levels, currents, strict=True)]
         computed, std, matrix = (np.array(part) for part in zip(*observed, strict=True))
         residual = ((voltages - computed) / std).astype(np.float32) * currents.any(axis=1, keepdims=True)
         self._filter.predict()
         innovation, variance, kept = self._filter.update(matrix, residual, np.ones_like(residual), gate=self._gate)
         return (innovation / np.sqrt(variance)).astype(float), kept
+
+    @property
+    def model(self) -> ReducedModel:
+        """The reduced model, in double precision."""
+        return self._shared.model
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """(B, r, r) of the present reduced states."""
+        return self._filter.covariance
 
     def grid(self) -> tuple[np.ndarray, np.ndarray]:
         patches = self._shared.patches

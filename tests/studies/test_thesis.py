@@ -26,7 +26,7 @@ GOLDEN = {
     ("Pipe3D", "kalman_filter"): 0.0021332,
     ("Pipe3DSmoothing", "fixed_interval_smoother"): 0.0012599,
     ("RotatingTank2D", "homogeneous"): 0.020959,
-    ("RotatingTank2D", "kalman_filter"): 0.010952,
+    ("RotatingTank2D", "kalman_filter"): 0.013727,
     ("RotatingTank2D", "gauss_newton"): 0.020741,
     ("StationaryTank2D", "homogeneous"): 0.40068,
     ("StationaryTank2D", "kalman_filter"): 0.21733,
