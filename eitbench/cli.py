@@ -1,4 +1,4 @@
-"""The command line: `eitbench list | run | bank | leaderboard | render | reproduce`."""
+"""The command line: `eitbench list | run | bank | train | leaderboard | render | reproduce`."""
 
 from __future__ import annotations
 
@@ -28,6 +28,16 @@ class Suite(StrEnum):
 
     quick = "quick"
     full = "full"
+
+
+class Algorithm(StrEnum):
+    """What may learn."""
+
+    ppo = "ppo"
+    dqn = "dqn"
+    sac = "sac"
+    recurrent_ppo = "recurrent_ppo"
+    maskable_ppo = "maskable_ppo"
 
 
 Figure = StrEnum("Figure", {re.sub(r"\W", "_", name).upper(): name for name in FIGURES})  # type: ignore[misc]
@@ -118,6 +128,32 @@ def bank(
         raise typer.BadParameter(f"seeds need {missing * each / 1e9:.1f} GB more, and {free / 1e9:.1f} GB are free")
     made = fill(scenario, numbers, n_jobs=jobs)
     typer.echo(f"{made} simulated, {len(numbers) - made} were there")
+
+
+@app.command()
+def train(
+    env: Annotated[str, typer.Option(help="Id of an injection environment.")],
+    algo: Annotated[Algorithm, typer.Option(help="Algorithm of stable-baselines3 or sb3-contrib.")] = Algorithm.ppo,
+    config: Annotated[Path, typer.Option(help="A YAML file such as those in baselines/rl.")] = Path(
+        "baselines/rl/ppo.yml"),
+    seed: Annotated[int, typer.Option(min=0, help="Of the training; episodes are drawn from the train split.")] = 0,
+    steps: Annotated[int | None, typer.Option(min=0, help="Steps in place of the configuration's total_steps.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder of the run. Default: "
+                                             "results/training/ENV/ALGO/seedK.")] = None,
+) -> None:
+    """Train an agent to choose injections.
+
+    The same command again goes on from the last checkpoint. The folder receives model.zip, config.json, monitor.csv,
+    evaluations.npz (scores on dev episodes) and logs for TensorBoard.
+    """
+    from dataclasses import replace
+    with _clear_errors():
+        from eitbench import training
+        asked = training.read_config(config)
+        folder = out or Path("results/training") / env.replace("/", "-") / algo.value / f"seed{seed}"
+        model = training.train(env, algo.value, asked if steps is None else replace(asked, total_steps=steps), seed,
+                               folder)
+    typer.echo(f"wrote {model}")
 
 
 @app.command()

@@ -19,6 +19,7 @@ FIELDS = {
     "Pipe3D": {"mean_velocity": 45.0, "scored_steps": 3, "frame": 2, "electrode_rings": 1, "electrodes_per_ring": 4,
                "potential_order": 1},
     "RotatingTank2D": {"n_electrodes": 8, "warm_up": 1, "scored_steps": 4},
+    "RotatingTankInjection": {"n_electrodes": 8, "warm_up": 1, "scored_steps": 4},
     "StationaryTank2D": {"n_electrodes": 8, "scored_steps": 5},
 }
 """Fields of the scenario by the name that the classes …Env and …VectorEnv of an id begin with."""

@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 
 from eitbench import _check
-from eitbench.envs.operator import GRID, FullOperator, Operator, electrode_pairs, pair_currents
+from eitbench.envs.operator import PATCHES, FullOperator, Operator, electrode_pairs, pair_currents
 from eitbench.envs.reduced_operator import ReducedOperator
 from eitbench.recordings import outline, recording
 from eitbench.scenarios.instrument import Faults, Instrument
@@ -166,7 +166,7 @@ class InjectionCore:
         shown: dict[str, spaces.Space] = {"voltages": spaces.Box(-largest, largest, (L,), np.float64),
                                           "currents": spaces.Box(-current, current, (L,), np.float64)}
         if self._operator_type:
-            patches = (GRID[0] * GRID[1],)
+            patches = (PATCHES,)
             shown |= {"recent": spaces.Box(-current, current, (RECENT, L), np.float64),
                       "frame": spaces.Box(-largest, largest, (self.first, L), np.float64),
                       "innovations": spaces.Box(-1e6, 1e6, (L,), np.float64),
@@ -207,7 +207,7 @@ class InjectionCore:
         self._voltages = self._frames[:, -1].copy()
         self._currents = np.repeat(scenario.currents[-1:], B, axis=0)
         for k in range(RECENT):
-            self._recent[:, k] = scenario.currents[-1 - k]
+            self._recent[:, k] = scenario.currents[(self.first - 1 - k) % self.first]
         level = self._operator.concentration[:, None] - scenario.background
         area = outline(scenario).mass.sum()
         self._homogeneous = (area * level**2 - 2.0 * level * totals + self._deviations) / self._squares

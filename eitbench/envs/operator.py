@@ -25,8 +25,8 @@ LEVEL_STEP = 0.02
 """ĉ_bh is rounded to steps of 2 %, so that what is linearised there serves many episodes."""
 LEVELS = np.arange(-50, 51)
 """Numbers of steps from the expected concentration: from a third of it to three times as much."""
-GRID = (12, 3)
-"""Along and across the vessel: patches on which an agent sees the estimate."""
+PATCHES = 36
+"""On so many patches of the vessel an agent sees the estimate."""
 BROKEN = 30.0
 """Standard deviations from a homogeneous liquid's voltage beyond which a reading says nothing of the level, where
 the instrument may be faulty."""
@@ -191,13 +191,15 @@ class FullOperator:
 
 
 def patch_averages(mesh: Mesh) -> np.ndarray:
-    """(patches, n) averages over the boxes of the grid; a node counts by its share of the mass matrix."""
+    """(PATCHES, n) averages over the boxes of a grid, 12 × 3 in pipes and 6 × 6 in tanks, x first; a node counts by its
+    share of the mass matrix."""
     from eitbench.physics.fem import mass_matrix
     points = mesh.points[:, :2]
     low, high = points.min(axis=0), points.max(axis=0)
-    column, row = np.minimum((points - low) / (high - low) * GRID, np.array(GRID) - 1).astype(int).T
-    averages = np.zeros((GRID[0] * GRID[1], len(points)))
-    averages[row * GRID[0] + column, np.arange(len(points))] = mass_matrix(mesh).sum(axis=0)
+    grid = (12, 3) if high[0] - low[0] > 2 * (high[1] - low[1]) else (6, 6)
+    column, row = np.minimum((points - low) / (high - low) * grid, np.array(grid) - 1).astype(int).T
+    averages = np.zeros((PATCHES, len(points)))
+    averages[row * grid[0] + column, np.arange(len(points))] = mass_matrix(mesh).sum(axis=0)
     if not averages.any(axis=1).all():
-        raise ValueError(f"the task's mesh must have a node in each of {GRID[0]} × {GRID[1]} patches of the vessel")
+        raise ValueError(f"the task's mesh must have a node in each of {grid[0]} × {grid[1]} patches of the vessel")
     return averages / averages.sum(axis=1, keepdims=True)

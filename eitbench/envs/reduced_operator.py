@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 from eitbench._files import write_atomically
 from eitbench.envs.operator import BROKEN, Linearisation, levels_of, pair_currents, patch_averages
 from eitbench.episodes import code_digest, folder, warn_not_kept
-from eitbench.estimation import LinearisedObservations, table_5_1
+from eitbench.estimation import LinearisedObservations, starting_filter
 from eitbench.estimation.reduced import ReducedFilter, ReducedModel, reduced_model
 from eitbench.recordings import outline
 from eitbench.task import make_task
@@ -136,7 +136,7 @@ def _make_model(scenario: Scenario) -> ReducedModel:
     task = make_task(scenario)
     every = pair_currents(scenario)
     currents = every[np.random.default_rng(0).integers(len(every), size=90)]
-    start = table_5_1(task.transport, task.prior, 1.0)
+    start = starting_filter(task.transport, task.prior, 1.0)
     level = scenario.expected_concentration
     linear = LinearisedObservations(task.observation, task.noise, np.full(task.mesh.n_nodes, level))
     record = []

@@ -89,6 +89,14 @@ class KalmanFilter:
         self.known = self.transition @ self.known
         self.time += 1
 
+    def apply_noise(self, X: np.ndarray) -> np.ndarray:
+        """Γ_w X for X (n, k)."""
+        return self.covariance.apply_noise(X)
+
+    def apply_initial(self, X: np.ndarray) -> np.ndarray:
+        """Γ_{0|0} X for X (n, k)."""
+        return self.covariance.apply(0, X)
+
     def update(self, observation: Observation) -> FilterStep:
         """Take in one measurement of the present state."""
         return self.take_in(observation.matrix, *self.expect(observation))

@@ -69,11 +69,24 @@ class ClosedVesselFilter(DenseKalmanFilter):
     def __init__(self, mean: np.ndarray, covariance: np.ndarray, transition: np.ndarray | None,
                  noise: np.ndarray | None) -> None:
         super().__init__(mean, covariance)
-        self._transition, self._noise = transition, noise
+        self._transition, self._noise, self._initial = transition, noise, covariance
+
+    @property
+    def transition(self) -> np.ndarray:
+        """(n, n) F."""
+        return np.eye(len(self.mean)) if self._transition is None else self._transition
 
     def predict(self) -> None:  # type: ignore[override]
         """Move one time step on."""
         super().predict(self._transition, None, self._noise)
+
+    def apply_noise(self, X: np.ndarray) -> np.ndarray:
+        """Γ_w X for X (n, k)."""
+        return np.zeros_like(X) if self._noise is None else self._noise @ X
+
+    def apply_initial(self, X: np.ndarray) -> np.ndarray:
+        """Γ_{0|0} X for X (n, k)."""
+        return self._initial @ X
 
 
 def initial_covariance(mesh: Mesh, prior: Prior) -> np.ndarray:

@@ -7,6 +7,7 @@ projection onto them gives a model of the same form with about a hundred states.
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Iterable
 from itertools import pairwise
@@ -17,6 +18,7 @@ import scipy.linalg
 
 from eitbench.estimation.gate import believable
 from eitbench.estimation.kalman import KalmanFilter, Observation
+from eitbench.estimation.parameters import ClosedVesselFilter
 
 
 class ReducedModel(NamedTuple):
@@ -32,13 +34,13 @@ class ReducedModel(NamedTuple):
     """(r, r) covariance of a at t = 0"""
 
 
-def reduced_model(start: KalmanFilter, mass: np.ndarray, observations: Iterable[Observation], rank: int, *,
-                  skip: int = 20) -> ReducedModel:
+def reduced_model(start: KalmanFilter | ClosedVesselFilter, mass: np.ndarray, observations: Iterable[Observation],
+                  rank: int, *, skip: int = 20) -> ReducedModel:
     """The model of ``start`` in the ``rank`` directions in which it learns most.
 
     Parameters
     ----------
-    start : KalmanFilter
+    start : KalmanFilter or ClosedVesselFilter
         At t = 0; it is run over the record.
     mass : (n, n)
         Mass matrix M in m² (m³ in 3D).
@@ -49,21 +51,32 @@ def reduced_model(start: KalmanFilter, mass: np.ndarray, observations: Iterable[
     skip : int
         Steps at the beginning that do not count, since the initial uncertainty is not typical.
     """
+    blind = copy.deepcopy(start) if isinstance(start, ClosedVesselFilter) else None           # never sees a measurement
     learnt = np.zeros_like(mass)
     for t, observation in enumerate(observations):
         start.predict()
         start.update(observation)
+        if blind is not None:
+            blind.predict()
         if t >= skip:
-            learnt += start.known @ start.known.T
+            learnt += _learnt(start, blind)
     root = np.linalg.cholesky(mass)
     n = len(mass)
     _, vectors = scipy.linalg.eigh(root.T @ learnt @ root, subset_by_index=[n - rank, n - 1])
     basis = scipy.linalg.solve_triangular(root.T, vectors[:, ::-1], lower=False)
     transition, rotation = scipy.linalg.schur(basis.T @ mass @ start.transition @ basis)
     basis = basis @ rotation
-    weighted, covariance = mass @ basis, start.covariance
-    return ReducedModel(basis, transition, weighted.T @ covariance.apply_noise(weighted),
-                        weighted.T @ covariance.apply(0, weighted))
+    weighted = mass @ basis
+    return ReducedModel(basis, transition, weighted.T @ start.apply_noise(weighted),
+                        weighted.T @ start.apply_initial(weighted))
+
+
+def _learnt(filter_: KalmanFilter | ClosedVesselFilter, blind: ClosedVesselFilter | None) -> np.ndarray:
+    """(n, n) by how much the measurements have reduced the covariance."""
+    if isinstance(filter_, KalmanFilter):
+        return filter_.known @ filter_.known.T
+    assert blind is not None
+    return blind.covariance - filter_.covariance
 
 
 class ReducedFilter:

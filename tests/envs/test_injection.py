@@ -5,57 +5,22 @@ import pickle
 import gymnasium as gym
 import numpy as np
 import pytest
+from choosing import CURRENTS, NAME, SHORT, arrays_of, make, play, some_actions, some_pairs, world
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 import eitbench
 from eitbench import make_task
 from eitbench.envs import INJECTION, reduced_operator
-from eitbench.envs.injection_core import Rules
 from eitbench.envs.operator import electrode_pairs
 from eitbench.episodes import CACHE_VARIABLE
 from eitbench.estimation import FirstFrame, LinearisedObservations, kalman_filter, table_5_1
 from eitbench.estimation.reduced import ReducedModel
 from eitbench.recordings import cycle_voltages, recording, score_operators
 from eitbench.scenarios import Pipe2D
-from eitbench.scenarios.instrument import Faults, Instrument
 
-NAME = "eitbench/Pipe2DInjection-v0"
-CURRENTS, FAULTS, BUDGET = (f"eitbench/Pipe2DInjection{kind}-v0" for kind in ("Currents", "Faults", "Budget"))
-# Sixteen electrodes and a short record; fewer electrodes would leave too little to learn from.
-SHORT = {"scored_steps": 4, "mean_velocity": 16.0}
 both = pytest.mark.parametrize("estimator", ["reduced", "none"])
 every = pytest.mark.parametrize("name", list(INJECTION))
-
-
-def make(estimator: str = "none", name: str = NAME, observation: str = "raw", longer: dict = {}, **kwargs,  # noqa: B006
-         ) -> gym.Env:
-    return gym.make(name, estimator=estimator, scenario=SHORT | longer, observation=observation, **kwargs)
-
-
-def play(env: gym.Env, seed: int, actions: np.ndarray) -> list[tuple]:
-    """(observation, reward, terminated, truncated, info) of the whole episode under the given actions."""
-    observation, info = env.reset(seed=seed)
-    steps = [(observation, 0.0, False, False, info)]
-    while not steps[-1][2]:
-        action = actions[len(steps) - 1]
-        steps.append(env.step(int(action) if action.ndim == 0 else action))
-    return steps
-
-
-def some_pairs(steps: int = 120, envs: int = 1, seed: int = 0) -> np.ndarray:
-    return np.random.default_rng(seed).integers(120, size=(steps, envs)).squeeze()
-
-
-def some_actions(env: gym.Env, steps: int = 120) -> np.ndarray:
-    """Actions of the environment's kind."""
-    if env.action_space.shape:
-        return np.random.default_rng(0).uniform(-1.0, 1.0, (steps, *env.action_space.shape)).astype(np.float32)
-    return some_pairs(steps)
-
-
-def arrays_of(observation) -> list[np.ndarray]:
-    return [observation[key] for key in sorted(observation)] if isinstance(observation, dict) else [observation]
 
 
 @every
@@ -76,7 +41,7 @@ def test_contract(name, estimator, observation):
     actions = some_actions(env)
     steps = play(env, 1, actions)
     scenario = env.unwrapped.scenario
-    assert len(steps) - 1 == scenario.n_steps - (16 if estimator != "none" else 0)
+    assert len(steps) - 1 == scenario.n_steps - (len(scenario.currents) if estimator != "none" else 0)
     arrays = [array for step in steps for array in arrays_of(step[0])]
     assert len({array.__array_interface__["data"][0] for array in arrays}) == len(arrays)
     for shown, reward, terminated, truncated, info in steps:
@@ -185,7 +150,8 @@ def test_estimator_is_the_kalman_filter_of_the_baselines():
 @pytest.mark.parametrize(("estimator", "observation"), [("reduced", "scaled"), ("reduced", "raw"), ("none", "raw")])
 def test_side_by_side_as_one_by_one(name, estimator, observation):
     """18 environments at once show, to the bit, what 18 alone show, over episodes' ends; threads change nothing."""
-    kwargs = {"num_envs": 18, "estimator": estimator, "scenario": SHORT, "episodes": 3, "observation": observation}
+    kwargs = {"num_envs": 18, "estimator": estimator, "scenario": world(name), "episodes": 3,
+              "observation": observation}
     sync = gym.make_vec(name, vectorization_mode="sync", **kwargs)
     ours = [gym.make_vec(name, vectorization_mode="vector_entry_point", threads=threads, **kwargs)
             for threads in (1, 2)]
@@ -241,103 +207,6 @@ def test_grid_of_the_full_operator_is_that_of_its_covariance():
     np.testing.assert_allclose(std[0], expected, rtol=1e-8)
 
 
-# -- currents, budgets, faults ----------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("limit", "order"), [("L1", 1), ("L2", 2), ("Linf", np.inf)])
-def test_currents_are_projected(limit, order):
-    """They sum to zero; those within the limit are only centred, those beyond it scaled onto a pair's norm."""
-    rules = Rules(Pipe2D(), limit=limit)
-    free = np.random.default_rng(0).uniform(-1.0, 1.0, (50, 16)) * np.geomspace(0.01, 1.0, 50)[:, None]
-    currents = rules.currents(free)
-    np.testing.assert_allclose(currents.sum(axis=1), 0.0, atol=1e-15)
-    pair = np.linalg.norm(np.array([0.1, -0.1]), order)
-    size = np.linalg.norm(currents, order, axis=1)
-    centred = 0.1 * (free - free.mean(axis=1, keepdims=True))
-    within = np.linalg.norm(centred, order, axis=1) <= pair
-    assert 0 < within.sum() < 50
-    np.testing.assert_allclose(currents[within], centred[within], rtol=1e-12)
-    np.testing.assert_allclose(size[~within], pair, rtol=1e-12)
-    np.testing.assert_allclose(np.cross(currents[~within][:, :3], centred[~within][:, :3]), 0.0, atol=1e-15)
-
-
-def test_a_pair_and_its_currents_are_the_same():
-    """The world with currents contains the one with pairs: the same voltages, innovations and estimate."""
-    pair = make("reduced", noise_floor=2e-4)
-    free = make("reduced", CURRENTS)
-    for env in (pair, free):
-        env.reset(seed=2)
-    for action in some_pairs()[:3]:
-        currents = np.zeros(16, dtype=np.float32)
-        currents[electrode_pairs(16)[action]] = 1.0, -1.0
-        a, b = pair.step(int(action))[0], free.step(currents)[0]
-        for key, array in a.items():
-            np.testing.assert_allclose(b[key], array, rtol=1e-5, atol=1e-5, err_msg=key)
-
-
-def test_budget_is_spent_and_then_nothing_flows():
-    """Only injections count; without one, or beyond the budget, nothing is learnt and uncertainty grows."""
-    env = make("reduced", BUDGET, budget=2, longer={"scored_steps": 8})
-    observation, _ = env.reset(seed=1)
-    left = [observation["left"][1]]
-    for action in (120, 7, 120, 33, 40, 41):
-        before, (observation, *_) = observation, env.step(action)
-        left.append(observation["left"][1])
-        flowed = action != 120 and left[-2] > 0
-        assert observation["currents"].any() == flowed and observation["voltages"].any() == flowed
-        assert observation["innovations"].any() == flowed
-        if not flowed:
-            assert observation["std"].sum() > before["std"].sum()
-        masks = env.unwrapped.action_masks()
-        assert masks[120] and (masks[:120] == (left[-1] > 0)).all()
-    assert left == [2, 2, 1, 1, 0, 0, 0]
-
-
-def test_dead_electrodes_read_nothing_and_carry_nothing():
-    """A broken wire reads interference; what would have to pass it does not flow; all else is 𝓡 I."""
-    instrument = Instrument(dead=(3, 3), failing=(2, 2), loose=(2, 2), interference=0.5)
-    rng = np.random.default_rng(0)
-    faults = instrument.draw(rng, 16, 50)
-    broken = faults.broken_from
-    assert (broken == 0).sum() == 3 and ((broken > 0) & (broken <= 50)).sum() == 2
-    assert (faults.resistance > 0).sum() == 2
-    assert not ((faults.resistance > 0) & (broken <= 50)).any()
-    root = rng.normal(size=(16, 16))
-    R, noise = root @ root.T, Pipe2D().noise
-    stacked = Faults(*(part[None] for part in faults))
-    zero, draws = np.zeros((1, 16)), rng.normal(size=(1, 16))
-    sound = np.flatnonzero(broken > 50)
-    i, j = sound[:2]
-    currents = np.zeros((1, 16))
-    currents[0, [i, j]] = 0.1, -0.1
-    wanted = R @ currents[0] + faults.resistance * currents[0]
-    read = instrument.measure(stacked, 50, noise, R[None], currents, zero)[0]
-    np.testing.assert_allclose(read[sound], wanted[sound], rtol=1e-14)
-    assert not read[broken <= 50].any()
-    noisy = instrument.measure(stacked, 50, noise, R[None], currents, draws)[0]
-    np.testing.assert_allclose(noisy[broken <= 50], 0.5 * draws[0, broken <= 50])
-    np.testing.assert_allclose((noisy - read)[sound], (noise.std(wanted) * faults.noise_factor * draws[0])[sound])
-    late = int(np.flatnonzero((broken > 0) & (broken <= 50))[0])
-    currents[0] = 0.0
-    currents[0, [i, late]] = 0.1, -0.1
-    assert instrument.measure(stacked, broken[late] - 1, noise, R[None], currents, zero)[0, i] != 0.0
-    assert not instrument.measure(stacked, broken[late], noise, R[None], currents, zero).any()
-
-
-def test_faults_depend_on_the_seed_alone_and_are_shown_by_doubt():
-    """The same seed has the same faults; electrodes in doubt after a while of injections are those with a fault."""
-    env = make("reduced", FAULTS, dead=[3, 3], failing=[0, 0], loose=[0, 0], longer={"scored_steps": 24})
-    base = env.unwrapped
-    steps = play(env, 4, some_pairs())
-    broken = np.flatnonzero(base._core._faults.broken_from[0] == 0)
-    again = play(env, 4, some_pairs())
-    assert all((a[0]["voltages"] == b[0]["voltages"]).all() for a, b in zip(steps, again, strict=True))
-    assert set(np.flatnonzero(steps[-1][0]["doubt"][0] > 0.5)) <= set(broken)
-    assert len(broken) == 3 and steps[-1][0]["doubt"][0][broken].mean() > 0.3
-    env.reset(seed=5)
-    assert set(np.flatnonzero(base._core._faults.broken_from[0] == 0)) != set(broken)
-
-
 @pytest.mark.parametrize(("change", "message"), [
     ({"estimator": "exact"}, "estimator must be one of reduced, full, none, got 'exact'"),
     ({"observation": "tidy"}, "observation must be one of scaled, raw"), ({"episodes": 0}, "episodes must"),
@@ -349,16 +218,6 @@ def test_wrong_arguments_are_named(change, message):
     """A wrong argument is named before anything is computed."""
     with pytest.raises(ValueError, match=message):
         gym.make(NAME, **change)
-
-
-@pytest.mark.parametrize(("name", "change", "message"), [
-    (FAULTS, {"dead": [3, 2]}, "dead must be a range least ≤ most"), (FAULTS, {"failing": [1]}, "failing must be a"),
-    (FAULTS, {"loose": [0, 12]}, "must leave two electrodes sound"), (BUDGET, {"budget": -1}, "budget must be"),
-])
-def test_wrong_rules_are_named(name, change, message):
-    """Of faults and budgets too."""
-    with pytest.raises(ValueError, match=message):
-        gym.make(name, **change)
 
 
 def test_wrong_actions_are_named():

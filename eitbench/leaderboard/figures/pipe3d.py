@@ -35,7 +35,7 @@ def fig5_10(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
             row[3 + k].set_ylabel("y / cm" if k == 0 else "")
             row[3 + k].tick_params(labelbottom=number == len(times), labelleft=k == 0)
         row[0].text(-0.02, 0.5, milliseconds(env, t), transform=row[0].transAxes, ha="right", va="center", fontsize=10)
-    for k, title in enumerate(("truth", "Kalman filter", "fixed-interval smoother")):
+    for k, title in enumerate(("truth", "Kalman filter", "smoother")):
         axes[0, k].set_title(title, fontsize=11)
         axes[0, 3 + k].set_title(f"{title}, slice x = 0", fontsize=11)
         axes[-1, 3 + k].set_xlabel("z / cm")

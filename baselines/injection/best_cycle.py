@@ -1,0 +1,31 @@
+"""Best cycle: up to four pairs in turn, the best of a search on training episodes; a budget is spread evenly."""
+
+from itertools import cycle
+from typing import Any
+
+import numpy as np
+
+from eitbench.envs.injection_core import Rules
+
+
+class Policy:
+    # Found by `python benchmarks/search_injections.py`; electrodes by world.
+    parameters: dict[str, Any] = {  # noqa: RUF012
+        "cycle": {"Pipe2D": [[0, 8]], "Pipe2D with faults": [[8, 11], [0, 4], [2, 8], [0, 14]],
+                  "Pipe2DIntermittent with a budget": [[0, 10]]},
+        "environment_steps": {"Pipe2D": 346_368, "Pipe2D with faults": 608_768,
+                              "Pipe2DIntermittent with a budget": 768_768}}
+
+    @classmethod
+    def suits(cls, rules: Rules) -> bool:
+        pairs = rules.pairs.tolist()
+        return rules.world in cls.parameters["cycle"] and all(
+            pair in pairs for pair in cls.parameters["cycle"][rules.world])
+
+    def __init__(self, rules: Rules, random: np.random.Generator) -> None:
+        pairs = rules.pairs.tolist()
+        self.rules, self.cycle = rules, cycle(pairs.index(pair) for pair in self.parameters["cycle"][rules.world])
+
+    def act(self, observation: dict[str, np.ndarray]) -> Any:
+        now = self.rules.spaced(observation["left"])
+        return self.rules.action(next(self.cycle) if now else None)

@@ -1,0 +1,25 @@
+"""Best fixed pair: the same one at every step, the best of all on training episodes; a budget is spread evenly."""
+
+from typing import Any
+
+import numpy as np
+
+from eitbench.envs.injection_core import Rules
+
+
+class Policy:
+    # Found by `python benchmarks/search_injections.py`; electrodes by world.
+    parameters: dict[str, Any] = {  # noqa: RUF012
+        "pair": {"Pipe2D": [0, 8], "Pipe2D with faults": [0, 8], "Pipe2DIntermittent with a budget": [0, 10]},
+        "environment_steps": {"Pipe2D": 314_880, "Pipe2D with faults": 314_880,
+                              "Pipe2DIntermittent with a budget": 698_880}}
+
+    @classmethod
+    def suits(cls, rules: Rules) -> bool:
+        return cls.parameters["pair"].get(rules.world) in rules.pairs.tolist()
+
+    def __init__(self, rules: Rules, random: np.random.Generator) -> None:
+        self.rules, self.pair = rules, rules.pairs.tolist().index(self.parameters["pair"][rules.world])
+
+    def act(self, observation: dict[str, np.ndarray]) -> Any:
+        return self.rules.action(self.pair if self.rules.spaced(observation["left"]) else None)

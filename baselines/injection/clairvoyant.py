@@ -1,0 +1,69 @@
+"""Clairvoyant: knows what is broken and what flows through the pipe; a bound for the others.
+
+It plays a few plans ahead on the very episode and then follows the best of them: greedy A-optimal among the electrodes
+that are sound, each of a few fixed pairs, and, where there is a budget, injecting when its true error is large.
+"""
+
+from itertools import product
+from typing import Any
+
+import numpy as np
+
+from eitbench.envs.belief import Belief
+from eitbench.envs.injection_core import InjectionCore, Rules
+
+NOTHING = -1
+
+
+class Policy:
+    privileged = True
+    parameters: dict[str, Any] = {"fixed_pairs": [[0, 8], [0, 10]], "thresholds": [1e-4, 3e-2, 16],  # noqa: RUF012
+                                  "intervals": [1, 2, 3]}
+
+    def __init__(self, rules: Rules, random: np.random.Generator, core: InjectionCore) -> None:
+        self.rules, self.core = rules, core
+        pairs, every = rules.pairs.tolist(), np.ones(core.length, dtype=int)
+        fixed = [pairs.index(pair) for pair in self.parameters["fixed_pairs"] if pair in pairs]
+        if rules.budget is None:
+            errors, plans = self.ahead(np.array([self.greedy(), *(pair * every for pair in fixed)]))
+        else:
+            first, last, count = self.parameters["thresholds"]
+            tried = product(fixed, np.geomspace(first, last, count), self.parameters["intervals"])
+            pair, threshold, interval = (np.array(part) for part in zip(*tried, strict=True))
+            errors, plans = self.ahead(pair[:, None] * every, threshold, interval)
+        self.plan = iter(plans[errors.argmin()].tolist())
+
+    def act(self, observation: dict[str, np.ndarray]) -> Any:
+        pair = next(self.plan)
+        return self.rules.action(None if pair == NOTHING else pair)
+
+    def greedy(self) -> np.ndarray:
+        """(steps,) pairs after which the variance is least, of electrodes without a fault."""
+        core = self.core
+        belief, covariance = Belief(self.rules, {name: array[0] for name, array in core.observe().items()}), None
+        plan = np.empty(core.length, dtype=int)
+        for k in range(core.length):
+            sound = (core.t + k + 1 < core.faults.broken_from[0]) & (core.faults.resistance[0] == 0.0)
+            predicted = belief.predicted(covariance)
+            plan[k] = belief.gains(predicted, sound)[0].argmax()
+            covariance = belief.after(predicted, plan[k], sound)
+        return plan
+
+    def ahead(self, plans: np.ndarray, threshold: np.ndarray | None = None, interval: np.ndarray | None = None,
+              ) -> tuple[np.ndarray, np.ndarray]:
+        """Play plans (B, steps) side by side: mean errors (B,) and what was injected (B, steps).
+
+        With a ``threshold`` (B,) nothing is injected while the true error lies below, nor before the ``interval`` (B,)
+        from the last injection is over.
+        """
+        twin, plans, errors = InjectionCore(self.rules, "reduced"), plans.copy(), []
+        twin.begin(self.core.seeds * len(plans))
+        last = np.full(len(plans), -twin.length)
+        for k in range(twin.length):
+            if threshold is not None:
+                silent = ~(twin.errors() > threshold) | (k < last + interval) | (twin.spent >= self.rules.budget)
+                plans[silent, k] = NOTHING
+                last[~silent] = k
+            twin.act(np.array([self.rules.action(None if pair == NOTHING else pair) for pair in plans[:, k]]))
+            errors.append(twin.errors())
+        return np.nanmean(errors, axis=0), plans

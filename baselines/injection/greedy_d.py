@@ -1,0 +1,21 @@
+"""Greedy, D-optimal: the pair that tells most bits, linear about the estimate; a budget is spread evenly."""
+
+from typing import Any
+
+import numpy as np
+
+from eitbench.envs.belief import Belief
+from eitbench.envs.injection_core import Rules
+
+
+class Policy:
+    def __init__(self, rules: Rules, random: np.random.Generator) -> None:
+        self.rules = rules
+        self.belief: Belief | None = None
+
+    def act(self, observation: dict[str, np.ndarray]) -> Any:
+        self.belief = Belief.follow(self.belief, self.rules, observation)
+        if not self.rules.spaced(observation["left"]):
+            return self.rules.action(None)
+        gains = self.belief.gains(self.belief.predicted(), derivative=self.belief.relinearised())[1]
+        return self.rules.action(int(gains.argmax()))

@@ -1,0 +1,19 @@
+"""Opposite pairs: round-robin straight across the vessel; a budget is spread evenly."""
+
+from itertools import cycle
+from typing import Any
+
+import numpy as np
+
+from eitbench.envs.injection_core import Rules
+
+
+class Policy:
+    def __init__(self, rules: Rules, random: np.random.Generator) -> None:
+        self.rules, L = rules, rules.scenario.currents.shape[1]
+        numbers = {frozenset(pair): k for k, pair in enumerate(rules.pairs.tolist())}
+        self.cycle = cycle(numbers[frozenset(pair)] for pair in ((i, i + L // 2) for i in range(L // 2)))
+
+    def act(self, observation: dict[str, np.ndarray]) -> Any:
+        now = self.rules.spaced(observation["left"])
+        return self.rules.action(next(self.cycle) if now else None)

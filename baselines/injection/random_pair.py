@@ -1,0 +1,17 @@
+"""Random pair: any of all pairs, each with the same probability; a budget is spread evenly."""
+
+from typing import Any
+
+import numpy as np
+
+from eitbench.envs.injection_core import Rules
+
+
+class Policy:
+    def __init__(self, rules: Rules, random: np.random.Generator) -> None:
+        self.rules, self.random = rules, random
+
+    def act(self, observation: dict[str, np.ndarray]) -> Any:
+        if not self.rules.spaced(observation["left"]):
+            return self.rules.action(None)
+        return self.rules.action(int(self.random.integers(len(self.rules.pairs))))

@@ -1,0 +1,60 @@
+"""Offline schedule: every injection chosen beforehand, for the least variances by the model alone.
+
+Greedy first, then, step by step, exchange for a better one; where there is a budget injections move in time, too. The
+variances of the model do not depend on what will be measured.
+"""
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from eitbench.envs.belief import Belief
+from eitbench.envs.injection_core import Rules
+
+CANDIDATES, SWEEPS, AFTERWARDS = 6, 2, 16
+"""Pairs that are tried at a step, how often all steps are gone through, and steps on which an exchange is judged."""
+
+
+class Policy:
+    parameters: dict[str, Any] = {"candidates": CANDIDATES, "sweeps": SWEEPS, "afterwards": AFTERWARDS}  # noqa: RUF012
+
+    def __init__(self, rules: Rules, random: np.random.Generator) -> None:
+        self.rules, self.plan = rules, iter(plan_of(rules))
+
+    def act(self, observation: dict[str, np.ndarray]) -> Any:
+        return self.rules.action(next(self.plan))
+
+
+@lru_cache(maxsize=8)
+def plan_of(rules: Rules) -> tuple[int | None, ...]:
+    """The pair of each step, None for no injection."""
+    belief = Belief.beforehand(rules)
+    steps = rules.scenario.n_steps - len(rules.scenario.currents)
+    plan: list[int | None] = [-1 if rules.spaced(np.array([steps - k])) else None for k in range(steps)]
+    states: list[np.ndarray | None] = [None] * (steps + 1)     # before each step; None is the one after the first frame
+
+    def follow(covariance: np.ndarray | None, pair: int | None) -> np.ndarray:
+        predicted = belief.predicted(covariance)
+        return predicted if pair is None else belief.after(predicted, pair)
+
+    def cost(k: int, pairs: list[int | None]) -> float:
+        covariance, total = states[k], 0.0
+        for pair in pairs + plan[k + len(pairs):k + AFTERWARDS]:
+            covariance = follow(covariance, pair)
+            total += covariance.trace()
+        return total
+
+    for sweep in range(1 + SWEEPS):
+        for k in range(steps):
+            if plan[k] is not None:
+                best = np.argsort(-belief.gains(belief.predicted(states[k]))[0])[:CANDIDATES].tolist()
+                if sweep == 0:
+                    plan[k] = best[0]
+                else:
+                    plan[k] = min([plan[k], *best], key=lambda pair: cost(k, [pair]))
+            if sweep and k + 1 < steps and (plan[k] is None) != (plan[k + 1] is None):
+                here, there = plan[k:k + 2]
+                plan[k:k + 2] = min(((here, there), (there, here)), key=lambda two: cost(k, [*two]))
+            states[k + 1] = follow(states[k], plan[k])
+    return tuple(plan)

@@ -1,0 +1,23 @@
+"""Transverse pairs: round-robin aslant across the pipe; a budget is spread evenly."""
+
+from itertools import cycle
+from typing import Any
+
+import numpy as np
+
+from eitbench.envs.injection_core import Rules
+
+DOWN = 3
+"""Electrodes by which the current leaves further down than it enters."""
+
+
+class Policy:
+    def __init__(self, rules: Rules, random: np.random.Generator) -> None:
+        self.rules, L = rules, rules.scenario.currents.shape[1]
+        half = L // 2
+        numbers = {frozenset(pair): k for k, pair in enumerate(rules.pairs.tolist())}
+        self.cycle = cycle(numbers[frozenset(pair)] for pair in ((i, half + (i + DOWN) % half) for i in range(half)))
+
+    def act(self, observation: dict[str, np.ndarray]) -> Any:
+        now = self.rules.spaced(observation["left"])
+        return self.rules.action(next(self.cycle) if now else None)

@@ -1,0 +1,136 @@
+"""What an injection policy may believe: the filter inside the environment, followed from outside in reduced order."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from eitbench.envs.operator import levels_of
+from eitbench.envs.reduced_operator import ReducedOperator
+from eitbench.estimation.design import pair_gains
+
+if TYPE_CHECKING:
+    from eitbench.envs.estimation import Observation
+    from eitbench.envs.injection_core import Rules
+
+DOUBTFUL = 0.35
+"""Share of recent readings, or injections, not believed from which on an electrode is taken for broken."""
+
+
+class Belief:
+    """The covariance of what the environment's filter knows, and what each injection would teach it.
+
+    It is made at the first observation of an episode and is shown every later one; all from raw observations. The state
+    is reduced (120 coordinates), in parts of the level, with the mass matrix as the identity: the trace of its
+    covariance is the expected squared error, integrated.
+
+    Parameters
+    ----------
+    rules : Rules
+        Of the environment.
+    observation : dict
+        The first one.
+    """
+
+    def __init__(self, rules: Rules, observation: Observation) -> None:
+        self.rules = rules
+        self._operator = ReducedOperator(rules.scenario, observation["frame"][None], gate=rules.gate,
+                                         noise_floor=rules.instrument.noise_floor)
+        self.doubt = observation["doubt"]
+
+    @classmethod
+    def beforehand(cls, rules: Rules) -> Belief:
+        """Before any episode: as if a first frame without fault or noise had been measured in the expected liquid."""
+        frame = rules.scenario.currents @ levels_of(rules.scenario).linearised(0).resistance
+        return cls(rules, {"frame": frame, "doubt": np.zeros((2, frame.shape[1]))})
+
+    @classmethod
+    def follow(cls, belief: Belief | None, rules: Rules, observation: Observation) -> Belief:
+        """One more observation: the first of an episode makes a belief, which is then shown the others."""
+        if belief is None:
+            return cls(rules, observation)
+        belief.see(observation)
+        return belief
+
+    def see(self, observation: Observation) -> None:
+        """Take in the outcome of the last injection."""
+        self._operator.assimilate(observation["voltages"][None], observation["currents"][None])
+        self.doubt = observation["doubt"]
+
+    @property
+    def mean(self) -> np.ndarray:
+        """(n,) estimate in mol/m³ at the nodes of the task's mesh."""
+        return self._operator.means()[0]
+
+    @property
+    def sound(self) -> np.ndarray:
+        """(L,) bool; electrodes that recent readings and injections give no reason to doubt."""
+        return np.asarray((self.doubt < DOUBTFUL).all(axis=0))
+
+    def predicted(self, covariance: np.ndarray | None = None) -> np.ndarray:
+        """(r, r) covariance one step on, before its measurement; from the present one or another."""
+        model = self._operator.model
+        now = self._operator.covariance[0].astype(float) if covariance is None else covariance
+        return model.transition @ now @ model.transition.T + model.noise
+
+    def gains(self, covariance: np.ndarray, sound: np.ndarray | None = None, derivative: np.ndarray | None = None,
+              ) -> tuple[np.ndarray, np.ndarray]:
+        """What each pair would teach about a state with this covariance: `pair_gains`, (pairs,) each.
+
+        Of electrodes that are not ``sound`` no reading counts, and pairs with one of them teach nothing. ``derivative``
+        is that about the level, or another, such as `relinearised`.
+        """
+        L = self.rules.pairs.max() + 1
+        D = (self.derivative if derivative is None else derivative).reshape(L * L, -1)
+        DP = D @ covariance
+        variance = self._noise_variance
+        if sound is not None:
+            variance = np.where(sound, variance, np.inf)
+        gains = pair_gains((DP @ D.T).reshape(L, L, L, L), (DP @ DP.T).reshape(L, L, L, L), self.rules.pairs, variance)
+        if sound is not None:
+            usable = sound[self.rules.pairs].all(axis=1)
+            gains = gains[0] * usable, gains[1] * usable
+        return gains
+
+    def after(self, covariance: np.ndarray, pair: int, sound: np.ndarray | None = None) -> np.ndarray:
+        """(r, r) covariance once this pair has been injected into a state with ``covariance``."""
+        i, j = self.rules.pairs[pair]
+        variance = self._noise_variance[pair]
+        matrix = (self.derivative[i] - self.derivative[j]) / np.sqrt(variance)[:, None]
+        if sound is not None:
+            if not sound[[i, j]].all():
+                return covariance
+            matrix = matrix[sound]
+        cross = matrix @ covariance
+        root = np.linalg.cholesky(cross @ matrix.T + np.eye(len(matrix)))
+        learnt = np.linalg.solve(root, cross)
+        return covariance - learnt.T @ learnt
+
+    @property
+    def derivative(self) -> np.ndarray:
+        """(L, L, r) of 𝓡 by the state, about the level."""
+        return self._operator.levels[0].derivative.astype(float)
+
+    def relinearised(self) -> np.ndarray:
+        """(L, L, r) of 𝓡 by the state, about the present estimate; some 10 ms."""
+        levels = levels_of(self.rules.scenario)
+        positive = np.maximum(self.mean, 0.1 * self._operator.concentration[0])     # a conductivity is
+        _, table = levels.task.observation.resistance_derivatives(positive)
+        return self._operator.concentration[0] * np.tensordot(table, self._operator.model.basis, axes=(0, 0))
+
+    @property
+    def _noise_variance(self) -> np.ndarray:
+        level = self._operator.levels[0]
+        return _noise_variance(self.rules, level.concentration, level.resistance.tobytes())
+
+
+@lru_cache(maxsize=64)
+def _noise_variance(rules: Rules, concentration: float, resistance: bytes) -> np.ndarray:
+    """(pairs, L) of the voltages of each pair, per current squared."""
+    i, j = rules.pairs.T
+    R = np.frombuffer(resistance).reshape(rules.pairs.max() + 1, -1)
+    levels = levels_of(rules.scenario)
+    std = [levels.noise_std(rules.amplitude * column, rules.instrument.noise_floor) for column in R[i] - R[j]]
+    return (np.array(std) / rules.amplitude)**2

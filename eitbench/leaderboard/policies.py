@@ -1,0 +1,199 @@
+"""Find, load and play injection policies: one Python file each, with a class `Policy`."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import json
+import re
+import sys
+import time
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
+
+import gymnasium as gym
+import numpy as np
+from tqdm import tqdm
+
+from eitbench._parallel import in_parallel
+from eitbench.envs import INJECTION
+from eitbench.envs.injection import InjectionEnv
+from eitbench.envs.injection_core import Rules
+from eitbench.leaderboard.baselines import baseline_folder
+from eitbench.seeds import name_seed
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+class PolicyFile(NamedTuple):
+    """A loaded policy file."""
+
+    name: str
+    """Name of the file without its suffix."""
+    title: str
+    """First line of its docstring, up to a colon, bracket or full stop."""
+    path: Path
+    sha256: str
+    privileged: bool    # shown the truth: a bound for the others, not one of them
+    parameters: dict[str, Any]
+    policy: type[Any]
+    """Policy(rules, random), if privileged Policy(rules, random, core), with act(observation) -> action."""
+
+    def suits(self, rules: Rules) -> bool:
+        """Whether it can play in this world; a policy without a word on that plays in all."""
+        judge = getattr(self.policy, "suits", None)
+        return judge is None or bool(judge(rules))
+
+
+def policy_folder() -> Path:
+    """Where our own policies lie."""
+    return baseline_folder() / "injection"
+
+
+def own_policies() -> list[str]:
+    """Names of our own policies."""
+    return sorted(path.stem for path in policy_folder().glob("*.py"))
+
+
+def load_policy(name: str) -> PolicyFile:
+    """Load one of our policies by name, or anybody's by the path of its file.
+
+    Raises
+    ------
+    ValueError
+        If there is no such policy, or its file has no class `Policy` with an `act` method.
+    """
+    path = Path(name) if name.endswith(".py") else policy_folder() / f"{name}.py"
+    if not path.is_file():
+        raise ValueError(f"policy must be a path to a .py file or one of {', '.join(own_policies())}; got {name!r}")
+    if path.stem in own_policies() and not path.samefile(policy_folder() / path.name):
+        raise ValueError(f"policy {path} has the name of one of ours, under which results are kept; rename it")
+    return _load(path, path.read_bytes())
+
+
+@lru_cache(maxsize=64)
+def _load(path: Path, source: bytes) -> PolicyFile:
+    """The file with this content, executed once a process."""
+    specification = importlib.util.spec_from_file_location(f"eitbench_policy_{path.stem}", path)
+    assert specification is not None
+    module = importlib.util.module_from_spec(specification)
+    sys.modules[specification.name] = module                       # dataclasses look their module up
+    try:
+        exec(compile(source, path, "exec"), module.__dict__)  # a cached .pyc may lag behind an edit by a second
+    except Exception as error:
+        raise ValueError(f"policy {path} cannot be loaded: {type(error).__name__}: {error}") from error
+    policy = getattr(module, "Policy", None)
+    if not isinstance(policy, type) or not callable(getattr(policy, "act", None)):
+        raise ValueError(f"policy {path} must define a class Policy with a method act(observation)")
+    privileged = getattr(policy, "privileged", False)
+    if not isinstance(privileged, bool):
+        raise ValueError(f"policy {path}: Policy.privileged must be True or False, got {privileged!r}")
+    parameters = getattr(policy, "parameters", {})
+    try:
+        json.dumps(parameters := dict(parameters), allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"policy {path}: Policy.parameters must be a dict fit for JSON: {error}") from None
+    title = re.split(r"[:(.]", f"{(module.__doc__ or '').strip()}\n".splitlines()[0])[0].strip() or path.stem
+    return PolicyFile(path.stem, title, path, hashlib.sha256(source).hexdigest(), privileged, parameters, policy)
+
+
+def play(env_id: str, kwargs: dict[str, Any], policy: str, seed: int, estimator: str = "full") -> dict[str, Any]:
+    """Play one episode.
+
+    Parameters
+    ----------
+    env_id, kwargs
+        One of `INJECTION`, and arguments for it.
+    policy : str
+        Name or path.
+    estimator : "full" or "reduced"
+        The exact filter, for scores, or the one of training.
+
+    Returns
+    -------
+    dict
+        error : ẽ_c (5.12), the mean over scored states; errors : of each; spent : the agent's injections;
+        seconds_per_step : of the policy, what it prepares included.
+
+    Raises
+    ------
+    ValueError
+        If there is no such environment or policy, or the policy does not suit it or acts wrongly.
+    """
+    env, loaded = _environment(env_id, json.dumps(kwargs), estimator), load_policy(policy)
+    if not loaded.suits(env.rules):
+        raise ValueError(f"policy {loaded.name} does not suit {env_id}")
+    observation, done = env.reset(seed=seed)[0], False
+    # The fifth of an episode's streams; three made the recording, the fourth its faults.
+    random = np.random.default_rng(np.random.SeedSequence(seed).spawn(5)[4])
+    begin = time.perf_counter()
+    player = loaded.policy(env.rules, random, *[env.core] * loaded.privileged)
+    seconds, spent, errors = time.perf_counter() - begin, 0, list[float]()
+    while not done:
+        begin = time.perf_counter()
+        action = player.act(observation)
+        seconds += time.perf_counter() - begin
+        observation, _, done, _, _ = env.step(action)
+        spent += bool(observation["currents"].any())
+        errors += [] if env.error is None else [env.error]
+    return {"error": float(np.mean(errors)), "errors": errors, "spent": spent,
+            "seconds_per_step": seconds / env.core.length}
+
+
+@lru_cache(maxsize=4)
+def _environment(env_id: str, kwargs: str, estimator: str) -> InjectionEnv:
+    """Made once a process, so that its models are shared by all episodes."""
+    if env_id not in INJECTION:
+        raise ValueError(f"env must be one of {', '.join(INJECTION)}; got {env_id!r}")
+    if estimator not in ("full", "reduced"):
+        raise ValueError(f"estimator must be 'full' or 'reduced', got {estimator!r}")
+    env = gym.make(env_id, disable_env_checker=True, observation="raw", estimator=estimator, **json.loads(kwargs))
+    return cast(InjectionEnv, env.unwrapped)
+
+
+def evaluate(env_id: str, kwargs: dict[str, Any], policies: Sequence[str], seeds: Sequence[int],
+             estimator: str = "full", n_jobs: int = 1) -> pd.DataFrame:
+    """Play all policies on all episodes, in ``n_jobs`` processes: a row each, in this order, with policy, seed and what
+    `play` returns but for ``errors``."""
+    import pandas as pd
+    jobs = [(env_id, kwargs, policy, seed, estimator) for policy in policies for seed in seeds]
+    played = in_parallel(_row, jobs, n_jobs)
+    rows = dict(tqdm(played, total=len(jobs), desc="playing policies", unit="episode", disable=None))
+    return pd.DataFrame([rows[policy, seed] for policy in policies for seed in seeds])
+
+
+def _row(env_id: str, kwargs: dict, policy: str, seed: int, estimator: str) -> tuple[tuple[str, int], dict[str, Any]]:
+    played = play(env_id, kwargs, policy, seed, estimator)
+    del played["errors"]
+    return (policy, seed), {"policy": load_policy(policy).name, "seed": name_seed(seed), **played}
+
+
+def adaptivity_gap(table: pd.DataFrame, open_loop: Sequence[str]) -> tuple[float, float, float]:
+    """(best open-loop − clairvoyant) / (random − clairvoyant), mean errors each, with its 95 % bootstrap interval.
+
+    Parameters
+    ----------
+    table : DataFrame
+        From `evaluate`, with the policies clairvoyant, random_pair and ``open_loop``, all on the same episodes.
+    open_loop : sequence of str
+        Names; the one of them with the least mean error counts.
+
+    Returns
+    -------
+    gap, low, high
+    """
+    errors = table.pivot(index="seed", columns="policy", values="error")
+    needed = ["clairvoyant", "random_pair", *open_loop]
+    if not open_loop or set(needed) - set(errors) or errors[needed].isna().to_numpy().any():
+        raise ValueError("table must hold clairvoyant, random_pair and some open-loop policies on the same episodes; "
+                         f"got {', '.join(map(str, errors))}")
+    best = errors[list(open_loop)].mean().idxmin()
+    three = errors[[best, "random_pair", "clairvoyant"]].to_numpy()
+    drawn = np.random.default_rng(0).integers(len(three), size=(10_000, len(three)))
+    means = np.concatenate([three.mean(axis=0)[None], three[drawn].mean(axis=1)])
+    gaps = (means[:, 0] - means[:, 2]) / (means[:, 1] - means[:, 2])
+    low, high = np.percentile(gaps[1:], [2.5, 97.5])
+    return float(gaps[0]), float(low), float(high)

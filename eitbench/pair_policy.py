@@ -1,0 +1,65 @@
+"""Networks for choosing electrode pairs: an electrode's worth is shared by all the pairs it belongs to.
+
+A plain network has to learn 120 times that an electrode is dead; here a pair's logit is the sum of what its two
+electrodes are worth as source and as sink, and of a part of its own.
+"""
+
+from __future__ import annotations
+
+from itertools import combinations
+from typing import Any
+
+import torch
+from sb3_contrib.common.maskable.policies import MaskableActorCriticPolicy
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.type_aliases import Schedule
+from torch import nn
+
+
+class PairLogits(nn.Module):
+    """Logits of all pairs of L electrodes, and of further actions, from h features; the pairs' own part begins at zero.
+
+    Parameters
+    ----------
+    features, actions : int
+        h, and how many actions there are: L(L−1)/2 pairs and perhaps one more, no injection.
+    """
+
+    incidence: torch.Tensor
+
+    def __init__(self, features: int, actions: int) -> None:
+        super().__init__()
+        electrodes = int((1 + (1 + 8 * actions)**0.5) / 2)
+        incidence = torch.zeros(actions, 2 * electrodes)
+        for k, (i, j) in enumerate(combinations(range(electrodes), 2)):
+            incidence[k, i] = incidence[k, electrodes + j] = 1.0
+        self.register_buffer("incidence", incidence)
+        self.worth, self.own = nn.Linear(features, 2 * electrodes), nn.Linear(features, actions)
+        for layer in (self.worth, self.own):
+            nn.init.orthogonal_(layer.weight, gain=0.01)
+            nn.init.zeros_(layer.bias)
+
+    def forward(self, features: torch.Tensor) -> torch.Tensor:
+        logits: torch.Tensor = self.worth(features) @ self.incidence.T + self.own(features)
+        return logits
+
+
+class PairPolicy(ActorCriticPolicy):
+    """For PPO."""
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        super()._build(lr_schedule)
+        _with_pairs(self, lr_schedule)
+
+
+class MaskablePairPolicy(MaskableActorCriticPolicy):
+    """For PPO with masks."""
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        super()._build(lr_schedule)
+        _with_pairs(self, lr_schedule)
+
+
+def _with_pairs(policy: Any, lr_schedule: Schedule) -> None:
+    policy.action_net = PairLogits(policy.mlp_extractor.latent_dim_pi, int(policy.action_space.n))
+    policy.optimizer = policy.optimizer_class(policy.parameters(), lr=lr_schedule(1), **policy.optimizer_kwargs)

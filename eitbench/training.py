@@ -1,0 +1,257 @@
+"""Train an agent to choose injections with stable-baselines3; interrupted, it goes on from its last checkpoint.
+
+A configuration is a YAML file such as those in ``baselines/rl/``. A run leaves in its folder: ``config.json`` (what was
+asked for), ``model.zip`` (the agent), ``monitor.csv`` (one row a training episode), ``evaluations.npz`` (scores on dev
+episodes over time), ``sha256`` of the model, and TensorBoard's logs.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from gymnasium import spaces
+from sb3_contrib import MaskablePPO, RecurrentPPO
+from stable_baselines3 import DQN, PPO, SAC
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.vec_env import VecEnv, VecMonitor
+from tqdm import tqdm
+
+from eitbench import _check
+from eitbench._files import write_atomically
+from eitbench.envs.injection import InjectionVectorEnv
+from eitbench.envs.sb3 import InjectionVecEnv
+from eitbench.imitation import check_imitation, imitate
+from eitbench.pair_policy import MaskablePairPolicy, PairPolicy
+from eitbench.seeds import SPLITS
+
+ALGORITHMS = ("ppo", "dqn", "sac", "recurrent_ppo", "maskable_ppo")
+
+
+@dataclass(frozen=True)
+class Config:
+    """What a configuration file may say."""
+
+    total_steps: int
+    """environment steps, all environments together"""
+    n_envs: int = 16
+    """environments side by side"""
+    interval: int = 50_000
+    """steps between two checkpoints, at which the agent is evaluated too"""
+    evaluation_episodes: int = 32
+    """dev episodes of an evaluation"""
+    episodes: int = 1000
+    """training episodes"""
+    reward_scale: float = 100.0
+    """factor of the rewards"""
+    hidden: tuple[int, ...] = (256, 256)
+    """units of the networks' hidden layers"""
+    algorithm: dict[str, Any] = field(default_factory=dict)
+    """passed on to stable-baselines3"""
+    imitate: dict[str, Any] = field(default_factory=dict)
+    """what to learn from before reinforcement: ``teacher``, ``episodes``, … (`eitbench.imitation`)"""
+
+    def __post_init__(self) -> None:
+        for name in ("total_steps", "n_envs", "interval", "evaluation_episodes", "episodes"):
+            _check.integer(name, getattr(self, name), low=0 if name == "total_steps" else 1)
+        _check.number("reward_scale", self.reward_scale, low=0.0, open_low=True)
+
+
+def read_config(path: str | Path) -> Config:
+    """The configuration in a YAML file; ``ValueError`` if there is none or an entry is unknown."""
+    import yaml
+    try:
+        content = yaml.safe_load(Path(path).read_text())
+    except (OSError, yaml.YAMLError) as error:
+        raise ValueError(f"config must be a YAML file, got {str(path)!r}: {error}") from None
+    known = Config.__dataclass_fields__
+    if not isinstance(content, dict) or not set(content) <= set(known):
+        raise ValueError(f"config {str(path)!r} must hold entries of {', '.join(known)}; got {content!r}")
+    entries: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value
+                               for name, value in content.items()}
+    return Config(**entries)
+
+
+def train(env: str, algo: str, config: Config, seed: int, folder: Path, kwargs: dict[str, Any] | None = None) -> Path:
+    """Train an agent; returns the path of its model.
+
+    Parameters
+    ----------
+    env : str
+        Id of an injection environment.
+    algo : str
+        One of `ALGORITHMS`.
+    config : Config
+    seed : int
+        Of the networks, the exploration and the choice of training episodes.
+    folder : Path
+        Where the run is kept; a run that was begun there with the same arguments is continued.
+    kwargs : dict, optional
+        Of the environment.
+    """
+    if algo not in ALGORITHMS:
+        raise ValueError(f"algo must be one of {', '.join(ALGORITHMS)}, got {algo!r}")
+    seed = _check.integer("seed", seed, low=0)
+    envs = vector_env(env, kwargs, config)
+    if config.imitate:
+        check_imitation(algo, config.imitate)
+    asked = {"env": env, "kwargs": kwargs or {}, "algo": algo, "seed": seed, "config": asdict(config)}
+    _begin_or_continue(folder, asked)
+    learning = VecMonitor(InjectionVecEnv(envs, reward_scale=config.reward_scale))
+    learning.seed(seed)
+    latest = folder / "latest.zip"
+    if latest.exists():
+        model = algorithm_of(algo).load(latest, env=learning, tensorboard_log=str(folder / "tensorboard"))
+    else:
+        model = _fresh(algo, config, learning, seed, folder)
+        if config.imitate:
+            assert isinstance(model, OnPolicyAlgorithm)
+            imitate(model, env, kwargs or {}, config.imitate, config.reward_scale, seed)
+        _save(model, latest)
+    evaluate = evaluation(env, kwargs, config)
+    left = config.total_steps - model.num_timesteps
+    if not (folder / "evaluations.npz").exists():
+        _append_evaluation(folder, model.num_timesteps, evaluate(model))
+    if left > 0:
+        model.learn(left, callback=_Checkpoints(folder, config, evaluate), reset_num_timesteps=False,
+                    tb_log_name="run")
+    _save(model, folder / "model.zip")
+    write_atomically(folder / "sha256", hashlib.sha256((folder / "model.zip").read_bytes()).hexdigest().encode())
+    latest.unlink()
+    return folder / "model.zip"
+
+
+def vector_env(env: str, kwargs: dict[str, Any] | None, config: Config, n_envs: int | None = None,
+               ) -> InjectionVectorEnv:
+    """The environments side by side; ``ValueError`` if ``env`` does not ask for injections."""
+    from eitbench.envs import INJECTION
+    if env not in INJECTION:
+        raise ValueError(f"env must be one of {', '.join(INJECTION)}; got {env!r}")
+    made = gym.make_vec(env, num_envs=n_envs or config.n_envs, vectorization_mode="vector_entry_point",
+                        episodes=config.episodes, **(kwargs or {}))
+    assert isinstance(made, InjectionVectorEnv)
+    return made
+
+
+def algorithm_of(name: str) -> Any:
+    """The class of one of `ALGORITHMS`."""
+    return {"ppo": PPO, "dqn": DQN, "sac": SAC, "recurrent_ppo": RecurrentPPO, "maskable_ppo": MaskablePPO}[name]
+
+
+def evaluation(env: str, kwargs: dict[str, Any] | None, config: Config) -> Callable[[BaseAlgorithm], np.ndarray]:
+    """A function that gives the ẽ_c of a model's deterministic actions in each of the first dev episodes, with the
+    filter of reduced order."""
+    envs = vector_env(env, kwargs, config, config.evaluation_episodes)
+    seeds = list(SPLITS["dev"])[:config.evaluation_episodes]
+
+    def evaluate(model: BaseAlgorithm) -> np.ndarray:
+        observation, _ = envs.reset(seed=seeds)  # type: ignore[arg-type]
+        state, starts, errors, ended = None, np.ones(len(seeds), dtype=bool), [], False
+        while not ended:
+            options = {"action_masks": envs.action_masks()} if _masked(model) else {}
+            actions, state = model.predict(observation, state=state, episode_start=starts, deterministic=True,  # type: ignore[call-arg]
+                                           **options)
+            starts = np.zeros(len(seeds), dtype=bool)
+            observation, _, done, _, _ = envs.step(actions)
+            errors.append(envs.errors())
+            ended = bool(done.all())
+        return np.nanmean(errors, axis=0)
+
+    return evaluate
+
+
+def _masked(model: BaseAlgorithm) -> bool:
+    return isinstance(model, MaskablePPO)
+
+
+def _begin_or_continue(folder: Path, asked: dict[str, Any]) -> None:
+    """Make the folder; ``ValueError`` if another run is kept there."""
+    asked = json.loads(json.dumps(asked))
+    path = folder / "config.json"
+    if path.exists():
+        there = json.loads(path.read_text())
+        if there != asked:
+            raise ValueError(f"out must be an empty folder or one of the same run; {folder} holds {there}")
+    folder.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, json.dumps(asked, indent=1).encode())
+
+
+def _fresh(algo: str, config: Config, learning: VecEnv, seed: int, folder: Path) -> BaseAlgorithm:
+    policy = {"ppo": PairPolicy, "maskable_ppo": MaskablePairPolicy, "recurrent_ppo": "MlpLstmPolicy"}.get(
+        algo, "MlpPolicy") if isinstance(learning.action_space, spaces.Discrete) else "MlpPolicy"
+    arguments = {"policy_kwargs": {"net_arch": list(config.hidden)}} | config.algorithm
+    made: BaseAlgorithm = algorithm_of(algo)(policy, learning, seed=seed, device="cpu",
+                                             tensorboard_log=str(folder / "tensorboard"), **arguments)
+    return made
+
+
+def _save(model: BaseAlgorithm, path: Path) -> None:
+    """Written beside its place and moved there."""
+    beside = path.with_name(f".{path.name}")
+    model.save(beside)
+    made = beside if beside.exists() else beside.with_name(beside.name + ".zip")
+    shutil.move(made, path)
+
+
+def _append_evaluation(folder: Path, steps: int, errors: np.ndarray) -> None:
+    path = folder / "evaluations.npz"
+    before = dict(np.load(path)) if path.exists() else {"steps": np.zeros(0, int), "errors": np.zeros((0, len(errors)))}
+    beside = path.with_name(".evaluations.npz")
+    np.savez(beside, steps=np.append(before["steps"], steps), errors=np.vstack([before["errors"], errors]))
+    shutil.move(beside, path)
+
+
+class _Checkpoints(BaseCallback):
+    """Every interval: a checkpoint and an evaluation. Every episode: a row of ``monitor.csv``. A progress bar."""
+
+    def __init__(self, folder: Path, config: Config, evaluate: Callable[[BaseAlgorithm], np.ndarray]) -> None:
+        super().__init__()
+        self.folder, self.config, self.evaluate = folder, config, evaluate
+
+    def _on_training_start(self) -> None:
+        self._bar = tqdm(total=self.config.total_steps, initial=self.num_timesteps, desc=self.folder.name, unit="step",
+                         disable=None)
+        self._next = (self.num_timesteps // self.config.interval + 1) * self.config.interval
+        self._rows: list[str] = []
+        self._begin = time.monotonic()
+        monitor = self.folder / "monitor.csv"
+        if not monitor.exists():
+            monitor.write_text("steps,return,length,seconds\n")
+
+    def _on_step(self) -> bool:
+        self._bar.update(self.num_timesteps - self._bar.n)
+        for info in self.locals["infos"]:
+            if "episode" in info:
+                self._rows.append(f"{self.num_timesteps},{info['episode']['r'] / self.config.reward_scale:.6f},"
+                                  f"{info['episode']['l']},{time.monotonic() - self._begin:.1f}\n")
+        if self.num_timesteps >= self._next:
+            self._next += self.config.interval
+            self._keep()
+        return True
+
+    def _on_training_end(self) -> None:
+        self._keep()
+        self._bar.close()
+
+    def _keep(self) -> None:
+        errors = self.evaluate(self.model)
+        self.logger.record("eval/relative_error", float(errors.mean()))
+        _append_evaluation(self.folder, self.num_timesteps, errors)
+        with (self.folder / "monitor.csv").open("a") as file:
+            file.writelines(self._rows)
+        self._rows.clear()
+        _save(self.model, self.folder / "latest.zip")
+
+
+torch.set_num_threads(1)

@@ -1,0 +1,48 @@
+"""Injection environments that leave the agent few steps, and what tests do with them."""
+
+import gymnasium as gym
+import numpy as np
+
+import eitbench  # noqa: F401 (registers)
+
+NAME = "eitbench/Pipe2DInjection-v0"
+CURRENTS, FAULTS, BUDGET = (f"eitbench/Pipe2DInjection{kind}-v0" for kind in ("Currents", "Faults", "Budget"))
+# Sixteen electrodes and a short record; fewer electrodes would leave too little to learn from.
+SHORT = {"scored_steps": 4, "mean_velocity": 16.0}
+TANK = "eitbench/RotatingTankInjection-v0"
+
+
+def make(estimator: str = "none", name: str = NAME, observation: str = "raw", longer: dict = {}, **kwargs,  # noqa: B006
+         ) -> gym.Env:
+    return gym.make(name, estimator=estimator, scenario=world(name) | longer, observation=observation,
+                    **kwargs)
+
+
+def world(name: str) -> dict:
+    """Fields of the scenario that leave the agent few steps."""
+    return {"warm_up": 2, "scored_steps": 3} if name == TANK else SHORT
+
+
+def play(env: gym.Env, seed: int, actions: np.ndarray) -> list[tuple]:
+    """(observation, reward, terminated, truncated, info) of the whole episode under the given actions."""
+    observation, info = env.reset(seed=seed)
+    steps = [(observation, 0.0, False, False, info)]
+    while not steps[-1][2]:
+        action = actions[len(steps) - 1]
+        steps.append(env.step(int(action) if action.ndim == 0 else action))
+    return steps
+
+
+def some_pairs(steps: int = 120, envs: int = 1, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).integers(120, size=(steps, envs)).squeeze()
+
+
+def some_actions(env: gym.Env, steps: int = 120) -> np.ndarray:
+    """Actions of the environment's kind."""
+    if env.action_space.shape:
+        return np.random.default_rng(0).uniform(-1.0, 1.0, (steps, *env.action_space.shape)).astype(np.float32)
+    return some_pairs(steps)
+
+
+def arrays_of(observation) -> list[np.ndarray]:
+    return [observation[key] for key in sorted(observation)] if isinstance(observation, dict) else [observation]

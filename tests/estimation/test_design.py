@@ -1,0 +1,58 @@
+"""What an injection teaches, for all pairs at once, against the textbook's update for each."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from eitbench.envs.operator import electrode_pairs
+from eitbench.estimation.design import pair_gains
+
+L, N = 5, 9
+PAIRS = electrode_pairs(L)
+
+
+def a_state(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Derivatives of 𝓡 (L, L, n), covariance, weight of the errors, noise variances (pairs, L); all at random."""
+    rng = np.random.default_rng(seed)
+    roots = rng.normal(size=(2, N, N))
+    covariance, weight = roots @ roots.swapaxes(1, 2)
+    return rng.normal(size=(L, L, N)), covariance, weight, rng.uniform(0.1, 10.0, (len(PAIRS), L))
+
+
+def gains_of(derivative, covariance, weight, noise_variance):
+    rows = derivative.reshape(L * L, N)
+    return pair_gains((rows @ covariance @ rows.T).reshape(L, L, L, L),
+                      (rows @ covariance @ weight @ covariance @ rows.T).reshape(L, L, L, L), PAIRS, noise_variance)
+
+
+def textbook(matrix: np.ndarray, covariance: np.ndarray, noise_variance: np.ndarray) -> np.ndarray:
+    """P − P Hᵀ (H P Hᵀ + R)⁻¹ H P."""
+    S = matrix @ covariance @ matrix.T + np.diag(noise_variance)
+    return covariance - covariance @ matrix.T @ np.linalg.inv(S) @ matrix @ covariance
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_gains_are_what_the_update_takes_away(seed):
+    """Of every pair: tr(W P) before less after, and half the logarithm of det P before over after."""
+    derivative, covariance, weight, noise_variance = a_state(seed)
+    traces, bits = gains_of(derivative, covariance, weight, noise_variance)
+    for k, (i, j) in enumerate(PAIRS):
+        after = textbook(derivative[i] - derivative[j], covariance, noise_variance[k])
+        assert traces[k] == pytest.approx(np.trace(weight @ (covariance - after)), rel=1e-6)
+        ratio = np.linalg.slogdet(covariance)[1] - np.linalg.slogdet(after)[1]
+        assert bits[k] == pytest.approx(0.5 * ratio, rel=1e-5, abs=1e-6)
+
+
+def test_endless_noise_is_no_reading():
+    """Readings that will not be believed teach as much as readings that are not there."""
+    derivative, covariance, weight, noise_variance = a_state(0)
+    noise_variance[:, 2] = np.inf
+    traces, bits = gains_of(derivative, covariance, weight, noise_variance)
+    kept = np.arange(L) != 2
+    for k, (i, j) in enumerate(PAIRS):
+        after = textbook((derivative[i] - derivative[j])[kept], covariance, noise_variance[k, kept])
+        assert traces[k] == pytest.approx(np.trace(weight @ (covariance - after)), rel=1e-8)
+        ratio = np.linalg.slogdet(covariance)[1] - np.linalg.slogdet(after)[1]
+        assert bits[k] == pytest.approx(0.5 * ratio, rel=1e-7)

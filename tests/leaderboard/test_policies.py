@@ -1,0 +1,236 @@
+"""Injection policies: what they believe, that they play, and what becomes of their mistakes."""
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from eitbench.envs.belief import Belief
+from eitbench.envs.injection import InjectionEnv
+from eitbench.envs.injection_core import Rules
+from eitbench.leaderboard import policies
+from eitbench.leaderboard.policies import adaptivity_gap, evaluate, load_policy, own_policies, play
+from eitbench.scenarios import Pipe2D
+from eitbench.seeds import parse_seeds
+
+NAME = "eitbench/Pipe2DInjection-v0"
+CURRENTS, FAULTS, BUDGET = (f"eitbench/Pipe2DInjection{kind}-v0" for kind in ("Currents", "Faults", "Budget"))
+SHORT = {"scenario": {"scored_steps": 4, "mean_velocity": 16.0}}
+"""Sixteen electrodes and a short record."""
+KWARGS = {NAME: SHORT, CURRENTS: SHORT, FAULTS: SHORT, BUDGET: SHORT | {"budget": 3},
+          "eitbench/RotatingTankInjection-v0": {"scenario": {"warm_up": 2, "scored_steps": 3}}}
+SEED = 5
+
+
+def environment(name: str) -> InjectionEnv:
+    return policies._environment(name, json.dumps(KWARGS[name]), "reduced")
+
+
+def actions_of(name: str, policy: str, monkeypatch) -> list[np.ndarray]:
+    """Everything that was injected in an episode."""
+    env, taken, step = environment(name), [], InjectionEnv.step
+    with monkeypatch.context() as patch:
+        patch.setattr(InjectionEnv, "step", lambda self, action: taken.append(np.array(action)) or step(self, action))
+        played = play(name, KWARGS[name], policy, SEED, "reduced")
+    assert len(taken) == env.core.length
+    budget = env.rules.budget
+    assert played["spent"] <= (len(taken) if budget is None else budget)
+    assert len(played["errors"]) == env.scenario.scored_steps
+    assert played["error"] == pytest.approx(np.mean(played["errors"]))
+    assert 0.0 < played["error"] < 1.0 and played["seconds_per_step"] >= 0.0
+    return taken
+
+
+def write_policy(folder, body: str = "def act(self, observation): return 7", name: str = "mine") -> str:
+    """The path of a policy file whose class has this body."""
+    path = folder / f"{name}.py"
+    path.write_text('"""Mine: always the same."""\nclass Policy:\n'
+                    f"    def __init__(self, rules, random): pass\n    {body}\n")
+    return str(path)
+
+
+# -- what a policy may believe ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", [NAME, FAULTS, BUDGET])
+def test_belief_is_the_filter_inside(name):
+    """Followed from outside, the reduced filter is that of the environment, to the bit."""
+    env = environment(name)
+    observation, _ = env.reset(seed=SEED)
+    belief = Belief(env.rules, observation)
+    for pair in (7, 100, None if env.rules.budget else 3, 7):
+        predicted = belief.predicted()
+        observation, *_ = env.step(env.rules.action(pair))
+        belief.see(observation)
+        inside = env.core._operator
+        np.testing.assert_array_equal(belief.mean, inside.means()[0])
+        np.testing.assert_array_equal(belief._operator.covariance, inside.covariance)
+        if name == NAME:                         # what it foretells: nothing was left out
+            expected = inside.covariance[0].astype(float)
+            np.testing.assert_allclose(belief.after(predicted, pair), expected, atol=2e-5 * np.abs(expected).max())
+            assert belief.gains(predicted)[0][pair] == pytest.approx((predicted - expected).trace(), rel=1e-3)
+
+
+def test_unsound_electrodes_teach_nothing():
+    """Pairs with one of them gain nothing, the others less than with all readings, but more than nothing."""
+    env = environment(NAME)
+    belief = Belief(env.rules, env.reset(seed=SEED)[0])
+    predicted, sound = belief.predicted(), np.arange(16) != 3
+    every, fewer = belief.gains(predicted)[0], belief.gains(predicted, sound)[0]
+    touched = (env.rules.pairs == 3).any(axis=1)
+    assert not fewer[touched].any() and (fewer[~touched] > 0.0).all() and (fewer[~touched] < every[~touched]).all()
+    k = int(np.flatnonzero(~touched)[0])
+    assert fewer[k] == pytest.approx((predicted - belief.after(predicted, k, sound)).trace(), rel=1e-6)
+    assert (belief.after(predicted, int(np.flatnonzero(touched)[0]), sound) == predicted).all()
+
+
+def test_beforehand_is_the_expected_liquid():
+    """A belief without data is linear about the expected level, and at the level both derivatives agree."""
+    env = environment(NAME)
+    belief = Belief.beforehand(env.rules)
+    assert belief._operator.concentration[0] == pytest.approx(env.scenario.expected_concentration, rel=1e-12)
+    level = belief._operator.concentration[0]
+    assert np.abs(belief.mean / level - 1.0).max() < 0.01
+    np.testing.assert_allclose(belief.relinearised(), belief.derivative, rtol=0.1,
+                               atol=0.02 * np.abs(belief.derivative).max())
+
+
+# -- rules ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", list(KWARGS))
+def test_the_action_of_a_pair_injects_it(name):
+    """In every world the pair's currents flow, and nothing flows where nothing is asked for."""
+    rules = environment(name).rules
+    action = rules.action(21)
+    assert rules.action_space.contains(np.int64(action) if rules.limit is None else action)
+    expected = np.zeros((1, 16))
+    expected[0, rules.pairs[21]] = rules.amplitude, -rules.amplitude
+    np.testing.assert_allclose(rules.currents(np.array([action])), expected, rtol=1e-6)
+    if rules.limit is None and rules.budget is None:
+        with pytest.raises(ValueError, match="pair must be a number: in a world without a budget each step injects"):
+            rules.action(None)
+    else:
+        assert not rules.currents(np.array([rules.action(None)])).any()
+
+
+@pytest.mark.parametrize("budget", [0, 1, 7, 30, 182, 500])
+def test_an_even_budget_is_spent_exactly(budget):
+    """So many injections, or one at each step; between two of them the same number of steps, give or take one."""
+    rules = Rules(Pipe2D(scored_steps=180), budget=budget)
+    steps = rules.scenario.n_steps - 16
+    when = np.flatnonzero([rules.spaced(np.array([left, 0.0])) for left in range(steps, 0, -1)])
+    assert len(when) == min(budget, steps)
+    assert len(when) < 2 or np.ptp(np.diff([-1, *when])) <= 1
+
+
+# -- playing ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", list(KWARGS))
+@pytest.mark.parametrize("policy", own_policies())
+def test_policies_play_what_they_suit(policy, name, monkeypatch):
+    """Valid actions, reproducible to the bit, within the budget; what does not suit is refused."""
+    env = environment(name)
+    if not load_policy(policy).suits(env.rules):
+        with pytest.raises(ValueError, match=f"policy {policy} does not suit {name}"):
+            play(name, KWARGS[name], policy, SEED, "reduced")
+        return
+    taken, again = (actions_of(name, policy, monkeypatch) for _ in range(2))
+    np.testing.assert_array_equal(taken, again)
+    dtype = np.float32 if env.rules.limit else np.int64
+    assert all(env.action_space.contains(action.astype(dtype)) for action in taken)
+
+
+def test_scores_are_those_of_the_exact_filter():
+    """The mean error under the full estimator is that of its own estimates, step by step."""
+    played = play(NAME, SHORT, "best_pair", SEED)
+    env = policies._environment(NAME, json.dumps(SHORT), "full")
+    env.reset(seed=SEED)
+    errors = []
+    for _ in range(env.core.length):
+        env.step(7)
+        assert (env.error is None) == (env.core.t <= env.scenario.warm_up)
+        errors += [env.core.errors()[0]] * (env.error is not None)
+    assert played["errors"] == errors
+
+
+def test_only_the_clairvoyant_is_privileged():
+    """All others play from observations."""
+    assert [name for name in own_policies() if load_policy(name).privileged] == ["clairvoyant"]
+    assert {"random_pair", "best_pair", "schedule", "greedy_a", "event_triggered"} < set(own_policies())
+
+
+def test_table_has_a_row_for_each_policy_and_episode():
+    """In the order asked for, whoever is done first."""
+    table = evaluate(NAME, SHORT, ["opposite", "adjacent"], parse_seeds("dev:1,0"), "reduced", n_jobs=1)
+    assert table["policy"].tolist() == ["opposite"] * 2 + ["adjacent"] * 2
+    assert table["seed"].tolist() == ["dev:1", "dev:0"] * 2
+    assert table["error"][3] == play(NAME, SHORT, "adjacent", parse_seeds("dev:0")[0], "reduced")["error"]
+
+
+# -- mistakes ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("body", "message"), [
+    ("x = 1", r"mine\.py must define a class Policy with a method act\(observation\)"),
+    ("privileged = 1\n    def act(self, observation): ...", "Policy.privileged must be True or False, got 1"),
+    ("parameters = {'a': {1}}\n    def act(self, observation): ...", "Policy.parameters must be a dict fit for JSON"),
+    ("parameters = 3\n    def act(self, observation): ...", "Policy.parameters must be a dict fit for JSON"),
+    ("1 / 0", r"mine\.py cannot be loaded: ZeroDivisionError"),
+])
+def test_wrong_files_are_named(tmp_path, body, message):
+    """What came and what was expected."""
+    with pytest.raises(ValueError, match=message):
+        load_policy(write_policy(tmp_path, body))
+
+
+def test_wrong_names_are_named(tmp_path):
+    """Of policies, environments and estimators."""
+    with pytest.raises(ValueError, match=r"policy must be a path to a .py file or one of adjacent, .*; got 'lucky'"):
+        load_policy("lucky")
+    with pytest.raises(ValueError, match="has the name of one of ours"):
+        load_policy(write_policy(tmp_path, name="adjacent"))
+    with pytest.raises(ValueError, match=r"env must be one of .*; got 'eitbench/Pipe2D-v0'"):
+        play("eitbench/Pipe2D-v0", {}, "adjacent", 1)
+    with pytest.raises(ValueError, match="estimator must be 'full' or 'reduced', got 'none'"):
+        play(NAME, SHORT, "adjacent", 1, "none")
+
+
+def test_anybodys_file_plays(tmp_path):
+    """Its title is its docstring's first words; a wrong action is named."""
+    loaded = load_policy(path := write_policy(tmp_path))
+    assert (loaded.name, loaded.title, loaded.privileged, loaded.parameters) == ("mine", "Mine", False, {})
+    played = play(NAME, SHORT, path, SEED, "reduced")
+    assert played["errors"] == play(NAME, SHORT, "best_pair", SEED, "reduced")["errors"]
+    with pytest.raises(ValueError, match="action must be an integer"):
+        play(NAME, SHORT, write_policy(tmp_path, "def act(self, observation): return 0.5", "wrong"), SEED, "reduced")
+
+
+# -- adaptivity gap ---------------------------------------------------------------------------------------------------
+
+
+def hand_made(**errors: list[float]) -> pd.DataFrame:
+    rows = [{"policy": policy, "seed": f"dev:{k}", "error": error}
+            for policy, each in errors.items() for k, error in enumerate(each)]
+    return pd.DataFrame(rows)
+
+
+def test_adaptivity_gap_is_the_formula():
+    """(2 − 1)/(5 − 1) on a table made by hand; the open-loop policy that is better in the mean counts."""
+    table = hand_made(clairvoyant=[1.0, 1.0], random_pair=[4.0, 6.0], a=[1.5, 2.5], b=[1.0, 9.0], spy=[0.0, 0.0])
+    gap, low, high = adaptivity_gap(table, ["b", "a"])
+    assert gap == 0.25
+    assert (low, high) == (pytest.approx(0.5 / 3.0), pytest.approx(1.5 / 5.0))      # both episodes the same
+    assert adaptivity_gap(table, ["a", "b"]) == (gap, low, high)
+    same = hand_made(clairvoyant=[1.0] * 9, random_pair=[5.0] * 9, a=[2.0] * 9)
+    assert adaptivity_gap(same, ["a"]) == (0.25, 0.25, 0.25)
+
+
+@pytest.mark.parametrize("open_loop", [[], ["c"]])
+def test_a_table_with_gaps_is_refused(open_loop):
+    """Every policy that counts has played every episode."""
+    table = hand_made(clairvoyant=[1.0, 1.0], random_pair=[4.0, 6.0], c=[2.0])
+    with pytest.raises(ValueError, match="table must hold clairvoyant, random_pair and some open-loop policies"):
+        adaptivity_gap(table, open_loop)
