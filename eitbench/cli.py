@@ -1,4 +1,4 @@
-"""The command line: `eitbench list | run | bank | train | leaderboard | render | reproduce`."""
+"""The command line: `eitbench list | run | bank | train | policies | leaderboard | render | reproduce`."""
 
 from __future__ import annotations
 
@@ -154,6 +154,31 @@ def train(
         model = training.train(env, algo.value, asked if steps is None else replace(asked, total_steps=steps), seed,
                                folder)
     typer.echo(f"wrote {model}")
+
+
+@app.command()
+def policies(
+    env: Annotated[str, typer.Option(help="Id of an injection environment.")],
+    policy: Annotated[list[str] | None, typer.Option(
+        help="Name of one of ours, or the path of your own .py file; may be repeated. Default: all of ours.")] = None,
+    seeds: Annotated[str, typer.Option(help="Episodes, such as dev:0-49 or test:0-49.")] = "test:0-49",
+    estimator: Annotated[str, typer.Option(help="full: the exact filter, for scores; reduced: that of training.")] = (
+        "full"),
+    jobs: Jobs = CORES,
+    out: Out = Path("results/policies"),
+) -> None:
+    """Play injection policies, print their scores and the environment's adaptivity gap.
+
+    Each episode is kept in OUT/ENV.csv the moment it is done; the same command again resumes.
+    """
+    from eitbench.leaderboard.policies import load_policy, own_policies, suited
+    from eitbench.leaderboard.policy_table import policy_table, run_policies
+    from eitbench.seeds import parse_seeds
+    with _clear_errors():
+        chosen = suited(env, policy or own_policies(), demanded=bool(policy))
+        numbers = parse_seeds(seeds)
+        rows = run_policies(env, {}, chosen, numbers, estimator, jobs, out / f"{env.replace('/', '-')}.csv")
+    typer.echo(policy_table(rows, [name for name in chosen if load_policy(name).privileged]))
 
 
 @app.command()

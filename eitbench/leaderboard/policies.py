@@ -15,14 +15,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import gymnasium as gym
 import numpy as np
-from tqdm import tqdm
 
-from eitbench._parallel import in_parallel
 from eitbench.envs import INJECTION
 from eitbench.envs.injection import InjectionEnv
 from eitbench.envs.injection_core import Rules
 from eitbench.leaderboard.baselines import baseline_folder
-from eitbench.seeds import name_seed
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -100,6 +97,17 @@ def _load(path: Path, source: bytes) -> PolicyFile:
     return PolicyFile(path.stem, title, path, hashlib.sha256(source).hexdigest(), privileged, parameters, policy)
 
 
+def suited(env_id: str, names: Sequence[str], *, demanded: bool) -> list[str]:
+    """Those of the policies that suit an environment; where they are ``demanded``, ``ValueError`` if one does not."""
+    rules, chosen = _environment(env_id, "{}", "reduced").rules, []
+    for name in names:
+        if load_policy(name).suits(rules):
+            chosen.append(name)
+        elif demanded:
+            raise ValueError(f"policy {load_policy(name).name} does not suit {env_id}")
+    return chosen
+
+
 def play(env_id: str, kwargs: dict[str, Any], policy: str, seed: int, estimator: str = "full") -> dict[str, Any]:
     """Play one episode.
 
@@ -154,30 +162,14 @@ def _environment(env_id: str, kwargs: str, estimator: str) -> InjectionEnv:
     return cast(InjectionEnv, env.unwrapped)
 
 
-def evaluate(env_id: str, kwargs: dict[str, Any], policies: Sequence[str], seeds: Sequence[int],
-             estimator: str = "full", n_jobs: int = 1) -> pd.DataFrame:
-    """Play all policies on all episodes, in ``n_jobs`` processes: a row each, in this order, with policy, seed and what
-    `play` returns but for ``errors``."""
-    import pandas as pd
-    jobs = [(env_id, kwargs, policy, seed, estimator) for policy in policies for seed in seeds]
-    played = in_parallel(_row, jobs, n_jobs)
-    rows = dict(tqdm(played, total=len(jobs), desc="playing policies", unit="episode", disable=None))
-    return pd.DataFrame([rows[policy, seed] for policy in policies for seed in seeds])
-
-
-def _row(env_id: str, kwargs: dict, policy: str, seed: int, estimator: str) -> tuple[tuple[str, int], dict[str, Any]]:
-    played = play(env_id, kwargs, policy, seed, estimator)
-    del played["errors"]
-    return (policy, seed), {"policy": load_policy(policy).name, "seed": name_seed(seed), **played}
-
-
 def adaptivity_gap(table: pd.DataFrame, open_loop: Sequence[str]) -> tuple[float, float, float]:
     """(best open-loop − clairvoyant) / (random − clairvoyant), mean errors each, with its 95 % bootstrap interval.
 
     Parameters
     ----------
     table : DataFrame
-        From `evaluate`, with the policies clairvoyant, random_pair and ``open_loop``, all on the same episodes.
+        Columns policy, seed and error, with the policies clairvoyant, random_pair and ``open_loop``, all on the same
+        episodes.
     open_loop : sequence of str
         Names; the one of them with the least mean error counts.
 

@@ -9,8 +9,9 @@ import pytest
 from eitbench.envs.belief import Belief
 from eitbench.envs.injection import InjectionEnv
 from eitbench.envs.injection_core import Rules
-from eitbench.leaderboard import policies
-from eitbench.leaderboard.policies import adaptivity_gap, evaluate, load_policy, own_policies, play
+from eitbench.leaderboard import policies, policy_table
+from eitbench.leaderboard.policies import adaptivity_gap, load_policy, own_policies, play
+from eitbench.leaderboard.policy_table import run_policies
 from eitbench.scenarios import Pipe2D
 from eitbench.seeds import parse_seeds
 
@@ -162,12 +163,37 @@ def test_only_the_clairvoyant_is_privileged():
     assert {"random_pair", "best_pair", "schedule", "greedy_a", "event_triggered"} < set(own_policies())
 
 
-def test_table_has_a_row_for_each_policy_and_episode():
-    """In the order asked for, whoever is done first."""
-    table = evaluate(NAME, SHORT, ["opposite", "adjacent"], parse_seeds("dev:1,0"), "reduced", n_jobs=1)
-    assert table["policy"].tolist() == ["opposite"] * 2 + ["adjacent"] * 2
-    assert table["seed"].tolist() == ["dev:1", "dev:0"] * 2
-    assert table["error"][3] == play(NAME, SHORT, "adjacent", parse_seeds("dev:0")[0], "reduced")["error"]
+def test_played_episodes_are_kept(tmp_path, monkeypatch):
+    """One row an episode; what is there is not played again, but for a row that was cut short."""
+    path = tmp_path / "new" / "rows.csv"
+    asked = (NAME, SHORT, ["opposite", "adjacent"], parse_seeds("dev:1,0"), "reduced")
+    rows = run_policies(*asked, 1, path)
+    assert sorted(zip(rows["policy"], rows["seed"], strict=True)) == [
+        (policy, seed) for policy in ("adjacent", "opposite") for seed in ("dev:0", "dev:1")]
+    error = rows.set_index(["policy", "seed"])["error"]["adjacent", "dev:0"]
+    assert error == play(NAME, SHORT, "adjacent", parse_seeds("dev:0")[0], "reduced")["error"]
+    text = path.read_text()
+    path.write_text(text[:-30])
+    played = []
+    monkeypatch.setattr(policy_table, "play", lambda *job: played.append(job) or play(*job))
+    pd.testing.assert_frame_equal(
+        run_policies(*asked, 1, path).drop(columns="seconds_per_step").sort_values("identity", ignore_index=True),
+        rows.drop(columns="seconds_per_step").sort_values("identity", ignore_index=True))
+    assert len(played) == 1
+    other = (NAME, SHORT, ["opposite"], parse_seeds("dev:1"), "full")
+    assert len(run_policies(*other, 1, path)) == 1 and len(played) == 2
+
+
+def test_table_pairs_the_episodes():
+    """Mean errors in order, and differences to the best that is not privileged with the interval of paired episodes."""
+    errors = {"clairvoyant": [1.0, 2.0, 3.0], "best_pair": [2.0, 3.1, 4.0], "random_pair": [3.0, 4.1, 5.2]}
+    rows = pd.DataFrame([{"policy": name, "seed": f"dev:{k}", "error": error, "spent": 5, "seconds_per_step": 0.001}
+                         for name, each in errors.items() for k, error in enumerate(each)])
+    lines = policy_table.policy_table(rows, ["clairvoyant"]).splitlines()
+    names = [line.split("|")[1].strip() for line in lines[2:5]]
+    assert names == ["clairvoyant (privileged)", "best_pair", "random_pair"]
+    # 1.0667 on average with a standard deviation of 0.1155: half the interval is 4.303·0.1155/√3
+    assert "1.1 ± 0.3" in lines[4] and "–" in lines[3] and "gap 0.49" in lines[-1]
 
 
 # -- mistakes ---------------------------------------------------------------------------------------------------------
