@@ -47,14 +47,20 @@ def animate(environment: str, baseline: str, seed: str, step: int | None, path: 
                 frames.append(Image.fromarray(np.asarray(env.render())))
             if t == last:
                 break
-    path.parent.mkdir(parents=True, exist_ok=True)
     if step is None:
-        palette = _palette()
-        small = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
-        small[0].save(path, save_all=True, append_images=small[1:], duration=1000 // env.metadata["render_fps"], loop=0)
+        save_animation(frames, path, env.metadata["render_fps"])
     else:
+        path.parent.mkdir(parents=True, exist_ok=True)
         frames[0].save(path)
     return path
+
+
+def save_animation(frames: list[Image.Image], path: Path, frames_per_second: int) -> None:
+    """Write frames of an environment as a GIF, and its folder if need be."""
+    palette = _palette()
+    small = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    small[0].save(path, save_all=True, append_images=small[1:], duration=1000 // frames_per_second, loop=0)
 
 
 def _palette() -> Image.Image:

@@ -4,9 +4,12 @@ import importlib
 import re
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
+import pandas as pd
 import pytest
 from matplotlib.image import imread
+from PIL import Image
 
 from eitbench.envs.pipe2d import Pipe2DEnv
 from eitbench.envs.pipe2d_obstacle import Pipe2DObstacleEnv
@@ -16,7 +19,7 @@ from eitbench.envs.stationary_tank import StationaryTank2DEnv
 from eitbench.episodes import CACHE_VARIABLE
 from eitbench.estimation import FirstFrame, initial_covariance
 from eitbench.leaderboard.baselines import load_baseline
-from eitbench.leaderboard.figures import FIGURES, obstacle, parameters, pipe2d, profiles, tanks, velocity
+from eitbench.leaderboard.figures import FIGURES, injection, obstacle, parameters, pipe2d, profiles, tanks, velocity
 from eitbench.leaderboard.figures.common import error_of, estimates_of
 from eitbench.physics.rest import AtRest
 from eitbench.scenarios import Pipe2DObstacle
@@ -90,7 +93,7 @@ def draw(monkeypatch, name, folder, estimator):
     return remark
 
 
-DRAWN = [name for name in FIGURES if name not in ("fig5.8", "fig5.10")]
+DRAWN = [name for name in FIGURES if name not in ("fig5.8", "fig5.10", "injection")]
 """fig5.8 is played in earnest in tests/studies; fig5.10 is in 3D, where even a made-up estimate takes minutes."""
 
 
@@ -109,6 +112,26 @@ def test_figure_is_drawn(name, monkeypatch, tmp_path):
 def test_words_follow_from_the_data(name, monkeypatch, tmp_path):
     """Estimates of no use do not agree with the thesis."""
     assert "DIFFERS" in draw(monkeypatch, name, tmp_path, constant)
+
+
+def test_injection_is_drawn(monkeypatch, tmp_path):
+    """Scores as they were played, told in a table for each world, and an animation with a frame for every step."""
+    played = []
+
+    def run(env, kwargs, policies, seeds, estimator, jobs, path):
+        played.append((env, estimator))
+        return pd.DataFrame([{"policy": name, "seed": f"dev:{k}", "error": 0.01 * (1 + place) + 0.001 * k, "spent": 5,
+                              "seconds_per_step": 0.001} for place, name in enumerate(policies) for k in seeds])
+
+    monkeypatch.setattr(injection, "run_policies", run)
+    short = {"scored_steps": 3, "mean_velocity": 16.0}
+    monkeypatch.setitem(gym.registry[injection.AT_WORK[0]].kwargs, "scenario", short)
+    path, remark = FIGURES["injection"]([0, 1, 2], 1, tmp_path / "new")
+    picture = imread(path)
+    assert min(picture.shape[:2]) > 250 and picture[..., :3].std() > 0.05
+    assert played == [(env, "full") for env in injection.WORLDS] and remark.count("| best_pair |") == 3
+    with Image.open(tmp_path / "new" / "injection.gif") as moving:
+        assert moving.n_frames == 3                               # the first frame of 16, then three steps
 
 
 def test_names():

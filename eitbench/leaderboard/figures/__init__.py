@@ -30,5 +30,5 @@ FIGURES: dict[str, Draw] = {name: _later(place) for name, place in {
     "fig6.1": "velocity:fig6_1", "fig6.2": "velocity:fig6_2", "fig6.3": "velocity:fig6_3", "fig6.4": "velocity:fig6_4",
     "fig6.5": "velocity:fig6_5", "fig6.6": "velocity:fig6_6",
     "fig7.2": "tanks:fig7_2", "fig7.3": "tanks:fig7_3", "fig7.4": "tanks:fig7_4",
-    "profiles": "profiles:profiles", "obstacle": "obstacle:obstacle",
+    "injection": "injection:injection", "profiles": "profiles:profiles", "obstacle": "obstacle:obstacle",
 }.items()}

@@ -1,0 +1,104 @@
+"""What choosing the injection is worth: scores by policy, learning curves, and a policy at work."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from PIL import Image
+from threadpoolctl import threadpool_limits
+from tqdm import tqdm
+
+from eitbench.envs.injection import InjectionEnv
+from eitbench.leaderboard.animate import save_animation
+from eitbench.leaderboard.baselines import baseline_folder
+from eitbench.leaderboard.figures.common import ACCENT, INK, TRUE, bare, save
+from eitbench.leaderboard.policies import load_policy, own_policies, suited
+from eitbench.leaderboard.policy_table import OPEN_LOOP, policy_table, run_policies
+from eitbench.leaderboard.summary import mean_and_interval
+
+WORLDS = {"eitbench/Pipe2DInjection-v0": "plain pipe (reference)",
+          "eitbench/Pipe2DInjectionFaults-v0": "faulty electrodes", "eitbench/Pipe2DInjectionBudget-v0": "a budget"}
+AT_WORK = ("eitbench/Pipe2DInjectionFaults-v0", "fault_aware")
+"""What the animation shows."""
+
+
+def injection(seeds: list[int], jobs: int, out: Path) -> tuple[Path, str]:
+    """Scores with the exact filter, of all our policies on these episodes."""
+    figure = Figure(figsize=(13.5, 7.4), dpi=120, layout="constrained")
+    above, below = figure.subplots(2, len(WORLDS), height_ratios=(3, 2))
+    said = []
+    for (env, title), top, bottom in zip(WORLDS.items(), above, below, strict=True):
+        chosen = suited(env, own_policies(), demanded=False)
+        rows = run_policies(env, {}, chosen, seeds, "full", jobs, out / f"{env.replace('/', '-')}.csv")
+        privileged = [name for name in chosen if load_policy(name).privileged]
+        _scores(top, rows, privileged)
+        top.set_title(title, fontsize=11)
+        _curves(bottom, env)
+        said.append(f"{env}\n{policy_table(rows, privileged)}\n")
+    path = out / "injection.png"
+    save(figure, path)
+    moving = _at_work(seeds[0], out / "injection.gif")
+    return path, "\n".join([*said, f"wrote {moving}: {AT_WORK[1]} in {AT_WORK[0]}"])
+
+
+def _scores(axes: Axes, rows: pd.DataFrame, privileged: list[str]) -> None:
+    """A dot for each policy with the 95 % interval over episodes, the best above."""
+    errors = rows.pivot(index="seed", columns="policy", values="error")
+    order = errors.mean().sort_values().index[::-1]
+    for place, name in enumerate(order):
+        mean, half = mean_and_interval(list(errors[name]))
+        colour = TRUE if name in privileged else INK if name in OPEN_LOOP or name == "random_pair" else ACCENT
+        axes.plot([mean], [place], "o", color=colour, markersize=5)
+        if np.isfinite(half):
+            axes.plot([mean - half, mean + half], [place, place], color=colour, linewidth=1.6)
+    axes.set_yticks(range(len(order)), [name.replace("_", " ") + " *" * (name in privileged) for name in order])
+    axes.set(xlim=(0, None), xlabel=f"ẽ$_c$, {len(errors)} episodes")
+    axes.plot([], [], "o", color=INK, label="open loop")
+    axes.plot([], [], "o", color=ACCENT, label="looks at the data")
+    axes.plot([], [], "o", color=TRUE, label="* is shown the truth")
+    axes.legend(frameon=False, fontsize=8, loc="upper right")
+    axes.tick_params(axis="y", length=0)
+    bare(axes)
+
+
+def _curves(axes: Axes, env: str) -> None:
+    """Scores on dev episodes while agents learnt, one line a training seed."""
+    runs = sorted((baseline_folder() / "checkpoints" / env.replace("/", "-")).glob("*/seed*/evaluations.npz"))
+    colours = dict(zip(sorted({run.parts[-3] for run in runs}), (ACCENT, INK, TRUE), strict=False))
+    seen = set()
+    for run in runs:
+        algo = json.loads((run.parent / "config.json").read_text())["algo"]
+        kept = np.load(run)
+        axes.plot(1e-6 * kept["steps"], kept["errors"].mean(axis=1), color=colours[run.parts[-3]], linewidth=1.2,
+                  label=None if algo in seen else f"{algo}, reduced filter, dev episodes")
+        seen.add(algo)
+    if runs:
+        axes.legend(frameon=False, fontsize=8)
+        axes.set(xlabel="million environment steps", ylabel="ẽ$_c$", ylim=(0, None))
+        bare(axes)
+    else:
+        axes.set_axis_off()
+        axes.text(0.5, 0.5, "no agent was trained here", ha="center", va="center", transform=axes.transAxes, color=TRUE)
+
+
+def _at_work(seed: int, path: Path) -> Path:
+    """Truth, estimate, spread and the pair that a policy chose, step by step."""
+    name, policy = AT_WORK
+    env = gym.make(name, disable_env_checker=True, observation="raw", estimator="full",
+                   render_mode="rgb_array").unwrapped
+    assert isinstance(env, InjectionEnv)
+    with threadpool_limits(1):
+        observation, _ = env.reset(seed=seed)
+        player = load_policy(policy).policy(env.rules, np.random.default_rng(0))
+        frames = []
+        for _ in tqdm(range(env.core.length), desc="drawing", unit="state", disable=None):
+            observation, *_ = env.step(player.act(observation))
+            frames.append(Image.fromarray(np.asarray(env.render())))
+    save_animation(frames, path, env.metadata["render_fps"])
+    return path
