@@ -16,7 +16,7 @@ from short import FIELDS, kind, short
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 from eitbench import Estimate, scoring
-from eitbench.envs import ESTIMATION
+from eitbench.envs import ENTRY_POINTS, ESTIMATION
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.episodes import CACHE_VARIABLE, Episode
 from eitbench.leaderboard.run import play_and_collect
@@ -58,7 +58,7 @@ def noise_actions(env: gym.Env, seed: int = 0) -> np.ndarray:
 
 def test_every_id_has_a_short_version():
     """And every short version an id: whoever registers an environment has it tested here."""
-    assert {kind(name) for name in ESTIMATION} == set(FIELDS)
+    assert {kind(name) for name in ENTRY_POINTS} == set(FIELDS)
 
 
 def test_gymnasium_checker_passes(name):
