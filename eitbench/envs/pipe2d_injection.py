@@ -28,8 +28,8 @@ class Pipe2DInjectionEnv(InjectionEnv, EzPickle):
     what they inject.
 
     This is the reference case, not a competition: one pair near the inlet, injected for ever, is as good as anything
-    (what is known at the inlet the flow carries through the whole pipe), and what to inject does not
-    depend on what is measured.
+    (what is known at the inlet the flow carries through the whole pipe), and what to inject does not depend on what is
+    measured. The adaptivity gap is 0.01 (`docs/injection.md`).
 
     `eitbench/Pipe2DInjectionCurrents-v0` is the same world with a current of its own for each electrode.
 

@@ -18,7 +18,8 @@ class Pipe2DInjectionBudgetEnv(InjectionEnv, EzPickle):
 
     The pipe of `eitbench/Pipe2D-v0` when slugs are rare: strong ones come one at a time, at times nobody foresees,
     about three in an episode (`Pipe2DIntermittent`). The agent may inject at one step in six only, so it has to notice
-    that a slug has come and then look closely, and to keep something for the next one.
+    that a slug has come and then look closely, and to keep something for the next one. The adaptivity gap is 0.46, with
+    a 95 % interval from 0.41 to 0.51 over 50 dev episodes (`docs/injection.md`).
 
     ## Action space
 

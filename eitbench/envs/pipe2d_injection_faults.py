@@ -33,7 +33,8 @@ class Pipe2DInjectionFaultsEnv(InjectionEnv, EzPickle):
     out readings that are further than 8 standard deviations from its prediction, and a whole injection if that is so of
     more than a third of its readings.
 
-    Which pair is best depends on the episode, and the measurements tell.
+    Which pair is best depends on the episode, and the measurements tell: the adaptivity gap is 0.48, with a 95 %
+    interval from 0.30 to 0.69 over 50 dev episodes (`docs/injection.md`).
 
     ## Action space
 
