@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import torch
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
@@ -22,19 +21,21 @@ from eitbench.leaderboard.policies import load_policy
 DEFAULTS = {"rounds": 4, "episodes": 50, "epochs": 10, "batch": 256, "learning_rate": 1e-3}
 
 
-def imitate(model: OnPolicyAlgorithm, env: str, kwargs: dict[str, Any], options: dict[str, Any], reward_scale: float,
-            seed: int) -> None:
+def imitate(model: OnPolicyAlgorithm, world: InjectionEnv, options: dict[str, Any], reward_scale: float,
+            plan: np.ndarray | None, seed: int) -> None:
     """Let ``model`` (PPO, with or without masks) learn from a policy file.
 
     Parameters
     ----------
+    world : InjectionEnv
+        With raw observations; its training episodes are played.
     options : dict
         ``teacher`` (name of one of our policies, or a path), and perhaps ``rounds``, ``episodes`` (a round), ``epochs``
         (a round), ``batch`` and ``learning_rate``. In the first round the teacher acts, in the others the pupil.
+    plan : (steps, ...), optional
+        Rewards are counted from those of these actions in the same episode, as in training.
     """
     settings, teacher = DEFAULTS | options, load_policy(str(options["teacher"]))
-    world = gym.make(env, disable_env_checker=True, observation="raw", **kwargs).unwrapped
-    assert isinstance(world, InjectionEnv)
     random = np.random.default_rng([seed, 1])
     optimiser = torch.optim.Adam(model.policy.parameters(), lr=settings["learning_rate"])
     seen, said, worth = [], [], []
@@ -42,10 +43,14 @@ def imitate(model: OnPolicyAlgorithm, env: str, kwargs: dict[str, Any], options:
               disable=None) as bar:
         for turn in range(settings["rounds"]):
             for _ in range(settings["episodes"]):
-                episode = _play(model, world, teacher, random, pupil_acts=turn > 0)
-                seen.append(episode[0])
-                said.append(episode[1])
-                worth.append(_returns(reward_scale * episode[2], model.gamma))
+                number = int(random.integers(world.episodes))
+                shown, advice, rewards = _play(model, world, teacher, number, random, pupil_acts=turn > 0)
+                if plan is not None:
+                    world.reset(seed=number)
+                    rewards -= [world.step(action)[1] for action in plan]
+                seen.append(shown)
+                said.append(advice)
+                worth.append(_returns(reward_scale * rewards, model.gamma))
                 bar.update()
             _fit(model, optimiser, np.concatenate(seen), np.concatenate(said), np.concatenate(worth), settings, random)
 
@@ -61,10 +66,10 @@ def check_imitation(algo: str, options: dict[str, Any]) -> None:
     load_policy(str(options["teacher"]))
 
 
-def _play(model: OnPolicyAlgorithm, world: InjectionEnv, teacher: Any, random: np.random.Generator, *,
+def _play(model: OnPolicyAlgorithm, world: InjectionEnv, teacher: Any, number: int, random: np.random.Generator, *,
           pupil_acts: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(T, d) scaled observations of a training episode, (T,) what the teacher says to them, (T,) rewards."""
-    observation, _ = world.reset(seed=int(random.integers(world.episodes)))
+    """(T, d) scaled observations of an episode, (T,) what the teacher says to them, (T,) rewards."""
+    observation, _ = world.reset(seed=number)
     stream = np.random.default_rng(int(random.integers(2**63)))
     advisor = teacher.policy(world.rules, stream, *[world.core] * teacher.privileged)
     seen, said, rewards, ended = [], [], [], False

@@ -30,9 +30,11 @@ from tqdm import tqdm
 
 from eitbench import _check
 from eitbench._files import write_atomically
-from eitbench.envs.injection import InjectionVectorEnv
+from eitbench.envs.injection import InjectionEnv, InjectionVectorEnv
 from eitbench.envs.sb3 import InjectionVecEnv
 from eitbench.imitation import check_imitation, imitate
+from eitbench.leaderboard.policies import load_policy
+from eitbench.leaderboard.policy_table import OPEN_LOOP
 from eitbench.pair_policy import MaskablePairPolicy, PairPolicy
 from eitbench.seeds import SPLITS
 
@@ -59,6 +61,8 @@ class Config:
     """units of the networks' hidden layers"""
     algorithm: dict[str, Any] = field(default_factory=dict)
     """passed on to stable-baselines3"""
+    reference: str = ""
+    """one of our open-loop policies, from whose rewards in the same episode those of training are counted"""
     imitate: dict[str, Any] = field(default_factory=dict)
     """what to learn from before reinforcement: ``teacher``, ``episodes``, … (`eitbench.imitation`)"""
 
@@ -108,7 +112,12 @@ def train(env: str, algo: str, config: Config, seed: int, folder: Path, kwargs: 
         check_imitation(algo, config.imitate)
     asked = {"env": env, "kwargs": kwargs or {}, "algo": algo, "seed": seed, "config": asdict(config)}
     _begin_or_continue(folder, asked)
-    learning = VecMonitor(InjectionVecEnv(envs, reward_scale=config.reward_scale))
+    world = gym.make(env, disable_env_checker=True, observation="raw", episodes=config.episodes,
+                     **(kwargs or {})).unwrapped
+    assert isinstance(world, InjectionEnv)
+    plan = plan_of(world, config.reference) if config.reference else None
+    reference = None if plan is None else (vector_env(env, kwargs, config), plan)
+    learning = VecMonitor(InjectionVecEnv(envs, reward_scale=config.reward_scale, reference=reference))
     learning.seed(seed)
     latest = folder / "latest.zip"
     if latest.exists():
@@ -117,7 +126,7 @@ def train(env: str, algo: str, config: Config, seed: int, folder: Path, kwargs: 
         model = _fresh(algo, config, learning, seed, folder)
         if config.imitate:
             assert isinstance(model, OnPolicyAlgorithm)
-            imitate(model, env, kwargs or {}, config.imitate, config.reward_scale, seed)
+            imitate(model, world, config.imitate, config.reward_scale, plan, seed)
         _save(model, latest)
     evaluate = evaluation(env, kwargs, config)
     left = config.total_steps - model.num_timesteps
@@ -142,6 +151,18 @@ def vector_env(env: str, kwargs: dict[str, Any] | None, config: Config, n_envs: 
                         episodes=config.episodes, **(kwargs or {}))
     assert isinstance(made, InjectionVectorEnv)
     return made
+
+
+def plan_of(world: InjectionEnv, policy: str) -> np.ndarray:
+    """(steps, ...) actions of an open-loop policy; ``ValueError`` if it looks at what is measured."""
+    if policy not in OPEN_LOOP:
+        raise ValueError(f"reference must be one of {', '.join(OPEN_LOOP)}; got {policy!r}")
+    player = load_policy(policy).policy(world.rules, np.random.default_rng(0))
+    (observation, _), plan, ended = world.reset(seed=0), [], False
+    while not ended:
+        plan.append(player.act(observation))
+        observation, _, ended, _, _ = world.step(plan[-1])
+    return np.array(plan)
 
 
 def algorithm_of(name: str) -> Any:

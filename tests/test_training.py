@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 
 from eitbench import training
+from eitbench.envs.injection_core import Rules
 from eitbench.envs.sb3 import InjectionVecEnv
+from eitbench.leaderboard.policies import load_policy, play
+from eitbench.scenarios import Pipe2D
 from eitbench.training import Config, read_config, train
 
 NAME = "eitbench/Pipe2DInjection-v0"
@@ -120,3 +123,44 @@ def test_wrong_arguments_are_named(tmp_path):
         train(NAME, "reinforce", TINY, 0, tmp_path)
     with pytest.raises(ValueError, match="imitate must hold teacher"):
         train(NAME, "ppo", replace(TINY, imitate={"rounds": 1}), 0, tmp_path, SHORT)
+
+
+def test_rewards_may_be_counted_from_a_plan():
+    """What a plan earns in the same episodes is taken away, step by step, in this episode and the next."""
+    envs, twin, plain = (gym.make_vec(NAME, num_envs=3, vectorization_mode="vector_entry_point", episodes=5, **SHORT)
+                         for _ in range(3))
+    plan = np.array([3, 40, 7, 99])
+    ours = InjectionVecEnv(envs, reward_scale=10.0, reference=(twin, plan))
+    ours.seed(5)
+    ours.reset()
+    rng = np.random.default_rng(0)
+    for _ in range(2):
+        playing, actions = list(envs.seeds), rng.integers(120, size=(4, 3))
+        earned = []
+        for chosen in (actions, np.repeat(plan[:, None], 3, axis=1)):
+            plain.reset(seed=playing)
+            earned.append([plain.step(action)[1] for action in chosen])
+        expected = 10.0 * np.subtract(*earned)
+        assert np.abs(expected).max() > 1e-3
+        np.testing.assert_allclose([ours.step(action)[1] for action in actions], expected, atol=1e-6)
+
+
+@pytest.mark.parametrize(("env", "algo"), [(NAME, "ppo"), (BUDGET, "maskable_ppo"), (CURRENTS, "sac"),
+                                           (NAME, "recurrent_ppo")])
+def test_an_agent_plays_as_it_was_evaluated(env, algo, tmp_path):
+    """As a policy its errors are those of the last evaluation; a file that was changed is not opened."""
+    options = {"learning_starts": 4, "batch_size": 4} if algo == "sac" else {"n_steps": 8, "batch_size": 8}
+    kwargs = SHORT | ({"budget": 2} if env == BUDGET else {})
+    path = train(env, algo, replace(TINY, algorithm=options), 1, tmp_path, kwargs)
+    expected = np.load(tmp_path / "evaluations.npz")["errors"][-1]
+    errors = [play(env, kwargs, str(path), seed, "reduced")["error"] for seed in (100_000, 100_001)]
+    np.testing.assert_allclose(errors, expected, rtol=1e-5)
+    agent = load_policy(str(path))
+    assert agent.name == f"{algo}_seed1" and not agent.privileged and agent.parameters["env"] == env
+    assert not agent.suits(Rules(Pipe2D(), limit=None if env == CURRENTS else "L1"))
+    path.write_bytes(path.read_bytes() + b"x")
+    with pytest.raises(ValueError, match="must have the sha256 that lies beside it"):
+        load_policy(str(path))
+    (tmp_path / "sha256").unlink()
+    with pytest.raises(ValueError, match="must lie beside the config.json and sha256"):
+        load_policy(str(path))

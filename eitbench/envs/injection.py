@@ -157,6 +157,11 @@ class InjectionVectorEnv(LockstepVectorEnv):
         if self._pool:
             self._pool.shutdown()
 
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        """The episodes that are being played."""
+        return tuple(seed for core in self._cores for seed in core.seeds)
+
     def action_masks(self) -> np.ndarray:
         """(num_envs, actions) as in `InjectionEnv`."""
         return np.concatenate([core.action_masks() for core in self._cores])

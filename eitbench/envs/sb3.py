@@ -20,10 +20,16 @@ class InjectionVecEnv(VecEnv):
     envs : InjectionVectorEnv
     reward_scale : float
         Rewards are multiplied by it, which changes no optimum: they are of the order of 0.01 in themselves.
+    reference : (InjectionVectorEnv, (steps, ...) array), optional
+        As many environments again, and a plan of actions: rewards are counted from what the plan earns in the same
+        episode. That changes no optimum either, since the agent has no hand in it, and most of what makes one episode
+        harder than another drops out of the returns.
     """
 
-    def __init__(self, envs: InjectionVectorEnv, *, reward_scale: float = 1.0) -> None:
-        self.envs, self.reward_scale = envs, reward_scale
+    def __init__(self, envs: InjectionVectorEnv, *, reward_scale: float = 1.0,
+                 reference: tuple[InjectionVectorEnv, np.ndarray] | None = None) -> None:
+        self.envs, self.reward_scale, self._reference = envs, reward_scale, reference
+        self._earned: dict[int, np.ndarray] = {}                     # episode -> the plan's rewards
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
 
     def reset(self) -> Any:
@@ -32,18 +38,33 @@ class InjectionVecEnv(VecEnv):
         seeds = None if first is None else [
             int(k) for k in np.random.default_rng(first).integers(self.envs.episodes, size=self.num_envs)]
         self._reset_seeds()
-        return self.envs.reset(seed=seeds)[0]  # type: ignore[arg-type]
+        return self._begin(seeds)
+
+    def _begin(self, seeds: list[int] | None) -> Any:
+        observation = self.envs.reset(seed=seeds)[0]  # type: ignore[arg-type]
+        playing, self._step = self.envs.seeds, 0
+        if self._reference is not None:
+            twin, plan = self._reference
+            if set(playing) - set(self._earned):
+                twin.reset(seed=list(playing))
+                rewards = np.array([twin.step(np.repeat(action[None], self.num_envs, axis=0))[1] for action in plan])
+                self._earned |= dict(zip(playing, rewards.T, strict=True))
+            self._baseline = np.array([self._earned[seed] for seed in playing])
+        return observation
 
     def step_async(self, actions: np.ndarray) -> None:
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
         observation, rewards, ended, _, _ = self.envs.step(self._actions)
+        if self._reference is not None:
+            rewards = rewards - self._baseline[:, self._step]
+        self._step += 1
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         if ended.all():
             for info, last in zip(infos, observation, strict=True):
                 info |= {"terminal_observation": last, "TimeLimit.truncated": False}
-            observation = self.envs.reset()[0]
+            observation = self._begin(None)
         return observation, (self.reward_scale * rewards).astype(np.float32), ended, infos
 
     def close(self) -> None:

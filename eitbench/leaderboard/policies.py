@@ -56,16 +56,18 @@ def own_policies() -> list[str]:
 
 
 def load_policy(name: str) -> PolicyFile:
-    """Load one of our policies by name, or anybody's by the path of its file.
+    """Load one of our policies by name, anybody's by the path of its file, or a trained agent by that of its model.zip.
 
     Raises
     ------
     ValueError
-        If there is no such policy, or its file has no class `Policy` with an `act` method.
+        If there is no such policy, its file has no class `Policy` with an `act` method, or an agent's file is not the
+        one that was left by training.
     """
-    path = Path(name) if name.endswith(".py") else policy_folder() / f"{name}.py"
+    path = Path(name) if name.endswith((".py", ".zip")) else policy_folder() / f"{name}.py"
     if not path.is_file():
-        raise ValueError(f"policy must be a path to a .py file or one of {', '.join(own_policies())}; got {name!r}")
+        raise ValueError("policy must be the path of a .py file or of an agent's model.zip, or one of "
+                         f"{', '.join(own_policies())}; got {name!r}")
     if path.stem in own_policies() and not path.samefile(policy_folder() / path.name):
         raise ValueError(f"policy {path} has the name of one of ours, under which results are kept; rename it")
     return _load(path, path.read_bytes())
@@ -74,6 +76,10 @@ def load_policy(name: str) -> PolicyFile:
 @lru_cache(maxsize=64)
 def _load(path: Path, source: bytes) -> PolicyFile:
     """The file with this content, executed once a process."""
+    if path.suffix == ".zip":
+        from eitbench.leaderboard.agents import load_agent
+        name, title, agent, parameters = load_agent(path, source)
+        return PolicyFile(name, title, path, hashlib.sha256(source).hexdigest(), False, parameters, agent)
     specification = importlib.util.spec_from_file_location(f"eitbench_policy_{path.stem}", path)
     assert specification is not None
     module = importlib.util.module_from_spec(specification)
