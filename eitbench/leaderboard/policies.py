@@ -141,8 +141,10 @@ def play(env_id: str, kwargs: dict[str, Any], policy: str, seed: int, estimator:
     if not loaded.suits(env.rules):
         raise ValueError(f"policy {loaded.name} does not suit {env_id}")
     observation, done = env.reset(seed=seed)[0], False
-    # The fifth of an episode's streams; three made the recording, the fourth its faults.
-    random = np.random.default_rng(np.random.SeedSequence(seed).spawn(5)[4])
+    # The fifth of an episode's streams; three made the recording, the fourth its faults. A generator knows what it was
+    # seeded with, so the policy's is seeded with a number that says nothing of the episode.
+    stream = np.random.default_rng(np.random.SeedSequence(seed).spawn(5)[4])
+    random = np.random.default_rng(int(stream.integers(2**63)))
     begin = time.perf_counter()
     player = loaded.policy(env.rules, random, *[env.core] * loaded.privileged)
     seconds, spent, errors = time.perf_counter() - begin, 0, list[float]()
