@@ -22,18 +22,18 @@ DEFAULTS = {"rounds": 4, "episodes": 50, "epochs": 10, "batch": 256, "learning_r
 
 
 def imitate(model: OnPolicyAlgorithm, world: InjectionEnv, options: dict[str, Any], reward_scale: float,
-            seed: int) -> None:
+            plan: np.ndarray | None, seed: int) -> None:
     """Let ``model`` (PPO, with or without masks) learn from a policy file.
 
     Parameters
     ----------
     world : InjectionEnv
         With raw observations; its training episodes are played.
-    reward_scale : float
-        Of the rewards that the critic will see; 0 if they will be counted from what the pupil earns after imitation.
     options : dict
         ``teacher`` (name of one of our policies, or a path), and perhaps ``rounds``, ``episodes`` (a round), ``epochs``
         (a round), ``batch`` and ``learning_rate``. In the first round the teacher acts, in the others the pupil.
+    plan : (steps, ...), optional
+        Rewards are counted from those of these actions in the same episode, as in training.
     """
     settings, teacher = DEFAULTS | options, load_policy(str(options["teacher"]))
     random = np.random.default_rng([seed, 1])
@@ -43,7 +43,11 @@ def imitate(model: OnPolicyAlgorithm, world: InjectionEnv, options: dict[str, An
               disable=None) as bar:
         for turn in range(settings["rounds"]):
             for _ in range(settings["episodes"]):
-                shown, advice, rewards = _play(model, world, teacher, random, pupil_acts=turn > 0)
+                number = int(random.integers(world.episodes))
+                shown, advice, rewards = _play(model, world, teacher, number, random, pupil_acts=turn > 0)
+                if plan is not None:
+                    world.reset(seed=number)
+                    rewards -= [world.step(action)[1] for action in plan]
                 seen.append(shown)
                 said.append(advice)
                 worth.append(_returns(reward_scale * rewards, model.gamma))
@@ -62,10 +66,10 @@ def check_imitation(algo: str, options: dict[str, Any]) -> None:
     load_policy(str(options["teacher"]))
 
 
-def _play(model: OnPolicyAlgorithm, world: InjectionEnv, teacher: Any, random: np.random.Generator, *,
+def _play(model: OnPolicyAlgorithm, world: InjectionEnv, teacher: Any, number: int, random: np.random.Generator, *,
           pupil_acts: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(T, d) scaled observations of a training episode, (T,) what the teacher says to them, (T,) rewards."""
-    observation, _ = world.reset(seed=int(random.integers(world.episodes)))
+    """(T, d) scaled observations of an episode, (T,) what the teacher says to them, (T,) rewards."""
+    observation, _ = world.reset(seed=number)
     stream = np.random.default_rng(int(random.integers(2**63)))
     advisor = teacher.policy(world.rules, stream, *[world.core] * teacher.privileged)
     seen, said, rewards, ended = [], [], [], False
@@ -94,7 +98,7 @@ def _fit(model: OnPolicyAlgorithm, optimiser: torch.optim.Optimizer, seen: np.nd
     policy.set_training_mode(True)
     observations, actions = torch.as_tensor(seen), torch.as_tensor(said)
     returns = torch.as_tensor(worth, dtype=torch.float32)
-    scale = returns.std().clamp(min=0.1)
+    scale = returns.std() + 1e-6
     for _ in range(settings["epochs"]):
         for part in np.array_split(random.permutation(len(seen)), max(1, len(seen) // settings["batch"])):
             values, likelihood, _ = policy.evaluate_actions(observations[part], actions[part])  # type: ignore[operator]

@@ -31,8 +31,10 @@ from tqdm import tqdm
 from eitbench import _check
 from eitbench._files import write_atomically
 from eitbench.envs.injection import InjectionEnv, InjectionVectorEnv
-from eitbench.envs.sb3 import Choose, InjectionVecEnv
+from eitbench.envs.sb3 import InjectionVecEnv
 from eitbench.imitation import check_imitation, imitate
+from eitbench.leaderboard.policies import load_policy
+from eitbench.leaderboard.policy_table import OPEN_LOOP
 from eitbench.pair_policy import MaskablePairPolicy, PairPolicy
 from eitbench.seeds import SPLITS
 
@@ -59,8 +61,8 @@ class Config:
     """units of the networks' hidden layers"""
     algorithm: dict[str, Any] = field(default_factory=dict)
     """passed on to stable-baselines3"""
-    reference: bool = False
-    """whether rewards are counted from those that the agent, as it was before reinforcement, earns in the episode"""
+    reference: str = ""
+    """one of our open-loop policies, from whose rewards in the same episode those of training are counted"""
     imitate: dict[str, Any] = field(default_factory=dict)
     """what to learn from before reinforcement: ``teacher``, ``episodes``, … (`eitbench.imitation`)"""
 
@@ -113,21 +115,19 @@ def train(env: str, algo: str, config: Config, seed: int, folder: Path, kwargs: 
     world = gym.make(env, disable_env_checker=True, observation="raw", episodes=config.episodes,
                      **(kwargs or {})).unwrapped
     assert isinstance(world, InjectionEnv)
-    ours = InjectionVecEnv(envs, reward_scale=config.reward_scale)
-    learning = VecMonitor(ours)
+    plan = plan_of(world, config.reference) if config.reference else None
+    reference = None if plan is None else (vector_env(env, kwargs, config), plan)
+    learning = VecMonitor(InjectionVecEnv(envs, reward_scale=config.reward_scale, reference=reference))
     learning.seed(seed)
-    latest, first = folder / "latest.zip", folder / "first.zip"
+    latest = folder / "latest.zip"
     if latest.exists():
         model = algorithm_of(algo).load(latest, env=learning, tensorboard_log=str(folder / "tensorboard"))
     else:
         model = _fresh(algo, config, learning, seed, folder)
         if config.imitate:
             assert isinstance(model, OnPolicyAlgorithm)
-            imitate(model, world, config.imitate, 0.0 if config.reference else config.reward_scale, seed)
-        _save(model, first)
+            imitate(model, world, config.imitate, config.reward_scale, plan, seed)
         _save(model, latest)
-    if config.reference:
-        ours.compare_with(vector_env(env, kwargs, config), chooser(algorithm_of(algo).load(first)))
     evaluate = evaluation(env, kwargs, config)
     left = config.total_steps - model.num_timesteps
     if not (folder / "evaluations.npz").exists():
@@ -138,7 +138,6 @@ def train(env: str, algo: str, config: Config, seed: int, folder: Path, kwargs: 
     _save(model, folder / "model.zip")
     write_atomically(folder / "sha256", hashlib.sha256((folder / "model.zip").read_bytes()).hexdigest().encode())
     latest.unlink()
-    first.unlink()
     return folder / "model.zip"
 
 
@@ -154,6 +153,18 @@ def vector_env(env: str, kwargs: dict[str, Any] | None, config: Config, n_envs: 
     return made
 
 
+def plan_of(world: InjectionEnv, policy: str) -> np.ndarray:
+    """(steps, ...) actions of an open-loop policy; ``ValueError`` if it looks at what is measured."""
+    if policy not in OPEN_LOOP:
+        raise ValueError(f"reference must be one of {', '.join(OPEN_LOOP)}; got {policy!r}")
+    player = load_policy(policy).policy(world.rules, np.random.default_rng(0))
+    (observation, _), plan, ended = world.reset(seed=0), [], False
+    while not ended:
+        plan.append(player.act(observation))
+        observation, _, ended, _, _ = world.step(plan[-1])
+    return np.array(plan)
+
+
 def algorithm_of(name: str) -> Any:
     """The class of one of `ALGORITHMS`."""
     return {"ppo": PPO, "dqn": DQN, "sac": SAC, "recurrent_ppo": RecurrentPPO, "maskable_ppo": MaskablePPO}[name]
@@ -166,10 +177,14 @@ def evaluation(env: str, kwargs: dict[str, Any] | None, config: Config) -> Calla
     seeds = list(SPLITS["dev"])[:config.evaluation_episodes]
 
     def evaluate(model: BaseAlgorithm) -> np.ndarray:
-        choose, observation = chooser(model), envs.reset(seed=seeds)[0]  # type: ignore[arg-type]
-        errors, ended = [], False
+        observation, _ = envs.reset(seed=seeds)  # type: ignore[arg-type]
+        state, starts, errors, ended = None, np.ones(len(seeds), dtype=bool), [], False
         while not ended:
-            observation, _, done, _, _ = envs.step(choose(envs, observation))
+            options = {"action_masks": envs.action_masks()} if _masked(model) else {}
+            actions, state = model.predict(observation, state=state, episode_start=starts, deterministic=True,  # type: ignore[call-arg]
+                                           **options)
+            starts = np.zeros(len(seeds), dtype=bool)
+            observation, _, done, _, _ = envs.step(actions)
             errors.append(envs.errors())
             ended = bool(done.all())
         return np.nanmean(errors, axis=0)
@@ -177,18 +192,8 @@ def evaluation(env: str, kwargs: dict[str, Any] | None, config: Config) -> Calla
     return evaluate
 
 
-def chooser(model: BaseAlgorithm) -> Choose:
-    """What a model thinks best, from the beginning of the next episode on; it keeps what recurrent ones remember."""
-    memory: Any = None
-
-    def choose(envs: InjectionVectorEnv, observation: Any) -> np.ndarray:
-        nonlocal memory
-        masks = {"action_masks": envs.action_masks()} if isinstance(model, MaskablePPO) else {}
-        actions, memory = model.predict(observation, state=memory, deterministic=True,  # type: ignore[call-arg]
-                                        episode_start=np.full(envs.num_envs, envs.begins), **masks)
-        return actions
-
-    return choose
+def _masked(model: BaseAlgorithm) -> bool:
+    return isinstance(model, MaskablePPO)
 
 
 def _begin_or_continue(folder: Path, asked: dict[str, Any]) -> None:

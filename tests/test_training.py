@@ -125,14 +125,12 @@ def test_wrong_arguments_are_named(tmp_path):
         train(NAME, "ppo", replace(TINY, imitate={"rounds": 1}), 0, tmp_path, SHORT)
 
 
-def test_rewards_may_be_counted_from_others():
-    """What others earn in the same episodes is taken away, step by step, in this episode and the next."""
+def test_rewards_may_be_counted_from_a_plan():
+    """What a plan earns in the same episodes is taken away, step by step, in this episode and the next."""
     envs, twin, plain = (gym.make_vec(NAME, num_envs=3, vectorization_mode="vector_entry_point", episodes=5, **SHORT)
                          for _ in range(3))
     plan = np.array([3, 40, 7, 99])
-    ours = InjectionVecEnv(envs, reward_scale=10.0)
-    step = iter([*plan, *plan])
-    ours.compare_with(twin, lambda envs, observation: np.full(3, next(step)))
+    ours = InjectionVecEnv(envs, reward_scale=10.0, reference=(twin, plan))
     ours.seed(5)
     ours.reset()
     rng = np.random.default_rng(0)

@@ -35,11 +35,6 @@ class LockstepVectorEnv(gym.vector.VectorEnv[Observation, np.ndarray, np.ndarray
         self._randoms: list[np.random.Generator | None] = [None] * num_envs
         self._step, self._ended = 0, False
 
-    @property
-    def begins(self) -> bool:
-        """Whether the episodes have just begun."""
-        return self._step == 1
-
     def _show(self, observation_space: gym.Space, action_space: gym.Space) -> None:
         """Say what one environment shows and takes."""
         self.single_observation_space, self.single_action_space = observation_space, action_space

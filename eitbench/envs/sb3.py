@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,9 +10,6 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from eitbench.envs.injection import InjectionVectorEnv
-
-Choose = Callable[[InjectionVectorEnv, Any], np.ndarray]
-"""Environments and what they show -> an action for each."""
 
 
 class InjectionVecEnv(VecEnv):
@@ -23,21 +20,17 @@ class InjectionVecEnv(VecEnv):
     envs : InjectionVectorEnv
     reward_scale : float
         Rewards are multiplied by it, which changes no optimum: they are of the order of 0.01 in themselves.
+    reference : (InjectionVectorEnv, (steps, ...) array), optional
+        As many environments again, and a plan of actions: rewards are counted from what the plan earns in the same
+        episode. That changes no optimum either, since the agent has no hand in it, and most of what makes one episode
+        harder than another drops out of the returns.
     """
 
-    def __init__(self, envs: InjectionVectorEnv, *, reward_scale: float = 1.0) -> None:
-        self.envs, self.reward_scale = envs, reward_scale
-        self._reference: tuple[InjectionVectorEnv, Choose] | None = None
-        self._earned: dict[int, np.ndarray] = {}                     # episode -> the reference's rewards
+    def __init__(self, envs: InjectionVectorEnv, *, reward_scale: float = 1.0,
+                 reference: tuple[InjectionVectorEnv, np.ndarray] | None = None) -> None:
+        self.envs, self.reward_scale, self._reference = envs, reward_scale, reference
+        self._earned: dict[int, np.ndarray] = {}                     # episode -> the plan's rewards
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
-
-    def compare_with(self, twin: InjectionVectorEnv, choose: Choose) -> None:
-        """From now on count rewards from what ``choose`` earns in the same episodes, which ``twin`` plays again.
-
-        That changes no optimum, since the agent has no hand in it, and most of what makes one episode harder than
-        another drops out of the returns.
-        """
-        self._reference, self._earned = (twin, choose), {}
 
     def reset(self) -> Any:
         """Begin training episodes; after ``seed(s)`` they are drawn from a sequence that s determines."""
@@ -51,8 +44,11 @@ class InjectionVecEnv(VecEnv):
         observation = self.envs.reset(seed=seeds)[0]  # type: ignore[arg-type]
         playing, self._step = self.envs.seeds, 0
         if self._reference is not None:
+            twin, plan = self._reference
             if set(playing) - set(self._earned):
-                self._earned |= dict(zip(playing, _play(*self._reference, playing).T, strict=True))
+                twin.reset(seed=list(playing))
+                rewards = np.array([twin.step(np.repeat(action[None], self.num_envs, axis=0))[1] for action in plan])
+                self._earned |= dict(zip(playing, rewards.T, strict=True))
             self._baseline = np.array([self._earned[seed] for seed in playing])
         return observation
 
@@ -94,13 +90,3 @@ class InjectionVecEnv(VecEnv):
 
     def get_images(self) -> Sequence[np.ndarray | None]:
         return [None] * self.num_envs
-
-
-def _play(envs: InjectionVectorEnv, choose: Choose, seeds: Sequence[int]) -> np.ndarray:
-    """(steps, num_envs) rewards of these episodes."""
-    observation, rewards, ended = envs.reset(seed=list(seeds))[0], [], False
-    while not ended:
-        observation, earned, done, _, _ = envs.step(choose(envs, observation))
-        rewards.append(earned)
-        ended = bool(done.all())
-    return np.array(rewards)
