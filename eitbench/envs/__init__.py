@@ -39,8 +39,8 @@ def register_all() -> None:
         gym.register(name, entry_point=f"{entry_point}Env", vector_entry_point=f"{entry_point}VectorEnv", kwargs=kwargs)
 
 
-def scenario_of(name: str) -> Any:
+def scenario_of(name: str, kwargs: dict[str, Any] | None = None) -> Any:
     """The scenario that an environment plays; ``ValueError`` if there is none of this id."""
     if name not in ENTRY_POINTS:
         raise ValueError(f"env must be one of {', '.join(ENTRY_POINTS)}; got {name!r}")
-    return gym.make(name, disable_env_checker=True).unwrapped.scenario  # type: ignore[attr-defined]
+    return gym.make(name, disable_env_checker=True, **(kwargs or {})).unwrapped.scenario  # type: ignore[attr-defined]

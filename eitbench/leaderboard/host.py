@@ -1,0 +1,186 @@
+"""Run somebody else's estimator or policy in a process of its own: `Guest`. What passes between is measured numbers.
+
+What this protects against, and what not, is in ``docs/trust.md``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import select
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from eitbench.leaderboard import wire
+
+MEMORY = 8 << 30
+"""bytes of address space that a guest may take"""
+PATIENCE = 120.0
+"""s that an answer may take; the first after an episode began may hold all preparations"""
+
+
+class GuestError(RuntimeError):
+    """The guest raised an exception, broke a limit, or does not speak the language."""
+
+    where: str = "guest"
+
+
+class Guest:
+    """A process that plays one estimator or policy in one environment, episode after episode.
+
+    Parameters
+    ----------
+    kind : "estimator" or "policy"
+    id, kwargs
+        The environment, of which it makes its own, without an episode.
+    name : str
+        One of ours, or the path of a .py file or an agent's model.zip. Such files are copied into a folder of the
+        guest's own, which is the only place where it can write.
+    memory : int
+        bytes
+    patience : float
+        s
+    """
+
+    def __init__(self, kind: str, id: str, kwargs: dict[str, Any], name: str, *, memory: int = MEMORY,
+                 patience: float = PATIENCE) -> None:
+        self._patience = patience
+        self._private = Path(tempfile.mkdtemp(prefix="eitbench-guest-"))
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "eitbench.leaderboard.guest", str(self._private), str(memory)],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=self._surroundings(id, kwargs), cwd=self._private)
+        try:
+            self.closed = bool(self._receive()[0]["closed"])
+            """Whether files are out of its reach."""
+            self._ask({"do": "play", "kind": kind, "id": id, "kwargs": kwargs, "name": self._copied(name)})
+        except BaseException:
+            self.close()
+            raise
+
+    def begin(self, random: int = 0) -> None:
+        """A new episode: another estimator or policy, of the same class; a policy's generator is seeded with this."""
+        self._ask({"do": "begin", "random": random})
+
+    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Any:
+        """What the estimator makes of a measurement: an `Estimate`, None, or the name of what it is instead."""
+        from eitbench.task import Estimate
+        words, arrays = self._ask({"do": "update"}, {"voltages": voltages, "currents": currents})
+        if words.get("estimate") != "Estimate":
+            return words.get("estimate")
+        if not {"mean"} <= set(arrays) <= set(Estimate._fields):
+            raise GuestError(f"ValueError: Estimator.update must return an Estimate, got one of {', '.join(arrays)}")
+        return Estimate(**arrays)
+
+    def act(self, observation: dict[str, np.ndarray]) -> Any:
+        """The policy's action."""
+        action = self._ask({"do": "act"}, observation)[1].get("action", np.zeros(0))
+        return int(action) if action.shape == () and action.dtype.kind in "iu" else action
+
+    @property
+    def peak_memory(self) -> int | None:
+        """bytes that it has held at most; None where that is not told."""
+        try:
+            status = Path(f"/proc/{self._process.pid}/status").read_text()
+        except OSError:
+            return None
+        return next((1024 * int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM")), None)
+
+    def close(self) -> None:
+        """End it, and remove its folder."""
+        self._process.kill()
+        self._process.wait()
+        for pipe in (self._process.stdin, self._process.stdout):
+            if pipe:
+                pipe.close()
+        shutil.rmtree(self._private, ignore_errors=True)
+
+    def __enter__(self) -> Guest:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 trace: TracebackType | None) -> None:
+        self.close()
+
+    def _surroundings(self, id: str, kwargs: dict[str, Any]) -> dict[str, str]:
+        """Environment variables; models that are kept in the cache, without a truth, are copied for the guest."""
+        from eitbench.envs import scenario_of
+        from eitbench.episodes import CACHE_VARIABLE, folder
+        cache, kernels = self._private / "cache", self._private / "kernels"
+        there = folder(scenario_of(id, kwargs))
+        (cache / there.name).mkdir(parents=True)
+        for model in (*there.glob("reduced-*.npz"), *there.glob("outline.npz")):
+            shutil.copy(model, cache / there.name)
+        _copy_kernels(kernels)
+        package = Path(__file__).parents[2]
+        return {"PATH": os.environ.get("PATH", ""), "HOME": str(self._private), "TMPDIR": str(self._private),
+                "PYTHONPATH": str(package), "PYTHONDONTWRITEBYTECODE": "1", CACHE_VARIABLE: str(cache),
+                "NUMBA_CACHE_DIR": str(kernels), **dict.fromkeys(
+                    ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")}
+
+    def _copied(self, name: str) -> str:
+        if not name.endswith((".py", ".zip")):
+            return name
+        path, place = Path(name), self._private / "own"
+        place.mkdir()
+        beside: Sequence[str] = ("config.json", "sha256") if path.suffix == ".zip" else ()
+        for each in (path, *(path.with_name(other) for other in beside)):
+            shutil.copy(each, place)
+        return str(place / path.name)
+
+    def _ask(self, words: dict[str, Any], arrays: dict[str, np.ndarray] | None = None,
+             ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write(wire.pack(words, arrays))
+            self._process.stdin.flush()
+        except BrokenPipeError:
+            raise self._ended() from None
+        answer = self._receive()
+        if "error" in answer[0]:
+            error = GuestError(str(answer[0]["error"]))
+            error.where = str(answer[0].get("where"))
+            raise error
+        return answer
+
+    def _receive(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        assert self._process.stdout is not None
+        pipe, deadline = self._process.stdout.fileno(), time.monotonic() + self._patience
+
+        def read(n: int) -> bytes:
+            parts, left = [], n
+            while left:
+                if not select.select([pipe], [], [], max(0.0, deadline - time.monotonic()))[0]:
+                    raise GuestError(f"TimeoutError: no answer within {self._patience:g} s")
+                part = os.read(pipe, min(left, 1 << 20))
+                if not part:
+                    raise self._ended()
+                parts.append(part)
+                left -= len(part)
+            return b"".join(parts)
+
+        try:
+            return wire.unpack(read)
+        except ValueError as error:
+            raise GuestError(f"ValueError: {error}") from None
+
+    def _ended(self) -> GuestError:
+        return GuestError(f"ChildProcessError: its process ended with status {self._process.wait()}, which is what a "
+                          "crash does, or a limit of memory")
+
+
+def _copy_kernels(place: Path) -> None:
+    """numba's compiled kernels, where it will look for them: compiling takes some 20 s."""
+    folder = Path(__file__).parents[1] / "physics"
+    there = place / f"{folder.name}_{hashlib.sha1(str(folder).encode()).hexdigest()}"
+    there.mkdir(parents=True)
+    for path in (folder / "__pycache__").glob("*.nb?"):
+        shutil.copy2(path, there)

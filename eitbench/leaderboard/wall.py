@@ -1,0 +1,93 @@
+"""Limits that a process puts on itself before it runs somebody else's code, and cannot lift again.
+
+Files: Linux' Landlock (kernel 5.13 and later). Whatever is not named is out of reach, other processes' memory too, and
+TCP where the kernel knows how to refuse it. Memory: a limit of the address space.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import resource
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+
+_CREATE, _ADD, _RESTRICT = 444, 445, 446
+"""System calls of Landlock, the same on every architecture that Python is at home on."""
+_READ = 1 << 0 | 1 << 2 | 1 << 3
+"""execute, read a file, list a folder"""
+_FILE = 1 << 0 | 1 << 1 | 1 << 2 | 1 << 14
+"""What rules on a single file may allow."""
+_ALL = {1: (1 << 13) - 1, 2: (1 << 14) - 1, 3: (1 << 15) - 1, 5: (1 << 16) - 1}
+"""What a version of the interface can refuse: all that came with it or earlier."""
+_NO_NEW_PRIVILEGES = 38
+
+
+class _Ruleset(ctypes.Structure):
+    _fields_ = (("files", ctypes.c_uint64), ("network", ctypes.c_uint64), ("scoped", ctypes.c_uint64))
+
+
+class _Beneath(ctypes.Structure):
+    _pack_ = 1
+    _layout_ = "ms"
+    _fields_ = (("allowed", ctypes.c_uint64), ("folder", ctypes.c_int32))
+
+
+def landlock_version() -> int:
+    """Version of the kernel's interface; 0 where there is none."""
+    if not sys.platform.startswith("linux"):
+        return 0
+    return max(0, int(_libc().syscall(_CREATE, None, 0, 1)))
+
+
+def close_files(readable: Iterable[Path], writable: Iterable[Path]) -> bool:
+    """From now on this process and its children reach only these files and folders, and what lies beneath them.
+
+    Returns whether that is so; False where the kernel has no Landlock. Raises ``OSError`` if it has and refuses.
+    """
+    version = landlock_version()
+    if not version:
+        return False
+    libc, everything = _libc(), _ALL[max(known for known in _ALL if known <= version)]
+    asked = _Ruleset(everything, 0b11 if version >= 4 else 0, 0b11 if version >= 6 else 0)
+    size = 24 if version >= 6 else 16 if version >= 4 else 8
+    ruleset = _checked(libc.syscall(_CREATE, ctypes.byref(asked), size, 0))
+    for paths, access in ((readable, _READ), (writable, everything)):
+        for path in paths:
+            if not path.exists():
+                continue
+            place = os.open(path, os.O_PATH)
+            allowed = (access if path.is_dir() else access & _FILE) & everything
+            rule = _Beneath(allowed, place)
+            _checked(libc.syscall(_ADD, ruleset, 1, ctypes.byref(rule), 0))
+            os.close(place)
+    _checked(libc.prctl(_NO_NEW_PRIVILEGES, 1, 0, 0, 0))
+    _checked(libc.syscall(_RESTRICT, ruleset, 0))
+    os.close(ruleset)
+    return True
+
+
+def limit_memory(size: int) -> None:
+    """No more than ``size`` bytes of address space, no core dumps; a request beyond raises ``MemoryError``."""
+    resource.setrlimit(resource.RLIMIT_AS, (size, size))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+
+def python_files() -> list[Path]:
+    """What Python and this package need to read: programs, libraries, this process' own entries and the processor's."""
+    package = Path(__file__).parents[1]
+    places = [sys.prefix, sys.base_prefix, sys.exec_prefix, str(package), str(package.parent / "baselines"), "/usr",
+              "/lib", "/lib64", "/bin", "/etc", "/dev/null", "/dev/urandom", "/dev/zero", f"/proc/{os.getpid()}", "/proc/cpuinfo",
+              "/proc/meminfo", "/proc/stat", "/sys/devices/system/cpu", *filter(None, sys.path)]
+    return [Path(place) for place in places]
+
+
+def _libc() -> ctypes.CDLL:
+    return ctypes.CDLL(None, use_errno=True)
+
+
+def _checked(result: int) -> int:
+    if result < 0:
+        raise OSError(ctypes.get_errno(), f"Landlock: {os.strerror(ctypes.get_errno())}")
+    return result
