@@ -78,8 +78,8 @@ def python_files() -> list[Path]:
     """What Python and this package need to read: programs, libraries, this process' own entries and the processor's."""
     package = Path(__file__).parents[1]
     places = [sys.prefix, sys.base_prefix, sys.exec_prefix, str(package), str(package.parent / "baselines"), "/usr",
-              "/lib", "/lib64", "/bin", "/etc", "/dev/null", "/dev/urandom", "/dev/zero", f"/proc/{os.getpid()}", "/proc/cpuinfo",
-              "/proc/meminfo", "/proc/stat", "/sys/devices/system/cpu", *filter(None, sys.path)]
+              "/lib", "/lib64", "/bin", "/etc", "/dev/null", "/dev/urandom", "/dev/zero", f"/proc/{os.getpid()}",
+              "/proc/cpuinfo", "/proc/meminfo", "/proc/stat", "/sys/devices/system/cpu", *filter(None, sys.path)]
     return [Path(place) for place in places]
 
 
