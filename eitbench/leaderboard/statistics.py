@@ -1,0 +1,249 @@
+"""Statistics of a board: interquartile mean, bootstrap intervals, comparisons seed by seed, shared ranks.
+
+Methods play the same episodes, named by their seeds, in several environments. An environment is a stratum: episodes are
+resampled within it, the environments stay as they are. Intervals are percentile bootstrap intervals of 95 % (Efron &
+Tibshirani, *An introduction to the bootstrap*, 1993, ch. 13), stratified as in Agarwal et al., "Deep reinforcement
+learning at the edge of the statistical precipice" (NeurIPS 2021) and its library rliable. Each stratum is sorted before
+it is resampled, and ``seed`` fixes the random stream: the same scores give the same interval in any process, however
+they are listed. `docs/statistics.md` says what the numbers mean, and how they compare with rliable's.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Mapping, Sequence
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+Scores = Mapping[str, Mapping[str, float]]
+"""Environment -> seed -> score: of one method, for comparisons seed by seed."""
+Statistic = Callable[..., Any]
+"""Takes one array (..., n_e) for each stratum and gives an array (...); n_e episodes, the axes before it are draws."""
+DRAWS = 10_000
+FEWEST = 6
+"""With fewer episodes altogether no interval is claimed: where all n differences have one sign each resample has it,
+and zero lies outside; for two equal methods that happens with probability 2^(1 − n), above 5 % for n < 6."""
+
+
+def interquartile_mean(*scores: ArrayLike) -> Any:
+    """Mean of the middle half of all scores pooled: the 25 % trimmed mean (Agarwal et al. 2021).
+
+    Of N scores the ⌊N/4⌋ lowest and the ⌊N/4⌋ highest are left out whole. Where 4 does not divide N a little more than
+    half therefore stays, with equal weights: all for N ≤ 3, 3 of 5, 4 of 6, 5 of 7, 4 of 8.
+
+    Parameters
+    ----------
+    *scores : (..., n_e) each
+        One array an environment, or a single one. Pooled along the last axis, so that an environment weighs as much as
+        it has episodes; all must be on one scale. A matrix (runs, tasks) of rliable is ``*matrix.T``.
+
+    Returns
+    -------
+    (...) array; a number for arrays (n_e,).
+    """
+    strata = [np.asarray(stratum, dtype=float) for stratum in scores]
+    if not (total := sum(stratum.shape[-1] for stratum in strata)):
+        raise ValueError("scores must hold at least one score")
+    # scipy.stats.trim_mean(…, 0.25), but faster for many draws, and the same to the last bit in whatever order
+    return np.sort(np.concatenate(strata, axis=-1), axis=-1)[..., total // 4:total - total // 4].mean(axis=-1)
+
+
+def mean_over_environments(*scores: ArrayLike) -> Any:
+    """Mean of the environments' means, (...) of one array (..., n_e) each: all weigh the same, however long."""
+    if not scores or not all(np.shape(stratum)[-1] for stratum in scores):
+        raise ValueError("scores must hold at least one score of each environment")
+    return np.mean([np.mean(np.asarray(stratum, dtype=float), axis=-1) for stratum in scores], axis=0)
+
+
+def stratified_bootstrap(scores_by_stratum: Mapping[str, ArrayLike], statistic: Statistic, *, draws: int = DRAWS,
+                         seed: int = 0) -> tuple[float, float, float]:
+    """A statistic with its 95 % percentile bootstrap interval, episodes resampled within each environment.
+
+    Parameters
+    ----------
+    scores_by_stratum : environment -> (n_e,)
+        The numbers of episodes may differ.
+    statistic : callable
+        Called with one array for each environment, in the order of their names: (n_e,) for the value, and once for all
+        draws with (draws, n_e). It must not depend on the order of episodes; as `interquartile_mean` and
+        `mean_over_environments`.
+    draws, seed : int
+        Number of resamples, and what fixes their random stream.
+
+    Returns
+    -------
+    value, low, high
+        With fewer than `FEWEST` episodes altogether, or fewer than two in an environment, low and high are infinite.
+    """
+    strata = _strata("scores_by_stratum", scores_by_stratum)
+    low, high = _interval(strata, statistic, draws, seed) if _enough(strata) else (-math.inf, math.inf)
+    return float(statistic(*strata)), low, high
+
+
+def paired_difference(a: Scores, b: Scores, *, draws: int = DRAWS, seed: int = 0) -> tuple[float, float, float]:
+    """Mean of a − b over the episodes that both have, with its 95 % interval; below zero a is lower.
+
+    What makes an episode hard for both cancels, so far smaller differences are seen than by comparing two intervals.
+    Pairs are resampled within each environment; of several environments the difference is the mean of their means.
+
+    Parameters
+    ----------
+    a, b : environment -> seed -> score
+        Seeds that only one of them has do not count.
+    draws, seed
+        As in `stratified_bootstrap`; so are the three numbers returned.
+
+    Raises
+    ------
+    ValueError
+        If the environments differ, or there is one without any shared seed.
+    """
+    differences = {environment: pair[0] - pair[1] for environment, pair in _pairs(a, b).items()}
+    return stratified_bootstrap(differences, mean_over_environments, draws=draws, seed=seed)
+
+
+def paired_probability_of_improvement(a: Scores, b: Scores, *, higher_is_better: bool = False, draws: int = DRAWS,
+                                      seed: int = 0) -> tuple[float, float, float]:
+    """Share of the shared episodes in which a is better than b, with its 95 % interval; an equal score counts ½.
+
+    The mean over environments of each one's share. Arguments, pairing and errors as in `paired_difference`; where there
+    is no interval, 0 and 1 are its ends.
+    """
+    wins = {environment: _wins(pair[0], pair[1], higher_is_better) for environment, pair in _pairs(a, b).items()}
+    value, low, high = stratified_bootstrap(wins, mean_over_environments, draws=draws, seed=seed)
+    return value, max(low, 0.0), min(high, 1.0)
+
+
+def probability_of_improvement(a: Mapping[str, ArrayLike], b: Mapping[str, ArrayLike], *,
+                               higher_is_better: bool = False, draws: int = DRAWS,
+                               seed: int = 0) -> tuple[float, float, float]:
+    """P(a better than b), whatever the seeds, with its 95 % interval: the Mann–Whitney statistic as in rliable.
+
+    In each environment the share of all n_a·n_b combinations of an episode of a with one of b in which a is better, an
+    equal score counting ½; then the mean over environments. For the interval both are resampled independently of each
+    other. Meant for runs that have nothing in common, as trainings from different random seeds; of methods that played
+    the same episodes `paired_probability_of_improvement` makes more.
+
+    Parameters
+    ----------
+    a, b : environment -> (n_e,)
+        In the same environments; the numbers of episodes may differ.
+    draws, seed
+        As in `stratified_bootstrap`; so are the three numbers returned, but 0 and 1 stand for infinity.
+    """
+    _same_environments(a, b)
+    ours, theirs = _strata("a", a), _strata("b", b)
+    wins = [_wins(x[:, None], y, higher_is_better) for x, y in zip(ours, theirs, strict=True)]       # (n_a, n_b)
+
+    def probability(*positions: np.ndarray) -> Any:
+        # A resample is how often each episode is in it, which makes of all its combinations one matrix product.
+        shares = [((_counts(i) @ won) * _counts(j)).sum(axis=-1) / won.size
+                  for i, j, won in zip(positions[:len(wins)], positions[len(wins):], wins, strict=True)]
+        return np.mean(shares, axis=0)
+
+    positions = [np.arange(len(stratum)) for stratum in [*ours, *theirs]]
+    enough = _enough(ours) and _enough(theirs)
+    low, high = _interval(positions, probability, draws, seed) if enough else (0.0, 1.0)
+    return float(probability(*positions)), low, high
+
+
+def shared_ranks(scores: Mapping[str, Scores], unranked: Collection[str] = (), *, higher_is_better: bool = False,
+                 draws: int = DRAWS, seed: int = 0) -> dict[str, int | None]:
+    """Rank of each method: 1 + the number of ranked methods that are significantly better than it.
+
+    Better is one whose `paired_difference` has its whole interval on the better side of zero. Rank 1 thus means that
+    nobody was shown to be better, rank 3 that two were, and they can be named. A method too uncertain to be told from
+    others costs them no rank.
+
+    "Cannot be told apart" is not transitive: a and b may be so, and b and c, and still a is better than c. No ranking
+    then gives one rank to exactly those that cannot be told apart; this one gives a and b rank 1 and c rank 2. Nor need
+    ranks rise along the means: a method of scattered scores may stand below one of rank 2 and have rank 1. Each
+    comparison is at 95 %, without correction for their number.
+
+    Parameters
+    ----------
+    scores : method -> environment -> seed -> score
+        In the same environments for all.
+    unranked : collection of str
+        Methods outside the competition, such as privileged ones and floors: they have no rank and count for nobody's.
+    draws, seed
+        As in `stratified_bootstrap`.
+
+    Returns
+    -------
+    method -> rank, or None if unranked; in the order of the means over environments of all own episodes, best first.
+    """
+    for method in scores:
+        _same_environments(next(iter(scores.values())), scores[method])
+    sign = -1.0 if higher_is_better else 1.0
+    means = {method: sign * mean_over_environments(*_strata("scores", {name: list(episodes.values())
+                                                                       for name, episodes in own.items()}))
+             for method, own in scores.items()}
+    order = sorted(scores, key=lambda method: (means[method], method))         # equal means: not as they happen to come
+    ranks = {method: 1 for method in order if method not in unranked}
+    for first, second in combinations(ranks, 2):
+        _, low, high = paired_difference(scores[first], scores[second], draws=draws, seed=seed)
+        low, high = sorted((sign * low, sign * high))
+        ranks[second] += high < 0
+        ranks[first] += low > 0                      # happens where each has episodes that the other has not
+    return {method: ranks.get(method) for method in order}
+
+
+def _interval(strata: Sequence[np.ndarray], statistic: Statistic, draws: int, seed: int) -> tuple[float, float]:
+    """2.5 % and 97.5 % points of a statistic over resamples of each stratum (n_e,)."""
+    if draws < 1:
+        raise ValueError(f"draws must be at least 1, got {draws}")
+    random = np.random.default_rng(seed)
+    values = np.asarray(statistic(*(stratum[random.integers(len(stratum), size=(draws, len(stratum)))]
+                                    for stratum in strata)))
+    if values.shape != (draws,):                        # np.mean, say, would make one number of all draws
+        raise ValueError(f"statistic must reduce the last axis only: expected shape {(draws,)}, got {values.shape}")
+    low, high = np.percentile(values, [2.5, 97.5])
+    return float(low), float(high)
+
+
+def _enough(strata: Sequence[np.ndarray]) -> bool:
+    sizes = [len(stratum) for stratum in strata]
+    return min(sizes) >= 2 and sum(sizes) >= FEWEST
+
+
+def _strata(name: str, scores: Mapping[str, ArrayLike]) -> list[np.ndarray]:
+    """The scores of each environment, sorted; environments by name."""
+    strata = [np.sort(np.asarray(scores[environment], dtype=float), axis=-1) for environment in sorted(scores)]
+    if not strata or any(stratum.ndim != 1 or not stratum.size or not np.isfinite(stratum).all() for stratum in strata):
+        raise ValueError(f"{name} must hold finite scores (n_e,) of at least one episode for each of its environments")
+    return strata
+
+
+def _pairs(a: Scores, b: Scores) -> dict[str, np.ndarray]:
+    """Environment -> (2, n_e): scores of the seeds that a and b share."""
+    _same_environments(a, b)
+    pairs = {}
+    for environment, own in a.items():
+        other = b[environment]
+        pairs[environment] = np.array([(own[s], other[s]) for s in own if s in other], dtype=float).reshape(-1, 2).T
+        if not pairs[environment].size:
+            raise ValueError(f"a and b must share a seed in every environment; there is none in {environment}")
+        if not np.isfinite(pairs[environment]).all():
+            raise ValueError(f"a and b must hold finite scores; there are others in {environment}")
+    return pairs
+
+
+def _same_environments(a: Mapping[str, Any], b: Mapping[str, Any]) -> None:
+    if set(a) != set(b):
+        raise ValueError(f"environments must be the same for both, got {', '.join(a)} and {', '.join(b)}")
+
+
+def _wins(a: np.ndarray, b: np.ndarray, higher_is_better: bool) -> np.ndarray:
+    """1 where a is better, ½ where they are equal, 0 elsewhere."""
+    return 0.5 * (1.0 + (np.sign(a - b) if higher_is_better else np.sign(b - a)))
+
+
+def _counts(positions: np.ndarray) -> np.ndarray:
+    """How often each of 0 … n − 1 is among the n positions: (..., n) of (..., n)."""
+    n = positions.shape[-1]
+    rows = positions.reshape(-1, n)
+    return np.bincount((rows + n * np.arange(len(rows))[:, None]).ravel(), minlength=rows.size).reshape(positions.shape)
