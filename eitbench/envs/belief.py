@@ -15,8 +15,10 @@ if TYPE_CHECKING:
     from eitbench.envs.estimation import Observation
     from eitbench.envs.injection_core import Rules
 
-DOUBTFUL = 0.35
-"""Share of recent readings, or injections, not believed from which on an electrode is taken for broken."""
+DOUBTFUL = 0.3
+"""`Belief.doubt` from which on an electrode is taken for broken."""
+FORGIVEN = 0.8
+"""Part of the doubt after failed injections that is left one step on, if the electrode does not drive."""
 
 
 class Belief:
@@ -38,7 +40,9 @@ class Belief:
         self.rules = rules
         self._operator = ReducedOperator(rules.scenario, observation["frame"][None], gate=rules.gate,
                                          noise_floor=rules.instrument.noise_floor)
-        self.doubt = observation["doubt"]
+        reading, self._driving = observation["doubt"]
+        self.doubt = reading + self._driving
+        """(L,) share of an electrode's recent readings, and of the recent injections it drove, not believed; summed."""
 
     @classmethod
     def beforehand(cls, rules: Rules) -> Belief:
@@ -55,9 +59,15 @@ class Belief:
         return belief
 
     def see(self, observation: Observation) -> None:
-        """Take in the outcome of the last injection."""
+        """Take in the outcome of the last injection.
+
+        A failed injection does not say which of its two electrodes is broken. Both are doubted and, if left alone,
+        forgiven: whichever then reads what was predicted is trusted again, and a broken one reads interference.
+        """
         self._operator.assimilate(observation["voltages"][None], observation["currents"][None])
-        self.doubt = observation["doubt"]
+        reading, driving = observation["doubt"]
+        self._driving = np.where(observation["currents"] == 0.0, FORGIVEN * self._driving, driving)
+        self.doubt = reading + self._driving
 
     @property
     def mean(self) -> np.ndarray:
@@ -67,7 +77,12 @@ class Belief:
     @property
     def sound(self) -> np.ndarray:
         """(L,) bool; electrodes that recent readings and injections give no reason to doubt."""
-        return np.asarray((self.doubt < DOUBTFUL).all(axis=0))
+        return np.asarray(self.doubt < DOUBTFUL)
+
+    @property
+    def least_doubtful(self) -> int:
+        """The pair to inject where too few electrodes are sound."""
+        return int(self.doubt[self.rules.pairs].sum(axis=1).argmin())
 
     def predicted(self, covariance: np.ndarray | None = None) -> np.ndarray:
         """(r, r) covariance one step on, before its measurement; from the present one or another."""
@@ -107,6 +122,26 @@ class Belief:
         root = np.linalg.cholesky(cross @ matrix.T + np.eye(len(matrix)))
         learnt = np.linalg.solve(root, cross)
         return covariance - learnt.T @ learnt
+
+    def look_ahead(self, depth: int, width: int, sound: np.ndarray | None = None) -> int:
+        """First pair of the plan of ``depth`` injections with the least sum of variances, by beam search.
+
+        Each of the best ``width`` plans grows by the ``width`` pairs that teach most; only ``sound`` electrodes count.
+        """
+        beam: list[tuple[float, int | None, np.ndarray | None]] = [(0.0, None, None)]
+        for _ in range(depth):
+            grown: list[tuple[float, int, np.ndarray, int]] = []
+            for cost, first, covariance in beam:
+                predicted = self.predicted(covariance)
+                gains = self.gains(predicted, sound)[0]
+                # A pair's cost is known before its covariance is computed.
+                grown += [(cost + predicted.trace() - gains[pair], int(pair) if first is None else first,
+                           predicted, int(pair)) for pair in np.argsort(-gains)[:width]]
+            beam = [(cost, first, self.after(predicted, pair, sound))
+                    for cost, first, predicted, pair in sorted(grown, key=lambda leaf: leaf[0])[:width]]
+        first = beam[0][1]
+        assert first is not None
+        return first
 
     @property
     def derivative(self) -> np.ndarray:

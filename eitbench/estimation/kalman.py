@@ -97,15 +97,17 @@ class KalmanFilter:
         """Γ_{0|0} X for X (n, k)."""
         return self.covariance.apply(0, X)
 
+    def apply_covariance(self, X: np.ndarray, limit_times_X: np.ndarray | None = None) -> np.ndarray:
+        """Γ X for X (n, k), Γ the covariance of the present state; arguments as in `FreeCovariance.apply`."""
+        return self.covariance.apply(self.time, X, limit_times_X) - self.known @ (self.known.T @ X)
+
     def update(self, observation: Observation) -> FilterStep:
         """Take in one measurement of the present state."""
         return self.take_in(observation.matrix, *self.expect(observation))
 
     def expect(self, observation: Observation) -> Expected:
         """How a measurement of the present state compares with what is known before it."""
-        H = observation.matrix
-        return expected(observation, self.mean,
-                        self.covariance.apply(self.time, H.T) - self.known @ (self.known.T @ H.T))
+        return expected(observation, self.mean, self.apply_covariance(observation.matrix.T))
 
     def take_in(self, H: np.ndarray, cross: np.ndarray, innovation: np.ndarray, S: np.ndarray) -> FilterStep:
         """Take in readings of the present state, with matrix (m, n) and what `expect` says of them."""

@@ -4,9 +4,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from models import LinearGaussian, dense_filter
 
 from eitbench.envs.operator import electrode_pairs
-from eitbench.estimation.design import pair_gains
+from eitbench.estimation import LinearisedObservations, kalman_filter, table_5_1
+from eitbench.estimation.design import independent_rows, pair_gains, pair_tables
+from eitbench.physics.fem import mass_matrix
+from eitbench.physics.flow import PlaneChannelFlow
+from eitbench.scenarios import Pipe2D
 
 L, N = 5, 9
 PAIRS = electrode_pairs(L)
@@ -56,3 +61,51 @@ def test_endless_noise_is_no_reading():
         assert traces[k] == pytest.approx(np.trace(weight @ (covariance - after)), rel=1e-8)
         ratio = np.linalg.slogdet(covariance)[1] - np.linalg.slogdet(after)[1]
         assert bits[k] == pytest.approx(0.5 * ratio, rel=1e-7)
+
+
+# -- tables of a large state ------------------------------------------------------------------------------------------
+
+
+def test_tables_from_independent_rows():
+    """For a symmetric 𝓡 with 𝓡1 = 0 they are the products over all L² rows."""
+    derivative, covariance, weight, _ = a_state(1)
+    derivative += derivative.swapaxes(0, 1)
+    derivative -= derivative.mean(axis=1, keepdims=True)
+    derivative -= derivative.mean(axis=0)
+    rows, independent = derivative.reshape(L * L, N), independent_rows(derivative)
+    tables = pair_tables(independent, covariance @ independent.T, weight)
+    for table, middle in zip(tables, (covariance, covariance @ weight @ covariance), strict=True):
+        expected = rows @ middle @ rows.T
+        np.testing.assert_allclose(table.reshape(L * L, L * L), expected, rtol=0.0, atol=1e-12 * np.abs(expected).max())
+
+
+def test_all_pairs_of_the_pipe():
+    """A filter in mid-record, 495 nodes, against an update of the full covariance for each of the 120 pairs."""
+    scenario = Pipe2D()
+    transport, observation = scenario._discretise(
+        cells=(44, 10), substeps=8, time_step=scenario.time_step, cells_at_electrodes=5, cells_across=14,
+        velocity=PlaneChannelFlow(scenario.mean_velocity, scenario.half_width))
+    level, evolution = 30.0, transport.evolution_model()
+    start = table_5_1(transport, scenario.prior, level, rank_tolerance=1e-6)
+    noise = evolution.state_noise_covariance((level / 4)**2, (level / 50)**2)
+    model = LinearGaussian(evolution.F, start.forcing, noise, start.mean, (level / 4)**2 * np.eye(len(start.mean)))
+    linearised = LinearisedObservations(observation, scenario.noise, start.mean)
+    record = [linearised(np.zeros(16), currents) for currents in scenario.currents]
+    covariance = dense_filter(model, record)[-1][0].covariance
+    kalman_filter(start, record[:-1])
+    start.predict()
+
+    resistance, table = observation.resistance_derivatives(start.mean)
+    derivative, weight, pairs = np.moveaxis(table, 0, 2), mass_matrix(transport.mesh), electrode_pairs(16)
+    noise_variance = scenario.noise.std(resistance[pairs[:, 0]] - resistance[pairs[:, 1]])**2
+    rows = independent_rows(derivative)
+    cross = start.apply_covariance(rows.T)
+    np.testing.assert_array_equal(cross, start.apply_covariance(rows.T, start.covariance.limit @ rows.T))
+    traces, bits = pair_gains(*pair_tables(rows, cross, weight), pairs, noise_variance)
+    before = np.linalg.slogdet(covariance)[1]
+    for k, (i, j) in enumerate(pairs):
+        after = textbook(derivative[i] - derivative[j], covariance, noise_variance[k])
+        assert traces[k] == pytest.approx(weight.multiply(covariance - after).sum(), rel=1e-10)
+        # The determinants, of e to the power of thousands, leave fewer digits.
+        assert bits[k] == pytest.approx(0.5 * (before - np.linalg.slogdet(after)[1]), rel=1e-9)
+    assert np.ptp(traces) > 0.1 * traces.max() and np.ptp(bits) > 0.1 * bits.max()

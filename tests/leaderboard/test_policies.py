@@ -86,6 +86,35 @@ def test_unsound_electrodes_teach_nothing():
     assert (belief.after(predicted, int(np.flatnonzero(touched)[0]), sound) == predicted).all()
 
 
+def test_doubt_is_forgiven_to_those_who_rest():
+    """A failed injection casts doubt on both electrodes; it fades at rest, but for whoever reads interference."""
+    env = environment(FAULTS)
+    observation, _ = env.reset(seed=SEED)
+    belief, currents, doubt = Belief(env.rules, observation), np.zeros((2, 16)), np.zeros((2, 16))
+    assert belief.sound.all()
+    currents[0, [2, 9]], currents[1, [0, 15]], doubt[1, [2, 9]] = (1.0, -1.0), (1.0, -1.0), 0.36
+    belief.see(observation | {"currents": currents[0], "doubt": doubt})
+    assert np.flatnonzero(~belief.sound).tolist() == [2, 9]
+    doubt[0, 9] = 0.2                            # whoever rests is doubted as driver by the environment for ever
+    belief.see(observation | {"currents": currents[1], "doubt": doubt})
+    assert np.flatnonzero(~belief.sound).tolist() == [9]
+    np.testing.assert_allclose(belief.doubt[[2, 9]], [0.8 * 0.36, 0.8 * 0.36 + 0.2])
+    assert not {2, 9} & set(env.rules.pairs[belief.least_doubtful])
+
+
+def test_look_ahead_finds_the_best_plan():
+    """With a beam that holds every pair, depth 2 is the minimum over all plans; depth 1 is greedy."""
+    env = environment(NAME)
+    belief, sound = Belief(env.rules, env.reset(seed=SEED)[0]), np.arange(16) % 3 != 0
+    predicted = belief.predicted()
+    gains, costs = belief.gains(predicted, sound)[0], []
+    for pair, gain in enumerate(gains):
+        later = belief.predicted(belief.after(predicted, pair, sound))
+        costs.append(-gain + later.trace() - belief.gains(later, sound)[0].max())
+    assert belief.look_ahead(1, 4, sound) == gains.argmax()
+    assert belief.look_ahead(2, len(gains), sound) == np.argmin(costs)
+
+
 def test_beforehand_is_the_expected_liquid():
     """A belief without data is linear about the expected level, and at the level both derivatives agree."""
     env = environment(NAME)

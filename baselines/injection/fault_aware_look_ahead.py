@@ -1,0 +1,26 @@
+"""Fault-aware look-ahead: beam search over the next three injections, among the electrodes that are not in doubt."""
+
+from typing import Any
+
+import numpy as np
+
+from eitbench.envs.belief import Belief
+from eitbench.envs.injection_core import Rules
+
+
+class Policy:
+    parameters: dict[str, Any] = {"depth": 3, "width": 4}  # noqa: RUF012
+
+    @classmethod
+    def suits(cls, rules: Rules) -> bool:
+        return rules.instrument.most > 0
+
+    def __init__(self, rules: Rules, random: np.random.Generator) -> None:
+        self.rules = rules
+        self.belief: Belief | None = None
+
+    def act(self, observation: dict[str, np.ndarray]) -> Any:
+        self.belief = belief = Belief.follow(self.belief, self.rules, observation)
+        if belief.sound.sum() < 4:
+            return self.rules.action(belief.least_doubtful)
+        return self.rules.action(belief.look_ahead(sound=belief.sound, **self.parameters))
