@@ -22,7 +22,7 @@ DEFAULTS = {"rounds": 4, "episodes": 50, "epochs": 10, "batch": 256, "learning_r
 
 
 def imitate(model: OnPolicyAlgorithm, world: InjectionEnv, options: dict[str, Any], reward_scale: float,
-            plan: np.ndarray | None, seed: int) -> None:
+            reference: np.ndarray | None, seed: int) -> None:
     """Let ``model`` (PPO, with or without masks) learn from a policy file.
 
     Parameters
@@ -32,8 +32,8 @@ def imitate(model: OnPolicyAlgorithm, world: InjectionEnv, options: dict[str, An
     options : dict
         ``teacher`` (name of one of our policies, or a path), and perhaps ``rounds``, ``episodes`` (a round), ``epochs``
         (a round), ``batch`` and ``learning_rate``. In the first round the teacher acts, in the others the pupil.
-    plan : (steps, ...), optional
-        Rewards are counted from those of these actions in the same episode, as in training.
+    reference : (episodes, steps), optional
+        Rewards are counted from these, as in training.
     """
     settings, teacher = DEFAULTS | options, load_policy(str(options["teacher"]))
     random = np.random.default_rng([seed, 1])
@@ -45,9 +45,8 @@ def imitate(model: OnPolicyAlgorithm, world: InjectionEnv, options: dict[str, An
             for _ in range(settings["episodes"]):
                 number = int(random.integers(world.episodes))
                 shown, advice, rewards = _play(model, world, teacher, number, random, pupil_acts=turn > 0)
-                if plan is not None:
-                    world.reset(seed=number)
-                    rewards -= [world.step(action)[1] for action in plan]
+                if reference is not None:
+                    rewards -= reference[number]
                 seen.append(shown)
                 said.append(advice)
                 worth.append(_returns(reward_scale * rewards, model.gamma))

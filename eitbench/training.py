@@ -8,6 +8,7 @@ episodes over time), ``sha256`` of the model, and TensorBoard's logs.
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import shutil
 import time
@@ -34,7 +35,6 @@ from eitbench.envs.injection import InjectionEnv, InjectionVectorEnv
 from eitbench.envs.sb3 import InjectionVecEnv
 from eitbench.imitation import check_imitation, imitate
 from eitbench.leaderboard.policies import load_policy
-from eitbench.leaderboard.policy_table import OPEN_LOOP
 from eitbench.pair_policy import MaskablePairPolicy, PairPolicy
 from eitbench.seeds import SPLITS
 
@@ -62,7 +62,7 @@ class Config:
     algorithm: dict[str, Any] = field(default_factory=dict)
     """passed on to stable-baselines3"""
     reference: str = ""
-    """one of our open-loop policies, from whose rewards in the same episode those of training are counted"""
+    """name or path of a policy from whose rewards in the same episode those of training are counted"""
     imitate: dict[str, Any] = field(default_factory=dict)
     """what to learn from before reinforcement: ``teacher``, ``episodes``, … (`eitbench.imitation`)"""
 
@@ -115,8 +115,7 @@ def train(env: str, algo: str, config: Config, seed: int, folder: Path, kwargs: 
     world = gym.make(env, disable_env_checker=True, observation="raw", episodes=config.episodes,
                      **(kwargs or {})).unwrapped
     assert isinstance(world, InjectionEnv)
-    plan = plan_of(world, config.reference) if config.reference else None
-    reference = None if plan is None else (vector_env(env, kwargs, config), plan)
+    reference = rewards_of(config.reference, world, folder / "reference.npy") if config.reference else None
     learning = VecMonitor(InjectionVecEnv(envs, reward_scale=config.reward_scale, reference=reference))
     learning.seed(seed)
     latest = folder / "latest.zip"
@@ -126,7 +125,7 @@ def train(env: str, algo: str, config: Config, seed: int, folder: Path, kwargs: 
         model = _fresh(algo, config, learning, seed, folder)
         if config.imitate:
             assert isinstance(model, OnPolicyAlgorithm)
-            imitate(model, world, config.imitate, config.reward_scale, plan, seed)
+            imitate(model, world, config.imitate, config.reward_scale, reference, seed)
         _save(model, latest)
     evaluate = evaluation(env, kwargs, config)
     left = config.total_steps - model.num_timesteps
@@ -138,6 +137,7 @@ def train(env: str, algo: str, config: Config, seed: int, folder: Path, kwargs: 
     _save(model, folder / "model.zip")
     write_atomically(folder / "sha256", hashlib.sha256((folder / "model.zip").read_bytes()).hexdigest().encode())
     latest.unlink()
+    (folder / "reference.npy").unlink(missing_ok=True)
     return folder / "model.zip"
 
 
@@ -153,16 +153,20 @@ def vector_env(env: str, kwargs: dict[str, Any] | None, config: Config, n_envs: 
     return made
 
 
-def plan_of(world: InjectionEnv, policy: str) -> np.ndarray:
-    """(steps, ...) actions of an open-loop policy; ``ValueError`` if it looks at what is measured."""
-    if policy not in OPEN_LOOP:
-        raise ValueError(f"reference must be one of {', '.join(OPEN_LOOP)}; got {policy!r}")
-    player = load_policy(policy).policy(world.rules, np.random.default_rng(0))
-    (observation, _), plan, ended = world.reset(seed=0), [], False
-    while not ended:
-        plan.append(player.act(observation))
-        observation, _, ended, _, _ = world.step(plan[-1])
-    return np.array(plan)
+def rewards_of(policy: str, world: InjectionEnv, path: Path) -> np.ndarray:
+    """(episodes, steps) what a policy earns in every training episode; kept at ``path``."""
+    if path.exists():
+        return np.asarray(np.load(path))
+    rewards, loaded = np.zeros((world.episodes, world.core.length)), load_policy(policy)
+    for episode in tqdm(range(world.episodes), desc=f"playing {policy}", unit="episode", disable=None):
+        observation, _ = world.reset(seed=episode)
+        player = loaded.policy(world.rules, np.random.default_rng(episode), *[world.core] * loaded.privileged)
+        for k in range(world.core.length):
+            observation, rewards[episode, k], *_ = world.step(player.act(observation))
+    content = io.BytesIO()
+    np.save(content, rewards)
+    write_atomically(path, content.getvalue())
+    return rewards
 
 
 def algorithm_of(name: str) -> Any:

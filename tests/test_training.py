@@ -125,24 +125,26 @@ def test_wrong_arguments_are_named(tmp_path):
         train(NAME, "ppo", replace(TINY, imitate={"rounds": 1}), 0, tmp_path, SHORT)
 
 
-def test_rewards_may_be_counted_from_a_plan():
-    """What a plan earns in the same episodes is taken away, step by step, in this episode and the next."""
-    envs, twin, plain = (gym.make_vec(NAME, num_envs=3, vectorization_mode="vector_entry_point", episodes=5, **SHORT)
-                         for _ in range(3))
-    plan = np.array([3, 40, 7, 99])
-    ours = InjectionVecEnv(envs, reward_scale=10.0, reference=(twin, plan))
+def test_rewards_may_be_counted_from_others(tmp_path):
+    """What a policy earns in the same episodes is taken away, step by step, in this episode and the next."""
+    world = gym.make(NAME, episodes=5, observation="raw", **SHORT).unwrapped
+    reference = training.rewards_of("best_pair", world, tmp_path / "reference.npy")
+    envs, plain = (gym.make_vec(NAME, num_envs=3, vectorization_mode="vector_entry_point", episodes=5, **SHORT)
+                   for _ in range(2))
+    ours = InjectionVecEnv(envs, reward_scale=10.0, reference=reference)
     ours.seed(5)
     ours.reset()
-    rng = np.random.default_rng(0)
+    rng, best = np.random.default_rng(0), world.rules.pairs.tolist().index([0, 8])
     for _ in range(2):
         playing, actions = list(envs.seeds), rng.integers(120, size=(4, 3))
         earned = []
-        for chosen in (actions, np.repeat(plan[:, None], 3, axis=1)):
+        for chosen in (actions, np.full((4, 3), best)):
             plain.reset(seed=playing)
             earned.append([plain.step(action)[1] for action in chosen])
         expected = 10.0 * np.subtract(*earned)
         assert np.abs(expected).max() > 1e-3
         np.testing.assert_allclose([ours.step(action)[1] for action in actions], expected, atol=1e-6)
+    np.testing.assert_array_equal(training.rewards_of("random_pair", world, tmp_path / "reference.npy"), reference)
 
 
 @pytest.mark.parametrize(("env", "algo"), [(NAME, "ppo"), (BUDGET, "maskable_ppo"), (CURRENTS, "sac"),

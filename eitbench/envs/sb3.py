@@ -20,16 +20,14 @@ class InjectionVecEnv(VecEnv):
     envs : InjectionVectorEnv
     reward_scale : float
         Rewards are multiplied by it, which changes no optimum: they are of the order of 0.01 in themselves.
-    reference : (InjectionVectorEnv, (steps, ...) array), optional
-        As many environments again, and a plan of actions: rewards are counted from what the plan earns in the same
-        episode. That changes no optimum either, since the agent has no hand in it, and most of what makes one episode
-        harder than another drops out of the returns.
+    reference : (episodes, steps), optional
+        What somebody else earned in each training episode: rewards are counted from that. It changes no optimum either,
+        since the agent has no hand in it, and most of what makes one episode harder than another drops out.
     """
 
     def __init__(self, envs: InjectionVectorEnv, *, reward_scale: float = 1.0,
-                 reference: tuple[InjectionVectorEnv, np.ndarray] | None = None) -> None:
+                 reference: np.ndarray | None = None) -> None:
         self.envs, self.reward_scale, self._reference = envs, reward_scale, reference
-        self._earned: dict[int, np.ndarray] = {}                     # episode -> the plan's rewards
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
 
     def reset(self) -> Any:
@@ -42,14 +40,7 @@ class InjectionVecEnv(VecEnv):
 
     def _begin(self, seeds: list[int] | None) -> Any:
         observation = self.envs.reset(seed=seeds)[0]  # type: ignore[arg-type]
-        playing, self._step = self.envs.seeds, 0
-        if self._reference is not None:
-            twin, plan = self._reference
-            if set(playing) - set(self._earned):
-                twin.reset(seed=list(playing))
-                rewards = np.array([twin.step(np.repeat(action[None], self.num_envs, axis=0))[1] for action in plan])
-                self._earned |= dict(zip(playing, rewards.T, strict=True))
-            self._baseline = np.array([self._earned[seed] for seed in playing])
+        self._step = 0
         return observation
 
     def step_async(self, actions: np.ndarray) -> None:
@@ -58,7 +49,7 @@ class InjectionVecEnv(VecEnv):
     def step_wait(self) -> VecEnvStepReturn:
         observation, rewards, ended, _, _ = self.envs.step(self._actions)
         if self._reference is not None:
-            rewards = rewards - self._baseline[:, self._step]
+            rewards = rewards - self._reference[list(self.envs.seeds), self._step]
         self._step += 1
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         if ended.all():

@@ -26,6 +26,8 @@ MEMORY = 8 << 30
 """bytes of address space that a guest may take"""
 PATIENCE = 120.0
 """s that an answer may take; the first after an episode began may hold all preparations"""
+ARITHMETIC = ("OPENBLAS_", "MKL_", "OMP_", "NPY_", "NUMBA_CPU")
+"""Variables on which the last bits of numbers depend begin so."""
 
 
 class GuestError(RuntimeError):
@@ -121,10 +123,12 @@ class Guest:
             shutil.copy(model, cache / there.name)
         _copy_kernels(kernels)
         package = Path(__file__).parents[2]
-        return {"PATH": os.environ.get("PATH", ""), "HOME": str(self._private), "TMPDIR": str(self._private),
-                "PYTHONPATH": str(package), "PYTHONDONTWRITEBYTECODE": "1", CACHE_VARIABLE: str(cache),
-                "NUMBA_CACHE_DIR": str(kernels), **dict.fromkeys(
-                    ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")}
+        arithmetic = {name: value for name, value in os.environ.items() if name.startswith(ARITHMETIC)}
+        return arithmetic | {
+            "PATH": os.environ.get("PATH", ""), "HOME": str(self._private), "TMPDIR": str(self._private),
+            "PYTHONPATH": str(package), "PYTHONDONTWRITEBYTECODE": "1", "NUMBA_CACHE_DIR": str(kernels),
+            CACHE_VARIABLE: str(cache),
+        } | dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
     def _copied(self, name: str) -> str:
         if not name.endswith((".py", ".zip")):

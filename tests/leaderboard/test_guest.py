@@ -1,0 +1,186 @@
+"""Somebody else's code in a process of its own: it answers as it would here, and reaches nothing that it should not."""
+
+import io
+import json
+import os
+import socket
+import time
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from tiny import FILTER, SCENARIO, write_baseline
+
+from eitbench.episodes import CACHE_VARIABLE, simulate
+from eitbench.leaderboard import wire
+from eitbench.leaderboard.baselines import load_baseline
+from eitbench.leaderboard.host import Guest, GuestError
+from eitbench.leaderboard.policies import load_policy
+from eitbench.leaderboard.wall import landlock_version
+from eitbench.recordings import cycle_voltages, recording
+from eitbench.scenarios import Pipe2D
+
+KWARGS = json.loads(FILTER.kwargs)
+walled = pytest.mark.skipif(not landlock_version(), reason="this kernel has no Landlock")
+
+ATTACKS = '''
+import gc, os, socket
+from pathlib import Path
+reached = []
+def attempt(what, deed):
+    try:
+        if deed() is not False:
+            reached.append(what)
+    except (OSError, KeyError):
+        pass
+parent = f"/proc/{os.getppid()}"
+attempt("the cache", lambda: os.listdir(SECRETS))
+attempt("a truth", lambda: Path(SECRETS, "secret.txt").read_text())
+attempt("its neighbours", lambda: os.listdir(Path(SECRETS).parent))
+attempt("the other's surroundings", lambda: Path(parent, "environ").read_bytes())
+attempt("the other's command", lambda: Path(parent, "cmdline").read_bytes())
+attempt("the other's memory", lambda: open(parent + "/mem", "rb"))
+attempt("the other's files", lambda: os.listdir(parent + "/fd"))
+attempt("the other process", lambda: os.kill(os.getppid(), 0))
+attempt("the network", lambda: socket.create_connection(("127.0.0.1", PORT), timeout=5))
+attempt("another folder", lambda: Path(SECRETS, "mine.txt").write_text("mine"))
+attempt("the name of the cache", lambda: os.environ["EITBENCH_CACHE"] == CACHE)
+held = [value for each in gc.get_objects() if type(each) is dict for value in each.values()]
+attempt("the truth in memory", lambda: any(type(o).__name__ == "ndarray" and list(o.shape) == SHAPE for o in held))
+'''
+
+
+@pytest.fixture
+def measured():
+    """(T, L) voltages and currents of an episode."""
+    scenario = Pipe2D(**SCENARIO)
+    voltages = cycle_voltages(scenario, recording(scenario, 3))
+    return voltages, scenario.currents[np.arange(len(voltages)) % len(scenario.currents)]
+
+
+@pytest.mark.parametrize("name", ["homogeneous", "mine"])
+def test_a_guest_answers_as_it_would_here(name, measured, tmp_path):
+    """All that estimators say, of two episodes, to the bit; None where nothing is said."""
+    if name == "mine":
+        name = write_baseline(tmp_path, update="return None if self.calls < 2 else Estimate(self.level + self.calls, "
+                              "self.level**2, voltages, np.outer(voltages, voltages))")
+    here = load_baseline(name)
+    with Guest("estimator", FILTER.id, KWARGS, name) as guest:
+        for _ in range(2):
+            guest.begin()
+            estimator = here.estimator(FILTER.make().task)
+            for voltages, currents in zip(*measured, strict=True):
+                said, expected = guest.update(voltages, currents), estimator.update(voltages, currents)
+                assert (said is None) == (expected is None)
+                for there, ours in zip(said or (), expected or (), strict=True):
+                    np.testing.assert_array_equal(there, ours)
+        assert guest.peak_memory > 50e6
+        folder, process = guest._private, guest._process
+        assert folder.exists()
+    assert not folder.exists() and process.poll() is not None
+
+
+def test_a_policy_plays_as_it_would_here():
+    """Actions of a random policy, from the same random numbers."""
+    name, kwargs = "eitbench/Pipe2DInjection-v0", {"estimator": "none", "observation": "raw"}
+    env = gym.make(name, **kwargs).unwrapped
+    observation, _ = env.reset(seed=1)
+    here = load_policy("random_pair").policy(env.rules, np.random.default_rng(12))
+    with Guest("policy", name, kwargs, "random_pair") as guest:
+        guest.begin(random=12)
+        assert [guest.act(observation) for _ in range(4)] == [here.act(observation) for _ in range(4)]
+
+
+@walled
+def test_it_reaches_nothing(tmp_path, monkeypatch):
+    """Neither files nor other processes, the network or a truth; without the wall the same code reaches them all."""
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+    here = {"truth": simulate(Pipe2D(**SCENARIO), 3, progress=False).concentration}
+    (tmp_path / "secret.txt").write_text("the truth")
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        known = {"SECRETS": str(tmp_path), "PORT": server.getsockname()[1], "CACHE": str(tmp_path / "cache"),
+                 "SHAPE": list(here["truth"].shape)}
+        source = "\n".join(f"{name} = {value!r}" for name, value in known.items()) + ATTACKS
+        within: dict = {}
+        exec(source, within)
+        assert {"the cache", "a truth", "the other's surroundings", "the other process", "the network",
+                "another folder", "the name of the cache", "the truth in memory"} <= set(within["reached"])
+        curious = write_baseline(tmp_path, init=f"exec({source!r}, globals())",
+                                 update="raise RuntimeError(f'reached {reached}')")
+        with Guest("estimator", FILTER.id, KWARGS, curious) as guest:
+            assert guest.closed
+            guest.begin()
+            with pytest.raises(GuestError, match=r"^RuntimeError: reached \[\]$"):
+                guest.update(np.zeros(4), np.zeros(4))
+
+
+@pytest.mark.parametrize(("statement", "message"), [
+    ("np.ones(2**29)", "MemoryError"), ("os._exit(3)", "ended with status 3"), ("raise SystemExit('bye')", "bye"),
+    ("__import__('time').sleep(60)", "no answer within 3 s"), ("print('hello')\n        return 7", "^$"),
+    ("[os.write(n, bytes(2**10)) for n in range(3, 5)]", "ValueError"),
+])
+def test_what_goes_wrong_is_said(statement, message, tmp_path):
+    """Limits of memory and time, a crash, an exit, nonsense on the wire; what it prints is no answer."""
+    path = write_baseline(tmp_path, update=statement)
+    began = time.monotonic()
+    with Guest("estimator", FILTER.id, KWARGS, path, memory=3 << 30, patience=60) as guest:
+        guest.begin()
+        guest._patience = 3.0
+        if message == "^$":
+            assert guest.update(np.zeros(4), np.zeros(4)) == "int"
+        else:
+            with pytest.raises(GuestError, match=message):
+                guest.update(np.zeros(4), np.zeros(4))
+    assert time.monotonic() - began < 55.0
+
+
+def test_a_file_that_cannot_be_loaded_is_named(tmp_path):
+    """As the error that it would be here."""
+    (tmp_path / "mine.py").write_text("class Estimator: pass")
+    with pytest.raises(GuestError, match="must define a class Estimator"):
+        Guest("estimator", FILTER.id, KWARGS, str(tmp_path / "mine.py"))
+
+
+numbers = hnp.arrays(st.sampled_from([np.float64, np.float32, np.int64, np.bool_]),
+                     hnp.array_shapes(min_dims=0, min_side=0))
+
+
+@given(st.dictionaries(st.text(), st.integers() | st.text() | st.none()), st.dictionaries(st.text(), numbers))
+def test_messages_arrive(words, arrays):
+    """Words and arrays, whatever their shape."""
+    stream = io.BytesIO(wire.pack(words, arrays))
+    said, there = wire.unpack(stream.read)
+    assert said == words and set(there) == set(arrays)
+    for name, array in arrays.items():
+        assert there[name].dtype == array.dtype
+        np.testing.assert_array_equal(there[name], array)
+
+
+@pytest.mark.parametrize(("head", "body"), [
+    (b"nonsense", b""), (b"[1, []]", b""), (b'[{}, [["a", "<f8", [2]]]]', b"\0" * 8), (b'[{}, []]', b"\0"),
+    (b'[{}, [["a", "O", [1]]]]', b"\0" * 8), (b'[{}, [["a", "<f8", [-1]]]]', b"\0" * 8),
+])
+def test_nonsense_is_refused(head, body):
+    """Objects above all: unpickled they would be code."""
+    content = len(head).to_bytes(8, "little") + len(body).to_bytes(8, "little") + head + body
+    stream = iter((content[:16], head, body))
+    with pytest.raises(ValueError, match="message"):
+        wire.unpack(lambda n: next(stream))
+    endless = (2**62).to_bytes(8, "little") * 2
+    with pytest.raises(ValueError, match="at most"):
+        wire.unpack(lambda n: endless)
+
+
+def test_the_variables_of_this_process_stay_here():
+    """A guest sees none of them but those it needs."""
+    os.environ["EITBENCH_TEST_SECRET"] = "salt"
+    try:
+        with Guest("estimator", FILTER.id, KWARGS, "homogeneous") as guest:
+            seen = Path(f"/proc/{guest._process.pid}/environ").read_text()
+    finally:
+        del os.environ["EITBENCH_TEST_SECRET"]
+    assert "SECRET" not in seen and "NUMBA_CACHE_DIR" in seen
