@@ -99,7 +99,7 @@ def test_a_policy_plays_as_it_would_here():
 def test_it_reaches_nothing(tmp_path, monkeypatch):
     """Neither files nor other processes, the network or a truth; without the wall the same code reaches them all."""
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
-    here = {"truth": simulate(Pipe2D(**SCENARIO), 3, progress=False).concentration}
+    here = {"truth": simulate(Pipe2D(**SCENARIO), 3, progress=False).concentration, "makes the collector look": []}
     (tmp_path / "secret.txt").write_text("the truth")
     with socket.create_server(("127.0.0.1", 0)) as server:
         known = {"SECRETS": str(tmp_path), "PORT": server.getsockname()[1], "CACHE": str(tmp_path / "cache"),
@@ -121,7 +121,7 @@ def test_it_reaches_nothing(tmp_path, monkeypatch):
 @pytest.mark.parametrize(("statement", "message"), [
     ("np.ones(2**29)", "MemoryError"), ("os._exit(3)", "ended with status 3"), ("raise SystemExit('bye')", "bye"),
     ("__import__('time').sleep(60)", "no answer within 3 s"), ("print('hello')\n        return 7", "^$"),
-    ("[os.write(n, bytes(2**10)) for n in range(3, 5)]", "ValueError"),
+    ("os.write(4, bytes(2**10))", "ValueError"),
 ])
 def test_what_goes_wrong_is_said(statement, message, tmp_path):
     """Limits of memory and time, a crash, an exit, nonsense on the wire; what it prints is no answer."""
