@@ -134,6 +134,7 @@ def train(env: str, algo: str, config: Config, seed: int, folder: Path, kwargs: 
     if left > 0:
         model.learn(left, callback=_Checkpoints(folder, config, evaluate), reset_num_timesteps=False,
                     tb_log_name="run")
+    _forget(model)
     _save(model, folder / "model.zip")
     write_atomically(folder / "sha256", hashlib.sha256((folder / "model.zip").read_bytes()).hexdigest().encode())
     latest.unlink()
@@ -227,6 +228,13 @@ def _save(model: BaseAlgorithm, path: Path) -> None:
     model.save(beside)
     made = beside if beside.exists() else beside.with_name(beside.name + ".zip")
     shutil.move(made, path)
+
+
+def _forget(model: BaseAlgorithm) -> None:
+    """Let go of what the optimisers remember, twice as much as the networks hold: the agent has learnt."""
+    for part in (model.policy, getattr(model.policy, "actor", None), getattr(model.policy, "critic", None)):
+        if isinstance(optimiser := getattr(part, "optimizer", None), torch.optim.Optimizer):
+            optimiser.state.clear()
 
 
 def _append_evaluation(folder: Path, steps: int, errors: np.ndarray) -> None:
