@@ -7,6 +7,7 @@ import re
 import shlex
 import sys
 from enum import StrEnum
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
@@ -160,7 +161,8 @@ def train(
 def policies(
     env: Annotated[str, typer.Option(help="Id of an injection environment.")],
     policy: Annotated[list[str] | None, typer.Option(
-        help="Name of one of ours, or the path of your own .py file; may be repeated. Default: all of ours.")] = None,
+        help="Name of one of ours, the path of your own .py file, or of an agent's model.zip; may be repeated. "
+             "Default: all of ours.")] = None,
     seeds: Annotated[str, typer.Option(help="Episodes, such as dev:0-49 or test:0-49.")] = "test:0-49",
     estimator: Annotated[str, typer.Option(help="full: the exact filter, for scores; reduced: that of training.")] = (
         "full"),
@@ -171,11 +173,12 @@ def policies(
 
     Each episode is kept in OUT/ENV.csv the moment it is done; the same command again resumes.
     """
-    from eitbench.leaderboard.policies import load_policy, own_policies, suited
+    from eitbench.leaderboard.policies import load_policy, own_agents, own_policies, suited
     from eitbench.leaderboard.policy_table import policy_table, run_policies
     from eitbench.seeds import parse_seeds
     with _clear_errors():
-        chosen = suited(env, policy or own_policies(), demanded=bool(policy))
+        ours = own_policies() + (own_agents(env) if find_spec("stable_baselines3") else [])
+        chosen = suited(env, policy or ours, demanded=bool(policy))
         numbers = parse_seeds(seeds)
         rows = run_policies(env, {}, chosen, numbers, estimator, jobs, out / f"{env.replace('/', '-')}.csv")
     typer.echo(policy_table(rows, [name for name in chosen if load_policy(name).privileged]))

@@ -55,6 +55,12 @@ def own_policies() -> list[str]:
     return sorted(path.stem for path in policy_folder().glob("*.py"))
 
 
+def own_agents(env_id: str) -> list[str]:
+    """Paths of our own trained agents for an environment: ``baselines/checkpoints/ENV/ALGO/seedK/model.zip``."""
+    folder = baseline_folder() / "checkpoints" / env_id.replace("/", "-")
+    return [str(path) for path in sorted(folder.glob("*/seed*/model.zip"))]
+
+
 def load_policy(name: str) -> PolicyFile:
     """Load one of our policies by name, anybody's by the path of its file, or a trained agent by that of its model.zip.
 

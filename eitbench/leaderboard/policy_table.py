@@ -71,10 +71,22 @@ def _row(*job: Any) -> dict[str, Any]:
                 name: played[name] for name in ("error", "spent", "seconds_per_step")}}
 
 
+def errors_by_policy(rows: pd.DataFrame) -> pd.DataFrame:
+    """ẽ_c with a row an episode and a column a policy; agents that differ in their training's seed are averaged."""
+    return rows.assign(policy=_without_training_seed(rows)).pivot_table(index="seed", columns="policy", values="error")
+
+
+def _without_training_seed(rows: pd.DataFrame) -> pd.Series:
+    return rows["policy"].str.replace(r"_seed\d+$", "", regex=True)
+
+
 def policy_table(rows: pd.DataFrame, privileged: Sequence[str]) -> str:
     """Markdown: policies by their mean ẽ_c, and by how much each is worse than the best that is not privileged, both
-    with 95 % intervals over episodes; below it the adaptivity gap, if the policies for it were played."""
-    errors = rows.pivot(index="seed", columns="policy", values="error")
+    with 95 % intervals over episodes; below it the adaptivity gap, if the policies for it were played.
+
+    Agents that differ in the seed of their training only are one policy: an episode's error is the mean of theirs.
+    """
+    rows, errors = rows.assign(policy=_without_training_seed(rows)), errors_by_policy(rows)
     means = errors.mean().sort_values()
     best = next((name for name in means.index if name not in privileged), means.index[0])
     lines = [f"| policy | ẽ_c | worse than {best} by | injections | ms/step |", "|---|---:|---:|---:|---:|"]

@@ -18,8 +18,8 @@ from eitbench.envs.injection import InjectionEnv
 from eitbench.leaderboard.animate import save_animation
 from eitbench.leaderboard.baselines import baseline_folder
 from eitbench.leaderboard.figures.common import ACCENT, INK, TRUE, bare, save
-from eitbench.leaderboard.policies import load_policy, own_policies, suited
-from eitbench.leaderboard.policy_table import OPEN_LOOP, policy_table, run_policies
+from eitbench.leaderboard.policies import load_policy, own_agents, own_policies, suited
+from eitbench.leaderboard.policy_table import OPEN_LOOP, errors_by_policy, policy_table, run_policies
 from eitbench.leaderboard.summary import mean_and_interval
 
 WORLDS = {"eitbench/Pipe2DInjection-v0": "plain pipe (reference)",
@@ -34,7 +34,7 @@ def injection(seeds: list[int], jobs: int, out: Path) -> tuple[Path, str]:
     above, below = figure.subplots(2, len(WORLDS), height_ratios=(3, 2))
     said = []
     for (env, title), top, bottom in zip(WORLDS.items(), above, below, strict=True):
-        chosen = suited(env, own_policies(), demanded=False)
+        chosen = suited(env, own_policies() + own_agents(env), demanded=False)
         rows = run_policies(env, {}, chosen, seeds, "full", jobs, out / f"{env.replace('/', '-')}.csv")
         privileged = [name for name in chosen if load_policy(name).privileged]
         _scores(top, rows, privileged)
@@ -49,7 +49,7 @@ def injection(seeds: list[int], jobs: int, out: Path) -> tuple[Path, str]:
 
 def _scores(axes: Axes, rows: pd.DataFrame, privileged: list[str]) -> None:
     """A dot for each policy with the 95 % interval over episodes, the best above."""
-    errors = rows.pivot(index="seed", columns="policy", values="error")
+    errors = errors_by_policy(rows)
     order = errors.mean().sort_values().index[::-1]
     for place, name in enumerate(order):
         mean, half = mean_and_interval(list(errors[name]))
