@@ -12,6 +12,7 @@ from eitbench import _check
 from eitbench._parallel import in_parallel
 from eitbench.episodes import simulate_together
 from eitbench.recordings import is_recorded, make_recording, outline, recording_path, recording_type, store_recording
+from eitbench.regions import are_kept, integrals_path, make_integrals, region_of, store_integrals
 
 if TYPE_CHECKING:
     from eitbench.scenarios.base import Scenario
@@ -21,8 +22,10 @@ TOGETHER = 8
 
 
 def recording_bytes(scenario: Scenario) -> int:
-    """Size of one recording on disk, but for its header of a few hundred bytes."""
-    return scenario.n_steps * recording_type(scenario, outline(scenario).mass.shape[0]).itemsize
+    """Size of one recording on disk, with what lies beside it, but for headers of a few hundred bytes."""
+    n = outline(scenario).mass.shape[0]
+    beside = 0 if region_of(scenario) is None else 4 * n + 16                                # see `Integrals`
+    return scenario.n_steps * (recording_type(scenario, n).itemsize + beside)
 
 
 def fill(scenario: Scenario, seeds: Sequence[int], *, n_jobs: int = 1) -> int:
@@ -34,7 +37,7 @@ def fill(scenario: Scenario, seeds: Sequence[int], *, n_jobs: int = 1) -> int:
     n_jobs, missing = _check.integer("n_jobs", n_jobs, low=1), missing_seeds(scenario, seeds)
     together = max(1, min(TOGETHER, -(-len(missing) // n_jobs)))
     # The folder is found out here: a worker may live in another environment than its parent does by now.
-    groups = [(scenario, group, [recording_path(scenario, seed) for seed in group])
+    groups = [(scenario, group, [(recording_path(scenario, seed), integrals_path(scenario, seed)) for seed in group])
               for group in (missing[k:k + together] for k in range(0, len(missing), together))]
     with tqdm(total=len(missing), desc="recording", unit="episode", disable=None) as bar:
         for done in in_parallel(_record, groups, n_jobs):
@@ -45,11 +48,13 @@ def fill(scenario: Scenario, seeds: Sequence[int], *, n_jobs: int = 1) -> int:
 def missing_seeds(scenario: Scenario, seeds: Sequence[int]) -> list[int]:
     """Those of ``seeds`` without a sound recording."""
     checked = [_check.integer("seeds", seed, low=0) for seed in seeds]
-    return [seed for seed in dict.fromkeys(checked) if not is_recorded(scenario, seed)]
+    return [seed for seed in dict.fromkeys(checked) if not (is_recorded(scenario, seed) and are_kept(scenario, seed))]
 
 
-def _record(scenario: Scenario, seeds: Sequence[int], paths: Sequence[Path]) -> int:
+def _record(scenario: Scenario, seeds: Sequence[int], paths: Sequence[tuple[Path, Path]]) -> int:
     episodes = simulate_together(scenario, seeds, progress=False)
-    for seed, path, episode in zip(seeds, paths, episodes, strict=True):
+    for seed, (path, beside), episode in zip(seeds, paths, episodes, strict=True):
+        if region_of(scenario) is not None:
+            store_integrals(beside, seed, make_integrals(scenario, episode))
         store_recording(path, make_recording(scenario, seed, episode))
     return len(seeds)

@@ -26,6 +26,7 @@ from stable_baselines3 import DQN, PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from tqdm import tqdm
 
@@ -59,6 +60,8 @@ class Config:
     """factor of the rewards"""
     hidden: tuple[int, ...] = (256, 256)
     """units of the networks' hidden layers"""
+    anneal: bool = False
+    """whether the learning rate falls linearly to zero"""
     algorithm: dict[str, Any] = field(default_factory=dict)
     """passed on to stable-baselines3"""
     reference: str = ""
@@ -70,6 +73,8 @@ class Config:
         for name in ("total_steps", "n_envs", "interval", "evaluation_episodes", "episodes"):
             _check.integer(name, getattr(self, name), low=0 if name == "total_steps" else 1)
         _check.number("reward_scale", self.reward_scale, low=0.0, open_low=True)
+        if self.anneal:
+            _check.number("algorithm.learning_rate", self.algorithm.get("learning_rate"), low=0.0, open_low=True)
 
 
 def read_config(path: str | Path) -> Config:
@@ -217,6 +222,8 @@ def _fresh(algo: str, config: Config, learning: VecEnv, seed: int, folder: Path)
     policy = {"ppo": PairPolicy, "maskable_ppo": MaskablePairPolicy, "recurrent_ppo": "MlpLstmPolicy"}.get(
         algo, "MlpPolicy") if isinstance(learning.action_space, spaces.Discrete) else "MlpPolicy"
     arguments = {"policy_kwargs": {"net_arch": list(config.hidden)}} | config.algorithm
+    if config.anneal:
+        arguments["learning_rate"] = LinearSchedule(arguments["learning_rate"], 0.0, 1.0)
     made: BaseAlgorithm = algorithm_of(algo)(policy, learning, seed=seed, device="cpu",
                                              tensorboard_log=str(folder / "tensorboard"), **arguments)
     return made

@@ -9,7 +9,7 @@ NAME = "eitbench/Pipe2DInjection-v0"
 CURRENTS, FAULTS, BUDGET = (f"eitbench/Pipe2DInjection{kind}-v0" for kind in ("Currents", "Faults", "Budget"))
 # Sixteen electrodes and a short record; fewer electrodes would leave too little to learn from.
 SHORT = {"scored_steps": 4, "mean_velocity": 16.0}
-TANK = "eitbench/RotatingTankInjection-v0"
+TANK, FLOW = "eitbench/RotatingTankInjection-v0", "eitbench/Pipe2DInjectionFlow-v0"
 
 
 def make(estimator: str = "none", name: str = NAME, observation: str = "raw", longer: dict = {}, **kwargs,  # noqa: B006
@@ -20,6 +20,8 @@ def make(estimator: str = "none", name: str = NAME, observation: str = "raw", lo
 
 def world(name: str) -> dict:
     """Fields of the scenario that leave the agent few steps."""
+    if name == FLOW:
+        return SHORT | {"velocity_range": [15.0, 17.0]}
     return {"warm_up": 2, "scored_steps": 3} if name == TANK else SHORT
 
 

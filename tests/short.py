@@ -13,6 +13,7 @@ FIELDS = {
     "Pipe2DInjection": PIPE,
     "Pipe2DInjectionFaults": PIPE,
     "Pipe2DInjectionBudget": PIPE,
+    "Pipe2DInjectionFlow": FLOW,
     "Pipe2DBiasedVelocity": FLOW,
     "Pipe2DVelocity": FLOW,
     "Pipe2DObstacle": PIPE | {"viscosity": 0.04, "obstacle_height": 0.01},

@@ -1,7 +1,9 @@
 """Clairvoyant: knows what is broken and what flows through the pipe; a bound for the others.
 
 It plays a few plans ahead on the very episode and then follows the best of them: greedy A-optimal among the electrodes
-that are sound, each of a few fixed pairs, and, where there is a budget, injecting when its true error is large.
+that are sound, each of a few fixed pairs, and, where there is a budget, injecting when its true error is large. Where
+the flow is unknown its variances are those about the true one and weigh errors by what they will do in the next steps;
+it tries more pairs, and cycles of them, and goes over from one plan to another wherever that turns out better.
 """
 
 from itertools import product
@@ -11,19 +13,26 @@ import numpy as np
 
 from eitbench.envs.belief import Belief
 from eitbench.envs.injection_core import InjectionCore, Rules
+from eitbench.recordings import recording
 
 NOTHING = -1
 
 
 class Policy:
     privileged = True
+    # The cycles are for an unknown flow; those of one pair were found by `python benchmarks/search_injections.py`.
     parameters: dict[str, Any] = {"fixed_pairs": [[0, 8], [0, 10]], "thresholds": [1e-4, 3e-2, 16],  # noqa: RUF012
-                                  "intervals": [1, 2, 3]}
+                                  "intervals": [1, 2, 3], "horizons": [0, 2, 4, 8, 16], "changes": 10, "cycles": [
+        [[7, 9]], [[7, 8]], [[8, 15]], [[9, 15]], [[1, 7]], [[6, 9]], [[1, 6]], [[8, 14]], [[0, 7]], [[7, 8], [1, 7]],
+        [[7, 8], [8, 15]], [[7, 8], [1, 7], [9, 15], [0, 7]]]}
 
     def __init__(self, rules: Rules, random: np.random.Generator, core: InjectionCore) -> None:
         self.rules, self.core = rules, core
         pairs, every = rules.pairs.tolist(), np.ones(core.length, dtype=int)
         fixed = [pairs.index(pair) for pair in self.parameters["fixed_pairs"] if pair in pairs]
+        if rules.scenario.velocity_model is not None and rules.budget is None:
+            self.plan = iter(self.changing().tolist())
+            return
         if rules.budget is None:
             errors, plans = self.ahead(np.array([self.greedy(), *(pair * every for pair in fixed)]))
         else:
@@ -37,17 +46,33 @@ class Policy:
         pair = next(self.plan)
         return self.rules.action(None if pair == NOTHING else pair)
 
-    def greedy(self) -> np.ndarray:
-        """(steps,) pairs after which the variance is least, of electrodes without a fault."""
+    def greedy(self, horizon: int = 0) -> np.ndarray:
+        """(steps,) pairs after which the variance is least, summed over so many steps more, of electrodes without a
+        fault."""
         core = self.core
         belief, covariance = Belief(self.rules, {name: array[0] for name, array in core.observe().items()}), None
+        if self.rules.scenario.velocity_model is not None:
+            belief.told(recording(self.rules.scenario, core.seeds[0])[core.t - 1:])
         plan = np.empty(core.length, dtype=int)
         for k in range(core.length):
             sound = (core.t + k + 1 < core.faults.broken_from[0]) & (core.faults.resistance[0] == 0.0)
-            predicted = belief.predicted(covariance)
-            plan[k] = belief.gains(predicted, sound)[0].argmax()
+            predicted = belief.predicted(covariance, k)
+            weight = belief.foresight(horizon, k) if horizon else None
+            plan[k] = belief.gains(predicted, sound, weight=weight)[0].argmax()
             covariance = belief.after(predicted, plan[k], sound)
         return plan
+
+    def changing(self) -> np.ndarray:
+        """(steps,) pairs of the best of many plans, with changes to another one after every so many steps."""
+        pairs, steps, options = self.rules.pairs.tolist(), np.arange(self.core.length), self.parameters
+        cycles = [[pairs.index(pair) for pair in cycle] for cycle in options["cycles"]]
+        plans = np.array([*map(self.greedy, options["horizons"]),
+                          *(np.array(cycle)[steps % len(cycle)] for cycle in cycles)])
+        best = plans[self.ahead(plans)[0].argmin()]
+        for begin in range(options["changes"], len(steps), options["changes"]):
+            tried = np.concatenate([best[None], np.where(steps < begin, best, plans)])
+            best = tried[self.ahead(tried)[0].argmin()]
+        return best
 
     def ahead(self, plans: np.ndarray, threshold: np.ndarray | None = None, interval: np.ndarray | None = None,
               ) -> tuple[np.ndarray, np.ndarray]:

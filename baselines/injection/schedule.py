@@ -1,7 +1,7 @@
 """Offline schedule: every injection chosen beforehand, for the least variances by the model alone.
 
 Greedy first, then, step by step, exchange for a better one; where there is a budget injections move in time, too. The
-variances of the model do not depend on what will be measured.
+variances of the model do not depend on what will be measured; where the flow is unknown they do.
 """
 
 from functools import lru_cache
@@ -18,6 +18,10 @@ CANDIDATES, SWEEPS, AFTERWARDS = 6, 2, 16
 
 class Policy:
     parameters: dict[str, Any] = {"candidates": CANDIDATES, "sweeps": SWEEPS, "afterwards": AFTERWARDS}  # noqa: RUF012
+
+    @classmethod
+    def suits(cls, rules: Rules) -> bool:
+        return rules.scenario.velocity_model is None
 
     def __init__(self, rules: Rules, random: np.random.Generator) -> None:
         self.rules, self.plan = rules, iter(plan_of(rules))

@@ -26,6 +26,7 @@ INJECTION: dict[str, tuple[str, dict]] = {
         "eitbench.envs.pipe2d_injection:Pipe2DInjection", {"limit": "Linf", "noise_floor": 2e-4}),
     "eitbench/Pipe2DInjectionFaults-v0": ("eitbench.envs.pipe2d_injection_faults:Pipe2DInjectionFaults", {}),
     "eitbench/Pipe2DInjectionBudget-v0": ("eitbench.envs.pipe2d_injection_budget:Pipe2DInjectionBudget", {}),
+    "eitbench/Pipe2DInjectionFlow-v0": ("eitbench.envs.pipe2d_injection_flow:Pipe2DInjectionFlow", {}),
     "eitbench/RotatingTankInjection-v0": ("eitbench.envs.rotating_tank_injection:RotatingTankInjection", {}),
 }
 """Environments that ask for injections."""

@@ -13,6 +13,7 @@ from gymnasium import spaces
 from eitbench import _check
 from eitbench.envs.injection_core import FURTHEST, InjectionCore, Rules, scaled
 from eitbench.envs.lockstep import LockstepVectorEnv
+from eitbench.regions import region_of
 from eitbench.task import Task, make_task
 
 if TYPE_CHECKING:
@@ -93,7 +94,7 @@ class InjectionEnv(gym.Env[Any, Any]):
         mean, spread, t = *self._core.estimate(), self._core.first + self._step - 1
         truth = simulate(self.scenario, self._seed).concentration[t].astype(float)
         return draw_frame(self.task, truth_discretisation(self.scenario).transport.mesh, truth, mean[0], spread[0],
-                          self._core.last_currents[0], t * self.scenario.time_step)
+                          self._core.last_currents[0], t * self.scenario.time_step, region_of(self.scenario))
 
     def action_masks(self) -> np.ndarray:
         """(actions,) which numbered actions do something: with the budget spent only the last, no injection."""

@@ -10,9 +10,11 @@ import numpy as np
 from gymnasium import spaces
 
 from eitbench import _check
+from eitbench.envs.joint_operator import JointFullOperator, JointReducedOperator
 from eitbench.envs.operator import PATCHES, FullOperator, Operator, electrode_pairs, pair_currents
 from eitbench.envs.reduced_operator import ReducedOperator
 from eitbench.recordings import outline, recording
+from eitbench.regions import integrals, score_mass
 from eitbench.scenarios.instrument import Faults, Instrument
 
 if TYPE_CHECKING:
@@ -21,7 +23,9 @@ if TYPE_CHECKING:
 
 FURTHEST = 5.0
 """Largest entry of a scaled observation."""
-OPERATORS: dict[str, type[Operator] | None] = {"reduced": ReducedOperator, "full": FullOperator, "none": None}
+OPERATORS: dict[str, tuple[type[Operator], type[Operator]] | None] = {
+    "reduced": (ReducedOperator, JointReducedOperator), "full": (FullOperator, JointFullOperator), "none": None}
+"""Estimators by name: where the flow is known, and where its mean velocity is to be estimated too."""
 LIMITS = ("L1", "L2", "Linf")
 """Norms that may bound the currents."""
 RECENT = 4
@@ -122,17 +126,29 @@ class Rules:
         return self.amplitude * free * (pair / np.maximum(size, pair))
 
 
+def operator_type(scenario: Scenario, estimator: str) -> type[Operator] | None:
+    """The estimator of this name for a scenario; ``ValueError`` if there is none."""
+    if estimator not in OPERATORS:
+        raise ValueError(f"estimator must be one of {', '.join(OPERATORS)}, got {estimator!r}")
+    known = OPERATORS[estimator]
+    return None if known is None else known[scenario.velocity_model is not None]
+
+
 def scaled(rules: Rules, observation: Observation) -> np.ndarray:
     """An observation as one array (..., d), float32, each entry about between −1 and 1 and never beyond ±5.
 
-    In this order: voltages, recent currents, innovations, mean and std on the grid, doubt, what is left; all as in the
-    raw observation but for the scale, the first frame left out.
+    In this order: voltages, recent currents, innovations, mean and std on the grid, doubt, what is left, and where the
+    flow is estimated its velocity and that one's std; all as in the raw observation but for the scale, the first frame
+    left out.
     """
     scenario, level = rules.scenario, rules.scenario.expected_concentration
     left = np.array([scenario.n_steps, rules.budget or 1][:observation["left"].shape[-1]])
     parts = [observation["voltages"] / outline(scenario).largest_voltage, observation["recent"] / rules.amplitude,
              observation["innovations"] / 3.0, 2.0 * (observation["mean"] / level - 1.0),
              observation["std"] / (scenario.prior.inflow_std * level), observation["doubt"], observation["left"] / left]
+    if scenario.velocity_model is not None:
+        flow = scenario.velocity_model
+        parts += [2.0 * (observation["velocity"] / flow.nominal - 1.0), observation["velocity_std"] / flow.initial_std]
     batch = observation["voltages"].shape[:-1]
     flat = np.concatenate([part.reshape(*batch, -1) for part in parts], axis=-1)
     return np.clip(flat, -FURTHEST, FURTHEST).astype(np.float32)
@@ -149,10 +165,8 @@ class InjectionCore:
     """
 
     def __init__(self, rules: Rules, estimator: str) -> None:
-        if estimator not in OPERATORS:
-            raise ValueError(f"estimator must be one of {', '.join(OPERATORS)}, got {estimator!r}")
         self.rules, self.scenario = rules, rules.scenario
-        self._operator_type = OPERATORS[estimator]
+        self._operator_type = operator_type(rules.scenario, estimator)
         self._table = rules.table if rules.limit is None else None
         self.first = len(self.scenario.currents) if self._operator_type else 0
         """Injections of the scenario's cycle before the agent's first."""
@@ -173,6 +187,10 @@ class InjectionCore:
                       "mean": spaces.Box(-1e3 * level, 1e3 * level, patches, np.float64),
                       "std": spaces.Box(0.0, 1e3 * level, patches, np.float64),
                       "doubt": spaces.Box(0.0, 1.0, (2, L), np.float64)}
+            if scenario.velocity_model is not None:
+                k, fastest = scenario.velocity_model.size, 100.0 * max(scenario.velocity_model.nominal)
+                shown |= {"velocity": spaces.Box(-fastest, fastest, (k,), np.float64),
+                          "velocity_std": spaces.Box(0.0, fastest, (k,), np.float64)}
         left = [scenario.n_steps] if rules.budget is None else [scenario.n_steps, rules.budget]
         shown["left"] = spaces.Box(np.zeros(len(left)), np.array(left, dtype=float), dtype=np.float64)
         return spaces.Dict(shown)
@@ -190,12 +208,12 @@ class InjectionCore:
         for k, seed in enumerate(seeds):     # all is copied: a mapped file is open, and there may be more than may be
             entries = recording(scenario, seed)
             self._resistance[:, k], self._draws[:, k] = entries["transfer_resistance"], entries["noise"]
-            self._deviations[k], self._squares[k] = entries["deviation"], entries["square"]
-            totals[k] = entries["moment"].sum(axis=1, dtype=float)
+            moment, self._deviations[k], self._squares[k] = integrals(scenario, seed)
+            totals[k] = moment.sum(axis=1, dtype=float)
             # The fourth of an episode's streams; the first three made the recording.
             faults.append(rules.instrument.draw(np.random.default_rng(np.random.SeedSequence(seed).spawn(4)[3]), L, T))
             if self._operator_type:
-                moments.append(self._operator_type.project(scenario, entries["moment"]))
+                moments.append(self._operator_type.project(scenario, moment))
         self._faults = Faults(*(np.array(part) for part in zip(*faults, strict=True)))
         if not self._operator_type:
             return
@@ -209,7 +227,7 @@ class InjectionCore:
         for k in range(RECENT):
             self._recent[:, k] = scenario.currents[(self.first - 1 - k) % self.first]
         level = self._operator.concentration[:, None] - scenario.background
-        area = outline(scenario).mass.sum()
+        area = score_mass(scenario).sum()
         self._homogeneous = (area * level**2 - 2.0 * level * totals + self._deviations) / self._squares
 
     def _measure(self, k: int, currents: np.ndarray) -> np.ndarray:
@@ -292,6 +310,8 @@ class InjectionCore:
             mean, std = self._operator.grid()
             shown |= {"recent": self._recent.copy(), "frame": self._frames.copy(),
                       "innovations": self._innovations.copy(), "mean": mean, "std": std, "doubt": self._doubt.copy()}
+            if (flow := self._operator.flow()) is not None:
+                shown |= {"velocity": flow[0], "velocity_std": flow[1]}
         left = [np.full(len(self._spent), float(self.scenario.n_steps - self._t))]
         if self.rules.budget is not None:
             left.append(self.rules.budget - self._spent.astype(float))

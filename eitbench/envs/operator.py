@@ -1,6 +1,7 @@
 """What the estimators inside injection environments have in common: levels, linearisation, patches; and the full one.
 
-`eitbench.envs.reduced_operator` holds the one of reduced order, which training runs on.
+`eitbench.envs.reduced_operator` holds the one of reduced order, which training runs on, and
+`eitbench.envs.joint_operator` those for a flow that is to be estimated too.
 """
 
 from __future__ import annotations
@@ -8,13 +9,14 @@ from __future__ import annotations
 import math
 from functools import lru_cache
 from itertools import combinations
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
 from eitbench.estimation import Observation, starting_filter
 from eitbench.estimation.gate import gated_update
-from eitbench.recordings import outline, step_error
+from eitbench.recordings import step_error
+from eitbench.regions import score_mass
 from eitbench.task import make_task
 
 if TYPE_CHECKING:
@@ -78,9 +80,13 @@ class Operator(Protocol):
         """(B, n) their standard deviations in mol/m³."""
         ...
 
+    def flow(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Velocity parameters θ and their standard deviations (B, k) in m/s, None where the flow is taken as known."""
+        ...
+
     @staticmethod
     def project(scenario: Scenario, moment: np.ndarray) -> np.ndarray:
-        """Moments of a recording (T, n) as `errors` wants them."""
+        """Moments over what counts (T, n), see `eitbench.regions.integrals`, as `errors` wants them."""
         ...
 
 
@@ -153,11 +159,15 @@ class FullOperator:
         broken = BROKEN if math.isfinite(gate) else math.inf
         self._levels = [levels.linearised(levels.best(frame, broken)) for frame in frames]
         self.concentration = np.array([level.concentration for level in self._levels])
-        task = levels.task
-        self._filters = [starting_filter(task.transport, task.prior, 1.0) for _ in frames]
-        self._patches = patch_averages(task.mesh)
+        self._filters = self._start(len(frames))
+        self._patches = patch_averages(levels.task.mesh)
         for k, currents in enumerate(scenario.currents):
             self.assimilate(frames[:, k], np.repeat(currents[None], len(frames), axis=0))
+
+    def _start(self, episodes: int) -> list[Any]:
+        """Filters at t = 0."""
+        task = self._shared.task
+        return [starting_filter(task.transport, task.prior, 1.0) for _ in range(episodes)]
 
     def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         innovations, kept = np.zeros_like(voltages), np.ones(voltages.shape, dtype=bool)
@@ -177,13 +187,16 @@ class FullOperator:
 
     def errors(self, moments: np.ndarray, deviations: np.ndarray, squares: np.ndarray) -> np.ndarray:
         estimate = self.means() - self._scenario.background
-        return step_error(outline(self._scenario).mass, estimate, moments, deviations, squares)
+        return step_error(score_mass(self._scenario), estimate, moments, deviations, squares)
 
     def means(self) -> np.ndarray:
         return self.concentration[:, None] * np.array([filter_.mean for filter_ in self._filters])
 
     def spreads(self) -> np.ndarray:
         return self.concentration[:, None] * np.sqrt([filter_.variances() for filter_ in self._filters])
+
+    def flow(self) -> tuple[np.ndarray, np.ndarray] | None:
+        return None
 
     @staticmethod
     def project(scenario: Scenario, moment: np.ndarray) -> np.ndarray:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import io
 import math
 import zlib
+from collections.abc import Callable
 from functools import cache, lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -14,31 +15,36 @@ from threadpoolctl import threadpool_limits
 from eitbench._files import write_atomically
 from eitbench.envs.operator import BROKEN, Linearisation, levels_of, pair_currents, patch_averages
 from eitbench.episodes import code_digest, folder, warn_not_kept
-from eitbench.estimation import LinearisedObservations, starting_filter
+from eitbench.estimation import LinearisedObservations, Observation, starting_filter
 from eitbench.estimation.reduced import ReducedFilter, ReducedModel, reduced_model
 from eitbench.recordings import outline
+from eitbench.regions import region_of, score_mass
 from eitbench.task import make_task
 
 if TYPE_CHECKING:
     from eitbench.scenarios.base import Scenario
 
 RANK = 120
+Model = TypeVar("Model")
 
 
 class ReducedOperator:
     """Kalman filters whose injections differ, in single precision, which halves the time; see `Operator`."""
 
     def __init__(self, scenario: Scenario, frames: np.ndarray, *, gate: float, noise_floor: float) -> None:
-        self._shared = shared = _shared(scenario)
+        self._shared = shared = self._share(scenario)
         self._gate, self._floor = gate, noise_floor
         broken = BROKEN if math.isfinite(gate) else math.inf
         self.levels = [shared.level(shared.levels.best(frame, broken)) for frame in frames]
         self.concentration = np.array([level.concentration for level in self.levels])
-        r = len(shared.single.transition)
-        self._filter = ReducedFilter(shared.single, np.zeros((len(frames), r), dtype=np.float32),
-                                     np.repeat(shared.single.initial[None], len(frames), axis=0))
+        self._filter = shared.start(len(frames))
         for k, currents in enumerate(scenario.currents):
             self.assimilate(frames[:, k], np.repeat(currents[None], len(frames), axis=0))
+
+    @staticmethod
+    def _share(scenario: Scenario) -> Shared:
+        """What all episodes have in common; made once a process."""
+        return _shared(scenario)
 
     def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         noise_std = self._shared.levels.noise_std
@@ -51,54 +57,96 @@ class ReducedOperator:
         return (innovation / np.sqrt(variance)).astype(float), kept
 
     @property
-    def model(self) -> ReducedModel:
-        """The reduced model, in double precision."""
-        return self._shared.model
+    def basis(self) -> np.ndarray:
+        """(n, r) Φ, in double precision."""
+        return self._shared.model.basis
+
+    @property
+    def state(self) -> np.ndarray:
+        """(B, r) present reduced concentrations."""
+        return self._filter.mean
+
+    @property
+    def state_covariance(self) -> np.ndarray:
+        """(B, r, r) their covariances."""
+        return self._filter.covariance
 
     @property
     def covariance(self) -> np.ndarray:
-        """(B, r, r) of the present reduced states."""
+        """(B, s, s) of all that is estimated, the reduced concentration first."""
         return self._filter.covariance
+
+    def steps(self, count: int, along: np.ndarray | None = None) -> list[tuple[np.ndarray, np.ndarray]]:
+        """How the first episode's deviations move in the next ``count`` steps, and their noise, (s, s) each; where that
+        depends on the state itself, about what is predicted or ``along`` (count, s), the states before each step."""
+        model = self._shared.model
+        return [(model.transition, model.noise)] * count
+
+    @property
+    def weight(self) -> np.ndarray | None:
+        """(s, s) W, with which tr(W P) is the expected squared error, integrated over what counts; None: identity."""
+        return None if region_of(self._shared.scenario) is None else self._shared.mass[1:, 1:]
+
+    def truth(self, entries: np.ndarray) -> np.ndarray:
+        """(T, s) what is estimated in the first episode, from its recording: for bounds only."""
+        shared, level = self._shared, self.concentration[0]
+        mass = outline(shared.scenario).mass
+        whole = 0.5 * (mass.sum(axis=0) + mass.sum(axis=1))                                 # ∫ of each node's function
+        beyond = (shared.background - level) * whole + entries["moment"]
+        return np.asarray(beyond @ self.basis / level)
 
     def grid(self) -> tuple[np.ndarray, np.ndarray]:
         patches = self._shared.patches
-        mean = 1.0 + (patches @ self._filter.mean[..., None])[..., 0]
-        variance = ((patches @ self._filter.covariance) * patches).sum(axis=2, dtype=float)
+        mean = 1.0 + (patches @ self.state[..., None])[..., 0]
+        variance = ((patches @ self.state_covariance) * patches).sum(axis=2, dtype=float)
         return self.concentration[:, None] * mean, self.concentration[:, None] * np.sqrt(variance)
 
     def errors(self, moments: np.ndarray, deviations: np.ndarray, squares: np.ndarray) -> np.ndarray:
         shared = self._shared
         state = np.concatenate([self.concentration[:, None] - shared.background,
-                                self.concentration[:, None] * self._filter.mean], axis=1)
+                                self.concentration[:, None] * self.state], axis=1)
         quadratic = (state * (shared.mass @ state[..., None])[..., 0]).sum(axis=1)
         return (quadratic - 2.0 * (state * moments).sum(axis=1) + deviations) / squares
 
     def means(self) -> np.ndarray:
-        return self.concentration[:, None] * (1.0 + self._filter.mean @ self._shared.model.basis.T)
+        return self.concentration[:, None] * (1.0 + self.state @ self._shared.model.basis.T)
 
     def spreads(self) -> np.ndarray:
         basis = self._shared.model.basis
-        variance = ((basis @ self._filter.covariance) * basis).sum(axis=2)
+        variance = ((basis @ self.state_covariance) * basis).sum(axis=2)
         return self.concentration[:, None] * np.sqrt(variance)
 
-    @staticmethod
-    def project(scenario: Scenario, moment: np.ndarray) -> np.ndarray:
-        return (moment @ _shared(scenario).basis).astype(float)
+    def flow(self) -> tuple[np.ndarray, np.ndarray] | None:
+        return None
+
+    @classmethod
+    def project(cls, scenario: Scenario, moment: np.ndarray) -> np.ndarray:
+        return (moment @ cls._share(scenario).basis).astype(float)
 
 
-class _Shared:
+class Shared:
     """What all episodes of a scenario share."""
 
     def __init__(self, scenario: Scenario) -> None:
-        self.background, self.levels = scenario.background, levels_of(scenario)
-        self.model = _stored_model(scenario)
+        self.scenario, self.background, self.levels = scenario, scenario.background, levels_of(scenario)
+        self.model = self._make(scenario)
         basis = np.column_stack([np.ones(len(self.model.basis)), self.model.basis])
-        half = outline(scenario).mass
+        half = score_mass(scenario)
         self.mass = 0.5 * (basis.T @ (half @ basis) + basis.T @ (half.T @ basis))
         self.basis = basis.astype(np.float32)
-        self.single = ReducedModel(*(array.astype(np.float32) for array in self.model))
         self.patches = (patch_averages(self.levels.task.mesh) @ self.model.basis).astype(np.float32)
         self.level = cache(self._level)
+
+    @staticmethod
+    def _make(scenario: Scenario) -> Any:
+        return _stored_model(scenario)
+
+    def start(self, episodes: int) -> ReducedFilter:
+        """Filters at t = 0, in single precision."""
+        single = ReducedModel(*(array.astype(np.float32) for array in self.model))
+        r = len(single.transition)
+        return ReducedFilter(single, np.zeros((episodes, r), dtype=np.float32),
+                             np.repeat(single.initial[None], episodes, axis=0))
 
     def _level(self, number: int) -> Linearisation:
         concentration, resistance, derivative = self.levels.linearised(number)
@@ -106,24 +154,29 @@ class _Shared:
 
 
 @lru_cache(maxsize=2)
-def _shared(scenario: Scenario) -> _Shared:
-    return _Shared(scenario)
+def _shared(scenario: Scenario) -> Shared:
+    return Shared(scenario)
 
 
 def _stored_model(scenario: Scenario) -> ReducedModel:
     """The reduced model, from the cache if it is there: making it takes half a minute."""
-    path = folder(scenario) / f"reduced-{code_digest('estimation/*.py', 'envs/*operator.py', 'task.py')[:16]}.npz"
+    return stored_model(scenario, "reduced", ReducedModel, lambda: _make_model(scenario))
+
+
+def stored_model(scenario: Scenario, name: str, kind: type[Model], make: Callable[[], Model]) -> Model:
+    """A model, a named tuple of arrays, from the cache if one of this name is there; else it is made and kept."""
+    path = folder(scenario) / f"{name}-{code_digest('estimation/*.py', 'envs/*operator.py', 'task.py')[:16]}.npz"
     try:
         with np.load(path, allow_pickle=False) as stored:
-            model = ReducedModel(*(stored[name] for name in ReducedModel._fields))
+            model = kind(*(stored[name] for name in kind._fields))  # type: ignore[attr-defined]
             if int(stored["checksum"]) == _checksum(model):
                 return model
     except Exception:       # missing or damaged: an archive may raise anything
         pass
     with threadpool_limits(1):                             # as many threads as here, the same bits
-        model = _make_model(scenario)
+        model = make()
     content = io.BytesIO()
-    np.savez(content, checksum=_checksum(model), **model._asdict())
+    np.savez(content, checksum=_checksum(model), **model._asdict())  # type: ignore[attr-defined]
     try:
         write_atomically(path, content.getvalue())
     except OSError as error:
@@ -134,17 +187,22 @@ def _stored_model(scenario: Scenario) -> ReducedModel:
 def _make_model(scenario: Scenario) -> ReducedModel:
     from eitbench.physics.fem import mass_matrix
     task = make_task(scenario)
-    every = pair_currents(scenario)
-    currents = every[np.random.default_rng(0).integers(len(every), size=90)]
     start = starting_filter(task.transport, task.prior, 1.0)
-    level = scenario.expected_concentration
+    return reduced_model(start, mass_matrix(task.mesh).toarray(), record_of_any(scenario, 90),
+                         min(RANK, task.mesh.n_nodes))
+
+
+def record_of_any(scenario: Scenario, length: int) -> list[Observation]:
+    """A record of pairs at random, about the expected level and in parts of it."""
+    task, every, level = make_task(scenario), pair_currents(scenario), scenario.expected_concentration
+    currents = every[np.random.default_rng(0).integers(len(every), size=length)]
     linear = LinearisedObservations(task.observation, task.noise, np.full(task.mesh.n_nodes, level))
     record = []
-    for current in currents:                               # the state is counted in parts of the level
+    for current in currents:
         seen = linear(np.zeros(current.shape), current)
         record.append(seen._replace(matrix=level * seen.matrix))
-    return reduced_model(start, mass_matrix(task.mesh).toarray(), record, min(RANK, task.mesh.n_nodes))
+    return record
 
 
-def _checksum(model: ReducedModel) -> int:
+def _checksum(model: Any) -> int:
     return zlib.crc32(b"".join(np.ascontiguousarray(array).tobytes() for array in model))

@@ -64,7 +64,7 @@ def draw_electrodes(axes: Axes, task: Task, currents: np.ndarray, width: float =
 
 
 def draw_frame(task: Task, truth_mesh: Mesh, truth: np.ndarray, estimate: np.ndarray, spread: np.ndarray | None,
-               currents: np.ndarray, time: float) -> np.ndarray:
+               currents: np.ndarray, time: float, region: tuple[float, float] | None = None) -> np.ndarray:
     """(height, width, 3) uint8 picture: truth and estimate in one colour scale, the estimate's spread, electrodes.
 
     Pipes lie one below the other, in 3D with isosurfaces beside them; tanks stand side by side.
@@ -77,6 +77,8 @@ def draw_frame(task: Task, truth_mesh: Mesh, truth: np.ndarray, estimate: np.nda
     spread : (n,) standard deviation in mol/m³, or None: not claimed
     currents : (L,) A
     time : float, s
+    region : (float, float), optional
+        m along a 2D pipe; lines are drawn where the part that counts begins and ends.
     """
     low, high = colour_range(task)
     spread_high = max(0.25, task.prior.initial_std) * task.expected_concentration
@@ -107,6 +109,8 @@ def draw_frame(task: Task, truth_mesh: Mesh, truth: np.ndarray, estimate: np.nda
                                     "standard deviation of the estimate"), strict=True):
         axes.set_title(title, loc="left", fontsize=10)
         draw_electrodes(axes, task, currents)
+        for end in region or ():
+            axes.axvline(100 * end, color="white", linewidth=1.0, linestyle="--")
     current = "current enters at the red electrode and leaves at the blue one"
     if tank:
         for axes in panels:

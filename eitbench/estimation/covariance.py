@@ -18,8 +18,8 @@ class FreeCovariance:
         F, with spectral radius below one (or F = I without noise, for a target that stands still).
     noise : (n, n)
         Γ_w.
-    initial : (n, n)
-        Γ_{0|0}.
+    initial : (n, n), optional
+        Γ_{0|0}; by default Π_∞.
     tolerance : float
         Eigenvalues of U D Uᵀ below this part of Π_∞'s largest entry are dropped.
 
@@ -29,14 +29,16 @@ class FreeCovariance:
         If Π_t has no limit.
     """
 
-    def __init__(self, transition: np.ndarray, noise: np.ndarray, initial: np.ndarray, *,
+    def __init__(self, transition: np.ndarray, noise: np.ndarray, initial: np.ndarray | None = None, *,
                  tolerance: float = 1e-14) -> None:
         self.scale = 1.0
         self.transition = transition
         self._noise = noise
         self.limit = _stationary(transition, noise)
         self._threshold = tolerance * np.abs(self.limit).max()
-        self._transients = [_signed_factor(initial - self.limit, self._threshold)]        # (U, D) at t = 0, 1, …
+        nothing = np.zeros((len(noise), 0)), np.zeros(0)
+        self._transients = [nothing if initial is None else                               # (U, D) at t = 0, 1, …
+                            _signed_factor(initial - self.limit, self._threshold)]
 
     def scaled(self, factor: float) -> FreeCovariance:
         """The same sequence times ``factor``, sharing all matrices."""

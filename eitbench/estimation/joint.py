@@ -9,7 +9,7 @@ import numpy as np
 
 from eitbench import _check
 from eitbench.estimation.dense import DenseKalmanFilter
-from eitbench.estimation.kalman import Observation
+from eitbench.estimation.kalman import Expected, Observation
 
 VelocityField = Callable[[np.ndarray], np.ndarray]
 
@@ -137,12 +137,23 @@ class JointFilter:
 
     def update(self, observation: Observation) -> JointStep:
         """Take in one measurement of the present concentration, linearised at `concentration` (see `linearised`)."""
-        n, (matrix, value, noise_variance) = self._n, observation
-        blind = np.zeros((len(matrix), len(self._start)))                                # θ itself is not seen
-        step = self._filter.update(Observation(np.hstack([matrix, blind]), value, noise_variance))
+        return self.take_in(observation.matrix, *self.expect(observation))
+
+    def expect(self, observation: Observation) -> Expected:
+        """How a measurement of the present concentration compares with what is known before it; the rows of the cross
+        covariance are (c, θ)."""
+        return self._filter.expect(observation._replace(matrix=self._blind(observation.matrix)))
+
+    def take_in(self, H: np.ndarray, cross: np.ndarray, innovation: np.ndarray, S: np.ndarray) -> JointStep:
+        """Take in readings of the present concentration, with matrix (m, n) and what `expect` says of them."""
+        n, step = self._n, self._filter.take_in(self._blind(H), cross, innovation, S)
         step.mean[n:] = self._physical(step.mean[n:])                                    # the filter's own array
         return JointStep(step.mean[:n].copy(), step.variance[:n], step.mean[n:].copy(), self.covariance[n:, n:].copy(),
                          step.innovation, step.innovation_covariance)
+
+    def _blind(self, matrix: np.ndarray) -> np.ndarray:
+        """(m, n + k): θ itself is not seen."""
+        return np.hstack([matrix, np.zeros((len(matrix), len(self._start)))])
 
     def _physical(self, parameters: np.ndarray) -> np.ndarray:
         """``parameters``, or the point nearest to them on the line towards θ_0 that keeps to the bounds."""

@@ -51,8 +51,18 @@ def reduced_model(start: KalmanFilter | ClosedVesselFilter, mass: np.ndarray, ob
     skip : int
         Steps at the beginning that do not count, since the initial uncertainty is not typical.
     """
+    basis = main_directions(learnt_of(start, observations, skip), mass, rank)
+    transition, rotation = scipy.linalg.schur(basis.T @ mass @ start.transition @ basis)
+    basis = basis @ rotation
+    weighted = mass @ basis
+    return ReducedModel(basis, transition, weighted.T @ start.apply_noise(weighted),
+                        weighted.T @ start.apply_initial(weighted))
+
+
+def learnt_of(start: KalmanFilter | ClosedVesselFilter, observations: Iterable[Observation], skip: int) -> np.ndarray:
+    """(n, n) by how much measurements reduce the covariance, summed over a record but for its first ``skip`` steps."""
     blind = copy.deepcopy(start) if isinstance(start, ClosedVesselFilter) else None           # never sees a measurement
-    learnt = np.zeros_like(mass)
+    learnt = np.zeros((len(start.mean), len(start.mean)))
     for t, observation in enumerate(observations):
         start.predict()
         start.update(observation)
@@ -60,15 +70,15 @@ def reduced_model(start: KalmanFilter | ClosedVesselFilter, mass: np.ndarray, ob
             blind.predict()
         if t >= skip:
             learnt += _learnt(start, blind)
-    root = np.linalg.cholesky(mass)
-    n = len(mass)
+    return learnt
+
+
+def main_directions(learnt: np.ndarray, mass: np.ndarray, rank: int) -> np.ndarray:
+    """(n, r) the directions that carry most of ``learnt`` (n, n), as measured by the mass matrix M: Φᵀ M Φ = I."""
+    root, n = np.linalg.cholesky(mass), len(mass)
     _, vectors = scipy.linalg.eigh(root.T @ learnt @ root, subset_by_index=[n - rank, n - 1])
-    basis = scipy.linalg.solve_triangular(root.T, vectors[:, ::-1], lower=False)
-    transition, rotation = scipy.linalg.schur(basis.T @ mass @ start.transition @ basis)
-    basis = basis @ rotation
-    weighted = mass @ basis
-    return ReducedModel(basis, transition, weighted.T @ start.apply_noise(weighted),
-                        weighted.T @ start.apply_initial(weighted))
+    basis: np.ndarray = scipy.linalg.solve_triangular(root.T, vectors[:, ::-1], lower=False)
+    return basis
 
 
 def _learnt(filter_: KalmanFilter | ClosedVesselFilter, blind: ClosedVesselFilter | None) -> np.ndarray:

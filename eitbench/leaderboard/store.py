@@ -124,8 +124,8 @@ def _folder_name(text: str) -> str:
 def source_digest() -> str:
     """Hash of the source that scores depend on: results of other code are not taken for this one's."""
     folder = Path(__file__).parent.parent
-    rooms = ("physics/*", "scenarios/*", "episodes", "task", "estimation/*", "scoring", "envs/*", "leaderboard/run",
-             "leaderboard/score")
+    rooms = ("physics/*", "scenarios/*", "episodes", "recordings", "regions", "task", "estimation/*", "scoring",
+             "envs/*", "leaderboard/run", "leaderboard/score")
     files = sorted(path for room in rooms for path in folder.glob(f"{room}.py"))
     return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
 

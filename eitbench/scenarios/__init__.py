@@ -1,6 +1,7 @@
 """Floor 2: one short file per example; a scenario says what world it is, with the source of every number."""
 
 from eitbench.scenarios.pipe2d import Pipe2D
+from eitbench.scenarios.pipe2d_drift import Pipe2DDriftingVelocity
 from eitbench.scenarios.pipe2d_flows import (
     Pipe2DBiasedVelocity,
     Pipe2DSkewedVelocity,
@@ -13,5 +14,6 @@ from eitbench.scenarios.pipe3d import Pipe3D
 from eitbench.scenarios.rotating_tank import RotatingTank2D
 from eitbench.scenarios.stationary_tank import StationaryTank2D
 
-__all__ = ["Pipe2D", "Pipe2DBiasedVelocity", "Pipe2DIntermittent", "Pipe2DObstacle", "Pipe2DSkewedVelocity",
-           "Pipe2DTimeVaryingVelocity", "Pipe2DUnknownVelocity", "Pipe3D", "RotatingTank2D", "StationaryTank2D"]
+__all__ = ["Pipe2D", "Pipe2DBiasedVelocity", "Pipe2DDriftingVelocity", "Pipe2DIntermittent", "Pipe2DObstacle",
+           "Pipe2DSkewedVelocity", "Pipe2DTimeVaryingVelocity", "Pipe2DUnknownVelocity", "Pipe3D", "RotatingTank2D",
+           "StationaryTank2D"]

@@ -17,9 +17,11 @@ from eitbench.seeds import parse_seeds
 
 NAME = "eitbench/Pipe2DInjection-v0"
 CURRENTS, FAULTS, BUDGET = (f"eitbench/Pipe2DInjection{kind}-v0" for kind in ("Currents", "Faults", "Budget"))
+FLOW = "eitbench/Pipe2DInjectionFlow-v0"
 SHORT = {"scenario": {"scored_steps": 4, "mean_velocity": 16.0}}
 """Sixteen electrodes and a short record."""
 KWARGS = {NAME: SHORT, CURRENTS: SHORT, FAULTS: SHORT, BUDGET: SHORT | {"budget": 3},
+          FLOW: {"scenario": SHORT["scenario"] | {"velocity_range": [15.0, 17.0]}},
           "eitbench/RotatingTankInjection-v0": {"scenario": {"warm_up": 2, "scored_steps": 3}}}
 SEED = 5
 
@@ -54,7 +56,7 @@ def write_policy(folder, body: str = "def act(self, observation): return 7", nam
 # -- what a policy may believe ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", [NAME, FAULTS, BUDGET])
+@pytest.mark.parametrize("name", [NAME, FAULTS, BUDGET, FLOW])
 def test_belief_is_the_filter_inside(name):
     """Followed from outside, the reduced filter is that of the environment, to the bit."""
     env = environment(name)
@@ -243,7 +245,7 @@ def test_wrong_files_are_named(tmp_path, body, message):
 
 def test_wrong_names_are_named(tmp_path):
     """Of policies, environments and estimators."""
-    with pytest.raises(ValueError, match=r"policy must be a path to a .py file or one of adjacent, .*; got 'lucky'"):
+    with pytest.raises(ValueError, match=r"policy must be the path of a .py file .* or one of adjacent, .*; got 'lucky'"):
         load_policy("lucky")
     with pytest.raises(ValueError, match="has the name of one of ours"):
         load_policy(write_policy(tmp_path, name="adjacent"))

@@ -1,0 +1,71 @@
+"""Concentration and mean velocity together in few coordinates: the tables and the filter."""
+
+import numpy as np
+import pytest
+
+from eitbench.estimation.reduced_joint import JointTables, ReducedJointFilter, joint_model
+
+
+@pytest.fixture(scope="module")
+def model():
+    """F(θ) and Γ_w(θ) that are cubic in θ, which the tables hold exactly, projected onto 5 of 8 directions."""
+    rng = np.random.default_rng(0)
+    parts, roots = 0.2 * rng.normal(size=(4, 8, 8)), rng.normal(size=(4, 8, 8))
+    root = rng.normal(size=(8, 8))
+    mass = root @ root.T + np.eye(8)
+    basis = np.linalg.solve(np.linalg.cholesky(mass).T, np.linalg.qr(rng.normal(size=(8, 5)))[0])
+    velocities = np.linspace(1.0, 6.0, 7)
+
+    def step(theta):
+        powers = (theta / 5)**np.arange(4)
+        return np.tensordot(powers, parts, 1), np.tensordot(powers, roots @ np.swapaxes(roots, 1, 2), 1)
+
+    return joint_model(basis, mass, np.eye(8), velocities, map(step, velocities)), basis, mass, step
+
+
+def test_tables_are_galerkins_projection(model):
+    """At velocities between those of the table, and with derivatives that are those of finite differences."""
+    made, basis, mass, step = model
+    tables, theta, small = JointTables(made), np.array([1.0, 2.3, 4.4, 5.9]), 1e-5
+    A, slope, W = tables.at(theta)
+    for k, velocity in enumerate(theta):
+        F, noise = step(velocity)
+        np.testing.assert_allclose(A[k], basis.T @ mass @ F @ basis, atol=1e-12)
+        np.testing.assert_allclose(W[k], basis.T @ mass @ noise @ mass @ basis, atol=1e-10)
+    inner = theta[1:]
+    difference = (tables.at(inner + small)[0] - tables.at(inner - small)[0]) / (2 * small)
+    np.testing.assert_allclose(slope[1:], difference, atol=1e-8)
+    for a, b in zip(tables.at(np.array([0.0, 9.0])), tables.at(made.velocities[[0, -1]]), strict=True):
+        np.testing.assert_array_equal(a, b)                # beyond the table as at its ends
+
+
+def test_filter_is_the_textbooks(model):
+    """Means and covariances are those of a dense joint EKF, written out here, for each of three records."""
+    tables, rng, walk, bounds = JointTables(model[0]), np.random.default_rng(1), 0.3, (2.5, 4.5)
+    mean = np.column_stack([rng.normal(size=(3, 5)), [3.0, 4.0, 4.4]])
+    roots = rng.normal(size=(3, 6, 6))
+    covariance = roots @ np.swapaxes(roots, 1, 2)
+    ours = ReducedJointFilter(tables, mean, covariance, walk, bounds)
+    x, P, touched = mean.copy(), covariance.copy(), False
+    for _ in range(6):
+        matrix, residual, variance = rng.normal(size=(3, 4, 5)), rng.normal(0.0, 5.0, (3, 4)), np.full((3, 4), 0.5)
+        ours.predict()
+        innovation, predicted, kept = ours.update(matrix, residual, variance)
+        for b in range(3):
+            A, slope, W = (part[0] for part in tables.at(x[b, -1:]))
+            J, Q = np.eye(6), np.zeros((6, 6))
+            J[:5, :5], J[:5, 5] = A, slope @ x[b, :5]
+            Q[:5, :5], Q[5, 5] = W, walk**2
+            x[b, :5], P[b] = A @ x[b, :5], J @ P[b] @ J.T + Q
+            H = np.column_stack([matrix[b], np.zeros(4)])
+            S = H @ P[b] @ H.T + np.diag(variance[b])
+            np.testing.assert_allclose(innovation[b], residual[b] - H @ x[b], atol=1e-9)
+            np.testing.assert_allclose(predicted[b], S.diagonal(), rtol=1e-9)
+            x[b] += P[b] @ H.T @ np.linalg.solve(S, residual[b] - H @ x[b])
+            P[b] -= P[b] @ H.T @ np.linalg.solve(S, H @ P[b])
+            touched |= not bounds[0] <= x[b, 5] <= bounds[1]
+            x[b, 5] = np.clip(x[b, 5], *bounds)
+        assert kept.all()
+        np.testing.assert_allclose(ours.mean, x, rtol=1e-8, atol=1e-9)
+        np.testing.assert_allclose(ours.covariance, P, rtol=1e-7, atol=1e-8)
+    assert touched                                         # the bounds were needed
