@@ -11,6 +11,7 @@ ALPHA = 0.177  # that of gauss_newton.py
 
 class Estimator:
     boards = ("filter",)
+    role = "floor"
     parameters = {"alpha": ALPHA}  # noqa: RUF012 (a plain dict is what a record stores)
 
     def __init__(self, task: Task) -> None:

@@ -3,6 +3,7 @@
 Importing it registers the environments ``eitbench/…-v0``; nothing heavy is loaded before something is used.
 """
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from eitbench.envs import register_all
@@ -18,11 +19,13 @@ register_all()
 
 
 def __getattr__(name: str) -> Any:
-    """Load the three nouns and their makers on first use."""
+    """Load the three nouns, their makers and the leaderboards on first use."""
     if name in ("Estimate", "Task", "make_task"):
         from eitbench import task
         return getattr(task, name)
     if name in ("Episode", "simulate"):
         from eitbench import episodes
         return getattr(episodes, name)
+    if name == "leaderboard":
+        return import_module("eitbench.leaderboard")
     raise AttributeError(f"module 'eitbench' has no attribute {name!r}")

@@ -1,4 +1,5 @@
-"""The command line: `eitbench list | run | bank | train | policies | leaderboard | render | reproduce`."""
+"""The command line: `eitbench list | run | bank | train | policies | submit | leaderboard | compare | render |
+reproduce`."""
 
 from __future__ import annotations
 
@@ -7,9 +8,8 @@ import re
 import shlex
 import sys
 from enum import StrEnum
-from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -46,6 +46,7 @@ Figure = StrEnum("Figure", {re.sub(r"\W", "_", name).upper(): name for name in F
 
 Out = Annotated[Path, typer.Option("--out", "-o", help="Folder of the results.")]
 Jobs = Annotated[int, typer.Option("--jobs", "-j", min=1, help="Processes; each takes a core and 1 to 4 GB.")]
+RECORDS = Path("leaderboards/results")
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -95,7 +96,7 @@ def run(
     from eitbench.seeds import parse_seeds
     with _clear_errors():
         todo = suites.jobs(suite.value, env or [], baseline or [], None if seeds is None else parse_seeds(seeds))
-    run_jobs(todo, EpisodeStore(out), n_jobs=jobs, command=shlex.join(["eitbench", *sys.argv[1:]]))
+    run_jobs(todo, EpisodeStore(out), n_jobs=jobs, command=_command())
     _report(out)
 
 
@@ -167,27 +168,98 @@ def policies(
     estimator: Annotated[str, typer.Option(help="full: the exact filter, for scores; reduced: that of training.")] = (
         "full"),
     jobs: Jobs = CORES,
-    out: Out = Path("results/policies"),
+    out: Out = Path("results"),
 ) -> None:
     """Play injection policies, print their scores and the environment's adaptivity gap.
 
-    Each episode is kept in OUT/ENV.csv the moment it is done; the same command again resumes.
+    Each episode is stored the moment it is done; the same command again resumes.
     """
-    from eitbench.leaderboard.policies import load_policy, own_agents, own_policies, suited
-    from eitbench.leaderboard.policy_table import policy_table, run_policies
+    from eitbench.leaderboard.policies import load_policy
+    from eitbench.leaderboard.policy_table import policy_rows, policy_table
+    from eitbench.leaderboard.run import run_jobs
+    from eitbench.leaderboard.store import EpisodeStore
+    from eitbench.leaderboard.suites import policy_jobs
     from eitbench.seeds import parse_seeds
     with _clear_errors():
-        ours = own_policies() + (own_agents(env) if find_spec("stable_baselines3") else [])
-        chosen = suited(env, policy or ours, demanded=bool(policy))
-        numbers = parse_seeds(seeds)
-        rows = run_policies(env, {}, chosen, numbers, estimator, jobs, out / f"{env.replace('/', '-')}.csv")
-    typer.echo(policy_table(rows, [name for name in chosen if load_policy(name).privileged]))
+        todo = policy_jobs([env], policy or [], parse_seeds(seeds), estimator)
+    store = EpisodeStore(out)
+    run_jobs(todo, store, n_jobs=jobs, command=_command())
+    asked = {load_policy(job.method).name: load_policy(job.method).privileged for job in todo}
+    typer.echo(policy_table(policy_rows(todo, store), [name for name, privileged in asked.items() if privileged]))
+    _say_failures([record for record in store.write_records()
+                   if record["method"] in asked and record["environment"]["id"] == env])
 
 
 @app.command()
-def leaderboard(out: Out = Path("results")) -> None:
+def submit(
+    env: Annotated[list[str], typer.Option(help="Environment id; may be repeated.")],
+    baseline: Annotated[str | None, typer.Option(help="Name of one of ours, or the path of your own .py file.")] = None,
+    policy: Annotated[str | None, typer.Option(
+        help="The same of an injection policy, or the path of a trained agent's model.zip.")] = None,
+    seeds: Annotated[str | None, typer.Option(help="Test episodes, as in test:0-9. Default: the full suite's.")] = None,
+    official: Annotated[bool, typer.Option("--official", help="For maintainers: a run of theirs.")] = False,
+    jobs: Jobs = CORES,
+    out: Out = Path("results"),
+    to: Annotated[Path, typer.Option(help="Folder of the records.")] = RECORDS,
+) -> None:
+    """Play the test episodes with one baseline or policy and write its records for the leaderboards.
+
+    Episodes are stored in OUT the moment they are done; the same command again resumes.
+    """
+    from eitbench.leaderboard.records import read_record
+    from eitbench.leaderboard.store import EpisodeStore
+    from eitbench.leaderboard.submit import submit
+    from eitbench.seeds import parse_seeds
+    with _clear_errors():
+        method = baseline or policy
+        if method is None or (baseline and policy):
+            raise ValueError("either --baseline or --policy must be given, and one of them only")
+        paths = submit(method, env, None if seeds is None else parse_seeds(seeds), EpisodeStore(out), to,
+                       policy=policy is not None, official=official, n_jobs=jobs, command=_command())
+    for path in paths:
+        record = read_record(path)
+        failed = sum(episode["status"] != "ok" for episode in record["episodes"])
+        typer.echo(f"wrote {path}: {len(record['seeds'])} episodes" + (f", {failed} failed" if failed else ""))
+
+
+@app.command()
+def leaderboard(
+    out: Out = Path("results"),
+    records: Annotated[Path | None, typer.Option(
+        help="Folder of the leaderboards' records, such as leaderboards/results: render leaderboard.csv and "
+             "leaderboard.md beside it instead.")] = None,
+) -> None:
     """Print the table and write the page again from the results stored in a folder."""
-    _report(out)
+    if records is None:
+        return _report(out)
+    from eitbench._files import write_atomically
+    from eitbench.leaderboard.boards import render
+    from eitbench.leaderboard.records import read_records
+    with _clear_errors():
+        texts = render(read_records(records))
+    for name, text in texts.items():
+        write_atomically(records.parent / name, text.encode())
+        typer.echo(f"wrote {records.parent / name}")
+
+
+@app.command()
+def compare(
+    a: Annotated[str, typer.Argument(help="A record's file, or METHOD or METHOD@VERSION among the records.")],
+    b: Annotated[str, typer.Argument(help="The same of the other.")],
+    records: Annotated[Path, typer.Option(help="Folder of the records.")] = RECORDS,
+    html: Annotated[Path | None, typer.Option(help="Write a page too.")] = None,
+) -> None:
+    """Compare two methods seed by seed: differences with intervals, and how often the first is better."""
+    from eitbench._files import write_atomically
+    from eitbench.leaderboard import compare as comparison
+    with _clear_errors():
+        ours, theirs = (comparison.find(name, records) for name in (a, b))
+        table = comparison.compare(ours, theirs)
+    names = comparison.names(ours[0], theirs[0])
+    typer.echo(comparison.markdown(table, *names))
+    if html is not None:
+        write_atomically(html, comparison.html(table, *names).encode())
+        typer.echo(f"\nwrote {html}")
 
 
 @app.command()
@@ -232,12 +304,21 @@ def _report(out: Path) -> None:
     table = summary(records)
     write_atomically(out / "leaderboard.md", (markdown(table) + "\n").encode())
     typer.echo(markdown(table))
+    _say_failures(records)
+    write_page(store, records, table)
+    typer.echo(f"\nwrote {out / 'index.html'}")
+
+
+def _command() -> str:
+    """What was typed."""
+    return shlex.join(["eitbench", *sys.argv[1:]])
+
+
+def _say_failures(records: list[dict[str, Any]]) -> None:
     for record in records:
         for episode in record["episodes"]:
             if episode["status"] != "ok":
-                typer.echo(f"failed: {record['baseline']} on {episode['seed']}: {episode['message']}", err=True)
-    write_page(store, records, table)
-    typer.echo(f"\nwrote {out / 'index.html'}")
+                typer.echo(f"failed: {record['method']} on {episode['seed']}: {episode['message']}", err=True)
 
 
 class _clear_errors:

@@ -18,7 +18,7 @@ from eitbench.leaderboard.baselines import own_baselines
 from eitbench.seeds import parse_seeds
 
 PIPE = "eitbench/Pipe2D-v0"
-COMMANDS = ("list", "run", "bank", "train", "policies", "leaderboard", "render", "reproduce")
+COMMANDS = ("list", "run", "bank", "train", "policies", "submit", "leaderboard", "compare", "render", "reproduce")
 TINY = {"mean_velocity": 45.0, "scored_steps": 3, "electrodes_per_wall": 2, "frame": 2}
 """A fast fluid flushes the pipe in two steps: an episode of five takes a third of a second."""
 
@@ -76,7 +76,8 @@ def test_ten_lines_of_ones_own_get_a_table_and_a_page(tmp_path):
     assert table.strip() in said and len(table.splitlines()) == 4
     assert "My method" in (results / "index.html").read_text(encoding="utf-8")
     assert "wrote results/index.html" in said
-    record = json.loads((results / "records" / "eitbench-Pipe2D-v0--mine--dev.json").read_text(encoding="utf-8"))
+    (path,) = (results / "records").glob("eitbench-Pipe2D-v0--mine--*--dev.json")
+    record = json.loads(path.read_text(encoding="utf-8"))
     assert record["seeds"] == ["dev:0", "dev:1"] and record["environment"]["id"] == PIPE
     assert all(episode["status"] == "ok" for episode in record["episodes"])
 
@@ -127,7 +128,7 @@ def test_suites():
     assert {job.environment.id for job in full} == set(ESTIMATION)
     missing = {job for job in full if job.environment.id in plain} - set(quick)
     assert missing == {suites.Job(suites.Environment(PIPE), "gauss_newton", 1)} and set(quick) < set(full)
-    assert {job.baseline for job in full} == set(own_baselines())
+    assert {job.method for job in full} == set(own_baselines())
     assert set(parse_seeds(suites.SEEDS["quick"])) < set(parse_seeds(suites.SEEDS["full"]))
     assert min(parse_seeds(suites.SEEDS["full"])) == 200_000
     asked_for = suites.jobs("quick", [PIPE], ["gauss_newton"], [1, 2])

@@ -20,6 +20,7 @@ NOTHING = -1
 
 class Policy:
     privileged = True
+    role = "reference"
     # The cycles are for an unknown flow; those of one pair were found by `python benchmarks/search_injections.py`.
     parameters: dict[str, Any] = {"fixed_pairs": [[0, 8], [0, 10]], "thresholds": [1e-4, 3e-2, 16],  # noqa: RUF012
                                   "intervals": [1, 2, 3], "horizons": [0, 2, 4, 8, 16], "changes": 10, "cycles": [

@@ -8,6 +8,8 @@ from eitbench.envs.injection_core import Rules
 
 
 class Policy:
+    role = "floor"
+
     def __init__(self, rules: Rules, random: np.random.Generator) -> None:
         self.rules, self.random = rules, random
 

@@ -10,12 +10,17 @@ import sys
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any, NamedTuple
+
+from eitbench._files import shipped
 
 if TYPE_CHECKING:
     from eitbench.task import Task
 
 BOARDS = ("filter", "fixed-lag", "smoothing")
+ROLES = (None, "floor", "reference")
+"""What a method is on a board: ranked, or a mark from which the others are judged."""
 
 
 class Baseline(NamedTuple):
@@ -32,6 +37,8 @@ class Baseline(NamedTuple):
     parameters: dict[str, Any]
     estimator: Callable[..., Any]
     """Estimator(task), with update(voltages, currents) -> Estimate or None."""
+    role: str | None = None
+    """One of `ROLES`."""
 
     def suits(self, task: Task) -> bool:
         """Whether it can play a task of its boards; an estimator without a word on that suits all."""
@@ -40,10 +47,8 @@ class Baseline(NamedTuple):
 
 
 def baseline_folder() -> Path:
-    """Where our own baselines lie: within an installed package, beside it in a checkout."""
-    package = Path(__file__).parent.parent
-    inside = package / "baselines"
-    return inside if inside.is_dir() else package.parent / "baselines"
+    """Where our own baselines lie."""
+    return shipped("baselines")
 
 
 def own_baselines() -> list[str]:
@@ -70,24 +75,48 @@ def load_baseline(name: str) -> Baseline:
 @lru_cache(maxsize=64)
 def _load(path: Path, source: bytes) -> Baseline:
     """The file with this content, executed once a process."""
-    specification = importlib.util.spec_from_file_location(f"eitbench_baseline_{path.stem}", path)
-    assert specification is not None
-    module = importlib.util.module_from_spec(specification)
-    sys.modules[specification.name] = module                       # dataclasses look their module up
-    try:
-        exec(compile(source, path, "exec"), module.__dict__)  # a cached .pyc may lag behind an edit by a second
-    except Exception as error:
-        raise ValueError(f"baseline {path} cannot be loaded: {type(error).__name__}: {error}") from error
+    module = load_module("baseline", path, source)
     estimator = getattr(module, "Estimator", None)
     if estimator is None or not callable(getattr(estimator, "update", None)):
         raise ValueError(f"baseline {path} must define a class Estimator with a method update(voltages, currents)")
     boards = tuple(getattr(estimator, "boards", ("filter",)))
     if not boards or not set(boards) <= set(BOARDS):
         raise ValueError(f"baseline {path}: Estimator.boards must be some of {', '.join(BOARDS)}, got {boards!r}")
-    title = re.split(r"[:(.]", f"{(module.__doc__ or '').strip()}\n".splitlines()[0])[0].strip() or path.stem
-    parameters = dict(getattr(estimator, "parameters", {}))
+    who = f"baseline {path}: Estimator"
+    return Baseline(path.stem, title_of(module, path), path, hashlib.sha256(source).hexdigest(), boards,
+                    parameters_of(who, estimator), estimator, role_of(who, estimator))
+
+
+def load_module(kind: str, path: Path, source: bytes) -> ModuleType:
+    """The module that a file's content makes; ``ValueError``, naming ``kind`` and path, if it cannot be executed."""
+    specification = importlib.util.spec_from_file_location(f"eitbench_{kind}_{path.stem}", path)
+    assert specification is not None
+    module = importlib.util.module_from_spec(specification)
+    sys.modules[specification.name] = module                       # dataclasses look their module up
     try:
-        json.dumps(parameters, allow_nan=False)
+        exec(compile(source, path, "exec"), module.__dict__)  # a cached .pyc may lag behind an edit by a second
+    except Exception as error:
+        raise ValueError(f"{kind} {path} cannot be loaded: {type(error).__name__}: {error}") from error
+    return module
+
+
+def title_of(module: ModuleType, path: Path) -> str:
+    """First line of the docstring, up to a colon, bracket or full stop; without one, the file's name."""
+    return re.split(r"[:(.]", f"{(module.__doc__ or '').strip()}\n".splitlines()[0])[0].strip() or path.stem
+
+
+def parameters_of(who: str, method: type[Any]) -> dict[str, Any]:
+    """The class attribute ``parameters``; ``ValueError``, naming ``who``, if JSON cannot hold them."""
+    try:
+        json.dumps(parameters := dict(getattr(method, "parameters", {})), allow_nan=False)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"baseline {path}: Estimator.parameters must be JSON: {error}") from None
-    return Baseline(path.stem, title, path, hashlib.sha256(source).hexdigest(), boards, parameters, estimator)
+        raise ValueError(f"{who}.parameters must be a dict fit for JSON: {error}") from None
+    return parameters
+
+
+def role_of(who: str, method: type[Any]) -> str | None:
+    """The class attribute ``role``; ``ValueError``, naming ``who``, if it is none of `ROLES`."""
+    role = getattr(method, "role", None)
+    if role not in ROLES:
+        raise ValueError(f"{who}.role must be None, 'floor' or 'reference', got {role!r}")
+    return role

@@ -71,7 +71,7 @@ def _runs(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def _record_of(records: list[dict[str, Any]], row: pd.Series) -> dict[str, Any]:
     return next(record for record in records
-                if (record["baseline"], record["environment"]["name"], record["split"])
+                if (record["method"], record["environment"]["name"], record["split"])
                 == (row["baseline"], row["environment"], row["split"]))
 
 
@@ -109,7 +109,7 @@ def _snapshots(store: EpisodeStore, records: list[dict[str, Any]]) -> dict[str, 
     records = [record for record in records if any(e["status"] == "ok" for e in record["episodes"])]
     records = [record for record in records if record["split"] == records[0]["split"]]
     chosen = [record for name, board in SHOWN for record in records
-              if record["baseline"] == name and record["board"] == board]
+              if record["method"] == name and record["board"] == board]
     chosen = chosen or records[:3]
     played = [{e["seed"] for e in record["episodes"] if e["status"] == "ok"} for record in chosen]
     shared = sorted(set.intersection(*played)) if played else []

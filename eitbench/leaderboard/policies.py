@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import hashlib
-import importlib.util
 import json
-import re
-import sys
 import time
 from collections.abc import Sequence
 from functools import lru_cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
@@ -19,7 +17,7 @@ import numpy as np
 from eitbench.envs import INJECTION
 from eitbench.envs.injection import InjectionEnv
 from eitbench.envs.injection_core import Rules
-from eitbench.leaderboard.baselines import baseline_folder
+from eitbench.leaderboard.baselines import baseline_folder, load_module, parameters_of, role_of, title_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -38,6 +36,8 @@ class PolicyFile(NamedTuple):
     parameters: dict[str, Any]
     policy: type[Any]
     """Policy(rules, random), if privileged Policy(rules, random, core), with act(observation) -> action."""
+    role: str | None = None
+    """One of `ROLES`, as of baselines."""
 
     def suits(self, rules: Rules) -> bool:
         """Whether it can play in this world; a policy without a word on that plays in all."""
@@ -56,7 +56,10 @@ def own_policies() -> list[str]:
 
 
 def own_agents(env_id: str) -> list[str]:
-    """Paths of our own trained agents for an environment: ``baselines/checkpoints/ENV/ALGO/seedK/model.zip``."""
+    """Paths of our own trained agents for an environment: ``baselines/checkpoints/ENV/ALGO/seedK/model.zip``; none
+    without the extra ``rl``."""
+    if not find_spec("stable_baselines3"):
+        return []
     folder = baseline_folder() / "checkpoints" / env_id.replace("/", "-")
     return [str(path) for path in sorted(folder.glob("*/seed*/model.zip"))]
 
@@ -86,32 +89,21 @@ def _load(path: Path, source: bytes) -> PolicyFile:
         from eitbench.leaderboard.agents import load_agent
         name, title, agent, parameters = load_agent(path, source)
         return PolicyFile(name, title, path, hashlib.sha256(source).hexdigest(), False, parameters, agent)
-    specification = importlib.util.spec_from_file_location(f"eitbench_policy_{path.stem}", path)
-    assert specification is not None
-    module = importlib.util.module_from_spec(specification)
-    sys.modules[specification.name] = module                       # dataclasses look their module up
-    try:
-        exec(compile(source, path, "exec"), module.__dict__)  # a cached .pyc may lag behind an edit by a second
-    except Exception as error:
-        raise ValueError(f"policy {path} cannot be loaded: {type(error).__name__}: {error}") from error
+    module = load_module("policy", path, source)
     policy = getattr(module, "Policy", None)
     if not isinstance(policy, type) or not callable(getattr(policy, "act", None)):
         raise ValueError(f"policy {path} must define a class Policy with a method act(observation)")
     privileged = getattr(policy, "privileged", False)
     if not isinstance(privileged, bool):
         raise ValueError(f"policy {path}: Policy.privileged must be True or False, got {privileged!r}")
-    parameters = getattr(policy, "parameters", {})
-    try:
-        json.dumps(parameters := dict(parameters), allow_nan=False)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"policy {path}: Policy.parameters must be a dict fit for JSON: {error}") from None
-    title = re.split(r"[:(.]", f"{(module.__doc__ or '').strip()}\n".splitlines()[0])[0].strip() or path.stem
-    return PolicyFile(path.stem, title, path, hashlib.sha256(source).hexdigest(), privileged, parameters, policy)
+    who = f"policy {path}: Policy"
+    return PolicyFile(path.stem, title_of(module, path), path, hashlib.sha256(source).hexdigest(), privileged,
+                      parameters_of(who, policy), policy, role_of(who, policy))
 
 
 def suited(env_id: str, names: Sequence[str], *, demanded: bool) -> list[str]:
     """Those of the policies that suit an environment; where they are ``demanded``, ``ValueError`` if one does not."""
-    rules, chosen = _environment(env_id, "{}", "reduced").rules, []
+    rules, chosen = environment(env_id, "{}", "reduced").rules, []
     for name in names:
         if load_policy(name).suits(rules):
             chosen.append(name)
@@ -143,7 +135,7 @@ def play(env_id: str, kwargs: dict[str, Any], policy: str, seed: int, estimator:
     ValueError
         If there is no such environment or policy, or the policy does not suit it or acts wrongly.
     """
-    env, loaded = _environment(env_id, json.dumps(kwargs), estimator), load_policy(policy)
+    env, loaded = environment(env_id, json.dumps(kwargs), estimator), load_policy(policy)
     if not loaded.suits(env.rules):
         raise ValueError(f"policy {loaded.name} does not suit {env_id}")
     observation, done = env.reset(seed=seed)[0], False
@@ -166,8 +158,8 @@ def play(env_id: str, kwargs: dict[str, Any], policy: str, seed: int, estimator:
 
 
 @lru_cache(maxsize=4)
-def _environment(env_id: str, kwargs: str, estimator: str) -> InjectionEnv:
-    """Made once a process, so that its models are shared by all episodes."""
+def environment(env_id: str, kwargs: str, estimator: str = "full") -> InjectionEnv:
+    """Made once a process, so that its models are shared by all episodes; ``kwargs`` are JSON."""
     if env_id not in INJECTION:
         raise ValueError(f"env must be one of {', '.join(INJECTION)}; got {env_id!r}")
     if estimator not in ("full", "reduced"):

@@ -1,4 +1,4 @@
-"""Run baselines on environments over seeds; each episode's result is stored the moment it is done."""
+"""Run baselines and policies on environments over seeds; each episode's result is stored the moment it is done."""
 
 from __future__ import annotations
 
@@ -20,9 +20,12 @@ from tqdm import tqdm
 
 from eitbench import _check
 from eitbench._parallel import in_parallel
-from eitbench.envs import ENTRY_POINTS
+from eitbench.bank import fill
+from eitbench.envs import ENTRY_POINTS, INJECTION
 from eitbench.envs.estimation import EstimationEnv
+from eitbench.envs.injection import InjectionEnv
 from eitbench.episodes import simulate
+from eitbench.leaderboard import policies
 from eitbench.leaderboard.baselines import BOARDS, Baseline, load_baseline
 from eitbench.leaderboard.score import Played, score
 from eitbench.leaderboard.store import EpisodeStore, provenance, source_digest
@@ -54,22 +57,28 @@ class Environment(NamedTuple):
 
 
 class Job(NamedTuple):
-    """One baseline on one episode."""
+    """One method on one episode."""
 
     environment: Environment
-    baseline: str
-    """Name or path."""
+    method: str
+    """Name or path: of a baseline or, in an environment that asks for injections, of a policy."""
     seed: int
+
+    def load(self) -> Baseline | policies.PolicyFile:
+        """The method's file."""
+        return (policies.load_policy if self.environment.id in INJECTION else load_baseline)(self.method)
 
     def identity(self) -> str:
         """What the outcome depends on; a stored result counts only for the very same."""
-        parts = [*self.environment, load_baseline(self.baseline).sha256, str(self.seed), source_digest(),
-                 np.__version__, scipy.__version__]
+        parts = [*self.environment, self.load().sha256, str(self.seed), source_digest(), np.__version__,
+                 scipy.__version__]
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
 
 
-def board_of(env: EstimationEnv) -> str:
-    """Which of `BOARDS` an environment belongs to."""
+def board_of(env: EstimationEnv | InjectionEnv) -> str:
+    """Which of `BOARDS` an environment belongs to, or ``injection``."""
+    if isinstance(env, InjectionEnv):
+        return "injection"
     return BOARDS[0] if env.lag == 0 else BOARDS[2] if env.lag == env.scenario.n_steps - 1 else BOARDS[1]
 
 
@@ -150,32 +159,45 @@ def run_episode(job: Job) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     result : dict
         JSON-ready: status "ok" with scores and the error of every scored step, or "failed" with a message.
     fields : dict of arrays
-        The estimates' means and standard deviations (float32), empty after a failure.
+        The estimates' means and standard deviations (float32); empty for policies and after a failure.
     """
-    baseline = load_baseline(job.baseline)
-    env = _environment(job.environment)
+    method, env = job.load(), _environment(job.environment)
     result: dict[str, Any] = {
-        "identity": job.identity(), "seed": name_seed(job.seed), "baseline": baseline.name, "title": baseline.title,
-        "parameters": baseline.parameters, "baseline_sha256": baseline.sha256, "board": board_of(env),
+        "identity": job.identity(), "seed": name_seed(job.seed), "method": method.name, "title": method.title,
+        "parameters": method.parameters, "role": method.role, "privileged": getattr(method, "privileged", False),
+        "method_sha256": method.sha256, "checkpoint_sha256": method.sha256 if method.path.suffix == ".zip" else None,
+        "board": board_of(env),
         "environment": {"id": job.environment.id, "name": job.environment.name,
                          "kwargs": env.spec.kwargs if env.spec else {}},
-        "source": source_digest(), "finished": None,
+        "source": source_digest(), "finished": None, "peak_memory": None,
     }
+    fields: dict[str, np.ndarray] = {}
     begin = time.perf_counter()
     try:
         with threadpool_limits(1):
-            played = play_and_collect(env, baseline, job.seed)
-            outcome = score(env, played)
-            for name, value in outcome["scores"].items():
-                _check.number(f"score {name}", value or 0.0)
-            result |= {"status": "ok", **outcome}
-    except (Exception, SystemExit) as error:        # whatever a baseline does wrong is its result, not our crash
+            if isinstance(method, Baseline):
+                assert isinstance(env, EstimationEnv)
+                played = play_and_collect(env, method, job.seed)
+                outcome, fields = score(env, played), played.fields()
+            else:
+                outcome = _play_policy(job)
+        for name, value in outcome["scores"].items():
+            _check.number(f"score {name}", value or 0.0)
+        result |= {"status": "ok", **outcome}
+    except (Exception, SystemExit) as error:        # whatever a method does wrong is its result, not our crash
         result |= {"status": "failed", "message": f"{type(error).__name__}: {error}",
                    "where": _where(error)}
-        played = None
+        fields = {}
     result["finished"] = datetime.now(UTC).isoformat(timespec="microseconds")
     result["seconds"] = time.perf_counter() - begin
-    return result, {} if played is None else played.fields()
+    return result, fields
+
+
+def _play_policy(job: Job) -> dict[str, Any]:
+    kwargs, estimator = _inside(job.environment)
+    played = policies.play(job.environment.id, kwargs, job.method, job.seed, estimator)
+    return {"scores": {name: played[name] for name in ("error", "spent", "seconds_per_step")},
+            "step_errors": played["errors"]}
 
 
 def _where(error: BaseException) -> str:
@@ -189,14 +211,25 @@ def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1, command: 
 
     ``command`` is what the results will name as the command that made them.
     """
-    todo = [job for job in jobs if not store.holds(job.environment.name, job.baseline, job.seed, job.identity())]
+    todo = [job for job in jobs
+            if not store.holds(job.environment.name, job.load().name, job.seed, job.identity())]
     if len(todo) < len(jobs):
         tqdm.write(f"{len(jobs) - len(todo)} of {len(jobs)} episodes are already there")
-    seen: dict[Any, Job] = {}
-    for job in todo:                                # each truth once, before several baselines want it at once
-        seen.setdefault((_environment(job.environment).scenario, job.seed), job)
-    for function, work, label in ((_simulate_job, [(job,) for job in seen.values()], "simulating truths"),
-                                  (_run_job, [(job, store, command) for job in todo], "running baselines")):
+    if not todo:
+        return
+    truths: dict[Any, Job] = {}                     # each once, before several methods want it at once
+    recordings: dict[Any, list[int]] = {}
+    for job in todo:
+        env = _environment(job.environment)
+        if isinstance(env, InjectionEnv):
+            recordings.setdefault(env.scenario, []).append(job.seed)
+        else:
+            truths.setdefault((env.scenario, job.seed), job)
+    for scenario, seeds in recordings.items():
+        fill(scenario, seeds, n_jobs=n_jobs)
+    run = {"command": command, **provenance()}
+    for function, work, label in ((_simulate_job, [(job,) for job in truths.values()], "simulating truths"),
+                                  (_run_job, [(job, store, run) for job in todo], "running methods")):
         for _ in tqdm(in_parallel(function, work, n_jobs), total=len(work), desc=label, unit="episode", disable=None):
             pass
 
@@ -205,13 +238,21 @@ def _simulate_job(job: Job) -> None:
     simulate(_environment(job.environment).scenario, job.seed, progress=False)
 
 
-def _run_job(job: Job, store: EpisodeStore, command: str) -> None:
+def _run_job(job: Job, store: EpisodeStore, run: dict[str, Any]) -> None:
     result, fields = run_episode(job)
-    store.put(job.environment.name, job.baseline, job.seed, result | {"run": {"command": command, **provenance()}},
-              fields)
+    store.put(job.environment.name, result["method"], job.seed, result | {"run": run}, fields)
 
 
 @lru_cache(maxsize=4)
-def _environment(environment: Environment) -> EstimationEnv:
+def _environment(environment: Environment) -> EstimationEnv | InjectionEnv:
     """Made once a process, so that models and what estimators derive from them are shared by its episodes."""
+    if environment.id in INJECTION:
+        kwargs, estimator = _inside(environment)
+        return policies.environment(environment.id, json.dumps(kwargs), estimator)
     return environment.make()
+
+
+def _inside(environment: Environment) -> tuple[dict[str, Any], str]:
+    """Arguments of an environment that asks for injections, and the estimator inside: the exact one for scores."""
+    kwargs = json.loads(environment.kwargs)
+    return {key: value for key, value in kwargs.items() if key != "estimator"}, kwargs.get("estimator", "full")

@@ -8,6 +8,7 @@ import json
 import os
 import platform
 import subprocess
+import time
 from collections.abc import Iterator
 from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
@@ -15,17 +16,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from eitbench._files import write_atomically
+from eitbench.leaderboard.records import SCHEMA, SHARED, sealed, split_of, write_record
 from eitbench.seeds import name_seed
 
-SCHEMA = 1
-_NEEDED = {"identity", "seed", "baseline", "environment", "source", "baseline_sha256", "finished", "status",
-           "run"}
+PACKAGES = ("eitbench", "numpy", "scipy", "gymnasium", "scikit-fem", "numba", "stable-baselines3", "sb3-contrib",
+            "torch")
+"""Whose versions a record names."""
+_NEEDED = {"identity", "seed", "method", "environment", "finished", "status", "run", *SHARED}
 
 
 class EpisodeStore:
-    """The folder of a run: ``episodes/ENV/BASELINE/SEED.json`` with its estimates in ``SEED.npz`` beside it.
+    """The folder of a run: ``episodes/ENV/METHOD/SEED.json`` with its estimates in ``SEED.npz`` beside it.
 
     Every file is written whole or not at all, so runs may share a folder and may be interrupted anywhere.
     """
@@ -33,19 +37,19 @@ class EpisodeStore:
     def __init__(self, folder: Path) -> None:
         self.folder = Path(folder).absolute()           # worker processes may stand elsewhere
 
-    def put(self, environment: str, baseline: str, seed: int, result: dict[str, Any],
+    def put(self, environment: str, method: str, seed: int, result: dict[str, Any],
             fields: dict[str, np.ndarray]) -> None:
         """Store one episode; the estimates first, so that a result never stands without them."""
-        path = self._path(environment, baseline, seed)
+        path = self._path(environment, method, seed)
         if fields:
             content = io.BytesIO()
             np.savez_compressed(content, **fields)  # type: ignore[arg-type]
             write_atomically(path.with_suffix(".npz"), content.getvalue())
         write_atomically(path, json.dumps(result, indent=1, allow_nan=False).encode())
 
-    def holds(self, environment: str, baseline: str, seed: int, identity: str) -> bool:
+    def holds(self, environment: str, method: str, seed: int, identity: str) -> bool:
         """Whether a successful result of exactly this identity is there."""
-        result = _read(self._path(environment, baseline, seed))
+        result = _read(self._path(environment, method, seed))
         return result is not None and result["identity"] == identity and result["status"] == "ok"
 
     def results(self) -> Iterator[dict[str, Any]]:
@@ -58,41 +62,42 @@ class EpisodeStore:
 
     def fields(self, result: dict[str, Any]) -> dict[str, np.ndarray]:
         """The estimates that belong to a result: ``mean`` and perhaps ``std``, (T, n) in mol/m³."""
-        folder = self.folder / "episodes" / _environment_folder(result) / result["baseline"]
+        folder = self.folder / "episodes" / result["environment"]["name"] / result["method"]
         with np.load(folder / f"{result['seed'].replace(':', '-')}.npz", allow_pickle=False) as stored:
             return dict(stored)
 
     def write_records(self) -> list[dict[str, Any]]:
-        """Gather the episodes into one record per environment, baseline and split of the seeds, in ``records/``."""
+        """Gather the episodes into one record per environment, method and split of the seeds, in ``records/``."""
         gathered: dict[tuple[str, str, str], list[dict[str, Any]]] = {}
         for result in self.results():
-            key = (json.dumps(result["environment"], sort_keys=True), result["baseline"], _split(result["seed"]))
+            key = (json.dumps(result["environment"], sort_keys=True), result["method"], split_of(result["seed"]))
             gathered.setdefault(key, []).append(result)
-        records = []
-        for (environment, baseline, split), results in gathered.items():
-            # Episodes of different code never stand in one record: those of the latest run's code do.
-            latest = max(results, key=lambda result: result["finished"])
-            results = [r for r in results if all(r[key] == latest[key] for key in ("source", "baseline_sha256"))]
-            shared = ("board", "title", "parameters", "baseline_sha256", "source")
-            runs: list[dict[str, Any]] = []
-            for result in results:
-                if result["run"] not in runs:
-                    runs.append(result["run"])
-            record = {
-                "schema": SCHEMA, "environment": json.loads(environment), "baseline": baseline, "split": split,
-                **{key: latest[key] for key in shared}, "seeds": [result["seed"] for result in results], "runs": runs,
-                "episodes": [{key: value for key, value in result.items()
-                              if key not in (*shared, "environment", "baseline", "run")}
-                             | {"run": runs.index(result["run"])} for result in results],
-            }
-            path = self.folder / "records" / f"{_environment_folder(record)}--{baseline}--{split}.json"
-            write_atomically(path, json.dumps(record, indent=1, allow_nan=False).encode())
-            records.append(record)
+        records = [_gathered(results) for results in gathered.values()]
+        for record in records:
+            write_record(self.folder / "records", record)
         return records
 
-    def _path(self, environment: str, baseline: str, seed: int) -> Path:
+    def _path(self, environment: str, method: str, seed: int) -> Path:
         name = f"{name_seed(seed).replace(':', '-')}.json"
-        return self.folder / "episodes" / _folder_name(environment) / _folder_name(baseline) / name
+        return self.folder / "episodes" / environment.replace("/", "-") / method / name
+
+
+def _gathered(results: list[dict[str, Any]]) -> dict[str, Any]:
+    """The record of one method's episodes, self-reported. Those of different code never stand in one record: those of
+    the latest run's code do."""
+    latest = max(results, key=lambda result: result["finished"])
+    results = [r for r in results if all(r[key] == latest[key] for key in ("source", "method_sha256"))]
+    runs: list[dict[str, Any]] = []
+    for result in results:
+        if result["run"] not in runs:
+            runs.append(result["run"])
+    apart = {*SHARED, "environment", "method", "run"}
+    return sealed({
+        "schema": SCHEMA, **{key: latest[key] for key in ("environment", "method", *SHARED)}, "official": False,
+        "split": split_of(latest["seed"]), "seeds": [result["seed"] for result in results], "runs": runs,
+        "episodes": [{key: value for key, value in result.items() if key not in apart}
+                     | {"run": runs.index(result["run"])} for result in results],
+    })
 
 
 def _read(path: Path) -> dict[str, Any] | None:
@@ -108,24 +113,12 @@ def _read_json(path: Path) -> dict[str, Any] | None:
     return result if isinstance(result, dict) else None
 
 
-def _split(seed: str) -> str:
-    return seed.split(":")[0] if ":" in seed else "own"
-
-
-def _environment_folder(result: dict[str, Any]) -> str:
-    return _folder_name(result["environment"].get("name", result["environment"]["id"]))
-
-
-def _folder_name(text: str) -> str:
-    return Path(text).stem if text.endswith(".py") else text.replace("/", "-")
-
-
 @lru_cache(maxsize=1)
 def source_digest() -> str:
     """Hash of the source that scores depend on: results of other code are not taken for this one's."""
     folder = Path(__file__).parent.parent
     rooms = ("physics/*", "scenarios/*", "episodes", "recordings", "regions", "task", "estimation/*", "scoring",
-             "envs/*", "leaderboard/run", "leaderboard/score")
+             "envs/*", "leaderboard/run", "leaderboard/score", "leaderboard/policies")
     files = sorted(path for room in rooms for path in folder.glob(f"{room}.py"))
     return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
 
@@ -133,15 +126,30 @@ def source_digest() -> str:
 @lru_cache(maxsize=1)
 def provenance() -> dict[str, Any]:
     """Versions, commit and machine of this process."""
-    status = _git("--no-optional-locks", "status", "--porcelain")
+    status = _git("--no-optional-locks", "status", "--porcelain", "--", ".", ":!leaderboards")   # results, not code
     return {
-        "versions": {"python": platform.python_version(), **{
-            name: _version(name) for name in ("eitbench", "numpy", "scipy", "gymnasium", "scikit-fem")}},
+        "versions": {"python": platform.python_version(), **{name: _version(name) for name in PACKAGES}},
         "blas": np.show_config(mode="dicts")["Build Dependencies"]["blas"]["name"],  # type: ignore[index,call-overload]
         "commit": _git("rev-parse", "HEAD"), "dirty": None if status is None else bool(status),
         "machine": {"processor": _processor(), "cores": os.cpu_count(), "system": platform.system(),
-                    "blas_threads": 1},
+                    "blas_threads": 1, "matmul_seconds": matmul_seconds()},
     }
+
+
+@lru_cache(maxsize=1)
+def matmul_seconds() -> float:
+    """Time of a 1000 × 1000 × 1000 matrix product in double precision on one thread here, in s: the median of three.
+
+    In units of it, times of different machines can be compared.
+    """
+    a, b = np.random.default_rng(0).normal(size=(2, 1000, 1000))
+    times = []
+    with threadpool_limits(1):
+        for _ in range(3):
+            begin = time.perf_counter()
+            a @ b
+            times.append(time.perf_counter() - begin)
+    return float(np.median(times))
 
 
 def _version(package: str) -> str | None:

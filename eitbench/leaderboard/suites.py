@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 from eitbench.envs import ESTIMATION
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.leaderboard.baselines import load_baseline, own_baselines
+from eitbench.leaderboard.policies import load_policy, own_agents, own_policies, suited
 from eitbench.leaderboard.run import Environment, Job, board_of
 from eitbench.seeds import parse_seeds
 
 QUICK = ("eitbench/Pipe2D-v0", "eitbench/Pipe2DFixedLag-v0", "eitbench/Pipe2DSmoothing-v0")
 """What the quick suite runs; the full one runs all that ask for estimates."""
 SEEDS = {"quick": "test:0-3", "full": "test:0-9"}
+POLICY_SEEDS = "test:0-49"
 FEWER_SEEDS = {"velocity": "test:0-3", "3d": "test:0-2"}
 """In the full suite, where an episode takes a minute a method and more: with the flow asked for too, and in 3D."""
 # An image at every step: minutes an episode, for what the frame-wise images of the other boards show as well.
@@ -28,12 +31,7 @@ def jobs(suite: str, environments: list[str], baselines: list[str], seeds: list[
     ValueError
         If an environment is not registered, a baseline does not exist, or no pair of them fits.
     """
-    names: dict[str, str] = {}
-    for baseline in baselines:
-        other = names.setdefault(load_baseline(baseline).name, baseline)
-        if other != baseline:
-            raise ValueError(f"baselines {other} and {baseline} have the same name, under which results are kept; "
-                             "rename one")
+    _distinct({baseline: load_baseline(baseline).name for baseline in baselines})
     todo = []
     for name in environments or (QUICK if suite == "quick" else ESTIMATION):
         environment = Environment(name)
@@ -57,6 +55,34 @@ def jobs(suite: str, environments: list[str], baselines: list[str], seeds: list[
     return todo
 
 
+def policy_jobs(environments: list[str], policies: list[str], seeds: list[int] | None = None,
+                estimator: str = "full") -> list[Job]:
+    """Every named policy (default: all of ours that suit, and our trained agents) in every named environment, on ``seeds`` (default:
+    `POLICY_SEEDS`), with this estimator inside.
+
+    Raises
+    ------
+    ValueError
+        If an environment does not ask for injections, or a policy does not exist or suit one.
+    """
+    _distinct({policy: load_policy(policy).name for policy in policies})
+    if estimator not in ("full", "reduced"):
+        raise ValueError(f"estimator must be 'full' or 'reduced', got {estimator!r}")
+    numbers = parse_seeds(POLICY_SEEDS) if seeds is None else seeds
+    kwargs = "{}" if estimator == "full" else json.dumps({"estimator": estimator})
+    return [Job(Environment(name, kwargs), _absolute(policy), seed) for name in environments
+            for policy in suited(name, policies or [*own_policies(), *own_agents(name)], demanded=bool(policies))
+            for seed in numbers]
+
+
+def _distinct(names: dict[str, str]) -> None:
+    """``ValueError`` if two of the methods, by the name of their file, would be kept under one name."""
+    first: dict[str, str] = {}
+    for file, name in names.items():
+        if first.setdefault(name, file) != file:
+            raise ValueError(f"{first[name]} and {file} have the same name, under which results are kept; rename one")
+
+
 def _expensive(env: EstimationEnv) -> str | None:
     """Which of `FEWER_SEEDS` an environment is among."""
     return "velocity" if env.task.velocity is not None else "3d" if env.task.mesh.dim == 3 else None
@@ -67,6 +93,6 @@ def _like_pipe(name: str) -> bool:
     return name.startswith("eitbench/Pipe2D") and name not in QUICK
 
 
-def _absolute(baseline: str) -> str:
+def _absolute(method: str) -> str:
     """A path that worker processes find too; a name as it is."""
-    return str(Path(baseline).absolute()) if baseline.endswith(".py") else baseline
+    return str(Path(method).absolute()) if method.endswith((".py", ".zip")) else method

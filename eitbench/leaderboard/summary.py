@@ -11,15 +11,14 @@ import numpy as np
 import pandas as pd
 from scipy.stats import t as student
 
-from eitbench.envs import ESTIMATION
-from eitbench.leaderboard.baselines import BOARDS
+from eitbench.envs import ENTRY_POINTS
+from eitbench.leaderboard.records import BOARDS
 from eitbench.scoring import skill
 
 COLUMNS = {
     "error": "ẽ_c", "skill": "skill", "contrast_error": "contrast", "nis": "NIS/m", "crps": "CRPS",
     "velocity_error": "ẽ_v", "coverage_50": "50 %", "coverage_90": "90 %", "spread_ratio": "var/MSE",
-    "voltage_discrepancy": "ẽ_V",
-    "seconds_per_step": "ms/step",
+    "voltage_discrepancy": "ẽ_V", "spent": "injections", "seconds_per_step": "ms/step",
 }
 EXPLANATIONS = {
     "ẽ_c": "relative estimation error (5.12), ± half the 95 % confidence interval over seeds; lower is better",
@@ -32,13 +31,16 @@ EXPLANATIONS = {
     "90 %": "part of the truth inside the claimed 90 % interval",
     "var/MSE": "claimed variance over squared error; 1 is honest, more is too modest",
     "ẽ_V": "voltage discrepancy (5.13), mV²; a diagnostic",
+    "injections": "how many the policy made, where it is asked for them",
     "ms/step": "time per injection on one core, in the fastest episode: what is done once for a model is left apart",
 }
 SPLITS = ["test", "dev", "train", "own"]
 """In the order in which boards are shown; the reported seeds first."""
 _TEXT = ("environment", "board", "method", "seeds")
 """Columns of words; the others are numbers."""
-_NOT_THE_WORLD = ("lag", "episodes", "render_mode")
+_WHERE_ASKED = ("velocity_error", "spent")
+"""Scores whose column is there only if anybody has them."""
+_NOT_THE_WORLD = ("lag", "episodes", "render_mode", "observation", "estimator")
 """Arguments of an environment that its episodes do not depend on, beside those of what is believed."""
 _UNIT = {"seconds_per_step": 1e3, "voltage_discrepancy": 1e6}
 
@@ -53,13 +55,24 @@ def mean_and_interval(values: list[float]) -> tuple[float, float]:
 
 def rounded(mean: float, half: float) -> str:
     """``0.0053 ± 0.0004``: the interval to one significant digit (two if that is a 1), the mean to the same place."""
-    if not math.isfinite(half) or half < 5e-6:                          # below the last place shown
-        return f"{mean:.3g}"
+    place = _places(half)
+    return f"{mean:.3g}" if place is None else f"{mean:.{place}f} ± {half:.{place}f}"
+
+
+def with_interval(value: float, low: float, high: float) -> str:
+    """``0.0053 (0.0049 to 0.0058)``, rounded as `rounded` does by half the interval; without one, the value."""
+    place = _places(0.5 * (high - low))
+    return f"{value:.3g}" if place is None else f"{value:.{place}f} ({low:.{place}f} to {high:.{place}f})"
+
+
+def _places(half: float) -> int | None:
+    """Decimal places that half an interval leaves significant; None if it is none, or below the last place shown."""
+    if not math.isfinite(half) or half < 5e-6:
+        return None
     place = -math.floor(math.log10(half))
     if round(half * 10**place) == 1:
         place += 1
-    place = min(max(place, 0), 5)
-    return f"{mean:.{place}f} ± {half:.{place}f}"
+    return min(max(place, 0), 5)
 
 
 def scores_by_seed(record: dict[str, Any], name: str) -> dict[str, float]:
@@ -71,33 +84,35 @@ def scores_by_seed(record: dict[str, Any], name: str) -> dict[str, float]:
 
 def summary(records: list[dict[str, Any]]) -> pd.DataFrame:
     """One row a record: world, board, environment, method, episodes, failed, (mean, half interval) of each score."""
-    rows = []
-    for record in records:
-        status = [episode["status"] for episode in record["episodes"]]
-        row: dict[str, Any] = {"world": world(record), "board": record["board"], "split": record["split"],
-                               "environment": record["environment"]["name"],
-                               "baseline": record["baseline"], "method": method(record),
-                               "seeds": seed_ranges(record["seeds"]),
-                               "episodes": len(status), "failed": sum(s != "ok" for s in status)}
-        for name in COLUMNS:
-            values = list((_skills(record, records) if name == "skill" else scores_by_seed(record, name)).values())
-            row[name] = mean_and_interval(values) if values else None
-            if name == "seconds_per_step" and values:
-                row[name] = (min(values), math.inf)
-        rows.append(row)
-    table = pd.DataFrame(rows)
+    table = pd.DataFrame([summary_row(record, records) for record in records])
     order = table["error"].map(lambda cell: math.inf if cell is None else cell[0])
-    worlds = sorted(set(table["world"]), key=_place)
+    worlds = sorted(set(table["world"]), key=place_of_world)
     keys = {"_split": table["split"].map(SPLITS.index), "_world": table["world"].map(worlds.index),
             "_board": table["board"].map(BOARDS.index), "_error": order}
     return table.assign(**keys).sort_values(["_split", "_world", "_board", "environment", "_error"]).drop(
         columns=list(keys)).reset_index(drop=True)
 
 
+def summary_row(record: dict[str, Any], records: list[dict[str, Any]]) -> dict[str, Any]:
+    """The row of one of the ``records``, among which are the anchors of its skill."""
+    status = [episode["status"] for episode in record["episodes"]]
+    row: dict[str, Any] = {"world": world(record), "board": record["board"], "split": record["split"],
+                           "environment": record["environment"]["name"],
+                           "baseline": record["method"], "method": method(record),
+                           "seeds": seed_ranges(record["seeds"]),
+                           "episodes": len(status), "failed": sum(s != "ok" for s in status)}
+    for name in COLUMNS:
+        values = list((_skills(record, records) if name == "skill" else scores_by_seed(record, name)).values())
+        row[name] = mean_and_interval(values) if values else None
+        if name == "seconds_per_step" and values:
+            row[name] = (min(values), math.inf)
+    return row
+
+
 def world(record: dict[str, Any]) -> str:
     """What the lagged siblings of an environment share, whatever is believed of it: ``Pipe2D (scored_steps=3)``."""
     environment = record["environment"]
-    registered = ESTIMATION.get(environment["id"], ("", {}))[1]
+    registered = ENTRY_POINTS.get(environment["id"], ("", {}))[1]
     changed = {key: value for key, value in environment["kwargs"].items()
                if value is not None and value != registered.get(key)
                and key not in _NOT_THE_WORLD and not key.startswith("assumed_")}
@@ -106,7 +121,7 @@ def world(record: dict[str, Any]) -> str:
 
 
 def method(record: dict[str, Any]) -> str:
-    """The baseline's title, and what it was made to believe: ``Linearised Kalman filter, assumed_flow=real``."""
+    """The method's title, and what it was made to believe: ``Linearised Kalman filter, assumed_flow=real``."""
     return ", ".join([record["title"], *filter(None, [_arguments(_beliefs(record))])])
 
 
@@ -116,9 +131,9 @@ def _kind(environment: str) -> str:
     return name.removeprefix("eitbench/").removesuffix("-v0")
 
 
-def _place(name: str) -> tuple[int, str]:
+def place_of_world(name: str) -> tuple[int, str]:
     """Where a world stands: as the ids were registered, and after them what is not ours."""
-    kinds = [_kind(environment) for environment in ESTIMATION]
+    kinds = [_kind(environment) for environment in ENTRY_POINTS]
     kind = name.split(" (")[0]
     return kinds.index(kind) if kind in kinds else len(kinds), name
 
@@ -126,7 +141,7 @@ def _place(name: str) -> tuple[int, str]:
 def _beliefs(record: dict[str, Any]) -> dict[str, Any]:
     """Arguments that change the task's model and leave the truth as it is."""
     return {key: value for key, value in record["environment"]["kwargs"].items()
-            if key.startswith("assumed_") and value is not None}
+            if (key.startswith("assumed_") and value is not None) or (key, value) == ("estimator", "reduced")}
 
 
 def _arguments(arguments: dict[str, Any]) -> str:
@@ -137,7 +152,7 @@ def _arguments(arguments: dict[str, Any]) -> str:
 def _skills(record: dict[str, Any], records: list[dict[str, Any]]) -> dict[str, float]:
     """(E_bh − E)/(E_bh − E_ref) with the means over the seeds that all three have; one number, or none."""
     def of(baseline: str, board: str) -> dict[str, float]:
-        found = [r for r in records if r["baseline"] == baseline and r["board"] == board
+        found = [r for r in records if r["method"] == baseline and r["board"] == board
                  and all(r[key] == record[key] for key in ("split", "source")) and world(r) == world(record)
                  and _beliefs(r) in ({}, {"assumed_flow": "real"})]      # an anchor is not led astray
         return scores_by_seed(max(found, key=lambda r: len(_beliefs(r))), "error") if found else {}
@@ -161,7 +176,7 @@ def cells(table: pd.DataFrame) -> pd.DataFrame:
     text["seeds"] = [f"{seeds}, {failed} failed" if failed else seeds
                      for seeds, failed in zip(table["seeds"], table["failed"], strict=True)]
     for name, heading in COLUMNS.items():
-        if name != "velocity_error" or table[name].notna().any():
+        if name not in _WHERE_ASKED or table[name].notna().any():
             text[heading] = [_cell(name, value) for value in table[name]]
     return text
 
@@ -188,16 +203,25 @@ def seed_ranges(seeds: list[str]) -> str:
 def _cell(name: str, value: tuple[float, float] | None) -> str:
     if value is None:
         return "–"
-    return rounded(*value) if name in ("error", "contrast_error") else f"{value[0]:.2g}" if abs(
-        value[0]) < 1 else f"{value[0]:.3g}"
+    return rounded(*value) if name in ("error", "contrast_error") else number(value[0])
+
+
+def number(value: float) -> str:
+    """Two digits below 1, three above."""
+    return f"{value:.2g}" if abs(value) < 1 else f"{value:.3g}"
 
 
 def markdown(table: pd.DataFrame) -> str:
-    """The summary as Markdown, also pleasant to read in a terminal."""
+    """The summary as Markdown."""
     text = cells(table)
+    return as_markdown(text, sum(heading in _TEXT for heading in text.columns))
+
+
+def as_markdown(text: pd.DataFrame, words: int) -> str:
+    """A table of text as Markdown, also pleasant to read in a terminal; all but the first ``words`` columns hold
+    numbers."""
     lines = [[str(cell).replace("|", "\\|") for cell in line]
              for line in [list(text.columns), *text.to_numpy().tolist()]]
-    words = sum(heading in _TEXT for heading in text.columns)            # they come first
     widths = [max(len(str(line[i])) for line in lines) for i in range(len(text.columns))]
 
     def row(line: list[str]) -> str:

@@ -118,18 +118,19 @@ def test_injection_is_drawn(monkeypatch, tmp_path):
     """Scores as they were played, told in a table for each world, and an animation with a frame for every step."""
     played = []
 
-    def run(env, kwargs, policies, seeds, estimator, jobs, path):
-        played.append((env, estimator))
+    def rows(jobs, store):
+        names = list(dict.fromkeys(job.method for job in jobs))
         return pd.DataFrame([{"policy": name, "seed": f"dev:{k}", "error": 0.01 * (1 + place) + 0.001 * k, "spent": 5,
-                              "seconds_per_step": 0.001} for place, name in enumerate(policies) for k in seeds])
+                              "seconds_per_step": 0.001} for place, name in enumerate(names) for k in range(3)])
 
-    monkeypatch.setattr(injection, "run_policies", run)
+    monkeypatch.setattr(injection, "run_jobs", lambda jobs, *_, **__: played.append(jobs[0].environment))
+    monkeypatch.setattr(injection, "policy_rows", rows)
     short = {"scored_steps": 3, "mean_velocity": 16.0}
     monkeypatch.setitem(gym.registry[injection.AT_WORK[0]].kwargs, "scenario", short)
     path, remark = FIGURES["injection"]([0, 1, 2], 1, tmp_path / "new")
     picture = imread(path)
     assert min(picture.shape[:2]) > 250 and picture[..., :3].std() > 0.05
-    assert played == [(env, "full") for env in injection.WORLDS] and remark.count("| best_pair |") == 3
+    assert played == [(env, "{}") for env in injection.WORLDS] and remark.count("| best_pair |") == 3
     with Image.open(tmp_path / "new" / "injection.gif") as moving:
         assert moving.n_frames == 3                               # the first frame of 16, then three steps
 

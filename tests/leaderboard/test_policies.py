@@ -11,7 +11,9 @@ from eitbench.envs.injection import InjectionEnv
 from eitbench.envs.injection_core import Rules
 from eitbench.leaderboard import policies, policy_table
 from eitbench.leaderboard.policies import adaptivity_gap, load_policy, own_policies, play
-from eitbench.leaderboard.policy_table import run_policies
+from eitbench.leaderboard.policy_table import policy_rows
+from eitbench.leaderboard.run import Environment, Job, run_jobs
+from eitbench.leaderboard.store import EpisodeStore
 from eitbench.scenarios import Pipe2D
 from eitbench.seeds import parse_seeds
 
@@ -27,7 +29,7 @@ SEED = 5
 
 
 def environment(name: str) -> InjectionEnv:
-    return policies._environment(name, json.dumps(KWARGS[name]), "reduced")
+    return policies.environment(name, json.dumps(KWARGS[name]), "reduced")
 
 
 def actions_of(name: str, policy: str, monkeypatch) -> list[np.ndarray]:
@@ -178,7 +180,7 @@ def test_policies_play_what_they_suit(policy, name, monkeypatch):
 def test_scores_are_those_of_the_exact_filter():
     """The mean error under the full estimator is that of its own estimates, step by step."""
     played = play(NAME, SHORT, "best_pair", SEED)
-    env = policies._environment(NAME, json.dumps(SHORT), "full")
+    env = policies.environment(NAME, json.dumps(SHORT), "full")
     env.reset(seed=SEED)
     errors = []
     for _ in range(env.core.length):
@@ -191,28 +193,54 @@ def test_scores_are_those_of_the_exact_filter():
 def test_only_the_clairvoyant_is_privileged():
     """All others play from observations."""
     assert [name for name in own_policies() if load_policy(name).privileged] == ["clairvoyant"]
+    assert {name: load_policy(name).role for name in own_policies() if load_policy(name).role} == {
+        "clairvoyant": "reference", "random_pair": "floor"}
     assert {"random_pair", "best_pair", "schedule", "greedy_a", "event_triggered"} < set(own_policies())
 
 
+def jobs_of(policies: list[str], seeds: str, **kwargs) -> list[Job]:
+    return [Job(Environment(NAME, json.dumps(SHORT | kwargs)), policy, seed)
+            for policy in policies for seed in parse_seeds(seeds)]
+
+
 def test_played_episodes_are_kept(tmp_path, monkeypatch):
-    """One row an episode; what is there is not played again, but for a row that was cut short."""
-    path = tmp_path / "new" / "rows.csv"
-    asked = (NAME, SHORT, ["opposite", "adjacent"], parse_seeds("dev:1,0"), "reduced")
-    rows = run_policies(*asked, 1, path)
+    """A record of the format that baselines have; what is there is not played again, but for what was cut short."""
+    store = EpisodeStore(tmp_path / "new")
+    todo = jobs_of(["opposite", "adjacent"], "dev:1,0", estimator="reduced")
+    run_jobs(todo, store, command="eitbench policies")
+    rows = policy_rows(todo, store)
     assert sorted(zip(rows["policy"], rows["seed"], strict=True)) == [
         (policy, seed) for policy in ("adjacent", "opposite") for seed in ("dev:0", "dev:1")]
-    error = rows.set_index(["policy", "seed"])["error"]["adjacent", "dev:0"]
-    assert error == play(NAME, SHORT, "adjacent", parse_seeds("dev:0")[0], "reduced")["error"]
-    text = path.read_text()
-    path.write_text(text[:-30])
-    played = []
-    monkeypatch.setattr(policy_table, "play", lambda *job: played.append(job) or play(*job))
-    pd.testing.assert_frame_equal(
-        run_policies(*asked, 1, path).drop(columns="seconds_per_step").sort_values("identity", ignore_index=True),
-        rows.drop(columns="seconds_per_step").sort_values("identity", ignore_index=True))
-    assert len(played) == 1
-    other = (NAME, SHORT, ["opposite"], parse_seeds("dev:1"), "full")
-    assert len(run_policies(*other, 1, path)) == 1 and len(played) == 2
+    played = play(NAME, SHORT, "adjacent", parse_seeds("dev:0")[0], "reduced")
+    assert rows.set_index(["policy", "seed"])["error"]["adjacent", "dev:0"] == played["error"]
+    record, _ = store.write_records()
+    assert (record["board"], record["method"], record["seeds"]) == ("injection", "adjacent", ["dev:0", "dev:1"])
+    assert record["environment"]["kwargs"]["estimator"] == "reduced"
+    assert record["episodes"][0]["scores"]["spent"] == played["spent"] > 0
+    assert record["episodes"][0]["step_errors"] == played["errors"]
+
+    next(store.folder.glob("episodes/*/opposite/dev-1.json")).write_text("{")
+    again = []
+    monkeypatch.setattr(policies, "play", lambda *job: again.append(job) or play(*job))
+    run_jobs(todo, store)
+    pd.testing.assert_frame_equal(policy_rows(todo, store).drop(columns="seconds_per_step"),
+                                  rows.drop(columns="seconds_per_step"))
+    assert len(again) == 1
+    exact = jobs_of(["opposite"], "dev:1")
+    run_jobs(exact, store)
+    assert len(policy_rows(exact, store)) == 1 and [job[-1] for job in again] == ["reduced", "full"]
+
+
+def test_a_mistake_is_the_result_of_its_policy(tmp_path):
+    """An episode that fails is recorded with its reason, and has no row; the privileged and the floor are marked."""
+    store = EpisodeStore(tmp_path)
+    bad = write_policy(tmp_path, "def act(self, observation): return 0.5", "bad")
+    run_jobs(jobs_of([bad, "random_pair"], "dev:0", estimator="reduced"), store)
+    failed, floor = store.write_records()
+    assert "action must be an integer" in failed["episodes"][0]["message"] and failed["role"] is None
+    assert floor["episodes"][0]["status"] == "ok" and floor["role"] == "floor"
+    assert policy_table.policy_table(policy_rows(jobs_of([bad], "dev:0", estimator="reduced"), store), []) == (
+        "no episode was finished")
 
 
 def test_table_pairs_the_episodes():
@@ -234,6 +262,7 @@ def test_table_pairs_the_episodes():
     ("x = 1", r"mine\.py must define a class Policy with a method act\(observation\)"),
     ("privileged = 1\n    def act(self, observation): ...", "Policy.privileged must be True or False, got 1"),
     ("parameters = {'a': {1}}\n    def act(self, observation): ...", "Policy.parameters must be a dict fit for JSON"),
+    ("role = 'best'\n    def act(self, observation): ...", "Policy.role must be None, .*, got 'best'"),
     ("parameters = 3\n    def act(self, observation): ...", "Policy.parameters must be a dict fit for JSON"),
     ("1 / 0", r"mine\.py cannot be loaded: ZeroDivisionError"),
 ])
@@ -245,7 +274,7 @@ def test_wrong_files_are_named(tmp_path, body, message):
 
 def test_wrong_names_are_named(tmp_path):
     """Of policies, environments and estimators."""
-    with pytest.raises(ValueError, match=r"policy must be the path of a .py file .* or one of adjacent, .*; got 'lucky'"):
+    with pytest.raises(ValueError, match=r"policy must be the path of .*, or one of adjacent, .*; got 'lucky'"):
         load_policy("lucky")
     with pytest.raises(ValueError, match="has the name of one of ours"):
         load_policy(write_policy(tmp_path, name="adjacent"))

@@ -72,7 +72,7 @@ def test_a_mistake_is_the_result_of_its_baseline_only(update, message, store, tm
     good, bad = write_baseline(tmp_path, "good"), write_baseline(tmp_path, "bad", update=update)
     run_jobs([Job(FILTER, bad, 1), Job(FILTER, good, 1)], store)
     failed, fine = sorted(store.results(), key=lambda result: result["status"])
-    assert (failed["baseline"], failed["status"], fine["status"]) == ("bad", "failed", "ok")
+    assert (failed["method"], failed["status"], fine["status"]) == ("bad", "failed", "ok")
     assert re.search(message, failed["message"])
     assert scores_of(fine) == scores_of(run_episode(Job(FILTER, good, 1))[0])
 
@@ -290,7 +290,7 @@ def test_interrupted_run_resumes(how, store, tmp_path):
 
 def in_another_process(jobs, store):
     """A started process that runs these jobs."""
-    plain = [[list(job.environment), job.baseline, job.seed] for job in jobs]
+    plain = [[list(job.environment), job.method, job.seed] for job in jobs]
     program = ("from pathlib import Path; from eitbench.leaderboard.run import *\n"
                f"jobs = [Job(Environment(*environment), *rest) for environment, *rest in {plain!r}]\n"
                f"run_jobs(jobs, EpisodeStore(Path({str(store.folder)!r})))")
@@ -310,7 +310,7 @@ def test_two_runs_into_one_folder_lose_nothing(store, tmp_path):
                             + wait.format(folder=str(meeting))) for name in ("first", "second")]
     running = [in_another_process([Job(FILTER, path, seed) for seed in (1, 2, 3)], store) for path in paths]
     assert [process.wait() for process in running] == [0, 0]
-    assert {(r["baseline"], r["seed"], r["status"]) for r in store.results()} == {
+    assert {(r["method"], r["seed"], r["status"]) for r in store.results()} == {
         (name, f"train:{seed}", "ok") for name in ("first", "second") for seed in (1, 2, 3)}
     assert all(store.fields(result)["mean"].shape == (5, 1701) for result in store.results())
 
@@ -333,6 +333,8 @@ def test_our_baselines_load():
         baseline = load_baseline(name)
         assert baseline.name == name and baseline.title and baseline.boards and len(baseline.sha256) == 64
         assert strict(json.dumps(baseline.parameters)) == baseline.parameters
+    roles = {name: load_baseline(name).role for name in own_baselines() if load_baseline(name).role}
+    assert roles == {"homogeneous": "floor", "persistence": "floor", "fixed_interval_smoother": "reference"}
 
 
 @pytest.mark.parametrize(("source", "message"), [
@@ -341,8 +343,9 @@ def test_our_baselines_load():
     ("class Estimator:\n  boards = ('filer',)\n  def update(self, V, I): pass", "boards must be some of filter"),
     ("class Estimator:\n  boards = ()\n  def update(self, V, I): pass", "boards must be some of filter"),
     ("class Estimator:\n  boards = 'filter'\n  def update(self, V, I): pass", "boards must be some of filter"),
-    ("class Estimator:\n  parameters = {'a': {1}}\n  def update(self, V, I): pass", "parameters must be JSON"),
-    ("class Estimator:\n  parameters = {'a': float('nan')}\n  def update(self, V, I): pass", "parameters must be JSON"),
+    ("class Estimator:\n  role = 'flor'\n  def update(self, V, I): pass", "role must be None, 'floor' or 'reference'"),
+    ("class Estimator:\n  parameters = {'a': {1}}\n  def update(self, V, I): pass", "fit for JSON"),
+    ("class Estimator:\n  parameters = {'a': float('nan')}\n  def update(self, V, I): pass", "fit for JSON"),
     ("import no_such_package", "no_such_package"),
     ("def broken(:", "invalid syntax"),
 ])

@@ -8,7 +8,7 @@ import threading
 
 import numpy as np
 import pytest
-from tiny import FILTER, FIXED_LAG, SCENARIO, strict, write_baseline
+from tiny import FILTER, FIXED_LAG, RUN, SCENARIO, sha, strict, write_baseline
 
 from eitbench.episodes import CACHE_VARIABLE
 from eitbench.leaderboard import store as store_module
@@ -34,18 +34,20 @@ def store(tmp_path):
     return EpisodeStore(tmp_path / "results")
 
 
-def result(seed=1, baseline="mine", **changes):
+def result(seed=1, method="mine", **changes):
     """A result such as `run_episode` makes."""
-    return {"identity": "abc", "seed": name_seed(seed), "baseline": baseline, "title": "Mine", "parameters": {},
-            "baseline_sha256": "5ha", "board": "filter", "environment": {"id": ENV, "kwargs": {}}, "source": "code",
-            "finished": "2025-01-01T00:00:00+00:00", "status": "ok", "scores": {"error": 0.1}, "step_errors": [0.1],
-            "seconds": 1.0, "run": {"command": COMMAND}} | changes
+    return {"identity": "abc", "seed": name_seed(seed), "method": method, "title": "Mine", "parameters": {},
+            "role": None, "privileged": False, "method_sha256": sha("mine"), "checkpoint_sha256": None,
+            "board": "filter", "environment": {"id": ENV, "name": "eitbench-Pipe2D-v0", "kwargs": {}},
+            "source": sha("code"), "finished": "2025-01-01T00:00:00+00:00", "status": "ok", "peak_memory": None,
+            "scores": {"error": 0.1, "seconds_per_step": 0.01}, "step_errors": [0.1], "seconds": 1.0,
+            "run": RUN} | changes
 
 
 def put(store, made, fields=None):
     """Store a result where it belongs."""
     seed = int(made["seed"].removeprefix("train:"))
-    store.put(made["environment"]["id"], made["baseline"], seed, made, fields or {})
+    store.put(made["environment"]["name"], made["method"], seed, made, fields or {})
 
 
 # -- episodes ---------------------------------------------------------------------------------------------------------
@@ -57,7 +59,7 @@ def test_round_trip(store):
     for baseline, seed in (("mine", 1), ("mine", 2), ("yours", 1)):
         put(store, result(seed, baseline), {"mean": seed * mean})
     found = list(store.results())
-    assert sorted((r["baseline"], r["seed"]) for r in found) == [
+    assert sorted((r["method"], r["seed"]) for r in found) == [
         ("mine", "train:1"), ("mine", "train:2"), ("yours", "train:1")]
     assert result(2) in found
     np.testing.assert_array_equal(store.fields(result(2))["mean"], 2 * mean)
@@ -66,7 +68,7 @@ def test_round_trip(store):
 def test_only_a_success_of_the_same_identity_is_held(store):
     """What failed, was made by other code, or belongs to another seed counts as not done."""
     put(store, result())
-    put(store, result(2, status="failed", message="oh"))
+    put(store, result(2, status="failed"))
     assert store.holds(ENV, "mine", 1, "abc")
     assert not store.holds(ENV, "mine", 1, "abd")
     assert not store.holds(ENV, "mine", 2, "abc")
@@ -140,25 +142,25 @@ def played(tmp_path_factory):
 
 def test_record_says_how_to_repeat_it(played):
     """Environment with arguments, baseline with parameters and hash, command, seeds, versions, commit, machine."""
-    bad, mine = sorted(played.write_records(), key=lambda record: record["baseline"])
+    bad, mine = sorted(played.write_records(), key=lambda record: record["method"])
     assert mine["environment"]["id"] == ENV and mine["environment"]["kwargs"]["scenario"] == SCENARIO
-    assert (mine["baseline"], mine["title"], mine["board"]) == ("mine", "Mine", "filter")
+    assert (mine["method"], mine["title"], mine["board"]) == ("mine", "Mine", "filter")
     assert mine["parameters"] == {"alpha": 0.5, "order": [1, 2]}
-    assert len(mine["baseline_sha256"]) == 64 and mine["baseline_sha256"] != bad["baseline_sha256"]
-    assert mine["source"] == source_digest() and mine["schema"] == store_module.SCHEMA
+    assert len(mine["method_sha256"]) == 64 and mine["method_sha256"] != bad["method_sha256"]
+    assert mine["source"] == source_digest() and mine["schema"] == store_module.SCHEMA == 2
     assert mine["seeds"] == ["train:1", "train:2"] and mine["split"] == "train"
     (run,) = mine["runs"]
     assert run["command"] == COMMAND and [episode["run"] for episode in mine["episodes"]] == [0, 0]
     assert run["commit"] == "c0ffee" and run["dirty"] is False
     assert run["versions"]["numpy"] == np.__version__ and run["versions"]["python"] == platform.python_version()
-    assert {"eitbench", "scipy", "gymnasium", "scikit-fem"} <= run["versions"].keys()
+    assert {"eitbench", "scipy", "gymnasium", "scikit-fem", "stable-baselines3", "torch"} <= run["versions"].keys()
     assert None not in run["versions"].values()
     assert run["machine"]["processor"] and run["machine"]["cores"] >= 1 and run["machine"]["blas_threads"] == 1
 
 
 def test_record_holds_every_episode(played):
     """Scores, the error of each scored step, and time; or the reason of a failure."""
-    bad, mine = sorted(played.write_records(), key=lambda record: record["baseline"])
+    bad, mine = sorted(played.write_records(), key=lambda record: record["method"])
     for episode in mine["episodes"]:
         assert episode["status"] == "ok" and episode["seconds"] > 0 and episode["finished"]
         assert {"error", "contrast_error", "voltage_discrepancy", "velocity_error", "nis", "crps", "coverage_50",
@@ -175,17 +177,17 @@ def test_every_file_is_strict_json(played):
     """What lies on disk is what was returned, without NaN or Infinity, so that any language can read it."""
     records = played.write_records()
     on_disk = [strict(path.read_text()) for path in sorted((played.folder / "records").iterdir())]
-    assert sorted(records, key=lambda record: record["baseline"]) == on_disk and len(on_disk) == 2
+    assert sorted(records, key=lambda record: record["method"]) == on_disk and len(on_disk) == 2
     assert len([strict(path.read_text()) for path in played.folder.glob("episodes/*/*/*.json")]) == 4
 
 
 def test_each_episode_keeps_the_run_that_made_it(store):
     """Episodes of several runs stand in one record, which names every run and says which made which."""
     put(store, result(1))
-    put(store, result(2, run={"command": "later"}))
+    put(store, result(2, run=RUN | {"command": "later"}))
     put(store, result(3))
     (record,) = store.write_records()
-    assert record["runs"] == [{"command": COMMAND}, {"command": "later"}]
+    assert [run["command"] for run in record["runs"]] == [RUN["command"], "later"]
     assert [episode["run"] for episode in record["episodes"]] == [0, 1, 0]
 
 
@@ -197,15 +199,15 @@ def test_splits_are_not_mixed(store):
     assert sorted(tuple(record["seeds"]) for record in store.write_records()) == [("dev:1",), ("train:1",)]
 
 
-@pytest.mark.parametrize("what", ["source", "baseline_sha256"])
+@pytest.mark.parametrize("what", ["source", "method_sha256"])
 def test_versions_of_code_are_not_mixed(what, store):
     """Only episodes of the code that ran last make the record; the older ones join again when they are replayed."""
     for seed in (1, 2, 3):
-        put(store, result(seed, **{what: "old"}))
-    put(store, result(2, **{what: "new"}, finished="2025-01-02T00:00:00+00:00"))
+        put(store, result(seed, **{what: sha("old")}))
+    put(store, result(2, **{what: sha("new")}, finished="2025-01-02T00:00:00+00:00"))
     (record,) = store.write_records()
-    assert record[what] == "new" and record["seeds"] == ["train:2"]
-    put(store, result(1, **{what: "new"}, finished="2025-01-02T00:01:00+00:00"))
+    assert record[what] == sha("new") and record["seeds"] == ["train:2"]
+    put(store, result(1, **{what: sha("new")}, finished="2025-01-02T00:01:00+00:00"))
     assert [record["seeds"] for record in store.write_records()] == [["train:1", "train:2"]]
 
 

@@ -1,8 +1,10 @@
 """A world whose episodes take a moment, and baselines written by a user of tomorrow."""
 
+import hashlib
 import json
 from pathlib import Path
 
+from eitbench.leaderboard.records import SCHEMA, sealed, split_of
 from eitbench.leaderboard.run import Environment
 
 SCENARIO = {"mean_velocity": 45.0, "scored_steps": 3, "electrodes_per_wall": 2, "frame": 2}
@@ -11,6 +13,13 @@ SCENARIO = {"mean_velocity": 45.0, "scored_steps": 3, "electrodes_per_wall": 2, 
 FILTER = Environment("eitbench/Pipe2D-v0", json.dumps({"scenario": SCENARIO}))
 FIXED_LAG = Environment("eitbench/Pipe2DFixedLag-v0", json.dumps({"scenario": SCENARIO, "lag": 2}))
 SMOOTHING = Environment("eitbench/Pipe2DSmoothing-v0", json.dumps({"scenario": SCENARIO}))
+
+RUN = {"command": "eitbench run", "blas": "scipy-openblas", "commit": "c0ffee", "dirty": False,
+       "versions": {"python": "3.12.1", "eitbench": "0.1.0", "numpy": "2.4.6", "scipy": "1.17.1",
+                    "stable-baselines3": None, "torch": None},
+       "machine": {"processor": "An abacus", "cores": 2, "system": "Linux", "blas_threads": 1, "matmul_seconds": 0.05}}
+BOARD_IDS = {"filter": "eitbench/Pipe2D-v0", "fixed-lag": "eitbench/Pipe2DFixedLag-v0",
+             "smoothing": "eitbench/Pipe2DSmoothing-v0", "injection": "eitbench/Pipe2DInjection-v0"}
 
 SOURCE = '''"""{doc}"""
 import os
@@ -60,3 +69,34 @@ def strict(text: str):
         raise ValueError(f"{constant} is not JSON")
 
     return json.loads(text, parse_constant=refuse)
+
+
+def sha(text: str) -> str:
+    """A hash that looks like one."""
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def episode(seed: str, error: float | None, *, seconds_per_step: float = 0.01, **scores) -> dict:
+    """An episode of a record; a failed one without an error."""
+    shared = {"identity": "abc", "seed": seed, "finished": "2025-01-01T00:00:00+00:00", "seconds": 1.0,
+              "peak_memory": None, "run": 0}
+    if error is None:
+        return shared | {"status": "failed", "message": "RuntimeError: oh", "where": "mine.py:3"}
+    return shared | {"status": "ok", "step_errors": [error],
+                     "scores": {"error": error, "seconds_per_step": seconds_per_step} | scores}
+
+
+def record(method: str, errors: dict[str, float | None] | list[float | None], *, board: str = "filter",
+           id: str | None = None, source: str = "code", version: str = "1", finished: str = "2025-01-01", scores=None,
+           **changes) -> dict:
+    """A valid record of these errors by seed; those of a list are of test:0, test:1 and so on."""
+    id = id or BOARD_IDS[board]
+    errors = errors if isinstance(errors, dict) else {f"test:{i}": error for i, error in enumerate(errors)}
+    episodes = [episode(seed, error, **(scores or {})) | {"finished": f"{finished}T00:00:00+00:00"}
+                for seed, error in errors.items()]
+    return sealed({
+        "schema": SCHEMA, "environment": {"id": id, "name": id.replace("/", "-"), "kwargs": {}}, "board": board,
+        "method": method, "title": method.replace("_", " ").capitalize(), "parameters": {}, "role": None,
+        "privileged": False, "official": False, "method_sha256": sha(method + version), "checkpoint_sha256": None,
+        "source": sha(source), "split": split_of(next(iter(errors))), "seeds": list(errors), "runs": [RUN],
+        "episodes": episodes} | changes)

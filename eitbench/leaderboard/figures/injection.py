@@ -18,8 +18,11 @@ from eitbench.envs.injection import InjectionEnv
 from eitbench.leaderboard.animate import save_animation
 from eitbench.leaderboard.baselines import baseline_folder
 from eitbench.leaderboard.figures.common import ACCENT, INK, TRUE, bare, save
-from eitbench.leaderboard.policies import load_policy, own_agents, own_policies, suited
-from eitbench.leaderboard.policy_table import OPEN_LOOP, errors_by_policy, policy_table, run_policies
+from eitbench.leaderboard.policies import load_policy
+from eitbench.leaderboard.policy_table import OPEN_LOOP, errors_by_policy, policy_rows, policy_table
+from eitbench.leaderboard.run import run_jobs
+from eitbench.leaderboard.store import EpisodeStore
+from eitbench.leaderboard.suites import policy_jobs
 from eitbench.leaderboard.summary import mean_and_interval
 
 WORLDS = {"eitbench/Pipe2DInjection-v0": "plain pipe (reference)",
@@ -34,8 +37,10 @@ def injection(seeds: list[int], jobs: int, out: Path) -> tuple[Path, str]:
     above, below = figure.subplots(2, len(WORLDS), height_ratios=(3, 2))
     said = []
     for (env, title), top, bottom in zip(WORLDS.items(), above, below, strict=True):
-        chosen = suited(env, own_policies() + own_agents(env), demanded=False)
-        rows = run_policies(env, {}, chosen, seeds, "full", jobs, out / f"{env.replace('/', '-')}.csv")
+        todo, store = policy_jobs([env], [], seeds), EpisodeStore(out)
+        chosen = list(dict.fromkeys(job.method for job in todo))
+        run_jobs(todo, store, n_jobs=jobs, command="eitbench reproduce injection")
+        rows = policy_rows(todo, store)
         privileged = [name for name in chosen if load_policy(name).privileged]
         _scores(top, rows, privileged)
         top.set_title(title, fontsize=11)

@@ -1,0 +1,26 @@
+"""Read the leaderboards' records into pandas and look at them: `python docs/read_leaderboards.py [FOLDER]`.
+
+Without a folder these are the published records, leaderboards/results. Each step stands by itself, as in a notebook.
+"""
+
+import sys
+
+from eitbench.leaderboard import load
+
+# One row for each score of each episode; of another version of the environments' code, none.
+frame = load(*sys.argv[1:])
+frame = frame[~frame["outdated"]]
+print(f"{len(frame)} scores of {frame['method'].nunique()} methods in {frame['environment'].nunique()} environments")
+
+# Mean error of each method and environment, best first. A failed episode has no value; `failed` counts them.
+errors = frame[frame["metric"] == "error"]
+for environment, rows in errors.groupby("environment"):
+    print(f"\n{environment}")
+    table = rows.groupby("method").agg(error=("value", "mean"), failed=("value", lambda x: int(x.isna().sum())))
+    print(table.sort_values("error").round(4).reset_index().to_string(index=False))
+
+# Episode by episode, two methods side by side: here the two that have the lowest mean in the first environment.
+if len(errors):
+    first = errors[errors["environment"] == errors["environment"].iloc[0]]
+    wide = first.pivot_table(index="seed", columns="method", values="value")
+    print("\n", wide[wide.mean().sort_values().index[:2]].round(4).to_string(), sep="")

@@ -1,0 +1,52 @@
+"""Play the test episodes with one method, and put what came out among the leaderboards' records."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from eitbench.leaderboard import suites
+from eitbench.leaderboard.records import split_of, write_record
+from eitbench.leaderboard.run import run_jobs
+from eitbench.leaderboard.store import EpisodeStore
+from eitbench.seeds import name_seed
+
+
+def submit(method: str, environments: list[str], seeds: list[int] | None, store: EpisodeStore, to: Path, *,
+           policy: bool = False, official: bool = False, n_jobs: int = 1, command: str = "") -> list[Path]:
+    """Play what ``store`` does not hold yet, and write one record for each environment into the folder ``to``.
+
+    Parameters
+    ----------
+    method : str
+        Name or path of a baseline, or of a ``policy``.
+    seeds : list of int
+        Of the test split; default: those of the full suite.
+    official : bool
+        Whether a maintainer runs it; else the records say that they are self-reported.
+
+    Returns
+    -------
+    list of paths
+        Of the records. All test episodes that the store holds of this method and this code are in them, those that
+        failed too.
+
+    Raises
+    ------
+    ValueError
+        If a seed is not of the test split, the method does not play one of the environments, or a record is not valid,
+        such as an official one from a checkout with changes.
+    """
+    outside = [name_seed(seed) for seed in seeds or [] if split_of(name_seed(seed)) != "test"]
+    if outside:
+        raise ValueError(f"seeds of a submission must be of the test split, got {', '.join(outside)}")
+    if not environments:
+        raise ValueError("env must name at least one environment to submit for")
+    jobs = (suites.policy_jobs(environments, [method], seeds) if policy
+            else suites.jobs("full", environments, [method], seeds))
+    played = {job.environment.id for job in jobs}
+    if left := [name for name in environments if name not in played]:
+        raise ValueError(f"{method} does not play {', '.join(left)}")
+    run_jobs(jobs, store, n_jobs=n_jobs, command=command)
+    asked = {(job.environment.name, job.load().name) for job in jobs}
+    return [write_record(to, record | {"official": official}) for record in store.write_records()
+            if (record["environment"]["name"], record["method"]) in asked and record["split"] == "test"]

@@ -1,0 +1,173 @@
+"""Submitting: test episodes are played, and their records written, failures and all; `eitbench` does it by command."""
+
+import re
+from pathlib import Path
+
+import gymnasium as gym
+import pytest
+from short import FIELDS
+from tiny import FILTER, SCENARIO, SMOOTHING, count, counting, write_baseline
+from typer.testing import CliRunner
+
+from eitbench.cli import app
+from eitbench.episodes import CACHE_VARIABLE
+from eitbench.leaderboard import load, policies, run
+from eitbench.leaderboard import store as store_module
+from eitbench.leaderboard.records import read_record, read_records
+from eitbench.leaderboard.store import EpisodeStore, provenance
+from eitbench.leaderboard.submit import submit
+from eitbench.seeds import parse_seeds
+
+INJECTION = "eitbench/Pipe2DInjection-v0"
+TEST = parse_seeds("test:0-1")
+
+
+@pytest.fixture(autouse=True)
+def tiny_world(monkeypatch, tmp_path, tmp_path_factory):
+    """The registered environments play tiny worlds, in an empty folder, from a clean commit."""
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path_factory.getbasetemp() / "episodes"))
+    monkeypatch.setattr(store_module, "_git", lambda *words: "c0ffee" if "rev-parse" in words else "")
+    for name in (FILTER.id, SMOOTHING.id):
+        monkeypatch.setitem(gym.registry[name].kwargs, "scenario", SCENARIO)
+    monkeypatch.setitem(gym.registry[INJECTION].kwargs, "scenario", FIELDS["Pipe2DInjection"])
+    monkeypatch.chdir(tmp_path)
+    for cached in (run._environment, policies.environment, provenance):
+        cached.cache_clear()
+    yield
+    for cached in (run._environment, policies.environment, provenance):
+        cached.cache_clear()
+
+
+def eitbench(*arguments):
+    """What the command does: exit code, standard output, standard error without boxes and line breaks."""
+    done = CliRunner().invoke(app, list(arguments))
+    if done.exception is not None and not isinstance(done.exception, SystemExit):
+        raise done.exception
+    return done.exit_code, done.stdout, re.sub(r"[│╭╮╰╯─\s]+", " ", done.stderr)
+
+
+def test_a_submission_is_a_record_an_environment(tmp_path):
+    """Self-reported unless said otherwise; the same again plays nothing, and official is a matter of the flag."""
+    log = tmp_path / "log"
+    mine, store, to = write_baseline(tmp_path, init=counting(log)), EpisodeStore(tmp_path / "results"), tmp_path / "to"
+    paths = submit(mine, [FILTER.id, SMOOTHING.id], TEST, store, to, command="eitbench submit")
+    first, second = (read_record(path) for path in paths)
+    assert (first["board"], second["board"]) == ("filter", "smoothing") and count(log) == 4
+    assert first["seeds"] == ["test:0", "test:1"] and not first["official"] and first["split"] == "test"
+    assert first["runs"][0]["command"] == "eitbench submit"
+    assert first["runs"][0]["machine"]["matmul_seconds"] == store_module.matmul_seconds() > 0
+    assert sorted(path.name for path in to.iterdir()) == sorted(path.name for path in paths)
+    again = submit(mine, [FILTER.id], TEST, store, to, official=True)
+    assert again == paths[:1] and count(log) == 4 and read_record(again[0])["official"]
+    assert [record["official"] for record in read_records(to)] == [True, False]
+
+
+def test_failures_are_submitted_too(tmp_path):
+    """Nothing is dropped: who fails in one episode has a record that says so."""
+    fails = write_baseline(tmp_path, update="assert self.calls < 2, 'dry'\n        return Estimate(self.level)")
+    (path,) = submit(fails, [FILTER.id], TEST, EpisodeStore(tmp_path), tmp_path / "to")
+    episodes = read_record(path)["episodes"]
+    assert [(e["status"], e["message"]) for e in episodes] == 2 * [("failed", "AssertionError: dry")]
+    assert load(tmp_path / "to")["value"].isna().all() and len(load(tmp_path / "to")) == 2
+
+
+def test_policies_are_submitted_alike(tmp_path):
+    """The very same format."""
+    (path,) = submit("random_pair", [INJECTION], TEST[:1], EpisodeStore(tmp_path), tmp_path / "to", policy=True)
+    record = read_record(path)
+    assert (record["board"], record["role"], record["seeds"]) == ("injection", "floor", ["test:0"])
+    assert record["environment"]["kwargs"]["estimator"] == "full" and record["episodes"][0]["scores"]["spent"] > 0
+
+
+def test_policies_by_command(tmp_path):
+    """`policies` prints scores and resumes; what it played stands in the table and on the page of `leaderboard`."""
+    command = ("policies", "--env", INJECTION, "--policy", "adjacent", "--policy", "random_pair", "--policy",
+               "clairvoyant", "--seeds", "test:0-1", "--estimator", "reduced", "-j", "1")
+    code, said, _ = eitbench(*command)
+    assert code == 0 and "| clairvoyant (privileged) |" in said and "adaptivity gap" in said
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.glob("results/episodes/*/*/*.json")}
+    assert len(before) == 6 and eitbench(*command)[1].endswith(said)
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+    assert eitbench("run", "--env", FILTER.id, "--baseline", "homogeneous", "--seeds", "test:0", "-j", "1")[0] == 0
+    code, said, _ = eitbench("leaderboard")
+    assert code == 0 and said.count("| Pipe2DInjection | injection |") == 3
+    assert "estimator=reduced" in said and "injections" in said.splitlines()[0]
+    page = (tmp_path / "results" / "index.html").read_text(encoding="utf-8")
+    assert page.count("<section") == 2 and "Pipe2DInjection" in page
+
+
+@pytest.mark.parametrize(("environments", "seeds", "message"), [
+    ([FILTER.id], "dev:0", "seeds of a submission must be of the test split, got dev:0"),
+    ([FILTER.id], "7", "must be of the test split, got train:7"),
+    ([FILTER.id], "400000", "must be of the test split, got 400000"),
+    ([], "test:0", "env must name at least one environment"),
+    ([FILTER.id, SMOOTHING.id], "test:0", f"kalman_filter does not play {SMOOTHING.id}"),
+    (["eitbench/Pipe4D-v0"], "test:0", "env must be one of"),
+])
+def test_what_cannot_be_submitted(environments, seeds, message, tmp_path):
+    """Nothing is played, and nothing written."""
+    with pytest.raises(ValueError, match=message):
+        submit("kalman_filter", environments, parse_seeds(seeds), EpisodeStore(tmp_path / "r"), tmp_path / "to")
+    assert not (tmp_path / "r").exists() and not (tmp_path / "to").exists()
+
+
+def test_official_needs_a_clean_commit(tmp_path, monkeypatch):
+    """The episodes are kept, and no record is written."""
+    monkeypatch.setattr(store_module, "_git", lambda *words: "c0ffee")
+    provenance.cache_clear()
+    with pytest.raises(ValueError, match="must be false where a run was not of a commit without changes"):
+        submit("homogeneous", [FILTER.id], TEST[:1], EpisodeStore(tmp_path), tmp_path / "to", official=True)
+    assert not (tmp_path / "to").exists()
+
+
+def test_from_a_file_to_the_boards_by_command(tmp_path):
+    """submit, leaderboard and compare, as README says."""
+    write_baseline(tmp_path)
+    common = ("--env", FILTER.id, "--seeds", "test:0-6", "-j", "1")
+    code, said, _ = eitbench("submit", "--baseline", "mine.py", *common)
+    assert code == 0 and re.fullmatch(
+        r"wrote leaderboards/results/eitbench-Pipe2D-v0--mine--\w{8}\.json: 7 episodes\n", said)
+    assert eitbench("submit", "--baseline", "homogeneous", *common)[0] == 0
+    assert eitbench("submit", "--policy", "random_pair", "--env", INJECTION, "--seeds", "test:0", "-j", "1")[0] == 0
+    code, said, _ = eitbench("leaderboard", "--records", "leaderboards/results")
+    assert said.splitlines() == [f"wrote leaderboards/leaderboard.{kind}" for kind in ("csv", "md")]
+    text = (tmp_path / "leaderboards" / "leaderboard.md").read_text(encoding="utf-8")
+    assert re.search(r"\| 1 +\| Mine \(mine \w{8}\) +\| self-reported \|", text)
+    assert "## injection" in text and "| floor |" in text
+
+    code, said, _ = eitbench("compare", "mine", "homogeneous", "--html", "pair.html")
+    assert code == 0 and "eitbench-Pipe2D-v0" in said and "wrote pair.html" in said
+    assert "mine and homogeneous" in (tmp_path / "pair.html").read_text(encoding="utf-8")
+    record = next(tmp_path.glob("leaderboards/results/*mine*"))
+    assert eitbench("compare", str(record), "homogeneous")[1].splitlines()[:3] == said.splitlines()[:3]
+
+    record.write_text(record.read_text().replace('"official": false', '"official": true'))
+    code, _, complaint = eitbench("leaderboard", "--records", "leaderboards/results")
+    assert code == 2 and "was changed since it was written" in complaint
+
+
+@pytest.mark.parametrize(("arguments", "message"), [
+    (["submit", "--env", FILTER.id], "either --baseline or --policy must be given"),
+    (["submit", "--env", FILTER.id, "--baseline", "homogeneous", "--policy", "adjacent"], "one of them only"),
+    (["submit", "--baseline", "homogeneous"], "--env"),
+    (["submit", "--env", INJECTION, "--baseline", "homogeneous"], "does not ask for estimates"),
+    (["submit", "--env", FILTER.id, "--policy", "adjacent"], "env must be one of eitbench/Pipe2DInjection-v0"),
+    (["submit", "--env", FILTER.id, "--baseline", "homogeneous", "--seeds", "dev:0"], "must be of the test split"),
+    (["compare", "mine", "yours"], "there is no record of mine in leaderboards/results"),
+    (["compare", "mine.json", "yours"], "record mine.json cannot be read"),
+])
+def test_mistakes_are_explained(arguments, message, tmp_path):
+    """Exit code 2 and a sentence; nothing is written."""
+    code, said, complaint = eitbench(*arguments)
+    assert code == 2 and said == "" and message in complaint
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_readme_s_commands_are_commands():
+    """Every `eitbench …` line of leaderboards/README.md names a command and options that exist."""
+    text = (Path(__file__).parents[2] / "leaderboards" / "README.md").read_text(encoding="utf-8")
+    lines = re.findall(r"^eitbench (\w+)(.*)$", text, flags=re.MULTILINE)
+    assert {command for command, _ in lines} >= {"submit", "leaderboard", "compare"}
+    for command, rest in lines:
+        _, help_, _ = eitbench(command, "--help")
+        assert all(option in help_ for option in re.findall(r"--\w+", rest)), (command, rest)
