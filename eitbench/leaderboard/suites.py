@@ -57,8 +57,8 @@ def jobs(suite: str, environments: list[str], baselines: list[str], seeds: list[
 
 def policy_jobs(environments: list[str], policies: list[str], seeds: list[int] | None = None,
                 estimator: str = "full") -> list[Job]:
-    """Every named policy (default: all of ours that suit, and our trained agents) in every named environment, on ``seeds`` (default:
-    `POLICY_SEEDS`), with this estimator inside.
+    """Every named policy (default: all of ours that suit, trained agents among them) in every named environment, on
+    ``seeds`` (default: `POLICY_SEEDS`), with this estimator inside.
 
     Raises
     ------
