@@ -159,6 +159,16 @@ def test_an_agent_plays_as_it_was_evaluated(env, algo, tmp_path):
     errors = [play(env, kwargs, str(path), seed, "reduced")["error"] for seed in (100_000, 100_001)]
     np.testing.assert_allclose(errors, expected, rtol=1e-5)
     agent = load_policy(str(path))
+    injected = []
+    for estimator in ("reduced", "full"):
+        world = gym.make(env, estimator=estimator, observation="raw", **kwargs).unwrapped
+        player, ended = agent.policy(world.rules, np.random.default_rng(0)), False
+        observation, _ = world.reset(seed=7)
+        injected.append([])
+        while not ended:
+            observation, _, ended, _, _ = world.step(player.act(observation))
+            injected[-1].append(observation["currents"])
+    np.testing.assert_array_equal(*injected)                # whichever filter is inside
     assert agent.name == f"{algo}_seed1" and not agent.privileged and agent.parameters["env"] == env
     assert not agent.suits(Rules(Pipe2D(), limit=None if env == CURRENTS else "L1"))
     path.write_bytes(path.read_bytes() + b"x")

@@ -10,6 +10,7 @@ import numpy as np
 from gymnasium import spaces
 
 from eitbench import _check
+from eitbench.envs.console import Console
 from eitbench.envs.joint_operator import JointFullOperator, JointReducedOperator
 from eitbench.envs.operator import PATCHES, FullOperator, Operator, electrode_pairs, pair_currents
 from eitbench.envs.reduced_operator import ReducedOperator
@@ -30,8 +31,6 @@ LIMITS = ("L1", "L2", "Linf")
 """Norms that may bound the currents."""
 RECENT = 4
 """Injections that an observation remembers."""
-DOUBT = 0.2
-"""Weight of the last injection in the running share of readings that were not believed."""
 
 
 @dataclass(frozen=True)
@@ -202,8 +201,8 @@ class InjectionCore:
         self.seeds, self._t, self._spent = tuple(seeds), self.first, np.zeros(B, dtype=int)
         self._resistance, self._draws = np.empty((T, B, L, L)), np.empty((T, B, L))
         self._deviations, self._squares, totals = np.empty((3, B, T))
-        self._voltages, self._currents, self._innovations = np.zeros((3, B, L))
-        self._recent, self._doubt = np.zeros((B, RECENT, L)), np.zeros((B, 2, L))
+        self._voltages, self._currents = np.zeros((2, B, L))
+        self._recent = np.zeros((B, RECENT, L))
         moments, faults = [], []
         for k, seed in enumerate(seeds):     # all is copied: a mapped file is open, and there may be more than may be
             entries = recording(scenario, seed)
@@ -220,8 +219,8 @@ class InjectionCore:
         self._moments = np.array(moments)
         self._frames = np.stack([self._measure(k, np.repeat(cycle[None], B, axis=0))
                                  for k, cycle in enumerate(scenario.currents)], axis=1)
-        self._operator = self._operator_type(scenario, self._frames, gate=rules.gate,
-                                             noise_floor=rules.instrument.noise_floor)
+        self._console = Console(self._operator_type, rules, self._frames)
+        self._operator = self._console.operator
         self._voltages = self._frames[:, -1].copy()
         self._currents = np.repeat(scenario.currents[-1:], B, axis=0)
         for k in range(RECENT):
@@ -246,8 +245,7 @@ class InjectionCore:
         self._t += 1
         if not self._operator_type:
             return np.zeros(len(currents))
-        self._innovations, believed = self._operator.assimilate(self._voltages, currents)
-        self._remember(currents, believed)
+        self._console.take_in(self._voltages, currents)
         k = self._t - 1
         return np.nan_to_num(self._homogeneous[:, k] - self.errors())
 
@@ -294,24 +292,11 @@ class InjectionCore:
             masks[self._spent >= self.rules.budget, :-1] = False
         return masks
 
-    def _remember(self, currents: np.ndarray, believed: np.ndarray) -> None:
-        """Of each electrode: how often lately its own reading was not believed, and the injections that it drove."""
-        reading, driving = self._doubt[:, 0], self._doubt[:, 1]
-        injected, drives = currents.any(axis=1, keepdims=True), currents != 0.0
-        failed = ~believed.any(axis=1, keepdims=True)
-        # A failed injection says nothing of the electrodes that only listened.
-        reading += DOUBT * (injected & ~failed) * (~believed - reading)
-        driving += DOUBT * drives * (failed - driving)
-
     def observe(self) -> Observation:
         """The last measurement and, if there is an estimator, what an operator makes of it; arrays (B, …)."""
         shown = {"voltages": self._voltages.copy(), "currents": self._currents.copy()}
         if self._operator_type:
-            mean, std = self._operator.grid()
-            shown |= {"recent": self._recent.copy(), "frame": self._frames.copy(),
-                      "innovations": self._innovations.copy(), "mean": mean, "std": std, "doubt": self._doubt.copy()}
-            if (flow := self._operator.flow()) is not None:
-                shown |= {"velocity": flow[0], "velocity_std": flow[1]}
+            shown |= {"recent": self._recent.copy(), "frame": self._frames.copy()} | self._console.shown()
         left = [np.full(len(self._spent), float(self.scenario.n_steps - self._t))]
         if self.rules.budget is not None:
             left.append(self.rules.budget - self._spent.astype(float))

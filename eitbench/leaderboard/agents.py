@@ -9,11 +9,16 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from eitbench.envs.injection_core import InjectionCore, Rules, scaled
+from eitbench.envs.console import Console
+from eitbench.envs.injection_core import InjectionCore, Rules, operator_type, scaled
 
 
 class Agent:
-    """A policy that does what a model of stable-baselines3 thinks best; subclasses have the model."""
+    """A policy that does what a model of stable-baselines3 thinks best; subclasses have the model.
+
+    Whatever filter is inside the environment, the agent is shown the one of reduced order with which it was trained,
+    and so injects the same.
+    """
 
     model: ClassVar[Any]
     masked: ClassVar[bool]
@@ -26,16 +31,24 @@ class Agent:
                     and cls.model.observation_space.shape == scaled(rules, zeros).shape)
 
     def __init__(self, rules: Rules, random: np.random.Generator) -> None:
-        self.rules, self.memory, self.begins = rules, None, True
+        self.rules, self.memory = rules, None
+        self.console: Console | None = None
 
     def act(self, observation: dict[str, np.ndarray]) -> Any:
+        begins = self.console is None
+        if self.console is None:
+            kind = operator_type(self.rules.scenario, "reduced")
+            assert kind is not None
+            self.console = Console(kind, self.rules, observation["frame"][None])
+        else:
+            self.console.take_in(observation["voltages"][None], observation["currents"][None])
+        observation = observation | {name: array[0] for name, array in self.console.shown().items()}
         masks = {}
         if self.masked:
             spent = self.rules.budget is not None and observation["left"][1] == 0.0
             masks["action_masks"] = np.arange(self.model.action_space.n) >= spent * (self.model.action_space.n - 1)
         action, self.memory = self.model.predict(scaled(self.rules, observation), state=self.memory,
-                                                 episode_start=np.array([self.begins]), deterministic=True, **masks)
-        self.begins = False
+                                                 episode_start=np.array([begins]), deterministic=True, **masks)
         return action if action.ndim else int(action)
 
 
