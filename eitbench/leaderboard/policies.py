@@ -183,7 +183,7 @@ def adaptivity_gap(table: pd.DataFrame, open_loop: Sequence[str]) -> tuple[float
     -------
     gap, low, high
     """
-    errors = table.pivot(index="seed", columns="policy", values="error")
+    errors = table.pivot_table(index="seed", columns="policy", values="error")
     needed = ["clairvoyant", "random_pair", *open_loop]
     if not open_loop or set(needed) - set(errors) or errors[needed].isna().to_numpy().any():
         raise ValueError("table must hold clairvoyant, random_pair and some open-loop policies on the same episodes; "

@@ -253,6 +253,11 @@ def test_table_pairs_the_episodes():
     assert names == ["clairvoyant (privileged)", "best_pair", "random_pair"]
     # 1.0667 on average with a standard deviation of 0.1155: half the interval is 4.303·0.1155/√3
     assert "1.1 ± 0.3" in lines[4] and "–" in lines[3] and "gap 0.49" in lines[-1]
+    # Agents of two trainings, 1.7 and 2.3 on average, are one policy.
+    agents = pd.DataFrame([{"policy": f"ppo_seed{k}", "seed": f"dev:{j}", "error": 1.7 + 0.6 * k + 0.1 * j, "spent": 5,
+                            "seconds_per_step": 0.001} for k in range(2) for j in range(3)])
+    lines = policy_table.policy_table(pd.concat([rows, agents]), ["clairvoyant"]).splitlines()
+    assert lines[3].startswith("| ppo | 2.1 ") and "ppo_seed" not in str(lines) and "gap 0.49" in lines[-1]
 
 
 # -- mistakes ---------------------------------------------------------------------------------------------------------
