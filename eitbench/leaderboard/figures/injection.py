@@ -57,13 +57,14 @@ def _scores(axes: Axes, rows: pd.DataFrame, privileged: list[str]) -> None:
     errors = errors_by_policy(rows)
     order = errors.mean().sort_values().index[::-1]
     for place, name in enumerate(order):
-        mean, half = mean_and_interval(list(errors[name]))
+        mean, half = mean_and_interval(list(errors[name].dropna()))
         colour = TRUE if name in privileged else INK if name in OPEN_LOOP or name == "random_pair" else ACCENT
         axes.plot([mean], [place], "o", color=colour, markersize=5)
         if np.isfinite(half):
             axes.plot([mean - half, mean + half], [place, place], color=colour, linewidth=1.6)
     axes.set_yticks(range(len(order)), [name.replace("_", " ") + " *" * (name in privileged) for name in order])
-    axes.set(xlim=(0, None), xlabel=f"ẽ$_c$, {len(errors)} episodes")
+    axes.set(xlim=(0, None), xlabel=f"ẽ$_c$, {len(errors)} episode{'s' * (len(errors) > 1)}")
+    axes.locator_params(axis="x", nbins=5)
     axes.plot([], [], "o", color=INK, label="open loop")
     axes.plot([], [], "o", color=ACCENT, label="looks at the data")
     axes.plot([], [], "o", color=TRUE, label="* is shown the truth")
@@ -85,7 +86,8 @@ def _curves(axes: Axes, env: str) -> None:
         seen.add(algo)
     if runs:
         axes.legend(frameon=False, fontsize=8)
-        axes.set(xlabel="million environment steps", ylabel="ẽ$_c$", ylim=(0, None))
+        axes.set(xlabel="million environment steps after imitation", ylabel="ẽ$_c$")
+        axes.margins(y=0.25)
         bare(axes)
     else:
         axes.set_axis_off()
