@@ -226,20 +226,25 @@ def submit(
 def leaderboard(
     out: Out = Path("results"),
     records: Annotated[Path | None, typer.Option(
-        help="Folder of the leaderboards' records, such as leaderboards/results: render leaderboard.csv and "
-             "leaderboard.md beside it instead.")] = None,
+        help="Folder of the leaderboards' records, such as leaderboards/results: render leaderboard.csv, "
+             "leaderboard.md and the pages site/ beside it instead.")] = None,
 ) -> None:
     """Print the table and write the page again from the results stored in a folder."""
     if records is None:
         return _report(out)
     from eitbench._files import write_atomically
-    from eitbench.leaderboard.boards import render
+    from eitbench.leaderboard.boards import boards, render
     from eitbench.leaderboard.records import read_records
+    from eitbench.leaderboard.site import read_media, render_site, write_site
+    beside = records.parent
     with _clear_errors():
-        texts = render(read_records(records))
-    for name, text in texts.items():
-        write_atomically(records.parent / name, text.encode())
-        typer.echo(f"wrote {records.parent / name}")
+        found = read_records(records)
+        table = boards(found)
+    for name, text in render(found, table).items():
+        write_atomically(beside / name, text.encode())
+        typer.echo(f"wrote {beside / name}")
+    write_site(beside / "site", render_site(found, table, read_media(beside / "media")))
+    typer.echo(f"wrote {beside / 'site' / 'index.html'}")
 
 
 @app.command()

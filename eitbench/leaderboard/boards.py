@@ -39,6 +39,7 @@ OTHERS = tuple(name for name in COLUMNS if name != "error")
 """Scores that stand beside ranks, as means over the episodes."""
 FIELDS = ("class", "environment", "method", "version", "title", "rank", "note", "official", "seeds", "error",
           "error_low", "error_high", "gain", "gain_low", "gain_high", *OTHERS, "matmuls_per_step", "peak_memory")
+NUMBERS = FIELDS[FIELDS.index("error"):]
 HEADINGS = {name: heading for name, heading in COLUMNS.items() if name != "error"} | {
     "matmuls_per_step": "products/step", "peak_memory": "MB"}
 MORE = {
@@ -104,7 +105,7 @@ def boards(records: list[dict[str, Any]]) -> pd.DataFrame:
             rows += _board(environment, entries, current)
         rows += _aggregate({environment: entries for environment, entries in played.items()
                             if any(entry.gains for entry in entries)})
-    return pd.DataFrame(rows, columns=list(FIELDS)).astype({"rank": "Int64"})
+    return pd.DataFrame(rows, columns=list(FIELDS)).astype({"rank": "Int64"} | dict.fromkeys(NUMBERS, float))
 
 
 def class_of(record: dict[str, Any]) -> str:
@@ -112,9 +113,10 @@ def class_of(record: dict[str, Any]) -> str:
     return "stationary" if record["environment"]["id"] in AT_REST else record["board"]
 
 
-def render(records: list[dict[str, Any]]) -> dict[str, str]:
-    """The content of ``leaderboard.csv`` and ``leaderboard.md``, by file name. The same records give the same text."""
-    table = boards(records)
+def render(records: list[dict[str, Any]], table: pd.DataFrame | None = None) -> dict[str, str]:
+    """The content of ``leaderboard.csv`` and ``leaderboard.md``, by file name, from the records and, if it is made
+    already, their `boards`. The same records give the same text."""
+    table = boards(records) if table is None else table
     return {"leaderboard.csv": table.to_csv(index=False, float_format="%.6g", lineterminator="\n"),
             "leaderboard.md": _markdown(table, newest(records)[1])}
 

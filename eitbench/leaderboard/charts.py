@@ -4,11 +4,18 @@ from __future__ import annotations
 
 import math
 from html import escape
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
-WIDTH, HEIGHT, LEFT, RIGHT, TOP, BOTTOM = 860, 360, 64, 12, 12, 46
+WIDTH, HEIGHT, LEFT, RIGHT, TOP, BOTTOM = 860, 360, 76, 30, 12, 46
+COLOURS = 12
+"""--c0 … --c11 of the style sheet; who comes after them has the same again, dashed."""
+LETTER = 7.0
+"""Width of a letter in px, about."""
+LONGEST, LONGEST_BESIDE = 36, 60
+"""Letters of a name within a chart and beside one; whole names are in titles, legends and tables."""
 
 
 class Series(NamedTuple):
@@ -18,71 +25,214 @@ class Series(NamedTuple):
     colour: int
     """Index of the page's colour, --c0, --c1, …"""
     values: np.ndarray
+    """Of a line: (n,); of an interval: (value, low, high), whose ends may be unknown."""
+    at: np.ndarray | None = None
+    """(n,): where on the x axis, if not where the others are."""
+    faint: bool = False
+    """Drawn thin, behind the others' story."""
 
 
-def _log_ticks(low: float, high: float) -> list[float]:
-    """1, 2, 5 times powers of ten within [low, high]; finer ones where fewer than two of them are."""
-    decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-    ticks: list[float] = []
-    for multiples in ([1, 2, 5], range(1, 10), np.arange(10, 100) / 10):
-        ticks = [m * 10.0**e for e in decades for m in multiples if low <= m * 10.0**e <= high]
-        if len(ticks) > 1:
-            break
-    return ticks
+class Point(NamedTuple):
+    """One mark of a `front`."""
+
+    name: str
+    colour: int
+    x: float
+    y: float
+    competes: bool = True
+    """Whether it may be on the front."""
+
+
+class Axis:
+    """From values to px: logarithmic or linear, with ticks at round numbers."""
+
+    def __init__(self, low: float, high: float, begin: float, end: float, *, log: bool) -> None:
+        self.low, self.high, self.begin, self.end, self.log = low, high, begin, end, log
+
+    def __call__(self, value: float) -> float:
+        value = max(value, self.low)
+        part = (math.log(value / self.low) / math.log(self.high / self.low) if self.log
+                else (value - self.low) / (self.high - self.low))
+        return self.begin + part * (self.end - self.begin)
+
+    def ticks(self) -> list[float]:
+        """1, 2, 5 times powers of ten, fewer than twelve."""
+        return _log_ticks(self.low, self.high) if self.log else _linear_ticks(self.low, self.high)
 
 
 def lines(x: np.ndarray, series: list[Series], x_label: str, y_label: str) -> str:
     """Curves over a linear x axis and a logarithmic y axis; a series may end before ``x`` does."""
     values = np.concatenate([s.values for s in series])
     floor = values[values > 0].min(initial=1.0) / 1.15            # where a perfect estimate's zero is drawn
-    low, high, width = floor, max(values.max(), floor) * 1.15, max(x[-1] - x[0], 1)
-
-    def px(value: float) -> float:
-        return LEFT + (value - x[0]) / width * (WIDTH - LEFT - RIGHT)
-
-    def py(value: float) -> float:
-        return HEIGHT - BOTTOM - math.log(max(value, low) / low) / math.log(high / low) * (HEIGHT - TOP - BOTTOM)
-
-    parts = [f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(y_label)} over {escape(x_label)}">']
-    for tick in _log_ticks(low, high):
-        parts.append(f'<line class="grid" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{py(tick):.1f}" y2="{py(tick):.1f}"/>'
-                     f'<text x="{LEFT - 8}" y="{py(tick) + 4:.1f}" text-anchor="end">{tick:g}</text>')
-    step = 10
-    for tick in range(math.ceil(x[0] / step) * step, int(x[-1]) + 1, step):
-        parts.append(f'<text x="{px(tick):.1f}" y="{HEIGHT - BOTTOM + 18}" text-anchor="middle">{tick}</text>')
+    last = max([x[-1], x[0] + 1, *(s.at[-1] for s in series if s.at is not None)])
+    px = Axis(x[0], last, LEFT, WIDTH - RIGHT, log=False)
+    py = Axis(floor, max(values.max(), floor) * 1.15, HEIGHT - BOTTOM, TOP, log=True)
+    parts = _frame(px, py, x_label, y_label)
     for s in series:
-        points = " ".join(f"{px(a):.1f},{py(b):.1f}" for a, b in zip(x, s.values, strict=False))
-        parts.append(f'<polyline class="series" style="stroke:var(--c{s.colour})" points="{points}">'
+        at = x if s.at is None else s.at
+        points = " ".join(f"{px(a):.1f},{py(b):.1f}" for a, b in zip(at, s.values, strict=False))
+        parts.append(f'<polyline class="series{" faint" * s.faint}" style="{_stroke(s.colour)}" points="{points}">'
                      f'<title>{escape(s.name)}</title></polyline>')
-    middle = (LEFT + WIDTH - RIGHT) / 2
-    parts.append(f'<text x="{middle}" y="{HEIGHT - 6}" text-anchor="middle">{escape(x_label)}</text>'
-                 f'<text text-anchor="middle" transform="translate(14 {(HEIGHT - BOTTOM + TOP) / 2}) rotate(-90)">'
-                 f'{escape(y_label)}</text></svg>')
-    return "".join(parts)
+    return "".join([*parts, "</svg>"])
 
 
-def intervals(rows: list[Series], x_label: str) -> str:
-    """A dot and its interval a row, ``values`` = (mean, half width), over a logarithmic axis."""
-    row_height, label = 28, min(max(300.0, 24 + 6.5 * max(len(s.name) for s in rows)), 520.0)
+def front(points: list[Point], x_label: str, y_label: str) -> str:
+    """Marks over two logarithmic axes, on which small is good; those that are `optimal` are filled and joined.
+
+    Names stand beside their marks as far as there is room.
+    """
+    def span(values: list[float]) -> tuple[float, float]:
+        positive = [value for value in values if value > 0] or [1.0]      # a zero is drawn at the edge
+        return min(positive) / 1.4, max(positive) * 1.4
+
+    px = Axis(*span([p.x for p in points]), LEFT, WIDTH - RIGHT, log=True)
+    py = Axis(*span([p.y for p in points]), HEIGHT - BOTTOM, TOP, log=True)
+    parts = _frame(px, py, x_label, y_label)
+    best = optimal(points)
+    stairs = " ".join(f"{px(p.x):.1f},{py(p.y):.1f}" for p in best)
+    parts.append(f'<polyline class="front" points="{stairs}"/>')
+    taken = [(px(p.x) - 6, py(p.y) - 6, px(p.x) + 6, py(p.y) + 6) for p in points]
+    for a, b in pairwise(best):                                          # names keep off the line too
+        along = [np.linspace(axis(begin), axis(end), 40) for axis, begin, end in ((px, a.x, b.x), (py, a.y, b.y))]
+        taken += [(x - 1, y - 1, x + 1, y + 1) for x, y in zip(*along, strict=True)]
+    for p in [*best, *(p for p in points if p not in best)]:              # the best choose their places first
+        colour = f"var(--c{p.colour % COLOURS})"
+        fill = colour if p in best else "var(--card)"
+        parts.append(f'<circle style="fill:{fill};stroke:{colour};stroke-width:2" cx="{px(p.x):.1f}" '
+                     f'cy="{py(p.y):.1f}" r="5"><title>{escape(p.name)}: {p.x:.3g}, {p.y:.3g}</title></circle>')
+        name = _shortened(p.name, LONGEST)
+        if place := _room(px(p.x), py(p.y), LETTER * len(name), taken):
+            x, y, anchor = place
+            parts.append(f'<text class="name" x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{escape(name)}</text>')
+    return "".join([*parts, "</svg>"])
+
+
+def optimal(points: list[Point]) -> list[Point]:
+    """Of those that compete, whom no other beats in one and equals or beats in the other, by x; of equals one."""
+    best: list[Point] = []
+    for p in sorted((p for p in points if p.competes), key=lambda p: (p.x, p.y)):
+        if not best or p.y < best[-1].y:
+            best.append(p)
+    return best
+
+
+def calibration(series: list[Series], nominal: tuple[float, ...], x_label: str, y_label: str) -> str:
+    """Observed over nominal parts, both in %; on the diagonal what is claimed is true."""
+    px, py = (Axis(0.0, 100.0, a, b, log=False) for a, b in ((LEFT, WIDTH - RIGHT), (HEIGHT - BOTTOM, TOP)))
+    parts = _frame(px, py, x_label, y_label)
+    parts.append(f'<line class="front" x1="{px(0)}" y1="{py(0)}" x2="{px(100)}" y2="{py(100)}"/>')
+    for s in series:
+        places = [(px(a), py(b)) for a, b in zip(nominal, s.values, strict=True)]
+        parts.append(f'<g><title>{escape(s.name)}: {", ".join(f"{value:.0f} %" for value in s.values)}</title>'
+                     f'<polyline class="series" style="{_stroke(s.colour)}" '
+                     f'points="{" ".join(f"{x:.1f},{y:.1f}" for x, y in places)}"/>')
+        parts += [f'<circle style="fill:var(--c{s.colour % COLOURS})" cx="{x:.1f}" cy="{y:.1f}" r="5"/>'
+                  for x, y in places] + ["</g>"]
+    return "".join([*parts, "</svg>"])
+
+
+def intervals(rows: list[Series], x_label: str, *, log: bool = True, mark: float | None = None) -> str:
+    """A dot and its interval a row, over a logarithmic or a linear axis, with a line at ``mark``."""
+    names = [_shortened(s.name, LONGEST_BESIDE) for s in rows]
+    row_height, label = 28, 24 + LETTER * max(8, *map(len, names))
     height = TOP + row_height * len(rows) + BOTTOM
-    ends = [(mean - (half if math.isfinite(half) else 0), mean + (half if math.isfinite(half) else 0))
-            for mean, half in (s.values for s in rows)]
-    smallest = min(mean for mean, _ in (s.values for s in rows)) / 2
-    low, high = max(min(a for a, _ in ends), smallest) / 1.15, max(b for _, b in ends) * 1.15
-
-    def px(value: float) -> float:
-        return label + math.log(max(value, low) / low) / math.log(high / low) * (WIDTH - label - RIGHT)
-
-    parts = [f'<svg viewBox="0 0 {WIDTH} {height}" role="img" aria-label="{escape(x_label)}">']
-    for tick in _log_ticks(low, high):
+    known = [value for s in rows for value in s.values if math.isfinite(value)] + ([] if mark is None else [mark])
+    if log:
+        least = min((float(s.values[0]) for s in rows if s.values[0] > 0), default=1.0)
+        low, high = max(min(known), least / 2) / 1.15, max(*known, least) * 1.15       # what reaches below is cut
+    else:
+        margin = 0.05 * (max(known) - min(known)) or 1.0
+        low, high = min(known) - margin, max(known) + margin
+    px = Axis(low, high, label, WIDTH - RIGHT, log=log)
+    parts = [_open(height, x_label)]
+    for tick in px.ticks():
         parts.append(f'<line class="grid" x1="{px(tick):.1f}" x2="{px(tick):.1f}" y1="{TOP}" y2="{height - BOTTOM}"/>'
-                     f'<text x="{px(tick):.1f}" y="{height - BOTTOM + 18}" text-anchor="middle">{tick:g}</text>')
-    for i, (s, (a, b)) in enumerate(zip(rows, ends, strict=True)):
+                     f'<text x="{px(tick):.1f}" y="{height - BOTTOM + 18}" text-anchor="middle">{_said(tick)}</text>')
+    if mark is not None:
+        parts.append(f'<line class="front" x1="{px(mark):.1f}" x2="{px(mark):.1f}" y1="{TOP}" y2="{height - BOTTOM}"/>')
+    for i, (s, name) in enumerate(zip(rows, names, strict=True)):
         y = TOP + row_height * (i + 0.5)
-        parts.append(f'<text x="{label - 12}" y="{y + 4}" text-anchor="end">{escape(s.name)}</text>'
-                     f'<line style="stroke:var(--c{s.colour});stroke-width:3" x1="{px(a):.1f}" x2="{px(b):.1f}" '
-                     f'y1="{y}" y2="{y}"/><circle style="fill:var(--c{s.colour})" cx="{px(s.values[0]):.1f}" cy="{y}" '
-                     f'r="5"><title>{s.values[0]:.3g}</title></circle>')
+        value, a, b = (float(end) if math.isfinite(end) else float(s.values[0]) for end in s.values)
+        parts.append(f'<text x="{label - 12}" y="{y + 4}" text-anchor="end">{escape(name)}</text>'
+                     f'<line style="stroke:var(--c{s.colour % COLOURS});stroke-width:3" x1="{px(a):.1f}" '
+                     f'x2="{px(b):.1f}" y1="{y}" y2="{y}"/><circle style="fill:var(--c{s.colour % COLOURS})" '
+                     f'cx="{px(value):.1f}" cy="{y}" r="5"><title>{value:.3g}</title></circle>')
     parts.append(f'<text x="{(label + WIDTH - RIGHT) / 2}" y="{height - 6}" text-anchor="middle">{escape(x_label)}'
                  '</text></svg>')
     return "".join(parts)
+
+
+def cell(three: tuple[float, float, float], low: float, high: float, *, log: bool) -> str:
+    """A dot and its interval within a table's cell, on the scale of its column from ``low`` to ``high``; the number
+    beside it says the same, so that it is hidden from those who listen."""
+    px = Axis(low, high if high > low else low + 1.0, 4, 76, log=log)
+    value, a, b = (min(end if math.isfinite(end) else three[0], px.high) for end in three)
+    return (f'<svg class="cell" viewBox="0 0 80 14" aria-hidden="true"><line x1="{px(a):.1f}" x2="{px(b):.1f}" '
+            f'y1="7" y2="7"/><circle cx="{px(value):.1f}" cy="7" r="3"/></svg>')
+
+
+def _frame(px: Axis, py: Axis, x_label: str, y_label: str) -> list[str]:
+    """A chart's beginning: grid, ticks and labels."""
+    parts = [_open(HEIGHT, f"{y_label} over {x_label}")]
+    for tick in py.ticks():
+        parts.append(f'<line class="grid" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{py(tick):.1f}" y2="{py(tick):.1f}"/>'
+                     f'<text x="{LEFT - 8}" y="{py(tick) + 4:.1f}" text-anchor="end">{_said(tick)}</text>')
+    for tick in px.ticks():
+        parts.append(f'<line class="grid" x1="{px(tick):.1f}" x2="{px(tick):.1f}" y1="{HEIGHT - BOTTOM}" '
+                     f'y2="{HEIGHT - BOTTOM + 5}"/>'
+                     f'<text x="{px(tick):.1f}" y="{HEIGHT - BOTTOM + 18}" text-anchor="middle">{_said(tick)}</text>')
+    middle = (LEFT + WIDTH - RIGHT) / 2
+    return [*parts, f'<text x="{middle}" y="{HEIGHT - 6}" text-anchor="middle">{escape(x_label)}</text>'
+            f'<text text-anchor="middle" transform="translate(14 {(HEIGHT - BOTTOM + TOP) / 2}) rotate(-90)">'
+            f'{escape(y_label)}</text>']
+
+
+def _open(height: float, label: str) -> str:
+    return f'<svg viewBox="0 0 {WIDTH} {height}" role="img" aria-label="{escape(label)}">'
+
+
+def _stroke(colour: int) -> str:
+    return f"stroke:var(--c{colour % COLOURS})" + (";stroke-dasharray:6 3" if colour >= COLOURS else "")
+
+
+def _said(tick: float) -> str:
+    """``200,000`` and ``0.002``, but never ``2e+05``."""
+    return f"{tick:,.0f}" if abs(tick) >= 1e4 else f"{tick:g}"
+
+
+def _shortened(name: str, letters: int) -> str:
+    return name if len(name) <= letters else f"{name[:letters - 1].rstrip()}…"
+
+
+def _room(x: float, y: float, width: float, taken: list[tuple[float, float, float, float]]
+          ) -> tuple[float, float, str] | None:
+    """Where a name of this width fits beside (x, y) without touching what is ``taken``, to which it is added."""
+    for left, dy, anchor in ((x + 10, 4, "start"), (x - 10 - width, 4, "end"), (x + 6, -9, "start"),
+                             (x + 6, 18, "start"), (x - 6 - width, -9, "end"), (x - 6 - width, 18, "end")):
+        box = (left, y + dy - 11, left + width, y + dy + 3)
+        inside = box[0] > LEFT and box[2] < WIDTH and box[1] > 0 and box[3] < HEIGHT - BOTTOM
+        if inside and not any(box[0] < b[2] and b[0] < box[2] and box[1] < b[3] and b[1] < box[3] for b in taken):
+            taken.append(box)
+            return (left if anchor == "start" else left + width), y + dy, anchor
+    return None
+
+
+def _log_ticks(low: float, high: float) -> list[float]:
+    """1, 2, 5 times powers of ten within [low, high]; finer ones where fewer than two of them are, only the powers
+    where they would be many."""
+    decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+    ticks: list[float] = []
+    for multiples in ([1, 2, 5], range(1, 10), np.arange(10, 100) / 10):
+        ticks = [float(m * 10.0**e) for e in decades for m in multiples if low <= m * 10.0**e <= high]
+        if len(ticks) > 1:
+            break
+    return ticks if len(ticks) < 12 else [10.0**e for e in decades if low <= 10.0**e <= high]
+
+
+def _linear_ticks(low: float, high: float) -> list[float]:
+    """Multiples of 1, 2 or 5 times a power of ten within [low, high], at most ten."""
+    rough = (high - low) / 10
+    power = 10.0 ** math.floor(math.log10(rough))
+    step = next(m * power for m in (1, 2, 5, 10) if m * power >= rough * (1 - 1e-9))
+    first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
+    return [round(i * step, 12) for i in range(first, last + 1)]

@@ -6,7 +6,6 @@ import math
 from pathlib import Path
 from typing import Any
 
-import jinja2
 import numpy as np
 import pandas as pd
 
@@ -17,6 +16,7 @@ from eitbench.leaderboard.statistics import (
     paired_probability_of_improvement,
 )
 from eitbench.leaderboard.summary import as_markdown, number, scores_by_seed, with_interval
+from eitbench.leaderboard.templates import template
 
 FIELDS = ("environment", "episodes", "a", "b", "difference", "low", "high", "better", "better_low", "better_high")
 
@@ -114,13 +114,11 @@ def markdown(table: pd.DataFrame, a: str, b: str) -> str:
 
 def html(table: pd.DataFrame, a: str, b: str) -> str:
     """The comparison as a page that needs no other file."""
-    environment = jinja2.Environment(loader=jinja2.PackageLoader("eitbench.leaderboard", "."), autoescape=True,
-                                     trim_blocks=True, lstrip_blocks=True)
     text = cells(table, a, b)
     widest = max((abs(end) for end in [*table["low"], *table["high"], *table["difference"]] if math.isfinite(end)),
                  default=0.0) or 1.0
     bars = [[f"{50.0 + 45.0 * value / widest:.2f}" if math.isfinite(value) else None for value in three]
             for three in table[["low", "difference", "high"]].itertuples(False)]
-    return environment.get_template("compare.html.j2").render(
+    return template("compare.html.j2").render(
         a=a, b=b, headings=list(text.columns), rows=list(zip(text.to_numpy().tolist(), bars, strict=True)))
 

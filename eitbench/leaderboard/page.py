@@ -8,7 +8,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import jinja2
 import numpy as np
 import pandas as pd
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -20,12 +19,11 @@ from eitbench.leaderboard import charts
 from eitbench.leaderboard.run import Environment
 from eitbench.leaderboard.store import EpisodeStore
 from eitbench.leaderboard.summary import EXPLANATIONS, board_label, cells, method
+from eitbench.leaderboard.templates import template
 from eitbench.physics.mesh import Mesh
 from eitbench.seeds import parse_seeds
 from eitbench.task import Task
 
-COLOURS = 12
-"""--c0 … --c11 of the style sheet"""
 SHOWN = (("kalman_filter", "filter"), ("joint_extended_kalman_filter", "filter"),
          ("fixed_interval_smoother", "smoothing"), ("gauss_newton", "smoothing"))
 """Beside the truth, in the snapshots: thesis Figs 5.4 and 5.6, and who estimates the flow too where it is asked for."""
@@ -33,12 +31,10 @@ SHOWN = (("kalman_filter", "filter"), ("joint_extended_kalman_filter", "filter")
 
 def write_page(store: EpisodeStore, records: list[dict[str, Any]], table: pd.DataFrame) -> Path:
     """Write ``index.html`` into the store's folder and return its path; it needs no other file and no network."""
-    environment = jinja2.Environment(loader=jinja2.PackageLoader("eitbench.leaderboard", "."), autoescape=True,
-                                     trim_blocks=True, lstrip_blocks=True)
     sections = [_section(store, records, str(name), rows.reset_index(drop=True))
                 for name, rows in table.groupby("world", sort=False)]
     shown = {heading for section in sections for heading in section["headings"]}
-    html = environment.get_template("page.html.j2").render(
+    html = template("page.html.j2").render(
         sections=sections, explanations={heading: text for heading, text in EXPLANATIONS.items() if heading in shown},
         colour_bar=_colour_bar(), runs=_runs(records),
     )
@@ -80,13 +76,17 @@ def _label(record: dict[str, Any] | pd.Series, title: str) -> str:
 
 
 def _intervals(table: pd.DataFrame) -> str:
-    rows = [charts.Series(_label(row, row["method"]), int(str(i)) % COLOURS, np.array(row["error"]))
+    rows = [charts.Series(_label(row, row["method"]), int(str(i)), _ends(*row["error"]))
             for i, row in table.iterrows() if row["error"] is not None]
     return charts.intervals(sorted(rows, key=lambda s: s.values[0]), "ẽ_c") if rows else ""
 
 
+def _ends(mean: float, half: float) -> np.ndarray:
+    return np.array([mean, mean - half, mean + half])
+
+
 def _legend(ordered: list[dict[str, Any]]) -> list[tuple[int, str]]:
-    return [(i % COLOURS, _label(record, method(record))) for i, record in enumerate(ordered)]
+    return [(i % charts.COLOURS, _label(record, method(record))) for i, record in enumerate(ordered)]
 
 
 def _curves(ordered: list[dict[str, Any]]) -> str:
@@ -95,7 +95,7 @@ def _curves(ordered: list[dict[str, Any]]) -> str:
     for i, record in enumerate(ordered):
         errors = [episode["step_errors"] for episode in record["episodes"] if episode["status"] == "ok"]
         if errors:
-            series.append(charts.Series(_label(record, method(record)), i % COLOURS, np.mean(errors, axis=0)))
+            series.append(charts.Series(_label(record, method(record)), i, np.mean(errors, axis=0)))
             steps = max(steps, len(errors[0]))
     return charts.lines(np.arange(1, steps + 1), series, "scored injection", "relative error") if series else ""
 

@@ -110,6 +110,7 @@ def test_few_episodes_have_no_interval():
                      record("b", times(0.9, FLOOR[:5])))
     assert table[["error_low", "error_high", "gain_low", "gain_high"]].isna().all(axis=None)
     assert list(table["rank"][:2]) == [1, 1]
+    assert "0.22" in render([record("homogeneous", FLOOR[:5], role="floor")])["leaderboard.md"]
 
 
 def test_who_has_no_rank():

@@ -30,7 +30,7 @@ EVIL = "Evil <script>alert('x')</script> & \\\"co\\\""
 class Page(HTMLParser):
     """Tags with attributes, and text, of a page; unbalanced tags are an error."""
 
-    VOID = ("meta", "img", "br")
+    VOID = ("meta", "img", "br", "link", "wbr", "input")
 
     def __init__(self, html):
         super().__init__()
@@ -225,10 +225,20 @@ def test_odd_curves_can_be_drawn(values):
 
 def test_intervals_of_one_episode_and_wide_ones():
     """An unknown interval is a dot, and one that reaches below zero ends at the edge of the chart."""
-    rows = [charts.Series("one", 0, np.array([0.02, np.inf])), charts.Series("wide", 1, np.array([0.01, 0.5]))]
+    rows = [charts.Series("one", 0, np.array([0.02, -np.inf, np.inf])),
+            charts.Series("wide", 1, np.array([0.01, -0.49, 0.51]))]
     chart = ElementTree.fromstring(charts.intervals(rows, "ẽ_c"))
     one, wide = [line for line in chart.findall("line") if line.get("style")]
-    assert one.get("x1") == one.get("x2") and float(wide.get("x2")) > float(wide.get("x1")) >= 300
+    assert one.get("x1") == one.get("x2") and float(wide.get("x2")) > float(wide.get("x1")) > max(
+        float(text.get("x")) for text in chart.findall("text[@text-anchor='end']"))
+
+
+@pytest.mark.parametrize("values", [[0.0], [0.0, 0.02]])
+def test_perfect_scores_have_intervals(values):
+    """A zero is drawn at the edge of the logarithmic axis."""
+    rows = [charts.Series("one", 0, np.array([value, value, value])) for value in values]
+    places = [float(mark.get("cx")) for mark in ElementTree.fromstring(charts.intervals(rows, "ẽ_c")).findall("circle")]
+    assert np.isfinite(places).all() and (np.array(places) <= charts.WIDTH).all()
 
 
 def test_other_seeds_do_not_take_the_snapshots_away(made, monkeypatch):

@@ -130,7 +130,9 @@ def test_from_a_file_to_the_boards_by_command(tmp_path):
     assert eitbench("submit", "--baseline", "homogeneous", *common)[0] == 0
     assert eitbench("submit", "--policy", "random_pair", "--env", INJECTION, "--seeds", "test:0", "-j", "1")[0] == 0
     code, said, _ = eitbench("leaderboard", "--records", "leaderboards/results")
-    assert said.splitlines() == [f"wrote leaderboards/leaderboard.{kind}" for kind in ("csv", "md")]
+    assert said.splitlines() == [f"wrote leaderboards/{name}" for name in (
+        "leaderboard.csv", "leaderboard.md", "site/index.html")]
+    assert "Mine" in (tmp_path / "leaderboards" / "site" / "methods" / "mine.html").read_text(encoding="utf-8")
     text = (tmp_path / "leaderboards" / "leaderboard.md").read_text(encoding="utf-8")
     assert re.search(r"\| 1 +\| Mine \(mine \w{8}\) +\| self-reported \|", text)
     assert "## injection" in text and "| floor |" in text

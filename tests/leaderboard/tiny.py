@@ -100,3 +100,25 @@ def record(method: str, errors: dict[str, float | None] | list[float | None], *,
         "privileged": False, "official": False, "method_sha256": sha(method + version), "checkpoint_sha256": None,
         "source": sha(source), "split": split_of(next(iter(errors))), "seeds": list(errors), "runs": [RUN],
         "episodes": episodes} | changes)
+
+
+def several_boards() -> list[dict]:
+    """As real ones may be: three worlds, floors, a reference, shared ranks, a failure, an outdated one, odd names."""
+    tank, floor = "eitbench/RotatingTank2D-v0", [0.20, 0.24, 0.22, 0.26, 0.18, 0.30, 0.25, 0.21]
+
+    def of(factor: float) -> list[float]:
+        return [factor * error * (1 + 0.05 * (-1) ** i) for i, error in enumerate(floor)]
+
+    claims = {"coverage_50": 0.4, "coverage_90": 0.8, "spread_ratio": 0.7, "nis": 1.2}
+    records = [record("homogeneous", floor, role="floor", official=True),
+               record("homogeneous", floor, id=tank, role="floor", official=True),
+               record("random_pair", floor, board="injection", role="floor", scores={"spent": 40})]
+    for id in (BOARD_IDS["filter"], tank):
+        records += [record("a", of(0.5), id=id, scores=claims | {"seconds_per_step": 0.02}),
+                    record("twin", of(0.5), id=id, scores={"seconds_per_step": 0.05}, official=True)]
+    return [*records, record("b", of(0.7), scores={"seconds_per_step": 0.004}, parameters={"window": 3}),
+            record("failing", [*of(0.6)[:7], None]), record("seer", of(0.1), role="reference", privileged=True),
+            record("a", of(0.45), source="old", version="0", finished="2020-01-01"),
+            record("<i>\"odd\"", of(0.8), title="Odd <script>alert(1)</script> & | \"co\"", runs=[RUN | {
+                "command": "eitbench submit --baseline '<b>it' --env x"}]),
+            record("greedy_a", of(0.4), board="injection", scores={"spent": 30})]
