@@ -1,9 +1,8 @@
-"""The command line: `eitbench list | run | bank | train | policies | submit | leaderboard | compare | render |
-reproduce`."""
+"""The command line: `eitbench list | run | bank | train | policies | submit | verify | held-out | leaderboard |
+compare | render | reproduce`."""
 
 from __future__ import annotations
 
-import os
 import re
 import shlex
 import sys
@@ -13,6 +12,8 @@ from typing import Annotated, Any
 
 import typer
 
+from eitbench._cli_options import CORES, Backend, Isolate, Isolation, Jobs, Out, clear_errors
+from eitbench._cli_trust import held_out, verify
 from eitbench.leaderboard.figures import FIGURES  # names only; matplotlib comes when one is drawn
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, context_settings={
@@ -44,10 +45,7 @@ class Algorithm(StrEnum):
 Figure = StrEnum("Figure", {re.sub(r"\W", "_", name).upper(): name for name in FIGURES})  # type: ignore[misc]
 
 
-Out = Annotated[Path, typer.Option("--out", "-o", help="Folder of the results.")]
-Jobs = Annotated[int, typer.Option("--jobs", "-j", min=1, help="Processes; each takes a core and 1 to 4 GB.")]
 RECORDS = Path("leaderboards/results")
-CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @app.command("list")
@@ -83,7 +81,11 @@ def run(
     baseline: Annotated[list[str] | None, typer.Option(
         help="Name of one of ours, or the path of your own .py file; may be repeated. Default: all of ours.")] = None,
     seeds: Annotated[str | None, typer.Option(help="Episodes, as in dev:0-9 or test:3. Default: the suite's.")] = None,
+    isolate: Isolate = Isolation.others,
     jobs: Jobs = CORES,
+    backend: Annotated[Backend, typer.Option(
+        help="Who starts the processes: loky on this machine; ray or dask (extra cluster) on the machines of one.")] = (
+            Backend.loky),
     out: Out = Path("results"),
 ) -> None:
     """Run baselines on environments, print the table and write the page.
@@ -94,9 +96,10 @@ def run(
     from eitbench.leaderboard.run import run_jobs
     from eitbench.leaderboard.store import EpisodeStore
     from eitbench.seeds import parse_seeds
-    with _clear_errors():
-        todo = suites.jobs(suite.value, env or [], baseline or [], None if seeds is None else parse_seeds(seeds))
-    run_jobs(todo, EpisodeStore(out), n_jobs=jobs, command=_command())
+    with clear_errors():
+        todo = suites.jobs(suite.value, env or [], baseline or [], None if seeds is None else parse_seeds(seeds),
+                           isolate=isolate)
+        run_jobs(todo, EpisodeStore(out), n_jobs=jobs, backend=backend, command=_command())
     _report(out)
 
 
@@ -116,7 +119,7 @@ def bank(
     from eitbench.envs import scenario_of
     from eitbench.episodes import folder
     from eitbench.seeds import parse_seeds
-    with _clear_errors():
+    with clear_errors():
         numbers, scenario = parse_seeds(seeds), scenario_of(env)
     place, each = folder(scenario), recording_bytes(scenario)
     try:
@@ -149,7 +152,7 @@ def train(
     evaluations.npz (scores on dev episodes) and logs for TensorBoard.
     """
     from dataclasses import replace
-    with _clear_errors():
+    with clear_errors():
         from eitbench import training
         asked = training.read_config(config)
         folder = out or Path("results/training") / env.replace("/", "-") / algo.value / f"seed{seed}"
@@ -167,6 +170,7 @@ def policies(
     seeds: Annotated[str, typer.Option(help="Episodes, such as dev:0-49 or test:0-49.")] = "test:0-49",
     estimator: Annotated[str, typer.Option(help="full: the exact filter, for scores; reduced: that of training.")] = (
         "full"),
+    isolate: Isolate = Isolation.others,
     jobs: Jobs = CORES,
     out: Out = Path("results"),
 ) -> None:
@@ -174,17 +178,17 @@ def policies(
 
     Each episode is stored the moment it is done; the same command again resumes.
     """
-    from eitbench.leaderboard.policies import load_policy
     from eitbench.leaderboard.policy_table import policy_rows, policy_table
     from eitbench.leaderboard.run import run_jobs
     from eitbench.leaderboard.store import EpisodeStore
     from eitbench.leaderboard.suites import policy_jobs
     from eitbench.seeds import parse_seeds
-    with _clear_errors():
-        todo = policy_jobs([env], policy or [], parse_seeds(seeds), estimator)
+    with clear_errors():
+        todo = policy_jobs([env], policy or [], parse_seeds(seeds), estimator, isolate=isolate)
     store = EpisodeStore(out)
-    run_jobs(todo, store, n_jobs=jobs, command=_command())
-    asked = {load_policy(job.method).name: load_policy(job.method).privileged for job in todo}
+    with clear_errors():
+        run_jobs(todo, store, n_jobs=jobs, command=_command())
+    asked = {job.load().name: getattr(job.load(), "privileged", False) for job in todo}
     typer.echo(policy_table(policy_rows(todo, store), [name for name, privileged in asked.items() if privileged]))
     _say_failures([record for record in store.write_records()
                    if record["method"] in asked and record["environment"]["id"] == env])
@@ -198,6 +202,7 @@ def submit(
         help="The same of an injection policy, or the path of a trained agent's model.zip.")] = None,
     seeds: Annotated[str | None, typer.Option(help="Test episodes, as in test:0-9. Default: the full suite's.")] = None,
     official: Annotated[bool, typer.Option("--official", help="For maintainers: a run of theirs.")] = False,
+    isolate: Isolate = Isolation.others,
     jobs: Jobs = CORES,
     out: Out = Path("results"),
     to: Annotated[Path, typer.Option(help="Folder of the records.")] = RECORDS,
@@ -210,16 +215,21 @@ def submit(
     from eitbench.leaderboard.store import EpisodeStore
     from eitbench.leaderboard.submit import submit
     from eitbench.seeds import parse_seeds
-    with _clear_errors():
+    with clear_errors():
         method = baseline or policy
         if method is None or (baseline and policy):
             raise ValueError("either --baseline or --policy must be given, and one of them only")
         paths = submit(method, env, None if seeds is None else parse_seeds(seeds), EpisodeStore(out), to,
-                       policy=policy is not None, official=official, n_jobs=jobs, command=_command())
+                       policy=policy is not None, official=official, isolate=isolate, n_jobs=jobs,
+                       command=_command())
     for path in paths:
         record = read_record(path)
         failed = sum(episode["status"] != "ok" for episode in record["episodes"])
         typer.echo(f"wrote {path}: {len(record['seeds'])} episodes" + (f", {failed} failed" if failed else ""))
+
+
+app.command()(verify)
+app.command("held-out")(held_out)
 
 
 @app.command()
@@ -237,7 +247,7 @@ def leaderboard(
     from eitbench.leaderboard.records import read_records
     from eitbench.leaderboard.site import read_media, render_site, write_site
     beside = records.parent
-    with _clear_errors():
+    with clear_errors():
         found = read_records(records)
         table = boards(found)
     for name, text in render(found, table).items():
@@ -257,7 +267,7 @@ def compare(
     """Compare two methods seed by seed: differences with intervals, and how often the first is better."""
     from eitbench._files import write_atomically
     from eitbench.leaderboard import compare as comparison
-    with _clear_errors():
+    with clear_errors():
         ours, theirs = (comparison.find(name, records) for name in (a, b))
         table = comparison.compare(ours, theirs)
     names = comparison.names(ours[0], theirs[0])
@@ -278,7 +288,7 @@ def render(
 ) -> None:
     """Draw an episode: truth, estimate, its spread, electrodes and the injected pair."""
     from eitbench.leaderboard.animate import animate
-    with _clear_errors():
+    with clear_errors():
         typer.echo(f"wrote {animate(env, baseline, seed, step, out)}")
 
 
@@ -291,7 +301,7 @@ def reproduce(
 ) -> None:
     """Draw a figure of the thesis from our data, and say what agrees and what differs."""
     from eitbench.seeds import parse_seeds
-    with _clear_errors():
+    with clear_errors():
         numbers = parse_seeds(seeds)
     path, remark = FIGURES[name.value](numbers, jobs, out)
     typer.echo(f"wrote {path}\n{remark}")
@@ -324,17 +334,6 @@ def _say_failures(records: list[dict[str, Any]]) -> None:
         for episode in record["episodes"]:
             if episode["status"] != "ok":
                 typer.echo(f"failed: {record['method']} on {episode['seed']}: {episode['message']}", err=True)
-
-
-class _clear_errors:
-    """Turn a ValueError about an argument into a message instead of a traceback."""
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, kind: type | None, error: BaseException | None, _: object) -> None:
-        if isinstance(error, ValueError):
-            raise typer.BadParameter(str(error)) from error
 
 
 if __name__ == "__main__":

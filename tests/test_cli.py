@@ -18,7 +18,8 @@ from eitbench.leaderboard.baselines import own_baselines
 from eitbench.seeds import parse_seeds
 
 PIPE = "eitbench/Pipe2D-v0"
-COMMANDS = ("list", "run", "bank", "train", "policies", "submit", "leaderboard", "compare", "render", "reproduce")
+COMMANDS = ("list", "run", "bank", "train", "policies", "submit", "verify", "held-out", "leaderboard", "compare",
+            "render", "reproduce")
 TINY = {"mean_velocity": 45.0, "scored_steps": 3, "electrodes_per_wall": 2, "frame": 2}
 """A fast fluid flushes the pipe in two steps: an episode of five takes a third of a second."""
 

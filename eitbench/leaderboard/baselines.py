@@ -56,6 +56,22 @@ def own_baselines() -> list[str]:
     return sorted(path.stem for path in baseline_folder().glob("*.py"))
 
 
+def is_ours(name: str) -> bool:
+    """Whether a method, by name or by path, is one of ours: it lies in our folder."""
+    return not name.endswith((".py", ".zip")) or Path(name).resolve().is_relative_to(baseline_folder().resolve())
+
+
+def find_baseline(name: str) -> Path:
+    """The file of one of our baselines by name, or anybody's by its path; ``ValueError`` if there is none, or it has
+    the name of another."""
+    path = Path(name) if name.endswith(".py") else baseline_folder() / f"{name}.py"
+    if not path.is_file():
+        raise ValueError(f"baseline must be a path to a .py file or one of {', '.join(own_baselines())}; got {name!r}")
+    if path.stem in own_baselines() and not path.samefile(baseline_folder() / path.name):
+        raise ValueError(f"baseline {path} has the name of one of ours, under which results are kept; rename it")
+    return path
+
+
 def load_baseline(name: str) -> Baseline:
     """Load one of our baselines by name, or anybody's by the path of its file.
 
@@ -64,11 +80,7 @@ def load_baseline(name: str) -> Baseline:
     ValueError
         If there is no such baseline, or its file has no class `Estimator` with an `update` method.
     """
-    path = Path(name) if name.endswith(".py") else baseline_folder() / f"{name}.py"
-    if not path.is_file():
-        raise ValueError(f"baseline must be a path to a .py file or one of {', '.join(own_baselines())}; got {name!r}")
-    if path.stem in own_baselines() and not path.samefile(baseline_folder() / path.name):
-        raise ValueError(f"baseline {path} has the name of one of ours, under which results are kept; rename it")
+    path = find_baseline(name)
     return _load(path, path.read_bytes())
 
 

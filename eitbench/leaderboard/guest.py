@@ -27,6 +27,7 @@ def main() -> None:
     silent = os.open(os.devnull, os.O_RDWR)
     os.dup2(silent, 0)
     os.dup2(2, 1)                                                      # what the guest prints is no answer
+    wall.end_with_parent()
     wall.limit_memory(memory)
     closed = wall.close_files(wall.python_files(), [private, Path(os.devnull)])
 
@@ -49,8 +50,8 @@ def main() -> None:
             return
         try:
             if words["do"] == "play":
-                answer = _player(words)
-                say({})
+                answer, about = _player(words)
+                say(about)
             else:
                 say(*answer(words, arrays))
         except (Exception, SystemExit) as error:
@@ -61,15 +62,25 @@ def _nothing(words: dict[str, Any], arrays: dict[str, np.ndarray]) -> Reply:
     raise ValueError("the first message must be 'play'")
 
 
-def _player(words: dict[str, Any]) -> Callable[..., Reply]:
+def _player(words: dict[str, Any]) -> tuple[Callable[..., Reply], dict[str, Any]]:
+    """What answers from now on, and what the method says of itself."""
     import gymnasium as gym
-    env = gym.make(words["id"], disable_env_checker=True, **words["kwargs"]).unwrapped
-    return _estimator(env, words["name"]) if words["kind"] == "estimator" else _policy(env, words["name"])
+    env: Any = gym.make(words["id"], disable_env_checker=True, **words["kwargs"]).unwrapped
+    about: dict[str, Any]
+    loaded: Any
+    if words["kind"] == "estimator":
+        from eitbench.leaderboard.baselines import load_baseline
+        loaded = baseline = load_baseline(words["name"])
+        answer, about = _estimator(env.task, baseline), {"boards": baseline.boards, "suits": baseline.suits(env.task)}
+    else:
+        from eitbench.leaderboard.policies import load_policy
+        loaded = policy = load_policy(words["name"])
+        answer, about = _policy(env.rules, policy), {"privileged": policy.privileged, "suits": policy.suits(env.rules)}
+    return answer, about | {name: getattr(loaded, name) for name in ("name", "title", "parameters", "role")}
 
 
-def _estimator(env: Any, name: str) -> Callable[..., Reply]:
-    from eitbench.leaderboard.baselines import load_baseline
-    baseline, task, estimator = load_baseline(name), env.task, None
+def _estimator(task: Any, baseline: Any) -> Callable[..., Reply]:
+    estimator = None
 
     def answer(words: dict[str, Any], arrays: dict[str, np.ndarray]) -> Reply:
         nonlocal estimator
@@ -88,9 +99,8 @@ def _estimator(env: Any, name: str) -> Callable[..., Reply]:
     return answer
 
 
-def _policy(env: Any, name: str) -> Callable[..., Reply]:
-    from eitbench.leaderboard.policies import load_policy
-    policy, rules, player = load_policy(name), env.rules, None
+def _policy(rules: Any, policy: Any) -> Callable[..., Reply]:
+    player = None
 
     def answer(words: dict[str, Any], arrays: dict[str, np.ndarray]) -> Reply:
         nonlocal player

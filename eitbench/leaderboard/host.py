@@ -26,6 +26,8 @@ MEMORY = 8 << 30
 """bytes of address space that a guest may take"""
 PATIENCE = 120.0
 """s that an answer may take; the first after an episode began may hold all preparations"""
+MODELS = ("outline.npz", "region.npz", "reduced-*.npz", "joint-*.npz")
+"""What the cache holds of a scenario, made without any episode; the files of an episode begin with its seed."""
 ARITHMETIC = ("OPENBLAS_", "MKL_", "OMP_", "NPY_", "NUMBA_CPU")
 """Variables on which the last bits of numbers depend begin so."""
 
@@ -56,6 +58,8 @@ class Guest:
     def __init__(self, kind: str, id: str, kwargs: dict[str, Any], name: str, *, memory: int = MEMORY,
                  patience: float = PATIENCE) -> None:
         self._patience = patience
+        self.sha256 = ""
+        """Of the file that was copied; empty for one of ours."""
         self._private = Path(tempfile.mkdtemp(prefix="eitbench-guest-"))
         self._process = subprocess.Popen(
             [sys.executable, "-m", "eitbench.leaderboard.guest", str(self._private), str(memory)],
@@ -63,7 +67,9 @@ class Guest:
         try:
             self.closed = bool(self._receive()[0]["closed"])
             """Whether files are out of its reach."""
-            self._ask({"do": "play", "kind": kind, "id": id, "kwargs": kwargs, "name": self._copied(name)})
+            self.about = self._ask({"do": "play", "kind": kind, "id": id, "kwargs": kwargs,
+                                    "name": self._copied(name)})[0]
+            """What the method's class says of itself: unchecked words of a stranger."""
         except BaseException:
             self.close()
             raise
@@ -73,19 +79,28 @@ class Guest:
         self._ask({"do": "begin", "random": random})
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Any:
-        """What the estimator makes of a measurement: an `Estimate`, None, or the name of what it is instead."""
+        """What the estimator makes of a measurement: an `Estimate` or None."""
         from eitbench.task import Estimate
         words, arrays = self._ask({"do": "update"}, {"voltages": voltages, "currents": currents})
-        if words.get("estimate") != "Estimate":
-            return words.get("estimate")
+        if words.get("estimate") is None:
+            return None
+        if words["estimate"] != "Estimate":
+            raise GuestError("ValueError: Estimator.update must return an Estimate or None, got "
+                             f"{_plain(words['estimate'])}")
         if not {"mean"} <= set(arrays) <= set(Estimate._fields):
-            raise GuestError(f"ValueError: Estimator.update must return an Estimate, got one of {', '.join(arrays)}")
+            raise GuestError(f"ValueError: Estimator.update must return an Estimate, got one of "
+                             f"{_plain(', '.join(arrays))}")
         return Estimate(**arrays)
 
     def act(self, observation: dict[str, np.ndarray]) -> Any:
         """The policy's action."""
         action = self._ask({"do": "act"}, observation)[1].get("action", np.zeros(0))
         return int(action) if action.shape == () and action.dtype.kind in "iu" else action
+
+    @property
+    def alive(self) -> bool:
+        """Whether it can be asked: not after a crash, nonsense, or an answer that did not come in time."""
+        return self._process.poll() is None
 
     @property
     def peak_memory(self) -> int | None:
@@ -119,7 +134,7 @@ class Guest:
         cache, kernels = self._private / "cache", self._private / "kernels"
         there = folder(scenario_of(id, kwargs))
         (cache / there.name).mkdir(parents=True)
-        for model in (*there.glob("reduced-*.npz"), *there.glob("outline.npz")):
+        for model in (path for pattern in MODELS for path in there.glob(pattern)):
             shutil.copy(model, cache / there.name)
         _copy_kernels(kernels)
         package = Path(__file__).parents[2]
@@ -137,7 +152,9 @@ class Guest:
         place.mkdir()
         beside: Sequence[str] = ("config.json", "sha256") if path.suffix == ".zip" else ()
         for each in (path, *(path.with_name(other) for other in beside)):
-            shutil.copy(each, place)
+            if each.exists():
+                shutil.copy(each, place)
+        self.sha256 = hashlib.sha256((place / path.name).read_bytes()).hexdigest()
         return str(place / path.name)
 
     def _ask(self, words: dict[str, Any], arrays: dict[str, np.ndarray] | None = None,
@@ -148,10 +165,15 @@ class Guest:
             self._process.stdin.flush()
         except BrokenPipeError:
             raise self._ended() from None
-        answer = self._receive()
+        try:
+            answer = self._receive()
+        except BaseException:                          # whatever it says from now on would answer another question
+            self._process.kill()
+            self._process.wait()
+            raise
         if "error" in answer[0]:
-            error = GuestError(str(answer[0]["error"]))
-            error.where = str(answer[0].get("where"))
+            error = GuestError(_plain(answer[0]["error"]).replace(f"{self._private}{os.sep}own{os.sep}", ""))
+            error.where = _plain(answer[0].get("where"))
             raise error
         return answer
 
@@ -179,6 +201,11 @@ class Guest:
     def _ended(self) -> GuestError:
         return GuestError(f"ChildProcessError: its process ended with status {self._process.wait()}, which is what a "
                           "crash does, or a limit of memory")
+
+
+def _plain(said: Any) -> str:
+    """What a guest said, as text that can be kept anywhere."""
+    return str(said)[:2000]
 
 
 def _copy_kernels(place: Path) -> None:

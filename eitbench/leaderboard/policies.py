@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -34,7 +34,7 @@ class PolicyFile(NamedTuple):
     sha256: str
     privileged: bool    # shown the truth: a bound for the others, not one of them
     parameters: dict[str, Any]
-    policy: type[Any]
+    policy: Callable[..., Any]
     """Policy(rules, random), if privileged Policy(rules, random, core), with act(observation) -> action."""
     role: str | None = None
     """One of `ROLES`, as of baselines."""
@@ -64,6 +64,17 @@ def own_agents(env_id: str) -> list[str]:
     return [str(path) for path in sorted(folder.glob("*/seed*/model.zip"))]
 
 
+def find_policy(name: str) -> Path:
+    """The file of a policy that `load_policy` loads; ``ValueError`` if there is none, or it has the name of another."""
+    path = Path(name) if name.endswith((".py", ".zip")) else policy_folder() / f"{name}.py"
+    if not path.is_file():
+        raise ValueError("policy must be the path of a .py file or of an agent's model.zip, or one of "
+                         f"{', '.join(own_policies())}; got {name!r}")
+    if path.stem in own_policies() and not path.samefile(policy_folder() / path.name):
+        raise ValueError(f"policy {path} has the name of one of ours, under which results are kept; rename it")
+    return path
+
+
 def load_policy(name: str) -> PolicyFile:
     """Load one of our policies by name, anybody's by the path of its file, or a trained agent by that of its model.zip.
 
@@ -73,12 +84,7 @@ def load_policy(name: str) -> PolicyFile:
         If there is no such policy, its file has no class `Policy` with an `act` method, or an agent's file is not the
         one that was left by training.
     """
-    path = Path(name) if name.endswith((".py", ".zip")) else policy_folder() / f"{name}.py"
-    if not path.is_file():
-        raise ValueError("policy must be the path of a .py file or of an agent's model.zip, or one of "
-                         f"{', '.join(own_policies())}; got {name!r}")
-    if path.stem in own_policies() and not path.samefile(policy_folder() / path.name):
-        raise ValueError(f"policy {path} has the name of one of ours, under which results are kept; rename it")
+    path = find_policy(name)
     return _load(path, path.read_bytes())
 
 
@@ -101,26 +107,16 @@ def _load(path: Path, source: bytes) -> PolicyFile:
                       parameters_of(who, policy), policy, role_of(who, policy))
 
 
-def suited(env_id: str, names: Sequence[str], *, demanded: bool) -> list[str]:
-    """Those of the policies that suit an environment; where they are ``demanded``, ``ValueError`` if one does not."""
-    rules, chosen = environment(env_id, "{}", "reduced").rules, []
-    for name in names:
-        if load_policy(name).suits(rules):
-            chosen.append(name)
-        elif demanded:
-            raise ValueError(f"policy {load_policy(name).name} does not suit {env_id}")
-    return chosen
-
-
-def play(env_id: str, kwargs: dict[str, Any], policy: str, seed: int, estimator: str = "full") -> dict[str, Any]:
+def play(env_id: str, kwargs: dict[str, Any], policy: str | PolicyFile, seed: int,
+         estimator: str = "full") -> dict[str, Any]:
     """Play one episode.
 
     Parameters
     ----------
     env_id, kwargs
         One of `INJECTION`, and arguments for it.
-    policy : str
-        Name or path.
+    policy : str or PolicyFile
+        Name or path, or what was loaded.
     estimator : "full" or "reduced"
         The exact filter, for scores, or the one of training.
 
@@ -135,7 +131,8 @@ def play(env_id: str, kwargs: dict[str, Any], policy: str, seed: int, estimator:
     ValueError
         If there is no such environment or policy, or the policy does not suit it or acts wrongly.
     """
-    env, loaded = environment(env_id, json.dumps(kwargs), estimator), load_policy(policy)
+    env = environment(env_id, json.dumps(kwargs), estimator)
+    loaded = policy if isinstance(policy, PolicyFile) else load_policy(policy)
     if not loaded.suits(env.rules):
         raise ValueError(f"policy {loaded.name} does not suit {env_id}")
     observation, done = env.reset(seed=seed)[0], False

@@ -25,10 +25,12 @@ from eitbench.envs import ENTRY_POINTS, INJECTION
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.injection import InjectionEnv
 from eitbench.episodes import simulate
-from eitbench.leaderboard import policies
+from eitbench.leaderboard import guests, policies
 from eitbench.leaderboard.baselines import BOARDS, Baseline, load_baseline
+from eitbench.leaderboard.host import GuestError
 from eitbench.leaderboard.score import Played, score
 from eitbench.leaderboard.store import EpisodeStore, provenance, source_digest
+from eitbench.leaderboard.wall import landlock_version
 from eitbench.seeds import name_seed
 from eitbench.task import Estimate, Task
 
@@ -63,10 +65,23 @@ class Job(NamedTuple):
     method: str
     """Name or path: of a baseline or, in an environment that asks for injections, of a policy."""
     seed: int
+    isolated: bool = False
+    """Whether the method runs in a process of its own, which is all that ever executes its file."""
 
     def load(self) -> Baseline | policies.PolicyFile:
         """The method's file."""
+        if self.isolated:
+            kind = "policy" if self.environment.id in INJECTION else "estimator"
+            spec = _environment(self.environment).spec
+            assert spec is not None
+            kwargs = spec.kwargs | ({"estimator": "none"} if kind == "policy" else {})        # it needs the rules only
+            return guests.load(kind, self.environment.id, json.dumps(kwargs), self.method)
         return (policies.load_policy if self.environment.id in INJECTION else load_baseline)(self.method)
+
+    @property
+    def isolation(self) -> str:
+        """What keeps the method from what it should not see: ``none``, a ``process``, or ``landlock`` around it."""
+        return "none" if not self.isolated else "landlock" if landlock_version() else "process"
 
     def identity(self) -> str:
         """What the outcome depends on; a stored result counts only for the very same."""
@@ -180,22 +195,27 @@ def run_episode(job: Job) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
                 played = play_and_collect(env, method, job.seed)
                 outcome, fields = score(env, played), played.fields()
             else:
-                outcome = _play_policy(job)
+                outcome = _play_policy(job, method)
         for name, value in outcome["scores"].items():
             _check.number(f"score {name}", value or 0.0)
         result |= {"status": "ok", **outcome}
+    except GuestError as error:
+        result |= {"status": "failed", "message": str(error), "where": error.where}
     except (Exception, SystemExit) as error:        # whatever a method does wrong is its result, not our crash
         result |= {"status": "failed", "message": f"{type(error).__name__}: {error}",
                    "where": _where(error)}
+    if result["status"] == "failed":
         fields = {}
+    if job.isolated:
+        result["peak_memory"] = guests.peak_memory()
     result["finished"] = datetime.now(UTC).isoformat(timespec="microseconds")
     result["seconds"] = time.perf_counter() - begin
     return result, fields
 
 
-def _play_policy(job: Job) -> dict[str, Any]:
+def _play_policy(job: Job, policy: policies.PolicyFile) -> dict[str, Any]:
     kwargs, estimator = _inside(job.environment)
-    played = policies.play(job.environment.id, kwargs, job.method, job.seed, estimator)
+    played = policies.play(job.environment.id, kwargs, policy, job.seed, estimator)
     return {"scores": {name: played[name] for name in ("error", "spent", "seconds_per_step")},
             "step_errors": played["errors"]}
 
@@ -206,10 +226,13 @@ def _where(error: BaseException) -> str:
     return f"{Path(last.filename).name}:{last.lineno}"
 
 
-def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1, command: str = "") -> None:
+def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1, backend: str = "loky",
+             command: str = "") -> None:
     """Run all jobs that ``store`` does not hold yet, in ``n_jobs`` processes with one BLAS thread each.
 
-    ``command`` is what the results will name as the command that made them.
+    Each process stores an episode the moment it is done. ``backend`` is one of `eitbench._parallel.BACKENDS`, of which
+    those of a cluster need the folders of ``store`` and cache on all its machines; ``command`` is what the results will
+    name as the command that made them. Errors as `eitbench._parallel.in_parallel`.
     """
     todo = [job for job in jobs
             if not store.holds(job.environment.name, job.load().name, job.seed, job.identity())]
@@ -228,10 +251,15 @@ def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1, command: 
     for scenario, seeds in recordings.items():
         fill(scenario, seeds, n_jobs=n_jobs)
     run = {"command": command, **provenance()}
-    for function, work, label in ((_simulate_job, [(job,) for job in truths.values()], "simulating truths"),
-                                  (_run_job, [(job, store, run) for job in todo], "running methods")):
-        for _ in tqdm(in_parallel(function, work, n_jobs), total=len(work), desc=label, unit="episode", disable=None):
-            pass
+    guests.close()                                  # that of `Job.load`; the workers have their own
+    try:
+        for function, work, label in ((_simulate_job, [(job,) for job in truths.values()], "simulating truths"),
+                                      (_run_job, [(job, store, run) for job in todo], "running methods")):
+            for _ in tqdm(in_parallel(function, work, n_jobs, backend), total=len(work), desc=label, unit="episode",
+                          disable=None):
+                pass
+    finally:
+        guests.close()
 
 
 def _simulate_job(job: Job) -> None:
@@ -240,7 +268,8 @@ def _simulate_job(job: Job) -> None:
 
 def _run_job(job: Job, store: EpisodeStore, run: dict[str, Any]) -> None:
     result, fields = run_episode(job)
-    store.put(job.environment.name, result["method"], job.seed, result | {"run": run}, fields)
+    store.put(job.environment.name, result["method"], job.seed, result | {"run": run | {"isolation": job.isolation}},
+              fields)
 
 
 @lru_cache(maxsize=4)

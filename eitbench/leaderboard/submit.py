@@ -12,7 +12,8 @@ from eitbench.seeds import name_seed
 
 
 def submit(method: str, environments: list[str], seeds: list[int] | None, store: EpisodeStore, to: Path, *,
-           policy: bool = False, official: bool = False, n_jobs: int = 1, command: str = "") -> list[Path]:
+           policy: bool = False, official: bool = False, isolate: str = "others", n_jobs: int = 1,
+           command: str = "") -> list[Path]:
     """Play what ``store`` does not hold yet, and write one record for each environment into the folder ``to``.
 
     Parameters
@@ -23,6 +24,8 @@ def submit(method: str, environments: list[str], seeds: list[int] | None, store:
         Of the test split; default: those of the full suite.
     official : bool
         Whether a maintainer runs it; else the records say that they are self-reported.
+    isolate : str
+        Whether the method runs in a process of its own; one of `suites.ISOLATE`.
 
     Returns
     -------
@@ -41,8 +44,8 @@ def submit(method: str, environments: list[str], seeds: list[int] | None, store:
         raise ValueError(f"seeds of a submission must be of the test split, got {', '.join(outside)}")
     if not environments:
         raise ValueError("env must name at least one environment to submit for")
-    jobs = (suites.policy_jobs(environments, [method], seeds) if policy
-            else suites.jobs("full", environments, [method], seeds))
+    jobs = (suites.policy_jobs(environments, [method], seeds, isolate=isolate) if policy
+            else suites.jobs("full", environments, [method], seeds, isolate=isolate))
     played = {job.environment.id for job in jobs}
     if left := [name for name in environments if name not in played]:
         raise ValueError(f"{method} does not play {', '.join(left)}")

@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from eitbench.envs import ESTIMATION
+from eitbench.envs import ESTIMATION, INJECTION
 from eitbench.envs.estimation import EstimationEnv
-from eitbench.leaderboard.baselines import load_baseline, own_baselines
-from eitbench.leaderboard.policies import load_policy, own_agents, own_policies, suited
+from eitbench.leaderboard.baselines import Baseline, find_baseline, is_ours, own_baselines
+from eitbench.leaderboard.policies import environment as injection_environment
+from eitbench.leaderboard.policies import find_policy, load_policy, own_agents, own_policies
 from eitbench.leaderboard.run import Environment, Job, board_of
 from eitbench.seeds import parse_seeds
 
@@ -20,19 +21,23 @@ FEWER_SEEDS = {"velocity": "test:0-3", "3d": "test:0-2"}
 """In the full suite, where an episode takes a minute a method and more: with the flow asked for too, and in 3D."""
 # An image at every step: minutes an episode, for what the frame-wise images of the other boards show as well.
 TOO_SLOW_FOR_QUICK = {("filter", "gauss_newton")}
+ISOLATE = ("never", "others", "always")
+"""Whose methods run in a process of their own."""
 
 
-def jobs(suite: str, environments: list[str], baselines: list[str], seeds: list[int] | None = None) -> list[Job]:
+def jobs(suite: str, environments: list[str], baselines: list[str], seeds: list[int] | None = None, *,
+         isolate: str = "others") -> list[Job]:
     """Every named baseline (default: all of ours) on every named environment (default: the suite's), on ``seeds``
-    (default: the suite's).
+    (default: the suite's), ordered by environment, method and seed. ``isolate`` is one of `ISOLATE`.
 
     Raises
     ------
     ValueError
         If an environment is not registered, a baseline does not exist, or no pair of them fits.
     """
-    _distinct({baseline: load_baseline(baseline).name for baseline in baselines})
-    todo = []
+    for baseline in baselines:
+        find_baseline(baseline)
+    todo, names = [], dict[str, str]()
     for name in environments or (QUICK if suite == "quick" else ESTIMATION):
         environment = Environment(name)
         env = environment.make()
@@ -40,15 +45,19 @@ def jobs(suite: str, environments: list[str], baselines: list[str], seeds: list[
         numbers = seeds
         if numbers is None:
             numbers = parse_seeds(FEWER_SEEDS[slow] if slow and suite == "full" else SEEDS[suite])
-        suited = []
-        for baseline in [_absolute(name) for name in baselines] or own_baselines():
+        suited = list[Job]()
+        for baseline in baselines or own_baselines():
             skipped = (suite == "quick" or slow or _like_pipe(name)) and not baselines and (
                 board, baseline) in TOO_SLOW_FOR_QUICK
-            loaded = load_baseline(baseline)
+            job = Job(environment, _absolute(baseline), 0, is_isolated(environment, baseline, isolate))
+            loaded = job.load()
+            assert isinstance(loaded, Baseline)
+            names[baseline] = loaded.name
             if board in loaded.boards and not skipped and loaded.suits(env.task):
-                suited.append(baseline)
-        # Environment by environment, since models are kept for a few only.
-        todo += [Job(environment, baseline, seed) for seed in numbers for baseline in suited]
+                suited.append(job)
+        # Environment by environment, since models are kept for a few only, and a guest for one method.
+        todo += [job._replace(seed=seed) for job in suited for seed in numbers]
+    _distinct(names)
     if not todo:
         raise ValueError(f"none of the baselines {', '.join(baselines)} plays any of the environments "
                          f"{', '.join(environments or QUICK)}; see `eitbench list`")
@@ -56,23 +65,44 @@ def jobs(suite: str, environments: list[str], baselines: list[str], seeds: list[
 
 
 def policy_jobs(environments: list[str], policies: list[str], seeds: list[int] | None = None,
-                estimator: str = "full") -> list[Job]:
+                estimator: str = "full", *, isolate: str = "others") -> list[Job]:
     """Every named policy (default: all of ours that suit, trained agents among them) in every named environment, on
-    ``seeds`` (default: `POLICY_SEEDS`), with this estimator inside.
+    ``seeds`` (default: `POLICY_SEEDS`), with this estimator inside. ``isolate`` is one of `ISOLATE`.
 
     Raises
     ------
     ValueError
         If an environment does not ask for injections, or a policy does not exist or suit one.
     """
-    _distinct({policy: load_policy(policy).name for policy in policies})
     if estimator not in ("full", "reduced"):
         raise ValueError(f"estimator must be 'full' or 'reduced', got {estimator!r}")
     numbers = parse_seeds(POLICY_SEEDS) if seeds is None else seeds
     kwargs = "{}" if estimator == "full" else json.dumps({"estimator": estimator})
-    return [Job(Environment(name, kwargs), _absolute(policy), seed) for name in environments
-            for policy in suited(name, policies or [*own_policies(), *own_agents(name)], demanded=bool(policies))
-            for seed in numbers]
+    for policy in policies:
+        find_policy(policy)
+    todo, names = [], dict[str, str]()
+    for id in environments:
+        environment, rules = Environment(id, kwargs), injection_environment(id, "{}", "reduced").rules
+        for policy in policies or [*own_policies(), *own_agents(id)]:
+            job = Job(environment, _absolute(policy), 0, is_isolated(environment, policy, isolate))
+            loaded = job.load()
+            assert not isinstance(loaded, Baseline)
+            names[policy] = loaded.name
+            if loaded.suits(rules):
+                todo += [job._replace(seed=seed) for seed in numbers]
+            elif policies:
+                raise ValueError(f"policy {loaded.name} does not suit {id}")
+    _distinct(names)
+    return todo
+
+
+def is_isolated(environment: Environment, method: str, isolate: str) -> bool:
+    """Whether a method plays in a process of its own; those of ours that are shown the truth never do."""
+    if isolate not in ISOLATE:
+        raise ValueError(f"isolate must be one of {', '.join(ISOLATE)}, got {isolate!r}")
+    if isolate != "always" or not is_ours(method):
+        return isolate != "never" and not is_ours(method)
+    return environment.id not in INJECTION or not load_policy(method).privileged
 
 
 def _distinct(names: dict[str, str]) -> None:

@@ -18,7 +18,7 @@ KINDS = "biuf"
 
 def pack(words: dict[str, Any], arrays: dict[str, np.ndarray] | None = None) -> bytes:
     """A message of JSON-ready ``words`` and numeric ``arrays``."""
-    made = {name: np.ascontiguousarray(array) for name, array in (arrays or {}).items()}
+    made = {name: np.asarray(array, order="C") for name, array in (arrays or {}).items()}
     head = json.dumps([words, [[name, array.dtype.str, array.shape] for name, array in made.items()]]).encode()
     body = b"".join(array.tobytes() for array in made.values())
     return struct.pack("<QQ", len(head), len(body)) + head + body
@@ -30,9 +30,10 @@ def unpack(read: Callable[[int], bytes]) -> tuple[dict[str, Any], dict[str, np.n
     if head + body > LARGEST:
         raise ValueError(f"a message must have at most {LARGEST} bytes, got {head + body}")
     try:
-        words, layout = json.loads(read(head))
+        words, layout = json.loads(read(head), parse_constant=_refuse)
+        json.dumps(words, ensure_ascii=False).encode()                 # half a character cannot be kept
         kinds = [(str(name), np.dtype(kind), tuple(int(n) for n in shape)) for name, kind, shape in layout]
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"a message must begin with JSON that names its arrays: {error}") from None
     content, at, arrays = read(body), 0, {}
     for name, kind, shape in kinds:
@@ -44,3 +45,7 @@ def unpack(read: Callable[[int], bytes]) -> tuple[dict[str, Any], dict[str, np.n
     if not isinstance(words, dict) or at != body:
         raise ValueError("a message must be a dictionary and its arrays, and nothing else")
     return words, arrays
+
+
+def _refuse(constant: str) -> None:
+    raise ValueError(f"{constant} is not JSON")

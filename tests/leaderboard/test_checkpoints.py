@@ -1,13 +1,16 @@
 """Our trained agents: each is whole, loads, and plays as it did when it was kept."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
 
 from eitbench.envs import INJECTION
+from eitbench.leaderboard import guests
 from eitbench.leaderboard.baselines import baseline_folder
 from eitbench.leaderboard.policies import load_policy, own_agents, play
+from eitbench.leaderboard.run import Environment, Job, run_episode
 
 FOLDER = baseline_folder() / "checkpoints"
 AGENTS = [path for env in INJECTION for path in own_agents(env)]
@@ -33,3 +36,17 @@ def test_an_agent_plays_as_it_did_when_it_was_kept(path):
     assert len((folder / "monitor.csv").read_text().splitlines()) > 100
     error = play(asked["env"], {}, path, FIRST, "reduced")["error"]
     np.testing.assert_allclose(error, kept["errors"][-1][0], rtol=0.02)
+
+
+@pytest.mark.skipif(not AGENTS, reason="needs the extra rl")
+def test_somebody_s_agent_plays_in_a_guest(tmp_path):
+    """A copy that lies elsewhere: unpickled in a process of its own, it does what it does here."""
+    folder = shutil.copytree(FOLDER.joinpath(*AGENTS[0].split("/")[-4:-1]), tmp_path / "theirs")
+    asked = json.loads((folder / "config.json").read_text())
+    job = Job(Environment(asked["env"], json.dumps({"estimator": "reduced"})), str(folder / "model.zip"), FIRST)
+    try:
+        here, there = (run_episode(job._replace(isolated=isolated))[0] for isolated in (False, True))
+    finally:
+        guests.close()
+    assert here["status"] == "ok" and here["step_errors"] == there["step_errors"]
+    assert here["checkpoint_sha256"] == there["checkpoint_sha256"] and there["peak_memory"] > 50e6

@@ -113,6 +113,7 @@ def test_the_digest_is_what_the_schema_says():
     ("environment.name", "eitbench-Pipe3D-v0", r"\$\.environment\.name: must begin with eitbench-Pipe2D-v0"),
     ("environment.kwargs", None, r"\$\.environment\.kwargs: None is not of type 'object'"),
     ("runs.0.commit", ..., r"\$\.runs\[0\]: 'commit' is a required property"),
+    ("runs.0.isolation", "jail", r"\$\.runs\[0\]\.isolation: 'jail' is not one of"),
     ("runs.0.versions.torch", ..., r"\$\.runs\[0\]\.versions: 'torch' is a required property"),
     ("runs.0.machine.matmul_seconds", 0.0, r"\$\.runs\[0\]\.machine\.matmul_seconds: 0.0 is less than"),
     ("runs.0.machine.processor", None, r"\$\.runs\[0\]\.machine\.processor: None is not of type 'string'"),

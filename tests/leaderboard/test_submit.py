@@ -50,14 +50,15 @@ def test_a_submission_is_a_record_an_environment(tmp_path):
     """Self-reported unless said otherwise; the same again plays nothing, and official is a matter of the flag."""
     log = tmp_path / "log"
     mine, store, to = write_baseline(tmp_path, init=counting(log)), EpisodeStore(tmp_path / "results"), tmp_path / "to"
-    paths = submit(mine, [FILTER.id, SMOOTHING.id], TEST, store, to, command="eitbench submit")
+    paths = submit(mine, [FILTER.id, SMOOTHING.id], TEST, store, to, isolate="never",
+                   command="eitbench submit")
     first, second = (read_record(path) for path in paths)
     assert (first["board"], second["board"]) == ("filter", "smoothing") and count(log) == 4
     assert first["seeds"] == ["test:0", "test:1"] and not first["official"] and first["split"] == "test"
     assert first["runs"][0]["command"] == "eitbench submit"
     assert first["runs"][0]["machine"]["matmul_seconds"] == store_module.matmul_seconds() > 0
     assert sorted(path.name for path in to.iterdir()) == sorted(path.name for path in paths)
-    again = submit(mine, [FILTER.id], TEST, store, to, official=True)
+    again = submit(mine, [FILTER.id], TEST, store, to, official=True, isolate="never")
     assert again == paths[:1] and count(log) == 4 and read_record(again[0])["official"]
     assert [record["official"] for record in read_records(to)] == [True, False]
 
@@ -65,7 +66,7 @@ def test_a_submission_is_a_record_an_environment(tmp_path):
 def test_failures_are_submitted_too(tmp_path):
     """Nothing is dropped: who fails in one episode has a record that says so."""
     fails = write_baseline(tmp_path, update="assert self.calls < 2, 'dry'\n        return Estimate(self.level)")
-    (path,) = submit(fails, [FILTER.id], TEST, EpisodeStore(tmp_path), tmp_path / "to")
+    (path,) = submit(fails, [FILTER.id], TEST, EpisodeStore(tmp_path), tmp_path / "to", isolate="never")
     episodes = read_record(path)["episodes"]
     assert [(e["status"], e["message"]) for e in episodes] == 2 * [("failed", "AssertionError: dry")]
     assert load(tmp_path / "to")["value"].isna().all() and len(load(tmp_path / "to")) == 2

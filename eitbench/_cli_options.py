@@ -1,0 +1,50 @@
+"""Options that several commands have, and how their mistakes are said."""
+
+from __future__ import annotations
+
+import os
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from eitbench._parallel import WorkerLost
+
+CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+Out = Annotated[Path, typer.Option("--out", "-o", help="Folder of the results.")]
+Jobs = Annotated[int, typer.Option("--jobs", "-j", min=1, help="Processes; each takes a core and 1 to 4 GB.")]
+
+
+class Backend(StrEnum):
+    """Who starts the processes."""
+
+    loky = "loky"
+    ray = "ray"
+    dask = "dask"
+
+
+class Isolation(StrEnum):
+    """Whose methods run in a process of their own."""
+
+    never = "never"
+    others = "others"
+    always = "always"
+
+
+Isolate = Annotated[Isolation, typer.Option(help="Whose methods run in a process of their own, out of reach of truths "
+                                                 "and files: those that are not ours, or all.")]
+
+
+class clear_errors:
+    """Turn a ValueError about an argument, or the loss of a process, into a message instead of a traceback."""
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: type | None, error: BaseException | None, _: object) -> None:
+        if isinstance(error, WorkerLost):
+            typer.echo(error, err=True)
+            raise typer.Exit(1) from error
+        if isinstance(error, ValueError):
+            raise typer.BadParameter(str(error)) from error

@@ -1,0 +1,70 @@
+"""The commands `verify` and `held-out`: whether a record is true."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from eitbench._cli_options import Isolate, Isolation, clear_errors
+
+
+def verify(
+    record: Annotated[Path, typer.Argument(help="A record's file.")],
+    baseline: Annotated[str | None, typer.Option(help="The method's file, if it is not one of ours.")] = None,
+    policy: Annotated[str | None, typer.Option(help="The same of an injection policy.")] = None,
+    episodes: Annotated[int, typer.Option(min=0, help="How many are played again.")] = 3,
+    seed: Annotated[int | None, typer.Option(min=0, help="By which they are drawn. Default: any.")] = None,
+    tolerance: Annotated[float, typer.Option(
+        min=0.0, help="Relative difference that is none; across machines 1e-3.")] = 1e-6,
+    isolate: Isolate = Isolation.always,
+    held_out: Annotated[int, typer.Option(
+        "--held-out", min=0, help="For maintainers: play so many held-out episodes too, and compare the errors.")] = 0,
+    salt_file: Annotated[Path | None, typer.Option(help="From which they follow; see `eitbench held-out`.")] = None,
+) -> None:
+    """Play episodes of a record again and say whether it is true: exit status 0 if so, 1 if not.
+
+    They are simulated anew, whatever the cache folder holds.
+    """
+    import secrets
+
+    from eitbench.leaderboard import held_out as beyond
+    from eitbench.leaderboard import verify as again
+    from eitbench.leaderboard.records import read_record
+    with clear_errors():
+        if baseline and policy:
+            raise ValueError("only one of --baseline and --policy may be given")
+        if (held_out > 0) != (salt_file is not None):
+            raise ValueError("--held-out and --salt-file belong together")
+        salt = beyond.read_salt(salt_file) if salt_file else b""
+    seed = secrets.randbelow(2**32) if seed is None else seed
+    try:
+        with again.empty_cache():
+            claimed = read_record(record)
+            job, differences = again.job_of(claimed, baseline or policy, isolate), list[str]()
+            if episodes:
+                table, differences = again.verify(claimed, job, episodes=episodes, seed=seed, tolerance=tolerance)
+                typer.echo(f"episodes drawn with --seed {seed}, isolation {job.isolation}\n\n{table}\n")
+            if held_out:
+                table, more = beyond.held_out(claimed, job, salt, held_out, record.parent)
+                differences += more
+                typer.echo(f"held-out episodes of the salt with sha256 {beyond.hash_of(salt)}\n\n{table}\n")
+    except ValueError as error:
+        differences = [str(error)]
+    for difference in differences:
+        typer.echo(f"differs: {difference}", err=True)
+    if differences:
+        raise typer.Exit(1)
+    typer.echo(f"{record.name}: what was played again is as it says")
+
+
+def held_out(
+    new: Annotated[Path, typer.Option(help="Where to write a new salt; keep it secret, and keep it.")],
+) -> None:
+    """For maintainers: draw the salt of held-out episodes, and publish its hash in leaderboards/held_out.json."""
+    from eitbench.leaderboard import held_out as beyond
+    with clear_errors():
+        digest = beyond.new_salt(new)
+    beyond.publish(digest)
+    typer.echo(f"wrote {new}, sha256 {digest}, and {beyond.PUBLISHED}")
