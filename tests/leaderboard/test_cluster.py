@@ -77,8 +77,8 @@ def test_backends_that_cannot_be_had(monkeypatch):
     """Unknown, or not installed: a sentence."""
     with pytest.raises(ValueError, match="backend must be one of loky, ray, dask, got 'slurm'"):
         list(in_parallel(print, [(1,)], 1, "slurm"))
-    monkeypatch.setattr(_parallel, "_with_ray", lambda *_: iter(importlib.import_module("ray_is_not_here")))
-    with pytest.raises(ModuleNotFoundError):
+    with monkeypatch.context() as patch, pytest.raises(ModuleNotFoundError):
+        patch.setattr(_parallel, "_with_ray", lambda *_: iter(importlib.import_module("ray_is_not_here")))
         list(in_parallel(print, [(1,)], 1, "ray"))
     for backend, package in CLUSTERS.items():
         if not importlib.util.find_spec(package):
