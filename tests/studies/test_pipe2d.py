@@ -74,6 +74,7 @@ def test_persistence_uses_the_alpha_of_gauss_newton():
     assert load_baseline("persistence").parameters == load_baseline("gauss_newton").parameters
 
 
+@pytest.mark.slow
 def test_velocity_sweep_finds_the_true_velocity():
     """Over assumed mean velocities of 0, 50, …, 900 cm/s the error is smallest within 400–500; it is 450 in truth.
 
