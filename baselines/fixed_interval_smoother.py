@@ -8,7 +8,6 @@ from eitbench.estimation import FirstFrame, LinearisedObservations, fixed_interv
 
 class Estimator:
     boards = ("smoothing",)
-    role = "reference"
 
     def __init__(self, task: Task) -> None:
         self.task = task

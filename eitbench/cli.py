@@ -188,7 +188,7 @@ def policies(
     store = EpisodeStore(out)
     with clear_errors():
         run_jobs(todo, store, n_jobs=jobs, command=_command())
-    asked = {job.load().name: getattr(job.load(), "privileged", False) for job in todo}
+    asked = {job.load().name: job.load().privileged for job in todo}
     typer.echo(policy_table(policy_rows(todo, store), [name for name, privileged in asked.items() if privileged]))
     _say_failures([record for record in store.write_records()
                    if record["method"] in asked and record["environment"]["id"] == env])

@@ -97,12 +97,17 @@ def simulate_together(scenario: Scenario, seeds: Sequence[int], progress: bool =
     label = f"simulating {type(scenario).__name__}, seed {', '.join(map(str, seeds))}"
     with tqdm(total=(scenario.lead_in + 2 * scenario.n_steps) * len(seeds), desc=label, unit="step", leave=False,
               disable=None if progress else True) as bar:
-        episodes = [Randomness(*map(np.random.default_rng, np.random.SeedSequence(seed).spawn(3))) for seed in seeds]
+        episodes = [randomness(seed) for seed in seeds]
         for history, random in zip(scenario.evolve(episodes, truth, bar.update), episodes, strict=True):
             noise = random.noise.standard_normal((scenario.n_steps, truth.observation.cem.n_electrodes))
             resistance = truth.observation.transfer_resistance(history.concentration[1:])
             bar.update(scenario.n_steps)
             yield Episode(history.concentration.astype(np.float32), resistance, noise, history.velocity)
+
+
+def randomness(seed: int) -> Randomness:
+    """The streams of the episode with this seed, from their beginning."""
+    return Randomness(*map(np.random.default_rng, np.random.SeedSequence(seed).spawn(3)))
 
 
 # -- cache ------------------------------------------------------------------------------------------------------------

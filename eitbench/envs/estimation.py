@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -11,14 +12,29 @@ from gymnasium import spaces
 
 from eitbench import _check
 from eitbench.recordings import cycle_voltages, outline, recording, step_error, velocity_error
+from eitbench.scenarios.base import Discretisation
 from eitbench.task import Task, lag_steps, make_task
 
 if TYPE_CHECKING:
     from eitbench.episodes import Episode
     from eitbench.physics.mesh import Mesh
+    from eitbench.physics.transport import ConvectionDiffusion
     from eitbench.scenarios.base import Scenario
 
 Observation = dict[str, np.ndarray]
+
+
+class Revealed(NamedTuple):
+    """What a reference is shown of the episode that is played, and nobody else."""
+
+    voltages: np.ndarray
+    """(T, L) V, the whole record"""
+    currents: np.ndarray
+    """(T, L) A (A/m in 2D)"""
+    transport: Callable[[int], ConvectionDiffusion]
+    """t = 1 … T -> the model, on the task's mesh, with the flow that there really is from t − 1 to t"""
+    velocity: np.ndarray
+    """(T, p) axial velocity in m/s at `VelocityModel.points`; p = 0 where the flow is not asked for"""
 
 
 class EstimationEnv(gym.Env[Observation, np.ndarray]):
@@ -128,6 +144,16 @@ class EstimationEnv(gym.Env[Observation, np.ndarray]):
     def true_velocity(self) -> np.ndarray:
         """(T, p) axial velocity in m/s at `VelocityModel.points` of this episode; for scoring, never for agents."""
         return self._episode("true_velocity").velocity
+
+    def reveal(self) -> Revealed:
+        """This episode's record and flow; for references, never for agents."""
+        from eitbench.episodes import randomness
+        if self._seed is None:
+            raise gym.error.ResetNeeded("call reset() before reveal()")
+        n_steps, told_nothing_wrong = self.scenario.n_steps, make_task(self.scenario, self.lag)
+        model = Discretisation(told_nothing_wrong.transport, told_nothing_wrong.observation)
+        return Revealed(self._voltages[:n_steps].copy(), self._currents[:n_steps].copy(),
+                        self.scenario.true_transport(model, randomness(self._seed).flow), self.true_velocity().copy())
 
     def truth_mesh(self) -> Mesh:
         """The mesh of `truth`."""

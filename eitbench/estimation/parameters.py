@@ -70,6 +70,7 @@ class ClosedVesselFilter(DenseKalmanFilter):
                  noise: np.ndarray | None) -> None:
         super().__init__(mean, covariance)
         self._transition, self._noise, self._initial = transition, noise, covariance
+        self.forcing = np.zeros_like(self.mean)
 
     @property
     def transition(self) -> np.ndarray:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
-from eitbench.estimation.kalman import FilterStep, KalmanFilter, Observation, compressed, kalman_filter
+from eitbench.estimation.kalman import Expected, FilterStep, KalmanFilter, Observation, compressed, kalman_filter
 
 
 class Smoothed(NamedTuple):
@@ -33,6 +33,47 @@ def smoothed_state(filter_: KalmanFilter, steps: Sequence[FilterStep]) -> Smooth
     """
     *_, (step, later) = _backwards(filter_, steps)
     return _smoothed(filter_, step, later)
+
+
+class _Moving(Protocol):
+    """A filter that moves on by itself; `predict` sets ``transition``, ``forcing`` and ``apply_noise`` to what it did."""
+
+    mean: np.ndarray
+
+    @property
+    def transition(self) -> np.ndarray: ...
+    @property
+    def forcing(self) -> np.ndarray: ...
+    @property
+    def apply_noise(self) -> Callable[[np.ndarray], np.ndarray]: ...
+    def apply_initial(self, X: np.ndarray) -> np.ndarray: ...
+    def predict(self) -> None: ...
+    def expect(self, observation: Observation) -> Expected: ...
+    def take_in(self, H: np.ndarray, cross: np.ndarray, innovation: np.ndarray, S: np.ndarray) -> object: ...
+
+
+def smoothed_means(start: _Moving, observations: Iterable[Observation]) -> np.ndarray:
+    """Means c_{t|T} (T, n) of a filter that stands at t = 0, whose motion may change from step to step.
+
+    The adjoint λ_t = Hᵀ S⁻¹ ν + (I − K H)ᵀ Fᵀ_{t+1} λ_{t+1} runs back over the innovations, and the smoothed state follows
+    forwards from c_{0|T} = c_{0|0} + Γ_{0|0} F₁ᵀ λ_1 as c_t = F_t c_{t−1} + s_t + Γ_w λ_t (problem.md §7): without
+    variances, and without a covariance being kept.
+    """
+    mean, steps = start.mean, []
+    for observation in observations:
+        start.predict()
+        expected = start.expect(observation)
+        start.take_in(observation.matrix, *expected)
+        steps.append((observation.matrix, expected, start.transition, start.forcing, start.apply_noise))
+    smoothed, later = np.empty((len(steps), len(mean))), np.zeros_like(mean)
+    for t in range(len(steps) - 1, -1, -1):
+        H, (cross, innovation, S), F, *_ = steps[t]
+        smoothed[t] = later + H.T @ np.linalg.solve(S, innovation - cross.T @ later)               # λ_t
+        later = F.T @ smoothed[t]
+    state = mean + start.apply_initial(later[:, None])[:, 0]
+    for t, (*_, F, forcing, apply_noise) in enumerate(steps):
+        state = smoothed[t] = F @ state + forcing + apply_noise(smoothed[t])
+    return smoothed
 
 
 def _backwards(filter_: KalmanFilter, steps: Sequence[FilterStep]) -> Iterator[tuple[FilterStep, np.ndarray]]:

@@ -39,6 +39,8 @@ class Baseline(NamedTuple):
     """Estimator(task), with update(voltages, currents) -> Estimate or None."""
     role: str | None = None
     """One of `ROLES`."""
+    privileged: bool = False
+    """Shown the episode's flow and whole record: Estimator(task, revealed). A mark for the others, not one of them."""
 
     def suits(self, task: Task) -> bool:
         """Whether it can play a task of its boards; an estimator without a word on that suits all."""
@@ -96,7 +98,8 @@ def _load(path: Path, source: bytes) -> Baseline:
         raise ValueError(f"baseline {path}: Estimator.boards must be some of {', '.join(BOARDS)}, got {boards!r}")
     who = f"baseline {path}: Estimator"
     return Baseline(path.stem, title_of(module, path), path, hashlib.sha256(source).hexdigest(), boards,
-                    parameters_of(who, estimator), estimator, role_of(who, estimator))
+                    parameters_of(who, estimator), estimator, role_of(who, estimator),
+                    is_privileged(who, estimator))
 
 
 def load_module(kind: str, path: Path, source: bytes) -> ModuleType:
@@ -124,6 +127,14 @@ def parameters_of(who: str, method: type[Any]) -> dict[str, Any]:
     except (TypeError, ValueError) as error:
         raise ValueError(f"{who}.parameters must be a dict fit for JSON: {error}") from None
     return parameters
+
+
+def is_privileged(who: str, method: type[Any]) -> bool:
+    """The class attribute ``privileged``; ``ValueError``, naming ``who``, if it is neither True nor False."""
+    privileged = getattr(method, "privileged", False)
+    if not isinstance(privileged, bool):
+        raise ValueError(f"{who}.privileged must be True or False, got {privileged!r}")
+    return privileged
 
 
 def role_of(who: str, method: type[Any]) -> str | None:

@@ -75,8 +75,9 @@ def _player(words: dict[str, Any]) -> tuple[Callable[..., Reply], dict[str, Any]
     else:
         from eitbench.leaderboard.policies import load_policy
         loaded = policy = load_policy(words["name"])
-        answer, about = _policy(env.rules, policy), {"privileged": policy.privileged, "suits": policy.suits(env.rules)}
-    return answer, about | {name: getattr(loaded, name) for name in ("name", "title", "parameters", "role")}
+        answer, about = _policy(env.rules, policy), {"suits": policy.suits(env.rules)}
+    return answer, about | {name: getattr(loaded, name)
+                            for name in ("name", "title", "parameters", "role", "privileged")}
 
 
 def _estimator(task: Any, baseline: Any) -> Callable[..., Reply]:

@@ -17,7 +17,14 @@ import numpy as np
 from eitbench.envs import INJECTION
 from eitbench.envs.injection import InjectionEnv
 from eitbench.envs.injection_core import Rules
-from eitbench.leaderboard.baselines import baseline_folder, load_module, parameters_of, role_of, title_of
+from eitbench.leaderboard.baselines import (
+    baseline_folder,
+    is_privileged,
+    load_module,
+    parameters_of,
+    role_of,
+    title_of,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -99,12 +106,9 @@ def _load(path: Path, source: bytes) -> PolicyFile:
     policy = getattr(module, "Policy", None)
     if not isinstance(policy, type) or not callable(getattr(policy, "act", None)):
         raise ValueError(f"policy {path} must define a class Policy with a method act(observation)")
-    privileged = getattr(policy, "privileged", False)
-    if not isinstance(privileged, bool):
-        raise ValueError(f"policy {path}: Policy.privileged must be True or False, got {privileged!r}")
     who = f"policy {path}: Policy"
-    return PolicyFile(path.stem, title_of(module, path), path, hashlib.sha256(source).hexdigest(), privileged,
-                      parameters_of(who, policy), policy, role_of(who, policy))
+    return PolicyFile(path.stem, title_of(module, path), path, hashlib.sha256(source).hexdigest(),
+                      is_privileged(who, policy), parameters_of(who, policy), policy, role_of(who, policy))
 
 
 def play(env_id: str, kwargs: dict[str, Any], policy: str | PolicyFile, seed: int,

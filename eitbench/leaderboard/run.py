@@ -115,7 +115,7 @@ def _play(env: EstimationEnv, baseline: Baseline, seed: int,
     """(t = i − lag, estimate, measurement i, seconds the estimator took) at each step i."""
     observation, _ = env.reset(seed=seed)
     begin = time.perf_counter()
-    estimator = baseline.estimator(env.task)
+    estimator = baseline.estimator(env.task, *[env.reveal()] * baseline.privileged)
     setup = time.perf_counter() - begin
     silence = np.full(env.task.mesh.n_nodes, env.task.expected_concentration)
     done, t = False, -env.task.lag
@@ -179,7 +179,7 @@ def run_episode(job: Job) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     method, env = job.load(), _environment(job.environment)
     result: dict[str, Any] = {
         "identity": job.identity(), "seed": name_seed(job.seed), "method": method.name, "title": method.title,
-        "parameters": method.parameters, "role": method.role, "privileged": getattr(method, "privileged", False),
+        "parameters": method.parameters, "role": method.role, "privileged": method.privileged,
         "method_sha256": method.sha256, "checkpoint_sha256": method.sha256 if method.path.suffix == ".zip" else None,
         "board": board_of(env),
         "environment": {"id": job.environment.id, "name": job.environment.name,

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from eitbench.envs import ESTIMATION, INJECTION
 from eitbench.envs.estimation import EstimationEnv
-from eitbench.leaderboard.baselines import Baseline, find_baseline, is_ours, own_baselines
+from eitbench.leaderboard.baselines import Baseline, find_baseline, is_ours, load_baseline, own_baselines
 from eitbench.leaderboard.policies import environment as injection_environment
 from eitbench.leaderboard.policies import find_policy, load_policy, own_agents, own_policies
 from eitbench.leaderboard.run import Environment, Job, board_of
@@ -102,7 +102,7 @@ def is_isolated(environment: Environment, method: str, isolate: str) -> bool:
         raise ValueError(f"isolate must be one of {', '.join(ISOLATE)}, got {isolate!r}")
     if isolate != "always" or not is_ours(method):
         return isolate != "never" and not is_ours(method)
-    return environment.id not in INJECTION or not load_policy(method).privileged
+    return not (load_policy if environment.id in INJECTION else load_baseline)(method).privileged
 
 
 def _distinct(names: dict[str, str]) -> None:

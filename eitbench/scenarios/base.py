@@ -117,6 +117,13 @@ class Scenario(Protocol):
         """The coarser one that estimators are given; ``assumptions`` are what they wrongly believe."""
         ...
 
+    def true_transport(self, model: Discretisation, flow: np.random.Generator) -> Callable[[int], ConvectionDiffusion]:
+        """t -> what moves the concentration of an episode from t − 1 to t, on the estimators' mesh; for references only.
+
+        ``model`` is what estimators are given when they are told nothing wrong, ``flow`` the episode's fresh stream.
+        """
+        return lambda t: model.transport
+
     def evolve(self, episodes: Sequence[Randomness], truth: Discretisation, tick: Callable[[int], object],
                ) -> Iterator[History]:
         """What moves in each episode. Its numbers do not depend on the others beside it, to the bit.

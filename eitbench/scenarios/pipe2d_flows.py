@@ -79,6 +79,10 @@ class Pipe2DBiasedVelocity(Pipe2D):
 
         return flow
 
+    def true_transport(self, model: Discretisation, flow: np.random.Generator) -> Callable[[int], ConvectionDiffusion]:
+        drawn, at = self.draw_flow(flow), lru_cache(maxsize=1)(model.transport.with_velocity)
+        return lambda t: at(drawn(t))
+
     def evolve(self, episodes: Sequence[Randomness], truth: Discretisation, tick: Callable[[int], object],
                ) -> Iterator[History]:
         for episode in episodes:
