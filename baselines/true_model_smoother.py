@@ -53,7 +53,7 @@ class ChangingFlow(DenseKalmanFilter):
         self.initial, self.inflow_std = self.covariance.copy(), c_bh * prior.inflow_std
         self.nodal = task.evolution.state_noise_covariance(0.0, (c_bh * prior.nodal_std)**2)
 
-    def predict(self) -> None:
+    def predict(self) -> None:  # type: ignore[override]
         self.transition, Y = next(self.transports).transition()
         self.forcing, Y = self.level * Y.sum(axis=1), self.inflow_std * Y
         self.apply_noise = partial(self.noise, Y)

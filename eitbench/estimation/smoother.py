@@ -36,7 +36,7 @@ def smoothed_state(filter_: KalmanFilter, steps: Sequence[FilterStep]) -> Smooth
 
 
 class _Moving(Protocol):
-    """A filter that moves on by itself; `predict` sets ``transition``, ``forcing`` and ``apply_noise`` to what it did."""
+    """A filter that moves on by itself; after `predict` the others say what it did."""
 
     mean: np.ndarray
 
@@ -55,8 +55,8 @@ class _Moving(Protocol):
 def smoothed_means(start: _Moving, observations: Iterable[Observation]) -> np.ndarray:
     """Means c_{t|T} (T, n) of a filter that stands at t = 0, whose motion may change from step to step.
 
-    The adjoint λ_t = Hᵀ S⁻¹ ν + (I − K H)ᵀ Fᵀ_{t+1} λ_{t+1} runs back over the innovations, and the smoothed state follows
-    forwards from c_{0|T} = c_{0|0} + Γ_{0|0} F₁ᵀ λ_1 as c_t = F_t c_{t−1} + s_t + Γ_w λ_t (problem.md §7): without
+    The adjoint λ_t = Hᵀ S⁻¹ ν + (I − K H)ᵀ Fᵀ_{t+1} λ_{t+1} runs back over the innovations, and the smoothed state
+    follows forwards from c_{0|T} = c_{0|0} + Γ_{0|0} F₁ᵀ λ_1 as c_t = F_t c_{t−1} + s_t + Γ_w λ_t (problem.md §7): without
     variances, and without a covariance being kept.
     """
     mean, steps = start.mean, []

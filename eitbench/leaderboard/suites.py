@@ -17,8 +17,9 @@ QUICK = ("eitbench/Pipe2D-v0", "eitbench/Pipe2DFixedLag-v0", "eitbench/Pipe2DSmo
 """What the quick suite runs; the full one runs all that ask for estimates."""
 SEEDS = {"quick": "test:0-3", "full": "test:0-9"}
 POLICY_SEEDS = "test:0-49"
-FEWER_SEEDS = {"velocity": "test:0-3", "3d": "test:0-2"}
-"""In the full suite, where an episode takes a minute a method and more: with the flow asked for too, and in 3D."""
+FEWER_SEEDS = {"velocity": "test:0-5", "3d": "test:0-5"}
+"""In the full suite, where an episode takes a minute a method and more: with the flow asked for too, and in 3D. With
+fewer than six there would be no intervals and no ranks."""
 # An image at every step: minutes an episode, for what the frame-wise images of the other boards show as well.
 TOO_SLOW_FOR_QUICK = {("filter", "gauss_newton")}
 ISOLATE = ("never", "others", "always")

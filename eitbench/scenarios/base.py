@@ -118,7 +118,7 @@ class Scenario(Protocol):
         ...
 
     def true_transport(self, model: Discretisation, flow: np.random.Generator) -> Callable[[int], ConvectionDiffusion]:
-        """t -> what moves the concentration of an episode from t − 1 to t, on the estimators' mesh; for references only.
+        """t -> what moves an episode's concentration from t − 1 to t, on the estimators' mesh; for references only.
 
         ``model`` is what estimators are given when they are told nothing wrong, ``flow`` the episode's fresh stream.
         """

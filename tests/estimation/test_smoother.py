@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 from models import dense_filter, draw, joint_posterior, pipe, random_design, random_model, rauch_tung_striebel
 
-from eitbench.estimation import fixed_interval_smoother, kalman_filter, smoothed_state
+from eitbench.estimation import (
+    DenseKalmanFilter,
+    Observation,
+    fixed_interval_smoother,
+    kalman_filter,
+    smoothed_means,
+    smoothed_state,
+)
 
 
 @pytest.fixture
@@ -63,3 +70,50 @@ def test_equals_the_textbook_in_the_pipe():
     smoothed = fixed_interval_smoother(make_filter(), observations)
     reference = rauch_tung_striebel(model, dense)
     assert_same(smoothed, reference, 1e-9)
+
+
+def test_means_are_those_of_the_smoother_with_variances(world):
+    """In a steady motion, to 1e-10."""
+    model, observations = world
+    expected = np.array([state.mean for state in fixed_interval_smoother(model.filter(), observations)])
+    smoothed = smoothed_means(model.filter(), observations)
+    np.testing.assert_allclose(smoothed, expected, atol=1e-10 * np.abs(expected).max())
+
+
+class Changing(DenseKalmanFilter):
+    """Another model at each step."""
+
+    def __init__(self, models):
+        super().__init__(models[0].mean, models[0].covariance)
+        self.models, self.initial = iter(models), models[0].covariance
+
+    def predict(self):
+        self.transition, self.forcing, noise, *_ = next(self.models)
+        self.apply_noise = noise.__matmul__
+        super().predict(self.transition, self.forcing, noise)
+
+    def apply_initial(self, X):
+        return self.initial @ X
+
+
+def test_motion_that_changes_at_every_step():
+    """F, s and Γ_w different at each of five steps: the means of all states given all measurements at once, to 1e-9."""
+    rng, n, T = np.random.default_rng(9), 6, 5
+    models = [random_model(rng, n) for _ in range(T)]
+    observations = [Observation(H, rng.normal(size=len(H)), variance)
+                    for H, variance in random_design(rng, n, T, noise=(1.0, 10.0))]
+    back = np.zeros(((T + 1) * n, (T + 1) * n))                    # c = A (offset + w), w₀ being the initial state
+    for t, model in enumerate(models, start=1):
+        back[t * n:(t + 1) * n, (t - 1) * n:t * n] = model.F
+    A = np.linalg.inv(np.eye((T + 1) * n) - back)
+    noise = np.zeros_like(A)
+    for t, block in enumerate([models[0].covariance, *[model.Q for model in models]]):
+        noise[t * n:(t + 1) * n, t * n:(t + 1) * n] = block
+    mean, C = A @ np.concatenate([models[0].mean, *[model.s for model in models]]), A @ noise @ A.T
+    H = np.zeros((3 * T, (T + 1) * n))
+    for t, observation in enumerate(observations, start=1):
+        H[3 * t - 3:3 * t, t * n:(t + 1) * n] = observation.matrix
+    S = H @ C @ H.T + np.diag(np.concatenate([o.noise_variance for o in observations]))
+    expected = mean + C @ H.T @ np.linalg.solve(S, np.concatenate([o.value for o in observations]) - H @ mean)
+    smoothed = smoothed_means(Changing(models), observations)
+    np.testing.assert_allclose(smoothed.ravel(), expected[n:], atol=1e-9 * np.abs(expected).max())

@@ -119,6 +119,30 @@ def test_estimators_see_the_task_and_measurements_only(environment):
         observation, *_ = env.step(np.full(1701, 30.0))
 
 
+BIASED = Environment("eitbench/Pipe2DSmoothing-v0",
+                     json.dumps({"scenario": SCENARIO, "assumed_mean_velocity": 30.0}))
+
+
+@pytest.mark.parametrize("environment", [FILTER, FIXED_LAG, SMOOTHING, BIASED],
+                         ids=["filter", "fixed-lag", "smoothing", "biased"])
+def test_reference_with_the_true_model(environment):
+    """Whatever a board asks for and believes, the reference says what the smoother with the true velocity says."""
+    reference, _ = run_episode(Job(environment, "true_model_smoother", 3))
+    smoother, _ = run_episode(Job(SMOOTHING, "fixed_interval_smoother", 3))
+    assert (reference["role"], reference["privileged"]) == ("reference", True)
+    np.testing.assert_allclose(reference["step_errors"], smoother["step_errors"], rtol=1e-6)
+
+
+def test_reference_in_a_flow_that_changes():
+    """Told the flow of every step it errs less than the filter that is told the first guess, and knows the flow."""
+    scenario = {**SCENARIO, "scored_steps": 12, "velocity_range": [30.0, 60.0]}
+    world = Environment("eitbench/Pipe2DTimeVaryingVelocity-v0", json.dumps({"scenario": scenario}))
+    reference, guessing = (run_episode(Job(world, name, 3))[0]["scores"]
+                           for name in ("true_model_smoother", "kalman_filter"))
+    assert reference["error"] < 0.9 * guessing["error"]
+    assert reference["velocity_error"] < 1e-20 < guessing["velocity_error"]
+
+
 def test_what_estimators_do_to_their_arrays_changes_nothing(tmp_path):
     """Overwriting measurements, or what was returned before, alters neither scores nor stored estimates."""
     said = "self.level[:] = 28.0 + self.calls; {}; {}; return Estimate(self.level, self.variance, self.nu, self.S)"
@@ -334,7 +358,8 @@ def test_our_baselines_load():
         assert baseline.name == name and baseline.title and baseline.boards and len(baseline.sha256) == 64
         assert strict(json.dumps(baseline.parameters)) == baseline.parameters
     roles = {name: load_baseline(name).role for name in own_baselines() if load_baseline(name).role}
-    assert roles == {"homogeneous": "floor", "persistence": "floor", "fixed_interval_smoother": "reference"}
+    assert roles == {"homogeneous": "floor", "persistence": "floor", "true_model_smoother": "reference"}
+    assert [name for name in own_baselines() if load_baseline(name).privileged] == ["true_model_smoother"]
 
 
 @pytest.mark.parametrize(("source", "message"), [

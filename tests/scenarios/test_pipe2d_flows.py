@@ -170,6 +170,18 @@ def test_recorded_flow_is_the_one_that_carries():
 
 
 @each_kind
+def test_a_reference_is_given_the_flow_that_carries(kind):
+    """A step with it, on the estimators' mesh, is one with the flow drawn for that very step, to the bit."""
+    scenario = kind(**FIELDS, **FAST)
+    model, flow = scenario.model(), drawn(scenario, 7)
+    transport_at = scenario.true_transport(model, streams(7).flow)
+    c = 30.0 + np.random.default_rng(0).normal(size=model.transport.mesh.n_nodes)
+    for t in (1, 2, 5):
+        real = model.transport.with_velocity(flow(t))
+        np.testing.assert_array_equal(transport_at(t).step(c, 30.0, 31.0), real.step(c, 30.0, 31.0))
+
+
+@each_kind
 def test_simulated_together_same_bits(kind):
     """Flows that differ are carried on one by one: each episode is the one that its seed has alone."""
     scenario = kind(**FIELDS, **FAST)
