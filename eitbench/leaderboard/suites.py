@@ -16,7 +16,9 @@ from eitbench.seeds import parse_seeds
 QUICK = ("eitbench/Pipe2D-v0", "eitbench/Pipe2DFixedLag-v0", "eitbench/Pipe2DSmoothing-v0")
 """What the quick suite runs; the full one runs all that ask for estimates."""
 SEEDS = {"quick": "test:0-3", "full": "test:0-9"}
-POLICY_SEEDS = "test:0-49"
+POLICY_SEEDS = {"eitbench/Pipe2DInjectionFaults-v0": "test:0-49", "eitbench/Pipe2DInjectionBudget-v0": "test:0-49",
+                "eitbench/Pipe2DInjectionFlow-v0": "test:0-5"}
+"""Competitions have many; where the estimator inside takes a minute an episode there are few. Others: test:0-9."""
 FEWER_SEEDS = {"velocity": "test:0-5", "3d": "test:0-5"}
 """In the full suite, where an episode takes a minute a method and more: with the flow asked for too, and in 3D. With
 fewer than six there would be no intervals and no ranks."""
@@ -68,7 +70,7 @@ def jobs(suite: str, environments: list[str], baselines: list[str], seeds: list[
 def policy_jobs(environments: list[str], policies: list[str], seeds: list[int] | None = None,
                 estimator: str = "full", *, isolate: str = "others") -> list[Job]:
     """Every named policy (default: all of ours that suit, trained agents among them) in every named environment, on
-    ``seeds`` (default: `POLICY_SEEDS`), with this estimator inside. ``isolate`` is one of `ISOLATE`.
+    ``seeds`` (default: those of `POLICY_SEEDS`), with this estimator inside. ``isolate`` is one of `ISOLATE`.
 
     Raises
     ------
@@ -77,7 +79,6 @@ def policy_jobs(environments: list[str], policies: list[str], seeds: list[int] |
     """
     if estimator not in ("full", "reduced"):
         raise ValueError(f"estimator must be 'full' or 'reduced', got {estimator!r}")
-    numbers = parse_seeds(POLICY_SEEDS) if seeds is None else seeds
     kwargs = "{}" if estimator == "full" else json.dumps({"estimator": estimator})
     for policy in policies:
         find_policy(policy)
@@ -89,6 +90,7 @@ def policy_jobs(environments: list[str], policies: list[str], seeds: list[int] |
             loaded = job.load()
             assert not isinstance(loaded, Baseline)
             names[policy] = loaded.name
+            numbers = parse_seeds(POLICY_SEEDS.get(id, SEEDS["full"])) if seeds is None else seeds
             if loaded.suits(rules):
                 todo += [job._replace(seed=seed) for seed in numbers]
             elif policies:
