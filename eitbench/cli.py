@@ -281,6 +281,8 @@ def compare(
 def render(
     env: Annotated[str, typer.Option(help="Environment id.")] = "eitbench/Pipe2D-v0",
     baseline: Annotated[str, typer.Option(help="Name of one of ours, or the path of a .py file.")] = "kalman_filter",
+    policy: Annotated[str | None, typer.Option(
+        help="The same of an injection policy, or of an agent's model.zip, where injections are asked for.")] = None,
     seed: Annotated[str, typer.Option(help="The episode, such as dev:0.")] = "dev:0",
     step: Annotated[int | None, typer.Option(help="Only this state t, as a PNG.")] = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="An animation .gif, or a .png with --step.")] = Path(
@@ -289,7 +291,7 @@ def render(
     """Draw an episode: truth, estimate, its spread, electrodes and the injected pair."""
     from eitbench.leaderboard.animate import animate
     with clear_errors():
-        typer.echo(f"wrote {animate(env, baseline, seed, step, out)}")
+        typer.echo(f"wrote {animate(env, policy or baseline, seed, step, out)}")
 
 
 @app.command()

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.colors import to_rgb
@@ -12,19 +15,22 @@ from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from eitbench import _check
+from eitbench.envs import INJECTION
 from eitbench.envs.rendering import FIELD_MAP, IDLE, SINK, SOURCE, SPREAD_MAP
-from eitbench.leaderboard.baselines import load_baseline
-from eitbench.leaderboard.run import Environment, board_of, play
+from eitbench.leaderboard.policies import inject
+from eitbench.leaderboard.run import Environment, Job, board_of, play
+from eitbench.leaderboard.suites import is_isolated
 from eitbench.seeds import parse_seeds
 
 
-def animate(environment: str, baseline: str, seed: str, step: int | None, path: Path) -> Path:
-    """Play ``baseline`` on one episode and draw its scored states, or only state ``step``, into ``path``.
+def animate(environment: str, method: str, seed: str, step: int | None, path: Path, *,
+            isolate: str = "others") -> Path:
+    """Play a baseline, or a policy, on one episode and draw its scored states, or only state ``step``, into ``path``.
 
     Raises
     ------
     ValueError
-        If the baseline cannot play the environment, or the path's suffix is not .gif (.png with ``step``).
+        If the method cannot play the environment, or the path's suffix is not .gif (.png with ``step``).
     """
     suffix = ".gif" if step is None else ".png"
     if path.suffix != suffix:
@@ -32,35 +38,37 @@ def animate(environment: str, baseline: str, seed: str, step: int | None, path: 
     seeds = parse_seeds(seed)
     if len(seeds) != 1:
         raise ValueError(f"seed must name one episode, got {seed!r}")
-    loaded, env = load_baseline(baseline), Environment(environment).make(render_mode="rgb_array")
-    if board_of(env) not in loaded.boards:
-        raise ValueError(f"baseline {loaded.name} plays {', '.join(loaded.boards)}, but {environment} is a "
-                         f"{board_of(env)} environment")
-    first, last = env.task.warm_up + 1, env.task.n_steps
-    if step is not None:
-        first = last = _check.integer("step", step, low=1, high=env.task.n_steps)
-    frames = []
+    played = Environment(environment)
     with threadpool_limits(1):
-        for t, _ in tqdm(play(env, loaded, seeds[0]), total=env.task.n_steps, desc="drawing", unit="state",
-                         disable=None):
+        loaded: Any = Job(played, method, seeds[0], is_isolated(played, method, isolate)).load()
+        env: Any
+        states: Iterator[tuple[Any, ...]]
+        if environment in INJECTION:
+            env = gym.make(environment, disable_env_checker=True, observation="raw", estimator="full",
+                                render_mode="rgb_array").unwrapped
+            first, last, states = env.scenario.warm_up + 1, env.scenario.n_steps, inject(env, loaded, seeds[0])
+        else:
+            env = played.make(render_mode="rgb_array")
+            if board_of(env) not in loaded.boards:
+                raise ValueError(f"baseline {loaded.name} plays {', '.join(loaded.boards)}, but {environment} is a "
+                                 f"{board_of(env)} environment")
+            first, last, states = env.task.warm_up + 1, env.task.n_steps, play(env, loaded, seeds[0])
+        if step is not None:
+            first = last = _check.integer("step", step, low=1, high=last)
+        frames = []
+        for t, *_ in tqdm(states, total=last, desc="drawing", unit="state", disable=None):
             if first <= t <= last:
                 frames.append(Image.fromarray(np.asarray(env.render())))
             if t == last:
                 break
+    path.parent.mkdir(parents=True, exist_ok=True)
     if step is None:
-        save_animation(frames, path, env.metadata["render_fps"])
+        palette = _palette()
+        small = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+        small[0].save(path, save_all=True, append_images=small[1:], duration=1000 // env.metadata["render_fps"], loop=0)
     else:
-        path.parent.mkdir(parents=True, exist_ok=True)
         frames[0].save(path)
     return path
-
-
-def save_animation(frames: list[Image.Image], path: Path, frames_per_second: int) -> None:
-    """Write frames of an environment as a GIF, and its folder if need be."""
-    palette = _palette()
-    small = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    small[0].save(path, save_all=True, append_images=small[1:], duration=1000 // frames_per_second, loop=0)
 
 
 def _palette() -> Image.Image:

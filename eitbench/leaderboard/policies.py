@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -136,26 +136,34 @@ def play(env_id: str, kwargs: dict[str, Any], policy: str | PolicyFile, seed: in
         If there is no such environment or policy, or the policy does not suit it or acts wrongly.
     """
     env = environment(env_id, json.dumps(kwargs), estimator)
-    loaded = policy if isinstance(policy, PolicyFile) else load_policy(policy)
+    spent, seconds, errors = 0, 0.0, list[float]()
+    for _, observation, elapsed in inject(env, policy if isinstance(policy, PolicyFile) else load_policy(policy), seed):
+        seconds += elapsed
+        spent += bool(observation["currents"].any())
+        errors += [] if env.error is None else [env.error]
+    return {"error": float(np.mean(errors)), "errors": errors, "spent": spent,
+            "seconds_per_step": seconds / env.core.length}
+
+
+def inject(env: InjectionEnv, loaded: PolicyFile, seed: int) -> Iterator[tuple[int, dict[str, np.ndarray], float]]:
+    """(t of the state now seen, observation, seconds the policy took) after each of its injections in one episode, the
+    first with what it took to prepare; errors as `play`."""
     if not loaded.suits(env.rules):
-        raise ValueError(f"policy {loaded.name} does not suit {env_id}")
-    observation, done = env.reset(seed=seed)[0], False
+        raise ValueError(f"policy {loaded.name} does not suit {env.spec.id if env.spec else env}")
+    observation, done, t = env.reset(seed=seed)[0], False, env.core.first
     # The fifth of an episode's streams; three made the recording, the fourth its faults. A generator knows what it was
     # seeded with, so the policy's is seeded with a number that says nothing of the episode.
     stream = np.random.default_rng(np.random.SeedSequence(seed).spawn(5)[4])
     random = np.random.default_rng(int(stream.integers(2**63)))
     begin = time.perf_counter()
     player = loaded.policy(env.rules, random, *[env.core] * loaded.privileged)
-    seconds, spent, errors = time.perf_counter() - begin, 0, list[float]()
     while not done:
-        begin = time.perf_counter()
         action = player.act(observation)
-        seconds += time.perf_counter() - begin
+        seconds = time.perf_counter() - begin
         observation, _, done, _, _ = env.step(action)
-        spent += bool(observation["currents"].any())
-        errors += [] if env.error is None else [env.error]
-    return {"error": float(np.mean(errors)), "errors": errors, "spent": spent,
-            "seconds_per_step": seconds / env.core.length}
+        t += 1
+        yield t, observation, seconds
+        begin = time.perf_counter()
 
 
 @lru_cache(maxsize=4)

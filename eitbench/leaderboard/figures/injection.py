@@ -5,17 +5,12 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import gymnasium as gym
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from PIL import Image
-from threadpoolctl import threadpool_limits
-from tqdm import tqdm
 
-from eitbench.envs.injection import InjectionEnv
-from eitbench.leaderboard.animate import save_animation
+from eitbench.leaderboard.animate import animate
 from eitbench.leaderboard.baselines import baseline_folder
 from eitbench.leaderboard.figures.common import ACCENT, INK, TRUE, bare, save
 from eitbench.leaderboard.policies import load_policy
@@ -24,6 +19,7 @@ from eitbench.leaderboard.run import run_jobs
 from eitbench.leaderboard.store import EpisodeStore
 from eitbench.leaderboard.suites import policy_jobs
 from eitbench.leaderboard.summary import mean_and_interval
+from eitbench.seeds import name_seed
 
 WORLDS = {"eitbench/Pipe2DInjection-v0": "plain pipe (reference)",
           "eitbench/Pipe2DInjectionFaults-v0": "faulty electrodes", "eitbench/Pipe2DInjectionBudget-v0": "a budget"}
@@ -48,7 +44,7 @@ def injection(seeds: list[int], jobs: int, out: Path) -> tuple[Path, str]:
         said.append(f"{env}\n{policy_table(rows, privileged)}\n")
     path = out / "injection.png"
     save(figure, path)
-    moving = _at_work(seeds[0], out / "injection.gif")
+    moving = animate(*AT_WORK, name_seed(seeds[0]), None, out / "injection.gif")
     return path, "\n".join([*said, f"wrote {moving}: {AT_WORK[1]} in {AT_WORK[0]}"])
 
 
@@ -92,20 +88,3 @@ def _curves(axes: Axes, env: str) -> None:
     else:
         axes.set_axis_off()
         axes.text(0.5, 0.5, "no agent was trained here", ha="center", va="center", transform=axes.transAxes, color=TRUE)
-
-
-def _at_work(seed: int, path: Path) -> Path:
-    """Truth, estimate, spread and the pair that a policy chose, step by step."""
-    name, policy = AT_WORK
-    env = gym.make(name, disable_env_checker=True, observation="raw", estimator="full",
-                   render_mode="rgb_array").unwrapped
-    assert isinstance(env, InjectionEnv)
-    with threadpool_limits(1):
-        observation, _ = env.reset(seed=seed)
-        player = load_policy(policy).policy(env.rules, np.random.default_rng(0))
-        frames = []
-        for _ in tqdm(range(env.core.length), desc="drawing", unit="state", disable=None):
-            observation, *_ = env.step(player.act(observation))
-            frames.append(Image.fromarray(np.asarray(env.render())))
-    save_animation(frames, path, env.metadata["render_fps"])
-    return path
