@@ -285,7 +285,7 @@ def render(
         help="The same of an injection policy, or of an agent's model.zip, where injections are asked for.")] = None,
     seed: Annotated[str, typer.Option(help="The episode, such as dev:0.")] = "dev:0",
     step: Annotated[int | None, typer.Option(help="Only this state t, as a PNG.")] = None,
-    out: Annotated[Path, typer.Option("--out", "-o", help="An animation .gif, or a .png with --step.")] = Path(
+    out: Annotated[Path, typer.Option("--out", "-o", help="An animation .gif or .webp, or a .png with --step.")] = Path(
         "results/episode.gif"),
 ) -> None:
     """Draw an episode: truth, estimate, its spread, electrodes and the injected pair."""

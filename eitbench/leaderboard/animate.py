@@ -22,6 +22,9 @@ from eitbench.leaderboard.run import Environment, Job, board_of, play
 from eitbench.leaderboard.suites import is_isolated
 from eitbench.seeds import parse_seeds
 
+MOVING = (".gif", ".webp")
+"""Suffixes of animations."""
+
 
 def animate(environment: str, method: str, seed: str, step: int | None, path: Path, *,
             isolate: str = "others") -> Path:
@@ -30,11 +33,12 @@ def animate(environment: str, method: str, seed: str, step: int | None, path: Pa
     Raises
     ------
     ValueError
-        If the method cannot play the environment, or the path's suffix is not .gif (.png with ``step``).
+        If the method cannot play the environment, or the path's suffix is not .gif or .webp (.png with ``step``).
     """
-    suffix = ".gif" if step is None else ".png"
-    if path.suffix != suffix:
-        raise ValueError(f"out must end in {suffix} {'without' if step is None else 'with'} step, got {path.name}")
+    suffixes = MOVING if step is None else (".png",)
+    if path.suffix not in suffixes:
+        raise ValueError(f"out must end in {' or '.join(suffixes)} {'without' if step is None else 'with'} step, got "
+                         f"{path.name}")
     seeds = parse_seeds(seed)
     if len(seeds) != 1:
         raise ValueError(f"seed must name one episode, got {seed!r}")
@@ -62,12 +66,16 @@ def animate(environment: str, method: str, seed: str, step: int | None, path: Pa
             if t == last:
                 break
     path.parent.mkdir(parents=True, exist_ok=True)
-    if step is None:
+    how: dict[str, Any] = {}
+    if path.suffix == ".gif":
         palette = _palette()
-        small = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
-        small[0].save(path, save_all=True, append_images=small[1:], duration=1000 // env.metadata["render_fps"], loop=0)
-    else:
-        frames[0].save(path)
+        frames = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+    elif path.suffix == ".webp":
+        how = {"quality": 50}                                # a fifth of the GIF, and the letters are still sharp
+    if step is None:
+        how |= {"save_all": True, "append_images": frames[1:], "loop": 0,
+                "duration": 1000 // env.metadata["render_fps"]}
+    frames[0].save(path, **how)
     return path
 
 

@@ -75,6 +75,7 @@ def test_unknown_mean_velocity_is_found():
                                                                                  "kalman_filter")
 
 
+@pytest.mark.slow
 def test_changing_mean_velocity_is_followed_with_a_lag():
     """Thesis example 2: closer than the best constant, and closest to what the truth was some steps before."""
     estimated, true, weights = velocities("Pipe2DTimeVaryingVelocity")
@@ -85,6 +86,7 @@ def test_changing_mean_velocity_is_followed_with_a_lag():
     error("Pipe2DTimeVaryingVelocity", "joint_extended_kalman_filter")
 
 
+@pytest.mark.slow
 def test_skewed_profile_comes_close_though_it_is_not_in_the_basis():
     """Thesis example 3: the final profile leans to the right side and errs by less than a parabola can."""
     estimated, true, weights = velocities("Pipe2DSkewedVelocity")
