@@ -25,6 +25,8 @@ def number(name: str, value: object, *, low: float = -math.inf, high: float = ma
 
 def integer(name: str, value: object, *, low: int, high: int | None = None) -> int:
     """``value`` as an int within [low, high]; else a ``ValueError``."""
+    if isinstance(value, np.ndarray) and value.ndim == 0:       # as stable-baselines3 gives a single action
+        value = value.item()
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < low or (
             high is not None and value > high):
         above = "" if high is None else f" and at most {high}"

@@ -15,8 +15,8 @@ from tqdm import tqdm
 
 from eitbench import _check
 from eitbench.envs.injection import InjectionEnv
-from eitbench.envs.injection_core import scaled
-from eitbench.leaderboard.policies import load_policy
+from eitbench.envs.injection_core import Rules, scaled
+from eitbench.leaderboard.policies import PolicyFile, load_policy
 
 DEFAULTS = {"rounds": 4, "episodes": 50, "epochs": 10, "batch": 256, "learning_rate": 1e-3}
 
@@ -54,15 +54,26 @@ def imitate(model: OnPolicyAlgorithm, world: InjectionEnv, options: dict[str, An
             _fit(model, optimiser, np.concatenate(seen), np.concatenate(said), np.concatenate(worth), settings, random)
 
 
-def check_imitation(algo: str, options: dict[str, Any]) -> None:
-    """``ValueError`` if `imitate` could not do what is asked for."""
+def suited(argument: str, name: str, rules: Rules) -> PolicyFile:
+    """The policy of this name or path; ``ValueError`` if it cannot play in this world."""
+    loaded = load_policy(name)
+    if not loaded.suits(rules):
+        raise ValueError(f"{argument} must be a policy that suits env, got {name!r}, which does not")
+    return loaded
+
+
+def check_imitation(algo: str, options: dict[str, Any], rules: Rules) -> None:
+    """``ValueError`` if `imitate` could not do what is asked for in this world."""
     if set(options) - {*DEFAULTS, "teacher"} or "teacher" not in options:
         raise ValueError(f"imitate must hold teacher and may hold {', '.join(DEFAULTS)}; got {options!r}")
     if algo not in ("ppo", "maskable_ppo"):
         raise ValueError(f"imitate is for ppo and maskable_ppo, got {algo}")
+    if rules.limit is not None:
+        raise ValueError("imitate is for actions that are numbers, and env takes currents")
     for name in ("rounds", "episodes", "epochs", "batch"):
-        _check.integer(name, (DEFAULTS | options)[name], low=1)
-    load_policy(str(options["teacher"]))
+        _check.integer(f"imitate.{name}", (DEFAULTS | options)[name], low=1)
+    _check.number("imitate.learning_rate", (DEFAULTS | options)["learning_rate"], low=0.0, open_low=True)
+    suited("imitate.teacher", str(options["teacher"]), rules)
 
 
 def _play(model: OnPolicyAlgorithm, world: InjectionEnv, teacher: Any, number: int, random: np.random.Generator, *,

@@ -156,7 +156,8 @@ def cycle_voltages(scenario: Scenario, entries: np.ndarray) -> np.ndarray:
 def step_error(mass: sp.csr_array, estimate: np.ndarray, moment: np.ndarray, deviation: np.ndarray | float,
                square: np.ndarray | float) -> np.ndarray:
     """∫(ĉ_t − c_t)² / ∫c_t² for ``estimate`` (..., n) less the background, with the entries of recordings."""
-    quadratic = np.einsum("...n,...n->...", estimate, (mass @ estimate.T).T)
+    # Contiguous: else the order of the sums, and so the last bit, would depend on how many estimates there are.
+    quadratic = np.einsum("...n,...n->...", estimate, np.ascontiguousarray((mass @ estimate.T).T))
     return (quadratic - 2.0 * np.einsum("...n,...n->...", estimate, moment) + deviation) / square
 
 

@@ -3,14 +3,17 @@
 A configuration is a YAML file such as those in ``baselines/rl/``. A run leaves in its folder: ``config.json`` (what was
 asked for), ``model.zip`` (the agent), ``monitor.csv`` (one row a training episode), ``evaluations.npz`` (scores on dev
 episodes over time), ``sha256`` of the model, and TensorBoard's logs.
+
+A run that goes on draws other episodes and other noise than it did before. A checkpoint holds the networks and the
+optimisers, not what dqn and sac have gathered in their replay buffers: these go on with an empty one.
 """
 
 from __future__ import annotations
 
 import hashlib
+import inspect
 import io
 import json
-import shutil
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
@@ -34,12 +37,14 @@ from eitbench import _check
 from eitbench._files import write_atomically
 from eitbench.envs.injection import InjectionEnv, InjectionVectorEnv
 from eitbench.envs.sb3 import InjectionVecEnv
-from eitbench.imitation import check_imitation, imitate
+from eitbench.imitation import check_imitation, imitate, suited
 from eitbench.leaderboard.policies import load_policy
 from eitbench.pair_policy import MaskablePairPolicy, PairPolicy
 from eitbench.seeds import SPLITS
 
 ALGORITHMS = ("ppo", "dqn", "sac", "recurrent_ppo", "maskable_ppo")
+OURS = {"policy", "env", "seed", "device", "tensorboard_log", "_init_setup_model"}
+"""Arguments of the algorithms that no configuration has a say in."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +52,7 @@ class Config:
     """What a configuration file may say."""
 
     total_steps: int
-    """environment steps, all environments together"""
+    """environment steps, all environments together; ppo finishes the rollout in which it reaches them"""
     n_envs: int = 16
     """environments side by side"""
     interval: int = 50_000
@@ -73,12 +78,25 @@ class Config:
         for name in ("total_steps", "n_envs", "interval", "evaluation_episodes", "episodes"):
             _check.integer(name, getattr(self, name), low=0 if name == "total_steps" else 1)
         _check.number("reward_scale", self.reward_scale, low=0.0, open_low=True)
+        for name in ("algorithm", "imitate"):
+            if not isinstance(getattr(self, name), dict):
+                raise ValueError(f"{name} must be a dict of names and values, got {getattr(self, name)!r}")
+        if not isinstance(self.hidden, (tuple, list)):
+            raise ValueError(f"hidden must be a list of integers, got {self.hidden!r}")
+        for units in self.hidden:
+            _check.integer("each entry of hidden", units, low=1)
         if self.anneal:
             _check.number("algorithm.learning_rate", self.algorithm.get("learning_rate"), low=0.0, open_low=True)
 
 
 def read_config(path: str | Path) -> Config:
-    """The configuration in a YAML file; ``ValueError`` if there is none or an entry is unknown."""
+    """The configuration in a YAML file, where an entry without a value is the default.
+
+    Raises
+    ------
+    ValueError
+        If there is none, or an entry is unknown or wrong.
+    """
     import yaml
     try:
         content = yaml.safe_load(Path(path).read_text())
@@ -88,8 +106,11 @@ def read_config(path: str | Path) -> Config:
     if not isinstance(content, dict) or not set(content) <= set(known):
         raise ValueError(f"config {str(path)!r} must hold entries of {', '.join(known)}; got {content!r}")
     entries: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value
-                               for name, value in content.items()}
-    return Config(**entries)
+                               for name, value in content.items() if value is not None}
+    try:
+        return Config(**entries)
+    except (TypeError, AttributeError) as error:
+        raise ValueError(f"config {str(path)!r} must hold what `Config` asks for: {error}") from None
 
 
 def train(env: str, algo: str, config: Config, seed: int, folder: Path, kwargs: dict[str, Any] | None = None) -> Path:
@@ -113,24 +134,33 @@ def train(env: str, algo: str, config: Config, seed: int, folder: Path, kwargs: 
         raise ValueError(f"algo must be one of {', '.join(ALGORITHMS)}, got {algo!r}")
     seed = _check.integer("seed", seed, low=0)
     envs = vector_env(env, kwargs, config)
-    if config.imitate:
-        check_imitation(algo, config.imitate)
     asked = {"env": env, "kwargs": kwargs or {}, "algo": algo, "seed": seed, "config": asdict(config)}
-    _begin_or_continue(folder, asked)
+    _compare(folder, asked)
+    made, latest = folder / "model.zip", folder / "latest.zip"
+    if made.exists() and (folder / "sha256").exists() and not latest.exists():
+        return made
     world = gym.make(env, disable_env_checker=True, observation="raw", episodes=config.episodes,
                      **(kwargs or {})).unwrapped
     assert isinstance(world, InjectionEnv)
-    reference = rewards_of(config.reference, world, folder / "reference.npy") if config.reference else None
-    learning = VecMonitor(InjectionVecEnv(envs, reward_scale=config.reward_scale, reference=reference))
+    _check_together(algo, config, world)
+    inner = InjectionVecEnv(envs, reward_scale=config.reward_scale)
+    learning = VecMonitor(inner)
     learning.seed(seed)
-    latest = folder / "latest.zip"
-    if latest.exists():
-        model = algorithm_of(algo).load(latest, env=learning, tensorboard_log=str(folder / "tensorboard"))
-    else:
+    begins = not latest.exists()
+    if begins:
         model = _fresh(algo, config, learning, seed, folder)
+    else:
+        model = algorithm_of(algo).load(latest, env=learning, device="cpu",
+                                        tensorboard_log=str(folder / "tensorboard"))
+        model.set_random_seed(seed + model.num_timesteps)       # loading seeded it as at the beginning
+    # From here on the folder belongs to this run: all that is cheap to check has been tried.
+    write_atomically(folder / "config.json", json.dumps(asked, indent=1).encode())
+    if config.reference:
+        inner.reference = rewards_of(config.reference, world, folder / "reference.npy")
+    if begins:
         if config.imitate:
             assert isinstance(model, OnPolicyAlgorithm)
-            imitate(model, world, config.imitate, config.reward_scale, reference, seed)
+            imitate(model, world, config.imitate, config.reward_scale, inner.reference, seed)
         _save(model, latest)
     evaluate = evaluation(env, kwargs, config)
     left = config.total_steps - model.num_timesteps
@@ -140,19 +170,23 @@ def train(env: str, algo: str, config: Config, seed: int, folder: Path, kwargs: 
         model.learn(left, callback=_Checkpoints(folder, config, evaluate), reset_num_timesteps=False,
                     tb_log_name="run")
     _forget(model)
-    _save(model, folder / "model.zip")
-    write_atomically(folder / "sha256", hashlib.sha256((folder / "model.zip").read_bytes()).hexdigest().encode())
+    _save(model, made)
+    write_atomically(folder / "sha256", hashlib.sha256(made.read_bytes()).hexdigest().encode())
     latest.unlink()
     (folder / "reference.npy").unlink(missing_ok=True)
-    return folder / "model.zip"
+    return made
 
 
 def vector_env(env: str, kwargs: dict[str, Any] | None, config: Config, n_envs: int | None = None,
                ) -> InjectionVectorEnv:
-    """The environments side by side; ``ValueError`` if ``env`` does not ask for injections."""
+    """The environments side by side; ``ValueError`` if ``env`` does not ask for injections, or ``kwargs`` hold what
+    training itself decides."""
     from eitbench.envs import INJECTION
     if env not in INJECTION:
         raise ValueError(f"env must be one of {', '.join(INJECTION)}; got {env!r}")
+    if taken := {"episodes", "observation", "estimator"} & set(kwargs or {}):
+        raise ValueError("kwargs must not hold episodes, which the configuration says, nor observation and estimator, "
+                         f"which training decides; got {', '.join(sorted(taken))}")
     made = gym.make_vec(env, num_envs=n_envs or config.n_envs, vectorization_mode="vector_entry_point",
                         episodes=config.episodes, **(kwargs or {}))
     assert isinstance(made, InjectionVectorEnv)
@@ -206,16 +240,27 @@ def _masked(model: BaseAlgorithm) -> bool:
     return isinstance(model, MaskablePPO)
 
 
-def _begin_or_continue(folder: Path, asked: dict[str, Any]) -> None:
-    """Make the folder; ``ValueError`` if another run is kept there."""
-    asked = json.loads(json.dumps(asked))
+def _compare(folder: Path, asked: dict[str, Any]) -> None:
+    """``ValueError`` if another run is kept in the folder."""
     path = folder / "config.json"
-    if path.exists():
-        there = json.loads(path.read_text())
-        if there != asked:
-            raise ValueError(f"out must be an empty folder or one of the same run; {folder} holds {there}")
-    folder.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, json.dumps(asked, indent=1).encode())
+    if path.exists() and (there := json.loads(path.read_text())) != json.loads(json.dumps(asked)):
+        raise ValueError(f"out must be an empty folder or one of the same run; {folder} holds {there}")
+
+
+def _check_together(algo: str, config: Config, world: InjectionEnv) -> None:
+    """``ValueError`` if algorithm, configuration and environment do not go together."""
+    numbered = isinstance(world.action_space, spaces.Discrete)
+    if algo in (("sac",) if numbered else ("dqn", "maskable_ppo")):
+        asks, takes = ("currents", "numbers") if numbered else ("numbers", "currents")
+        raise ValueError(f"algo must suit env: {algo} is for actions that are {asks}, and env takes {takes}")
+    known = set(inspect.signature(algorithm_of(algo)).parameters) - OURS
+    if unknown := set(config.algorithm) - known:
+        raise ValueError(f"algorithm must hold arguments of {algo}, {', '.join(sorted(known))}; "
+                         f"got {', '.join(sorted(map(str, unknown)))}")
+    if config.reference:
+        suited("reference", config.reference, world.rules)
+    if config.imitate:
+        check_imitation(algo, config.imitate, world.rules)
 
 
 def _fresh(algo: str, config: Config, learning: VecEnv, seed: int, folder: Path) -> BaseAlgorithm:
@@ -224,17 +269,18 @@ def _fresh(algo: str, config: Config, learning: VecEnv, seed: int, folder: Path)
     arguments = {"policy_kwargs": {"net_arch": list(config.hidden)}} | config.algorithm
     if config.anneal:
         arguments["learning_rate"] = LinearSchedule(arguments["learning_rate"], 0.0, 1.0)
-    made: BaseAlgorithm = algorithm_of(algo)(policy, learning, seed=seed, device="cpu",
-                                             tensorboard_log=str(folder / "tensorboard"), **arguments)
+    try:
+        made: BaseAlgorithm = algorithm_of(algo)(policy, learning, seed=seed, device="cpu",
+                                                 tensorboard_log=str(folder / "tensorboard"), **arguments)
+    except (AssertionError, TypeError) as error:
+        raise ValueError(f"algorithm must hold what {algo} takes: {error}") from None
     return made
 
 
 def _save(model: BaseAlgorithm, path: Path) -> None:
-    """Written beside its place and moved there."""
-    beside = path.with_name(f".{path.name}")
-    model.save(beside)
-    made = beside if beside.exists() else beside.with_name(beside.name + ".zip")
-    shutil.move(made, path)
+    content = io.BytesIO()
+    model.save(content)
+    write_atomically(path, content.getvalue())
 
 
 def _forget(model: BaseAlgorithm) -> None:
@@ -245,11 +291,19 @@ def _forget(model: BaseAlgorithm) -> None:
 
 
 def _append_evaluation(folder: Path, steps: int, errors: np.ndarray) -> None:
+    """One row more; rows of as many steps or more are of a checkpoint that was never kept, or of this very one."""
     path = folder / "evaluations.npz"
     before = dict(np.load(path)) if path.exists() else {"steps": np.zeros(0, int), "errors": np.zeros((0, len(errors)))}
-    beside = path.with_name(".evaluations.npz")
-    np.savez(beside, steps=np.append(before["steps"], steps), errors=np.vstack([before["errors"], errors]))
-    shutil.move(beside, path)
+    kept, content = before["steps"] < steps, io.BytesIO()
+    np.savez(content, steps=np.append(before["steps"][kept], steps), errors=np.vstack([before["errors"][kept], errors]))
+    write_atomically(path, content.getvalue())
+
+
+def _forget_beyond(monitor: Path, steps: int) -> None:
+    """Keep the rows up to so many steps: later ones are of a checkpoint that was never kept, and come again."""
+    rows = monitor.read_text().splitlines(keepends=True)[1:] if monitor.exists() else []
+    kept = [row for row in rows if row.endswith("\n") and int(row.split(",")[0]) <= steps]
+    write_atomically(monitor, "".join(["steps,return,length,seconds\n", *kept]).encode())
 
 
 class _Checkpoints(BaseCallback):
@@ -265,9 +319,7 @@ class _Checkpoints(BaseCallback):
         self._next = (self.num_timesteps // self.config.interval + 1) * self.config.interval
         self._rows: list[str] = []
         self._begin = time.monotonic()
-        monitor = self.folder / "monitor.csv"
-        if not monitor.exists():
-            monitor.write_text("steps,return,length,seconds\n")
+        _forget_beyond(self.folder / "monitor.csv", self.num_timesteps)
 
     def _on_step(self) -> bool:
         self._bar.update(self.num_timesteps - self._bar.n)

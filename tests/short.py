@@ -17,8 +17,7 @@ FIELDS = {
     "Pipe2DBiasedVelocity": FLOW,
     "Pipe2DVelocity": FLOW,
     "Pipe2DObstacle": PIPE | {"viscosity": 0.04, "obstacle_height": 0.01},
-    "Pipe3D": {"mean_velocity": 45.0, "scored_steps": 3, "frame": 2, "electrode_rings": 1, "electrodes_per_ring": 4,
-               "potential_order": 1},
+    "Pipe3D": {"mean_velocity": 45.0, "scored_steps": 3, "frame": 2, "potential_order": 1},
     "RotatingTank2D": {"n_electrodes": 8, "warm_up": 1, "scored_steps": 4},
     "RotatingTankInjection": {"n_electrodes": 8, "warm_up": 1, "scored_steps": 4},
     "StationaryTank2D": {"n_electrodes": 8, "scored_steps": 5},
@@ -26,12 +25,24 @@ FIELDS = {
 """Fields of the scenario by the name that the classes …Env and …VectorEnv of an id begin with."""
 
 
+ARGUMENTS = {
+    "Pipe3D": {"electrode_rings": 1, "electrodes_per_ring": 4},
+    "Pipe2DInjectionFaults": {"dead": [0, 1], "failing": [0, 1], "loose": [0, 0]},
+}
+"""What else must be small where there are four electrodes."""
+
+
 def kind(name: str) -> str:
     """What the classes of an id are called, without …Env."""
     return ENTRY_POINTS[name][0].split(":")[1]
 
 
-def short(name: str) -> dict:
-    """Keyword arguments that make an id's episodes short, and its training episodes few."""
+def world(name: str) -> dict:
+    """Keyword arguments that make an id's episodes short."""
     assert kind(name) in FIELDS, f"{name} has no short version yet: give {kind(name)!r} one in tests/envs/short.py"
-    return {"scenario": FIELDS[kind(name)], "episodes": 2}
+    return {"scenario": FIELDS[kind(name)]} | ARGUMENTS.get(kind(name), {})
+
+
+def short(name: str) -> dict:
+    """And its training episodes few."""
+    return world(name) | {"episodes": 2}

@@ -7,7 +7,7 @@ import sys
 
 import gymnasium as gym
 import pytest
-from short import FIELDS, PLAIN, kind
+from short import PLAIN, world
 from typer.testing import CliRunner
 
 from eitbench.cli import app
@@ -42,7 +42,8 @@ def tiny_world(monkeypatch, tmp_path, tmp_path_factory):
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path_factory.getbasetemp() / "episodes"))
     monkeypatch.setattr(store, "_git", lambda *words: None)
     for name in ENTRY_POINTS:
-        monkeypatch.setitem(gym.registry[name].kwargs, "scenario", TINY if name in PLAIN else FIELDS[kind(name)])
+        for argument, value in ({"scenario": TINY} if name in PLAIN else world(name)).items():
+            monkeypatch.setitem(gym.registry[name].kwargs, argument, value)
     monkeypatch.setitem(gym.registry["eitbench/Pipe2DFixedLag-v0"].kwargs, "lag", 2)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.py").write_text(MINE)

@@ -1,7 +1,7 @@
 """Training with stable-baselines3: what is learnt from is what the environments show, and nothing is lost."""
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import gymnasium as gym
 import numpy as np
@@ -10,6 +10,7 @@ import pytest
 from eitbench import training
 from eitbench.envs.injection_core import Rules
 from eitbench.envs.sb3 import InjectionVecEnv
+from eitbench.leaderboard.agents import _mark, load_agent
 from eitbench.leaderboard.policies import load_policy, play
 from eitbench.scenarios import Pipe2D
 from eitbench.training import Config, read_config, train
@@ -35,6 +36,8 @@ def test_sb3_sees_what_the_environments_show():
     rng = np.random.default_rng(0)
     for step in range(1, 6):
         actions = rng.integers(120, size=3)
+        assert ours.get_attr("action_space") == [env.action_space for env in single]
+        assert ours.get_attr("observation_space", [1]) == [single[1].observation_space]
         shown, rewards, ended, infos = ours.step(actions)
         outcome = [env.step(int(action)) for env, action in zip(single, actions, strict=True)]
         np.testing.assert_allclose(rewards, [10.0 * each[1] for each in outcome], rtol=1e-6)
@@ -57,7 +60,7 @@ def test_every_algorithm_leaves_a_whole_run(env, algo, options, tmp_path):
     model = training.algorithm_of(algo).load(path)
     assert 32 <= model.num_timesteps < 48
     kept = np.load(tmp_path / "evaluations.npz")
-    assert kept["steps"][0] == 0 and (np.diff(kept["steps"]) >= 0).all() and kept["steps"][-1] == model.num_timesteps
+    assert kept["steps"][0] == 0 and (np.diff(kept["steps"]) > 0).all() and kept["steps"][-1] == model.num_timesteps
     np.testing.assert_allclose(kept["errors"][-1], training.evaluation(env, SHORT, TINY)(model), rtol=1e-6)
     rows = (tmp_path / "monitor.csv").read_text().splitlines()
     assert rows[0] == "steps,return,length,seconds" and len(rows) - 1 == model.num_timesteps // 4
@@ -82,9 +85,69 @@ def test_a_killed_run_loses_no_more_than_an_interval(tmp_path, monkeypatch):
     assert calls == [16]
     model = training.algorithm_of("ppo").load(train(NAME, "ppo", TINY, 1, tmp_path, SHORT))
     assert model.num_timesteps == 32
-    assert np.load(tmp_path / "evaluations.npz")["steps"].tolist() == [0, 16, 32, 32]
+    assert np.load(tmp_path / "evaluations.npz")["steps"].tolist() == [0, 16, 32]
     with pytest.raises(ValueError, match="out must be an empty folder or one of the same run"):
         train(NAME, "ppo", TINY, 2, tmp_path, SHORT)
+
+
+def killed_at_the_first_checkpoint(folder, monkeypatch, config=TINY):
+    """All but the model is written when the run is killed: the one that is kept has learnt nothing yet."""
+    save = training._save
+
+    def kill(model, path):
+        if model.num_timesteps:
+            raise KeyboardInterrupt
+        save(model, path)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(training, "_save", kill)
+        with pytest.raises(KeyboardInterrupt):
+            train(NAME, "ppo", config, 1, folder, SHORT)
+
+
+def test_no_row_is_kept_twice(tmp_path, monkeypatch):
+    """What was recorded of steps that are gone, and come again, is recorded once."""
+    killed_at_the_first_checkpoint(tmp_path, monkeypatch)
+    with (tmp_path / "monitor.csv").open("a") as file:
+        file.write("1")                                         # cut short
+    train(NAME, "ppo", TINY, 1, tmp_path, SHORT)
+    assert np.load(tmp_path / "evaluations.npz")["steps"].tolist() == [0, 16, 32]
+    rows = (tmp_path / "monitor.csv").read_text().splitlines()
+    assert [row.split(",")[0] for row in rows] == ["steps", *(str(8 * (1 + k // 2)) for k in range(8))]
+
+
+def test_a_run_that_goes_on_plays_other_episodes(tmp_path, monkeypatch):
+    """Not those of its beginning once more; whoever begins anew plays the same as ever."""
+    begin, keep, played = InjectionVecEnv._begin, training._Checkpoints._keep, []
+    config = replace(TINY, episodes=12)
+
+    def noting(self, seeds):
+        observation = begin(self, seeds)
+        played[-1].append(self.envs.seeds)
+        return observation
+
+    def kill(self):
+        keep(self)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(InjectionVecEnv, "_begin", noting)
+    for name in ("a", "b"):
+        with monkeypatch.context() as patch:
+            patch.setattr(training._Checkpoints, "_keep", kill)
+            played.append([])
+            with pytest.raises(KeyboardInterrupt):
+                train(NAME, "ppo", config, 1, tmp_path / name, SHORT)
+    played.append([])
+    train(NAME, "ppo", config, 1, tmp_path / "a", SHORT)
+    assert played[0] == played[1] and played[0][:2] != played[2][:2]
+
+
+def test_a_finished_run_stays_as_it_is(tmp_path):
+    """The same command again gives the same model, and touches nothing."""
+    path = train(NAME, "ppo", TINY, 1, tmp_path, SHORT)
+    before = {each: each.stat().st_mtime_ns for each in tmp_path.iterdir()}
+    assert train(NAME, "ppo", TINY, 1, tmp_path, SHORT) == path
+    assert before == {each: each.stat().st_mtime_ns for each in tmp_path.iterdir()}
 
 
 def test_the_same_seed_learns_the_same(tmp_path):
@@ -106,6 +169,11 @@ def test_a_pupil_learns_what_its_teacher_says(tmp_path):
 
 @pytest.mark.parametrize(("text", "message"), [
     ("- a\n", "must hold entries of"), ("steps: 3\n", "must hold entries of"), ("a: [", "config must be a YAML file"),
+    ("n_envs: 2\n", "config .*config.yml' must hold what `Config` asks for: .*'total_steps'"),
+    ("total_steps: 1\nanneal: true\nalgorithm: fast\n", "algorithm must be a dict of names and values, got 'fast'"),
+    ("total_steps: 1\nimitate: [best_pair]\n", "imitate must be a dict"),
+    ("total_steps: 1\nhidden: 8\n", "hidden must be a list of integers, got 8"),
+    ("total_steps: 1\nhidden: [8, x]\n", "each entry of hidden must be an integer of at least 1, got 'x'"),
     ("total_steps: -1\n", "total_steps must"), ("total_steps: 1\nreward_scale: 0\n", "reward_scale must"),
 ])
 def test_wrong_configurations_are_named(text, message, tmp_path):
@@ -122,8 +190,27 @@ def test_wrong_arguments_are_named(tmp_path):
         train("eitbench/Pipe2D-v0", "ppo", TINY, 0, tmp_path)
     with pytest.raises(ValueError, match="algo must be one of ppo"):
         train(NAME, "reinforce", TINY, 0, tmp_path)
-    with pytest.raises(ValueError, match="imitate must hold teacher"):
-        train(NAME, "ppo", replace(TINY, imitate={"rounds": 1}), 0, tmp_path, SHORT)
+
+
+@pytest.mark.parametrize(("env", "algo", "change", "kwargs", "message"), [
+    (NAME, "ppo", {"imitate": {"rounds": 1}}, {}, "imitate must hold teacher"),
+    (NAME, "ppo", {"imitate": {"teacher": "event_triggered"}}, {},
+     "imitate.teacher must be a policy that suits env, got 'event_triggered'"),
+    (NAME, "ppo", {"imitate": {"teacher": "best_pair", "learning_rate": 0}}, {}, "imitate.learning_rate must be"),
+    (NAME, "ppo", {"reference": "event_triggered"}, {}, "reference must be a policy that suits env"),
+    (NAME, "ppo", {"algorithm": {"speed": 1, "seed": 2}}, {}, "algorithm must hold.*; got seed, speed"),
+    (NAME, "sac", {}, {}, "sac is for actions that are currents, and env takes numbers"),
+    (CURRENTS, "dqn", {}, {}, "dqn is for actions that are numbers, and env takes currents"),
+    (CURRENTS, "maskable_ppo", {}, {}, "maskable_ppo is for actions that are numbers"),
+    (CURRENTS, "ppo", {"imitate": {"teacher": "best_pair"}}, {}, "imitate is for actions that are numbers"),
+    (NAME, "ppo", {}, {"episodes": 3, "estimator": "full"}, "kwargs must not hold.*; got episodes, estimator"),
+    (NAME, "ppo", {"algorithm": {"n_steps": 0}}, {}, "algorithm must hold what ppo takes: "),
+])
+def test_what_does_not_go_together_is_named_before_the_folder_is_taken(env, algo, change, kwargs, message, tmp_path):
+    """So that the same folder serves once the mistake is mended."""
+    with pytest.raises(ValueError, match=message):
+        train(env, algo, replace(TINY, **({"algorithm": {}} | change)), 0, tmp_path, SHORT | kwargs)
+    assert not list(tmp_path.iterdir())
 
 
 def test_rewards_may_be_counted_from_others(tmp_path):
@@ -154,7 +241,8 @@ def test_an_agent_plays_as_it_was_evaluated(env, algo, tmp_path):
     """As a policy its errors are those of the last evaluation; a file that was changed is not opened."""
     options = {"learning_starts": 4, "batch_size": 4} if algo == "sac" else {"n_steps": 8, "batch_size": 8}
     kwargs = SHORT | ({"budget": 2} if env == BUDGET else {})
-    path = train(env, algo, replace(TINY, algorithm=options), 1, tmp_path, kwargs)
+    config = replace(TINY, algorithm=options)
+    path = train(env, algo, config, 1, tmp_path, kwargs)
     expected = np.load(tmp_path / "evaluations.npz")["errors"][-1]
     errors = [play(env, kwargs, str(path), seed, "reduced")["error"] for seed in (100_000, 100_001)]
     np.testing.assert_allclose(errors, expected, rtol=1e-5)
@@ -169,9 +257,14 @@ def test_an_agent_plays_as_it_was_evaluated(env, algo, tmp_path):
             observation, _, ended, _, _ = world.step(player.act(observation))
             injected[-1].append(observation["currents"])
     np.testing.assert_array_equal(*injected)                # whichever filter is inside
-    assert agent.name == f"{algo}_seed1" and not agent.privileged and agent.parameters["env"] == env
+    asked = json.loads((tmp_path / "config.json").read_text())
+    assert asked["config"] == json.loads(json.dumps(asdict(config)))
+    assert agent.name == f"{algo}_{_mark(asked)}_seed1" and _mark(asked) == _mark(asked | {"seed": 2})
+    assert _mark(asked) != _mark(asked | {"kwargs": {}}) and not agent.privileged and agent.parameters["env"] == env
     assert not agent.suits(Rules(Pipe2D(), limit=None if env == CURRENTS else "L1"))
-    path.write_bytes(path.read_bytes() + b"x")
+    content = path.read_bytes()
+    path.write_bytes(content + b"x")
+    assert load_agent(path, content)[0] == agent.name            # what was checked is what is opened
     with pytest.raises(ValueError, match="must have the sha256 that lies beside it"):
         load_policy(str(path))
     (tmp_path / "sha256").unlink()

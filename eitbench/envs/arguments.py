@@ -12,9 +12,18 @@ from eitbench.scenarios.pipe2d import PROFILES
 S = TypeVar("S")
 
 
-def with_fields(kind: Callable[..., S], changes: dict[str, Any] | None) -> S:
-    """A scenario of this class with some fields changed; lists become tuples."""
-    changes = {name: tuple(value) if isinstance(value, list) else value for name, value in (changes or {}).items()}
+def with_fields(kind: Callable[..., S], changes: dict[str, Any] | None, **arguments: Any) -> S:
+    """A scenario of this class with some fields changed; lists become tuples.
+
+    ``arguments`` are the fields that an environment takes by themselves: in ``changes`` they would be lost, or win.
+    """
+    changes = {} if changes is None else changes
+    if not isinstance(changes, dict):
+        raise ValueError(f"scenario must be a dict of fields, got {changes!r}")
+    for name in arguments.keys() & changes.keys():
+        raise ValueError(f"{name} must be given as an argument, not in scenario; got scenario {changes!r}")
+    changes = {name: tuple(value) if isinstance(value, list) else value
+               for name, value in (changes | arguments).items()}
     known = [field.name for field in fields(kind)]  # type: ignore[arg-type]
     unknown = sorted(changes.keys() - set(known))
     if unknown:

@@ -122,7 +122,8 @@ class Belief:
         """
         first = self._operator.weight
         weight = total = np.eye(len(self._step(ahead)[0])) if first is None else first
-        last = len(self._along) if self._along is not None else ahead + steps + 1
+        # The states of an episode are one more than the steps between them.
+        last = len(self._along) - 1 if self._along is not None else ahead + steps + 1
         for k in range(min(ahead + steps, last - 1), ahead, -1):
             transition = self._step(k)[0]
             total = weight + transition.T @ total @ transition

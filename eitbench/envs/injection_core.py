@@ -62,6 +62,9 @@ class Rules:
         if self.budget is not None:
             _check.integer("budget", self.budget, low=0)
         _check.number("gate", min(self.gate, 1e300), low=0.0, open_low=True)
+        most, L = self.instrument.most, self.scenario.currents.shape[1]
+        if most > L - 2:
+            raise ValueError(f"dead, failing and loose must leave two electrodes sound, got up to {most} of {L}")
 
     @property
     def pairs(self) -> np.ndarray:

@@ -50,7 +50,7 @@ class JointFullOperator(FullOperator):
     def grid(self) -> tuple[np.ndarray, np.ndarray]:
         patches, n = self._patches, self._patches.shape[1]
         variance = [((patches @ filter_.covariance[:n, :n]) * patches).sum(axis=1) for filter_ in self._filters]
-        return self.means() @ patches.T, self.concentration[:, None] * np.sqrt(variance)
+        return self._patch_means(), self.concentration[:, None] * np.sqrt(variance)
 
     def means(self) -> np.ndarray:
         return self.concentration[:, None] * np.array([filter_.concentration for filter_ in self._filters])

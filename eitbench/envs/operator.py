@@ -183,7 +183,11 @@ class FullOperator:
 
     def grid(self) -> tuple[np.ndarray, np.ndarray]:
         spread = np.array([np.sqrt(filter_.variance_of(self._patches)) for filter_ in self._filters])
-        return self.means() @ self._patches.T, self.concentration[:, None] * spread
+        return self._patch_means(), self.concentration[:, None] * spread
+
+    def _patch_means(self) -> np.ndarray:
+        # Episode by episode: the bits of one product of matrices would depend on how many play side by side.
+        return (self._patches @ self.means()[..., None])[..., 0]
 
     def errors(self, moments: np.ndarray, deviations: np.ndarray, squares: np.ndarray) -> np.ndarray:
         estimate = self.means() - self._scenario.background

@@ -41,7 +41,7 @@ class Pipe2DInjectionBudgetEnv(InjectionEnv, EzPickle):
 
     ## Episode end
 
-    Terminated after 182 steps. Never truncated.
+    Terminated after 182 steps (198 with `estimator="none"`). Never truncated.
 
     ## Arguments
 

@@ -13,7 +13,7 @@ from eitbench.scenarios import Pipe2DDriftingVelocity
 
 
 def _rules(region: list[float] | None, scenario: dict[str, Any] | None) -> Rules:
-    return Rules(with_fields(Pipe2DDriftingVelocity, {**(scenario or {}), "region": region}))
+    return Rules(with_fields(Pipe2DDriftingVelocity, scenario, region=region))
 
 
 class Pipe2DInjectionFlowEnv(InjectionEnv, EzPickle):

@@ -92,5 +92,4 @@ class Pipe3DVectorEnv(EstimationVectorEnv):
 
 
 def _scenario(changes: dict[str, Any] | None, electrode_rings: int, electrodes_per_ring: int) -> Pipe3D:
-    electrodes = {"electrode_rings": electrode_rings, "electrodes_per_ring": electrodes_per_ring}
-    return with_fields(Pipe3D, electrodes | (changes or {}))
+    return with_fields(Pipe3D, changes, electrode_rings=electrode_rings, electrodes_per_ring=electrodes_per_ring)

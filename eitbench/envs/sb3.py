@@ -27,7 +27,7 @@ class InjectionVecEnv(VecEnv):
 
     def __init__(self, envs: InjectionVectorEnv, *, reward_scale: float = 1.0,
                  reference: np.ndarray | None = None) -> None:
-        self.envs, self.reward_scale, self._reference = envs, reward_scale, reference
+        self.envs, self.reward_scale, self.reference = envs, reward_scale, reference
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
 
     def reset(self) -> Any:
@@ -48,8 +48,8 @@ class InjectionVecEnv(VecEnv):
 
     def step_wait(self) -> VecEnvStepReturn:
         observation, rewards, ended, _, _ = self.envs.step(self._actions)
-        if self._reference is not None:
-            rewards = rewards - self._reference[list(self.envs.seeds), self._step]
+        if self.reference is not None:
+            rewards = rewards - self.reference[list(self.envs.seeds), self._step]
         self._step += 1
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         if ended.all():
@@ -67,7 +67,9 @@ class InjectionVecEnv(VecEnv):
         return [every[k] for k in self._get_indices(indices)]
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        value = getattr(self.envs, attr_name)
+        # A space is asked for as each environment's own.
+        spaces = ("observation_space", "action_space")
+        value = getattr(self.envs, f"single_{attr_name}" if attr_name in spaces else attr_name)
         return [value for _ in self._get_indices(indices)]
 
     def has_attr(self, attr_name: str) -> bool:

@@ -294,6 +294,8 @@ def test_frames_show_truth_estimate_and_spread(name):
     (PIPE, {"lag": "some"}, "lag must be 'all'"), (PIPE, {"lag": 98}, "lag must be"),
     (PIPE, {"render_mode": "tv"}, "render_mode must be"), (PIPE, {"episodes": 0}, "episodes must"),
     (PIPE, {"scenario": {"colour": 1}}, "scenario has no field 'colour'"),
+    (PIPE, {"scenario": [1.0]}, r"scenario must be a dict of fields, got \[1.0\]"),
+    ("eitbench/Pipe3D-v0", {"scenario": {"electrode_rings": 2}}, "electrode_rings must be given as an argument"),
     (PIPE, {"assumed_mean_velocity": -1.0}, "mean_velocity"),
     (PIPE, {"scenario": {"diffusivity": 0.0}}, "diffusivity must be"),
     (PIPE, {"scenario": {"electrode_cover": 2.0}}, "cover"),

@@ -5,7 +5,7 @@ import pickle
 import gymnasium as gym
 import numpy as np
 import pytest
-from choosing import CURRENTS, NAME, SHORT, arrays_of, make, play, some_actions, some_pairs, world
+from choosing import CURRENTS, FAULTS, FLOW, NAME, SHORT, arrays_of, make, play, some_actions, some_pairs, world
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
@@ -173,6 +173,20 @@ def test_side_by_side_as_one_by_one(name, estimator, observation):
     assert sum(int(step[-1]["step"][0]) == 1 for step in steps[0]) >= 2          # another episode was begun
 
 
+@pytest.mark.parametrize("name", [FAULTS, FLOW])
+def test_with_the_exact_filter_too_others_beside_change_nothing(name):
+    """An episode is the same to the bit whether it is played alone or beside two others."""
+    alone, beside = (gym.make_vec(name, num_envs=n, vectorization_mode="vector_entry_point", estimator="full",
+                                  observation="raw", scenario=world(name)) for n in (1, 3))
+    shown = [(alone.reset(seed=[0])[0], beside.reset(seed=[0, 1, 2])[0])]
+    for action in (7, 40):
+        (first, pay, *_), (second, paid, *_) = alone.step(np.array([action])), beside.step(np.full(3, action))
+        shown.append((first | {"pay": pay}, second | {"pay": paid}))
+    for one, many in shown:
+        for key, array in one.items():
+            np.testing.assert_array_equal(many[key][0], array[0], err_msg=key)
+
+
 # -- the operators inside ---------------------------------------------------------------------------------------------
 
 
@@ -220,11 +234,21 @@ def test_wrong_arguments_are_named(change, message):
         gym.make(NAME, **change)
 
 
+def test_one_action_may_be_an_array():
+    """Of no axes, as stable-baselines3's models give it for a single observation, and as the action space holds."""
+    env, steps = make("reduced"), []
+    for action in (7, np.array(7)):
+        assert env.action_space.contains(np.asarray(action))
+        env.reset(seed=1)
+        steps.append(env.step(action)[:2])
+    assert steps[0][1] == steps[1][1] and (steps[0][0]["voltages"] == steps[1][0]["voltages"]).all()
+
+
 def test_wrong_actions_are_named():
     """There are 120 pairs, and only they can be injected."""
     env = make().unwrapped
     env.reset(seed=1)
-    for action in (-1, 120, 1.5, True, "first"):
+    for action in (-1, 120, 1.5, True, "first", np.array(1.5), np.array([7])):
         with pytest.raises(ValueError, match="action must be an integer of at least 0 and at most 119"):
             env.step(action)
     many = gym.make_vec(NAME, num_envs=2, vectorization_mode="vector_entry_point", estimator="none", scenario=SHORT,

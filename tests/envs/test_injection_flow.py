@@ -120,6 +120,7 @@ def test_the_bank_keeps_the_integrals(monkeypatch, tmp_path):
 
 @pytest.mark.parametrize(("change", "message"), [
     ({"region": [0.3, 0.2]}, "region must be a range"), ({"region": [0.283, 0.4]}, "multiples of 0.01 m"),
+    ({"scenario": {"region": [0.2, 0.4]}}, "region must be given as an argument, not in scenario"),
     ({"region": [0.3, 0.5]}, "region must be a range"), ({"region": [0.3]}, "region must have shape"),
     ({"scenario": {"velocity_walk": 0.0}}, "velocity_walk must be"),
     ({"scenario": {"swing_range": [0.0, 0.2]}}, "swing_range and skewness_range must be"),
@@ -269,3 +270,13 @@ def test_told_the_truth_the_belief_moves_along_it(env, shared):
     transition, noise = joint_step(shared.tables, told[17:18], 0.1**2)
     np.testing.assert_allclose(belief._step(2)[0], transition[0], rtol=1e-12)
     np.testing.assert_allclose(belief._step(2)[1], noise[0], rtol=1e-12)
+
+
+def test_foresight_ends_with_the_episode(env):
+    """Whoever is told the truth: after the last injection nothing is left to do harm, before it one step is."""
+    belief, entries = Belief(env.rules, env.reset(seed=3)[0]), recording(env.scenario, 3)
+    belief.told(entries[15:])
+    last = env.core.length - 1
+    np.testing.assert_array_equal(belief.foresight(4, last), belief.foresight(0, last))
+    np.testing.assert_array_equal(belief.foresight(4, last - 1), belief.foresight(1, last - 1))
+    assert (belief.foresight(1, last - 1) != belief.foresight(0, last - 1)).any()

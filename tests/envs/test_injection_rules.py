@@ -107,7 +107,11 @@ def test_faults_depend_on_the_seed_alone_and_are_shown_by_doubt():
 
 @pytest.mark.parametrize(("name", "change", "message"), [
     (FAULTS, {"dead": [3, 2]}, "dead must be a range least ≤ most"), (FAULTS, {"failing": [1]}, "failing must be a"),
-    (FAULTS, {"loose": [0, 12]}, "must leave two electrodes sound"), (BUDGET, {"budget": -1}, "budget must be"),
+    (FAULTS, {"loose": [0, 12]}, "must leave two electrodes sound, got up to 18 of 16"),
+    (FAULTS, {"scenario": {"electrodes_per_wall": 2}}, "must leave two electrodes sound, got up to 8 of 4"),
+    (FAULTS, {"dead": 3}, r"dead must be a range \(least, most\), got 3"),
+    (FAULTS, {"loose": "01"}, r"loose must be a range \(least, most\), got '01'"),
+    (BUDGET, {"budget": -1}, "budget must be"),
 ])
 def test_wrong_rules_are_named(name, change, message):
     """Of faults and budgets too."""

@@ -48,5 +48,6 @@ def test_somebody_s_agent_plays_in_a_guest(tmp_path):
         here, there = (run_episode(job._replace(isolated=isolated))[0] for isolated in (False, True))
     finally:
         guests.close()
+    assert here["method"] == there["method"] == f"{asked['algo']}_seed{asked['seed']}"          # it is still ours
     assert here["status"] == "ok" and here["step_errors"] == there["step_errors"]
     assert here["checkpoint_sha256"] == there["checkpoint_sha256"] and there["peak_memory"] > 50e6
