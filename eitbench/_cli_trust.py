@@ -37,6 +37,8 @@ def verify(
             raise ValueError("only one of --baseline and --policy may be given")
         if (held_out > 0) != (salt_file is not None):
             raise ValueError("--held-out and --salt-file belong together")
+        if not episodes and not held_out:
+            raise ValueError("--episodes must be at least 1 where no --held-out episodes are played, got 0")
         salt = beyond.read_salt(salt_file) if salt_file else b""
     seed = secrets.randbelow(2**32) if seed is None else seed
     try:
@@ -62,9 +64,8 @@ def verify(
 def held_out(
     new: Annotated[Path, typer.Option(help="Where to write a new salt; keep it secret, and keep it.")],
 ) -> None:
-    """For maintainers: draw the salt of held-out episodes, and publish its hash in leaderboards/held_out.json."""
+    """For maintainers: draw the salt of held-out episodes, and publish its hash in leaderboards/held_out.json, once."""
     from eitbench.leaderboard import held_out as beyond
     with clear_errors():
-        digest = beyond.new_salt(new)
-    beyond.publish(digest)
+        digest = beyond.publish_new_salt(new)
     typer.echo(f"wrote {new}, sha256 {digest}, and {beyond.PUBLISHED}")

@@ -25,11 +25,13 @@ def main() -> None:
     private, memory = Path(sys.argv[1]), int(sys.argv[2])
     incoming, outgoing = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     silent = os.open(os.devnull, os.O_RDWR)
-    os.dup2(silent, 0)
-    os.dup2(2, 1)                                                      # what the guest prints is no answer
+    for stream in range(3):                                            # what the guest prints is no answer
+        os.dup2(silent, stream)
+    readable = wall.python_files()
     wall.end_with_parent()
     wall.limit_memory(memory)
-    closed = wall.close_files(wall.python_files(), [private, Path(os.devnull)])
+    closed = wall.close_files(readable, [private, Path(os.devnull)])
+    wall.close_sockets()
 
     def read(n: int) -> bytes:
         content = incoming.read(n)
@@ -41,7 +43,7 @@ def main() -> None:
         outgoing.write(wire.pack(words, arrays))
         outgoing.flush()
 
-    say({"closed": closed})
+    say({"closed": closed, "readable": [str(place) for place in readable]})
     answer: Callable[..., Reply] = _nothing
     while True:
         try:

@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from eitbench.leaderboard.baselines import BOARDS, ROLES, Baseline, find_baseline
+from eitbench.leaderboard.baselines import BOARDS, ROLES, Baseline, find_baseline, is_ours
 from eitbench.leaderboard.host import Guest, GuestError
-from eitbench.leaderboard.policies import PolicyFile, find_policy
+from eitbench.leaderboard.policies import PolicyFile, find_policy, own_agents, own_policies
 
 NAME = re.compile(r"[^./\\][^/\\]*")
 """Of a method, as records have it."""
@@ -74,17 +74,27 @@ def _load(kind: str, id: str, kwargs: str, method: str, path: Path, sha256: str)
         raise ValueError(f"{path} cannot be played: {error}") from None
     if about.get("privileged"):
         raise ValueError(f"{path} is privileged: it asks for the truth, which a process of its own has not")
+    if path.suffix == ".py":
+        about = about | {"name": path.stem}                             # a guest may call itself anything
     sound = {"name": isinstance(about.get("name"), str) and NAME.fullmatch(about["name"]),
              "title": isinstance(about.get("title"), str) and about["title"],
              "parameters": isinstance(about.get("parameters"), dict), "role": about.get("role") in ROLES,
              "boards": kind == "policy" or all(board in BOARDS for board in about.get("boards") or [None])}
     if wrong := [name for name, is_sound in sound.items() if not is_sound]:
         raise ValueError(f"{path} says nonsense of its {', '.join(wrong)}")
+    if kind == "policy" and about["name"] in _own_names(id) and not is_ours(str(path)):
+        raise ValueError(f"{path} has the name of one of ours, {about['name']}, under which results are kept")
     name, title, parameters, role = (about[key] for key in ("name", "title", "parameters", "role"))
     there = _Elsewhere(enter, bool(about.get("suits")))
     if kind == "estimator":
         return Baseline(name, title, path, sha256, tuple(about["boards"]), parameters, there, role)
     return PolicyFile(name, title, path, sha256, False, parameters, there, role)
+
+
+def _own_names(id: str) -> set[str]:
+    """Under which the results of our own policies and agents are kept; no agent is opened to learn its name."""
+    agents = (Path(agent).parent for agent in own_agents(id))
+    return {*own_policies(), *(f"{folder.parent.name}_{folder.name}" for folder in agents)}
 
 
 def _enter(kind: str, id: str, kwargs: str, method: str, sha256: str) -> Guest:

@@ -16,7 +16,7 @@ from typing import Any
 
 import pandas as pd
 
-from eitbench._files import write_atomically
+from eitbench._files import shipped, write_atomically
 from eitbench.envs import INJECTION
 from eitbench.leaderboard.baselines import is_ours
 from eitbench.leaderboard.boards import FLOOR
@@ -27,7 +27,7 @@ from eitbench.leaderboard.summary import as_markdown, scores_by_seed, with_inter
 from eitbench.leaderboard.wall import python_files
 from eitbench.seeds import SPLITS
 
-PUBLISHED = Path("leaderboards/held_out.json")
+PUBLISHED = shipped("leaderboards") / "held_out.json"
 """Where the hash of the salt is."""
 LENGTH = 32
 """bytes"""
@@ -45,9 +45,17 @@ def new_salt(path: Path) -> str:
     return hash_of(salt)
 
 
-def publish(digest: str) -> None:
-    """Write the hash where everybody can see it."""
+def publish_new_salt(path: Path) -> str:
+    """Write a new salt, and its hash, which is returned, where everybody can see it.
+
+    ``ValueError`` if a hash is published already: who could replace it unseen could choose a salt.
+    """
+    if PUBLISHED.exists():
+        raise ValueError(f"the hash of a salt is published in {PUBLISHED} already; to begin a new season, remove that "
+                         "file in a commit of its own first, for everybody to see")
+    digest = new_salt(path)
     write_atomically(PUBLISHED, (json.dumps({"salt_sha256": digest}, indent=1) + "\n").encode())
+    return digest
 
 
 def read_salt(path: Path) -> bytes:
@@ -56,11 +64,15 @@ def read_salt(path: Path) -> bytes:
     if any(path.resolve().is_relative_to(place.resolve()) for place in python_files()):
         raise ValueError(f"salt {path} lies among Python's files, which guests may read; move it elsewhere")
     try:
-        if os.name == "posix" and path.stat().st_mode & 0o077:
-            raise ValueError(f"salt {path} must be readable by its owner only, which `chmod 600` makes it")
-        salt = bytes.fromhex(path.read_text())
+        shared, text = os.name == "posix" and path.stat().st_mode & 0o077, path.read_text()
     except (OSError, UnicodeDecodeError) as error:
         raise ValueError(f"salt {path} cannot be read: {error}") from None
+    if shared:
+        raise ValueError(f"salt {path} must be readable by its owner only, which `chmod 600` makes it")
+    try:
+        salt = bytes.fromhex(text)
+    except ValueError as error:
+        raise ValueError(f"salt {path} must hold hexadecimal digits: {error}") from None
     if len(salt) != LENGTH:
         raise ValueError(f"salt {path} must hold {LENGTH} bytes, got {len(salt)}")
     if PUBLISHED.exists() and (told := json.loads(PUBLISHED.read_text())["salt_sha256"]) != hash_of(salt):

@@ -9,18 +9,22 @@ import hashlib
 import os
 import select
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 import numpy as np
 
+from eitbench.episodes import cache_folder
 from eitbench.leaderboard import wire
+from eitbench.leaderboard.baselines import is_ours
 
 MEMORY = 8 << 30
 """bytes of address space that a guest may take"""
@@ -47,26 +51,39 @@ class Guest:
     id, kwargs
         The environment, of which it makes its own, without an episode.
     name : str
-        One of ours, or the path of a .py file or an agent's model.zip. Such files are copied into a folder of the
-        guest's own, which is the only place where it can write.
+        One of ours, or the path of a .py file or an agent's model.zip. A file that is not ours is copied into a folder
+        of the guest's own, which is the only place where it can write.
     memory : int
         bytes
     patience : float
         s
+
+    Raises
+    ------
+    GuestError
+        If the method cannot be loaded.
+    ValueError
+        If the cache folder lies where the guest can read.
     """
 
     def __init__(self, kind: str, id: str, kwargs: dict[str, Any], name: str, *, memory: int = MEMORY,
                  patience: float = PATIENCE) -> None:
-        self._patience = patience
+        self._patience, self._over = patience, False
         self.sha256 = ""
         """Of the file that was copied; empty for one of ours."""
         self._private = Path(tempfile.mkdtemp(prefix="eitbench-guest-"))
         self._process = subprocess.Popen(
             [sys.executable, "-m", "eitbench.leaderboard.guest", str(self._private), str(memory)],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=self._surroundings(id, kwargs), cwd=self._private)
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,    # a terminal can be typed into
+            start_new_session=True, env=self._surroundings(id, kwargs), cwd=self._private)
         try:
-            self.closed = bool(self._receive()[0]["closed"])
+            assert self._process.stdin is not None
+            os.set_blocking(self._process.stdin.fileno(), False)
+            wall = self._receive()[0]                                                    # no stranger's word yet
+            self.closed = bool(wall["closed"])
             """Whether files are out of its reach."""
+            if self.closed:
+                _refuse_open_cache(wall["readable"])
             self.about = self._ask({"do": "play", "kind": kind, "id": id, "kwargs": kwargs,
                                     "name": self._copied(name)})[0]
             """What the method's class says of itself: unchecked words of a stranger."""
@@ -112,9 +129,8 @@ class Guest:
         return next((1024 * int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM")), None)
 
     def close(self) -> None:
-        """End it, and remove its folder."""
-        self._process.kill()
-        self._process.wait()
+        """End it and its children, and remove its folder."""
+        self._end()
         for pipe in (self._process.stdin, self._process.stdout):
             if pipe:
                 pipe.close()
@@ -148,6 +164,8 @@ class Guest:
     def _copied(self, name: str) -> str:
         if not name.endswith((".py", ".zip")):
             return name
+        if is_ours(name):                              # a copy would pass for a stranger's that has taken our name
+            return str(Path(name).resolve())
         path, place = Path(name), self._private / "own"
         place.mkdir()
         beside: Sequence[str] = ("config.json", "sha256") if path.suffix == ".zip" else ()
@@ -159,23 +177,28 @@ class Guest:
 
     def _ask(self, words: dict[str, Any], arrays: dict[str, np.ndarray] | None = None,
              ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-        assert self._process.stdin is not None
         try:
-            self._process.stdin.write(wire.pack(words, arrays))
-            self._process.stdin.flush()
-        except BrokenPipeError:
-            raise self._ended() from None
-        try:
+            self._send(wire.pack(words, arrays))
             answer = self._receive()
         except BaseException:                          # whatever it says from now on would answer another question
-            self._process.kill()
-            self._process.wait()
+            self._end()
             raise
         if "error" in answer[0]:
             error = GuestError(_plain(answer[0]["error"]).replace(f"{self._private}{os.sep}own{os.sep}", ""))
             error.where = _plain(answer[0].get("where"))
             raise error
         return answer
+
+    def _send(self, message: bytes) -> None:
+        assert self._process.stdin is not None
+        pipe, deadline, left = self._process.stdin.fileno(), time.monotonic() + self._patience, memoryview(message)
+        while left:                                    # a pipe that nobody reads is full some time
+            if not select.select([], [pipe], [], max(0.0, deadline - time.monotonic()))[1]:
+                raise GuestError(f"TimeoutError: a question was not read within {self._patience:g} s")
+            try:
+                left = left[os.write(pipe, left):]
+            except BrokenPipeError:
+                raise self._ended() from None
 
     def _receive(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         assert self._process.stdout is not None
@@ -199,8 +222,24 @@ class Guest:
             raise GuestError(f"ValueError: {error}") from None
 
     def _ended(self) -> GuestError:
-        return GuestError(f"ChildProcessError: its process ended with status {self._process.wait()}, which is what a "
-                          "crash does, or a limit of memory")
+        return GuestError(f"ChildProcessError: its process ended with status {self._end()}, which is what a crash "
+                          "does, or a limit of memory")
+
+    def _end(self) -> int:
+        """Kill it and all processes of its session; its status."""
+        if not self._over:                             # only once: later the number may be another's
+            self._over = True
+            with suppress(ProcessLookupError, PermissionError):            # it has ended by itself
+                os.killpg(self._process.pid, signal.SIGKILL)
+        return self._process.wait()
+
+
+def _refuse_open_cache(readable: list[str]) -> None:
+    """``ValueError`` if the truths of episodes are kept in one of these places or beneath."""
+    cache = cache_folder().resolve()
+    if place := next((place for place in readable if cache.is_relative_to(Path(place).resolve())), None):
+        raise ValueError(f"the cache folder {cache} lies in {place}, which guests may read; let $EITBENCH_CACHE name "
+                         "another")
 
 
 def _plain(said: Any) -> str:

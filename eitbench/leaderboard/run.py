@@ -160,6 +160,10 @@ def _check_estimate(estimate: Estimate, task: Task) -> None:
         _check.array("Estimate.innovation", innovation, (n_electrodes,), units="V")
     if covariance is not None:
         _check.array("Estimate.innovation_covariance", covariance, (n_electrodes, n_electrodes), units="V²")
+        spectrum = np.linalg.eigvalsh(0.5 * np.asarray(covariance, float) + 0.5 * np.asarray(covariance, float).T)
+        if spectrum[0] <= n_electrodes * np.finfo(float).eps * spectrum[-1]:       # νᵀS⁻¹ν could be less than none
+            raise ValueError("Estimate.innovation_covariance must be positive definite, got eigenvalues "
+                             f"from {spectrum[0]:g} to {spectrum[-1]:g} V²")
     if variance is None:
         return
     if np.shape(variance) != (n,) or not np.isfinite(variance).all() or (np.asarray(variance) < 0).any():

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from eitbench import _check
 from eitbench.envs import INJECTION
 from eitbench.episodes import CACHE_VARIABLE
 from eitbench.leaderboard import guests
@@ -67,7 +68,7 @@ def verify(record: dict[str, Any], job: Job, *, episodes: int = 3, seed: int = 0
     record, job
         As read, and what `job_of` makes of it.
     episodes : int
-        How many; drawn from all of them, with this ``seed``.
+        How many, at least one; drawn from all of them, with this ``seed``.
     tolerance : float
         Relative difference of scores that is taken for none.
 
@@ -76,6 +77,7 @@ def verify(record: dict[str, Any], job: Job, *, episodes: int = 3, seed: int = 0
     table, differences
         Markdown, and a sentence for each thing that is not as the record says.
     """
+    _check.integer("episodes", episodes, low=1)
     drawn = np.random.default_rng(seed).permutation(len(record["episodes"]))[:episodes]
     rows, differences = [], list[str]()
     for said in (record["episodes"][i] for i in sorted(drawn)):

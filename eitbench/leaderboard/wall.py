@@ -1,12 +1,13 @@
 """Limits that a process puts on itself before it runs somebody else's code, and cannot lift again.
 
 Files: Linux' Landlock (kernel 5.13 and later). Whatever is not named is out of reach, other processes' memory too, and
-TCP where the kernel knows how to refuse it. Memory: a limit of the address space.
+TCP where the kernel knows how to refuse it. Sockets of all kinds: Linux' seccomp. Memory: a limit of the address space.
 """
 
 from __future__ import annotations
 
 import ctypes
+import errno
 import os
 import signal
 import sys
@@ -21,7 +22,17 @@ _FILE = 1 << 0 | 1 << 1 | 1 << 2 | 1 << 14
 """What rules on a single file may allow."""
 _ALL = {1: (1 << 13) - 1, 2: (1 << 14) - 1, 3: (1 << 15) - 1, 5: (1 << 16) - 1}
 """What a version of the interface can refuse: all that came with it or earlier."""
-_NO_NEW_PRIVILEGES, _END_WITH_PARENT = 38, 1
+_NO_NEW_PRIVILEGES, _END_WITH_PARENT, _FILTER_CALLS = 38, 1, (22, 2)
+_SOCKETS = {"x86_64": (0xC000003E, 41, 53, 109, 112, 425), "aarch64": (0xC00000B7, 198, 199, 154, 157, 425)}
+"""Architecture, as the kernel names it, and the numbers of its calls socket, socketpair, setpgid, setsid and
+io_uring_setup."""
+_LOAD, _EQUAL, _AT_LEAST, _RETURN = 0x20, 0x15, 0x35, 0x06
+"""What a step of a filter of system calls does."""
+_ALLOWED, _REFUSED = 0x7FFF0000, 0x00050000 | errno.EACCES
+_CALL, _ARCHITECTURE = 0, 4
+"""Where a filter finds them."""
+_FOREIGN = 0x40000000
+"""From here on calls have x86_64's other numbers, for 32-bit pointers."""
 
 
 class _Ruleset(ctypes.Structure):
@@ -32,6 +43,15 @@ class _Beneath(ctypes.Structure):
     _pack_ = 1
     _layout_ = "ms"
     _fields_ = (("allowed", ctypes.c_uint64), ("folder", ctypes.c_int32))
+
+
+class _Step(ctypes.Structure):
+    _fields_ = (("deed", ctypes.c_uint16), ("skip_if", ctypes.c_uint8), ("skip_else", ctypes.c_uint8),
+                ("value", ctypes.c_uint32))
+
+
+class _Filter(ctypes.Structure):
+    _fields_ = (("length", ctypes.c_ushort), ("steps", ctypes.POINTER(_Step)))
 
 
 def landlock_version() -> int:
@@ -68,6 +88,25 @@ def close_files(readable: Iterable[Path], writable: Iterable[Path]) -> bool:
     return True
 
 
+def close_sockets() -> bool:
+    """From now on this process and its children make no socket of any kind, and leave neither session nor group.
+
+    Pairs of sockets are refused too, as one of datagrams can be turned to any address. Returns whether that is so;
+    False where the kernel cannot filter system calls or this does not know their numbers.
+    """
+    if not sys.platform.startswith("linux") or os.uname().machine not in _SOCKETS:
+        return False
+    architecture, *calls = _SOCKETS[os.uname().machine]
+    asked = [(_AT_LEAST, _FOREIGN), *((_EQUAL, call) for call in calls)]
+    steps = [(_LOAD, 0, 0, _ARCHITECTURE), (_EQUAL, 1, 0, architecture), (_RETURN, 0, 0, _REFUSED),
+             (_LOAD, 0, 0, _CALL),
+             *((deed, len(asked) - i, 0, value) for i, (deed, value) in enumerate(asked)),
+             (_RETURN, 0, 0, _ALLOWED), (_RETURN, 0, 0, _REFUSED)]
+    libc, content = _libc(), (_Step * len(steps))(*(_Step(*step) for step in steps))
+    _checked(libc.prctl(_NO_NEW_PRIVILEGES, 1, 0, 0, 0))
+    return bool(libc.prctl(*_FILTER_CALLS, ctypes.byref(_Filter(len(steps), content)), 0, 0) == 0)
+
+
 def limit_memory(size: int) -> None:
     """No more than ``size`` bytes of address space, no core dumps; a request beyond raises ``MemoryError``."""
     import resource  # not on Windows
@@ -84,10 +123,11 @@ def end_with_parent() -> None:
 def python_files() -> list[Path]:
     """What Python and this package need to read: programs, libraries, this process' own entries and the processor's."""
     package = Path(__file__).parents[1]
+    checkout = package.parent if (package.parent / "pyproject.toml").exists() else None       # else others lie beside
     places = [sys.prefix, sys.base_prefix, sys.exec_prefix, str(package), str(package.parent / "baselines"), "/usr",
               "/lib", "/lib64", "/bin", "/etc", "/dev/null", "/dev/urandom", "/dev/zero", f"/proc/{os.getpid()}",
               "/proc/cpuinfo", "/proc/meminfo", "/proc/stat", "/sys/devices/system/cpu",
-              *(place for place in sys.path if place and Path(place) != package.parent)]   # not all of a checkout
+              *(place for place in sys.path if place and Path(place) != checkout)]
     return [Path(place) for place in places]
 
 
@@ -97,5 +137,5 @@ def _libc() -> ctypes.CDLL:
 
 def _checked(result: int) -> int:
     if result < 0:
-        raise OSError(ctypes.get_errno(), f"Landlock: {os.strerror(ctypes.get_errno())}")
+        raise OSError(ctypes.get_errno(), f"a limit of this process: {os.strerror(ctypes.get_errno())}")
     return result

@@ -5,6 +5,7 @@ import json
 import os
 import socket
 import time
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import gymnasium as gym
@@ -16,7 +17,7 @@ from hypothesis.extra import numpy as hnp
 from tiny import FILTER, SCENARIO, write_baseline
 
 from eitbench.episodes import CACHE_VARIABLE, simulate
-from eitbench.leaderboard import wire
+from eitbench.leaderboard import wall, wire
 from eitbench.leaderboard.baselines import load_baseline
 from eitbench.leaderboard.host import Guest, GuestError
 from eitbench.leaderboard.policies import load_policy
@@ -28,7 +29,7 @@ KWARGS = json.loads(FILTER.kwargs)
 walled = pytest.mark.skipif(not landlock_version(), reason="this kernel has no Landlock")
 
 ATTACKS = '''
-import gc, os, socket
+import fcntl, gc, os, socket, termios
 from pathlib import Path
 reached = []
 def attempt(what, deed):
@@ -48,6 +49,11 @@ attempt("the other's memory", lambda: open(parent + "/mem", "rb"))
 attempt("the other's files", lambda: os.listdir(parent + "/fd"))
 attempt("the other process", lambda: os.kill(os.getppid(), 0))
 attempt("the network", lambda: socket.create_connection(("127.0.0.1", PORT), timeout=5))
+attempt("UDP", lambda: socket.socket(type=socket.SOCK_DGRAM).sendto(b"the truth", ("127.0.0.1", PORT)))
+attempt("a service", lambda: socket.socket(socket.AF_UNIX).connect(SECRETS + "/service"))
+attempt("a service by pairs", lambda: socket.socketpair(type=socket.SOCK_DGRAM)[0].sendto(b"x", SECRETS + "/log"))
+attempt("the terminal", lambda: any(map(os.isatty, range(64))))
+attempt("its keys", lambda: fcntl.ioctl(2, termios.TIOCSTI, b"x"))
 attempt("another folder", lambda: Path(SECRETS, "mine.txt").write_text("mine"))
 attempt("the name of the cache", lambda: os.environ["EITBENCH_CACHE"] == CACHE)
 held = [value for each in gc.get_objects() if type(each) is dict for value in each.values()]
@@ -97,20 +103,38 @@ def test_a_policy_plays_as_it_would_here():
         assert said == [here.act(observation) for _ in range(4)] and {type(action) for action in said} == {int}
 
 
+@contextmanager
+def a_terminal():
+    """Within, standard error is one."""
+    master, slave, before = *os.openpty(), os.dup(2)
+    os.dup2(slave, 2)
+    try:
+        yield
+    finally:
+        os.dup2(before, 2)
+        for each in (master, slave, before):
+            os.close(each)
+
+
 @walled
 def test_it_reaches_nothing(tmp_path, monkeypatch):
-    """Neither files nor other processes, the network or a truth; without the wall the same code reaches them all."""
+    """Neither files nor other processes, sockets, a terminal or a truth; without the wall the same code does."""
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
     here = {"truth": simulate(Pipe2D(**SCENARIO), 3, progress=False).concentration, "makes the collector look": []}
     (tmp_path / "secret.txt").write_text("the truth")
-    with socket.create_server(("127.0.0.1", 0)) as server:
+    with (socket.create_server(("127.0.0.1", 0)) as server, socket.socket(socket.AF_UNIX) as service,
+          socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as log, a_terminal()):
+        service.bind(str(tmp_path / "service"))
+        service.listen()
+        log.bind(str(tmp_path / "log"))
         known = {"SECRETS": str(tmp_path), "PORT": server.getsockname()[1], "CACHE": str(tmp_path / "cache"),
                  "ROOT": str(Path(__file__).parents[2]), "SHAPE": list(here["truth"].shape)}
         source = "\n".join(f"{name} = {value!r}" for name, value in known.items()) + ATTACKS
         within: dict = {}
         exec(source, within)
         assert {"the cache", "a truth", "the checkout", "the other's surroundings", "the other process", "the network",
-                "another folder", "the name of the cache", "the truth in memory"} <= set(within["reached"])
+                "UDP", "a service", "a service by pairs", "the terminal", "another folder", "the name of the cache",
+                "the truth in memory"} <= set(within["reached"])
         curious = write_baseline(tmp_path, init=f"exec({source!r}, globals())",
                                  update="raise RuntimeError(f'reached {reached}')")
         with Guest("estimator", FILTER.id, KWARGS, curious) as guest:
@@ -120,8 +144,70 @@ def test_it_reaches_nothing(tmp_path, monkeypatch):
                 guest.update(np.zeros(4), np.zeros(4))
 
 
+CHILD = """child = os.fork()
+        if not child:
+            import time
+            for leave in (os.setsid, os.setpgrp):
+                try:
+                    leave()
+                except OSError:
+                    pass
+            time.sleep(60)
+            os._exit(0)
+        Path.home().joinpath("child").write_text(str(child))
+        """
+
+
+@walled
+@pytest.mark.parametrize("end", ["return Estimate(self.level)", "os._exit(1)"])
+def test_its_children_end_with_it(end, tmp_path):
+    """Also one that would leave its session, and when the guest itself has ended before."""
+    with Guest("estimator", FILTER.id, KWARGS, write_baseline(tmp_path, update=CHILD + end)) as guest:
+        guest.begin()
+        guest._patience = 5.0
+        with suppress(GuestError):
+            guest.update(np.zeros(4), np.zeros(4))
+        child = Path("/proc", (guest._private / "child").read_text(), "status")
+    until = time.monotonic() + 5.0
+    while child.exists() and "State:\tZ" not in child.read_text():
+        assert time.monotonic() < until
+        time.sleep(0.05)
+
+
+def test_a_question_that_is_not_read_is_too_late(tmp_path):
+    """A guest may answer in advance and read nothing; the pipe is full some time."""
+    ahead = ("from eitbench.leaderboard import wire\n        os.write(4, wire.pack({}))\n"
+             "        while True: os.write(4, wire.pack({'estimate': None}))")
+    with Guest("estimator", FILTER.id, KWARGS, write_baseline(tmp_path, init=ahead)) as guest:
+        guest.begin()
+        guest._patience, began = 2.0, time.monotonic()
+        with pytest.raises(GuestError, match="TimeoutError: a question was not read within 2 s"):
+            for _ in range(100):
+                guest.update(np.zeros(1000), np.zeros(1000))
+        assert not guest.alive and time.monotonic() - began < 20.0
+
+
+@walled
+def test_no_guest_where_the_cache_can_be_read(monkeypatch):
+    """As in the folder of Python's packages: truths would lie open."""
+    place = Path(np.__file__).parents[1] / "eitbench-test-cache"
+    monkeypatch.setenv(CACHE_VARIABLE, str(place))
+    with pytest.raises(ValueError, match=r"the cache folder .*eitbench-test-cache lies in .*, which guests may read"):
+        Guest("estimator", FILTER.id, KWARGS, "homogeneous")
+
+
+def test_what_lies_beside_the_package_is_read_unless_it_is_a_checkout(tmp_path, monkeypatch):
+    """Dependencies, as `pip install --target` puts them; not records, tests and whatever else a checkout holds."""
+    monkeypatch.setattr(wall, "__file__", str(tmp_path / "eitbench" / "leaderboard" / "wall.py"))
+    monkeypatch.syspath_prepend(tmp_path)
+    assert tmp_path in wall.python_files()
+    (tmp_path / "pyproject.toml").touch()
+    assert tmp_path not in wall.python_files() and tmp_path / "eitbench" in wall.python_files()
+
+
 @pytest.mark.parametrize(("statement", "message"), [
-    ("np.ones(2**29)", "MemoryError"), ("os._exit(3)", "ended with status 3"), ("raise SystemExit('bye')", "bye"),
+    ("np.ones(2**29)", "MemoryError"), ("os._exit(3)", "ended with status 3"),
+    ("os.close(4); __import__('time').sleep(60)", "ended with status -9"), ("raise SystemExit('bye')", "bye"),
     ("__import__('time').sleep(60)", "no answer within 3 s"), ("print('hello')\n        return 7", "or None, got int"),
     ("os.write(4, bytes(2**10))", "ValueError"),
 ])

@@ -6,7 +6,9 @@ import re
 import subprocess
 import sys
 import time
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ from short import PIPE
 from tiny import FILTER, FIXED_LAG, SMOOTHING, write_baseline
 
 from eitbench.episodes import CACHE_VARIABLE
-from eitbench.leaderboard import guests, host, suites
+from eitbench.leaderboard import guests, host, policies, suites
 from eitbench.leaderboard.policies import own_policies
 from eitbench.leaderboard.run import Environment, Job, run_episode, run_jobs
 from eitbench.leaderboard.store import EpisodeStore
@@ -204,6 +206,32 @@ def test_files_that_cannot_be_played(said, message, tmp_path):
     with pytest.raises(ValueError, match=message) as caught:
         Job(FILTER, str(path), 1, True).load()
     assert str(path) in str(caught.value)
+
+
+def test_a_guest_does_not_choose_its_name(tmp_path, monkeypatch):
+    """Results are kept under it: those of a file that calls itself like ours would take the place of ours."""
+    path = Path(write_baseline(tmp_path))
+    path.write_text(path.read_text() + "\nimport eitbench.leaderboard.baselines as b\nmade = b.Baseline\n"
+                    "b.Baseline = lambda name, *rest: made('homogeneous', *rest)\n")
+    assert Job(FILTER, str(path), 1, True).load().name == "mine"
+    agent = tmp_path / "model.zip"
+    agent.write_bytes(b"")
+    ours = policies.baseline_folder() / "checkpoints" / "some" / "ppo" / "seed3" / "model.zip"
+    monkeypatch.setattr(guests, "own_agents", lambda id: [str(ours)])
+    about = {"title": "Mine", "parameters": {}, "role": None, "suits": True}
+    for name, refused in (("ppo_seed3", True), ("random_pair", True), ("ppo_seed4", False)):
+        guests._load.cache_clear()
+        monkeypatch.setattr(guests, "_enter", lambda *_, name=name: SimpleNamespace(about=about | {"name": name}))
+        with pytest.raises(ValueError, match=f"model.zip has the name of one of ours, {name}") if refused else (
+                nullcontext()):
+            assert Job(INJECTION, str(agent), 1, True).load().name == name
+    guests._load.cache_clear()
+
+
+def test_ours_are_ours_by_path_too(tmp_path):
+    """Nobody's copy, which would be refused as having the name of one of ours."""
+    ours = os.path.relpath(Path(__file__).parents[2] / "baselines" / "homogeneous.py")
+    assert Job(FILTER, ours, 1, True).load().name == "homogeneous"
 
 
 def test_who_is_isolated(tmp_path):

@@ -66,6 +66,8 @@ def baseline_of(update, boards=("filter",)):
     ("return self.level", "must return an Estimate"),
     ("return Estimate(self.level, None, voltages, np.full((4, 4), np.nan))", "innovation"),
     ("return Estimate(self.level, None, voltages[:2], np.eye(4))", "innovation"),
+    ("return Estimate(self.level, None, voltages, -np.eye(4))", "covariance must be positive definite"),
+    ("return Estimate(self.level, None, voltages, np.ones((4, 4)))", "covariance must be positive definite"),
 ])
 def test_a_mistake_is_the_result_of_its_baseline_only(update, message, store, tmp_path):
     """Whatever a baseline does wrong is recorded with the reason; the run goes on, and others score as ever."""

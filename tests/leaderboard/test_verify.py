@@ -3,6 +3,8 @@
 import json
 import re
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import gymnasium as gym
@@ -34,6 +36,7 @@ def tiny_world(monkeypatch, tmp_path, tmp_path_factory):
     monkeypatch.setattr(store_module, "_git", lambda *words: None)
     monkeypatch.setitem(gym.registry[FILTER.id].kwargs, "scenario", SCENARIO)
     monkeypatch.setitem(gym.registry[INJECTION].kwargs, "scenario", FIELDS["Pipe2DInjection"])
+    monkeypatch.setattr(held_out, "PUBLISHED", tmp_path / "leaderboards" / "held_out.json")
     monkeypatch.chdir(tmp_path)
     cached = (run._environment, policies.environment, store_module.provenance)
     for each in cached:
@@ -89,6 +92,8 @@ def test_an_honest_record_is_verified(mine):
     seeds = {tuple(re.findall(r"test:\d", verification.verify(*claim, episodes=2, seed=seed)[0]))
              for claim in [(read_record(path), verification.job_of(read_record(path), mine))] for seed in range(4)}
     assert len(seeds) > 1
+    with pytest.raises(ValueError, match="episodes must be an integer of at least 1, got 0"):
+        verification.verify({}, None, episodes=0)
 
 
 def test_ours_are_known_by_name(tmp_path):
@@ -214,8 +219,13 @@ def test_a_salt_is_its_owner_s_and_its_hash_everybody_s(tmp_path):
     salt = held_out.read_salt(tmp_path / "salt")
     told = json.loads((tmp_path / "leaderboards" / "held_out.json").read_text())
     assert told == {"salt_sha256": held_out.hash_of(salt)} and told["salt_sha256"] in said and salt.hex() not in said
-    code, _, complaint = eitbench("held-out", "--new", "salt")
-    assert code == 2 and "cannot be written" in complaint and held_out.read_salt(tmp_path / "salt") == salt
+    code, _, complaint = eitbench("held-out", "--new", "next")
+    assert code == 2 and "to begin a new season, remove that file in a commit" in complaint
+    assert not (tmp_path / "next").exists()
+    with pytest.raises(ValueError, match="cannot be written"):
+        held_out.new_salt(tmp_path / "salt")
+    assert held_out.read_salt(tmp_path / "salt") == salt
+    (tmp_path / "words").write_text("hello")
     held_out.new_salt(tmp_path / "other")
     held_out.new_salt(package := Path(run.__file__).parent / "test_salt.tmp")
     try:
@@ -224,11 +234,19 @@ def test_a_salt_is_its_owner_s_and_its_hash_everybody_s(tmp_path):
     finally:
         package.unlink()
     for name, change, message in (("other", 0o600, "has the hash"), ("salt", 0o640, "readable by its owner only"),
+                                  ("words", 0o600, "salt .*words must hold hexadecimal digits"),
                                   ("none", None, "cannot be read")):
         if change:
             (tmp_path / name).chmod(change)
         with pytest.raises(ValueError, match=message):
             held_out.read_salt(tmp_path / name)
+
+
+def test_the_published_hash_is_found_from_everywhere(tmp_path):
+    """It is that of the checkout or the installed package, not of the working folder."""
+    program = "from eitbench.leaderboard.held_out import PUBLISHED; print(PUBLISHED)"
+    said = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, text=True, capture_output=True, check=True)
+    assert Path(said.stdout.strip()) == Path(run.__file__).parents[2] / "leaderboards" / "held_out.json"
 
 
 @walled
@@ -293,6 +311,7 @@ def test_held_out_seeds_stay_here(mine, tmp_path, monkeypatch):
 @pytest.mark.parametrize(("arguments", "message"), [
     (["--held-out", "3"], "--held-out and --salt-file belong together"),
     (["--salt-file", "salt"], "--held-out and --salt-file belong together"),
+    (["--episodes", "0"], "--episodes must be at least 1 where no --held-out episodes are played, got 0"),
     (["--baseline", "a.py", "--policy", "b.py"], "only one of --baseline and --policy"),
 ])
 def test_mistakes_are_explained(arguments, message):
