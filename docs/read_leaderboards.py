@@ -12,15 +12,17 @@ frame = load(*sys.argv[1:])
 frame = frame[~frame["outdated"]]
 print(f"{len(frame)} scores of {frame['method'].nunique()} methods in {frame['environment'].nunique()} environments")
 
-# Mean error of each method and environment, best first. A failed episode has no value; `failed` counts them.
+# Mean error of each version of a method in each environment, best first. A failed episode has no value; `failed` counts
+# them.
 errors = frame[frame["metric"] == "error"]
 for environment, rows in errors.groupby("environment"):
     print(f"\n{environment}")
-    table = rows.groupby("method").agg(error=("value", "mean"), failed=("value", lambda x: int(x.isna().sum())))
+    versions = rows.groupby(["method", "version"])
+    table = versions.agg(error=("value", "mean"), failed=("value", lambda x: int(x.isna().sum())))
     print(table.sort_values("error").round(4).reset_index().to_string(index=False))
 
-# Episode by episode, two methods side by side: here the two that have the lowest mean in the first environment.
+# Episode by episode, two of them side by side: here the two that have the lowest mean in the first environment.
 if len(errors):
     first = errors[errors["environment"] == errors["environment"].iloc[0]]
-    wide = first.pivot_table(index="seed", columns="method", values="value")
+    wide = first.pivot_table(index="seed", columns=["method", "version"], values="value")
     print("\n", wide[wide.mean().sort_values().index[:2]].round(4).to_string(), sep="")

@@ -24,6 +24,10 @@ class Backend(StrEnum):
     dask = "dask"
 
 
+Backends = Annotated[Backend, typer.Option("--backend", help="Who starts the processes: loky on this machine; ray or "
+                                           "dask (extra cluster) on the machines of one.")]
+
+
 class Isolation(StrEnum):
     """Whose methods run in a process of their own."""
 

@@ -28,8 +28,11 @@ def recording_bytes(scenario: Scenario) -> int:
     return scenario.n_steps * (recording_type(scenario, n).itemsize + beside)
 
 
-def fill(scenario: Scenario, seeds: Sequence[int], *, n_jobs: int = 1) -> int:
+def fill(scenario: Scenario, seeds: Sequence[int], *, n_jobs: int = 1, backend: str = "loky") -> int:
     """Make the recordings that are missing, in ``n_jobs`` processes, and return their number.
+
+    ``backend`` is one of `eitbench._parallel.BACKENDS`, of which those of a cluster need the cache folder on all
+    machines.
 
     Each is stored as soon as it is done; after an interruption the same call goes on where it was. Only what an
     environment needs is kept: the truth, five times as large, is simulated anew should anybody ask for it.
@@ -40,7 +43,7 @@ def fill(scenario: Scenario, seeds: Sequence[int], *, n_jobs: int = 1) -> int:
     groups = [(scenario, group, [(recording_path(scenario, seed), integrals_path(scenario, seed)) for seed in group])
               for group in (missing[k:k + together] for k in range(0, len(missing), together))]
     with tqdm(total=len(missing), desc="recording", unit="episode", disable=None) as bar:
-        for done in in_parallel(_record, groups, n_jobs):
+        for done in in_parallel(_record, groups, n_jobs, backend):
             bar.update(done)
     return len(missing)
 

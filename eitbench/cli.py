@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 import typer
 
-from eitbench._cli_options import CORES, Backend, Isolate, Isolation, Jobs, Out, clear_errors
+from eitbench._cli_options import CORES, Backend, Backends, Isolate, Isolation, Jobs, Out, clear_errors
 from eitbench._cli_trust import held_out, verify
 from eitbench.leaderboard.figures import FIGURES  # names only; matplotlib comes when one is drawn
 
@@ -83,9 +83,7 @@ def run(
     seeds: Annotated[str | None, typer.Option(help="Episodes, as in dev:0-9 or test:3. Default: the suite's.")] = None,
     isolate: Isolate = Isolation.others,
     jobs: Jobs = CORES,
-    backend: Annotated[Backend, typer.Option(
-        help="Who starts the processes: loky on this machine; ray or dask (extra cluster) on the machines of one.")] = (
-            Backend.loky),
+    backend: Backends = Backend.loky,
     out: Out = Path("results"),
 ) -> None:
     """Run baselines on environments, print the table and write the page.
@@ -100,7 +98,7 @@ def run(
         todo = suites.jobs(suite.value, env or [], baseline or [], None if seeds is None else parse_seeds(seeds),
                            isolate=isolate)
         run_jobs(todo, EpisodeStore(out), n_jobs=jobs, backend=backend, command=_command())
-    _report(out)
+        _report(out)
 
 
 @app.command()
@@ -108,6 +106,7 @@ def bank(
     env: Annotated[str, typer.Option(help="Environment id.")] = "eitbench/Pipe2D-v0",
     seeds: Annotated[str, typer.Option(help="Episodes, such as train:0-999.")] = "train:0-99",
     jobs: Jobs = CORES,
+    backend: Backends = Backend.loky,
 ) -> None:
     """Simulate many episodes ahead of training and keep what an environment needs of them.
 
@@ -131,7 +130,8 @@ def bank(
     free = shutil.disk_usage(place).free
     if missing * each > free:
         raise typer.BadParameter(f"seeds need {missing * each / 1e9:.1f} GB more, and {free / 1e9:.1f} GB are free")
-    made = fill(scenario, numbers, n_jobs=jobs)
+    with clear_errors():
+        made = fill(scenario, numbers, n_jobs=jobs, backend=backend)
     typer.echo(f"{made} simulated, {len(numbers) - made} were there")
 
 
@@ -172,6 +172,7 @@ def policies(
         "full"),
     isolate: Isolate = Isolation.others,
     jobs: Jobs = CORES,
+    backend: Backends = Backend.loky,
     out: Out = Path("results"),
 ) -> None:
     """Play injection policies, print their scores and the environment's adaptivity gap.
@@ -187,7 +188,7 @@ def policies(
         todo = policy_jobs([env], policy or [], parse_seeds(seeds), estimator, isolate=isolate)
     store = EpisodeStore(out)
     with clear_errors():
-        run_jobs(todo, store, n_jobs=jobs, command=_command())
+        run_jobs(todo, store, n_jobs=jobs, backend=backend, command=_command())
     asked = {job.load().name: job.load().privileged for job in todo}
     typer.echo(policy_table(policy_rows(todo, store), [name for name, privileged in asked.items() if privileged]))
     _say_failures([record for record in store.write_records()
@@ -204,6 +205,7 @@ def submit(
     official: Annotated[bool, typer.Option("--official", help="For maintainers: a run of theirs.")] = False,
     isolate: Isolate = Isolation.others,
     jobs: Jobs = CORES,
+    backend: Backends = Backend.loky,
     out: Out = Path("results"),
     to: Annotated[Path, typer.Option(help="Folder of the records.")] = RECORDS,
 ) -> None:
@@ -221,7 +223,7 @@ def submit(
             raise ValueError("either --baseline or --policy must be given, and one of them only")
         paths = submit(method, env, None if seeds is None else parse_seeds(seeds), EpisodeStore(out), to,
                        policy=policy is not None, official=official, isolate=isolate, n_jobs=jobs,
-                       command=_command())
+                       backend=backend, command=_command())
     for path in paths:
         record = read_record(path)
         failed = sum(episode["status"] != "ok" for episode in record["episodes"])
@@ -241,19 +243,22 @@ def leaderboard(
 ) -> None:
     """Print the table and write the page again from the results stored in a folder."""
     if records is None:
-        return _report(out)
+        with clear_errors():
+            return _report(out)
     from eitbench._files import write_atomically
     from eitbench.leaderboard.boards import boards, render
     from eitbench.leaderboard.records import read_records
     from eitbench.leaderboard.site import read_media, render_site, write_site
     beside = records.parent
     with clear_errors():
+        if not records.is_dir():
+            raise ValueError(f"records must be a folder that exists, got {records}")
         found = read_records(records)
         table = boards(found)
+        write_site(beside / "site", render_site(found, table, read_media(beside / "media")))
     for name, text in render(found, table).items():
         write_atomically(beside / name, text.encode())
         typer.echo(f"wrote {beside / name}")
-    write_site(beside / "site", render_site(found, table, read_media(beside / "media")))
     typer.echo(f"wrote {beside / 'site' / 'index.html'}")
 
 

@@ -164,7 +164,8 @@ def _place(entry: Entry) -> tuple[bool, float, str]:
 
 
 def _aggregate(played: dict[str, list[Entry]]) -> list[dict[str, Any]]:
-    """Rows of the methods that have finished all of several environments, by the interquartile mean of their gains."""
+    """Rows of the methods that have finished all of several environments, ordered and ranked by the interquartile mean
+    of their gains."""
     if len(played) < 2:
         return []
     found = [{entry.label: entry for entry in entries if entry.complete and entry.gains} for entries in played.values()]
@@ -172,7 +173,7 @@ def _aggregate(played: dict[str, list[Entry]]) -> list[dict[str, Any]]:
     gains = {label: {environment: entries[label].gains for environment, entries in zip(played, found, strict=True)}
              for label in labels}
     competing = {label: own for label, own in gains.items() if not found[0][label].note}
-    ranks = shared_ranks(competing, higher_is_better=True) if competing else {}
+    ranks = shared_ranks(competing, statistic=interquartile_mean, higher_is_better=True) if competing else {}
     rows = []
     for label in labels:
         row = _row(found[0][label], ALL, ranks.get(label)) | _three("gain", gains[label], interquartile_mean)

@@ -20,6 +20,7 @@ import jsonschema
 from eitbench._files import shipped, write_atomically
 from eitbench.envs import ENTRY_POINTS
 from eitbench.leaderboard.baselines import BOARDS as ESTIMATION_BOARDS
+from eitbench.seeds import name_seed, parse_seeds
 
 SCHEMA = 2
 BOARDS = (*ESTIMATION_BOARDS, "injection")
@@ -140,6 +141,7 @@ def _contradictions(record: dict[str, Any]) -> list[str]:
         wrong.append(f"$.environment.name: must begin with {id}")
     if record["seeds"] != [episode["seed"] for episode in record["episodes"]]:
         wrong.append("$.seeds: must be those of the episodes, in their order")
+    wrong += [f"$.seeds: {seed!r} names no episode" for seed in record["seeds"] if not _names_an_episode(seed)]
     if {split_of(seed) for seed in record["seeds"]} != {record["split"]}:
         wrong.append(f"$.seeds: must all be of the split {record['split']}")
     if record["official"] and any(run["commit"] is None or run["dirty"] for run in record["runs"]):
@@ -151,6 +153,14 @@ def _contradictions(record: dict[str, Any]) -> list[str]:
         if steps and not math.isclose(episode["scores"]["error"], sum(steps) / len(steps), rel_tol=1e-9):
             wrong.append(f"$.episodes[{i}].scores.error: must be the mean of step_errors")
     return wrong
+
+
+def _names_an_episode(seed: str) -> bool:
+    """Whether it lies within its split and is written as `name_seed` does: an episode has one name."""
+    try:
+        return name_seed(parse_seeds(seed)[0]) == seed
+    except ValueError:
+        return False
 
 
 @lru_cache(maxsize=1)

@@ -29,7 +29,7 @@ from eitbench.leaderboard import guests, policies
 from eitbench.leaderboard.baselines import BOARDS, Baseline, load_baseline
 from eitbench.leaderboard.host import GuestError
 from eitbench.leaderboard.score import Played, score
-from eitbench.leaderboard.store import EpisodeStore, provenance, source_digest
+from eitbench.leaderboard.store import EpisodeStore, machine, provenance, source_digest
 from eitbench.leaderboard.wall import landlock_version
 from eitbench.seeds import name_seed
 from eitbench.task import Estimate, Task
@@ -253,7 +253,7 @@ def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1, backend: 
         else:
             truths.setdefault((env.scenario, job.seed), job)
     for scenario, seeds in recordings.items():
-        fill(scenario, seeds, n_jobs=n_jobs)
+        fill(scenario, seeds, n_jobs=n_jobs, backend=backend)
     run = {"command": command, **provenance()}
     guests.close()                                  # that of `Job.load`; the workers have their own
     try:
@@ -272,8 +272,8 @@ def _simulate_job(job: Job) -> None:
 
 def _run_job(job: Job, store: EpisodeStore, run: dict[str, Any]) -> None:
     result, fields = run_episode(job)
-    store.put(job.environment.name, result["method"], job.seed, result | {"run": run | {"isolation": job.isolation}},
-              fields)
+    here = {"machine": machine(), "isolation": job.isolation}               # whose times these are, not who asked
+    store.put(job.environment.name, result["method"], job.seed, result | {"run": run | here}, fields)
 
 
 @lru_cache(maxsize=4)

@@ -83,16 +83,20 @@ def stratified_bootstrap(scores_by_stratum: Mapping[str, ArrayLike], statistic: 
     return float(statistic(*strata)), low, high
 
 
-def paired_difference(a: Scores, b: Scores, *, draws: int = DRAWS, seed: int = 0) -> tuple[float, float, float]:
-    """Mean of a − b over the episodes that both have, with its 95 % interval; below zero a is lower.
+def paired_difference(a: Scores, b: Scores, *, statistic: Statistic = mean_over_environments, draws: int = DRAWS,
+                      seed: int = 0) -> tuple[float, float, float]:
+    """A statistic of a less that of b, on the episodes that both have, with its 95 % interval; below zero a is lower.
 
     What makes an episode hard for both cancels, so far smaller differences are seen than by comparing two intervals.
-    Pairs are resampled within each environment; of several environments the difference is the mean of their means.
+    Pairs are resampled within each environment, so that both have the same episodes in every resample. By default it is
+    the mean difference, of several environments the mean of their means.
 
     Parameters
     ----------
     a, b : environment -> seed -> score
         Seeds that only one of them has do not count.
+    statistic : callable
+        As in `stratified_bootstrap`.
     draws, seed
         As in `stratified_bootstrap`; so are the three numbers returned.
 
@@ -101,8 +105,15 @@ def paired_difference(a: Scores, b: Scores, *, draws: int = DRAWS, seed: int = 0
     ValueError
         If the environments differ, or there is one without any shared seed.
     """
-    differences = {environment: pair[0] - pair[1] for environment, pair in _pairs(a, b).items()}
-    return stratified_bootstrap(differences, mean_over_environments, draws=draws, seed=seed)
+    pairs = [_sorted(pair) for _, pair in sorted(_pairs(a, b).items())]
+
+    def difference(*positions: np.ndarray) -> Any:
+        ours, theirs = ([pair[i][drawn] for pair, drawn in zip(pairs, positions, strict=True)] for i in (0, 1))
+        return statistic(*ours) - statistic(*theirs)
+
+    positions = [np.arange(pair.shape[1]) for pair in pairs]
+    low, high = _interval(positions, difference, draws, seed) if _enough(positions) else (-math.inf, math.inf)
+    return float(difference(*positions)), low, high
 
 
 def paired_probability_of_improvement(a: Scores, b: Scores, *, higher_is_better: bool = False, draws: int = DRAWS,
@@ -150,8 +161,9 @@ def probability_of_improvement(a: Mapping[str, ArrayLike], b: Mapping[str, Array
     return float(probability(*positions)), low, high
 
 
-def shared_ranks(scores: Mapping[str, Scores], unranked: Collection[str] = (), *, higher_is_better: bool = False,
-                 draws: int = DRAWS, seed: int = 0) -> dict[str, int | None]:
+def shared_ranks(scores: Mapping[str, Scores], unranked: Collection[str] = (), *,
+                 statistic: Statistic = mean_over_environments, higher_is_better: bool = False, draws: int = DRAWS,
+                 seed: int = 0) -> dict[str, int | None]:
     """Rank of each method: 1 + the number of ranked methods that are significantly better than it.
 
     Better is one whose `paired_difference` has its whole interval on the better side of zero. Rank 1 thus means that
@@ -160,7 +172,7 @@ def shared_ranks(scores: Mapping[str, Scores], unranked: Collection[str] = (), *
 
     "Cannot be told apart" is not transitive: a and b may be so, and b and c, and still a is better than c. No ranking
     then gives one rank to exactly those that cannot be told apart; this one gives a and b rank 1 and c rank 2. Nor need
-    ranks rise along the means: a method of scattered scores may stand below one of rank 2 and have rank 1. Each
+    ranks rise along the statistic: a method of scattered scores may stand below one of rank 2 and have rank 1. Each
     comparison is at 95 %, without correction for their number.
 
     Parameters
@@ -169,23 +181,25 @@ def shared_ranks(scores: Mapping[str, Scores], unranked: Collection[str] = (), *
         In the same environments for all.
     unranked : collection of str
         Methods outside the competition, such as privileged ones and floors: they have no rank and count for nobody's.
+    statistic : callable
+        Whose differences decide, and whose value orders the methods; as in `stratified_bootstrap`.
     draws, seed
         As in `stratified_bootstrap`.
 
     Returns
     -------
-    method -> rank, or None if unranked; in the order of the means over environments of all own episodes, best first.
+    method -> rank, or None if unranked; in the order of the statistic of all own episodes, best first.
     """
     for method in scores:
         _same_environments(next(iter(scores.values())), scores[method])
     sign = -1.0 if higher_is_better else 1.0
-    means = {method: sign * mean_over_environments(*_strata("scores", {name: list(episodes.values())
-                                                                       for name, episodes in own.items()}))
-             for method, own in scores.items()}
-    order = sorted(scores, key=lambda method: (means[method], method))         # equal means: not as they happen to come
+    values = {method: sign * statistic(*_strata("scores", {name: list(episodes.values())
+                                                           for name, episodes in own.items()}))
+              for method, own in scores.items()}
+    order = sorted(scores, key=lambda method: (values[method], method))       # equal values: not as they happen to come
     ranks = {method: 1 for method in order if method not in unranked}
     for first, second in combinations(ranks, 2):
-        _, low, high = paired_difference(scores[first], scores[second], draws=draws, seed=seed)
+        _, low, high = paired_difference(scores[first], scores[second], statistic=statistic, draws=draws, seed=seed)
         low, high = sorted((sign * low, sign * high))
         ranks[second] += high < 0
         ranks[first] += low > 0                      # happens where each has episodes that the other has not
@@ -221,6 +235,8 @@ def _strata(name: str, scores: Mapping[str, ArrayLike]) -> list[np.ndarray]:
 def _pairs(a: Scores, b: Scores) -> dict[str, np.ndarray]:
     """Environment -> (2, n_e): scores of the seeds that a and b share."""
     _same_environments(a, b)
+    if not a:
+        raise ValueError("a and b must hold scores of at least one environment, got none")
     pairs = {}
     for environment, own in a.items():
         other = b[environment]
@@ -230,6 +246,11 @@ def _pairs(a: Scores, b: Scores) -> dict[str, np.ndarray]:
         if not np.isfinite(pairs[environment]).all():
             raise ValueError(f"a and b must hold finite scores; there are others in {environment}")
     return pairs
+
+
+def _sorted(pair: np.ndarray) -> np.ndarray:
+    """(2, n_e) by the difference and then by the first, so that no interval depends on how episodes are listed."""
+    return pair[:, np.lexsort((pair[0], pair[0] - pair[1]))]
 
 
 def _same_environments(a: Mapping[str, Any], b: Mapping[str, Any]) -> None:

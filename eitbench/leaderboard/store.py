@@ -9,6 +9,7 @@ import os
 import platform
 import subprocess
 import time
+import warnings
 from collections.abc import Iterator
 from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
@@ -66,16 +67,28 @@ class EpisodeStore:
         with np.load(folder / f"{result['seed'].replace(':', '-')}.npz", allow_pickle=False) as stored:
             return dict(stored)
 
-    def write_records(self) -> list[dict[str, Any]]:
-        """Gather the episodes into one record per environment, method and split of the seeds, in ``records/``."""
+    def records(self) -> list[dict[str, Any]]:
+        """The episodes, gathered into one record per environment, method and split of the seeds; not checked yet."""
         gathered: dict[tuple[str, str, str], list[dict[str, Any]]] = {}
         for result in self.results():
             key = (json.dumps(result["environment"], sort_keys=True), result["method"], split_of(result["seed"]))
             gathered.setdefault(key, []).append(result)
-        records = [_gathered(results) for results in gathered.values()]
-        for record in records:
-            write_record(self.folder / "records", record)
-        return records
+        return [_gathered(results) for results in gathered.values()]
+
+    def write_records(self) -> list[dict[str, Any]]:
+        """Write the `records` into ``records/`` and return them.
+
+        One that is not valid is left out with a warning: what a method claimed there is no obstacle for the others.
+        """
+        written = []
+        for record in self.records():
+            try:
+                write_record(self.folder / "records", record)
+            except ValueError as error:
+                warnings.warn(f"left out: {error}", stacklevel=2)
+            else:
+                written.append(record)
+        return written
 
     def _path(self, environment: str, method: str, seed: int) -> Path:
         name = f"{name_seed(seed).replace(':', '-')}.json"
@@ -117,23 +130,29 @@ def _read_json(path: Path) -> dict[str, Any] | None:
 def source_digest() -> str:
     """Hash of the source that scores depend on: results of other code are not taken for this one's."""
     folder = Path(__file__).parent.parent
-    rooms = ("physics/*", "scenarios/*", "episodes", "recordings", "regions", "task", "estimation/*", "scoring",
-             "envs/*", "leaderboard/run", "leaderboard/score", "leaderboard/policies")
+    rooms = ("physics/*", "scenarios/*", "episodes", "recordings", "regions", "bank", "seeds", "task", "estimation/*",
+             "scoring", "envs/*", "pair_policy", "leaderboard/run", "leaderboard/score", "leaderboard/policies",
+             "leaderboard/agents")
     files = sorted(path for room in rooms for path in folder.glob(f"{room}.py"))
     return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
 
 
 @lru_cache(maxsize=1)
 def provenance() -> dict[str, Any]:
-    """Versions, commit and machine of this process."""
+    """Versions and commit of the code that this process runs."""
     status = _git("--no-optional-locks", "status", "--porcelain", "--", ".", ":!leaderboards")   # results, not code
     return {
         "versions": {"python": platform.python_version(), **{name: _version(name) for name in PACKAGES}},
         "blas": np.show_config(mode="dicts")["Build Dependencies"]["blas"]["name"],  # type: ignore[index,call-overload]
         "commit": _git("rev-parse", "HEAD"), "dirty": None if status is None else bool(status),
-        "machine": {"processor": _processor(), "cores": os.cpu_count(), "system": platform.system(),
-                    "blas_threads": 1, "matmul_seconds": matmul_seconds()},
     }
+
+
+@lru_cache(maxsize=1)
+def machine() -> dict[str, Any]:
+    """The machine of this process: in a cluster, another one than that of whoever started the run."""
+    return {"processor": _processor(), "cores": os.cpu_count(), "system": platform.system(), "blas_threads": 1,
+            "matmul_seconds": matmul_seconds()}
 
 
 @lru_cache(maxsize=1)

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from eitbench.leaderboard import suites
-from eitbench.leaderboard.records import split_of, write_record
+from eitbench.leaderboard.records import file_name, read_record, split_of, write_record
 from eitbench.leaderboard.run import run_jobs
-from eitbench.leaderboard.store import EpisodeStore
+from eitbench.leaderboard.store import EpisodeStore, provenance
+from eitbench.leaderboard.summary import seed_ranges
 from eitbench.seeds import name_seed
 
 
 def submit(method: str, environments: list[str], seeds: list[int] | None, store: EpisodeStore, to: Path, *,
            policy: bool = False, official: bool = False, isolate: str = "others", n_jobs: int = 1,
-           command: str = "") -> list[Path]:
+           backend: str = "loky", command: str = "") -> list[Path]:
     """Play what ``store`` does not hold yet, and write one record for each environment into the folder ``to``.
 
     Parameters
@@ -26,6 +28,8 @@ def submit(method: str, environments: list[str], seeds: list[int] | None, store:
         Whether a maintainer runs it; else the records say that they are self-reported.
     isolate : str
         Whether the method runs in a process of its own; one of `suites.ISOLATE`.
+    n_jobs, backend, command
+        As in `run.run_jobs`.
 
     Returns
     -------
@@ -36,9 +40,13 @@ def submit(method: str, environments: list[str], seeds: list[int] | None, store:
     Raises
     ------
     ValueError
-        If a seed is not of the test split, the method does not play one of the environments, or a record is not valid,
-        such as an official one from a checkout with changes.
+        If a seed is not of the test split, the method does not play one of the environments, an official one is asked
+        for from a checkout with changes, or a record is not valid or would replace one of the same code that says more.
     """
+    code = provenance()
+    if official and (code["commit"] is None or code["dirty"]):
+        raise ValueError("official must be False unless this is a commit without changes, got official=True "
+                         + ("outside a checkout" if code["commit"] is None else f"and changes to {code['commit'][:8]}"))
     outside = [name_seed(seed) for seed in seeds or [] if split_of(name_seed(seed)) != "test"]
     if outside:
         raise ValueError(f"seeds of a submission must be of the test split, got {', '.join(outside)}")
@@ -49,7 +57,24 @@ def submit(method: str, environments: list[str], seeds: list[int] | None, store:
     played = {job.environment.id for job in jobs}
     if left := [name for name in environments if name not in played]:
         raise ValueError(f"{method} does not play {', '.join(left)}")
-    run_jobs(jobs, store, n_jobs=n_jobs, command=command)
+    run_jobs(jobs, store, n_jobs=n_jobs, backend=backend, command=command)
     asked = {(job.environment.name, job.load().name) for job in jobs}
-    return [write_record(to, record | {"official": official}) for record in store.write_records()
+    made = [record | {"official": official} for record in store.records()
             if (record["environment"]["name"], record["method"]) in asked and record["split"] == "test"]
+    for record in made:
+        _check_nothing_is_lost(Path(to) / file_name(record), record)
+    return [write_record(to, record) for record in made]
+
+
+def _check_nothing_is_lost(path: Path, record: dict[str, Any]) -> None:
+    """``ValueError`` if a record of the same code lies at ``path`` and would lose what makes it worth more."""
+    if not path.exists():
+        return
+    before = read_record(path)
+    if before["source"] != record["source"]:                              # outdated, and played again
+        return
+    missing = [seed for seed in before["seeds"] if seed not in record["seeds"]]
+    lost = [*["its being official"] * (before["official"] and not record["official"]),
+            *([f"its episodes {seed_ranges(missing)}"] if missing else [])]
+    if lost:
+        raise ValueError(f"to must not hold a record that says more; {path} would lose {' and '.join(lost)}")

@@ -24,7 +24,9 @@ def tidy(folder: Path | str | None = None) -> pd.DataFrame:
             shared = {name: record[name] for name in _OF_RECORDS} | {
                 "environment": record["environment"]["name"], "version": version(record), "outdated": outdated}
             for episode in record["episodes"]:
-                scores = episode.get("scores", {"error": math.nan}) | {"peak_memory": episode["peak_memory"]}
+                finished = episode["status"] == "ok"
+                scores = (episode["scores"] | {"peak_memory": episode["peak_memory"]} if finished
+                          else {"error": math.nan})
                 rows += [shared | {"seed": episode["seed"], "status": episode["status"], "metric": metric,
                                    "value": value} for metric, value in scores.items() if value is not None]
     return pd.DataFrame(rows, columns=list(COLUMNS)).astype(

@@ -155,6 +155,24 @@ def test_aggregate_of_a_class():
     assert total["error"].isna().all() and not total["official"].any()
 
 
+def test_an_aggregate_is_ranked_by_what_orders_it():
+    """By the interquartile mean of gains, which a disaster leaves as it is; a board of one environment by the mean."""
+    def made(gains):
+        return [floor * (1 - gain) for floor, gain in zip(FLOOR, gains, strict=True)]
+
+    pipe = BOARD_IDS["filter"]
+    records = [floor(), floor(id=TANK), record("daring", made([0.9] * 7 + [-9.0])),
+               record("daring", made([0.9] * 8), id=TANK)]
+    records += [record(name, made([gain] * 8), id=id) for name, gain in (("steady", 0.6), ("slow", 0.3))
+                for id in (pipe, TANK)]
+    table = boards(records)
+    total, one = (table[table["environment"] == name].set_index("method") for name in (ALL, pipe.replace("/", "-")))
+    assert list(total.index) == ["daring", "steady", "slow", "homogeneous"]
+    assert dict(total["rank"].dropna()) == {"daring": 1, "steady": 2, "slow": 3}
+    assert list(one.index[:2]) == ["steady", "slow"] and dict(one["rank"].dropna()) == {
+        "steady": 1, "slow": 2, "daring": 1}                           # too scattered to be beaten
+
+
 def test_targets_at_rest_are_a_class_of_their_own():
     """They are not averaged with those that flow."""
     assert class_of(record("a", [0.1], id="eitbench/StationaryTank2D-v0")) == "stationary"
@@ -257,6 +275,12 @@ def test_load_is_tidy(folder):
     assert set(frame[frame["outdated"]]["version"]) == {sha("a0")[:8]}
     ours = frame[(frame["method"] == "homogeneous") & (frame["metric"] == "error") & frame["official"]]
     assert list(ours["value"]) == FLOOR and set(ours["role"]) == {"floor"}
+    mine = record("isolated", [0.1, None])
+    mine["episodes"] = [episode | {"peak_memory": 10**8} for episode in mine["episodes"]]
+    write_record(folder, mine)
+    alone = eitbench.leaderboard.load(folder).query("method == 'isolated'")
+    assert list(alone[alone["status"] == "failed"]["metric"]) == ["error"]        # a single row, whatever it held
+    assert dict(alone[alone["status"] == "ok"].set_index("metric")["value"])["peak_memory"] == 1e8
     spent = frame[frame["metric"] == "spent"]
     assert set(spent["board"]) == {"injection"} and set(spent["value"]) == {3.0}
 
@@ -273,12 +297,13 @@ def test_load_of_nothing(tmp_path):
 
 
 def test_the_example_in_the_docs_runs(folder):
-    """docs/read_leaderboards.py on these records: it prints each method's mean, the best first."""
+    """docs/read_leaderboards.py on these records: it prints each version's mean, the best first."""
+    write_record(folder, record("a", times(0.8), version="2"))
     done = subprocess.run([sys.executable, str(ROOT / "docs" / "read_leaderboards.py"), str(folder)], check=True,
                           capture_output=True, text=True)
     frame = load(folder)
     frame = frame[(frame["metric"] == "error") & ~frame["outdated"] & (frame["environment"] == "eitbench-Pipe2D-v0")]
-    best = frame.groupby("method")["value"].mean().sort_values()
-    lines = done.stdout.split("eitbench-Pipe2D-v0")[1].splitlines()[2:5]
-    assert [line.split()[0] for line in lines] == list(best.index)
-    assert [float(line.split()[1]) for line in lines] == pytest.approx(list(best), abs=5e-5)
+    best = frame.groupby(["method", "version"])["value"].mean().sort_values()
+    lines = done.stdout.split("eitbench-Pipe2D-v0")[1].splitlines()[2:6]
+    assert [tuple(line.split()[:2]) for line in lines] == list(best.index) and len(lines) == 4
+    assert [float(line.split()[2]) for line in lines] == pytest.approx(list(best), abs=5e-5)

@@ -105,6 +105,14 @@ def test_words_follow_from_the_intervals():
     assert (few["verdict"][0], few["a better"][0], few["difference"][0]) == ("–", "100 %", "-0.3")
 
 
+def test_long_names_may_break():
+    """After an underscore, in headings and cells, and nowhere inside of a tag."""
+    a, b = two_methods()
+    page = html(compare(a, b), "my_long_name", "x")
+    assert '<th scope="col">ẽ_c of my_<wbr/>long_<wbr/>name</th>' in page
+    assert "<td>my_<wbr/>long_<wbr/>name</td>" in page and "&lt;wbr" not in page
+
+
 def test_page_needs_nothing_else():
     """Self-contained, well-formed, with every number of the table; whatever a method is called is text."""
     a, b = two_methods()
@@ -113,7 +121,7 @@ def test_page_needs_nothing_else():
     assert "<script" not in page and not re.search(r"(src|href)=|url\(|@import", page)
     body = page[page.index("<body>"):page.index("</body>")].replace("&nbsp;", " ") + "</body>"
     tree = ElementTree.fromstring(body)
-    shown = [cell.text for cell in tree.iter("td") if cell.text and cell.text.strip()]
+    shown = [text for cell in tree.iter("td") if (text := "".join(cell.itertext()).strip())]
     assert shown == cells(table, evil, "yours").to_numpy().ravel().tolist()
     circles = [float(circle.get("cx")) for circle in tree.iter("circle")]
     assert [x < 50 for x in circles] == [difference < 0 for difference in table["difference"]]

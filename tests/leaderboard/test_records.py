@@ -98,6 +98,10 @@ def test_the_digest_is_what_the_schema_says():
     ("schema", 1, r"\$\.schema: 2 was expected"),
     ("title", ..., "'title' is a required property"),
     ("title", "", r"\$\.title: "),
+    ("title", "Fine |\n| 1 | Forged |", r"\$\.title: "),
+    ("title", "Fine\n", r"\$\.title: "),
+    ("title", 121 * "x", r"\$\.title: .* is too long"),
+    ("method", "mine\n", r"\$\.method: "),
     ("board", "smooth", r"\$\.board: 'smooth' is not one of"),
     ("role", "best", r"\$\.role: 'best' is not one of"),
     ("official", "no", r"\$\.official: 'no' is not of type 'boolean'"),
@@ -149,6 +153,15 @@ def test_splits_do_not_mix(tmp_path):
     mixed = changed("seeds", ["test:0", "dev:1", "test:2"], changed("episodes.1.seed", "dev:1"))
     with pytest.raises(ValueError, match=r"\$\.seeds: must all be of the split test"):
         write_record(tmp_path, mixed)
+
+
+@pytest.mark.parametrize("seed", ["test:999999", "test:007", "200001", "train:100000", "99999999999"])
+def test_seeds_have_one_name(seed, tmp_path):
+    """Those that lie outside their split, or that have another name, are no episode's."""
+    with pytest.raises(ValueError, match=rf"\$\.seeds: '{seed}' names no episode"):
+        write_record(tmp_path, record("mine", {seed: 0.1}))
+    for fine in ("test:99999", "300000"):
+        write_record(tmp_path, record("mine", {fine: 0.1}))
 
 
 @pytest.mark.parametrize("run", [RUN | {"dirty": True}, RUN | {"commit": None, "dirty": None}])

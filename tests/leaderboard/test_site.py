@@ -87,10 +87,20 @@ def test_no_records_make_a_page_that_says_so(tmp_path):
     files = rendered([])
     assert files.keys() == {"index.html", "style.css", "script.js"}
     assert "There are no records yet" in files["index.html"].decode()
+    write_site(tmp_path, files)
     (tmp_path / "methods").mkdir()
     (tmp_path / "methods" / "gone.html").write_text("old")
     write_site(tmp_path, files)
     assert {path.name for path in tmp_path.rglob("*") if path.is_file()} == files.keys()
+
+
+@pytest.mark.parametrize("name", ["index.html", "notes.txt"])
+def test_a_folder_of_somebody_else_is_left_alone(name, tmp_path):
+    """No file is deleted or written where there are others than ours."""
+    (tmp_path / name).write_text("<strong>mine</strong>")
+    with pytest.raises(ValueError, match="folder must be empty or hold a site of the leaderboards"):
+        write_site(tmp_path, rendered([]))
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["<strong>mine</strong>"]
 
 
 def test_sizes(site):
@@ -168,6 +178,15 @@ def test_a_method_s_page_has_every_episode(pages):
     assert pages["methods/a.html"].count("<h2>Version") == 2
 
 
+def test_processes_of_one_machine_are_said_once():
+    """Each has its own time of a matrix product; another machine or another commit is another matter."""
+    runs = [RUN | {"machine": RUN["machine"] | {"matmul_seconds": seconds}} for seconds in (0.06, 0.05, 0.055)]
+    text = text_of(rendered([record("a", [0.1], runs=runs)])["methods/a.html"].decode())
+    assert text.count("An abacus") == 1 and "matrix product 50 to 60 ms" in text
+    text = text_of(rendered([record("a", [0.1], runs=[RUN, RUN | {"commit": "decaf"}])])["methods/a.html"].decode())
+    assert text.count("An abacus") == 2 and text.count("matrix product 50 ms") == 2
+
+
 def test_the_command_names_the_file_that_was_typed():
     """A path as it was typed, without the folders of whoever typed it; a policy as a policy."""
     def of(method, typed, **changes):
@@ -181,8 +200,17 @@ def test_the_command_names_the_file_that_was_typed():
     assert "--baseline mine.py " in of("mine", "eitbench submit --baseline=/home/me/mine.py")
     assert "--baseline mine " in of("mine", "eitbench 'unfinished")
     assert "--policy greedy_a " in of("greedy_a", "eitbench policies", board="injection")
-    agent = of("maskable_ppo_seed0", "eitbench policies", id=BUDGET.replace("-", "/", 1), board="injection")
-    assert f"--policy baselines/checkpoints/{BUDGET}/maskable_ppo/seed0/model.zip " in agent
+
+
+def test_the_command_names_an_agent_s_file():
+    """Ours if it is the very one that was played; of others a path, since an agent's name leads to no file."""
+    file = f"baselines/checkpoints/{BUDGET}/maskable_ppo/seed0/model.zip"
+    ours = hashlib.sha256((ROOT / file).read_bytes()).hexdigest()
+    for digest, expected in ((ours, file), ("0" * 64, "path/to/model.zip")):
+        agent = record("maskable_ppo_seed0", [0.1], id=BUDGET.replace("-", "/", 1), board="injection",
+                       method_sha256=digest, checkpoint_sha256=digest)
+        assert f"--policy {expected} " in command(agent)
+        assert (file in rendered([agent])["methods/maskable_ppo_seed0.html"].decode()) == (digest == ours)
 
 
 def test_docstrings_are_of_the_version_that_was_played(pages):

@@ -197,6 +197,25 @@ def test_paired_interval_is_scipys():
     assert (low, high) == pytest.approx(tuple(theirs), abs=4 * math.sqrt(2) * 0.02 * sd)
 
 
+def test_paired_difference_of_interquartile_means():
+    """The difference of the two statistics, as a loop that draws the same episodes for both, to Monte-Carlo error."""
+    a, b = two_methods()
+    random, differences = np.random.default_rng(6), []
+    for _ in range(4000):
+        drawn = {name: random.choice(list(own), len(own)) for name, own in a.items()}
+        x, y = (interquartile_mean(*[[scores[name][seed] for seed in seeds] for name, seeds in drawn.items()])
+                for scores in (a, b))
+        differences.append(x - y)
+    value, low, high = paired_difference(a, b, statistic=interquartile_mean)
+    assert value == interquartile_mean(*plain(a).values()) - interquartile_mean(*plain(b).values())
+    theirs = tuple(np.percentile(differences, [2.5, 97.5]))
+    assert (low, high) == pytest.approx(theirs, abs=4 * 0.05 * np.std(differences))
+    assert paired_difference(shuffled(a, random), shuffled(b, random), statistic=interquartile_mean) == (
+        value, low, high)
+    same = paired_difference(a, b, statistic=mean_over_environments)
+    assert same == paired_difference(a, b) and same[0] != value
+
+
 def test_only_shared_seeds_count():
     """Scores on other seeds change nothing, however bad they are; environments weigh the same."""
     a = {"pipe": seeded(np.arange(8.0)), "tank": seeded(np.arange(6.0))}
@@ -300,6 +319,13 @@ def test_ranks_need_not_rise_along_the_means():
     assert list(shared_ranks(scores).items()) == [("a", 1), ("b", 2), ("c", 1)]
 
 
+def test_ranks_by_another_statistic():
+    """A single disaster decides the mean, and not the interquartile mean; the order follows."""
+    scores = board(a=np.zeros(12), b=np.r_[np.full(11, -1.0), 100.0])
+    assert list(shared_ranks(scores)) == ["a", "b"]
+    assert list(shared_ranks(scores, statistic=interquartile_mean).items()) == [("b", 1), ("a", 2)]
+
+
 def test_the_unranked_cost_nobody_a_rank():
     """A clairvoyant is shown in its place, without a rank; the next one is first. So is a floor."""
     scores = board(clairvoyant=NOISE, a=NOISE + 1, floor=NOISE + 2, b=NOISE + 3)
@@ -341,7 +367,7 @@ def test_a_method_below_may_be_the_better_one():
     (lambda: stratified_bootstrap({"pipe": NOISE}, interquartile_mean, draws=0), "draws must be at least 1"),
     (lambda: paired_difference({"pipe": seeded(NOISE)}, {"pipe": seeded(NOISE, "dev")}), "a and b must share a seed"),
     (lambda: paired_difference({"pipe": seeded(NOISE)}, {"tank": seeded(NOISE)}), "environments must be the same"),
-    (lambda: paired_difference({}, {}), "scores_by_stratum must hold"),
+    (lambda: paired_difference({}, {}), "a and b must hold scores of at least one environment"),
     (lambda: paired_difference({"pipe": {"a": math.inf}}, {"pipe": {"a": math.inf}}), "a and b must hold finite"),
     (lambda: probability_of_improvement({"pipe": NOISE}, {"pipe": NOISE, "tank": NOISE}), "environments must be"),
     (lambda: probability_of_improvement({"pipe": [1.0]}, {"pipe": []}), "b must hold"),

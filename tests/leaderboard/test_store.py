@@ -5,6 +5,7 @@ import math
 import platform
 import re
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from tiny import FILTER, FIXED_LAG, RUN, SCENARIO, sha, strict, write_baseline
 from eitbench.episodes import CACHE_VARIABLE
 from eitbench.leaderboard import store as store_module
 from eitbench.leaderboard.run import Environment, Job, run_jobs
-from eitbench.leaderboard.store import EpisodeStore, provenance, source_digest
+from eitbench.leaderboard.store import EpisodeStore, machine, provenance, source_digest
 from eitbench.seeds import name_seed
 
 ENV, COMMAND = "eitbench/Pipe2D-v0", "eitbench run --seeds train:1-2"
@@ -227,6 +228,38 @@ def test_arguments_of_an_environment_make_other_records(store, tmp_path):
     noise = [record["environment"]["kwargs"]["scenario"].get("noise_relative") for record in records]
     assert sorted(noise, key=str) == [0.02, None, None]
     assert len(list((store.folder / "records").iterdir())) == 3
+
+
+def test_an_invalid_record_is_left_out(store):
+    """With a warning that names it; the others are written."""
+    put(store, result())
+    put(store, result(method="mad", scores={"error": 0.1, "seconds_per_step": -1.0}))
+    with pytest.warns(UserWarning, match=r"left out: .*--mad--.*seconds_per_step"):
+        (written,) = store.write_records()
+    assert written["method"] == "mine" and len(list((store.folder / "records").iterdir())) == 1
+
+
+def test_a_record_names_the_machine_that_played(store, tmp_path, monkeypatch):
+    """Not the one that started the run: there the processes of a cluster may be elsewhere."""
+    monkeypatch.setattr(store_module, "matmul_seconds", lambda: 123.0)      # here, and not in the processes
+    machine.cache_clear()
+    run_jobs([Job(FILTER, write_baseline(tmp_path), seed) for seed in (1, 2)], store, n_jobs=2)
+    machine.cache_clear()
+    seconds = [result["run"]["machine"]["matmul_seconds"] for result in store.results()]
+    assert len(seconds) == 2 and 123.0 not in seconds
+
+
+@pytest.mark.parametrize("name", ["bank.py", "seeds.py", "pair_policy.py", "leaderboard/agents.py",
+                                  "envs/estimation.py"])
+def test_the_source_is_all_that_scores_depend_on(name, monkeypatch):
+    """A change in any of these files makes another digest."""
+    changed, read, before = Path(store_module.__file__).parents[1] / name, Path.read_bytes, source_digest()
+    assert changed.exists()
+    source_digest.cache_clear()
+    monkeypatch.setattr(Path, "read_bytes", lambda path: read(path) + b"#" * (path == changed))
+    after = source_digest()
+    source_digest.cache_clear()
+    assert after != before
 
 
 def test_provenance_without_git(monkeypatch):

@@ -9,11 +9,12 @@ from short import FIELDS
 from tiny import FILTER, SCENARIO, SMOOTHING, count, counting, write_baseline
 from typer.testing import CliRunner
 
+from eitbench import bank
 from eitbench.cli import app
 from eitbench.episodes import CACHE_VARIABLE
 from eitbench.leaderboard import load, policies, run
 from eitbench.leaderboard import store as store_module
-from eitbench.leaderboard.records import read_record, read_records
+from eitbench.leaderboard.records import read_record, read_records, write_record
 from eitbench.leaderboard.store import EpisodeStore, provenance
 from eitbench.leaderboard.submit import submit
 from eitbench.seeds import parse_seeds
@@ -113,12 +114,92 @@ def test_what_cannot_be_submitted(environments, seeds, message, tmp_path):
 
 
 def test_official_needs_a_clean_commit(tmp_path, monkeypatch):
-    """The episodes are kept, and no record is written."""
-    monkeypatch.setattr(store_module, "_git", lambda *words: "c0ffee")
-    provenance.cache_clear()
-    with pytest.raises(ValueError, match="must be false where a run was not of a commit without changes"):
-        submit("homogeneous", [FILTER.id], TEST[:1], EpisodeStore(tmp_path), tmp_path / "to", official=True)
-    assert not (tmp_path / "to").exists()
+    """It is said before anything is played, and so stands in nobody's way once the changes are committed."""
+    to = tmp_path / "to"
+
+    def official():
+        provenance.cache_clear()
+        return submit("homogeneous", [FILTER.id], TEST[:1], EpisodeStore(tmp_path / "r"), to, official=True)
+
+    for commit, message in (("c0ffee", "and changes to c0ffee"), (None, "outside a checkout")):
+        with monkeypatch.context() as patch, pytest.raises(ValueError, match=f"official must be False .*{message}"):
+            patch.setattr(store_module, "_git", lambda *words, commit=commit: commit)
+            official()
+        assert not (tmp_path / "r").exists() and not to.exists()
+    (path,) = official()
+    assert read_record(path)["official"]
+
+
+def test_what_says_more_is_not_replaced(tmp_path):
+    """By a record that is no longer official, or has fewer episodes; an outdated one is, and any by one with more."""
+    to = tmp_path / "to"
+
+    def submitted(results, seeds, **how):
+        (path,) = submit("homogeneous", [FILTER.id], seeds, EpisodeStore(tmp_path / results), to, **how)
+        return read_record(path)
+
+    first = submitted("a", TEST, official=True)
+    for seeds, official, lost in ((TEST, False, "its being official$"), (TEST[:1], True, r"its episodes test:1$"),
+                                  (TEST[1:], False, r"its being official and its episodes test:0$")):
+        with pytest.raises(ValueError, match=f"to must not hold a record that says more; .*homogeneous.* lose {lost}"):
+            submitted(f"b{seeds}", seeds, official=official)
+        assert read_records(to) == [first]
+    assert submitted("a", parse_seeds("test:0-2"), official=True)["seeds"] == ["test:0", "test:1", "test:2"]
+    write_record(to, first | {"source": "0" * 64})
+    assert submitted("b", TEST[:1])["seeds"] == ["test:0"]
+
+
+def test_an_invalid_record_is_in_nobody_s_way(tmp_path, monkeypatch):
+    """What another method claimed, and no schema allows, is left out of the table and the page."""
+    monkeypatch.setattr(run, "score", lambda env, played, score=run.score: _with_negative_nis(score(env, played)))
+    submitted = ("--env", FILTER.id, "--seeds", "test:0", "-j", "1")
+    with pytest.warns(UserWarning, match=r"left out: .*homogeneous.* is not valid: .*nis"):
+        code, _, complaint = eitbench("run", "--baseline", "homogeneous", *submitted)
+    assert code == 2 and "no results in results" in complaint
+    code, _, complaint = eitbench("submit", "--baseline", "homogeneous", *submitted)
+    assert code == 2 and "is not valid" in complaint and not (tmp_path / "leaderboards").exists()
+    monkeypatch.undo()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(gym.registry[FILTER.id].kwargs, "scenario", SCENARIO)
+    with pytest.warns(UserWarning, match="left out"):
+        assert eitbench("run", "--baseline", "persistence", *submitted)[0] == 0
+    assert eitbench("submit", "--baseline", "persistence", *submitted)[0] == 0
+
+
+def _with_negative_nis(scored):
+    outcome = dict(scored)
+    return outcome | {"scores": outcome["scores"] | {"nis": -1.0}}
+
+
+def test_mistyped_records_delete_nothing(tmp_path):
+    """Neither beside a folder that does not exist, nor in a folder site/ that is somebody else's."""
+    kept = tmp_path / "site" / "index.html"
+    kept.parent.mkdir()
+    kept.write_text("mine")
+    (tmp_path / "results").mkdir()
+    for records, message in (("result", "records must be a folder that exists, got result"),
+                             ("results", "folder must be empty or hold a site of the leaderboards")):
+        code, _, complaint = eitbench("leaderboard", "--records", records)
+        assert code == 2 and message in complaint
+        assert {path.name for path in tmp_path.iterdir()} == {"site", "results"} and kept.read_text() == "mine"
+
+
+@pytest.mark.parametrize("arguments", [
+    ("policies", "--env", INJECTION, "--policy", "adjacent", "--seeds", "test:0"),
+    ("submit", "--env", INJECTION, "--policy", "adjacent", "--seeds", "test:0"),
+    ("bank", "--env", INJECTION, "--seeds", "train:77")])
+def test_the_backend_is_that_of_the_recordings_too(arguments, monkeypatch):
+    """Whatever plays or records says that it is not installed, and names it."""
+    asked = []
+
+    def in_parallel(function, work, n_jobs, backend="loky"):
+        asked.append(backend)
+        raise ValueError("backend ray is not here")
+
+    monkeypatch.setattr(bank, "in_parallel", in_parallel)
+    monkeypatch.setenv(CACHE_VARIABLE, "empty")
+    code, _, complaint = eitbench(*arguments, "-j", "1", "--backend", "ray")
+    assert code == 2 and "backend ray is not here" in complaint and asked == ["ray"]
 
 
 def test_from_a_file_to_the_boards_by_command(tmp_path):

@@ -1,4 +1,8 @@
-"""The leaderboards as a static site: rendered from the records alone, so that the same records give the same bytes."""
+"""The leaderboards as a static site.
+
+Rendered from the records and from what the repository holds: docstrings of environments and methods, our baselines'
+files and checkpoints. The same records and the same checkout give the same bytes.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +18,8 @@ from eitbench.leaderboard.site.environment import environment_page
 from eitbench.leaderboard.site.index import index_page
 from eitbench.leaderboard.site.method import method_page
 
+MARK = b"<strong>eitbench</strong> leaderboards"
+"""By which an index.html is known to be ours."""
 HERE = Path(__file__).parent
 ASSETS = {"style.css": ("../style.css", "site.css"), "script.js": ("script.js",)}
 """Files that all pages share, and what they are put together from."""
@@ -52,7 +58,17 @@ def read_media(folder: Path) -> dict[str, bytes]:
 
 
 def write_site(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Make the folder hold these files and no others: a page whose records are gone goes too."""
+    """Make the folder hold these files and no others: a page whose records are gone goes too.
+
+    Raises
+    ------
+    ValueError
+        If the folder is neither empty nor such a site: then nothing of it is touched.
+    """
+    index = folder / "index.html"
+    if folder.exists() and any(folder.iterdir()) and not (index.is_file() and MARK in index.read_bytes()):
+        raise ValueError(f"folder must be empty or hold a site of the leaderboards, since other files in it are "
+                         f"deleted; {folder} holds something else")
     for path in [path for path in folder.rglob("*") if path.is_file()]:
         if path.relative_to(folder).as_posix() not in files:
             path.unlink()

@@ -75,10 +75,21 @@ def _record(record: dict[str, Any], site: Site) -> dict[str, Any]:
     board, row = next(((board, row) for board in site.boards for row in board.rows if row.record is record),
                       (None, None))                                  # it played none of the board's episodes
     return {"title": title_of(record), "address": board and board.address, "official": record["official"],
-            "outdated": row is not None and row.outdated, "runs": record["runs"], "command": command(record),
+            "outdated": row is not None and row.outdated, "runs": _runs(record), "command": command(record),
             "typed": sorted({run["command"] for run in record["runs"]}), "source": record["source"],
             "episodes": _episodes(record),
             "failures": [episode for episode in record["episodes"] if episode["status"] != "ok"]}
+
+
+def _runs(record: dict[str, Any]) -> list[dict[str, Any]]:
+    """Runs of one code on one machine as one, with ``products``, the times in ms that its processes took for theirs."""
+    alike: dict[str, list[dict[str, Any]]] = {}
+    for run in record["runs"]:
+        machine = {key: value for key, value in run["machine"].items() if key != "matmul_seconds"}
+        what = [run["commit"], run["dirty"], run["versions"], run["blas"], machine]
+        alike.setdefault(json.dumps(what, sort_keys=True), []).append(run)
+    return [runs[0] | {"products": sorted(1000 * run["machine"]["matmul_seconds"] for run in runs)}
+            for runs in alike.values()]
 
 
 def _episodes(record: dict[str, Any]) -> Table:
@@ -107,7 +118,10 @@ def command(record: dict[str, Any]) -> str:
 
 
 def _argument(record: dict[str, Any]) -> str:
-    """The name of a method, or the path that was typed for it, without the folders of whoever typed it."""
+    """The name of a method, or the path that was typed for it, without the folders of whoever typed it.
+
+    An agent's name says nothing of its file: where it is none of ours, the path is left to the reader.
+    """
     for run in record["runs"]:
         try:
             words = shlex.split(run["command"])
@@ -118,23 +132,33 @@ def _argument(record: dict[str, Any]) -> str:
             if Path(path).stem == record["method"] and path.endswith(".py"):
                 return path if not Path(path).is_absolute() else Path(path).name
     file = source_file(record)
-    return file if file.endswith(".zip") else record["method"]
+    if record["checkpoint_sha256"] is not None:
+        return file or "path/to/model.zip"
+    return record["method"]
 
 
 def source_file(record: dict[str, Any]) -> str:
-    """The method's file as it is named in this repository; empty if it is not there."""
+    """The method's file as it is named in this repository; empty if it is not there.
+
+    Of agents, whose names others may give to theirs, the very version only.
+    """
     folder = shipped("baselines")
     for path in (*folder.glob("*.py"), *folder.glob("injection/*.py"), *folder.glob("checkpoints/*/*/*/model.zip")):
         name = path.stem if path.suffix == ".py" else f"{path.parent.parent.name}_{path.parent.name}"
         same_world = path.suffix == ".py" or path.parents[2].name == record["environment"]["id"].replace("/", "-")
-        if name == record["method"] and same_world:
+        if name == record["method"] and same_world and (path.suffix == ".py" or _is_version(path, record)):
             return f"baselines/{path.relative_to(folder).as_posix()}"
     return ""
 
 
 def docstring(record: dict[str, Any], file: str) -> Markup:
     """Of the method's file, if this repository still holds the very version that was played."""
-    content = (shipped("baselines").parent / file).read_bytes() if file.endswith(".py") else b""
-    if hashlib.sha256(content).hexdigest() != record["method_sha256"]:
+    path = shipped("baselines").parent / file
+    if path.suffix != ".py" or not _is_version(path, record):
         return Markup()
-    return markdown(ast.get_docstring(ast.parse(content)) or "")
+    return markdown(ast.get_docstring(ast.parse(path.read_bytes())) or "")
+
+
+def _is_version(path: Path, record: dict[str, Any]) -> bool:
+    """Whether the file is the one that was played."""
+    return hashlib.sha256(path.read_bytes()).hexdigest() == record["method_sha256"]
