@@ -197,10 +197,11 @@ def policies(
 
 @app.command()
 def submit(
-    env: Annotated[list[str], typer.Option(help="Environment id; may be repeated.")],
+    env: Annotated[list[str] | None, typer.Option(help="Environment id; may be repeated.")] = None,
     baseline: Annotated[str | None, typer.Option(help="Name of one of ours, or the path of your own .py file.")] = None,
     policy: Annotated[str | None, typer.Option(
-        help="The same of an injection policy, or the path of a trained agent's model.zip.")] = None,
+        help="The same of an injection policy, or the path of a trained agent's model.zip. Without any method: all of "
+             "ours, by default in all environments.")] = None,
     seeds: Annotated[str | None, typer.Option(help="Test episodes, as in test:0-9. Default: the full suite's.")] = None,
     official: Annotated[bool, typer.Option("--official", help="For maintainers: a run of theirs.")] = False,
     isolate: Isolate = Isolation.others,
@@ -209,7 +210,7 @@ def submit(
     out: Out = Path("results"),
     to: Annotated[Path, typer.Option(help="Folder of the records.")] = RECORDS,
 ) -> None:
-    """Play the test episodes with one baseline or policy and write its records for the leaderboards.
+    """Play the test episodes with one baseline or policy, or all of ours, and write records for the leaderboards.
 
     Episodes are stored in OUT the moment they are done; the same command again resumes.
     """
@@ -218,16 +219,14 @@ def submit(
     from eitbench.leaderboard.submit import submit
     from eitbench.seeds import parse_seeds
     with clear_errors():
-        method = baseline or policy
-        if method is None or (baseline and policy):
-            raise ValueError("either --baseline or --policy must be given, and one of them only")
-        paths = submit(method, env, None if seeds is None else parse_seeds(seeds), EpisodeStore(out), to,
-                       policy=policy is not None, official=official, isolate=isolate, n_jobs=jobs,
-                       backend=backend, command=_command())
-    for path in paths:
-        record = read_record(path)
-        failed = sum(episode["status"] != "ok" for episode in record["episodes"])
-        typer.echo(f"wrote {path}: {len(record['seeds'])} episodes" + (f", {failed} failed" if failed else ""))
+        if baseline and policy:
+            raise ValueError("one of --baseline and --policy may be given, got both")
+        for path in submit(baseline or policy, env or [], None if seeds is None else parse_seeds(seeds),
+                           EpisodeStore(out), to, policy=policy is not None, official=official, isolate=isolate,
+                           n_jobs=jobs, backend=backend, command=_command()):
+            record = read_record(path)
+            failed = sum(episode["status"] != "ok" for episode in record["episodes"])
+            typer.echo(f"wrote {path}: {len(record['seeds'])} episodes" + (f", {failed} failed" if failed else ""))
 
 
 app.command()(verify)
@@ -290,13 +289,14 @@ def render(
         help="The same of an injection policy, or of an agent's model.zip, where injections are asked for.")] = None,
     seed: Annotated[str, typer.Option(help="The episode, such as dev:0.")] = "dev:0",
     step: Annotated[int | None, typer.Option(help="Only this state t, as a PNG.")] = None,
+    every: Annotated[int, typer.Option(min=1, help="Draw one state in so many.")] = 1,
     out: Annotated[Path, typer.Option("--out", "-o", help="An animation .gif or .webp, or a .png with --step.")] = Path(
         "results/episode.gif"),
 ) -> None:
     """Draw an episode: truth, estimate, its spread, electrodes and the injected pair."""
     from eitbench.leaderboard.animate import animate
     with clear_errors():
-        typer.echo(f"wrote {animate(env, policy or baseline, seed, step, out)}")
+        typer.echo(f"wrote {animate(env, policy or baseline, seed, step, out, every=every)}")
 
 
 @app.command()

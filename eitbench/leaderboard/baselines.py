@@ -116,8 +116,10 @@ def load_module(kind: str, path: Path, source: bytes) -> ModuleType:
 
 
 def title_of(module: ModuleType, path: Path) -> str:
-    """First line of the docstring, up to a colon, bracket or full stop; without one, the file's name."""
-    return re.split(r"[:(.]", f"{(module.__doc__ or '').strip()}\n".splitlines()[0])[0].strip() or path.stem
+    """First line of the docstring, up to a colon, bracket or full stop, 120 letters at most; without one, the file's
+    name."""
+    line = f"{(module.__doc__ or '').strip()}\n".splitlines()[0]
+    return re.split(r"[:(.]", line)[0].strip()[:120] or path.stem
 
 
 def parameters_of(who: str, method: type[Any]) -> dict[str, Any]:

@@ -1,27 +1,33 @@
-"""Play the test episodes with one method, and put what came out among the leaderboards' records."""
+"""Play the test episodes with one method, or all of ours, and put what came out among the leaderboards' records."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from eitbench.envs import ENTRY_POINTS, INJECTION
 from eitbench.leaderboard import suites
 from eitbench.leaderboard.records import file_name, read_record, split_of, write_record
-from eitbench.leaderboard.run import run_jobs
+from eitbench.leaderboard.run import Job, run_jobs
 from eitbench.leaderboard.store import EpisodeStore, provenance
 from eitbench.leaderboard.summary import seed_ranges
 from eitbench.seeds import name_seed
 
 
-def submit(method: str, environments: list[str], seeds: list[int] | None, store: EpisodeStore, to: Path, *,
+def submit(method: str | None, environments: list[str], seeds: list[int] | None, store: EpisodeStore, to: Path, *,
            policy: bool = False, official: bool = False, isolate: str = "others", n_jobs: int = 1,
-           backend: str = "loky", command: str = "") -> list[Path]:
+           backend: str = "loky", command: str = "") -> Iterator[Path]:
     """Play what ``store`` does not hold yet, and write one record for each environment into the folder ``to``.
+
+    Environment after environment, so that what was done when the run is interrupted has its records.
 
     Parameters
     ----------
-    method : str
-        Name or path of a baseline, or of a ``policy``.
+    method : str or None
+        Name or path of a baseline, or of a ``policy``. None: all of ours.
+    environments : list of str
+        With a method at least one, and all of them must be such that it plays them; without, by default all.
     seeds : list of int
         Of the test split; default: those of the full suite.
     official : bool
@@ -31,10 +37,10 @@ def submit(method: str, environments: list[str], seeds: list[int] | None, store:
     n_jobs, backend, command
         As in `run.run_jobs`.
 
-    Returns
-    -------
-    list of paths
-        Of the records. All test episodes that the store holds of this method and this code are in them, those that
+    Yields
+    ------
+    path
+        Of a record. All test episodes that the store holds of this method and this code are in them, those that
         failed too.
 
     Raises
@@ -50,20 +56,25 @@ def submit(method: str, environments: list[str], seeds: list[int] | None, store:
     outside = [name_seed(seed) for seed in seeds or [] if split_of(name_seed(seed)) != "test"]
     if outside:
         raise ValueError(f"seeds of a submission must be of the test split, got {', '.join(outside)}")
-    if not environments:
+    if method is not None and not environments:
         raise ValueError("env must name at least one environment to submit for")
-    jobs = (suites.policy_jobs(environments, [method], seeds, isolate=isolate) if policy
-            else suites.jobs("full", environments, [method], seeds, isolate=isolate))
-    played = {job.environment.id for job in jobs}
-    if left := [name for name in environments if name not in played]:
-        raise ValueError(f"{method} does not play {', '.join(left)}")
-    run_jobs(jobs, store, n_jobs=n_jobs, backend=backend, command=command)
-    asked = {(job.environment.name, job.load().name) for job in jobs}
-    made = [record | {"official": official} for record in store.records()
-            if (record["environment"]["name"], record["method"]) in asked and record["split"] == "test"]
-    for record in made:
-        _check_nothing_is_lost(Path(to) / file_name(record), record)
-    return [write_record(to, record) for record in made]
+    for jobs in [_jobs(method, id, policy, seeds, isolate) for id in environments or ENTRY_POINTS]:
+        run_jobs(jobs, store, n_jobs=n_jobs, backend=backend, command=command)
+        asked = {(job.environment.name, job.load().name) for job in jobs}
+        made = [record | {"official": official} for record in store.records()
+                if (record["environment"]["name"], record["method"]) in asked and record["split"] == "test"]
+        for record in made:
+            _check_nothing_is_lost(Path(to) / file_name(record), record)
+        for record in made:
+            yield write_record(to, record)
+
+
+def _jobs(method: str | None, id: str, policy: bool, seeds: list[int] | None, isolate: str) -> list[Job]:
+    """What is to be played in one environment."""
+    methods = [] if method is None else [method]
+    if id in INJECTION if method is None else policy:
+        return suites.policy_jobs([id], methods, seeds, isolate=isolate)
+    return suites.jobs("full", [id], methods, seeds, isolate=isolate)
 
 
 def _check_nothing_is_lost(path: Path, record: dict[str, Any]) -> None:

@@ -280,9 +280,9 @@ def test_animations_are_offered_where_there_are_any(site, pages):
     """And are not played before they are asked for."""
     shown = [path for path, html in pages.items() if "<img" in html]
     assert shown == ["environments/eitbench-Pipe2D-v0.html"]
-    assert re.search(r"<details class=\"episode\">.*<img src=\"../media/eitbench-Pipe2D-v0.gif\"", pages[shown[0]],
+    assert re.search(r"<details class=\"episode\">.*<img src=\"../media/eitbench-Pipe2D-v0.webp\"", pages[shown[0]],
                      flags=re.DOTALL)
-    assert "media/eitbench-Pipe2D-v0.gif" in site
+    assert "media/eitbench-Pipe2D-v0.webp" in site
     assert not any(path.startswith("media") for path in rendered(several_boards(), elsewhere=gif()))
 
 

@@ -23,8 +23,8 @@ MARK = b"<strong>eitbench</strong> leaderboards"
 HERE = Path(__file__).parent
 ASSETS = {"style.css": ("../style.css", "site.css"), "script.js": ("script.js",)}
 """Files that all pages share, and what they are put together from."""
-MEDIA = "*.gif"
-"""Animations beside the records' folder, in ``media/``: named like an environment, as in eitbench-Pipe2D-v0.gif."""
+MEDIA = "*.webp"
+"""Animations beside the records' folder, in ``media/``: named like an environment, as in eitbench-Pipe2D-v0.webp."""
 
 
 def render_site(records: list[dict[str, Any]], table: pd.DataFrame,
@@ -37,7 +37,7 @@ def render_site(records: list[dict[str, Any]], table: pd.DataFrame,
         As `records.read_records` has them.
     table : DataFrame
         Their `boards.boards`.
-    media : environment -> GIF
+    media : environment -> WebP
         Animations of episodes, shown where their environment is. Default: none.
     """
     media = media or {}
@@ -49,7 +49,7 @@ def render_site(records: list[dict[str, Any]], table: pd.DataFrame,
     files = {path: html.encode() for path, html in pages.items()}
     files |= {name: b"".join((HERE / part).read_bytes() for part in parts) for name, parts in ASSETS.items()}
     shown = {board.environment for board in site.boards}
-    return files | {f"media/{name}.gif": content for name, content in media.items() if name in shown}
+    return files | {f"media/{name}.webp": content for name, content in media.items() if name in shown}
 
 
 def read_media(folder: Path) -> dict[str, bytes]:
