@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from eitbench._files import write_atomically
 from eitbench.envs.rendering import FIELD_MAP, colour_range, draw_field
 from eitbench.leaderboard import charts
+from eitbench.leaderboard.records import alike
 from eitbench.leaderboard.run import Environment
 from eitbench.leaderboard.store import EpisodeStore
 from eitbench.leaderboard.summary import EXPLANATIONS, board_label, cells, method
@@ -59,10 +60,7 @@ def _section(store: EpisodeStore, records: list[dict[str, Any]], name: str, tabl
 
 def _runs(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """The distinct runs behind the records, each with its command, versions, commit and machine."""
-    runs: list[dict[str, Any]] = []
-    for record in records:
-        runs += [run for run in record["runs"] if run not in runs]
-    return runs
+    return [group[0] for group in alike((run for record in records for run in record["runs"]), "command")]
 
 
 def _record_of(records: list[dict[str, Any]], row: pd.Series) -> dict[str, Any]:

@@ -11,6 +11,7 @@ import hashlib
 import json
 import math
 import warnings
+from collections.abc import Iterable
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -104,6 +105,16 @@ def file_name(record: dict[str, Any]) -> str:
 def split_of(seed: str) -> str:
     """``test`` of ``test:4``; ``own`` of a plain number."""
     return seed.split(":")[0] if ":" in seed else "own"
+
+
+def alike(runs: Iterable[dict[str, Any]], *keys: str) -> list[list[dict[str, Any]]]:
+    """Runs grouped by code, machine and these ``keys``; the processes of a machine time its matrix product each."""
+    groups: dict[str, list[dict[str, Any]]] = {}
+    for run in runs:
+        machine = {key: value for key, value in run["machine"].items() if key != "matmul_seconds"}
+        what = [machine, *(run[key] for key in ("commit", "dirty", "versions", "blas", *keys))]
+        groups.setdefault(_json(what), []).append(run)
+    return list(groups.values())
 
 
 def finished(record: dict[str, Any]) -> str:

@@ -15,7 +15,7 @@ from markupsafe import Markup
 from eitbench._files import shipped
 from eitbench.leaderboard import charts
 from eitbench.leaderboard.boards import HEADINGS
-from eitbench.leaderboard.records import finished, version
+from eitbench.leaderboard.records import alike, finished, version
 from eitbench.leaderboard.site.collect import Board, Row, Site, title_of
 from eitbench.leaderboard.site.environment import markdown
 from eitbench.leaderboard.site.tables import Cell, Table, interval_cell, scale, three, value_cell
@@ -83,13 +83,8 @@ def _record(record: dict[str, Any], site: Site) -> dict[str, Any]:
 
 def _runs(record: dict[str, Any]) -> list[dict[str, Any]]:
     """Runs of one code on one machine as one, with ``products``, the times in ms that its processes took for theirs."""
-    alike: dict[str, list[dict[str, Any]]] = {}
-    for run in record["runs"]:
-        machine = {key: value for key, value in run["machine"].items() if key != "matmul_seconds"}
-        what = [run["commit"], run["dirty"], run["versions"], run["blas"], machine]
-        alike.setdefault(json.dumps(what, sort_keys=True), []).append(run)
-    return [runs[0] | {"products": sorted(1000 * run["machine"]["matmul_seconds"] for run in runs)}
-            for runs in alike.values()]
+    return [group[0] | {"products": sorted(1000 * run["machine"]["matmul_seconds"] for run in group)}
+            for group in alike(record["runs"])]
 
 
 def _episodes(record: dict[str, Any]) -> Table:
