@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from eitbench.leaderboard.baselines import BOARDS, ROLES, Baseline, find_baseline, is_ours
+from eitbench.leaderboard.baselines import BOARDS, ROLES, Baseline, find_baseline
 from eitbench.leaderboard.host import Guest, GuestError
 from eitbench.leaderboard.policies import PolicyFile, find_policy, own_agents, own_policies
 
@@ -82,7 +82,7 @@ def _load(kind: str, id: str, kwargs: str, method: str, path: Path, sha256: str)
              "boards": kind == "policy" or all(board in BOARDS for board in about.get("boards") or [None])}
     if wrong := [name for name, is_sound in sound.items() if not is_sound]:
         raise ValueError(f"{path} says nonsense of its {', '.join(wrong)}")
-    if kind == "policy" and about["name"] in _own_names(id) and not is_ours(str(path)):
+    if kind == "policy" and _own_names(id).get(about["name"], sha256) != sha256:
         raise ValueError(f"{path} has the name of one of ours, {about['name']}, under which results are kept")
     name, title, parameters, role = (about[key] for key in ("name", "title", "parameters", "role"))
     there = _Elsewhere(enter, bool(about.get("suits")))
@@ -91,10 +91,11 @@ def _load(kind: str, id: str, kwargs: str, method: str, path: Path, sha256: str)
     return PolicyFile(name, title, path, sha256, False, parameters, there, role)
 
 
-def _own_names(id: str) -> set[str]:
-    """Under which the results of our own policies and agents are kept; no agent is opened to learn its name."""
-    agents = (Path(agent).parent for agent in own_agents(id))
-    return {*own_policies(), *(f"{folder.parent.name}_{folder.name}" for folder in agents)}
+def _own_names(id: str) -> dict[str, str]:
+    """Under which the results of our own policies and agents are kept, and the sha256 of their files."""
+    policies = {name: find_policy(name) for name in own_policies()}
+    agents = {f"{path.parents[1].name}_{path.parent.name}": path for path in map(Path, own_agents(id))}
+    return {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in (policies | agents).items()}
 
 
 def _enter(kind: str, id: str, kwargs: str, method: str, sha256: str) -> Guest:

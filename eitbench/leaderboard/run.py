@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import platform
 import time
 import traceback
 from collections.abc import Iterator
@@ -254,11 +255,11 @@ def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1, backend: 
             truths.setdefault((env.scenario, job.seed), job)
     for scenario, seeds in recordings.items():
         fill(scenario, seeds, n_jobs=n_jobs, backend=backend)
-    run = {"command": command, **provenance()}
+    run, home = {"command": command, **provenance(), "machine": machine()}, platform.node()
     guests.close()                                  # that of `Job.load`; the workers have their own
     try:
         for function, work, label in ((_simulate_job, [(job,) for job in truths.values()], "simulating truths"),
-                                      (_run_job, [(job, store, run) for job in todo], "running methods")):
+                                      (_run_job, [(job, store, run, home) for job in todo], "running methods")):
             for _ in tqdm(in_parallel(function, work, n_jobs, backend), total=len(work), desc=label, unit="episode",
                           disable=None):
                 pass
@@ -270,10 +271,11 @@ def _simulate_job(job: Job) -> None:
     simulate(_environment(job.environment).scenario, job.seed, progress=False)
 
 
-def _run_job(job: Job, store: EpisodeStore, run: dict[str, Any]) -> None:
+def _run_job(job: Job, store: EpisodeStore, run: dict[str, Any], home: str) -> None:
     result, fields = run_episode(job)
-    here = {"machine": machine(), "isolation": job.isolation}               # whose times these are, not who asked
-    store.put(job.environment.name, result["method"], job.seed, result | {"run": run | here}, fields)
+    elsewhere = {} if platform.node() == home else {"machine": machine()}         # whose times these are, not who asked
+    store.put(job.environment.name, result["method"], job.seed,
+              result | {"run": run | elsewhere | {"isolation": job.isolation}}, fields)
 
 
 @lru_cache(maxsize=4)

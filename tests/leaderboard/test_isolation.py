@@ -16,7 +16,7 @@ from short import PIPE
 from tiny import FILTER, FIXED_LAG, SMOOTHING, write_baseline
 
 from eitbench.episodes import CACHE_VARIABLE
-from eitbench.leaderboard import guests, host, policies, suites
+from eitbench.leaderboard import guests, host, suites
 from eitbench.leaderboard.policies import own_policies
 from eitbench.leaderboard.run import Environment, Job, run_episode, run_jobs
 from eitbench.leaderboard.store import EpisodeStore
@@ -216,7 +216,9 @@ def test_a_guest_does_not_choose_its_name(tmp_path, monkeypatch):
     assert Job(FILTER, str(path), 1, True).load().name == "mine"
     agent = tmp_path / "model.zip"
     agent.write_bytes(b"")
-    ours = policies.baseline_folder() / "checkpoints" / "some" / "ppo" / "seed3" / "model.zip"
+    ours = tmp_path / "ppo" / "seed3" / "model.zip"
+    ours.parent.mkdir(parents=True)
+    ours.write_bytes(b"another")
     monkeypatch.setattr(guests, "own_agents", lambda id: [str(ours)])
     about = {"title": "Mine", "parameters": {}, "role": None, "suits": True}
     for name, refused in (("ppo_seed3", True), ("random_pair", True), ("ppo_seed4", False)):

@@ -240,13 +240,17 @@ def test_an_invalid_record_is_left_out(store):
 
 
 def test_a_record_names_the_machine_that_played(store, tmp_path, monkeypatch):
-    """Not the one that started the run: there the processes of a cluster may be elsewhere."""
+    """Not the one that started the run: the processes of a cluster may be elsewhere. Those of one machine
+    say the same."""
     monkeypatch.setattr(store_module, "matmul_seconds", lambda: 123.0)      # here, and not in the processes
+    jobs = [Job(FILTER, write_baseline(tmp_path), seed) for seed in (1, 2)]
+    for node, elsewhere in ((platform.node(), False), ("another", True)):
+        machine.cache_clear()
+        monkeypatch.setattr(platform, "node", lambda node=node: node)
+        run_jobs(jobs, EpisodeStore(tmp_path / node), n_jobs=2)
+        seconds = {result["run"]["machine"]["matmul_seconds"] for result in EpisodeStore(tmp_path / node).results()}
+        assert seconds == {123.0} if not elsewhere else 123.0 not in seconds
     machine.cache_clear()
-    run_jobs([Job(FILTER, write_baseline(tmp_path), seed) for seed in (1, 2)], store, n_jobs=2)
-    machine.cache_clear()
-    seconds = [result["run"]["machine"]["matmul_seconds"] for result in store.results()]
-    assert len(seconds) == 2 and 123.0 not in seconds
 
 
 @pytest.mark.parametrize("name", ["bank.py", "seeds.py", "pair_policy.py", "leaderboard/agents.py",
