@@ -12,13 +12,13 @@ import re
 from collections.abc import Callable
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
-from eitbench.leaderboard.baselines import BOARDS, ROLES, Baseline, find_baseline
+from eitbench.leaderboard.baselines import BOARDS, ROLES, Baseline, find_baseline, is_ours, load_baseline
 from eitbench.leaderboard.host import Guest, GuestError
-from eitbench.leaderboard.policies import PolicyFile, find_policy, own_agents, own_policies
+from eitbench.leaderboard.policies import PolicyFile, find_policy, load_policy, own_agents, own_policies
 
 NAME = re.compile(r"[^./\\][^/\\]*")
 """Of a method, as records have it."""
@@ -35,6 +35,8 @@ def load(kind: str, id: str, kwargs: str, method: str) -> Baseline | PolicyFile:
         If there is no such file, it cannot be loaded, or it asks for the truth, which a guest has not.
     """
     path = (find_baseline if kind == "estimator" else find_policy)(method)
+    if is_ours(method):                                  # what it says of itself need not be asked of a guest
+        return _ours(kind, id, kwargs, method, path)
     return _load(kind, id, kwargs, method, path, hashlib.sha256(path.read_bytes()).hexdigest())
 
 
@@ -52,17 +54,25 @@ def close() -> None:
 class _Elsewhere:
     """Stands for a method's class: to make one is to begin an episode in the guest, which then answers."""
 
-    def __init__(self, enter: Callable[[], Guest], suits: bool) -> None:
-        self._enter, self._suits = enter, suits
-
-    def suits(self, world: Any) -> bool:
-        """Whether it can play in the world that its guest knows."""
-        return self._suits
+    def __init__(self, enter: Callable[[], Guest], suits: Callable[[Any], bool]) -> None:
+        self._enter = enter
+        self.suits = suits
+        """world -> whether it can play there"""
 
     def __call__(self, world: Any, random: np.random.Generator | None = None) -> Guest:
         guest = self._enter()
         guest.begin(0 if random is None else random.bit_generator.seed_seq.entropy)  # type: ignore[attr-defined]
         return guest
+
+
+def _ours(kind: str, id: str, kwargs: str, method: str, path: Path) -> Baseline | PolicyFile:
+    """One of ours: loaded here, played in a guest."""
+    loaded = load_baseline(method) if kind == "estimator" else load_policy(method)
+    if loaded.privileged:
+        raise ValueError(f"{path} is privileged: it asks for the truth, which a process of its own has not")
+    there = _Elsewhere(partial(_enter, kind, id, kwargs, method, loaded.sha256), loaded.suits)
+    return (loaded._replace(estimator=there) if isinstance(loaded, Baseline)
+            else loaded._replace(policy=cast(Any, there)))
 
 
 @lru_cache(maxsize=64)
@@ -85,7 +95,7 @@ def _load(kind: str, id: str, kwargs: str, method: str, path: Path, sha256: str)
     if kind == "policy" and _own_names(id).get(about["name"], sha256) != sha256:
         raise ValueError(f"{path} has the name of one of ours, {about['name']}, under which results are kept")
     name, title, parameters, role = (about[key] for key in ("name", "title", "parameters", "role"))
-    there = _Elsewhere(enter, bool(about.get("suits")))
+    there = _Elsewhere(enter, lambda world: bool(about.get("suits")))                # in the one that its guest knows
     if kind == "estimator":
         return Baseline(name, title, path, sha256, tuple(about["boards"]), parameters, there, role)
     return PolicyFile(name, title, path, sha256, False, parameters, there, role)

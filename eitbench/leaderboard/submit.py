@@ -58,7 +58,8 @@ def submit(method: str | None, environments: list[str], seeds: list[int] | None,
         raise ValueError(f"seeds of a submission must be of the test split, got {', '.join(outside)}")
     if method is not None and not environments:
         raise ValueError("env must name at least one environment to submit for")
-    for jobs in [_jobs(method, id, policy, seeds, isolate) for id in environments or ENTRY_POINTS]:
+    todo = (_jobs(method, id, policy, seeds, isolate) for id in environments or ENTRY_POINTS)
+    for jobs in todo if method is None else list(todo):          # what does not fit is said before anything is played
         run_jobs(jobs, store, n_jobs=n_jobs, backend=backend, command=command)
         asked = {(job.environment.name, job.load().name) for job in jobs}
         made = [record | {"official": official} for record in store.records()

@@ -230,7 +230,8 @@ def test_leaderboard_scores_what_is_rewarded(name, said, monkeypatch):
     velocity = None if said is None else np.append(said, np.zeros(task.velocity.size - 1))
     estimator = SimpleNamespace(update=lambda *_: Estimate(np.full(task.mesh.n_nodes, 31.0), velocity=velocity))
     monkeypatch.setattr(base, "step", lambda action: played.append((action, step(action))) or played[-1][1])
-    scores = score(base, play_and_collect(base, SimpleNamespace(estimator=lambda _: estimator), 1))["scores"]
+    baseline = SimpleNamespace(estimator=lambda _: estimator, privileged=False)
+    scores = score(base, play_and_collect(base, baseline, 1))["scores"]
     rewards = np.array([reward for _, (_, reward, *_) in played])[task.warm_up:]
     assert scores["error"] + scores["velocity_error"] == pytest.approx(-rewards.mean(), abs=1e-7)
     assert scores["velocity_error"] > 1e-3
@@ -246,7 +247,7 @@ def test_flow_is_refused_where_it_is_not_asked_for():
         level = np.full(base.task.mesh.n_nodes, 31.0)
         estimator = SimpleNamespace(update=lambda *_, level=level, said=velocity: Estimate(level, velocity=said))
         with pytest.raises(ValueError, match=message):
-            play_and_collect(base, SimpleNamespace(estimator=lambda _, e=estimator: e), 1)
+            play_and_collect(base, SimpleNamespace(estimator=lambda _, e=estimator: e, privileged=False), 1)
 
 
 def test_truth_is_not_within_reach_of_observation_or_info(name):
