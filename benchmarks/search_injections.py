@@ -1,9 +1,12 @@
-"""Search the best fixed pair and the best cycle: `python benchmarks/search_injections.py eitbench/Pipe2DInjection-v0`.
+"""Search the best injections for ever: `python benchmarks/search_injections.py eitbench/Pipe2DInjection-v0`.
 
 The rule: the greatest mean reward on the first training episodes, with the reduced estimator, a budget being spread
 evenly. All pairs for ever; then, of the twelve best, cycles that grow by the best pair while that helps, to four at
-most; then each place in the cycle is given to the pair that does best there, until nothing changes. Dev and test
-episodes are not touched. What comes out stands in `baselines/injection/best_pair.py` and `best_cycle.py`.
+most; then each place in the cycle is given to the pair that does best there, until nothing changes. Where each
+electrode has a current of its own: from the best pair, from the first half of the electrodes against the second, and
+from random signs, each electrode in turn is given the current of -1, -1/2, 0, 1/2 or 1 that does best, until nothing
+changes. Dev and test episodes are not touched. What comes out stands in `baselines/injection/best_pair.py`,
+`best_cycle.py` and `best_currents.py`.
 """
 
 from __future__ import annotations
@@ -22,6 +25,7 @@ from eitbench.envs.injection import InjectionVectorEnv
 from eitbench.seeds import SPLITS
 
 BEST, LONGEST = 12, 4
+RESTARTS, VALUES = 6, (-1.0, -0.5, 0.0, 0.5, 1.0)
 
 
 class Search:
@@ -31,17 +35,18 @@ class Search:
         made: Any = gym.make_vec(env_id, num_envs=episodes, vectorization_mode="vector_entry_point", observation="raw")
         assert isinstance(made, InjectionVectorEnv)
         self.env, self.seeds, self.steps = made, list(SPLITS["train"][:episodes]), 0
-        self.played: dict[tuple[int, ...], float] = {}
+        self.played: dict[tuple[Any, ...], float] = {}
 
-    def __call__(self, cycle: Sequence[int]) -> float:
-        """Mean reward of a scored state under this cycle of pairs."""
+    def __call__(self, cycle: Sequence[Any]) -> float:
+        """Mean reward of a scored state under this cycle of pairs, or of tuples of currents."""
         key = tuple(cycle)
         if key not in self.played:
             env, rules, injected, total = self.env, self.env.rules, 0, 0.0
             observation, _ = env.reset(seed=self.seeds)
             for _ in range(rules.scenario.n_steps - len(rules.scenario.currents)):
                 now = rules.spaced(observation["left"][0])
-                action = rules.action(key[injected % len(key)] if now else None)
+                chosen = key[injected % len(key)] if now else None
+                action = np.array(chosen, np.float32) if isinstance(chosen, tuple) else rules.action(chosen)
                 observation, reward, *_ = env.step(np.array([action] * env.num_envs))
                 injected += now
                 total += reward.mean()
@@ -62,8 +67,33 @@ def main() -> None:
     best = order[:BEST]
     for pair in best:
         print(f"    {pairs[pair].tolist()}: {search([pair]):.6f}")
+    (search_currents if search.env.rules.limit else search_cycle)(search, best)
 
-    cycle = best[:1]
+
+def search_currents(search: Search, best: Sequence[int]) -> None:
+    """The currents that stay, from several beginnings."""
+    rules, random = search.env.rules, np.random.default_rng(0)
+    L = rules.scenario.currents.shape[1]
+    begins = [rules.action(best[0]), np.repeat([1.0, -1.0], L // 2),
+              *random.choice([-1.0, 1.0], (RESTARTS, L))]
+    found = []
+    for begin in tqdm(begins, desc="beginnings", disable=None):
+        currents, before = tuple(map(float, begin)), None
+        while before != currents:
+            before = currents
+            for k in range(L):
+                currents = max(((*currents[:k], value, *currents[k + 1:]) for value in (currents[k], *VALUES)),
+                               key=lambda each: search([each]))
+        found.append(currents)
+        print(f"    {search([currents]):.6f}: {currents}")
+    currents = max(found, key=lambda each: search([each]))
+    print(f"currents: {list(currents)}, mean reward {search([currents]):.6f} of {len(search.seeds)} episodes, "
+          f"{search.steps} environment steps")
+
+
+def search_cycle(search: Search, best: Sequence[int]) -> None:
+    """Up to `LONGEST` of these pairs in turn."""
+    pairs, cycle = search.env.rules.pairs, list(best[:1])
     while len(cycle) < LONGEST:
         longer = max(([*cycle, pair] for pair in tqdm(best, desc="longer", disable=None)), key=search)
         if search(longer) <= search(cycle):
