@@ -28,7 +28,7 @@ from eitbench.leaderboard.baselines import is_ours
 
 MEMORY = 8 << 30
 """bytes of address space that a guest may take"""
-PATIENCE = 120.0
+PATIENCE = 600.0
 """s that an answer may take; the first after an episode began may hold all preparations"""
 MODELS = ("outline.npz", "region.npz", "reduced-*.npz", "joint-*.npz")
 """What the cache holds of a scenario, made without any episode; the files of an episode begin with its seed."""
