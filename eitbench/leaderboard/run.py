@@ -115,8 +115,9 @@ def _play(env: EstimationEnv, baseline: Baseline, seed: int,
           ) -> Iterator[tuple[int, Estimate | None, dict[str, np.ndarray], float]]:
     """(t = i − lag, estimate, measurement i, seconds the estimator took) at each step i."""
     observation, _ = env.reset(seed=seed)
+    shown = (env.task, env.reveal()) if baseline.privileged else (env.task,)
     begin = time.perf_counter()
-    estimator = baseline.estimator(env.task, *[env.reveal()] * baseline.privileged)
+    estimator = baseline.estimator(*shown)
     setup = time.perf_counter() - begin
     silence = np.full(env.task.mesh.n_nodes, env.task.expected_concentration)
     done, t = False, -env.task.lag
