@@ -4,11 +4,13 @@ from typing import Any
 
 import numpy as np
 
-from eitbench.envs.belief import Belief
+from eitbench.envs.belief import DOUBTFUL, FORGIVEN, Belief
 from eitbench.envs.injection_core import Rules
 
 
 class Policy:
+    parameters: dict[str, Any] = {"doubtful": DOUBTFUL, "forgiven": FORGIVEN}  # noqa: RUF012
+
     @classmethod
     def suits(cls, rules: Rules) -> bool:
         return rules.instrument.most > 0

@@ -4,12 +4,12 @@ from typing import Any
 
 import numpy as np
 
-from eitbench.envs.belief import Belief
+from eitbench.envs.belief import DOUBTFUL, FORGIVEN, Belief
 from eitbench.envs.injection_core import Rules
 
 
 class Policy:
-    parameters: dict[str, Any] = {"depth": 3, "width": 4}  # noqa: RUF012
+    parameters: dict[str, Any] = {"depth": 3, "width": 4, "doubtful": DOUBTFUL, "forgiven": FORGIVEN}  # noqa: RUF012
 
     @classmethod
     def suits(cls, rules: Rules) -> bool:
@@ -23,4 +23,5 @@ class Policy:
         self.belief = belief = Belief.follow(self.belief, self.rules, observation)
         if belief.sound.sum() < 4:
             return self.rules.action(belief.least_doubtful)
-        return self.rules.action(belief.look_ahead(sound=belief.sound, **self.parameters))
+        depth, width = self.parameters["depth"], self.parameters["width"]
+        return self.rules.action(belief.look_ahead(depth, width, sound=belief.sound))

@@ -33,8 +33,8 @@ class InjectionVecEnv(VecEnv):
     def reset(self) -> Any:
         """Begin training episodes; after ``seed(s)`` they are drawn from a sequence that s determines."""
         first = self._seeds[0]
-        seeds = None if first is None else [
-            int(k) for k in np.random.default_rng(first).integers(self.envs.episodes, size=self.num_envs)]
+        seeds = None if first is None else np.random.default_rng(first).choice(
+            self.envs.episodes, size=self.num_envs, replace=self.num_envs > self.envs.episodes).tolist()
         self._reset_seeds()
         return self._begin(seeds)
 
