@@ -1,9 +1,10 @@
 """Clairvoyant: knows what is broken and what flows through the pipe; a bound for the others.
 
 It plays a few plans ahead on the very episode and then follows the best of them: greedy A-optimal among the electrodes
-that are sound, each of a few fixed pairs, and, where there is a budget, injecting when its true error is large. Where
-the flow is unknown its variances are those about the true one and weigh errors by what they will do in the next steps;
-it tries more pairs, and cycles of them, and goes over from one plan to another wherever that turns out better.
+that are sound, each of a few fixed pairs, the best fixed currents where each electrode may have its own, and, where
+there is a budget, injecting when its true error is large. Where the flow is unknown its variances are those about the
+true one and weigh errors by what they will do in the next steps; it tries more pairs, and cycles of them, and goes over
+from one plan to another wherever that turns out better.
 """
 
 from itertools import product
@@ -13,9 +14,11 @@ import numpy as np
 
 from eitbench.envs.belief import Belief
 from eitbench.envs.injection_core import InjectionCore, Rules
+from eitbench.leaderboard.policies import load_policy
 from eitbench.recordings import recording
 
-NOTHING = -1
+NOTHING, CURRENTS = -1, -2
+"""What plans say, besides the number of a pair, of a step where nothing is injected, or the best fixed currents."""
 
 
 class Policy:
@@ -35,7 +38,8 @@ class Policy:
             self.plan = iter(self.changing().tolist())
             return
         if rules.budget is None:
-            errors, plans = self.ahead(np.array([self.greedy(), *(pair * every for pair in fixed)]))
+            currents = [CURRENTS] * load_policy("best_currents").suits(rules)
+            errors, plans = self.ahead(np.array([self.greedy(), *(option * every for option in fixed + currents)]))
         else:
             first, last, count = self.parameters["thresholds"]
             tried = product(fixed, np.geomspace(first, last, count), self.parameters["intervals"])
@@ -44,8 +48,12 @@ class Policy:
         self.plan = iter(plans[errors.argmin()].tolist())
 
     def act(self, observation: dict[str, np.ndarray]) -> Any:
-        pair = next(self.plan)
-        return self.rules.action(None if pair == NOTHING else pair)
+        return self.action(next(self.plan))
+
+    def action(self, number: int) -> Any:
+        if number == CURRENTS:
+            return np.array(load_policy("best_currents").parameters["currents"], dtype=np.float32)
+        return self.rules.action(None if number == NOTHING else number)
 
     def greedy(self, horizon: int = 0) -> np.ndarray:
         """(steps,) pairs after which the variance is least, summed over so many steps more, of electrodes without a
@@ -90,6 +98,6 @@ class Policy:
                 silent = ~(twin.errors() > threshold) | (k < last + interval) | (twin.spent >= self.rules.budget)
                 plans[silent, k] = NOTHING
                 last[~silent] = k
-            twin.act(np.array([self.rules.action(None if pair == NOTHING else pair) for pair in plans[:, k]]))
+            twin.act(np.array([self.action(number) for number in plans[:, k]]))
             errors.append(twin.errors())
         return np.nanmean(errors, axis=0), plans

@@ -11,7 +11,7 @@ from eitbench.leaderboard.run import Job
 from eitbench.leaderboard.store import EpisodeStore
 from eitbench.leaderboard.summary import mean_and_interval, rounded
 
-OPEN_LOOP = ("adjacent", "opposite", "transverse", "best_pair", "best_cycle", "schedule")
+OPEN_LOOP = ("adjacent", "opposite", "transverse", "best_pair", "best_cycle", "best_currents", "schedule")
 """Our policies that inject the same whatever is measured."""
 
 

@@ -209,8 +209,8 @@ def _cell(name: str, value: tuple[float, float] | None) -> str:
 
 
 def number(value: float) -> str:
-    """Two digits below 1, three above."""
-    return f"{value:.2g}" if abs(value) < 1 else f"{value:.3g}"
+    """Two digits below 1, three above, and all that stand before the point."""
+    return f"{value:.2g}" if abs(value) < 1 else f"{value:.3g}" if abs(value) < 999.5 else f"{value:.0f}"
 
 
 def markdown(table: pd.DataFrame) -> str:

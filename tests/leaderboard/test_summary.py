@@ -15,6 +15,7 @@ from eitbench.leaderboard.summary import (
     cells,
     markdown,
     mean_and_interval,
+    number,
     rounded,
     scores_by_seed,
     seed_ranges,
@@ -104,6 +105,12 @@ def test_no_interval_is_shown_as_nothing(mean, half):
 
 
 # -- skill ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("value", "text"), [(0.01234, "0.012"), (1.234, "1.23"), (29.47, "29.5"), (999.4, "999"),
+                                           (999.6, "1000"), (3078.2, "3078"), (0.0, "0"), (-1.234, "-1.23")])
+def test_numbers_are_short_and_never_powers_of_ten(value, text):
+    assert number(value) == text
 
 
 def test_skill_of_the_anchors():

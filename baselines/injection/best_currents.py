@@ -1,0 +1,26 @@
+"""Best fixed currents: one for each electrode, the same at every step, the best found on training episodes."""
+
+from typing import Any
+
+import numpy as np
+
+from eitbench.envs.injection_core import Rules
+
+
+class Policy:
+    # Found by `python benchmarks/search_injections.py eitbench/Pipe2DInjectionCurrents-v0`.
+    parameters: dict[str, Any] = {  # noqa: RUF012
+        "world": "Pipe2D", "limit": "Linf", "environment_steps": 0,
+        "currents": [1.0, -0.5, -0.5, -0.5, 0.0, -0.5, 0.0, 0.0, -1.0, 0.0, 0.0, 0.5, -0.5, 0.0, -1.0, 0.0]}
+
+    @classmethod
+    def suits(cls, rules: Rules) -> bool:
+        electrodes = rules.scenario.currents.shape[1]
+        return (rules.world, rules.limit, electrodes) == (
+            cls.parameters["world"], cls.parameters["limit"], len(cls.parameters["currents"]))
+
+    def __init__(self, rules: Rules, random: np.random.Generator) -> None:
+        self.currents = np.array(self.parameters["currents"], dtype=np.float32)
+
+    def act(self, observation: dict[str, np.ndarray]) -> Any:
+        return self.currents
