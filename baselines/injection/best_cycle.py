@@ -12,9 +12,11 @@ class Policy:
     # Found by `python benchmarks/search_injections.py`; electrodes by world.
     parameters: dict[str, Any] = {  # noqa: RUF012
         "cycle": {"Pipe2D": [[0, 8]], "Pipe2D with faults": [[8, 11], [0, 4], [2, 8], [0, 14]],
-                  "Pipe2DIntermittent with a budget": [[0, 10]], "Pipe2DDriftingVelocity": [[7, 8], [1, 7]]},
+                  "Pipe2DIntermittent with a budget": [[0, 10]], "Pipe2DDriftingVelocity": [[7, 8], [1, 7]],
+                  "RotatingTank2D": [[9, 15]]},
         "environment_steps": {"Pipe2D": 346_368, "Pipe2D with faults": 608_768,
-                              "Pipe2DIntermittent with a budget": 768_768, "Pipe2DDriftingVelocity": 217_792}}
+                              "Pipe2DIntermittent with a budget": 768_768, "Pipe2DDriftingVelocity": 217_792,
+                              "RotatingTank2D": 333_696}}
 
     @classmethod
     def suits(cls, rules: Rules) -> bool:

@@ -11,9 +11,10 @@ class Policy:
     # Found by `python benchmarks/search_injections.py`; electrodes by world.
     parameters: dict[str, Any] = {  # noqa: RUF012
         "pair": {"Pipe2D": [0, 8], "Pipe2D with faults": [0, 8], "Pipe2DIntermittent with a budget": [0, 10],
-                 "Pipe2DDriftingVelocity": [7, 9]},
+                 "Pipe2DDriftingVelocity": [7, 9], "RotatingTank2D": [9, 15]},
         "environment_steps": {"Pipe2D": 314_880, "Pipe2D with faults": 314_880,
-                              "Pipe2DIntermittent with a budget": 698_880, "Pipe2DDriftingVelocity": 157_440}}
+                              "Pipe2DIntermittent with a budget": 698_880, "Pipe2DDriftingVelocity": 157_440,
+                              "RotatingTank2D": 303_360}}
 
     @classmethod
     def suits(cls, rules: Rules) -> bool:

@@ -218,14 +218,12 @@ def _room(x: float, y: float, width: float, taken: list[tuple[float, float, floa
 
 
 def _log_ticks(low: float, high: float) -> list[float]:
-    """1, 2, 5 times powers of ten within [low, high]; finer ones where fewer than two of them are, only the powers
-    where they would be many."""
+    """1, 2, 5 times powers of ten within [low, high]; only the powers where they would be many, and those of a linear
+    axis where there would be fewer than two."""
     decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-    ticks: list[float] = []
-    for multiples in ([1, 2, 5], range(1, 10), np.arange(10, 100) / 10):
-        ticks = [float(m * 10.0**e) for e in decades for m in multiples if low <= m * 10.0**e <= high]
-        if len(ticks) > 1:
-            break
+    ticks = [m * 10.0**e for e in decades for m in (1, 2, 5) if low <= m * 10.0**e <= high]
+    if len(ticks) < 2:
+        return _linear_ticks(low, high)
     return ticks if len(ticks) < 12 else [10.0**e for e in decades if low <= 10.0**e <= high]
 
 

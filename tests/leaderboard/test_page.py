@@ -318,7 +318,7 @@ def test_curves_may_end_before_others():
         assert [len(line.get("points").split()) for line in lines] == lengths
 
 
-@pytest.mark.parametrize(("low", "high"), [(0.01, 10.0), (0.025, 0.036), (0.0301, 0.0329)])
+@pytest.mark.parametrize(("low", "high"), [(0.01, 10.0), (0.025, 0.036), (0.0301, 0.0329), (0.0107, 0.0199)])
 def test_every_axis_has_ticks(low, high):
     """Two of them at least, however near the values lie; all within."""
     ticks = charts._log_ticks(low, high)
