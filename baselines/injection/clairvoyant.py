@@ -33,7 +33,8 @@ class Policy:
     def __init__(self, rules: Rules, random: np.random.Generator, core: InjectionCore) -> None:
         self.rules, self.core = rules, core
         pairs, every = rules.pairs.tolist(), np.ones(core.length, dtype=int)
-        fixed = [pairs.index(pair) for pair in self.parameters["fixed_pairs"] if pair in pairs]
+        best = load_policy("best_pair").parameters["pair"].get(rules.world)
+        fixed = sorted({pairs.index(pair) for pair in [*self.parameters["fixed_pairs"], best] if pair in pairs})
         if rules.scenario.velocity_model is not None and rules.budget is None:
             self.plan = iter(self.changing().tolist())
             return
