@@ -23,6 +23,7 @@ import scipy
 from tqdm import tqdm
 
 from eitbench import _check
+from eitbench._code import code_digest, package_files
 from eitbench._files import write_atomically
 from eitbench.physics._backend import backend_version
 from eitbench.scenarios.base import Discretisation, Randomness, Scenario
@@ -154,7 +155,8 @@ def _identity(scenario: Scenario, seed: int) -> str:
 
 @lru_cache(maxsize=1)
 def _code_digest() -> str:
-    return code_digest("physics/*.py", "scenarios/base.py", "scenarios/carried.py", "recordings.py", "episodes.py")
+    return code_digest(package_files("physics/*.py", "scenarios/base.py", "scenarios/carried.py", "recordings.py",
+                                     "episodes.py"))
 
 
 @lru_cache(maxsize=64)
@@ -170,14 +172,7 @@ def _source_digest(kind: type) -> str:
                 files.append(Path(inspect.getfile(part)))
             except (OSError, TypeError):
                 continue
-    return _digest(b"".join(file.read_bytes() for file in dict.fromkeys(files)))
-
-
-def code_digest(*patterns: str) -> str:
-    """SHA-256 of the package's files that match: what is computed by other code is not taken for the same."""
-    here = Path(__file__).parent
-    files = sorted(file for pattern in patterns for file in here.glob(pattern))
-    return _digest(b"".join(file.read_bytes() for file in files))
+    return code_digest(dict.fromkeys(files))
 
 
 def _store(path: Path, whole: str, episode: Episode) -> None:

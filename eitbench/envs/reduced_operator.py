@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from eitbench._code import code_digest, package_files
 from eitbench._files import write_atomically
 from eitbench.envs.operator import BROKEN, Linearisation, levels_of, pair_currents, patch_averages
-from eitbench.episodes import code_digest, folder, warn_not_kept
+from eitbench.episodes import folder, warn_not_kept
 from eitbench.estimation import LinearisedObservations, Observation, starting_filter
 from eitbench.estimation.reduced import ReducedFilter, ReducedModel, reduced_model
 from eitbench.recordings import outline
@@ -165,7 +166,8 @@ def _stored_model(scenario: Scenario) -> ReducedModel:
 
 def stored_model(scenario: Scenario, name: str, kind: type[Model], make: Callable[[], Model]) -> Model:
     """A model, a named tuple of arrays, from the cache if one of this name is there; else it is made and kept."""
-    path = folder(scenario) / f"{name}-{code_digest('estimation/*.py', 'envs/*operator.py', 'task.py')[:16]}.npz"
+    code = code_digest(package_files("estimation/*.py", "envs/*operator.py", "task.py"))
+    path = folder(scenario) / f"{name}-{code[:16]}.npz"
     try:
         with np.load(path, allow_pickle=False) as stored:
             model = kind(*(stored[name] for name in kind._fields))  # type: ignore[attr-defined]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
 import os
@@ -19,6 +18,7 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from eitbench._code import code_digest, package_files
 from eitbench._files import write_atomically
 from eitbench.leaderboard.records import SCHEMA, SHARED, sealed, split_of, write_record
 from eitbench.seeds import name_seed
@@ -128,13 +128,11 @@ def _read_json(path: Path) -> dict[str, Any] | None:
 
 @lru_cache(maxsize=1)
 def source_digest() -> str:
-    """Hash of the source that scores depend on: results of other code are not taken for this one's."""
-    folder = Path(__file__).parent.parent
+    """Hash of the code that scores depend on: results of other code are not taken for this one's."""
     rooms = ("physics/*", "scenarios/*", "episodes", "recordings", "regions", "bank", "seeds", "task", "estimation/*",
              "scoring", "envs/*", "pair_policy", "leaderboard/run", "leaderboard/score", "leaderboard/policies",
              "leaderboard/agents")
-    files = sorted(path for room in rooms for path in folder.glob(f"{room}.py"))
-    return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
+    return code_digest(package_files(*(f"{room}.py" for room in rooms)))
 
 
 @lru_cache(maxsize=1)

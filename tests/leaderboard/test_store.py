@@ -260,7 +260,7 @@ def test_the_source_is_all_that_scores_depend_on(name, monkeypatch):
     changed, read, before = Path(store_module.__file__).parents[1] / name, Path.read_bytes, source_digest()
     assert changed.exists()
     source_digest.cache_clear()
-    monkeypatch.setattr(Path, "read_bytes", lambda path: read(path) + b"#" * (path == changed))
+    monkeypatch.setattr(Path, "read_bytes", lambda path: read(path) + b"#\n" * (path == changed))
     after = source_digest()
     source_digest.cache_clear()
     assert after != before
