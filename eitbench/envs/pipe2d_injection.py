@@ -32,8 +32,8 @@ class Pipe2DInjectionEnv(InjectionEnv, EzPickle):
     measured. The adaptivity gap is 0.01 (`docs/injection.md`).
 
     `eitbench/Pipe2DInjectionCurrents-v0` is the same world with a current of its own for each electrode, and as much a
-    reference: the best currents, the same at every step, leave 12 % less of ẽ_c than pairs do and the clairvoyant
-    nothing beyond. There the gap is 0.02.
+    reference: the best currents, the same at every step, take a tenth off the ẽ_c of any pairs, and the clairvoyant
+    2 % more. There the gap is 0.02.
 
     ## Action space
 
