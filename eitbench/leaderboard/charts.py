@@ -210,7 +210,7 @@ def _room(x: float, y: float, width: float, taken: list[tuple[float, float, floa
     for left, dy, anchor in ((x + 10, 4, "start"), (x - 10 - width, 4, "end"), (x + 6, -9, "start"),
                              (x + 6, 18, "start"), (x - 6 - width, -9, "end"), (x - 6 - width, 18, "end")):
         box = (left, y + dy - 11, left + width, y + dy + 3)
-        inside = box[0] > LEFT and box[2] < WIDTH and box[1] > 0 and box[3] < HEIGHT - BOTTOM
+        inside = box[0] > LEFT and box[2] < WIDTH - 2 * LETTER and box[1] > 0 and box[3] < HEIGHT - BOTTOM
         if inside and not any(box[0] < b[2] and b[0] < box[2] and box[1] < b[3] and b[1] < box[3] for b in taken):
             taken.append(box)
             return (left if anchor == "start" else left + width), y + dy, anchor
