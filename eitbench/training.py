@@ -15,6 +15,7 @@ import inspect
 import io
 import json
 import time
+import zipfile
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -280,7 +281,16 @@ def _fresh(algo: str, config: Config, learning: VecEnv, seed: int, folder: Path)
 def _save(model: BaseAlgorithm, path: Path) -> None:
     content = io.BytesIO()
     model.save(content)
-    write_atomically(path, content.getvalue())
+    write_atomically(path, _compressed(content))
+
+
+def _compressed(archive: io.BytesIO) -> bytes:
+    """The same files in a zip that is smaller: stable-baselines3 stores them as they are."""
+    content = io.BytesIO()
+    with zipfile.ZipFile(archive) as stored, zipfile.ZipFile(content, "w") as packed:
+        for file in stored.infolist():
+            packed.writestr(file, stored.read(file), zipfile.ZIP_DEFLATED, 9)
+    return content.getvalue()
 
 
 def _forget(model: BaseAlgorithm) -> None:

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import asdict, replace
+from zipfile import ZIP_DEFLATED, ZipFile
 
 import gymnasium as gym
 import numpy as np
@@ -68,6 +69,8 @@ def test_every_algorithm_leaves_a_whole_run(env, algo, options, tmp_path):
     assert json.loads((tmp_path / "config.json").read_text())["algo"] == algo
     assert not (getattr(model.policy, "actor", None) or model.policy).optimizer.state
     assert len((tmp_path / "sha256").read_text()) == 64 and not (tmp_path / "latest.zip").exists()
+    with ZipFile(path) as model_zip:                                                        # fifteen lie in git
+        assert {file.compress_type for file in model_zip.infolist()} == {ZIP_DEFLATED}
 
 
 def test_a_killed_run_loses_no_more_than_an_interval(tmp_path, monkeypatch):
