@@ -31,7 +31,7 @@ def _without_docstrings(file: Path) -> bytes:
     begins = [0]
     for line in code.splitlines(keepends=True):
         begins.append(begins[-1] + len(line))
-    for node in sorted(said, key=lambda node: node.lineno, reverse=True):
+    for node in sorted(said, key=lambda node: (node.lineno, node.col_offset), reverse=True):
         assert node.end_lineno is not None and node.end_col_offset is not None
         code = (code[:begins[node.lineno - 1] + node.col_offset]
                 + code[begins[node.end_lineno - 1] + node.end_col_offset:])

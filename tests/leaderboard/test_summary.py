@@ -104,13 +104,13 @@ def test_no_interval_is_shown_as_nothing(mean, half):
     assert "±" not in shown or float(shown.split(" ± ")[1]) > 0
 
 
-# -- skill ------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("value", "text"), [(0.01234, "0.012"), (1.234, "1.23"), (29.47, "29.5"), (999.4, "999"),
                                            (999.6, "1000"), (3078.2, "3078"), (0.0, "0"), (-1.234, "-1.23")])
 def test_numbers_are_short_and_never_powers_of_ten(value, text):
     assert number(value) == text
+
+
+# -- skill ------------------------------------------------------------------------------------------------------------
 
 
 def test_skill_of_the_anchors():
