@@ -18,7 +18,8 @@ def area(width):
 
 @pytest.mark.parametrize(("old", "new", "counts"), [
     ("A module.", "A module,\nand more of it.", False), ("in a line", "", False), ("Über alles: m²", "In m²", False),
-    ("after an assignment", "ä", False), ("beside it", "beside", False), ("after an assignment", "", False), ("size = 1", "size = 2", True), ('"width"', '"depth"', True),
+    ("after an assignment", "ä", False), ("beside it", "beside", False),
+    ("after an assignment", "", False), ("size = 1", "size = 2", True), ('"width"', '"depth"', True),
     ("return", "return 2 *", True), ("\n    return", "\n    # why\n    return", True), ("(width)", "(wide", True),
 ])
 def test_docstrings_do_not_count(old, new, counts, tmp_path):
