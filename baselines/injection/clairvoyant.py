@@ -32,14 +32,16 @@ class Policy:
 
     def __init__(self, rules: Rules, random: np.random.Generator, core: InjectionCore) -> None:
         self.rules, self.core = rules, core
-        pairs, every = rules.pairs.tolist(), np.ones(core.length, dtype=int)
-        best = load_policy("best_pair").parameters["pair"].get(rules.world)
-        fixed = sorted({pairs.index(pair) for pair in [*self.parameters["fixed_pairs"], best] if pair in pairs})
         if rules.scenario.velocity_model is not None and rules.budget is None:
             self.plan = iter(self.changing().tolist())
             return
+        pairs, every = rules.pairs.tolist(), np.ones(core.length, dtype=int)
+        best = load_policy("best_pair").parameters["pair"].get(rules.world)
+        fixed = sorted({pairs.index(pair) for pair in [*self.parameters["fixed_pairs"], best] if pair in pairs})
         if rules.budget is None:
-            currents = [CURRENTS] * load_policy("best_currents").suits(rules)
+            any_currents = load_policy("best_currents")
+            self.currents = np.array(any_currents.parameters["currents"], dtype=np.float32)
+            currents = [CURRENTS] * any_currents.suits(rules)
             errors, plans = self.ahead(np.array([self.greedy(), *(option * every for option in fixed + currents)]))
         else:
             first, last, count = self.parameters["thresholds"]
@@ -53,7 +55,7 @@ class Policy:
 
     def action(self, number: int) -> Any:
         if number == CURRENTS:
-            return np.array(load_policy("best_currents").parameters["currents"], dtype=np.float32)
+            return self.currents
         return self.rules.action(None if number == NOTHING else number)
 
     def greedy(self, horizon: int = 0) -> np.ndarray:
