@@ -83,7 +83,7 @@ def verify(record: dict[str, Any], job: Job, *, episodes: int = 3, seed: int = 0
     for said in (record["episodes"][i] for i in sorted(drawn)):
         again = json.loads(json.dumps(run_episode(job._replace(seed=parse_seeds(said["seed"])[0]))[0]))
         wrong = {} if said["status"] == again["status"] == "failed" else _off(said, again)
-        differences += [f"{said['seed']}: {name} is {_value(again, name)}, the record says {_value(said, name)}"
+        differences += [f"{said['seed']}: {_difference(name, said, again)}"
                         for name, off in wrong.items() if off > tolerance]
         again["environment"]["name"] = record["environment"]["name"]             # arguments may stand in another order
         differences += [f"{name} is {again[name]!r}, the record says {record[name]!r}"
@@ -136,7 +136,18 @@ def _relative(a: list[float | None], b: list[float | None]) -> float:
                for x, y in zip(a, b, strict=True))
 
 
+def _difference(name: str, said: dict[str, Any], again: dict[str, Any]) -> str:
+    """What one score is now and was then; of the errors of all steps, the one that has changed most."""
+    if name != "step_errors":
+        return f"{name} is {_value(again, name)}, the record says {_value(said, name)}"
+    now, then = again[name], said[name]
+    if len(now) != len(then):
+        return f"{name} are {len(now)}, the record has {len(then)}"
+    worst = max(range(len(now)), key=lambda k: _relative([now[k]], [then[k]]))
+    return f"{name}[{worst}] is {now[worst]}, the record says {then[worst]}"
+
+
 def _value(episode: dict[str, Any], name: str) -> str:
     if name == "status" or episode["status"] == "failed":
         return episode["status"] + (f" ({episode['message']})" if "message" in episode and name == "status" else "")
-    return str(episode["step_errors"] if name == "step_errors" else episode["scores"].get(name))
+    return str(episode["scores"].get(name))
