@@ -68,7 +68,7 @@ def lines(x: np.ndarray, series: list[Series], x_label: str, y_label: str) -> st
     px = Axis(x[0], last, LEFT, WIDTH - RIGHT, log=False)
     py = Axis(floor, max(values.max(), floor) * 1.15, HEIGHT - BOTTOM, TOP, log=True)
     parts = _frame(px, py, x_label, y_label)
-    for s in series:
+    for s in sorted(series, key=lambda s: not s.faint):
         at = x if s.at is None else s.at
         points = " ".join(f"{px(a):.1f},{py(b):.1f}" for a, b in zip(at, s.values, strict=False))
         parts.append(f'<polyline class="series{" faint" * s.faint}" style="{_stroke(s.colour)}" points="{points}">'

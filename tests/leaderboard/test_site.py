@@ -23,8 +23,8 @@ from eitbench.leaderboard import charts
 from eitbench.leaderboard.boards import ALL, boards
 from eitbench.leaderboard.records import read_records, write_record
 from eitbench.leaderboard.site import read_media, render_site, write_site
-from eitbench.leaderboard.site.collect import collect
-from eitbench.leaderboard.site.environment import documentation, learning_curves, markdown
+from eitbench.leaderboard.site.collect import Row, collect
+from eitbench.leaderboard.site.environment import _told, documentation, learning_curves, markdown
 from eitbench.leaderboard.site.method import command
 from eitbench.leaderboard.summary import number, with_interval
 
@@ -301,6 +301,18 @@ def test_charts_are_within_their_frame(pages):
             assert chart.get("aria-hidden") or chart.get("aria-label")
     used = {colour for html in pages.values() for colour in re.findall(r"var\((--\w+)\)", html)}
     assert used <= set(re.findall(r"(--\w+):", (ROOT / "eitbench/leaderboard/style.css").read_text()))
+
+
+def test_of_many_curves_a_few_stand_out():
+    """The reference and the floor, and the best of the others, agents of several seeds once; of few, all."""
+    ranks = {"bound": None, "ppo_seed3": 1, "ppo_seed0": 2, "greedy": 3, "cycle": 4, "pair": 5, "ppo_seed1": 6,
+             "random": None}
+    rows = [Row({"method": name, "rank": rank}, None, False, i) for i, (name, rank) in enumerate(ranks.items())]
+    assert [row.cells["method"] for row in _told(rows)] == ["bound", "ppo_seed3", "greedy", "cycle", "random"]
+    assert _told(rows[:7]) == rows[:7]
+    drawn = ElementTree.fromstring(charts.lines(np.arange(1, 4), [
+        charts.Series(name, 0, np.full(3, 0.1), faint=name != "b") for name in "abc"], "x", "y")).findall("polyline")
+    assert ["faint" in line.get("class") for line in drawn] == [True, True, False]           # the others lie behind
 
 
 def test_the_front_is_of_those_whom_nobody_beats():

@@ -19,6 +19,8 @@ from eitbench.leaderboard.site.tables import explanations, table, three
 from eitbench.leaderboard.templates import template
 
 NOMINAL = ("coverage_50", "coverage_90")
+MOST, TOLD = 7, 5
+"""Jagged curves that can be told apart, and how many are drawn strongly where there are more."""
 
 
 def environment_page(site: Site, board: Board, animation: bytes | None) -> str:
@@ -83,10 +85,27 @@ def _curves(board: Board) -> dict[str, Any] | None:
     """Error of each scored step, the mean over the episodes."""
     found = [(row, [episode["step_errors"] for episode in row.episodes()]) for row in board.current]
     found = [(row, errors) for row, errors in found if errors and len(errors[0]) > 1]
-    series = [charts.Series(row.cells["title"], row.colour, np.mean(errors, axis=0)) for row, errors in found]
+    told = _told([row for row, _ in found])
+    series = [charts.Series(row.cells["title"], row.colour, np.mean(errors, axis=0), faint=row not in told)
+              for row, errors in found]
     longest = max((len(s.values) for s in series), default=0)
-    return _chart(charts.lines(np.arange(1, longest + 1), series, "scored state", "relative error") if series else "",
-                  [row for row, _ in found])
+    made = _chart(charts.lines(np.arange(1, longest + 1), series, "scored state", "relative error") if series else "",
+                  told)
+    return made and made | {"faint": len(told) < len(found)}
+
+
+def _told(rows: list[Row]) -> list[Row]:
+    """Whose curves are drawn strongly: all, or of many two without a rank and the best of each kind of the others;
+    agents that differ by their training's seed are of one kind."""
+    if len(rows) <= MOST:
+        return rows
+    kinds: dict[str, Row] = {}
+    for row in rows:
+        if row.competes:
+            kinds.setdefault(re.sub(r"seed\d+$", "", row.cells["method"]), row)
+    unranked = [row for row in rows if not row.competes][:2]
+    best = list(kinds.values())[:TOLD - len(unranked)]
+    return [row for row in rows if row in unranked or row in best]
 
 
 def _calibration(board: Board) -> dict[str, Any] | None:
