@@ -17,7 +17,7 @@ def verify(
     episodes: Annotated[int, typer.Option(min=0, help="How many are played again.")] = 3,
     seed: Annotated[int | None, typer.Option(min=0, help="By which they are drawn. Default: any.")] = None,
     tolerance: Annotated[float, typer.Option(
-        min=0.0, help="Relative difference that is none; across machines 1e-3.")] = 1e-6,
+        min=0.0, help="Relative difference of scores that is none.")] = 1e-6,
     isolate: Isolate = Isolation.always,
     held_out: Annotated[int, typer.Option(
         "--held-out", min=0, help="For maintainers: play so many held-out episodes too, and compare the errors.")] = 0,
