@@ -305,9 +305,11 @@ def test_charts_are_within_their_frame(pages):
 
 def test_of_many_curves_a_few_stand_out():
     """The reference and the floor, and the best of the others, agents of several seeds once; of few, all."""
-    ranks = {"bound": None, "ppo_seed3": 1, "ppo_seed0": 2, "greedy": 3, "cycle": 4, "pair": 5, "ppo_seed1": 6,
-             "random": None}
-    rows = [Row({"method": name, "rank": rank}, None, False, i) for i, (name, rank) in enumerate(ranks.items())]
+    ranks = {"bound": None, "ppo_seed3": 1, "failed": None, "ppo_seed0": 2, "greedy": 3, "cycle": 4, "pair": 5,
+             "ppo_seed1": 6, "random": None}
+    notes = {"bound": "reference", "random": "floor", "failed": "failed in test:0"}
+    rows = [Row({"method": name, "rank": rank, "note": notes.get(name, "")}, None, False, i)
+            for i, (name, rank) in enumerate(ranks.items())]
     assert [row.cells["method"] for row in _told(rows)] == ["bound", "ppo_seed3", "greedy", "cycle", "random"]
     assert _told(rows[:7]) == rows[:7]
     drawn = ElementTree.fromstring(charts.lines(np.arange(1, 4), [

@@ -86,6 +86,6 @@ def _curves(axes: Axes, env: str) -> None:
                   label=None if algo in seen else f"{algo}, reduced filter, dev episodes")
         seen.add(algo)
     axes.legend(frameon=False, fontsize=8)
-    axes.set(xlabel="million environment steps after imitation", ylabel="ẽ$_c$")
+    axes.set(xlabel="million environment steps of reinforcement", ylabel="ẽ$_c$")
     axes.margins(y=0.25)
     bare(axes)

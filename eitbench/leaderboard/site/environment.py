@@ -95,15 +95,15 @@ def _curves(board: Board) -> dict[str, Any] | None:
 
 
 def _told(rows: list[Row]) -> list[Row]:
-    """Whose curves are drawn strongly: all, or of many two without a rank and the best of each kind of the others;
-    agents that differ by their training's seed are of one kind."""
+    """Whose curves are drawn strongly: all, or of many two floors or references and the best of each kind of those with
+    a rank; agents that differ by their training's seed are of one kind."""
     if len(rows) <= MOST:
         return rows
     kinds: dict[str, Row] = {}
     for row in rows:
         if row.competes:
             kinds.setdefault(re.sub(r"seed\d+$", "", row.cells["method"]), row)
-    unranked = [row for row in rows if not row.competes][:2]
+    unranked = [row for row in rows if row.unranked][:2]
     best = list(kinds.values())[:TOLD - len(unranked)]
     return [row for row in rows if row in unranked or row in best]
 
