@@ -54,9 +54,9 @@ def table(board: Board, root: str, *, compact: bool) -> Table:
     columns: list[tuple[str, list[Cell]]] = [
         ("rank", [_rank(row, shared) for row in board.rows]),
         ("method", [_method(row, root) for row in board.rows]),
-        ("by", [_plain("official" if row.cells["official"] else "self-reported") for row in board.rows]),
         *((heading, [interval_cell(row, name, drawn[name]) for row in board.rows])
           for name, (heading, _) in SCALES.items()),
+        ("by", [_plain("official" if row.cells["official"] else "self-reported") for row in board.rows]),
         *((HEADINGS[name], [value_cell(row.cells[name]) for row in board.rows]) for name in scores)]
     columns = [(heading, cells) for heading, cells in columns
                if heading == "rank" or any(cell.text != "–" for cell in cells)]
