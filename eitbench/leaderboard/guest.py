@@ -31,7 +31,7 @@ def main() -> None:
     wall.end_with_parent()
     wall.limit_memory(memory)
     closed = wall.close_files(readable, [private, Path(os.devnull)])
-    wall.close_sockets()
+    wall.refuse_calls()
 
     def read(n: int) -> bytes:
         content = incoming.read(n)

@@ -1,7 +1,8 @@
 """Limits that a process puts on itself before it runs somebody else's code, and cannot lift again.
 
 Files: Linux' Landlock (kernel 5.13 and later). Whatever is not named is out of reach, other processes' memory too, and
-TCP where the kernel knows how to refuse it. Sockets of all kinds: Linux' seccomp. Memory: a limit of the address space.
+TCP where the kernel knows how to refuse it. Linux' seccomp: sockets of all kinds, and what Landlock lets pass, such as
+being told the names of files that others open. Memory: a limit of the address space.
 """
 
 from __future__ import annotations
@@ -23,16 +24,33 @@ _FILE = 1 << 0 | 1 << 1 | 1 << 2 | 1 << 14
 _ALL = {1: (1 << 13) - 1, 2: (1 << 14) - 1, 3: (1 << 15) - 1, 5: (1 << 16) - 1}
 """What a version of the interface can refuse: all that came with it or earlier."""
 _NO_NEW_PRIVILEGES, _END_WITH_PARENT, _FILTER_CALLS = 38, 1, (22, 2)
-_SOCKETS = {"x86_64": (0xC000003E, 41, 53, 109, 112, 425), "aarch64": (0xC00000B7, 198, 199, 154, 157, 425)}
-"""Architecture, as the kernel names it, and the numbers of its calls socket, socketpair, setpgid, setsid and
-io_uring_setup."""
+_REFUSED_CALLS = {
+    "x86_64": (0xC000003E, 302, (
+        41, 53, 425,                                                  # socket, socketpair, io_uring_setup
+        109, 112,                                                     # setpgid, setsid
+        253, 294, 254, 300, 301, 303, 304,                            # inotify, fanotify, files by their handles
+        90, 91, 268, 452, 92, 93, 94, 260,                            # chmod and chown
+        132, 235, 261, 280, 188, 189, 190, 463, 197, 198, 199, 466,   # utime and extended attributes
+        101, 310, 311, 298, 321,                                      # ptrace, others' memory, perf events, bpf
+        141, 142, 144, 314, 251, 203)),                               # priorities and processors, of others too
+    "aarch64": (0xC00000B7, 261, (
+        198, 199, 425, 154, 157, 26, 27, 262, 263, 264, 265, 52, 53, 452, 54, 55, 88, 5, 6, 7, 463, 14, 15, 16, 466,
+        117, 270, 271, 241, 280, 140, 118, 119, 274, 30, 122)),
+}
+"""Architecture as the kernel names it, the number of its call prlimit64, which may ask about the process itself, and
+those of the calls that are refused; the second in the order of the first, which has more of its own."""
 _LOAD, _EQUAL, _AT_LEAST, _RETURN = 0x20, 0x15, 0x35, 0x06
 """What a step of a filter of system calls does."""
 _ALLOWED, _REFUSED = 0x7FFF0000, 0x00050000 | errno.EACCES
-_CALL, _ARCHITECTURE = 0, 4
-"""Where a filter finds them."""
+_CALL, _ARCHITECTURE, _ARGUMENT = 0, 4, 16
+"""Where a filter finds them, and the lower half of the first argument."""
 _FOREIGN = 0x40000000
 """From here on calls have x86_64's other numbers, for 32-bit pointers."""
+
+
+_SETTINGS = ("ld.so.cache", "localtime", "timezone", "passwd", "group", "nsswitch.conf", "mime.types", "os-release",
+             "fonts", "alternatives")
+"""What programs look up in /etc; much else there is not for everybody."""
 
 
 class _Ruleset(ctypes.Structure):
@@ -88,20 +106,23 @@ def close_files(readable: Iterable[Path], writable: Iterable[Path]) -> bool:
     return True
 
 
-def close_sockets() -> bool:
-    """From now on this process and its children make no socket of any kind, and leave neither session nor group.
+def refuse_calls() -> bool:
+    """From now on this process and its children make no socket of any kind, leave neither session nor group, and are
+    not told which files others open; owners, modes, times and attributes of files stay what they are, and so do
+    priorities and limits of other processes.
 
     Pairs of sockets are refused too, as one of datagrams can be turned to any address. Returns whether that is so;
     False where the kernel cannot filter system calls or this does not know their numbers.
     """
-    if not sys.platform.startswith("linux") or os.uname().machine not in _SOCKETS:
+    if not sys.platform.startswith("linux") or os.uname().machine not in _REFUSED_CALLS:
         return False
-    architecture, *calls = _SOCKETS[os.uname().machine]
+    architecture, limits, calls = _REFUSED_CALLS[os.uname().machine]
     asked = [(_AT_LEAST, _FOREIGN), *((_EQUAL, call) for call in calls)]
+    last = [(_EQUAL, 0, 2, limits), (_LOAD, 0, 0, _ARGUMENT), (_EQUAL, 0, 1, 0),         # limits of process 0: its own
+            (_RETURN, 0, 0, _ALLOWED), (_RETURN, 0, 0, _REFUSED)]
     steps = [(_LOAD, 0, 0, _ARCHITECTURE), (_EQUAL, 1, 0, architecture), (_RETURN, 0, 0, _REFUSED),
              (_LOAD, 0, 0, _CALL),
-             *((deed, len(asked) - i, 0, value) for i, (deed, value) in enumerate(asked)),
-             (_RETURN, 0, 0, _ALLOWED), (_RETURN, 0, 0, _REFUSED)]
+             *((deed, len(asked) - i + len(last) - 2, 0, value) for i, (deed, value) in enumerate(asked)), *last]
     libc, content = _libc(), (_Step * len(steps))(*(_Step(*step) for step in steps))
     _checked(libc.prctl(_NO_NEW_PRIVILEGES, 1, 0, 0, 0))
     return bool(libc.prctl(*_FILTER_CALLS, ctypes.byref(_Filter(len(steps), content)), 0, 0) == 0)
@@ -125,9 +146,9 @@ def python_files() -> list[Path]:
     package = Path(__file__).parents[1]
     checkout = package.parent if (package.parent / "pyproject.toml").exists() else None       # else others lie beside
     places = [sys.prefix, sys.base_prefix, sys.exec_prefix, str(package), str(package.parent / "baselines"), "/usr",
-              "/lib", "/lib64", "/bin", "/etc", "/dev/null", "/dev/urandom", "/dev/zero", f"/proc/{os.getpid()}",
-              "/proc/cpuinfo", "/proc/meminfo", "/proc/stat", "/sys/devices/system/cpu",
-              *(place for place in sys.path if place and Path(place) != checkout)]
+              "/lib", "/lib64", "/bin", *(f"/etc/{name}" for name in _SETTINGS), "/dev/null", "/dev/urandom",
+              "/dev/zero", f"/proc/{os.getpid()}", "/proc/cpuinfo", "/proc/meminfo", "/proc/stat",
+              "/sys/devices/system/cpu", *(place for place in sys.path if place and Path(place) != checkout)]
     return [Path(place) for place in places]
 
 

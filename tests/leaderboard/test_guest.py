@@ -29,7 +29,7 @@ KWARGS = json.loads(FILTER.kwargs)
 walled = pytest.mark.skipif(not landlock_version(), reason="this kernel has no Landlock")
 
 ATTACKS = '''
-import fcntl, gc, os, socket, termios
+import ctypes, fcntl, gc, os, resource, socket, termios
 from pathlib import Path
 reached = []
 def attempt(what, deed):
@@ -38,7 +38,10 @@ def attempt(what, deed):
             reached.append(what)
     except (OSError, KeyError):
         pass
-parent = f"/proc/{os.getppid()}"
+def not_negative(result):
+    return result >= 0
+parent, libc = f"/proc/{os.getppid()}", ctypes.CDLL(None)
+other = os.PRIO_PROCESS, os.getppid()
 attempt("the cache", lambda: os.listdir(SECRETS))
 attempt("a truth", lambda: Path(SECRETS, "secret.txt").read_text())
 attempt("the checkout", lambda: Path(ROOT, "README.md").read_text())
@@ -54,6 +57,13 @@ attempt("a service", lambda: socket.socket(socket.AF_UNIX).connect(SECRETS + "/s
 attempt("a service by pairs", lambda: socket.socketpair(type=socket.SOCK_DGRAM)[0].sendto(b"x", SECRETS + "/log"))
 attempt("the terminal", lambda: any(map(os.isatty, range(64))))
 attempt("its keys", lambda: fcntl.ioctl(2, termios.TIOCSTI, b"x"))
+attempt("names in the cache", lambda: not_negative(libc.inotify_add_watch(libc.inotify_init(), SECRETS.encode(), 32)))
+attempt("names everywhere", lambda: not_negative(libc.fanotify_init(0x600, 0)))
+attempt("who may read", lambda: os.chmod(SECRETS + "/secret.txt", 0o644))
+attempt("when it was written", lambda: os.utime(SECRETS + "/secret.txt"))
+attempt("the other's haste", lambda: os.setpriority(*other, os.getpriority(*other)))
+attempt("the other's limits", lambda: resource.prlimit(os.getppid(), resource.RLIMIT_NOFILE))
+attempt("the machine's secrets", lambda: open("/etc/shadow"))
 attempt("another folder", lambda: Path(SECRETS, "mine.txt").write_text("mine"))
 attempt("the name of the cache", lambda: os.environ["EITBENCH_CACHE"] == CACHE)
 held = [value for each in gc.get_objects() if type(each) is dict for value in each.values()]
@@ -118,7 +128,8 @@ def a_terminal():
 
 @walled
 def test_it_reaches_nothing(tmp_path, monkeypatch):
-    """Neither files nor other processes, sockets, a terminal or a truth; without the wall the same code does."""
+    """Neither files nor other processes, sockets, a terminal or a truth, nor which files are opened, whose names hold
+    seeds; without the wall the same code does."""
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
     here = {"truth": simulate(Pipe2D(**SCENARIO), 3, progress=False).concentration, "makes the collector look": []}
     (tmp_path / "secret.txt").write_text("the truth")
@@ -133,8 +144,9 @@ def test_it_reaches_nothing(tmp_path, monkeypatch):
         within: dict = {}
         exec(source, within)
         assert {"the cache", "a truth", "the checkout", "the other's surroundings", "the other process", "the network",
-                "UDP", "a service", "a service by pairs", "the terminal", "another folder", "the name of the cache",
-                "the truth in memory"} <= set(within["reached"])
+                "UDP", "a service", "a service by pairs", "the terminal", "names in the cache", "who may read",
+                "when it was written", "the other's haste", "the other's limits", "another folder",
+                "the name of the cache", "the truth in memory"} <= set(within["reached"])
         curious = write_baseline(tmp_path, init=f"exec({source!r}, globals())",
                                  update="raise RuntimeError(f'reached {reached}')")
         with Guest("estimator", FILTER.id, KWARGS, curious) as guest:

@@ -91,7 +91,7 @@ def test_interquartile_mean_pools_and_the_mean_does_not():
     (6, mean_over_environments, 0.932), (10, mean_over_environments, 0.944), (30, mean_over_environments, 0.950),
     (6, interquartile_mean, 0.955), (10, interquartile_mean, 0.972), (30, interquartile_mean, 0.959)])
 def test_coverage(n, statistic, expected):
-    """How many intervals hold the truth, of 1000 data sets of n normal numbers, as of 6000 others, to 3 standard errors.
+    """Intervals that hold the truth, of 1000 data sets of n normal numbers: as of 6000 others, to 3 standard errors.
 
     Not cut as Student's t would they are too few: 0.854, 0.902 and 0.938 for the mean, 0.904, 0.937 and 0.948.
     """
@@ -115,7 +115,8 @@ def test_coverage_over_environments():
         held += low <= 59 / 3 <= high
         width.append(high - low)
     assert held / 400 == pytest.approx(0.95, abs=0.033)
-    assert np.mean(width) == pytest.approx(2 * stats.t(92).ppf(0.975) / 3 * math.sqrt(1 / 30 + 4 / 40 + 1 / 25), rel=0.03)
+    expected = 2 * stats.t(92).ppf(0.975) / 3 * math.sqrt(1 / 30 + 4 / 40 + 1 / 25)
+    assert np.mean(width) == pytest.approx(expected, rel=0.03)
 
 
 @pytest.mark.parametrize("statistic", [interquartile_mean, mean_over_environments])
@@ -193,7 +194,8 @@ def test_paired_interval_is_scipys():
     x, y = random.normal(0.0, 1.0, (2, 40))
     cut = stats.norm.sf(stats.t(39).ppf(0.975) * math.sqrt(40 / 39))
     theirs = stats.bootstrap((x, y), lambda x, y, axis: (x - y).mean(axis=axis), paired=True, method="percentile",
-                             confidence_level=1 - 2 * cut, n_resamples=20_000, rng=np.random.default_rng(4)).confidence_interval
+                             confidence_level=1 - 2 * cut, n_resamples=20_000,
+                             rng=np.random.default_rng(4)).confidence_interval
     value, low, high = paired_difference({"pipe": seeded(x)}, {"pipe": seeded(y)}, draws=20_000)
     assert value == pytest.approx((x - y).mean(), rel=1e-12)
     sd = (x - y).std() / math.sqrt(40)                           # Monte-Carlo error of an end of the interval: 0.02 sd
