@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from statistics import median
 from typing import Any, NamedTuple
 
 import pandas as pd
 
+from eitbench.envs import ENTRY_POINTS
 from eitbench.leaderboard.records import file_name, finished, newest, version
 from eitbench.leaderboard.statistics import (
     interquartile_mean,
@@ -50,7 +52,8 @@ MORE = {
     "gain": "1 − ẽ_c over that of the floor (homogeneous; random_pair) in the same episode: 0 as the floor, 1 perfect. "
             "Interquartile mean with its 95 % bootstrap interval",
     **{heading: EXPLANATIONS[heading] for heading in HEADINGS.values() if heading in EXPLANATIONS},
-    "products/step": "time per step in units of a 1000 × 1000 × 1000 matrix product on one thread of that machine",
+    "products/step": "time per step in units of a 1000 × 1000 × 1000 matrix product on one thread of that processor, "
+                     "the median of all that were timed on it",
     "MB": "memory that the method's own process held at most",
 }
 
@@ -83,7 +86,8 @@ def boards(records: list[dict[str, Any]]) -> pd.DataFrame:
 
     A board is an environment. Its episodes are those that its floor has played (without one, those that anybody has);
     others are not looked at. After the boards of a class comes its aggregate, with ``environment`` `ALL`, if
-    there are several environments with a floor: of methods that have finished every episode of every one of them.
+    there are several registered environments with a floor: of methods that have finished every episode of every one of
+    them. Environments with arguments of somebody's own have boards, and no part in it.
     ``seconds_per_step`` is in ms of the fastest episode, ``voltage_discrepancy`` in mV², ``peak_memory`` in 10⁶ bytes.
 
     Raises
@@ -95,6 +99,7 @@ def boards(records: list[dict[str, Any]]) -> pd.DataFrame:
         if record["split"] != "test":
             raise ValueError(f"leaderboards are made of test seeds; {file_name(record)} has {record['split']} seeds")
     current, _ = newest(records)
+    registered = {id.replace("/", "-") for id in ENTRY_POINTS}
     rows: list[dict[str, Any]] = []
     for name in CLASSES:
         members = [record for record in current if class_of(record) == name]
@@ -104,7 +109,7 @@ def boards(records: list[dict[str, Any]]) -> pd.DataFrame:
         for environment, entries in played.items():
             rows += _board(environment, entries, current)
         rows += _aggregate({environment: entries for environment, entries in played.items()
-                            if any(entry.gains for entry in entries)})
+                            if environment in registered and any(entry.gains for entry in entries)})
     return pd.DataFrame(rows, columns=list(FIELDS)).astype({"rank": "Int64"} | dict.fromkeys(NUMBERS, float))
 
 
@@ -146,7 +151,7 @@ def _board(environment: str, entries: list[Entry], current: list[dict[str, Any]]
     """Rows of one environment, by their mean error; after them who has not finished every episode."""
     competing = {entry.label: {environment: entry.errors} for entry in entries if not entry.note}
     ranks = shared_ranks(competing) if competing else {}
-    rows = []
+    rows, products = [], _matrix_products(current)
     for entry in sorted(entries, key=_place):
         record, summarised = entry.record, summary_row(entry.record, current)
         rows.append(_row(entry, environment, ranks.get(entry.label)) | {
@@ -154,7 +159,7 @@ def _board(environment: str, entries: list[Entry], current: list[dict[str, Any]]
             **_three("error", {environment: entry.errors}, mean_over_environments),
             **_three("gain", {environment: entry.gains}, interquartile_mean),
             **{name: None if summarised[name] is None else summarised[name][0] for name in OTHERS},
-            "matmuls_per_step": _in_products(record), "peak_memory": _peak(record)})
+            "matmuls_per_step": _in_products(record, products), "peak_memory": _peak(record)})
     return rows
 
 
@@ -197,10 +202,19 @@ def _three(name: str, scores: dict[str, dict[str, float]], statistic: Any) -> di
                     (value if math.isfinite(value) else None for value in three), strict=True))
 
 
-def _in_products(record: dict[str, Any]) -> float | None:
-    """Time per step of the fastest episode in units of the matrix product on its machine."""
+def _matrix_products(records: list[dict[str, Any]]) -> dict[str, float]:
+    """Processor -> time of a matrix product in s, the median of the runs: a single one depends on what runs beside."""
+    timed: dict[str, list[float]] = {}
+    for record in records:
+        for run in record["runs"]:
+            timed.setdefault(run["machine"]["processor"], []).append(run["machine"]["matmul_seconds"])
+    return {processor: median(seconds) for processor, seconds in timed.items()}
+
+
+def _in_products(record: dict[str, Any], products: dict[str, float]) -> float | None:
+    """Time per step of the fastest episode in units of the matrix product on its processor."""
     return min((episode["scores"]["seconds_per_step"]
-                / record["runs"][episode["run"]]["machine"]["matmul_seconds"]
+                / products[record["runs"][episode["run"]]["machine"]["processor"]]
                 for episode in record["episodes"] if episode["status"] == "ok"), default=None)
 
 

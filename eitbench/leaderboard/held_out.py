@@ -22,7 +22,7 @@ from eitbench.leaderboard.baselines import is_ours
 from eitbench.leaderboard.boards import FLOOR
 from eitbench.leaderboard.records import read_records
 from eitbench.leaderboard.run import Job, run_episode
-from eitbench.leaderboard.statistics import FEWEST, interquartile_mean, stratified_bootstrap
+from eitbench.leaderboard.statistics import FEWEST, interquartile_mean, mean_over_environments, stratified_bootstrap
 from eitbench.leaderboard.summary import as_markdown, scores_by_seed, with_interval
 from eitbench.leaderboard.wall import python_files
 from eitbench.seeds import SPLITS
@@ -93,7 +93,9 @@ def held_out_seeds(salt: bytes, count: int) -> list[int]:
 
 
 def held_out(record: dict[str, Any], job: Job, salt: bytes, episodes: int, folder: Path) -> tuple[str, list[str]]:
-    """Whether the error of a record is also that of held-out episodes.
+    """Whether what a record gains over the board's floor, its method gains in held-out episodes too.
+
+    The interquartile mean gains of both are compared; where the floor's record is not there, the mean errors.
 
     Parameters
     ----------
@@ -133,17 +135,21 @@ def held_out(record: dict[str, Any], job: Job, salt: bytes, episodes: int, folde
     differences = [f"failed in a held-out episode: {message}" for message in failed]
     if len(pairs) < 2:
         return "", differences
-    new, gains = [error for error, _ in pairs], {"held-out": [1.0 - error / zero for error, zero in pairs]}
-    step, low, high = stratified_bootstrap({"a": new, "b": list(errors.values())},
-                                           lambda a, b: a.mean(axis=-1) - b.mean(axis=-1))
+    compared = {"ẽ_c": (mean_over_environments, list(errors.values()), [error for error, _ in pairs])}
+    if gains := _gains(record, floor, errors, folder):
+        # How hard an episode is cancels in its gain, so that far smaller differences are seen.
+        compared[f"gain over {floor}"] = interquartile_mean, gains, [1.0 - error / zero for error, zero in pairs]
+    rows = [{"episodes": "record", "number": str(len(errors))}, {"episodes": "held-out", "number": str(len(pairs))},
+            {"episodes": "difference", "number": ""}]
+    for name, (statistic, theirs, new) in compared.items():
+        step, low, high = stratified_bootstrap({"a": new, "b": theirs},
+                                               lambda a, b, statistic=statistic: statistic(a) - statistic(b))
+        said = [_said(stratified_bootstrap({"": each}, statistic)) for each in (theirs, new)]
+        for row, text in zip(rows, (*said, with_interval(step, low, high)), strict=True):
+            row[name] = text
     if not low <= 0.0 <= high:
-        differences.append(f"ẽ_c of held-out episodes differs from the record's by {with_interval(step, low, high)}")
-    gains["record"] = _gains(record, floor, errors, folder)
-    rows = [{"episodes": name, "number": str(len(own_errors)), "ẽ_c": _mean(own_errors),
-             f"gain over {floor}": _interval({name: gains[name]}, interquartile_mean)}
-            for name, own_errors in (("record", list(errors.values())), ("held-out", new))]
-    rows.append({"episodes": "difference", "ẽ_c": with_interval(step, low, high)})
-    return as_markdown(pd.DataFrame(rows).fillna(""), words=1), differences
+        differences.append(f"{name} of held-out episodes differs from the record's by {with_interval(step, low, high)}")
+    return as_markdown(pd.DataFrame(rows), words=1), differences
 
 
 def _gains(record: dict[str, Any], floor: str, errors: dict[str, float], folder: Path) -> list[float]:
@@ -151,17 +157,12 @@ def _gains(record: dict[str, Any], floor: str, errors: dict[str, float], folder:
     for other in read_records(folder):
         if other["method"] == floor and all(other[key] == record[key] for key in ("environment", "source")):
             zero = scores_by_seed(other, "error")
-            return [1.0 - error / zero[seed] for seed, error in errors.items() if zero.get(seed)]
+            gains = [1.0 - error / zero[seed] for seed, error in errors.items() if zero.get(seed)]
+            return gains if len(gains) > 1 else []
     return []
 
 
-def _mean(values: list[float]) -> str:
-    return _interval({"": values}, lambda each: each.mean(axis=-1))
-
-
-def _interval(values: dict[str, list[float]], statistic: Any) -> str:
-    """A statistic with its interval, as far as there are enough values."""
-    if not all(values.values()):
-        return "–"
-    value, low, high = stratified_bootstrap(values, statistic)
+def _said(three: tuple[float, float, float]) -> str:
+    """A value with its interval, if it has one."""
+    value, low, high = three
     return with_interval(value, low, high) if math.isfinite(low) else f"{value:.3g}"

@@ -10,7 +10,7 @@ from eitbench.envs import ENTRY_POINTS, INJECTION
 from eitbench.leaderboard import suites
 from eitbench.leaderboard.records import file_name, read_record, split_of, write_record
 from eitbench.leaderboard.run import Job, run_jobs
-from eitbench.leaderboard.store import EpisodeStore, provenance
+from eitbench.leaderboard.store import EpisodeStore, provenance, source_digest
 from eitbench.leaderboard.summary import seed_ranges
 from eitbench.seeds import name_seed
 
@@ -60,6 +60,8 @@ def submit(method: str | None, environments: list[str], seeds: list[int] | None,
         raise ValueError("env must name at least one environment to submit for")
     todo = (_jobs(method, id, policy, seeds, isolate) for id in environments or ENTRY_POINTS)
     for jobs in todo if method is None else list(todo):          # what does not fit is said before anything is played
+        for job in {(job.environment, job.method): job for job in jobs}.values():
+            _check_rank(Path(to), job, official)
         run_jobs(jobs, store, n_jobs=n_jobs, backend=backend, command=command)
         asked = {(job.environment.name, job.load().name) for job in jobs}
         made = [record | {"official": official} for record in store.records()
@@ -78,6 +80,17 @@ def _jobs(method: str | None, id: str, policy: bool, seeds: list[int] | None, is
     return suites.jobs("full", [id], methods, seeds, isolate=isolate)
 
 
+def _check_rank(to: Path, job: Job, official: bool) -> None:
+    """``ValueError`` if the record that is to be made would replace an official one of the same code and be none."""
+    method = job.load()
+    path = to / file_name({"environment": {"name": job.environment.name}, "method": method.name,
+                           "method_sha256": method.sha256, "split": "test"})
+    if not official and path.exists() and (before := read_record(path))["official"] and (
+            before["source"] == source_digest()):
+        raise ValueError(f"to must be another folder than {to}, whose {path.name} is official and would be replaced by "
+                         "a self-reported record of the same")
+
+
 def _check_nothing_is_lost(path: Path, record: dict[str, Any]) -> None:
     """``ValueError`` if a record of the same code lies at ``path`` and would lose what makes it worth more."""
     if not path.exists():
@@ -86,7 +99,6 @@ def _check_nothing_is_lost(path: Path, record: dict[str, Any]) -> None:
     if before["source"] != record["source"]:                              # outdated, and played again
         return
     missing = [seed for seed in before["seeds"] if seed not in record["seeds"]]
-    lost = [*["its being official"] * (before["official"] and not record["official"]),
-            *([f"its episodes {seed_ranges(missing)}"] if missing else [])]
-    if lost:
-        raise ValueError(f"to must not hold a record that says more; {path} would lose {' and '.join(lost)}")
+    if missing:
+        raise ValueError(f"to must not hold a record that says more; {path} would lose its episodes "
+                         f"{seed_ranges(missing)}")

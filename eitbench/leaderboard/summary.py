@@ -22,7 +22,8 @@ COLUMNS = {
 }
 EXPLANATIONS = {
     "ẽ_c": "relative estimation error (5.12), ± half the 95 % confidence interval over seeds; lower is better",
-    "skill": "0 for the homogeneous estimate, 1 for the fixed-interval smoother that is told the true flow",
+    "skill": "0 for the homogeneous estimate, 1 for the fixed-interval smoother that is told the true flow; both with "
+             "the whole record, where the environment has such a board, so that filters may fall below 0",
     "contrast": "error relative to the deviation from the homogeneous estimate; 1 is no better than that",
     "NIS/m": "normalised innovation squared; 1 when the filter's own uncertainty fits",
     "CRPS": "continuous ranked probability score, mol/m³",
@@ -56,13 +57,13 @@ def mean_and_interval(values: list[float]) -> tuple[float, float]:
 def rounded(mean: float, half: float) -> str:
     """``0.0053 ± 0.0004``: the interval to one significant digit (two if that is a 1), the mean to the same place."""
     place = _places(half)
-    return f"{mean:.3g}" if place is None else f"{mean:.{place}f} ± {half:.{place}f}"
+    return f"{mean:.3g}" if place is None else f"{mean:z.{place}f} ± {half:.{place}f}"
 
 
 def with_interval(value: float, low: float, high: float) -> str:
     """``0.0053 (0.0049 to 0.0058)``, rounded as `rounded` does by half the interval; without one, the value."""
     place = _places(0.5 * (high - low))
-    return f"{value:.3g}" if place is None else f"{value:.{place}f} ({low:.{place}f} to {high:.{place}f})"
+    return f"{value:.3g}" if place is None else f"{value:z.{place}f} ({low:z.{place}f} to {high:z.{place}f})"
 
 
 def _places(half: float) -> int | None:

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pandas as pd
 
@@ -39,13 +40,17 @@ def job_of(record: dict[str, Any], file: str | None = None, isolate: str = "alwa
     Raises
     ------
     ValueError
-        If there is no such method, or it or the environment's code is not that of the record.
+        If there is no such method, it or the environment's code is not that of the record, or the record gives the
+        registered environment another name.
     """
     id = record["environment"]["id"]
     kwargs = {key: value for key, value in record["environment"]["kwargs"].items()
               if key != "observation" or id not in INJECTION}                  # what policies see is not a choice
     environment = Environment(id)
     if record["environment"]["name"] != environment.name:
+        if kwargs == gym.spec(id).kwargs | ({"estimator": "full"} if id in INJECTION else {}):
+            raise ValueError(f"the record's environment must be named {environment.name}, whose arguments it has, got "
+                             f"{record['environment']['name']}")
         environment = Environment(id, json.dumps(kwargs))
     method = _own(record) if file is None else str(Path(file).absolute())
     if method is None:

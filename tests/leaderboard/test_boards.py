@@ -155,6 +155,18 @@ def test_aggregate_of_a_class():
     assert total["error"].isna().all() and not total["official"].any()
 
 
+def test_an_environment_with_arguments_has_no_part_in_an_aggregate():
+    """It would shut out all who did not play it: two records with an invented name, and one method is left."""
+    honest = [floor(), floor(id=TANK), *(record(name, times(0.5), id=id) for name in "ab"
+                                         for id in (BOARD_IDS["filter"], TANK))]
+    name = "eitbench-Pipe2D-v0-deadbeef"
+    invented = [each | {"environment": each["environment"] | {"name": name}}
+                for each in (floor(), record("b", times(0.9)))]
+    table = boards([*honest, *invented])
+    assert set(table[table["environment"] == ALL]["method"]) == {"a", "b", "homogeneous"}
+    assert set(table[table["environment"] == name]["method"]) == {"b", "homogeneous"}
+
+
 def test_an_aggregate_is_ranked_by_what_orders_it():
     """By the interquartile mean of gains, which a disaster leaves as it is; a board of one environment by the mean."""
     def made(gains):
@@ -188,12 +200,16 @@ def test_injection_counts_from_the_random_pair():
 
 
 def test_time_in_products_and_memory():
-    """The fastest episode, in units of its own machine's matrix product; 10⁶ bytes at most."""
+    """The fastest episode, in units of its own processor's matrix product, the median of all; 10⁶ bytes at most."""
     mine = record("a", FLOOR, scores={"seconds_per_step": 0.02})
-    slow = RUN | {"machine": RUN["machine"] | {"matmul_seconds": 0.2}}
+    slow = RUN | {"machine": RUN["machine"] | {"processor": "An old abacus", "matmul_seconds": 0.2}}
     episodes = [episode | {"run": i % 2, "peak_memory": 10**8 + i} for i, episode in enumerate(mine["episodes"])]
     table = table_of(floor(), record("a", FLOOR, runs=[RUN, slow], episodes=episodes))
-    assert table["seconds_per_step"]["a"] == pytest.approx(20) and table["matmuls_per_step"]["a"] == pytest.approx(0.1)
+    assert tuple(table.loc["a", ["seconds_per_step", "matmuls_per_step"]]) == pytest.approx((20, 0.1))
+    busy = RUN | {"machine": RUN["machine"] | {"matmul_seconds": 0.5}}             # another took 0.05
+    b, c = (record(name, FLOOR, runs=[run], scores={"seconds_per_step": 0.02}) for name, run in (("b", busy), ("c", RUN)))
+    one = table_of(floor(), b, c)["matmuls_per_step"]
+    assert one["b"] == one["c"] == pytest.approx(0.4)
     assert table["peak_memory"]["a"] == pytest.approx(100.000007) and pd.isna(table["peak_memory"]["homogeneous"])
 
 

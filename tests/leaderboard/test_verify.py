@@ -155,6 +155,9 @@ def test_changed_numbers_are_found(mine, tmp_path):
              "environment is")):
         code, said, complaint = eitbench("verify", forged(path, change), "--baseline", mine)
         assert code == 1 and re.search(message, complaint) and "as it says" not in said, (message, complaint)
+    invented = forged(path, lambda record: record["environment"].update(name=f"{path.name.split('--')[0]}-deadbeef"))
+    code, _, complaint = eitbench("verify", invented, "--baseline", mine)
+    assert code == 1 and "the record's environment must be named eitbench-Pipe2D-v0, whose arguments" in complaint
     slower = forged(path, other("seconds_per_step", 1e-9))
     assert eitbench("verify", slower, "--baseline", mine)[0] == 0        # a clock is no proof of anything
 
@@ -268,6 +271,10 @@ def test_held_out_episodes_tell_the_honest_from_the_prepared(mine, tmp_path, mon
 
     code, said, complaint = eitbench("verify", forged(public, much_better), *claim)
     assert code == 1 and re.search(r"ẽ_c of held-out episodes differs from the record's by 0\.\d+ \(0", complaint)
+
+    code, said, complaint = eitbench("verify", forged(public, much_better, to="records"), *claim)
+    assert code == 1 and "| gain over homogeneous |" in re.sub(" +", " ", said)
+    assert re.search(r"gain over homogeneous of held-out episodes differs from the record's by -0\.\d+ \(-", complaint)
 
     with monkeypatch.context() as patch:
         patch.setattr(run, "landlock_version", lambda: 0)

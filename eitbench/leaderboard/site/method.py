@@ -109,7 +109,7 @@ def command(record: dict[str, Any]) -> str:
         return ""
     kind = "--policy" if record["board"] == "injection" else "--baseline"
     return shlex.join(["eitbench", "submit", kind, _argument(record), "--env", record["environment"]["id"],
-                       "--seeds", seed_ranges(record["seeds"])])
+                       "--seeds", seed_ranges(record["seeds"]), "--to", "again"])
 
 
 def _argument(record: dict[str, Any]) -> str:
