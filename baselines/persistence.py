@@ -1,4 +1,7 @@
-"""Persistence: the stationary image of the last complete frame, held until the next frame is complete."""
+"""Persistence: the stationary image of the last complete frame, held until the next frame is complete.
+
+Where estimates are asked for later it says what it would have said at the time: the floor for those who look back.
+"""
 
 import numpy as np
 
@@ -10,7 +13,7 @@ ALPHA = 0.177  # that of gauss_newton.py
 
 
 class Estimator:
-    boards = ("filter",)
+    boards = ("filter", "fixed-lag", "smoothing")
     role = "floor"
     parameters = {"alpha": ALPHA}  # noqa: RUF012 (a plain dict is what a record stores)
 
@@ -18,14 +21,20 @@ class Estimator:
         self.task = task
         self.frame: list[tuple[np.ndarray, np.ndarray]] = []
         self.penalty = ALPHA**2 * stiffness_matrix(task.mesh)
-        self.image = np.full(task.mesh.n_nodes, task.expected_concentration)
+        self.held = [np.full(task.mesh.n_nodes, task.expected_concentration)]
+        self.asked_for = -task.lag
 
-    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate:
-        self.frame.append((voltages, currents))
-        if len(self.frame) == len(self.task.currents):
-            V, I = (np.array(part) for part in zip(*self.frame, strict=True))
-            noise, model = self.task.noise, self.task.observation
-            c_bh = best_homogeneous(model, noise, len(self.image), V, I, self.task.expected_concentration)
-            self.image = gauss_newton(model, V, I, noise.std(V), self.penalty, np.full(len(self.image), c_bh))
-            self.frame = []
-        return Estimate(self.image)
+    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
+        self.asked_for += 1
+        if len(self.held) <= self.task.n_steps:
+            self.frame.append((voltages, currents))
+            self.held.append(self.image() if len(self.frame) == len(self.task.currents) else self.held[-1])
+        return Estimate(self.held[self.asked_for]) if self.asked_for >= 1 else None
+
+    def image(self) -> np.ndarray:
+        """Of the frame, which begins anew."""
+        V, I = (np.array(part) for part in zip(*self.frame, strict=True))
+        noise, model = self.task.noise, self.task.observation
+        c_bh = best_homogeneous(model, noise, len(self.held[0]), V, I, self.task.expected_concentration)
+        self.frame = []
+        return gauss_newton(model, V, I, noise.std(V), self.penalty, np.full(len(self.held[0]), c_bh))

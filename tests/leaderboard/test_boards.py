@@ -207,7 +207,8 @@ def test_time_in_products_and_memory():
     table = table_of(floor(), record("a", FLOOR, runs=[RUN, slow], episodes=episodes))
     assert tuple(table.loc["a", ["seconds_per_step", "matmuls_per_step"]]) == pytest.approx((20, 0.1))
     busy = RUN | {"machine": RUN["machine"] | {"matmul_seconds": 0.5}}             # another took 0.05
-    b, c = (record(name, FLOOR, runs=[run], scores={"seconds_per_step": 0.02}) for name, run in (("b", busy), ("c", RUN)))
+    timed = {"scores": {"seconds_per_step": 0.02}}
+    b, c = record("b", FLOOR, runs=[busy], **timed), record("c", FLOOR, runs=[RUN], **timed)
     one = table_of(floor(), b, c)["matmuls_per_step"]
     assert one["b"] == one["c"] == pytest.approx(0.4)
     assert table["peak_memory"]["a"] == pytest.approx(100.000007) and pd.isna(table["peak_memory"]["homogeneous"])
