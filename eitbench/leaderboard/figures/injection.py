@@ -25,6 +25,7 @@ WORLDS = {"eitbench/Pipe2DInjectionFaults-v0": "faulty electrodes", "eitbench/Pi
           "eitbench/Pipe2DInjectionFlow-v0": "unknown flow", "eitbench/Pipe2DInjection-v0": "plain pipe (reference)",
           "eitbench/Pipe2DInjectionCurrents-v0": "any currents (reference)",
           "eitbench/RotatingTankInjection-v0": "stirred tank (reference)"}
+KINDS = {INK: "open loop", ACCENT: "looks at the data", TRUE: "* is shown the truth"}
 COMPETITIONS = list(WORLDS)[:3]
 """Where agents have learnt."""
 AT_WORK = ("eitbench/Pipe2DInjectionFaults-v0", "fault_aware")
@@ -33,7 +34,7 @@ AT_WORK = ("eitbench/Pipe2DInjectionFaults-v0", "fault_aware")
 
 def injection(seeds: list[int], jobs: int, out: Path) -> tuple[Path, str]:
     """Scores with the exact filter, of all our policies on these episodes; of the unknown flow, a minute each."""
-    figure = Figure(figsize=(13.5, 13.5), dpi=110, layout="constrained")
+    figure = Figure(figsize=(13.5, 13.8), dpi=110, layout="constrained")
     panels, said = figure.subplots(3, 3, height_ratios=(4, 4, 3)), []
     for (env, title), axes in zip(WORLDS.items(), panels[:2].flat, strict=True):
         todo, store = policy_jobs([env], [], seeds), EpisodeStore(out)
@@ -47,6 +48,9 @@ def injection(seeds: list[int], jobs: int, out: Path) -> tuple[Path, str]:
     for env, axes in zip(COMPETITIONS, panels[2], strict=True):
         _curves(axes, env)
         axes.set_title(WORLDS[env], fontsize=11)
+    for colour, meaning in KINDS.items():
+        panels[0, 0].plot([], [], "o", color=colour, label=meaning)
+    figure.legend(*panels[0, 0].get_legend_handles_labels(), frameon=False, ncols=3, loc="outside upper center")
     path = out / "injection.png"
     save(figure, path)
     moving = animate(*AT_WORK, name_seed(seeds[0]), None, out / "injection.gif")
@@ -66,10 +70,6 @@ def _scores(axes: Axes, rows: pd.DataFrame, privileged: list[str]) -> None:
     axes.set_yticks(range(len(order)), [name.replace("_", " ") + " *" * (name in privileged) for name in order])
     axes.set(xlim=(0, None), xlabel=f"ẽ$_c$, {len(errors)} episode{'s' * (len(errors) > 1)}")
     axes.locator_params(axis="x", nbins=5)
-    axes.plot([], [], "o", color=INK, label="open loop")
-    axes.plot([], [], "o", color=ACCENT, label="looks at the data")
-    axes.plot([], [], "o", color=TRUE, label="* is shown the truth")
-    axes.legend(frameon=False, fontsize=8, loc="upper right")
     axes.tick_params(axis="y", length=0)
     bare(axes)
 
