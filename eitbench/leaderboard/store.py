@@ -139,9 +139,10 @@ def source_digest() -> str:
 def provenance() -> dict[str, Any]:
     """Versions and commit of the code that this process runs."""
     status = _git("--no-optional-locks", "status", "--porcelain", "--", ".", ":!leaderboards")   # results, not code
+    blas = np.show_config(mode="dicts")["Build Dependencies"]["blas"]  # type: ignore[index,call-overload]
     return {
         "versions": {"python": platform.python_version(), **{name: _version(name) for name in PACKAGES}},
-        "blas": np.show_config(mode="dicts")["Build Dependencies"]["blas"]["name"],  # type: ignore[index,call-overload]
+        "blas": f"{blas['name']} {blas['version']}",
         "commit": _git("rev-parse", "HEAD"), "dirty": None if status is None else bool(status),
     }
 
