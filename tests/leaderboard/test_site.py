@@ -147,6 +147,24 @@ def test_numbers_are_those_of_the_boards(pages):
             assert all("outdated" in cells[1] and cells[0] == "–" for cells in by_label.values())
 
 
+def test_who_beats_whom(pages):
+    """In how many of 100 shared episodes a row's error is below a column's, an equal one counting one half."""
+    table = boards(several_boards())
+    board = table[table["environment"] == "eitbench-Pipe2D-v0"]
+    errors = [{e["seed"]: e["scores"]["error"] for e in r["episodes"] if e["status"] == "ok"}
+              for name, version in zip(board["method"], board["version"], strict=True) for r in several_boards()
+              if (r["environment"]["name"], r["method"], r["method_sha256"][:8]) == (
+                  "eitbench-Pipe2D-v0", name, version)]
+    html = pages["environments/eitbench-Pipe2D-v0.html"].split('class="duels"')[1].split("</table>")[0]
+    shown = [re.findall(r"<td.*?>(.*?)</td>", row) for row in html.split("<tbody>")[1].split("</tr>")[:-1]]
+    assert len(shown) == len(board) > 3
+    for i, ours in enumerate(errors):
+        for j, theirs in enumerate(errors):
+            wins = [1.0 if ours[s] < theirs[s] else 0.5 * (ours[s] == theirs[s]) for s in ours.keys() & theirs.keys()]
+            assert shown[i][j] == ("·" if i == j else f"{100 * np.mean(wins):.0f}"), (i, j)
+    assert re.search(r'class="more tells" title="\S+ .*better than .*: 100 % \(100 to 100 %\)">100<', html)
+
+
 def test_shared_ranks_say_so(pages):
     """Two that cannot be told apart."""
     rows = rows_of(pages["environments/eitbench-Pipe2D-v0.html"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import re
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from eitbench.envs import ENTRY_POINTS
 from eitbench.leaderboard import charts
 from eitbench.leaderboard.site.collect import Board, Row, Site
 from eitbench.leaderboard.site.tables import explanations, table, three
+from eitbench.leaderboard.statistics import paired_probability_of_improvement
 from eitbench.leaderboard.templates import template
 
 NOMINAL = ("coverage_50", "coverage_90")
@@ -30,7 +32,7 @@ def environment_page(site: Site, board: Board, animation: bytes | None) -> str:
     description, details = documentation(id)
     return template("site/environment.html.j2").render(
         root="../", board=board, id=id, table=made, explanations=explanations([made]), description=description,
-        details=details, front=_front(board), intervals=_intervals(board), curves=_curves(board),
+        details=details, front=_front(board), intervals=_intervals(board), curves=_curves(board), duels=_duels(board),
         calibration=_calibration(board), spread=_spread(board), learning=learning_curves(board.environment),
         media_mb=f"{1e-6 * len(animation):.1f} MB" if animation else "",
         siblings=[other for other in site.boards if other.of_class == board.of_class and not other.is_aggregate])
@@ -106,6 +108,24 @@ def _told(rows: list[Row]) -> list[Row]:
     unranked = [row for row in rows if row.unranked][:2]
     best = list(kinds.values())[:TOLD - len(unranked)]
     return [row for row in rows if row in unranked or row in best]
+
+
+def _duels(board: Board) -> list[tuple[str, list[dict[str, Any] | None]]]:
+    """Name of each method, and how often it is better than each of them, seed by seed; None against itself.
+
+    ``share`` in %, ``low`` and ``high`` the ends of its 95 % interval, and whether it ``tells``: 50 % is outside.
+    """
+    scores = [(row.cells["title"], {board.environment: {e["seed"]: e["scores"]["error"] for e in row.episodes()}})
+              for row in board.current]
+    scores = [(name, own) for name, own in scores if own[board.environment]]
+    cells: dict[tuple[int, int], dict[str, Any]] = {}
+    for (i, (_, ours)), (j, (_, theirs)) in combinations(enumerate(scores), 2):
+        if ours[board.environment].keys() & theirs[board.environment].keys():
+            won = [100 * each for each in paired_probability_of_improvement(ours, theirs)]
+            lost = [100 - won[0], 100 - won[2], 100 - won[1]]
+            for place, (share, low, high) in (((i, j), won), ((j, i), lost)):
+                cells[place] = {"share": share, "low": low, "high": high, "tells": not low <= 50 <= high}
+    return [(name, [cells.get((i, j)) for j in range(len(scores))]) for i, (name, _) in enumerate(scores)]
 
 
 def _calibration(board: Board) -> dict[str, Any] | None:
