@@ -22,7 +22,7 @@ POLICY_SEEDS = {"eitbench/Pipe2DInjectionFaults-v0": "test:0-49", "eitbench/Pipe
 FEWER_SEEDS = {"velocity": "test:0-5", "3d": "test:0-5"}
 """In the full suite, where an episode takes a minute a method and more: with the flow asked for too, and in 3D. With
 fewer than six there would be no intervals and no ranks."""
-# An image at every step: minutes an episode, for what the frame-wise images of the other boards show as well.
+# An image at every step: minutes an episode.
 TOO_SLOW_FOR_QUICK = {("filter", "gauss_newton")}
 ISOLATE = ("never", "others", "always")
 """Whose methods run in a process of their own."""
@@ -50,8 +50,7 @@ def jobs(suite: str, environments: list[str], baselines: list[str], seeds: list[
             numbers = parse_seeds(FEWER_SEEDS[slow] if slow and suite == "full" else SEEDS[suite])
         suited = list[Job]()
         for baseline in baselines or own_baselines():
-            skipped = (suite == "quick" or slow or _like_pipe(name)) and not baselines and (
-                board, baseline) in TOO_SLOW_FOR_QUICK
+            skipped = suite == "quick" and not baselines and (board, baseline) in TOO_SLOW_FOR_QUICK
             job = Job(environment, _absolute(baseline), 0, is_isolated(environment, baseline, isolate))
             loaded = job.load()
             assert isinstance(loaded, Baseline)
@@ -119,11 +118,6 @@ def _distinct(names: dict[str, str]) -> None:
 def _expensive(env: EstimationEnv) -> str | None:
     """Which of `FEWER_SEEDS` an environment is among."""
     return "velocity" if env.task.velocity is not None else "3d" if env.task.mesh.dim == 3 else None
-
-
-def _like_pipe(name: str) -> bool:
-    """Whether stationary images, which know nothing of the flow, fare as they do in the 2D pipe."""
-    return name.startswith("eitbench/Pipe2D") and name not in QUICK
 
 
 def _absolute(method: str) -> str:
