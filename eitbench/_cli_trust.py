@@ -20,7 +20,7 @@ def verify(
         min=0.0, help="Relative difference of scores that is none.")] = 1e-6,
     isolate: Isolate = Isolation.always,
     held_out: Annotated[int, typer.Option(
-        "--held-out", min=0, help="For maintainers: play so many held-out episodes too, and compare the errors.")] = 0,
+        "--held-out", min=0, help="For maintainers: play so many held-out episodes too, and compare the gains.")] = 0,
     salt_file: Annotated[Path | None, typer.Option(help="From which they follow; see `eitbench held-out`.")] = None,
 ) -> None:
     """Play episodes of a record again and say whether it is true: exit status 0 if so, 1 if not.

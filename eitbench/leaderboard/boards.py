@@ -99,7 +99,7 @@ def boards(records: list[dict[str, Any]]) -> pd.DataFrame:
         if record["split"] != "test":
             raise ValueError(f"leaderboards are made of test seeds; {file_name(record)} has {record['split']} seeds")
     current, _ = newest(records)
-    registered = {id.replace("/", "-") for id in ENTRY_POINTS}
+    registered, products = {id.replace("/", "-") for id in ENTRY_POINTS}, _matrix_products(current)
     rows: list[dict[str, Any]] = []
     for name in CLASSES:
         members = [record for record in current if class_of(record) == name]
@@ -107,7 +107,7 @@ def boards(records: list[dict[str, Any]]) -> pd.DataFrame:
         played = {environment: _entries([r for r in members if r["environment"]["name"] == environment])
                   for _, environment in environments}
         for environment, entries in played.items():
-            rows += _board(environment, entries, current)
+            rows += _board(environment, entries, current, products)
         rows += _aggregate({environment: entries for environment, entries in played.items()
                             if environment in registered and any(entry.gains for entry in entries)})
     return pd.DataFrame(rows, columns=list(FIELDS)).astype({"rank": "Int64"} | dict.fromkeys(NUMBERS, float))
@@ -147,11 +147,12 @@ def _entries(records: list[dict[str, Any]]) -> list[Entry]:
     return entries
 
 
-def _board(environment: str, entries: list[Entry], current: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def _board(environment: str, entries: list[Entry], current: list[dict[str, Any]],
+           products: dict[str, float]) -> list[dict[str, Any]]:
     """Rows of one environment, by their mean error; after them who has not finished every episode."""
     competing = {entry.label: {environment: entry.errors} for entry in entries if not entry.note}
     ranks = shared_ranks(competing) if competing else {}
-    rows, products = [], _matrix_products(current)
+    rows = []
     for entry in sorted(entries, key=_place):
         record, summarised = entry.record, summary_row(entry.record, current)
         rows.append(_row(entry, environment, ranks.get(entry.label)) | {

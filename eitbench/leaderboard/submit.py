@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 from eitbench.envs import ENTRY_POINTS, INJECTION
 from eitbench.leaderboard import suites
@@ -61,13 +60,13 @@ def submit(method: str | None, environments: list[str], seeds: list[int] | None,
     todo = (_jobs(method, id, policy, seeds, isolate) for id in environments or ENTRY_POINTS)
     for jobs in todo if method is None else list(todo):          # what does not fit is said before anything is played
         for job in {(job.environment, job.method): job for job in jobs}.values():
-            _check_rank(Path(to), job, official)
+            _check_nothing_is_lost(_path_of(Path(to), job), source_digest(), official)
         run_jobs(jobs, store, n_jobs=n_jobs, backend=backend, command=command)
         asked = {(job.environment.name, job.load().name) for job in jobs}
         made = [record | {"official": official} for record in store.records()
                 if (record["environment"]["name"], record["method"]) in asked and record["split"] == "test"]
         for record in made:
-            _check_nothing_is_lost(Path(to) / file_name(record), record)
+            _check_nothing_is_lost(Path(to) / file_name(record), record["source"], official, record["seeds"])
         for record in made:
             yield write_record(to, record)
 
@@ -80,25 +79,23 @@ def _jobs(method: str | None, id: str, policy: bool, seeds: list[int] | None, is
     return suites.jobs("full", [id], methods, seeds, isolate=isolate)
 
 
-def _check_rank(to: Path, job: Job, official: bool) -> None:
-    """``ValueError`` if the record that is to be made would replace an official one of the same code and be none."""
+def _path_of(to: Path, job: Job) -> Path:
+    """Where the record of a job's method will lie."""
     method = job.load()
-    path = to / file_name({"environment": {"name": job.environment.name}, "method": method.name,
+    return to / file_name({"environment": {"name": job.environment.name}, "method": method.name,
                            "method_sha256": method.sha256, "split": "test"})
-    if not official and path.exists() and (before := read_record(path))["official"] and (
-            before["source"] == source_digest()):
-        raise ValueError(f"to must be another folder than {to}, whose {path.name} is official and would be replaced by "
-                         "a self-reported record of the same")
 
 
-def _check_nothing_is_lost(path: Path, record: dict[str, Any]) -> None:
-    """``ValueError`` if a record of the same code lies at ``path`` and would lose what makes it worth more."""
+def _check_nothing_is_lost(path: Path, source: str, official: bool, seeds: list[str] | None = None) -> None:
+    """``ValueError`` if a record of the same code lies at ``path`` and would lose what makes it worth more; before it
+    is played, without ``seeds``, as far as is known then."""
     if not path.exists():
         return
     before = read_record(path)
-    if before["source"] != record["source"]:                              # outdated, and played again
+    if before["source"] != source:                                        # outdated, and played again
         return
-    missing = [seed for seed in before["seeds"] if seed not in record["seeds"]]
-    if missing:
-        raise ValueError(f"to must not hold a record that says more; {path} would lose its episodes "
-                         f"{seed_ranges(missing)}")
+    missing = [] if seeds is None else [seed for seed in before["seeds"] if seed not in seeds]
+    lost = [*["its being official"] * (before["official"] and not official),
+            *([f"its episodes {seed_ranges(missing)}"] if missing else [])]
+    if lost:
+        raise ValueError(f"to must not hold a record that says more; {path} would lose {' and '.join(lost)}")

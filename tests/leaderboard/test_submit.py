@@ -150,11 +150,12 @@ def test_what_says_more_is_not_replaced(tmp_path):
         return read_record(path)
 
     first = submitted("a", TEST, official=True)
-    with pytest.raises(ValueError, match=r"to must not hold .* says more; .* would lose its episodes test:1$"):
-        submitted("b", TEST[:1], official=True)
-    with pytest.raises(ValueError, match=r"to must be another folder .*homogeneous.* is official and would be"):
-        submitted("c", TEST)
-    assert read_records(to) == [first] and not (tmp_path / "c").exists()              # said before anything is played
+    for seeds, official, lost in ((TEST, False, "its being official$"), (TEST[:1], True, r"its episodes test:1$"),
+                                  (TEST[1:], False, "its being official$")):
+        with pytest.raises(ValueError, match=f"to must not hold a record that says more; .*homogeneous.* lose {lost}"):
+            submitted(f"b{len(seeds)}{official}", seeds, official=official)
+        assert read_records(to) == [first]
+        assert (tmp_path / f"b{len(seeds)}{official}").exists() == official            # else said before it is played
     assert submitted("a", parse_seeds("test:0-2"), official=True)["seeds"] == ["test:0", "test:1", "test:2"]
     write_record(to, first | {"source": "0" * 64})
     assert submitted("b", TEST[:1])["seeds"] == ["test:0"]

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from eitbench.leaderboard.animate import animate
 from eitbench.leaderboard.baselines import baseline_folder
@@ -48,9 +49,8 @@ def injection(seeds: list[int], jobs: int, out: Path) -> tuple[Path, str]:
     for env, axes in zip(COMPETITIONS, panels[2], strict=True):
         _curves(axes, env)
         axes.set_title(WORLDS[env], fontsize=11)
-    for colour, meaning in KINDS.items():
-        panels[0, 0].plot([], [], "o", color=colour, label=meaning)
-    figure.legend(*panels[0, 0].get_legend_handles_labels(), frameon=False, ncols=3, loc="outside upper center")
+    figure.legend(handles=[Line2D([], [], marker="o", linestyle="", color=colour, label=meaning)
+                           for colour, meaning in KINDS.items()], frameon=False, ncols=3, loc="outside upper center")
     path = out / "injection.png"
     save(figure, path)
     moving = animate(*AT_WORK, name_seed(seeds[0]), None, out / "injection.gif")
