@@ -9,9 +9,10 @@ import platform
 import subprocess
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,8 @@ from eitbench.seeds import name_seed
 PACKAGES = ("eitbench", "numpy", "scipy", "gymnasium", "scikit-fem", "numba", "stable-baselines3", "sb3-contrib",
             "torch")
 """Whose versions a record names."""
+_VERSION = ("source", "method_sha256")
+"""What results of one record must agree in."""
 _NEEDED = {"identity", "seed", "method", "environment", "finished", "status", "run", *SHARED}
 
 
@@ -56,7 +59,7 @@ class EpisodeStore:
     def results(self) -> Iterator[dict[str, Any]]:
         """All stored results; files that cannot be read are passed over."""
         paths = self.folder.glob("episodes/*/*/*.json")
-        for path in sorted(paths, key=lambda path: (path.parent, len(path.name), path.name)):   # 9 before 10
+        for path in sorted(paths):
             result = _read(path)
             if result is not None:
                 yield result
@@ -67,13 +70,17 @@ class EpisodeStore:
         with np.load(folder / f"{result['seed'].replace(':', '-')}.npz", allow_pickle=False) as stored:
             return dict(stored)
 
-    def records(self) -> list[dict[str, Any]]:
-        """The episodes, gathered into one record per environment, method and split of the seeds; not checked yet."""
-        gathered: dict[tuple[str, str, str], list[dict[str, Any]]] = {}
-        for result in self.results():
+    def records(self, also: Iterable[dict[str, Any]] = ()) -> list[dict[str, Any]]:
+        """The episodes, and ``also`` results of others or of such as failed here, gathered into one record per
+        environment, method and split of the seeds; not checked yet."""
+        gathered: dict[tuple[str, str, str], dict[tuple[str, ...], dict[str, Any]]] = {}
+        for result in chain(self.results(), also):
             key = (json.dumps(result["environment"], sort_keys=True), result["method"], split_of(result["seed"]))
-            gathered.setdefault(key, []).append(result)
-        return [_gathered(results) for results in gathered.values()]
+            episode = (result["seed"], *(result[what] for what in _VERSION))
+            first = gathered.setdefault(key, {}).setdefault(episode, result)
+            if first["status"] != "ok":
+                gathered[key][episode] = result
+        return [_gathered(list(results.values())) for results in gathered.values()]
 
     def write_records(self) -> list[dict[str, Any]]:
         """Write the `records` into ``records/`` and return them.
@@ -99,7 +106,8 @@ def _gathered(results: list[dict[str, Any]]) -> dict[str, Any]:
     """The record of one method's episodes, self-reported. Those of different code never stand in one record: those of
     the latest run's code do."""
     latest = max(results, key=lambda result: result["finished"])
-    results = [r for r in results if all(r[key] == latest[key] for key in ("source", "method_sha256"))]
+    results = sorted((r for r in results if all(r[key] == latest[key] for key in _VERSION)),
+                     key=lambda result: (len(result["seed"]), result["seed"]))                  # 9 before 10
     runs: list[dict[str, Any]] = []
     for result in results:
         if result["run"] not in runs:
@@ -111,6 +119,12 @@ def _gathered(results: list[dict[str, Any]]) -> dict[str, Any]:
         "episodes": [{key: value for key, value in result.items() if key not in apart}
                      | {"run": runs.index(result["run"])} for result in results],
     })
+
+
+def results_of(record: dict[str, Any]) -> list[dict[str, Any]]:
+    """The results that were gathered into a record, as a store would hold them."""
+    shared = {key: record[key] for key in ("environment", "method", *SHARED)}
+    return [episode | shared | {"run": record["runs"][episode["run"]]} for episode in record["episodes"]]
 
 
 def _read(path: Path) -> dict[str, Any] | None:

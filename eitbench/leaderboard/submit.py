@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from eitbench.envs import ENTRY_POINTS, INJECTION
 from eitbench.leaderboard import suites
 from eitbench.leaderboard.records import file_name, read_record, split_of, write_record
 from eitbench.leaderboard.run import Job, run_jobs
-from eitbench.leaderboard.store import EpisodeStore, provenance, source_digest
+from eitbench.leaderboard.store import EpisodeStore, provenance, results_of, source_digest
 from eitbench.leaderboard.summary import seed_ranges
 from eitbench.seeds import name_seed
 
@@ -17,7 +18,8 @@ from eitbench.seeds import name_seed
 def submit(method: str | None, environments: list[str], seeds: list[int] | None, store: EpisodeStore, to: Path, *,
            policy: bool = False, official: bool = False, isolate: str = "others", n_jobs: int = 1,
            backend: str = "loky", command: str = "") -> Iterator[Path]:
-    """Play what ``store`` does not hold yet, and write one record for each environment into the folder ``to``.
+    """Play what neither ``store`` nor a record holds yet, and write one record for each environment into the folder
+    ``to``.
 
     Environment after environment, so that what was done when the run is interrupted has its records.
 
@@ -39,8 +41,8 @@ def submit(method: str | None, environments: list[str], seeds: list[int] | None,
     Yields
     ------
     path
-        Of a record. All test episodes that the store holds of this method and this code are in them, those that
-        failed too.
+        Of a record. All test episodes that the store, or a record there before, holds of this method and this code are
+        in them, those that failed too.
 
     Raises
     ------
@@ -57,14 +59,19 @@ def submit(method: str | None, environments: list[str], seeds: list[int] | None,
         raise ValueError(f"seeds of a submission must be of the test split, got {', '.join(outside)}")
     if method is not None and not environments:
         raise ValueError("env must name at least one environment to submit for")
-    todo = (_jobs(method, id, policy, seeds, isolate) for id in environments or ENTRY_POINTS)
-    for jobs in todo if method is None else list(todo):          # what does not fit is said before anything is played
+    asked = (_jobs(method, id, policy, seeds, isolate) for id in environments or ENTRY_POINTS)
+    for jobs in asked if method is None else list(asked):          # what does not fit is said before anything is played
+        before = list[dict[str, Any]]()
         for job in {(job.environment, job.method): job for job in jobs}.values():
-            _check_nothing_is_lost(_path_of(Path(to), job), source_digest(), official)
-        run_jobs(jobs, store, n_jobs=n_jobs, backend=backend, command=command)
-        asked = {(job.environment.name, job.load().name) for job in jobs}
-        made = [record | {"official": official} for record in store.records()
-                if (record["environment"]["name"], record["method"]) in asked and record["split"] == "test"]
+            path = _path_of(Path(to), job)
+            _check_nothing_is_lost(path, source_digest(), official)
+            before += _to_extend(path, official)
+        done = {(result["method"], result["identity"]) for result in before if result["status"] == "ok"}
+        missing = [job for job in jobs if (job.load().name, job.identity()) not in done]
+        run_jobs(missing, store, n_jobs=n_jobs, backend=backend, command=command)
+        played = {(job.environment.name, job.load().name) for job in jobs}
+        made = [record | {"official": official} for record in store.records(also=before)
+                if (record["environment"]["name"], record["method"]) in played and record["split"] == "test"]
         for record in made:
             _check_nothing_is_lost(Path(to) / file_name(record), record["source"], official, record["seeds"])
         for record in made:
@@ -84,6 +91,14 @@ def _path_of(to: Path, job: Job) -> Path:
     method = job.load()
     return to / file_name({"environment": {"name": job.environment.name}, "method": method.name,
                            "method_sha256": method.sha256, "split": "test"})
+
+
+def _to_extend(path: Path, official: bool) -> list[dict[str, Any]]:
+    """Results of the record at ``path``, if it is one of this code and of the same standing."""
+    if not path.exists():
+        return []
+    record = read_record(path)
+    return results_of(record) if record["source"] == source_digest() and record["official"] == official else []
 
 
 def _check_nothing_is_lost(path: Path, source: str, official: bool, seeds: list[str] | None = None) -> None:

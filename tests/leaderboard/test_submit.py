@@ -149,16 +149,36 @@ def test_what_says_more_is_not_replaced(tmp_path):
         (path,) = submit("homogeneous", [FILTER.id], seeds, EpisodeStore(tmp_path / results), to, **how)
         return read_record(path)
 
+    first = submitted("a", TEST)
+    with pytest.raises(ValueError, match=r"to must not hold a record that says more; .*homogeneous.* lose its episodes "
+                                         "test:1$"):
+        submitted("b", TEST[:1], official=True)
+    assert read_records(to) == [first]
     first = submitted("a", TEST, official=True)
-    for seeds, official, lost in ((TEST, False, "its being official$"), (TEST[:1], True, r"its episodes test:1$"),
-                                  (TEST[1:], False, "its being official$")):
-        with pytest.raises(ValueError, match=f"to must not hold a record that says more; .*homogeneous.* lose {lost}"):
-            submitted(f"b{len(seeds)}{official}", seeds, official=official)
-        assert read_records(to) == [first]
-        assert (tmp_path / f"b{len(seeds)}{official}").exists() == official            # else said before it is played
-    assert submitted("a", parse_seeds("test:0-2"), official=True)["seeds"] == ["test:0", "test:1", "test:2"]
+    with pytest.raises(ValueError, match=r"to must not hold a record that says more; .* lose its being official$"):
+        submitted("c", TEST)
+    assert read_records(to) == [first] and not (tmp_path / "c").exists()               # it is said before it is played
     write_record(to, first | {"source": "0" * 64})
     assert submitted("b", TEST[:1])["seeds"] == ["test:0"]
+
+
+@pytest.mark.parametrize("official", [False, True])
+def test_a_record_is_extended(official, tmp_path):
+    """By what another folder's run plays beside it: what is in the record is neither played again nor lost."""
+    log, to = tmp_path / "log", tmp_path / "to"
+    mine = write_baseline(tmp_path, init=counting(log))
+
+    def submitted(results, seeds):
+        (path,) = submit(mine, [FILTER.id], parse_seeds(seeds), EpisodeStore(tmp_path / results), to, isolate="never",
+                         official=official, command=f"submit {seeds}")
+        return read_record(path)
+
+    first = submitted("a", "test:10")
+    both = submitted("b", "test:9-10")
+    assert count(log) == 2 and both["seeds"] == ["test:9", "test:10"] and both["official"] == official
+    assert [run["command"] for run in both["runs"]] == ["submit test:9-10", "submit test:10"]
+    assert both["episodes"][1] == first["episodes"][0] | {"run": 1}
+    assert submitted("c", "test:9-10") == both and count(log) == 2
 
 
 def test_an_invalid_record_is_in_nobody_s_way(tmp_path, monkeypatch):
