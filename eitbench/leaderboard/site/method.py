@@ -42,13 +42,12 @@ def _standings(standings: list[tuple[Board, Row]]) -> Table:
         rank = row.cells["rank"]
         link = f"../index.html#{board.anchor}" if board.is_aggregate else f"../{board.address}"
         badges = (*filter(None, row.cells["note"].split(", ")), *["outdated"] * row.outdated)
-        rows.append(([Cell(board.title, board.title.casefold(), link=link, badges=badges),
-                      Cell(board.of_class, board.of_class),
+        rows.append(([Cell(board.title, board.title.casefold(), link=link, small=board.of_class, badges=badges),
                       *[Cell(row.cells["version"], row.cells["version"])] * several,
                       Cell("–") if rank is None else Cell(str(rank), float(rank), small=f"of {competing}"),
                       *(interval_cell(row, score, scale(board, score)) for score in ("error", "gain")),
                       value_cell(row.cells["seconds_per_step"])], ""))
-    return Table("Boards", ["board", "class", *["version"] * several, "rank", "ẽ_c", "gain", "ms/step"], rows)
+    return Table("Boards", ["board", *["version"] * several, "rank", "ẽ_c", "gain", "ms/step"], rows)
 
 
 def _intervals(standings: list[tuple[Board, Row]]) -> Markup:
