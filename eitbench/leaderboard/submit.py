@@ -64,8 +64,9 @@ def submit(method: str | None, environments: list[str], seeds: list[int] | None,
         before = list[dict[str, Any]]()
         for job in {(job.environment, job.method): job for job in jobs}.values():
             path = _path_of(Path(to), job)
-            _check_nothing_is_lost(path, source_digest(), official)
-            before += _to_extend(path, official)
+            if (earlier := _earlier(path, source_digest())) is not None:
+                _check_nothing_is_lost(path, earlier, official)
+                before += results_of(earlier) if earlier["official"] == official else []
         done = {(result["method"], result["identity"]) for result in before if result["status"] == "ok"}
         missing = [job for job in jobs if (job.load().name, job.identity()) not in done]
         run_jobs(missing, store, n_jobs=n_jobs, backend=backend, command=command)
@@ -73,7 +74,9 @@ def submit(method: str | None, environments: list[str], seeds: list[int] | None,
         made = [record | {"official": official} for record in store.records(also=before)
                 if (record["environment"]["name"], record["method"]) in played and record["split"] == "test"]
         for record in made:
-            _check_nothing_is_lost(Path(to) / file_name(record), record["source"], official, record["seeds"])
+            path = Path(to) / file_name(record)
+            if (earlier := _earlier(path, record["source"])) is not None:
+                _check_nothing_is_lost(path, earlier, official, record["seeds"])
         for record in made:
             yield write_record(to, record)
 
@@ -93,24 +96,17 @@ def _path_of(to: Path, job: Job) -> Path:
                            "method_sha256": method.sha256, "split": "test"})
 
 
-def _to_extend(path: Path, official: bool) -> list[dict[str, Any]]:
-    """Results of the record at ``path``, if it is one of this code and of the same standing."""
-    if not path.exists():
-        return []
-    record = read_record(path)
-    return results_of(record) if record["source"] == source_digest() and record["official"] == official else []
+def _earlier(path: Path, source: str) -> dict[str, Any] | None:
+    """The record at ``path``, if it is one of the same code; an outdated one is played again."""
+    record = read_record(path) if path.exists() else None
+    return record if record is not None and record["source"] == source else None
 
 
-def _check_nothing_is_lost(path: Path, source: str, official: bool, seeds: list[str] | None = None) -> None:
-    """``ValueError`` if a record of the same code lies at ``path`` and would lose what makes it worth more; before it
-    is played, without ``seeds``, as far as is known then."""
-    if not path.exists():
-        return
-    before = read_record(path)
-    if before["source"] != source:                                        # outdated, and played again
-        return
-    missing = [] if seeds is None else [seed for seed in before["seeds"] if seed not in seeds]
-    lost = [*["its being official"] * (before["official"] and not official),
+def _check_nothing_is_lost(path: Path, earlier: dict[str, Any], official: bool, seeds: list[str] | None = None) -> None:
+    """``ValueError`` if the record at ``path`` would lose what makes it worth more; before anything is played, without
+    ``seeds``, as far as is known then."""
+    missing = [] if seeds is None else [seed for seed in earlier["seeds"] if seed not in seeds]
+    lost = [*["its being official"] * (earlier["official"] and not official),
             *([f"its episodes {seed_ranges(missing)}"] if missing else [])]
     if lost:
         raise ValueError(f"to must not hold a record that says more; {path} would lose {' and '.join(lost)}")

@@ -14,7 +14,7 @@ from tiny import FILTER, FIXED_LAG, RUN, SCENARIO, sha, strict, write_baseline
 from eitbench.episodes import CACHE_VARIABLE
 from eitbench.leaderboard import store as store_module
 from eitbench.leaderboard.run import Environment, Job, run_jobs
-from eitbench.leaderboard.store import EpisodeStore, machine, provenance, source_digest
+from eitbench.leaderboard.store import EpisodeStore, machine, provenance, results_of, source_digest
 from eitbench.seeds import name_seed
 
 ENV, COMMAND = "eitbench/Pipe2D-v0", "eitbench run --seeds train:1-2"
@@ -273,3 +273,17 @@ def test_provenance_without_git(monkeypatch):
     provenance.cache_clear()
     assert (provenance()["commit"], provenance()["dirty"]) == (None, None)
     provenance.cache_clear()
+
+
+def test_other_results_fill_what_is_missing_or_failed(store):
+    """An episode that was played well here stays; results of other code do not come in with it."""
+    failed = {"status": "failed", "message": "broke", "where": "mine.py:1", "scores": None}
+    put(store, result(1, seconds=2.0))
+    put(store, result(2) | failed)
+    others = [result(1, seconds=9.0), result(2, seconds=3.0), result(3, seconds=4.0),
+              result(4, source=sha("older"), finished="2024-01-01T00:00:00+00:00")]
+    (record,) = store.records(also=others)
+    assert [(row["seed"], row["seconds"]) for row in record["episodes"]] == [
+        ("train:1", 2.0), ("train:2", 3.0), ("train:3", 4.0)]
+    (same,) = EpisodeStore(store.folder / "empty").records(also=results_of(record))
+    assert same == record
