@@ -174,6 +174,9 @@ def policies(
     jobs: Jobs = CORES,
     backend: Backends = Backend.loky,
     out: Out = Path("results"),
+    records: Annotated[Path | None, typer.Option(
+        exists=True, file_okay=False, help="Folder of records, such as leaderboards/results: what they hold of these "
+                                           "episodes is not played again.")] = None,
 ) -> None:
     """Play injection policies, print their scores and the environment's adaptivity gap.
 
@@ -181,16 +184,18 @@ def policies(
     """
     from eitbench.leaderboard.policy_table import policy_rows, policy_table
     from eitbench.leaderboard.run import run_jobs
-    from eitbench.leaderboard.store import EpisodeStore
+    from eitbench.leaderboard.store import EpisodeStore, results_in, unplayed
     from eitbench.leaderboard.suites import policy_jobs
     from eitbench.seeds import parse_seeds
     with clear_errors():
         todo = policy_jobs([env], policy or [], parse_seeds(seeds), estimator, isolate=isolate)
+        before = results_in(records) if records else []
     store = EpisodeStore(out)
     with clear_errors():
-        run_jobs(todo, store, n_jobs=jobs, backend=backend, command=_command())
+        run_jobs(unplayed(todo, before), store, n_jobs=jobs, backend=backend, command=_command())
     asked = {job.load().name: job.load().privileged for job in todo}
-    typer.echo(policy_table(policy_rows(todo, store), [name for name, privileged in asked.items() if privileged]))
+    rows = policy_rows(todo, [*before, *store.results()])
+    typer.echo(policy_table(rows, [name for name, privileged in asked.items() if privileged]))
     _say_failures([record for record in store.write_records()
                    if record["method"] in asked and record["environment"]["id"] == env])
 

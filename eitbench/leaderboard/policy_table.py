@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 import pandas as pd
 
 from eitbench.leaderboard.policies import adaptivity_gap
 from eitbench.leaderboard.run import Job
-from eitbench.leaderboard.store import EpisodeStore
 from eitbench.leaderboard.summary import mean_and_interval, rounded
 
 OPEN_LOOP = ("adjacent", "opposite", "transverse", "best_pair", "best_cycle", "best_currents", "schedule")
 """Our policies that inject the same whatever is measured."""
 
 
-def policy_rows(jobs: Sequence[Job], store: EpisodeStore) -> pd.DataFrame:
-    """One row for each of the jobs that ``store`` holds: policy, seed, error, spent, seconds_per_step."""
-    wanted = {job.identity() for job in jobs}
-    rows = [{"policy": result["method"], "seed": result["seed"], **result["scores"]} for result in store.results()
-            if result["identity"] in wanted and result["status"] == "ok"]
+def policy_rows(jobs: Sequence[Job], results: Iterable[dict[str, Any]]) -> pd.DataFrame:
+    """One row for each of the jobs that succeeded according to ``results``: policy, seed, error, spent,
+    seconds_per_step."""
+    fine = {result["identity"]: result for result in results if result["status"] == "ok"}
+    rows = [{"policy": result["method"], "seed": result["seed"], **result["scores"]}
+            for result in (fine[identity] for identity in (job.identity() for job in jobs) if identity in fine)]
     return pd.DataFrame(rows, columns=["policy", "seed", "error", "spent", "seconds_per_step"])
 
 

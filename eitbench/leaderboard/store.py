@@ -14,15 +14,18 @@ from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from eitbench._code import code_digest, package_files
 from eitbench._files import write_atomically
-from eitbench.leaderboard.records import SCHEMA, SHARED, sealed, split_of, write_record
+from eitbench.leaderboard.records import SCHEMA, SHARED, read_records, sealed, split_of, write_record
 from eitbench.seeds import name_seed
+
+if TYPE_CHECKING:
+    from eitbench.leaderboard.run import Job
 
 PACKAGES = ("eitbench", "numpy", "scipy", "gymnasium", "scikit-fem", "numba", "stable-baselines3", "sb3-contrib",
             "torch")
@@ -125,6 +128,17 @@ def results_of(record: dict[str, Any]) -> list[dict[str, Any]]:
     """The results that were gathered into a record, as a store would hold them."""
     shared = {key: record[key] for key in ("environment", "method", *SHARED)}
     return [episode | shared | {"run": record["runs"][episode["run"]]} for episode in record["episodes"]]
+
+
+def results_in(folder: Path) -> list[dict[str, Any]]:
+    """The results that were gathered into the records of a folder. Errors as `records.read_records`."""
+    return [result for record in read_records(folder) for result in results_of(record)]
+
+
+def unplayed(jobs: Iterable[Job], results: Iterable[dict[str, Any]]) -> list[Job]:
+    """The jobs of which none of the results is a successful one."""
+    done = {(result["method"], result["identity"]) for result in results if result["status"] == "ok"}
+    return [job for job in jobs if (job.load().name, job.identity()) not in done]
 
 
 def _read(path: Path) -> dict[str, Any] | None:

@@ -10,7 +10,7 @@ from eitbench.envs import ENTRY_POINTS, INJECTION
 from eitbench.leaderboard import suites
 from eitbench.leaderboard.records import file_name, read_record, split_of, write_record
 from eitbench.leaderboard.run import Job, run_jobs
-from eitbench.leaderboard.store import EpisodeStore, provenance, results_of, source_digest
+from eitbench.leaderboard.store import EpisodeStore, provenance, results_of, source_digest, unplayed
 from eitbench.leaderboard.summary import seed_ranges
 from eitbench.seeds import name_seed
 
@@ -67,9 +67,7 @@ def submit(method: str | None, environments: list[str], seeds: list[int] | None,
             if (earlier := _earlier(path, source_digest())) is not None:
                 _check_nothing_is_lost(path, earlier, official)
                 before += results_of(earlier) if earlier["official"] == official else []
-        done = {(result["method"], result["identity"]) for result in before if result["status"] == "ok"}
-        missing = [job for job in jobs if (job.load().name, job.identity()) not in done]
-        run_jobs(missing, store, n_jobs=n_jobs, backend=backend, command=command)
+        run_jobs(unplayed(jobs, before), store, n_jobs=n_jobs, backend=backend, command=command)
         played = {(job.environment.name, job.load().name) for job in jobs}
         made = [record | {"official": official} for record in store.records(also=before)
                 if (record["environment"]["name"], record["method"]) in played and record["split"] == "test"]

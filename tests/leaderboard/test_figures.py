@@ -118,13 +118,14 @@ def test_injection_is_drawn(monkeypatch, tmp_path):
     """Scores as they were played, told in a table for each world, and an animation with a frame for every step."""
     played = []
 
-    def rows(jobs, store):
-        names = list(dict.fromkeys(job.method for job in jobs))
+    def rows(jobs, results):
+        names = list(dict.fromkeys(job.load().name for job in jobs))
         return pd.DataFrame([{"policy": name, "seed": f"dev:{k}", "error": 0.01 * (1 + place) + 0.001 * k, "spent": 5,
                               "seconds_per_step": 0.001} for place, name in enumerate(names) for k in range(3)])
 
     monkeypatch.setattr(injection, "run_jobs", lambda jobs, *_, **__: played.append(jobs[0].environment))
     monkeypatch.setattr(injection, "policy_rows", rows)
+    monkeypatch.setattr(injection, "results_in", lambda folder: [])
     short = {"scored_steps": 3, "mean_velocity": 16.0}
     monkeypatch.setitem(gym.registry[injection.AT_WORK[0]].kwargs, "scenario", short)
     path, remark = FIGURES["injection"]([0, 1, 2], 1, tmp_path / "new")

@@ -208,7 +208,7 @@ def test_played_episodes_are_kept(tmp_path, monkeypatch):
     store = EpisodeStore(tmp_path / "new")
     todo = jobs_of(["opposite", "adjacent"], "dev:1,0", estimator="reduced")
     run_jobs(todo, store, command="eitbench policies")
-    rows = policy_rows(todo, store)
+    rows = policy_rows(todo, store.results())
     assert sorted(zip(rows["policy"], rows["seed"], strict=True)) == [
         (policy, seed) for policy in ("adjacent", "opposite") for seed in ("dev:0", "dev:1")]
     played = play(NAME, SHORT, "adjacent", parse_seeds("dev:0")[0], "reduced")
@@ -223,12 +223,12 @@ def test_played_episodes_are_kept(tmp_path, monkeypatch):
     again = []
     monkeypatch.setattr(policies, "play", lambda *job: again.append(job) or play(*job))
     run_jobs(todo, store)
-    pd.testing.assert_frame_equal(policy_rows(todo, store).drop(columns="seconds_per_step"),
+    pd.testing.assert_frame_equal(policy_rows(todo, store.results()).drop(columns="seconds_per_step"),
                                   rows.drop(columns="seconds_per_step"))
     assert len(again) == 1
     exact = jobs_of(["opposite"], "dev:1")
     run_jobs(exact, store)
-    assert len(policy_rows(exact, store)) == 1 and [job[-1] for job in again] == ["reduced", "full"]
+    assert len(policy_rows(exact, store.results())) == 1 and [job[-1] for job in again] == ["reduced", "full"]
 
 
 def test_a_mistake_is_the_result_of_its_policy(tmp_path):
@@ -239,8 +239,8 @@ def test_a_mistake_is_the_result_of_its_policy(tmp_path):
     failed, floor = store.write_records()
     assert "action must be an integer" in failed["episodes"][0]["message"] and failed["role"] is None
     assert floor["episodes"][0]["status"] == "ok" and floor["role"] == "floor"
-    assert policy_table.policy_table(policy_rows(jobs_of([bad], "dev:0", estimator="reduced"), store), []) == (
-        "no episode was finished")
+    rows = policy_rows(jobs_of([bad], "dev:0", estimator="reduced"), store.results())
+    assert policy_table.policy_table(rows, []) == "no episode was finished"
 
 
 def test_table_pairs_the_episodes():

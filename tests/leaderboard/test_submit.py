@@ -109,6 +109,19 @@ def test_policies_by_command(tmp_path):
     assert page.count("<section") == 2 and "Pipe2DInjection" in page
 
 
+def test_policies_in_records_are_not_played_again(tmp_path):
+    """The table is that of all the episodes; only those that no record holds are played."""
+    policy, short = ("--env", INJECTION, "--policy", "adjacent"), ("-j", "1", "-o")
+    assert eitbench("submit", *policy, "--seeds", "test:0", *short, "first")[0] == 0
+    code, said, _ = eitbench("policies", *policy, "--seeds", "test:0-1", "--records", "leaderboards/results", *short,
+                             "rest")
+    assert code == 0 and [path.name for path in tmp_path.glob("rest/episodes/*/*/*.json")] == ["test-1.json"]
+    (score,) = re.findall(r"\| adjacent \| ([^|]+) \|", said)
+    assert f"| adjacent | {score} |" in eitbench("policies", *policy, "--seeds", "test:0-1", *short, "all")[1]
+    code, _, complaint = eitbench("policies", *policy, "--records", "nowhere", *short, "none")
+    assert code == 2 and "'nowhere' does not exist" in complaint
+
+
 @pytest.mark.parametrize(("environments", "seeds", "message"), [
     ([FILTER.id], "dev:0", "seeds of a submission must be of the test split, got dev:0"),
     ([FILTER.id], "7", "must be of the test split, got train:7"),

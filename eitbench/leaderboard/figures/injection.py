@@ -11,13 +11,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from eitbench._files import shipped
 from eitbench.leaderboard.animate import animate
 from eitbench.leaderboard.baselines import baseline_folder
 from eitbench.leaderboard.figures.common import ACCENT, INK, TRUE, bare, save
-from eitbench.leaderboard.policies import load_policy
 from eitbench.leaderboard.policy_table import OPEN_LOOP, errors_by_policy, policy_rows, policy_table
 from eitbench.leaderboard.run import run_jobs
-from eitbench.leaderboard.store import EpisodeStore
+from eitbench.leaderboard.store import EpisodeStore, results_in, unplayed
 from eitbench.leaderboard.suites import policy_jobs
 from eitbench.leaderboard.summary import mean_and_interval
 from eitbench.seeds import name_seed
@@ -34,15 +34,16 @@ AT_WORK = ("eitbench/Pipe2DInjectionFaults-v0", "fault_aware")
 
 
 def injection(seeds: list[int], jobs: int, out: Path) -> tuple[Path, str]:
-    """Scores with the exact filter, of all our policies on these episodes; of the unknown flow, a minute each."""
+    """Scores with the exact filter, of all our policies on these episodes; those in the official records, of this very
+    code, are not played again. Those with an unknown flow take a minute each."""
+    store, before = EpisodeStore(out), results_in(shipped("leaderboards") / "results")
     figure = Figure(figsize=(13.5, 13.8), dpi=110, layout="constrained")
     panels, said = figure.subplots(3, 3, height_ratios=(4, 4, 3)), []
     for (env, title), axes in zip(WORLDS.items(), panels[:2].flat, strict=True):
-        todo, store = policy_jobs([env], [], seeds), EpisodeStore(out)
-        chosen = list(dict.fromkeys(job.method for job in todo))
-        run_jobs(todo, store, n_jobs=jobs, command="eitbench reproduce injection")
-        rows = policy_rows(todo, store)
-        privileged = [name for name in chosen if load_policy(name).privileged]
+        todo = policy_jobs([env], [], seeds)
+        run_jobs(unplayed(todo, before), store, n_jobs=jobs, command="eitbench reproduce injection")
+        rows = policy_rows(todo, [*before, *store.results()])
+        privileged = sorted({job.load().name for job in todo if job.load().privileged})
         _scores(axes, rows, privileged)
         axes.set_title(title, fontsize=11)
         said.append(f"{env}\n{policy_table(rows, privileged)}\n")
