@@ -27,6 +27,8 @@ WORLDS = {"eitbench/Pipe2DInjectionFaults-v0": "faulty electrodes", "eitbench/Pi
           "eitbench/Pipe2DInjectionCurrents-v0": "any currents (reference)",
           "eitbench/RotatingTankInjection-v0": "stirred tank (reference)"}
 KINDS = {INK: "open loop", ACCENT: "looks at the data", TRUE: "* is shown the truth"}
+THIN, THICK = 1.2, 4.0
+LINES = {THIN: "95 % interval", THICK: "95 % interval of the paired difference to the best that ranks"}
 COMPETITIONS = list(WORLDS)[:3]
 """Where agents have learnt."""
 AT_WORK = ("eitbench/Pipe2DInjectionFaults-v0", "fault_aware")
@@ -51,7 +53,9 @@ def injection(seeds: list[int], jobs: int, out: Path) -> tuple[Path, str]:
         _curves(axes, env)
         axes.set_title(WORLDS[env], fontsize=11)
     figure.legend(handles=[Line2D([], [], marker="o", linestyle="", color=colour, label=meaning)
-                           for colour, meaning in KINDS.items()], frameon=False, ncols=3, loc="outside upper center")
+                           for colour, meaning in KINDS.items()]
+                  + [Line2D([], [], color=TRUE, linewidth=width, label=meaning) for width, meaning in LINES.items()],
+                  frameon=False, ncols=5, loc="outside upper center")
     path = out / "injection.png"
     save(figure, path)
     moving = animate(*AT_WORK, name_seed(seeds[0]), None, out / "injection.gif")
@@ -59,15 +63,21 @@ def injection(seeds: list[int], jobs: int, out: Path) -> tuple[Path, str]:
 
 
 def _scores(axes: Axes, rows: pd.DataFrame, privileged: list[str]) -> None:
-    """A dot for each policy with the 95 % interval over episodes, the best above."""
+    """A dot for each policy, the best above; thin, the 95 % interval over episodes, which differ in how hard they are;
+    thick, that of the difference to the best one that is not privileged, episode by episode."""
     errors = errors_by_policy(rows)
     order = errors.mean().sort_values().index[::-1]
+    best = errors[[name for name in order if name not in privileged][-1]]
+    axes.axvline(best.mean(), color=TRUE, linewidth=0.6, linestyle=":", zorder=0)
     for place, name in enumerate(order):
-        mean, half = mean_and_interval(list(errors[name].dropna()))
+        mean = errors[name].mean()
         colour = TRUE if name in privileged else INK if name in OPEN_LOOP or name == "random_pair" else ACCENT
         axes.plot([mean], [place], "o", color=colour, markersize=5)
-        if np.isfinite(half):
-            axes.plot([mean - half, mean + half], [place, place], color=colour, linewidth=1.6)
+        for width, values in ((THIN, errors[name]), (THICK, errors[name] - best)):
+            _, half = mean_and_interval(list(values.dropna()))
+            if np.isfinite(half):
+                axes.plot([mean - half, mean + half], [place, place], color=colour, linewidth=width,
+                          solid_capstyle="butt")
     axes.set_yticks(range(len(order)), [name.replace("_", " ") + " *" * (name in privileged) for name in order])
     axes.set(xlim=(0, None), xlabel=f"ẽ$_c$, {len(errors)} episode{'s' * (len(errors) > 1)}")
     axes.locator_params(axis="x", nbins=5)
