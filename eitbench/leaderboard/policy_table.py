@@ -9,6 +9,7 @@ import pandas as pd
 
 from eitbench.leaderboard.policies import adaptivity_gap
 from eitbench.leaderboard.run import Job
+from eitbench.leaderboard.store import successful
 from eitbench.leaderboard.summary import mean_and_interval, rounded
 
 OPEN_LOOP = ("adjacent", "opposite", "transverse", "best_pair", "best_cycle", "best_currents", "schedule")
@@ -18,9 +19,8 @@ OPEN_LOOP = ("adjacent", "opposite", "transverse", "best_pair", "best_cycle", "b
 def policy_rows(jobs: Sequence[Job], results: Iterable[dict[str, Any]]) -> pd.DataFrame:
     """One row for each of the jobs that succeeded according to ``results``: policy, seed, error, spent,
     seconds_per_step."""
-    fine = {result["identity"]: result for result in results if result["status"] == "ok"}
     rows = [{"policy": result["method"], "seed": result["seed"], **result["scores"]}
-            for result in (fine[identity] for identity in (job.identity() for job in jobs) if identity in fine)]
+            for result in successful(jobs, results).values()]
     return pd.DataFrame(rows, columns=["policy", "seed", "error", "spent", "seconds_per_step"])
 
 

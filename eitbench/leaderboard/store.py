@@ -135,10 +135,18 @@ def results_in(folder: Path) -> list[dict[str, Any]]:
     return [result for record in read_records(folder) for result in results_of(record)]
 
 
+def successful(jobs: Iterable[Job], results: Iterable[dict[str, Any]]) -> dict[Job, dict[str, Any]]:
+    """The successful results of the jobs that have one: of the same method's name and of the very same identity."""
+    fine = {(result["method"], result["identity"]): result for result in results if result["status"] == "ok"}
+    named = ((job, (job.load().name, job.identity())) for job in jobs)
+    return {job: fine[name] for job, name in named if name in fine}
+
+
 def unplayed(jobs: Iterable[Job], results: Iterable[dict[str, Any]]) -> list[Job]:
     """The jobs of which none of the results is a successful one."""
-    done = {(result["method"], result["identity"]) for result in results if result["status"] == "ok"}
-    return [job for job in jobs if (job.load().name, job.identity()) not in done]
+    jobs = list(jobs)
+    done = successful(jobs, results)
+    return [job for job in jobs if job not in done]
 
 
 def _read(path: Path) -> dict[str, Any] | None:

@@ -231,6 +231,15 @@ def test_played_episodes_are_kept(tmp_path, monkeypatch):
     assert len(policy_rows(exact, store.results())) == 1 and [job[-1] for job in again] == ["reduced", "full"]
 
 
+def test_copies_under_two_names_keep_their_rows(tmp_path):
+    """The same text under another name is another policy, though its episodes have the same identity."""
+    copies = [write_policy(tmp_path, "def act(self, observation): return 3", name) for name in ("one", "two")]
+    todo, store = jobs_of(copies, "dev:0", estimator="reduced"), EpisodeStore(tmp_path / "results")
+    run_jobs(todo, store)
+    assert todo[0].identity() == todo[1].identity()
+    assert list(policy_rows(todo, store.results())["policy"]) == ["one", "two"]
+
+
 def test_a_mistake_is_the_result_of_its_policy(tmp_path):
     """An episode that fails is recorded with its reason, and has no row; the privileged and the floor are marked."""
     store = EpisodeStore(tmp_path)

@@ -36,8 +36,8 @@ AT_WORK = ("eitbench/Pipe2DInjectionFaults-v0", "fault_aware")
 
 
 def injection(seeds: list[int], jobs: int, out: Path) -> tuple[Path, str]:
-    """Scores with the exact filter, of all our policies on these episodes; those in the official records, of this very
-    code, are not played again. Those with an unknown flow take a minute each."""
+    """Scores with the exact filter, of all our policies on these episodes; what the leaderboards' records hold,
+    of this very code, is not played again. An episode with an unknown flow takes one to two minutes."""
     store, before = EpisodeStore(out), results_in(shipped("leaderboards") / "results")
     figure = Figure(figsize=(13.5, 13.8), dpi=110, layout="constrained")
     panels, said = figure.subplots(3, 3, height_ratios=(4, 4, 3)), []
