@@ -307,14 +307,15 @@ def render(
 @app.command()
 def reproduce(
     name: Annotated[Figure, typer.Argument(help="Figure or table of the thesis, or a study beside it.")],
-    seeds: Annotated[str, typer.Option(help="Episodes; pictures show the first, sweeps average over all.")] = "dev:0-1",
+    seeds: Annotated[str | None, typer.Option(help="Episodes; pictures show the first, sweeps average over all. "
+                                                   "Default: dev:0-1; of the injection those of the boards.")] = None,
     jobs: Jobs = CORES,
     out: Out = Path("results/figures"),
 ) -> None:
     """Draw a figure of the thesis from our data, and say what agrees and what differs."""
     from eitbench.seeds import parse_seeds
     with clear_errors():
-        numbers = parse_seeds(seeds)
+        numbers = None if seeds is None else parse_seeds(seeds)
     path, remark = FIGURES[name.value](numbers, jobs, out)
     typer.echo(f"wrote {path}\n{remark}")
 

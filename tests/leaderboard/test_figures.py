@@ -21,8 +21,11 @@ from eitbench.estimation import FirstFrame, initial_covariance
 from eitbench.leaderboard.baselines import load_baseline
 from eitbench.leaderboard.figures import FIGURES, injection, obstacle, parameters, pipe2d, profiles, tanks, velocity
 from eitbench.leaderboard.figures.common import error_of, estimates_of
+from eitbench.leaderboard.suites import POLICY_SEEDS
+from eitbench.leaderboard.summary import seed_ranges
 from eitbench.physics.rest import AtRest
 from eitbench.scenarios import Pipe2DObstacle
+from eitbench.seeds import name_seed
 from eitbench.task import Estimate
 
 SEED = 100_000
@@ -115,25 +118,34 @@ def test_words_follow_from_the_data(name, monkeypatch, tmp_path):
 
 
 def test_injection_is_drawn(monkeypatch, tmp_path):
-    """Scores as they were played, told in a table for each world, and an animation with a frame for every step."""
-    played = []
+    """Scores as they were played, told in a table for each world, and an animation with a frame for every step; when
+    not told which episodes, in those of the boards."""
+    played = {}
 
     def rows(jobs, results):
         names = list(dict.fromkeys(job.load().name for job in jobs))
         return pd.DataFrame([{"policy": name, "seed": f"dev:{k}", "error": 0.01 * (1 + place) + 0.001 * k, "spent": 5,
                               "seconds_per_step": 0.001} for place, name in enumerate(names) for k in range(3)])
 
-    monkeypatch.setattr(injection, "run_jobs", lambda jobs, *_, **__: played.append(jobs[0].environment))
+    monkeypatch.setattr(injection, "run_jobs", lambda jobs, *_, **__: played.update({
+        jobs[0].environment: seed_ranges(list(dict.fromkeys(name_seed(job.seed) for job in jobs)))}))
     monkeypatch.setattr(injection, "policy_rows", rows)
     monkeypatch.setattr(injection, "results_in", lambda folder: [])
     short = {"scored_steps": 3, "mean_velocity": 16.0}
     monkeypatch.setitem(gym.registry[injection.AT_WORK[0]].kwargs, "scenario", short)
-    path, remark = FIGURES["injection"]([0, 1, 2], 1, tmp_path / "new")
+    path, remark = FIGURES["injection"](None, 1, tmp_path / "new")
     picture = imread(path)
     assert min(picture.shape[:2]) > 250 and picture[..., :3].std() > 0.05
-    assert played == [(env, "{}") for env in injection.WORLDS] and remark.count("| best_pair |") == 6
+    assert played == {(env, "{}"): POLICY_SEEDS.get(env, "test:0-9") for env in injection.WORLDS}
+    assert remark.count("| best_pair |") == 6
     with Image.open(tmp_path / "new" / "injection.gif") as moving:
         assert moving.n_frames == 3                               # the first frame of 16, then three steps
+
+
+def test_thesis_figures_show_dev_episodes_when_not_told(monkeypatch, tmp_path):
+    """Nothing is drawn from test episodes by chance."""
+    monkeypatch.setattr(pipe2d, "fig5_4", lambda seeds, jobs, out: (out, " ".join(map(name_seed, seeds))))
+    assert FIGURES["fig5.4"](None, 1, tmp_path)[1] == "dev:0 dev:1"
 
 
 def test_names():

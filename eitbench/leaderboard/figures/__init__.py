@@ -1,7 +1,8 @@
 """Figures and studies after the thesis, drawn from our data; a module is imported when one of its figures is drawn.
 
 A figure is a function (seeds, processes, folder) -> (path of the picture, what it shows in words). Its lines beginning
-"Agrees" or "DIFFERS" compare with the thesis; which of the two stands there is computed.
+"Agrees" or "DIFFERS" compare with the thesis; which of the two stands there is computed. Without seeds it shows two dev
+episodes; the injection, whose scores are those of the boards, shows the boards' episodes.
 """
 
 from __future__ import annotations
@@ -10,13 +11,17 @@ from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 
-Draw = Callable[[list[int], int, Path], tuple[Path, str]]
+from eitbench.seeds import parse_seeds
+
+Draw = Callable[[list[int] | None, int, Path], tuple[Path, str]]
 
 
 def _later(place: str) -> Draw:
     """The function at ``place``, "module:function" of this package."""
-    def draw(seeds: list[int], jobs: int, out: Path) -> tuple[Path, str]:
+    def draw(seeds: list[int] | None, jobs: int, out: Path) -> tuple[Path, str]:
         module, function = place.split(":")
+        if seeds is None and function != "injection":
+            seeds = parse_seeds("dev:0-1")
         result: tuple[Path, str] = getattr(import_module(f"{__name__}.{module}"), function)(seeds, jobs, out)
         return result
 

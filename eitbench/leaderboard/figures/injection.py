@@ -35,9 +35,10 @@ AT_WORK = ("eitbench/Pipe2DInjectionFaults-v0", "fault_aware")
 """What the animation shows."""
 
 
-def injection(seeds: list[int], jobs: int, out: Path) -> tuple[Path, str]:
-    """Scores with the exact filter, of all our policies on these episodes; what the leaderboards' records hold,
-    of this very code, is not played again. An episode with an unknown flow takes one to two minutes."""
+def injection(seeds: list[int] | None, jobs: int, out: Path) -> tuple[Path, str]:
+    """Scores with the exact filter, of all our policies on these episodes, by default the boards'; what the
+    leaderboards' records hold, of this very code, is not played again. An episode with an unknown flow takes one to
+    two minutes."""
     store, before = EpisodeStore(out), results_in(shipped("leaderboards") / "results")
     figure = Figure(figsize=(13.5, 13.8), dpi=110, layout="constrained")
     panels, said = figure.subplots(3, 3, height_ratios=(4, 4, 3)), []
@@ -58,7 +59,8 @@ def injection(seeds: list[int], jobs: int, out: Path) -> tuple[Path, str]:
                   frameon=False, ncols=5, loc="outside upper center")
     path = out / "injection.png"
     save(figure, path)
-    moving = animate(*AT_WORK, name_seed(seeds[0]), None, out / "injection.gif")
+    first = policy_jobs([AT_WORK[0]], [AT_WORK[1]], seeds)[0].seed
+    moving = animate(*AT_WORK, name_seed(first), None, out / "injection.gif")
     return path, "\n".join([*said, f"wrote {moving}: {AT_WORK[1]} in {AT_WORK[0]}"])
 
 
