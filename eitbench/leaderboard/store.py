@@ -9,7 +9,7 @@ import platform
 import subprocess
 import time
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
 from itertools import chain
@@ -142,9 +142,8 @@ def successful(jobs: Iterable[Job], results: Iterable[dict[str, Any]]) -> dict[J
     return {job: fine[name] for job, name in named if name in fine}
 
 
-def unplayed(jobs: Iterable[Job], results: Iterable[dict[str, Any]]) -> list[Job]:
+def unplayed(jobs: Sequence[Job], results: Iterable[dict[str, Any]]) -> list[Job]:
     """The jobs of which none of the results is a successful one."""
-    jobs = list(jobs)
     done = successful(jobs, results)
     return [job for job in jobs if job not in done]
 
