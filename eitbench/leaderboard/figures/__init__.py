@@ -16,12 +16,12 @@ from eitbench.seeds import parse_seeds
 Draw = Callable[[list[int] | None, int, Path], tuple[Path, str]]
 
 
-def _later(place: str) -> Draw:
-    """The function at ``place``, "module:function" of this package."""
+def _later(place: str, default: str | None = "dev:0-1") -> Draw:
+    """The function at ``place``, "module:function" of this package; without seeds it is given the default's."""
     def draw(seeds: list[int] | None, jobs: int, out: Path) -> tuple[Path, str]:
         module, function = place.split(":")
-        if seeds is None and function != "injection":
-            seeds = parse_seeds("dev:0-1")
+        if seeds is None and default is not None:
+            seeds = parse_seeds(default)
         result: tuple[Path, str] = getattr(import_module(f"{__name__}.{module}"), function)(seeds, jobs, out)
         return result
 
@@ -35,5 +35,5 @@ FIGURES: dict[str, Draw] = {name: _later(place) for name, place in {
     "fig6.1": "velocity:fig6_1", "fig6.2": "velocity:fig6_2", "fig6.3": "velocity:fig6_3", "fig6.4": "velocity:fig6_4",
     "fig6.5": "velocity:fig6_5", "fig6.6": "velocity:fig6_6",
     "fig7.2": "tanks:fig7_2", "fig7.3": "tanks:fig7_3", "fig7.4": "tanks:fig7_4",
-    "injection": "injection:injection", "profiles": "profiles:profiles", "obstacle": "obstacle:obstacle",
-}.items()}
+    "profiles": "profiles:profiles", "obstacle": "obstacle:obstacle",
+}.items()} | {"injection": _later("injection:injection", default=None)}
