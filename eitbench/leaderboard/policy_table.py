@@ -29,6 +29,12 @@ def errors_by_policy(rows: pd.DataFrame) -> pd.DataFrame:
     return rows.assign(policy=_without_training_seed(rows)).pivot_table(index="seed", columns="policy", values="error")
 
 
+def ranking(errors: pd.DataFrame) -> list[str]:
+    """Columns of `errors_by_policy`, the best first. Who failed in an episode comes after all who did not: a mean over
+    the others, perhaps the easy ones, is no match for theirs."""
+    return sorted(map(str, errors), key=lambda name: (errors[name].isna().any(), errors[name].mean()))
+
+
 def _without_training_seed(rows: pd.DataFrame) -> pd.Series:
     return rows["policy"].str.replace(r"_seed\d+$", "", regex=True)
 
@@ -38,18 +44,21 @@ def policy_table(rows: pd.DataFrame, privileged: Sequence[str]) -> str:
     with 95 % intervals over episodes; below it the adaptivity gap, if the policies for it were played.
 
     Agents that differ in the seed of their training only are one policy: an episode's error is the mean of theirs.
+    Policies that did not finish every episode are below all that did, with the number of those they did.
     """
     if rows.empty:
         return "no episode was finished"
     rows, errors = rows.assign(policy=_without_training_seed(rows)), errors_by_policy(rows)
-    means = errors.mean().sort_values()
-    best = next((name for name in means.index if name not in privileged), means.index[0])
+    names = ranking(errors)
+    best = next((name for name in names if name not in privileged), names[0])
     lines = [f"| policy | ẽ_c | worse than {best} by | injections | ms/step |", "|---|---:|---:|---:|---:|"]
-    for name in means.index:
+    for name in names:
         own = rows[rows["policy"] == name]
         score, behind = (rounded(*mean_and_interval(list(values))) for values in
                          (errors[name].dropna(), (errors[name] - errors[best]).dropna()))
-        title = f"{name} (privileged)" if name in privileged else name
+        title = name + " (privileged)" * (name in privileged)
+        if (finished := errors[name].count()) < len(errors):
+            title += f" ({finished} of {len(errors)} episodes)"
         lines.append(f"| {title} | {score} | {'–' if name == best else behind} | {own['spent'].mean():.1f} | "
                      f"{1e3 * own['seconds_per_step'].min():.1f} |")
     there = [name for name in OPEN_LOOP if name in errors]

@@ -269,6 +269,16 @@ def test_table_pairs_the_episodes():
     assert lines[3].startswith("| ppo | 2.1 ") and "ppo_seed" not in str(lines) and "gap 0.49" in lines[-1]
 
 
+def test_who_failed_comes_after_who_did_not():
+    """Two easy episodes do not make a best policy of one that failed in the hard one; the table says how many count."""
+    rows = pd.DataFrame([{"policy": name, "seed": f"dev:{k}", "error": error, "spent": 5, "seconds_per_step": 0.001}
+                         for name, each in {"bold": [1.0, 2.0], "sound": [1.1, 2.1, 9.0]}.items()
+                         for k, error in enumerate(each)])
+    lines = policy_table.policy_table(rows, []).splitlines()
+    assert lines[0].startswith("| policy | ẽ_c | worse than sound by |")
+    assert lines[2].startswith("| sound | ") and lines[3].startswith("| bold (2 of 3 episodes) | ")
+
+
 # -- mistakes ---------------------------------------------------------------------------------------------------------
 
 

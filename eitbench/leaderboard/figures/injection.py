@@ -15,7 +15,7 @@ from eitbench._files import shipped
 from eitbench.leaderboard.animate import animate
 from eitbench.leaderboard.baselines import baseline_folder
 from eitbench.leaderboard.figures.common import ACCENT, INK, TRUE, bare, save
-from eitbench.leaderboard.policy_table import OPEN_LOOP, errors_by_policy, policy_rows, policy_table
+from eitbench.leaderboard.policy_table import OPEN_LOOP, errors_by_policy, policy_rows, policy_table, ranking
 from eitbench.leaderboard.run import run_jobs
 from eitbench.leaderboard.store import EpisodeStore, results_in, unplayed
 from eitbench.leaderboard.suites import policy_jobs
@@ -68,7 +68,7 @@ def _scores(axes: Axes, rows: pd.DataFrame, privileged: list[str]) -> None:
     """A dot for each policy, the best above; thin, the 95 % interval over episodes, which differ in how hard they are;
     thick, that of the difference to the best one that is not privileged, episode by episode."""
     errors = errors_by_policy(rows)
-    order = errors.mean().sort_values().index[::-1]
+    order = ranking(errors)[::-1]
     best = errors[[name for name in order if name not in privileged][-1]]
     axes.axvline(best.mean(), color=TRUE, linewidth=0.6, linestyle=":", zorder=0)
     for place, name in enumerate(order):
