@@ -86,6 +86,10 @@ class Config:
             raise ValueError(f"hidden must be a list of integers, got {self.hidden!r}")
         for units in self.hidden:
             _check.integer("each entry of hidden", units, low=1)
+        if not isinstance(self.reference, str):
+            raise ValueError(f"reference must be the name or path of a policy, got {self.reference!r}")
+        if not isinstance(self.anneal, bool):
+            raise ValueError(f"anneal must be true or false, got {self.anneal!r}")
         if self.anneal:
             _check.number("algorithm.learning_rate", self.algorithm.get("learning_rate"), low=0.0, open_low=True)
 
@@ -232,7 +236,9 @@ def evaluation(env: str, kwargs: dict[str, Any] | None, config: Config) -> Calla
             observation, _, done, _, _ = envs.step(actions)
             errors.append(envs.errors())
             ended = bool(done.all())
-        return np.nanmean(errors, axis=0)
+        # States that are not scored are of no episode; an estimate that is not finite must not pass for one of them.
+        scored = np.array([row for row in errors if not np.isnan(row).all()])
+        return scored.mean(axis=0)
 
     return evaluate
 

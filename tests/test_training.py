@@ -178,6 +178,8 @@ def test_a_pupil_learns_what_its_teacher_says(tmp_path):
     ("total_steps: 1\nimitate: [best_pair]\n", "imitate must be a dict"),
     ("total_steps: 1\nhidden: 8\n", "hidden must be a list of integers, got 8"),
     ("total_steps: 1\nhidden: [8, x]\n", "each entry of hidden must be an integer of at least 1, got 'x'"),
+    ("total_steps: 1\nreference: 3\n", "reference must be the name or path of a policy, got 3"),
+    ("total_steps: 1\nanneal: 'no'\n", "anneal must be true or false, got 'no'"),
     ("total_steps: -1\n", "total_steps must"), ("total_steps: 1\nreward_scale: 0\n", "reward_scale must"),
 ])
 def test_wrong_configurations_are_named(text, message, tmp_path):
