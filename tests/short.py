@@ -39,7 +39,7 @@ def kind(name: str) -> str:
 
 def world(name: str) -> dict:
     """Keyword arguments that make an id's episodes short."""
-    assert kind(name) in FIELDS, f"{name} has no short version yet: give {kind(name)!r} one in tests/envs/short.py"
+    assert kind(name) in FIELDS, f"{name} has no short version yet: give {kind(name)!r} one in tests/short.py"
     return {"scenario": FIELDS[kind(name)]} | ARGUMENTS.get(kind(name), {})
 
 
