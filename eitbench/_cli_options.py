@@ -40,8 +40,13 @@ Isolate = Annotated[Isolation, typer.Option(help="Whose methods run in a process
                                                  "and files: those that are not ours, or all.")]
 
 
+RL = ("torch", "stable_baselines3", "sb3_contrib", "yaml")
+"""What the extra rl installs for training and for trained agents."""
+
+
 class clear_errors:
-    """Turn a ValueError about an argument, or the loss of a process, into a message instead of a traceback."""
+    """Turn a ValueError about an argument, the loss of a process, or the want of an extra into a message instead of a
+    traceback."""
 
     def __enter__(self) -> None:
         pass
@@ -49,6 +54,9 @@ class clear_errors:
     def __exit__(self, kind: type | None, error: BaseException | None, _: object) -> None:
         if isinstance(error, WorkerLost):
             typer.echo(error, err=True)
+            raise typer.Exit(1) from error
+        if isinstance(error, ModuleNotFoundError) and (error.name or "").split(".")[0] in RL:
+            typer.echo(f"training and trained agents need the extra rl, pip install 'eitbench[rl]': {error}", err=True)
             raise typer.Exit(1) from error
         if isinstance(error, ValueError):
             raise typer.BadParameter(str(error)) from error

@@ -63,10 +63,11 @@ def list_() -> None:
         typer.echo(f"  {name:40} {board_of(env):10}  lag {env.lag}, {scenario.n_steps - scenario.warm_up} scored of "
                    f"{scenario.n_steps} states, {env.action_space.shape[0]} numbers each")  # type: ignore[index]
     for name in INJECTION:
-        rules = gym.make(name).unwrapped.rules  # type: ignore[attr-defined]
+        core = gym.make(name).unwrapped.core  # type: ignore[attr-defined]
+        rules = core.rules
         what = f"{len(rules.pairs)} electrode pairs" if rules.limit is None else f"{rules.limit} currents"
         allowed = "" if rules.budget is None else f", {rules.budget} of them allowed"
-        typer.echo(f"  {name:40} injection   {what}, {rules.scenario.n_steps} injections{allowed}")
+        typer.echo(f"  {name:40} injection   {what}, {core.length} injections{allowed}")
     typer.echo("baselines")
     for name in own_baselines():
         baseline = load_baseline(name)
@@ -167,7 +168,7 @@ def policies(
     policy: Annotated[list[str] | None, typer.Option(
         help="Name of one of ours, the path of your own .py file, or of an agent's model.zip; may be repeated. "
              "Default: all of ours.")] = None,
-    seeds: Annotated[str, typer.Option(help="Episodes, such as dev:0-49 or test:0-49.")] = "test:0-49",
+    seeds: Annotated[str | None, typer.Option(help="Episodes, such as dev:0-49. Default: those of the boards.")] = None,
     estimator: Annotated[str, typer.Option(help="full: the exact filter, for scores; reduced: that of training.")] = (
         "full"),
     isolate: Isolate = Isolation.others,
@@ -188,7 +189,8 @@ def policies(
     from eitbench.leaderboard.suites import policy_jobs
     from eitbench.seeds import parse_seeds
     with clear_errors():
-        todo = policy_jobs([env], policy or [], parse_seeds(seeds), estimator, isolate=isolate)
+        todo = policy_jobs([env], policy or [], None if seeds is None else parse_seeds(seeds), estimator,
+                           isolate=isolate)
         before = results_in(records) if records else []
     store = EpisodeStore(out)
     with clear_errors():
@@ -207,7 +209,8 @@ def submit(
     policy: Annotated[str | None, typer.Option(
         help="The same of an injection policy, or the path of a trained agent's model.zip. Without any method: all of "
              "ours, by default in all environments.")] = None,
-    seeds: Annotated[str | None, typer.Option(help="Test episodes, as in test:0-9. Default: the full suite's.")] = None,
+    seeds: Annotated[str | None, typer.Option(help="Test episodes, as in test:0-9. Default: those of the "
+                                                   "boards.")] = None,
     official: Annotated[bool, typer.Option("--official", help="For maintainers: a run of theirs.")] = False,
     isolate: Isolate = Isolation.others,
     jobs: Jobs = CORES,
@@ -291,7 +294,8 @@ def render(
     env: Annotated[str, typer.Option(help="Environment id.")] = "eitbench/Pipe2D-v0",
     baseline: Annotated[str, typer.Option(help="Name of one of ours, or the path of a .py file.")] = "kalman_filter",
     policy: Annotated[str | None, typer.Option(
-        help="The same of an injection policy, or of an agent's model.zip, where injections are asked for.")] = None,
+        help="The same of an injection policy, or of an agent's model.zip, in place of a baseline where injections are "
+             "asked for.")] = None,
     seed: Annotated[str, typer.Option(help="The episode, such as dev:0.")] = "dev:0",
     step: Annotated[int | None, typer.Option(help="Only this state t, as a PNG.")] = None,
     every: Annotated[int, typer.Option(min=1, help="Draw one state in so many.")] = 1,
@@ -299,8 +303,11 @@ def render(
         "results/episode.gif"),
 ) -> None:
     """Draw an episode: truth, estimate, its spread, electrodes and the injected pair."""
+    from eitbench.envs import INJECTION
     from eitbench.leaderboard.animate import animate
     with clear_errors():
+        if env in INJECTION and policy is None:
+            raise ValueError(f"policy must be given for {env}, which asks for injections")
         typer.echo(f"wrote {animate(env, policy or baseline, seed, step, out, every=every)}")
 
 
@@ -315,8 +322,7 @@ def reproduce(
     """Draw a figure of the thesis from our data, and say what agrees and what differs."""
     from eitbench.seeds import parse_seeds
     with clear_errors():
-        numbers = None if seeds is None else parse_seeds(seeds)
-    path, remark = FIGURES[name.value](numbers, jobs, out)
+        path, remark = FIGURES[name.value](None if seeds is None else parse_seeds(seeds), jobs, out)
     typer.echo(f"wrote {path}\n{remark}")
 
 

@@ -17,7 +17,7 @@ from eitbench.leaderboard import run, store, suites
 from eitbench.leaderboard.baselines import own_baselines
 from eitbench.seeds import parse_seeds
 
-PIPE = "eitbench/Pipe2D-v0"
+PIPE, INJECTION = "eitbench/Pipe2D-v0", "eitbench/Pipe2DInjection-v0"
 COMMANDS = ("list", "run", "bank", "train", "policies", "submit", "verify", "held-out", "leaderboard", "compare",
             "render", "reproduce")
 TINY = {"mean_velocity": 45.0, "scored_steps": 3, "electrodes_per_wall": 2, "frame": 2}
@@ -193,8 +193,12 @@ def test_module_can_be_run(monkeypatch, capsys):
     (["render", "--seed", "dev:x"], "seeds must look like"),
     (["render", "--step", "3"], "out must end in .png with step"),
     (["render", "--baseline", "fixed_interval_smoother"], "plays smoothing, but eitbench/Pipe2D-v0 is a filter"),
+    (["render", "--env", INJECTION], f"policy must be given for {INJECTION}"),
+    (["render", "--env", INJECTION, "--policy", "random_pair", "--step", "1", "-o", "a.png"],
+     "step must be an integer of at least 3 and at most 5, got 1"),
     (["reproduce", "fig9.9"], "fig5.4"),
     (["reproduce", "fig5.4", "--seeds", "exam:1"], "seeds must name"),
+    (["reproduce", "injection", "--seeds", "exam:1"], "seeds must name"),
     (["rnu"], "No such command"),
 ])
 def test_mistakes_are_explained(arguments, message, tmp_path):
@@ -207,3 +211,11 @@ def test_mistakes_are_explained(arguments, message, tmp_path):
     assert code == 2 and said == ""
     assert message in complaint and "Traceback" not in complaint
     assert not (tmp_path / "results").exists() and not (tmp_path / "nothing").exists()
+
+
+def test_a_missing_extra_is_named(monkeypatch, tmp_path):
+    """Without what training needs, exit code 1 and the name of what to install."""
+    monkeypatch.setitem(sys.modules, "yaml", None)
+    code, said, complaint = eitbench("train", "--env", INJECTION)
+    assert code == 1 and said == "" and "need the extra rl, pip install 'eitbench[rl]'" in complaint
+    assert not (tmp_path / "results").exists()

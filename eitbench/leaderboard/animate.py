@@ -51,15 +51,16 @@ def animate(environment: str, method: str, seed: str, step: int | None, path: Pa
         if environment in INJECTION:
             env = gym.make(environment, disable_env_checker=True, observation="raw", estimator="full",
                                 render_mode="rgb_array").unwrapped
-            first, last, states = env.scenario.warm_up + 1, env.scenario.n_steps, inject(env, loaded, seeds[0])
+            begin, states = env.core.first + 1, inject(env, loaded, seeds[0])
         else:
             env = played.make(render_mode="rgb_array")
             if board_of(env) not in loaded.boards:
                 raise ValueError(f"baseline {loaded.name} plays {', '.join(loaded.boards)}, but {environment} is a "
                                  f"{board_of(env)} environment")
-            first, last, states = env.task.warm_up + 1, env.task.n_steps, play(env, loaded, seeds[0])
+            begin, states = 1, play(env, loaded, seeds[0])
+        first, last = env.scenario.warm_up + 1, env.scenario.n_steps
         if step is not None:
-            first = last = _check.integer("step", step, low=1, high=last)
+            first = last = _check.integer("step", step, low=begin, high=last)
         frames = []
         for t, *_ in tqdm(states, total=last, desc="drawing", unit="state", disable=None):
             if first <= t <= last and (t - first) % every == 0:

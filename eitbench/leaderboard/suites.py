@@ -41,7 +41,8 @@ def jobs(suite: str, environments: list[str], baselines: list[str], seeds: list[
     for baseline in baselines:
         find_baseline(baseline)
     todo, names = [], dict[str, str]()
-    for name in environments or (QUICK if suite == "quick" else ESTIMATION):
+    environments = environments or list(QUICK if suite == "quick" else ESTIMATION)
+    for name in environments:
         environment = Environment(name)
         env = environment.make()
         board, slow = board_of(env), _expensive(env)
@@ -62,7 +63,7 @@ def jobs(suite: str, environments: list[str], baselines: list[str], seeds: list[
     _distinct(names)
     if not todo:
         raise ValueError(f"none of the baselines {', '.join(baselines)} plays any of the environments "
-                         f"{', '.join(environments or QUICK)}; see `eitbench list`")
+                         f"{', '.join(environments)}; see `eitbench list`")
     return todo
 
 
