@@ -17,8 +17,8 @@ QUICK = ("eitbench/Pipe2D-v0", "eitbench/Pipe2DFixedLag-v0", "eitbench/Pipe2DSmo
 """What the quick suite runs; the full one runs all that ask for estimates."""
 SEEDS = {"quick": "test:0-3", "full": "test:0-9"}
 POLICY_SEEDS = {"eitbench/Pipe2DInjectionFaults-v0": "test:0-49", "eitbench/Pipe2DInjectionBudget-v0": "test:0-49",
-                "eitbench/Pipe2DInjectionFlow-v0": "test:0-5"}
-"""Competitions have many; where the estimator inside takes a minute an episode there are few. Others: test:0-9."""
+                "eitbench/Pipe2DInjectionFlow-v0": "test:0-29"}
+"""Competitions have many, fewer where the estimator inside takes a minute an episode. Others: test:0-9."""
 FEWER_SEEDS = {"velocity": "test:0-5", "3d": "test:0-5"}
 """In the full suite, where an episode takes a minute a method and more: with the flow asked for too, and in 3D. With
 fewer than six there would be no intervals and no ranks."""
