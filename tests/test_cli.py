@@ -4,6 +4,7 @@ import json
 import re
 import runpy
 import sys
+from pathlib import Path
 
 import gymnasium as gym
 import pytest
@@ -17,6 +18,7 @@ from eitbench.leaderboard import run, store, suites
 from eitbench.leaderboard.baselines import own_baselines
 from eitbench.seeds import parse_seeds
 
+ROOT = Path(__file__).parent.parent
 PIPE, INJECTION = "eitbench/Pipe2D-v0", "eitbench/Pipe2DInjection-v0"
 COMMANDS = ("list", "run", "bank", "train", "policies", "submit", "verify", "held-out", "leaderboard", "compare",
             "render", "reproduce")
@@ -169,6 +171,23 @@ def test_module_can_be_run(monkeypatch, capsys):
     with pytest.raises(SystemExit) as done:
         runpy.run_module("eitbench.cli", run_name="__main__")
     assert done.value.code == 0 and "leaderboard" in capsys.readouterr().out
+
+
+def test_documented_commands_are_commands():
+    """Every `eitbench …` of our documents, on a line of its own or within one, names a command and options that exist;
+    so says their help."""
+    named, helps = dict[str, set[str]](), dict[str, str]()
+    for path in (ROOT / "README.md", ROOT / "leaderboards" / "README.md", *(ROOT / "docs").glob("*.md")):
+        text = path.read_text(encoding="utf-8").replace("\\\n", "")
+        blocks = re.findall(r"```sh\n(.*?)```", text, re.DOTALL)
+        lines = re.findall(r"^.*?\beitbench (.*)$", "\n".join(blocks), re.MULTILINE)
+        for words in lines + re.findall(r"`eitbench ([^`]*)`", text):
+            command, *rest = words.split("#")[0].split()
+            named.setdefault(command, set()).update(word for word in rest if word.startswith("--"))
+            helps.setdefault(command, eitbench(command, "--help")[1])
+    assert named.keys() == set(COMMANDS)
+    for command, options in named.items():
+        assert all(re.search(rf"{option}\b", helps[command]) for option in options), (command, options)
 
 
 # -- mistakes ---------------------------------------------------------------------------------------------------------
