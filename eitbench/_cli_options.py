@@ -56,7 +56,7 @@ class clear_errors:
             typer.echo(error, err=True)
             raise typer.Exit(1) from error
         if isinstance(error, ModuleNotFoundError) and (error.name or "").split(".")[0] in RL:
-            typer.echo(f"training and trained agents need the extra rl, pip install 'eitbench[rl]': {error}", err=True)
+            typer.echo(f"training and trained agents need the extra rl, pip install -e '.[rl]': {error}", err=True)
             raise typer.Exit(1) from error
         if isinstance(error, ValueError):
             raise typer.BadParameter(str(error)) from error
