@@ -62,14 +62,12 @@ class Settled:
 
 
 def rows() -> Iterator[Row]:
-    import gains  # which take their problem from here
-    import greedy
+    import gains  # which takes its problem from here
     for cells in CELLS:
         settled = settle(problem(cells))
         yield against_textbook(settled)
         yield from against_filterpy(settled)
         yield from against_dynamax(settled)
-    yield from greedy.rows(settled)
     yield from gains.rows()
     yield memory(CELLS[0], measured=True)
     yield memory(CELLS[-1], measured=False)

@@ -19,7 +19,7 @@ from eitbench._files import write_atomically
 
 HERE = Path(__file__).parent
 SECTIONS = {"forward": "Complete electrode model", "kernels": "What the compiled kernels buy",
-            "filtering": "Kalman filter and smoother", "stepping": "Environments",
+            "filtering": "Kalman filter and smoother", "greedy": "Choosing the injection", "stepping": "Environments",
             "simulation": "Simulation of new episodes", "scaling": "Growth with size"}
 """name of a module here, with `rows()` or `curves()` → heading"""
 
