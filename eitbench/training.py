@@ -32,6 +32,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
+from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from eitbench import _check
@@ -118,6 +119,7 @@ def read_config(path: str | Path) -> Config:
         raise ValueError(f"config {str(path)!r} must hold what `Config` asks for: {error}") from None
 
 
+@threadpool_limits.wrap(limits=1)              # with more, rounding and so what is learnt depends on how many there are
 def train(env: str, algo: str, config: Config, seed: int, folder: Path, kwargs: dict[str, Any] | None = None) -> Path:
     """Train an agent; returns the path of its model.
 

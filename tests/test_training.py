@@ -7,6 +7,7 @@ from zipfile import ZIP_DEFLATED, ZipFile
 import gymnasium as gym
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_limits
 
 from eitbench import training
 from eitbench.envs.injection_core import Rules
@@ -155,11 +156,14 @@ def test_a_finished_run_stays_as_it_is(tmp_path):
 
 
 def test_the_same_seed_learns_the_same(tmp_path):
-    """Two runs end with the same networks, another seed with others."""
-    def networks(seed, name):
-        model = training.algorithm_of("ppo").load(train(NAME, "ppo", TINY, seed, tmp_path / name, SHORT))
+    """Two runs end with the same networks, on however many threads; another seed with others."""
+    config = replace(TINY, n_envs=32, total_steps=256)            # so many that products are worth threads
+
+    def networks(seed, name, threads):
+        with threadpool_limits(threads):
+            model = training.algorithm_of("ppo").load(train(NAME, "ppo", config, seed, tmp_path / name, SHORT))
         return np.concatenate([p.detach().numpy().ravel() for p in model.policy.parameters()])
-    first, again, other = networks(1, "a"), networks(1, "b"), networks(2, "c")
+    first, again, other = networks(1, "a", 1), networks(1, "b", 2), networks(2, "c", 1)
     assert (first == again).all() and (first != other).any()
 
 
