@@ -10,6 +10,7 @@ import pytest
 from threadpoolctl import threadpool_limits
 
 from eitbench import training
+from eitbench.envs.injection import InjectionVectorEnv
 from eitbench.envs.injection_core import Rules
 from eitbench.envs.sb3 import InjectionVecEnv
 from eitbench.leaderboard.agents import _mark, load_agent
@@ -165,6 +166,18 @@ def test_the_same_seed_learns_the_same(tmp_path):
         return np.concatenate([p.detach().numpy().ravel() for p in model.policy.parameters()])
     first, again, other = networks(1, "a", 1), networks(1, "b", 2), networks(2, "c", 1)
     assert (first == again).all() and (first != other).any()
+
+
+def test_an_estimate_that_is_not_finite_shows(monkeypatch):
+    """States that are not scored are left out of an evaluation, a scored one that is not a number is not."""
+    class Still:
+        def predict(self, observation, **_):
+            return np.zeros(2, dtype=int), None
+
+    errors, factors = InjectionVectorEnv.errors, iter([[1, 1], [1, 1], [1, 1], [1, np.nan]])
+    assert np.isfinite(training.evaluation(NAME, SHORT, TINY)(Still())).all()
+    monkeypatch.setattr(InjectionVectorEnv, "errors", lambda self: errors(self) * next(factors))
+    assert list(np.isnan(training.evaluation(NAME, SHORT, TINY)(Still()))) == [False, True]
 
 
 def test_a_pupil_learns_what_its_teacher_says(tmp_path):
