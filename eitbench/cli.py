@@ -94,9 +94,8 @@ def run(
     from eitbench.leaderboard import suites
     from eitbench.leaderboard.run import run_jobs
     from eitbench.leaderboard.store import EpisodeStore
-    from eitbench.seeds import parse_seeds
     with clear_errors():
-        todo = suites.jobs(suite.value, env or [], baseline or [], None if seeds is None else parse_seeds(seeds),
+        todo = suites.jobs(suite.value, env or [], baseline or [], _numbers(seeds),
                            isolate=isolate)
         run_jobs(todo, EpisodeStore(out), n_jobs=jobs, backend=backend, command=_command())
         _report(out)
@@ -187,10 +186,8 @@ def policies(
     from eitbench.leaderboard.run import run_jobs
     from eitbench.leaderboard.store import EpisodeStore, results_in, unplayed
     from eitbench.leaderboard.suites import policy_jobs
-    from eitbench.seeds import parse_seeds
     with clear_errors():
-        todo = policy_jobs([env], policy or [], None if seeds is None else parse_seeds(seeds), estimator,
-                           isolate=isolate)
+        todo = policy_jobs([env], policy or [], _numbers(seeds), estimator, isolate=isolate)
         before = results_in(records) if records else []
     store = EpisodeStore(out)
     with clear_errors():
@@ -225,11 +222,10 @@ def submit(
     from eitbench.leaderboard.records import read_record
     from eitbench.leaderboard.store import EpisodeStore
     from eitbench.leaderboard.submit import submit
-    from eitbench.seeds import parse_seeds
     with clear_errors():
         if baseline and policy:
             raise ValueError("one of --baseline and --policy may be given, got both")
-        for path in submit(baseline or policy, env or [], None if seeds is None else parse_seeds(seeds),
+        for path in submit(baseline or policy, env or [], _numbers(seeds),
                            EpisodeStore(out), to, policy=policy is not None, official=official, isolate=isolate,
                            n_jobs=jobs, backend=backend, command=_command()):
             record = read_record(path)
@@ -320,10 +316,15 @@ def reproduce(
     out: Out = Path("results/figures"),
 ) -> None:
     """Draw a figure of the thesis from our data, and say what agrees and what differs."""
-    from eitbench.seeds import parse_seeds
     with clear_errors():
-        path, remark = FIGURES[name.value](None if seeds is None else parse_seeds(seeds), jobs, out)
+        path, remark = FIGURES[name.value](_numbers(seeds), jobs, out)
     typer.echo(f"wrote {path}\n{remark}")
+
+
+def _numbers(seeds: str | None) -> list[int] | None:
+    """What is asked for; None if nothing is."""
+    from eitbench.seeds import parse_seeds
+    return None if seeds is None else parse_seeds(seeds)
 
 
 def _report(out: Path) -> None:
