@@ -7,11 +7,11 @@ from typing import Annotated
 
 import typer
 
-from eitbench._cli_options import Isolate, Isolation, clear_errors
+from eitbench._cli_options import CORES, Backend, Backends, Isolate, Isolation, Jobs, clear_errors
 
 
 def verify(
-    record: Annotated[Path, typer.Argument(help="A record's file.")],
+    record: Annotated[Path | None, typer.Argument(help="A record's file.")] = None,
     baseline: Annotated[str | None, typer.Option(help="The method's file, if it is not one of ours.")] = None,
     policy: Annotated[str | None, typer.Option(help="The same of an injection policy.")] = None,
     episodes: Annotated[int, typer.Option(min=0, help="How many are played again.")] = 3,
@@ -22,11 +22,23 @@ def verify(
     held_out: Annotated[int, typer.Option(
         "--held-out", min=0, help="For maintainers: play so many held-out episodes too, and compare the gains.")] = 0,
     salt_file: Annotated[Path | None, typer.Option(help="From which they follow; see `eitbench held-out`.")] = None,
+    every: Annotated[bool, typer.Option("--all", help="Every official record of a folder; resumes.")] = False,
+    records: Annotated[Path, typer.Option(help="With --all: the folder of the records.")] = Path(
+        "leaderboards/results"),
+    env: Annotated[list[str] | None, typer.Option(help="With --all: only this environment; may be repeated.")] = None,
+    jobs: Jobs = CORES,
+    backend: Backends = Backend.loky,
+    out: Annotated[Path, typer.Option("--out", "-o", help="With --all: where what came out is kept.")] = Path(
+        "results/verify"),
 ) -> None:
     """Play episodes of a record again and say whether it is true: exit status 0 if so, 1 if not.
 
     They are simulated anew, whatever the cache folder holds.
     """
+    if every:
+        return _verify_all(records, env or [], out, episodes, seed or 0, tolerance, isolate, jobs, backend)
+    if record is None:
+        raise typer.BadParameter("a record's file must be given, or --all")
     import secrets
 
     from eitbench.leaderboard import held_out as beyond
@@ -59,6 +71,26 @@ def verify(
     if differences:
         raise typer.Exit(1)
     typer.echo(f"{record.name}: what was played again is as it says")
+
+
+def _verify_all(folder: Path, environments: list[str], out: Path, episodes: int, seed: int, tolerance: float,
+                isolate: str, jobs: int, backend: str) -> None:
+    from eitbench.leaderboard.records import read_record
+    from eitbench.leaderboard.verify_all import by_environment, verify_all
+    with clear_errors():
+        read = {path: read_record(path) for path in sorted(folder.glob("*.json"))}
+        chosen = [path for path, record in read.items()
+                  if record["official"] and (not environments or record["environment"]["id"] in environments)]
+        if not chosen:
+            raise ValueError(f"records must be a folder with official records, got {folder}")
+        rows = verify_all(chosen, out, episodes=episodes, seed=seed, isolate=isolate, n_jobs=jobs, backend=backend)
+    typer.echo(by_environment(rows, tolerance))
+    wrong = rows[(rows["difference"] > tolerance) | (rows["problem"] != "")]
+    for _, row in wrong.iterrows():
+        typer.echo(f"differs: {row['record']}, {row['episode']}: "
+                   f"{row['problem'] or row['score'] + ' by ' + format(row['difference'], '.2g')}", err=True)
+    if len(wrong):
+        raise typer.Exit(1)
 
 
 def held_out(

@@ -87,7 +87,7 @@ def verify(record: dict[str, Any], job: Job, *, episodes: int = 3, seed: int = 0
     rows, differences = [], list[str]()
     for said in (record["episodes"][i] for i in sorted(drawn)):
         again = json.loads(json.dumps(run_episode(job._replace(seed=parse_seeds(said["seed"])[0]))[0]))
-        wrong = {} if said["status"] == again["status"] == "failed" else _off(said, again)
+        wrong = differences_of(said, again)
         differences += [f"{said['seed']}: {_difference(name, said, again)}"
                         for name, off in wrong.items() if off > tolerance]
         again["environment"]["name"] = record["environment"]["name"]             # arguments may stand in another order
@@ -124,10 +124,12 @@ def _own(record: dict[str, Any]) -> str | None:
     return next((own for own in [*own_policies(), *own_agents(id)] if load_policy(own).name == name), None)
 
 
-def _off(said: dict[str, Any], again: dict[str, Any]) -> dict[str, float]:
-    """Score -> relative difference."""
+def differences_of(said: dict[str, Any], again: dict[str, Any]) -> dict[str, float]:
+    """Score -> relative difference between two results of an episode."""
     if said["status"] != again["status"]:
         return {"status": np.inf}
+    if said["status"] == "failed":
+        return {}
     off = {name: _relative([said["scores"].get(name)], [again["scores"].get(name)])
            for name in sorted({*said["scores"], *again["scores"]} - {*UNCERTAIN})}
     return off | {"step_errors": _relative(said["step_errors"], again["step_errors"])}
