@@ -9,7 +9,7 @@ import numpy as np
 
 from eitbench import Estimate, Task
 from eitbench.estimation import best_homogeneous, gauss_newton
-from eitbench.physics.fem import stiffness_matrix
+from eitbench.numerics.fem import stiffness_matrix
 
 ALPHA = 0.177  # 1/(mol/m³): weighs the gradient of c/(1 mol/m³) against voltages in noise standard deviations
 

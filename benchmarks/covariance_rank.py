@@ -12,9 +12,9 @@ import time
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from eitbench.data.recordings import cycle_voltages, recording, score_operators
 from eitbench.envs.pipe3d import Pipe3DEnv
 from eitbench.estimation import DenseKalmanFilter, FirstFrame, LinearisedObservations, table_5_1
-from eitbench.recordings import cycle_voltages, recording, score_operators
 from eitbench.scoring import relative_error
 
 TOLERANCES = (1e-6, 1e-4, 1e-3, 1e-2, 1e-1)

@@ -20,7 +20,7 @@ from eitbench.estimation.kalman import KalmanFilter, LinearisedObservations, Obs
 from eitbench.estimation.parameters import table_5_1
 from eitbench.estimation.smoother import _backwards, fixed_interval_smoother
 from eitbench.physics.flow import PlaneChannelFlow
-from eitbench.scenarios import Pipe2D
+from eitbench.worlds import Pipe2D
 
 CELLS = ((44, 10), (62, 15), (80, 20))
 """along and across the pipe: 495, 1008 and 1701 nodes"""

@@ -14,10 +14,10 @@ import skfem
 from common import Row, ceilings, compare, of_flops, peer, quantity
 from solvers import entry_by_entry, pair_by_pair, refactorisations, splu_and_solves
 
+from eitbench.numerics.fem import element, to_skfem
+from eitbench.numerics.mesh import Mesh, graded_pipe_mesh
 from eitbench.physics.cem import CompleteElectrodeModel
-from eitbench.physics.fem import element, to_skfem
-from eitbench.physics.mesh import Mesh, graded_pipe_mesh
-from eitbench.scenarios import Pipe2D
+from eitbench.worlds import Pipe2D
 
 SIZES = ((5, 13), (7, 20), (11, 32))
 """cells at an electrode and across: 4,300, 9,200 and 23,000 unknowns"""

@@ -16,13 +16,13 @@ import scipy.sparse as sp
 from threadpoolctl import threadpool_limits
 
 from eitbench import simulate
+from eitbench.data.seeds import parse_seeds
+from eitbench.numerics.fem import mass_matrix
+from eitbench.numerics.mesh import graded_pipe_mesh
 from eitbench.physics.cem import CompleteElectrodeModel
-from eitbench.physics.fem import mass_matrix
-from eitbench.physics.mesh import graded_pipe_mesh
 from eitbench.physics.observation import ObservationModel
-from eitbench.scenarios import Pipe2D
-from eitbench.scenarios.base import Discretisation
-from eitbench.seeds import parse_seeds
+from eitbench.worlds import Pipe2D
+from eitbench.worlds.base import Discretisation
 
 SEEDS, STATES = "train:0-3", range(20, 99, 6)
 

@@ -12,10 +12,10 @@ from forward_error import _transport_error
 from threadpoolctl import threadpool_limits
 
 from eitbench import simulate
+from eitbench.numerics.round import round_pipe_mesh
 from eitbench.physics.cem import CompleteElectrodeModel
 from eitbench.physics.observation import ObservationModel
-from eitbench.physics.round import round_pipe_mesh
-from eitbench.scenarios import Pipe3D
+from eitbench.worlds import Pipe3D
 
 REFERENCE = ((5, 6), 6, (2.5, 1.75, 2.5), 2)
 MESHES = {"P1": ((3, 4), 6, (2.0, 1.5, 2.0), 1), "P1, finer": ((4, 6), 7, (2.0, 1.5, 2.0), 1),

@@ -10,9 +10,9 @@ import numpy as np
 from common import Row, compare, of_flops
 from filtering import CELLS, SCENARIO, problem, same, settle
 
-from eitbench.envs.operator import electrode_pairs
 from eitbench.estimation.design import independent_rows, pair_gains, pair_tables
-from eitbench.physics.fem import mass_matrix
+from eitbench.estimation.onboard.operator import electrode_pairs
+from eitbench.numerics.fem import mass_matrix
 
 
 def rows() -> Iterator[Row]:

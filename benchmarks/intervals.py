@@ -14,10 +14,10 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from eitbench._files import shipped
-from eitbench.leaderboard import statistics
-from eitbench.leaderboard.records import read_records
-from eitbench.leaderboard.statistics import interquartile_mean, mean_over_environments, stratified_bootstrap
-from eitbench.leaderboard.summary import scores_by_seed
+from eitbench.bench import statistics
+from eitbench.bench.records import read_records
+from eitbench.bench.statistics import interquartile_mean, mean_over_environments, stratified_bootstrap
+from eitbench.report.summary import scores_by_seed
 
 SPREAD = 0.8
 """of the logarithm of a lognormal number"""

@@ -11,7 +11,7 @@ from forward import conductivities, pipe_mesh
 from eitbench.physics.cem import CompleteElectrodeModel
 from eitbench.physics.flow import PlaneChannelFlow
 from eitbench.physics.transport import ConvectionDiffusion
-from eitbench.scenarios import Pipe2D
+from eitbench.worlds import Pipe2D
 
 SCENARIO = Pipe2D()
 BACKENDS = ("compiled", "scipy")

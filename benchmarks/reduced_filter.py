@@ -11,11 +11,11 @@ import json
 from tqdm import tqdm
 
 from eitbench._files import shipped
-from eitbench.leaderboard.records import read_records
-from eitbench.leaderboard.run import Environment, Job, run_episode
-from eitbench.leaderboard.summary import mean_and_interval, rounded, scores_by_seed, seed_ranges
-from eitbench.leaderboard.verify import job_of
-from eitbench.seeds import parse_seeds
+from eitbench.bench.records import read_records
+from eitbench.bench.run import Environment, Job, run_episode
+from eitbench.bench.verify import job_of
+from eitbench.data.seeds import parse_seeds
+from eitbench.report.summary import mean_and_interval, rounded, scores_by_seed, seed_ranges
 
 PLAYED = {"Pipe2DInjection": ("best_pair", "random_pair"),
           "Pipe2DInjectionFaults": ("fault_aware", "ppo_seed0", "schedule"),

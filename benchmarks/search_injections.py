@@ -21,8 +21,8 @@ from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 import eitbench.envs
+from eitbench.data.seeds import SPLITS
 from eitbench.envs.injection import InjectionVectorEnv
-from eitbench.seeds import SPLITS
 
 BEST, LONGEST = 12, 4
 RESTARTS, VALUES = 6, (-1.0, -0.5, 0.0, 0.5, 1.0)

@@ -14,12 +14,12 @@ import scipy.sparse as sp
 from common import Row, compare, quantity
 from solvers import refactorisations
 
-from eitbench.bank import recording_bytes
-from eitbench.episodes import simulate, simulate_together, truth_discretisation
+from eitbench.data.bank import recording_bytes
+from eitbench.data.episodes import simulate, simulate_together, truth_discretisation
 from eitbench.physics.cem import CompleteElectrodeModel
 from eitbench.physics.flow import PlaneChannelFlow
 from eitbench.physics.transport import ConvectionDiffusion
-from eitbench.scenarios import Pipe2D
+from eitbench.worlds import Pipe2D
 
 SCENARIO = Pipe2D()
 BANK = 256
@@ -61,6 +61,6 @@ def bank(jobs: int) -> float:
     """Seconds that the command takes for a bank in an empty cache, its start included."""
     with tempfile.TemporaryDirectory() as empty:
         begin = time.perf_counter()
-        command = [sys.executable, "-m", "eitbench.cli", "bank", "--seeds", f"train:0-{BANK - 1}", "-j", str(jobs)]
+        command = [sys.executable, "-m", "eitbench.cli.app", "bank", "--seeds", f"train:0-{BANK - 1}", "-j", str(jobs)]
         subprocess.run(command, env=os.environ | {"EITBENCH_CACHE": empty}, check=True, capture_output=True)
         return time.perf_counter() - begin

@@ -15,8 +15,8 @@ import numpy as np
 from common import Row, ceilings, in_fresh_process, peak_growth
 
 import eitbench  # noqa: F401 (registers)
-from eitbench.bank import fill
-from eitbench.scenarios import Pipe2D
+from eitbench.data.bank import fill
+from eitbench.worlds import Pipe2D
 
 ESTIMATION, INJECTION = "eitbench/Pipe2D-v0", "eitbench/Pipe2DInjection-v0"
 EPISODES = 64

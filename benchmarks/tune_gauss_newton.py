@@ -8,12 +8,12 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from eitbench import make_task, simulate
+from eitbench.data.recordings import score_operators
+from eitbench.data.seeds import parse_seeds
 from eitbench.estimation import best_homogeneous, gauss_newton
-from eitbench.physics.fem import stiffness_matrix
-from eitbench.recordings import score_operators
-from eitbench.scenarios import Pipe2D
+from eitbench.numerics.fem import stiffness_matrix
 from eitbench.scoring import relative_error
-from eitbench.seeds import parse_seeds
+from eitbench.worlds import Pipe2D
 
 SEEDS, STATES = "train:0-3", (30, 60, 90)
 ALPHAS = 2.0 ** np.arange(-5, 2.5, 0.5)

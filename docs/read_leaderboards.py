@@ -5,7 +5,7 @@ Without a folder these are the published records, leaderboards/results. Each ste
 
 import sys
 
-from eitbench.leaderboard import load
+from eitbench.bench import load
 
 # One row for each score of each episode; of another version of the environments' code, none.
 frame = load(*sys.argv[1:])

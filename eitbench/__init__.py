@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 from eitbench.envs import register_all
 
 if TYPE_CHECKING:
-    from eitbench.episodes import Episode, simulate
-    from eitbench.task import Estimate, Task, make_task
+    from eitbench.data.episodes import Episode, simulate
+    from eitbench.worlds.task import Estimate, Task, make_task
 
 __version__ = "0.1.0"
 __all__ = ["Episode", "Estimate", "Task", "make_task", "simulate"]
@@ -21,11 +21,11 @@ register_all()
 def __getattr__(name: str) -> Any:
     """Load the three nouns, their makers and the leaderboards on first use."""
     if name in ("Estimate", "Task", "make_task"):
-        from eitbench import task
+        from eitbench.worlds import task
         return getattr(task, name)
     if name in ("Episode", "simulate"):
-        from eitbench import episodes
+        from eitbench.data import episodes
         return getattr(episodes, name)
     if name == "leaderboard":
-        return import_module("eitbench.leaderboard")
+        return import_module("eitbench.bench")
     raise AttributeError(f"module 'eitbench' has no attribute {name!r}")

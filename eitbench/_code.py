@@ -7,6 +7,8 @@ import hashlib
 from collections.abc import Iterable
 from pathlib import Path
 
+from eitbench._files import PACKAGE
+
 
 def code_digest(files: Iterable[Path]) -> str:
     """SHA-256 of these files, in this order, but for the docstrings of Python's: words may be mended without anything
@@ -16,8 +18,7 @@ def code_digest(files: Iterable[Path]) -> str:
 
 def package_files(*patterns: str) -> list[Path]:
     """Files of this package that match, in order."""
-    here = Path(__file__).parent
-    return sorted(file for pattern in patterns for file in here.glob(pattern))
+    return sorted(file for pattern in patterns for file in PACKAGE.glob(pattern))
 
 
 def _without_docstrings(file: Path) -> bytes:

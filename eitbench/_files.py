@@ -19,7 +19,10 @@ def write_atomically(path: Path, data: bytes) -> None:
         raise
 
 
+PACKAGE = Path(__file__).parent
+"""Where this package lies."""
+
+
 def shipped(name: str) -> Path:
     """A folder that comes with the package: within an installed one, beside it in a checkout."""
-    package = Path(__file__).parent
-    return package / name if (package / name).is_dir() else package.parent / name
+    return PACKAGE / name if (PACKAGE / name).is_dir() else PACKAGE.parent / name

@@ -5,8 +5,8 @@ import pytest
 import scipy.integrate
 from scipy.stats import norm
 
-from eitbench.physics.fem import mass_matrix
-from eitbench.physics.mesh import rectangle_mesh
+from eitbench.numerics.fem import mass_matrix
+from eitbench.numerics.mesh import rectangle_mesh
 from eitbench.scoring import (
     coverage,
     crps,

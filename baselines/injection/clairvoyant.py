@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from eitbench.envs.belief import Belief
+from eitbench.bench.policies import load_policy
+from eitbench.data.recordings import recording
 from eitbench.envs.injection_core import InjectionCore, Rules
-from eitbench.leaderboard.policies import load_policy
-from eitbench.recordings import recording
+from eitbench.estimation.onboard.belief import Belief
 
 NOTHING, CURRENTS = -1, -2
 """What plans say, besides the number of a pair, of a step where nothing is injected, or the best fixed currents."""

@@ -7,7 +7,7 @@ from dataclasses import fields
 from typing import Any, TypeVar
 
 from eitbench import _check
-from eitbench.scenarios.pipe2d import PROFILES
+from eitbench.worlds.pipe2d import PROFILES
 
 S = TypeVar("S")
 

@@ -11,15 +11,15 @@ import numpy as np
 from gymnasium import spaces
 
 from eitbench import _check
-from eitbench.recordings import cycle_voltages, outline, recording, step_error, velocity_error
-from eitbench.scenarios.base import Discretisation
-from eitbench.task import Task, lag_steps, make_task
+from eitbench.data.recordings import cycle_voltages, outline, recording, step_error, velocity_error
+from eitbench.worlds.base import Discretisation
+from eitbench.worlds.task import Task, lag_steps, make_task
 
 if TYPE_CHECKING:
-    from eitbench.episodes import Episode
-    from eitbench.physics.mesh import Mesh
+    from eitbench.data.episodes import Episode
+    from eitbench.numerics.mesh import Mesh
     from eitbench.physics.transport import ConvectionDiffusion
-    from eitbench.scenarios.base import Scenario
+    from eitbench.worlds.base import Scenario
 
 Observation = dict[str, np.ndarray]
 
@@ -88,7 +88,7 @@ class EstimationEnv(gym.Env[Observation, np.ndarray]):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None,
               ) -> tuple[Observation, dict[str, Any]]:
-        """Begin the episode with this seed (see `eitbench.seeds`), or without one a random training episode."""
+        """Begin the episode with this seed (see `eitbench.data.seeds`), or without one a random training episode."""
         super().reset(seed=seed)
         self._seed = int(self.np_random.integers(self.episodes)) if seed is None else seed
         self._entries = recording(self.scenario, self._seed)
@@ -147,7 +147,7 @@ class EstimationEnv(gym.Env[Observation, np.ndarray]):
 
     def reveal(self) -> Revealed:
         """This episode's record and flow; for references, never for agents."""
-        from eitbench.episodes import randomness
+        from eitbench.data.episodes import randomness
         if self._seed is None:
             raise gym.error.ResetNeeded("call reset() before reveal()")
         n_steps, told_nothing_wrong = self.scenario.n_steps, make_task(self.scenario, self.lag)
@@ -157,11 +157,11 @@ class EstimationEnv(gym.Env[Observation, np.ndarray]):
 
     def truth_mesh(self) -> Mesh:
         """The mesh of `truth`."""
-        from eitbench.episodes import truth_discretisation
+        from eitbench.data.episodes import truth_discretisation
         return truth_discretisation(self.scenario).transport.mesh
 
     def _episode(self, asked_by: str) -> Episode:
-        from eitbench.episodes import simulate
+        from eitbench.data.episodes import simulate
         if self._seed is None:
             raise gym.error.ResetNeeded(f"call reset() before {asked_by}()")
         return simulate(self.scenario, self._seed)

@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from eitbench.data.recordings import cycle_voltages, outline, recording, step_error, velocity_error
 from eitbench.envs.estimation import Observation, checked_actions, cycle_currents, estimation_spaces
 from eitbench.envs.lockstep import LockstepVectorEnv
-from eitbench.recordings import cycle_voltages, outline, recording, step_error, velocity_error
-from eitbench.task import lag_steps
+from eitbench.worlds.task import lag_steps
 
 if TYPE_CHECKING:
-    from eitbench.scenarios.base import Scenario
+    from eitbench.worlds.base import Scenario
 
 
 TOGETHER = 16

@@ -11,10 +11,10 @@ import numpy as np
 from gymnasium import spaces
 
 from eitbench import _check
+from eitbench.data.regions import region_of
 from eitbench.envs.injection_core import FURTHEST, InjectionCore, Rules, scaled
 from eitbench.envs.lockstep import LockstepVectorEnv
-from eitbench.regions import region_of
-from eitbench.task import Task, make_task
+from eitbench.worlds.task import Task, make_task
 
 if TYPE_CHECKING:
     from eitbench.envs.estimation import Observation
@@ -63,7 +63,7 @@ class InjectionEnv(gym.Env[Any, Any]):
         return make_task(self.scenario)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Begin the episode with this seed (see `eitbench.seeds`), or without one a random training episode."""
+        """Begin the episode with this seed (see `eitbench.data.seeds`), or without one a random training episode."""
         super().reset(seed=seed)
         self._seed = int(self.np_random.integers(self.episodes)) if seed is None else seed
         self._core.begin([self._seed])
@@ -89,8 +89,8 @@ class InjectionEnv(gym.Env[Any, Any]):
             return None
         if self._step == 0:
             raise gym.error.ResetNeeded("call reset() before render()")
+        from eitbench.data.episodes import simulate, truth_discretisation
         from eitbench.envs.rendering import draw_frame
-        from eitbench.episodes import simulate, truth_discretisation
         mean, spread, t = *self._core.estimate(), self._core.first + self._step - 1
         truth = simulate(self.scenario, self._seed).concentration[t].astype(float)
         return draw_frame(self.task, truth_discretisation(self.scenario).transport.mesh, truth, mean[0], spread[0],

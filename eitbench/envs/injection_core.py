@@ -10,17 +10,17 @@ import numpy as np
 from gymnasium import spaces
 
 from eitbench import _check
-from eitbench.envs.console import Console
-from eitbench.envs.joint_operator import JointFullOperator, JointReducedOperator
-from eitbench.envs.operator import PATCHES, FullOperator, Operator, electrode_pairs, pair_currents
-from eitbench.envs.reduced_operator import ReducedOperator
-from eitbench.recordings import outline, recording
-from eitbench.regions import integrals, score_mass
-from eitbench.scenarios.instrument import Faults, Instrument
+from eitbench.data.recordings import outline, recording
+from eitbench.data.regions import integrals, score_mass
+from eitbench.estimation.onboard.console import Console
+from eitbench.estimation.onboard.joint_operator import JointFullOperator, JointReducedOperator
+from eitbench.estimation.onboard.operator import PATCHES, FullOperator, Operator, electrode_pairs, pair_currents
+from eitbench.estimation.onboard.reduced_operator import ReducedOperator
+from eitbench.worlds.instrument import Faults, Instrument
 
 if TYPE_CHECKING:
     from eitbench.envs.estimation import Observation
-    from eitbench.scenarios.base import Scenario
+    from eitbench.worlds.base import Scenario
 
 FURTHEST = 5.0
 """Largest entry of a scaled observation."""

@@ -7,8 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_rgba_array
 
+from eitbench.numerics.mesh import Mesh
 from eitbench.physics.cem import CompleteElectrodeModel
-from eitbench.physics.mesh import Mesh
 
 RICH, POOR = "#e08e0b", "#2f6db5"
 _EYE = np.linalg.qr(np.array([[0.30, 0.0, 1.0], [0.22, 1.0, 0.0], [0.9, -0.3, -0.3]]).T)[0].T * [[-1.0], [-1.0], [-1.0]]

@@ -9,7 +9,7 @@ from gymnasium.utils import EzPickle
 from eitbench.envs.arguments import assumed_flow, with_fields
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.estimation_vector import EstimationVectorEnv
-from eitbench.scenarios import Pipe2D
+from eitbench.worlds import Pipe2D
 
 
 class Pipe2DEnv(EstimationEnv, EzPickle):
@@ -19,7 +19,7 @@ class Pipe2DEnv(EstimationEnv, EzPickle):
     Fluid streams through a straight 2D pipe, 40 cm long and 10 cm wide, at 4.5 m/s on average; slugs of higher and
     lower concentration enter at random. Sixteen electrodes on the walls, one current injection every 5 ms: while a
     frame of 16 injections is measured, the fluid moves on by 36 cm. From the voltages of each injection, and a model
-    of flow, estimate the concentration everywhere (Seppänen 2005, ch. 5; all numbers in `eitbench.scenarios.Pipe2D`).
+    of flow, estimate the concentration everywhere (Seppänen 2005, ch. 5; all numbers in `eitbench.worlds.Pipe2D`).
 
     The truth is computed on finer meshes and time steps than the model in ``env.unwrapped.task``, which holds all that
     an estimator may know.
@@ -52,8 +52,8 @@ class Pipe2DEnv(EstimationEnv, EzPickle):
 
     ## Starting state
 
-    The fluid has been flowing for one flush time. `reset(seed=s)` plays episode s (`eitbench.seeds`: train, dev and
-    test ranges); without a seed a random one of the first `episodes` training episodes. The first use of a seed
+    The fluid has been flowing for one flush time. `reset(seed=s)` plays episode s (`eitbench.data.seeds`: train,
+    dev and test ranges); without a seed a random one of the first `episodes` training episodes. The first use of a seed
     simulates its truth (about 2 s), which is then kept on disk; `eitbench bank` does so for many seeds ahead of time.
 
     ## Episode end

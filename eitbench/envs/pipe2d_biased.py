@@ -10,7 +10,7 @@ from eitbench import _check
 from eitbench.envs.arguments import assumed_flow, with_fields
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.estimation_vector import EstimationVectorEnv
-from eitbench.scenarios import Pipe2DBiasedVelocity
+from eitbench.worlds import Pipe2DBiasedVelocity
 
 
 class Pipe2DBiasedVelocityEnv(EstimationEnv, EzPickle):
@@ -19,7 +19,7 @@ class Pipe2DBiasedVelocityEnv(EstimationEnv, EzPickle):
 
     The pipe of `eitbench/Pipe2D-v0`, but the mean velocity that estimators are told, 4.5 m/s, is not the true one,
     which is drawn for each episode from 2.5 … 7 m/s (Seppänen 2005, 5.1.2, Figs 5.7 and 5.8; all numbers in
-    `eitbench.scenarios.Pipe2DBiasedVelocity`). How much does a method suffer from a wrong model of the flow?
+    `eitbench.worlds.Pipe2DBiasedVelocity`). How much does a method suffer from a wrong model of the flow?
 
     In the thesis the truth is 450 cm/s and the assumed velocity varies; that is
     `gym.make(id, true_mean_velocity=4.5, assumed_mean_velocity=2.0)` here.

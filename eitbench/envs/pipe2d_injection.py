@@ -10,8 +10,8 @@ from eitbench import _check
 from eitbench.envs.arguments import with_fields
 from eitbench.envs.injection import InjectionEnv, InjectionVectorEnv
 from eitbench.envs.injection_core import Rules
-from eitbench.scenarios import Pipe2D
-from eitbench.scenarios.instrument import Instrument
+from eitbench.worlds import Pipe2D
+from eitbench.worlds.instrument import Instrument
 
 
 def _rules(scenario: dict[str, Any] | None, limit: str | None, noise_floor: float) -> Rules:
@@ -38,7 +38,7 @@ class Pipe2DInjectionEnv(InjectionEnv, EzPickle):
     ## Action space
 
     `Discrete(120)`: the electrode pairs (0, 1), (0, 2), …, (14, 15) in this order
-    (`eitbench.envs.operator.electrode_pairs`); current enters at the first and leaves at the second. Electrodes 0 … 7
+    (`electrode_pairs`); current enters at the first and leaves at the second. Electrodes 0 … 7
     lie on the lower wall, 8 … 15 on the upper one, both along the flow.
 
     With `limit`: `Box(-1, 1, (16,), float32)`, currents in parts of the instrument's 0.1 A/m. Their mean is taken away

@@ -9,8 +9,8 @@ from gymnasium.utils import EzPickle
 from eitbench.envs.arguments import with_fields
 from eitbench.envs.injection import InjectionEnv, InjectionVectorEnv
 from eitbench.envs.injection_core import Rules
-from eitbench.scenarios import Pipe2D
-from eitbench.scenarios.instrument import Instrument
+from eitbench.worlds import Pipe2D
+from eitbench.worlds.instrument import Instrument
 
 GATE = 8.0
 """Standard deviations beyond which the estimator does not believe a reading: slugs do not reach them."""

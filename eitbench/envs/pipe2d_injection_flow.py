@@ -9,7 +9,7 @@ from gymnasium.utils import EzPickle
 from eitbench.envs.arguments import with_fields
 from eitbench.envs.injection import InjectionEnv, InjectionVectorEnv
 from eitbench.envs.injection_core import Rules
-from eitbench.scenarios import Pipe2DDriftingVelocity
+from eitbench.worlds import Pipe2DDriftingVelocity
 
 
 def _rules(region: list[float] | None, scenario: dict[str, Any] | None) -> Rules:

@@ -9,8 +9,8 @@ from gymnasium.utils import EzPickle
 from eitbench.envs.arguments import with_fields
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.estimation_vector import EstimationVectorEnv
-from eitbench.scenarios import Pipe2DObstacle
-from eitbench.scenarios.pipe2d_obstacle import FLOWS
+from eitbench.worlds import Pipe2DObstacle
+from eitbench.worlds.pipe2d_obstacle import FLOWS
 
 
 class Pipe2DObstacleEnv(EstimationEnv, EzPickle):
@@ -20,7 +20,7 @@ class Pipe2DObstacleEnv(EstimationEnv, EzPickle):
     The pipe of `eitbench/Pipe2D-v0` with a bulge in its lower wall. The flow separates behind it and recirculates; it
     solves the steady Navier–Stokes equations. Estimators know the walls, but their model assumes a parabola between
     them at each place; with `assumed_flow="real"` they are given the real flow (all numbers in
-    `eitbench.scenarios.Pipe2DObstacle`). How far does the simple model of the thesis carry, and what is gained by a
+    `eitbench.worlds.Pipe2DObstacle`). How far does the simple model of the thesis carry, and what is gained by a
     better one (Seppänen 2005, 5.1.1, names better fluid models as the next step)?
 
     ## Action space

@@ -9,7 +9,7 @@ from gymnasium.utils import EzPickle
 from eitbench.envs.arguments import with_fields
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.estimation_vector import EstimationVectorEnv
-from eitbench.scenarios import Pipe2DSkewedVelocity, Pipe2DTimeVaryingVelocity, Pipe2DUnknownVelocity
+from eitbench.worlds import Pipe2DSkewedVelocity, Pipe2DTimeVaryingVelocity, Pipe2DUnknownVelocity
 
 FLOWS = {"unknown": Pipe2DUnknownVelocity, "time-varying": Pipe2DTimeVaryingVelocity, "skewed": Pipe2DSkewedVelocity}
 
@@ -19,7 +19,7 @@ class Pipe2DVelocityEnv(EstimationEnv, EzPickle):
     ## Description
 
     The pipe of `eitbench/Pipe2D-v0`, but the flow is not known: estimate the concentration and the flow from the
-    voltages (Seppänen 2005, ch. 6; all numbers in `eitbench.scenarios.pipe2d_flows`). The axial velocity is written as
+    voltages (Seppänen 2005, ch. 6; all numbers in `eitbench.worlds.pipe2d_flows`). The axial velocity is written as
     v̂(y) = Σ θ_k φ_k(y/R); `task.velocity` holds the φ_k, what is believed of θ at first, and how fast it may change.
 
     ## Ids

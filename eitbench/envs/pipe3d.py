@@ -9,7 +9,7 @@ from gymnasium.utils import EzPickle
 from eitbench.envs.arguments import with_fields
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.estimation_vector import EstimationVectorEnv
-from eitbench.scenarios import Pipe3D
+from eitbench.worlds import Pipe3D
 
 
 class Pipe3DEnv(EstimationEnv, EzPickle):
@@ -19,7 +19,7 @@ class Pipe3DEnv(EstimationEnv, EzPickle):
     Fluid streams through a round pipe, 40 cm long and 10 cm wide, at 4.5 m/s on average; slugs of higher and lower
     concentration enter at random. Four rings of eight electrodes on the wall, one current injection every 5 ms. From
     the voltages of each injection, and a model of flow, estimate the concentration everywhere (Seppänen 2005, 5.2,
-    Fig. 5.10; all numbers in `eitbench.scenarios.Pipe3D`).
+    Fig. 5.10; all numbers in `eitbench.worlds.Pipe3D`).
 
     The truth is computed on finer meshes and time steps than the model in ``env.unwrapped.task``, which holds all that
     an estimator may know.

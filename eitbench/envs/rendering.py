@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 from matplotlib.gridspec import GridSpec
 from matplotlib.tri import Triangulation
 
-from eitbench.physics.mesh import Mesh, rectangle_mesh
-from eitbench.task import Task
+from eitbench.numerics.mesh import Mesh, rectangle_mesh
+from eitbench.worlds.task import Task
 
 FIELD_MAP, SPREAD_MAP = "viridis", "magma"
 SOURCE, SINK, IDLE = "#d1495b", "#2e86ab", "#5c5c5c"

@@ -9,7 +9,7 @@ from gymnasium.utils import EzPickle
 from eitbench.envs.arguments import with_fields
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.estimation_vector import EstimationVectorEnv
-from eitbench.scenarios import RotatingTank2D
+from eitbench.worlds import RotatingTank2D
 
 
 class RotatingTank2DEnv(EstimationEnv, EzPickle):
@@ -19,7 +19,7 @@ class RotatingTank2DEnv(EstimationEnv, EzPickle):
     A flat round tank of stirred saline carries a ball round that hardly conducts; sixteen electrodes on the wall. One
     pair of them injects all the time. A stationary image of one injection shows nothing, but the flow carries the
     target through the pair's field, and a filter that knows the flow can follow it (Seppänen 2005, 7.1, Figs 7.2 and
-    7.3; all numbers in `eitbench.scenarios.RotatingTank2D`).
+    7.3; all numbers in `eitbench.worlds.RotatingTank2D`).
 
     The truth is a rigid ball on a path of its own; the model in ``env.unwrapped.task`` is a liquid without any ball, in
     which concentration is carried and spreads, as in the thesis.

@@ -9,7 +9,7 @@ from gymnasium.utils import EzPickle
 from eitbench.envs.arguments import with_fields
 from eitbench.envs.injection import InjectionEnv, InjectionVectorEnv
 from eitbench.envs.injection_core import Rules
-from eitbench.scenarios import RotatingTank2D
+from eitbench.worlds import RotatingTank2D
 
 
 class RotatingTankInjectionEnv(InjectionEnv, EzPickle):

@@ -9,7 +9,7 @@ from gymnasium.utils import EzPickle
 from eitbench.envs.arguments import with_fields
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.estimation_vector import EstimationVectorEnv
-from eitbench.scenarios import StationaryTank2D
+from eitbench.worlds import StationaryTank2D
 
 
 class StationaryTank2DEnv(EstimationEnv, EzPickle):
@@ -19,7 +19,7 @@ class StationaryTank2DEnv(EstimationEnv, EzPickle):
     Two metal cylinders stand in a flat round tank of saline; nothing moves. Sixteen electrodes on the wall, one
     injection after another: estimate the concentration (which stands for the conductivity) from the first injection on.
     A Kalman filter with F = I and a smoothness prior in Γ_{0|0} has found both cylinders after about five injections
-    (Seppänen 2005, 7.2, Fig. 7.4; all numbers in `eitbench.scenarios.StationaryTank2D`).
+    (Seppänen 2005, 7.2, Fig. 7.4; all numbers in `eitbench.worlds.StationaryTank2D`).
 
     ## Action space
 

@@ -9,7 +9,7 @@ import numpy as np
 from eitbench.estimation.homogeneous import best_homogeneous
 
 if TYPE_CHECKING:
-    from eitbench.task import Task
+    from eitbench.worlds.task import Task
 
 
 class FirstFrame:

@@ -14,9 +14,9 @@ from eitbench.estimation.smoothness import smoothness_covariance
 from eitbench.physics.rest import AtRest
 
 if TYPE_CHECKING:
-    from eitbench.physics.mesh import Mesh
+    from eitbench.numerics.mesh import Mesh
     from eitbench.physics.transport import ConvectionDiffusion
-    from eitbench.scenarios.base import Prior
+    from eitbench.worlds.base import Prior
 
 
 def starting_filter(transport: ConvectionDiffusion | AtRest, prior: Prior, c_bh: float,
@@ -99,7 +99,7 @@ def initial_covariance(mesh: Mesh, prior: Prior) -> np.ndarray:
 
 @lru_cache(maxsize=4)
 def _smooth(mesh: Mesh, length: float, std: float) -> np.ndarray:
-    from eitbench.physics.fem import mass_matrix, stiffness_matrix
+    from eitbench.numerics.fem import mass_matrix, stiffness_matrix
     covariance = smoothness_covariance(mass_matrix(mesh), stiffness_matrix(mesh), length, std)
     covariance.setflags(write=False)
     return covariance

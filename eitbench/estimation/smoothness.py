@@ -19,7 +19,7 @@ def smoothness_covariance(mass: sp.csr_array, stiffness: sp.csr_array, length: f
     Parameters
     ----------
     mass, stiffness : (n, n) sparse
-        M in m^d and K in m^(d−2); see `eitbench.physics.fem`.
+        M in m^d and K in m^(d−2); see `eitbench.numerics.fem`.
     length : float
         ℓ in m, > 0.
     std : float

@@ -14,10 +14,10 @@ from scipy.sparse.csgraph import connected_components
 from skfem.helpers import dot, grad
 
 from eitbench import _check
-from eitbench.physics._backend import Backend
-from eitbench.physics.condensation import condensation
-from eitbench.physics.fem import element, to_skfem
-from eitbench.physics.mesh import Mesh
+from eitbench.numerics._backend import Backend
+from eitbench.numerics.condensation import condensation
+from eitbench.numerics.fem import element, to_skfem
+from eitbench.numerics.mesh import Mesh
 from eitbench.physics.sensitivity import Sensitivity
 
 
@@ -39,7 +39,7 @@ class CompleteElectrodeModel:
         1 or 2: polynomial order of the potential. First order is wrong by several noise standard deviations on meshes
         of a few thousand unknowns.
     backend : "auto", "compiled" or "scipy"
-        What factorises; see `eitbench.physics.condensation`.
+        What factorises; see `eitbench.numerics.condensation`.
 
     Raises
     ------

@@ -14,8 +14,8 @@ from scipy.sparse.linalg import splu
 from skfem.helpers import dot, grad
 
 from eitbench import _check
-from eitbench.physics.fem import element, to_skfem
-from eitbench.physics.mesh import Mesh
+from eitbench.numerics.fem import element, to_skfem
+from eitbench.numerics.mesh import Mesh
 from eitbench.physics.transport import VelocityField
 
 _EDGES = np.array([[0, 1], [1, 2], [2, 0]])               # of a triangle; their middles are its nodes 3, 4 and 5

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from eitbench.physics.mesh import Mesh
+    from eitbench.numerics.mesh import Mesh
 
 
 @dataclass(frozen=True, eq=False)

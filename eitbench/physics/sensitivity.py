@@ -6,7 +6,7 @@ import numpy as np
 import scipy.sparse as sp
 import skfem
 
-from eitbench.physics._backend import aligned_zeros, kernels, scratch
+from eitbench.numerics._backend import aligned_zeros, kernels, scratch
 
 
 class Sensitivity:

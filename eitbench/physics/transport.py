@@ -12,10 +12,10 @@ import skfem
 from skfem.helpers import dot, grad
 
 from eitbench import _check
-from eitbench.physics._backend import Backend
-from eitbench.physics.fem import element, to_skfem
-from eitbench.physics.mesh import Mesh
-from eitbench.physics.sparse_lu import SparseLU
+from eitbench.numerics._backend import Backend
+from eitbench.numerics.fem import element, to_skfem
+from eitbench.numerics.mesh import Mesh
+from eitbench.numerics.sparse_lu import SparseLU
 
 VelocityField = Callable[[np.ndarray], np.ndarray]
 
@@ -60,7 +60,7 @@ class ConvectionDiffusion:
     inlet : (n_inlet,) int, optional
         Nodes where the concentration is given; default: nodes of the boundary facets through which fluid enters.
     backend : "auto", "compiled" or "scipy"
-        What solves; see `eitbench.physics.sparse_lu`.
+        What solves; see `eitbench.numerics.sparse_lu`.
 
     Raises
     ------

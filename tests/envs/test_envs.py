@@ -16,13 +16,13 @@ from short import FIELDS, kind, short
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 from eitbench import Estimate, scoring
+from eitbench.bench.run import play_and_collect
+from eitbench.bench.score import score
+from eitbench.data.episodes import CACHE_VARIABLE, Episode
+from eitbench.data.recordings import score_operators
 from eitbench.envs import ENTRY_POINTS, ESTIMATION
 from eitbench.envs.estimation import EstimationEnv
-from eitbench.episodes import CACHE_VARIABLE, Episode
-from eitbench.leaderboard.run import play_and_collect
-from eitbench.leaderboard.score import score
-from eitbench.recordings import score_operators
-from eitbench.scenarios.base import Scenario
+from eitbench.worlds.base import Scenario
 
 PIPE = "eitbench/Pipe2D-v0"
 VELOCITY = [name for name in ESTIMATION if kind(name) == "Pipe2DVelocity"]

@@ -11,13 +11,14 @@ from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 import eitbench
 from eitbench import make_task
-from eitbench.envs import INJECTION, reduced_operator
-from eitbench.envs.operator import electrode_pairs
-from eitbench.episodes import CACHE_VARIABLE
+from eitbench.data.episodes import CACHE_VARIABLE
+from eitbench.data.recordings import cycle_voltages, recording, score_operators
+from eitbench.envs import INJECTION
 from eitbench.estimation import FirstFrame, LinearisedObservations, kalman_filter, table_5_1
+from eitbench.estimation.onboard import reduced_operator
+from eitbench.estimation.onboard.operator import electrode_pairs
 from eitbench.estimation.reduced import ReducedModel
-from eitbench.recordings import cycle_voltages, recording, score_operators
-from eitbench.scenarios import Pipe2D
+from eitbench.worlds import Pipe2D
 
 both = pytest.mark.parametrize("estimator", ["reduced", "none"])
 every = pytest.mark.parametrize("name", list(INJECTION))

@@ -8,20 +8,20 @@ import pytest
 from choosing import FLOW, NAME, make, some_pairs
 
 import eitbench
-from eitbench.bank import fill, missing_seeds, recording_bytes
-from eitbench.envs import joint_operator
-from eitbench.envs.belief import Belief
+from eitbench.bench.baselines import load_baseline
+from eitbench.data.bank import fill, missing_seeds, recording_bytes
+from eitbench.data.episodes import CACHE_VARIABLE
+from eitbench.data.recordings import cycle_voltages, outline, recording, recording_path
+from eitbench.data.regions import integrals, integrals_path, make_integrals, mass_between, score_mass
 from eitbench.envs.injection_core import scaled
-from eitbench.envs.operator import electrode_pairs
-from eitbench.episodes import CACHE_VARIABLE
 from eitbench.estimation import LinearisedObservations
+from eitbench.estimation.onboard import joint_operator
+from eitbench.estimation.onboard.belief import Belief
+from eitbench.estimation.onboard.operator import electrode_pairs
 from eitbench.estimation.reduced_joint import JointTables, joint_step
-from eitbench.leaderboard.baselines import load_baseline
-from eitbench.physics.fem import mass_matrix
-from eitbench.recordings import cycle_voltages, outline, recording, recording_path
-from eitbench.regions import integrals, integrals_path, make_integrals, mass_between, score_mass
-from eitbench.scenarios import Pipe2DDriftingVelocity
-from eitbench.task import make_task
+from eitbench.numerics.fem import mass_matrix
+from eitbench.worlds import Pipe2DDriftingVelocity
+from eitbench.worlds.task import make_task
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +85,7 @@ def test_without_a_region_all_counts(env):
 
 def test_integrals_are_kept_and_damage_is_noticed(env, monkeypatch, tmp_path):
     """Made once from the truth; a damaged file, or another seed's, is made anew."""
-    from eitbench import regions
+    from eitbench.data import regions
     made, scenario = integrals(env.scenario, 3), env.scenario
     places = {seed: tmp_path / f"{seed}.npz" for seed in (3, 4)}
     monkeypatch.setattr(regions, "integrals_path", lambda _, seed: places[seed])

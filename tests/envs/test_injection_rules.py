@@ -6,9 +6,9 @@ import pytest
 from choosing import BUDGET, CURRENTS, FAULTS, make, play, some_pairs
 
 from eitbench.envs.injection_core import Rules
-from eitbench.envs.operator import electrode_pairs
-from eitbench.scenarios import Pipe2D
-from eitbench.scenarios.instrument import Faults, Instrument
+from eitbench.estimation.onboard.operator import electrode_pairs
+from eitbench.worlds import Pipe2D
+from eitbench.worlds.instrument import Faults, Instrument
 
 
 @pytest.mark.parametrize(("limit", "order"), [("L1", 1), ("L2", 2), ("Linf", np.inf)])

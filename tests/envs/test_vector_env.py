@@ -14,10 +14,10 @@ from short import PIPE as FIELDS
 from short import kind, short
 
 import eitbench  # noqa: F401 (registers)
+from eitbench.data.episodes import CACHE_VARIABLE, simulate
 from eitbench.envs import ESTIMATION, estimation
-from eitbench.episodes import CACHE_VARIABLE, simulate
-from eitbench.scenarios import Pipe2D
-from eitbench.task import lag_steps
+from eitbench.worlds import Pipe2D
+from eitbench.worlds.task import lag_steps
 
 LAGS = [name for name in ESTIMATION if kind(name) == "Pipe2D"]
 """The plain pipe with its three lags; what does not depend on the scenario is tested on these."""

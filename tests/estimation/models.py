@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from eitbench.estimation import FreeCovariance, KalmanFilter, LinearisedObservations, Observation, table_5_1
-from eitbench.scenarios.pipe2d import Pipe2D
+from eitbench.worlds.pipe2d import Pipe2D
 
 
 class LinearGaussian(NamedTuple):

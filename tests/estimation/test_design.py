@@ -6,12 +6,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from models import LinearGaussian, dense_filter
 
-from eitbench.envs.operator import electrode_pairs
 from eitbench.estimation import LinearisedObservations, kalman_filter, table_5_1
 from eitbench.estimation.design import independent_rows, pair_gains, pair_tables
-from eitbench.physics.fem import mass_matrix
+from eitbench.estimation.onboard.operator import electrode_pairs
+from eitbench.numerics.fem import mass_matrix
 from eitbench.physics.flow import PlaneChannelFlow
-from eitbench.scenarios import Pipe2D
+from eitbench.worlds import Pipe2D
 
 L, N = 5, 9
 PAIRS = electrode_pairs(L)

@@ -7,8 +7,8 @@ import scipy.sparse as sp
 from models import QuadraticModel
 
 from eitbench.estimation import best_homogeneous, gauss_newton
+from eitbench.numerics.mesh import rectangle_mesh
 from eitbench.physics.cem import CompleteElectrodeModel
-from eitbench.physics.mesh import rectangle_mesh
 from eitbench.physics.observation import KohlrauschConductivity, ObservationModel, VoltageNoise
 
 

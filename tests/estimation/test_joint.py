@@ -6,7 +6,7 @@ from models import LinearGaussian, dense_filter
 
 from eitbench.estimation.joint import JointFilter
 from eitbench.estimation.kalman import Observation
-from eitbench.physics.mesh import rectangle_mesh
+from eitbench.numerics.mesh import rectangle_mesh
 from eitbench.physics.transport import ConvectionDiffusion
 
 # -- a coarse pipe of 147 nodes, seen by local averages ---------------------------------------------------------------

@@ -9,12 +9,12 @@ from scipy.linalg import cho_factor, cho_solve, eigvalsh
 from scipy.special import kv
 
 from eitbench.estimation import LinearisedObservations, gauss_newton, smoothness_covariance, starting_filter
-from eitbench.physics.fem import mass_matrix, stiffness_matrix
-from eitbench.physics.mesh import rectangle_mesh
-from eitbench.physics.round import uniform_disc
-from eitbench.scenarios import StationaryTank2D
-from eitbench.scenarios.tank2d import disc_indicator
-from eitbench.task import make_task
+from eitbench.numerics.fem import mass_matrix, stiffness_matrix
+from eitbench.numerics.mesh import rectangle_mesh
+from eitbench.numerics.round import uniform_disc
+from eitbench.worlds import StationaryTank2D
+from eitbench.worlds.tank2d import disc_indicator
+from eitbench.worlds.task import make_task
 
 LENGTH, STD = 0.1, 2.0
 

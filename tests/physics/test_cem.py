@@ -21,9 +21,9 @@ from shapes import (
     slab_resistance,
 )
 
+from eitbench.numerics.mesh import Mesh, graded_pipe_mesh
 from eitbench.physics.cem import CompleteElectrodeModel
-from eitbench.physics.mesh import Mesh, graded_pipe_mesh
-from eitbench.scenarios import Pipe2D
+from eitbench.worlds import Pipe2D
 
 # -- a small problem in each dimension, with nothing symmetric about it -----------------------------------------------
 

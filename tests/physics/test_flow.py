@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from eitbench.physics.fem import mass_matrix
+from eitbench.numerics.fem import mass_matrix
+from eitbench.numerics.mesh import rectangle_mesh
+from eitbench.numerics.round import uniform_disc
 from eitbench.physics.flow import PlaneChannelFlow, PlugFlow, PowerLawFlow, RoundPipeFlow
-from eitbench.physics.mesh import rectangle_mesh
-from eitbench.physics.round import uniform_disc
 
 
 def test_mean_over_a_section_is_the_mean_velocity():

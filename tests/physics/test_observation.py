@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from eitbench.numerics.mesh import rectangle_mesh
 from eitbench.physics.cem import CompleteElectrodeModel
-from eitbench.physics.mesh import rectangle_mesh
 from eitbench.physics.observation import KohlrauschConductivity, LinearConductivity, ObservationModel, VoltageNoise
 
 LAWS = [LinearConductivity(0.011), KohlrauschConductivity()]

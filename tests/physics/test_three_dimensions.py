@@ -9,11 +9,11 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from shapes import annulus_resistance, polar_mesh, ring_facets, slab_resistance
 
+from eitbench.numerics.fem import mass_matrix
+from eitbench.numerics.mesh import Mesh
+from eitbench.numerics.round import electrode_disc, extrude, round_pipe_mesh, uniform_disc
 from eitbench.physics.cem import CompleteElectrodeModel
-from eitbench.physics.fem import mass_matrix
 from eitbench.physics.flow import RoundPipeFlow
-from eitbench.physics.mesh import Mesh
-from eitbench.physics.round import electrode_disc, extrude, round_pipe_mesh, uniform_disc
 from eitbench.physics.transport import ConvectionDiffusion, _supg_matrices
 
 R = 0.05

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from eitbench.physics.fem import mass_matrix
+from eitbench.numerics.fem import mass_matrix
+from eitbench.numerics.mesh import Mesh, rectangle_mesh
 from eitbench.physics.flow import PlaneChannelFlow
-from eitbench.physics.mesh import Mesh, rectangle_mesh
 from eitbench.physics.transport import ConvectionDiffusion, _supg_matrices, inlet_nodes
-from eitbench.scenarios.pipe2d import Pipe2D
+from eitbench.worlds.pipe2d import Pipe2D
 
 # -- helpers ----------------------------------------------------------------------------------------------------------
 

@@ -5,8 +5,8 @@ from itertools import permutations
 import numpy as np
 import pytest
 
+from eitbench.numerics.mesh import Mesh, rectangle_mesh
 from eitbench.physics.flow import PlaneChannelFlow
-from eitbench.physics.mesh import Mesh, rectangle_mesh
 from eitbench.physics.transport import ConvectionDiffusion
 
 # -- helpers ----------------------------------------------------------------------------------------------------------

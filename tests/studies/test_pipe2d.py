@@ -3,20 +3,24 @@
 These take minutes; with pytest-xdist they run side by side. Dev seeds are for choosing and testing, never reported.
 """
 
+import importlib
+
 import numpy as np
 import pytest
 
 from eitbench import make_task, simulate
+from eitbench.bench.baselines import load_baseline
+from eitbench.bench.run import Environment, Job, run_episode
+from eitbench.cli.studies import NAME, thesis
+from eitbench.data.recordings import score_operators
+from eitbench.data.seeds import parse_seeds
 from eitbench.estimation import best_homogeneous, gauss_newton
-from eitbench.leaderboard.baselines import load_baseline
-from eitbench.leaderboard.figures.pipe2d import VELOCITIES, velocity_sweep
-from eitbench.leaderboard.run import Environment, Job, run_episode
-from eitbench.physics.fem import stiffness_matrix
-from eitbench.recordings import score_operators
-from eitbench.scenarios import Pipe2D
+from eitbench.numerics.fem import stiffness_matrix
 from eitbench.scoring import relative_error
-from eitbench.seeds import parse_seeds
+from eitbench.worlds import Pipe2D
 
+thesis()
+pipe2d = importlib.import_module(f"{NAME}.pipe2d")
 SEEDS = parse_seeds("dev:0-19")
 METHODS = {
     "homogeneous": ("eitbench/Pipe2D-v0", "homogeneous"),
@@ -81,8 +85,8 @@ def test_velocity_sweep_finds_the_true_velocity():
 
     The voltages alone, by discrepancy and by NIS, point near it too (thesis Fig. 5.8).
     """
-    sweep = {key: values.mean(axis=1) for key, values in velocity_sweep(SEEDS[:1], jobs=1).items()}
-    best = {key: VELOCITIES[values.argmin()] for key, values in sweep.items()}
+    sweep = {key: values.mean(axis=1) for key, values in pipe2d.velocity_sweep(SEEDS[:1], jobs=1).items()}
+    best = {key: pipe2d.VELOCITIES[values.argmin()] for key, values in sweep.items()}
     assert 4.0 <= best["error"] <= 5.0, (best, sweep)
     assert 4.0 <= best["voltage_discrepancy"] <= 5.5, (best, sweep)
     assert 4.0 <= best["nis"] <= 5.5, (best, sweep)

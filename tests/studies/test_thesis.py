@@ -9,10 +9,10 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from eitbench.leaderboard.run import Environment, Job, run_episode
-from eitbench.scenarios.base import Randomness
+from eitbench.bench.run import Environment, Job, run_episode
+from eitbench.data.seeds import parse_seeds
 from eitbench.scoring import deficit_centre
-from eitbench.seeds import parse_seeds
+from eitbench.worlds.base import Randomness
 
 SEED = parse_seeds("dev:0")[0]
 GOLDEN = {

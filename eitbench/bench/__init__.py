@@ -1,0 +1,34 @@
+"""Floor 5: run baselines on environments, keep what came out, and report it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+def load(folder: Path | str | None = None) -> pd.DataFrame:
+    """All records of a folder as a tidy table: one row for each score of each episode.
+
+    Parameters
+    ----------
+    folder : path
+        Default: the published records, ``leaderboards/results``.
+
+    Returns
+    -------
+    DataFrame
+        environment, board, method, version, title, role, privileged, official, outdated, split, seed, status, metric,
+        value. Metrics are named and measured as in ``leaderboards/schema.json`` (s, V², bytes). A failed episode has
+        one row, with the metric error and no value. ``outdated`` are records of another version of the code than the
+        board's: not to be mixed with the others.
+
+    Raises
+    ------
+    ValueError
+        Naming the file, if one is no valid record.
+    """
+    from eitbench.bench.tidy import tidy
+    return tidy(folder)

@@ -1,0 +1,199 @@
+"""Find, load and play injection policies: one Python file each, with a class `Policy`."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
+
+import gymnasium as gym
+import numpy as np
+
+from eitbench.bench.baselines import baseline_folder, is_privileged, load_module, parameters_of, role_of, title_of
+from eitbench.envs import INJECTION
+from eitbench.envs.injection import InjectionEnv
+from eitbench.envs.injection_core import Rules
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+class PolicyFile(NamedTuple):
+    """A loaded policy file."""
+
+    name: str
+    """Name of the file without its suffix."""
+    title: str
+    """First line of its docstring, up to a colon, bracket or full stop."""
+    path: Path
+    sha256: str
+    privileged: bool    # shown the truth: a bound for the others, not one of them
+    parameters: dict[str, Any]
+    policy: Callable[..., Any]
+    """Policy(rules, random), if privileged Policy(rules, random, core), with act(observation) -> action."""
+    role: str | None = None
+    """One of `ROLES`, as of baselines."""
+
+    def suits(self, rules: Rules) -> bool:
+        """Whether it can play in this world; a policy without a word on that plays in all."""
+        judge = getattr(self.policy, "suits", None)
+        return judge is None or bool(judge(rules))
+
+
+def policy_folder() -> Path:
+    """Where our own policies lie."""
+    return baseline_folder() / "injection"
+
+
+def own_policies() -> list[str]:
+    """Names of our own policies."""
+    return sorted(path.stem for path in policy_folder().glob("*.py"))
+
+
+def own_agents(env_id: str) -> list[str]:
+    """Paths of our own trained agents for an environment: ``baselines/checkpoints/ENV/ALGO/seedK/model.zip``; none
+    without the extra ``rl``."""
+    if not find_spec("stable_baselines3"):
+        return []
+    folder = baseline_folder() / "checkpoints" / env_id.replace("/", "-")
+    return [str(path) for path in sorted(folder.glob("*/seed*/model.zip"))]
+
+
+def find_policy(name: str) -> Path:
+    """The file of a policy that `load_policy` loads; ``ValueError`` if there is none, or it has the name of another."""
+    path = Path(name) if name.endswith((".py", ".zip")) else policy_folder() / f"{name}.py"
+    if not path.is_file():
+        raise ValueError("policy must be the path of a .py file or of an agent's model.zip, or one of "
+                         f"{', '.join(own_policies())}; got {name!r}")
+    if path.stem in own_policies() and not path.samefile(policy_folder() / path.name):
+        raise ValueError(f"policy {path} has the name of one of ours, under which results are kept; rename it")
+    return path
+
+
+def load_policy(name: str) -> PolicyFile:
+    """Load one of our policies by name, anybody's by the path of its file, or a trained agent by that of its model.zip.
+
+    Raises
+    ------
+    ValueError
+        If there is no such policy, its file has no class `Policy` with an `act` method, or an agent's file is not the
+        one that was left by training.
+    """
+    path = find_policy(name)
+    return _load(path, path.read_bytes())
+
+
+@lru_cache(maxsize=64)
+def _load(path: Path, source: bytes) -> PolicyFile:
+    """The file with this content, executed once a process."""
+    if path.suffix == ".zip":
+        from eitbench.rl.agents import load_agent
+        name, title, agent, parameters = load_agent(path, source)
+        return PolicyFile(name, title, path, hashlib.sha256(source).hexdigest(), False, parameters, agent)
+    module = load_module("policy", path, source)
+    policy = getattr(module, "Policy", None)
+    if not isinstance(policy, type) or not callable(getattr(policy, "act", None)):
+        raise ValueError(f"policy {path} must define a class Policy with a method act(observation)")
+    who = f"policy {path}: Policy"
+    return PolicyFile(path.stem, title_of(module, path), path, hashlib.sha256(source).hexdigest(),
+                      is_privileged(who, policy), parameters_of(who, policy), policy, role_of(who, policy))
+
+
+def play(env_id: str, kwargs: dict[str, Any], policy: str | PolicyFile, seed: int,
+         estimator: str = "full") -> dict[str, Any]:
+    """Play one episode.
+
+    Parameters
+    ----------
+    env_id, kwargs
+        One of `INJECTION`, and arguments for it.
+    policy : str or PolicyFile
+        Name or path, or what was loaded.
+    estimator : "full" or "reduced"
+        The exact filter, for scores, or the one of training.
+
+    Returns
+    -------
+    dict
+        error : ẽ_c (5.12), the mean over scored states; errors : of each; spent : the agent's injections;
+        seconds_per_step : of the policy, what it prepares included.
+
+    Raises
+    ------
+    ValueError
+        If there is no such environment or policy, or the policy does not suit it or acts wrongly.
+    """
+    env = environment(env_id, json.dumps(kwargs), estimator)
+    spent, seconds, errors = 0, 0.0, list[float]()
+    for _, observation, elapsed in inject(env, policy if isinstance(policy, PolicyFile) else load_policy(policy), seed):
+        seconds += elapsed
+        spent += bool(observation["currents"].any())
+        errors += [] if env.error is None else [env.error]
+    return {"error": float(np.mean(errors)), "errors": errors, "spent": spent,
+            "seconds_per_step": seconds / env.core.length}
+
+
+def inject(env: InjectionEnv, loaded: PolicyFile, seed: int) -> Iterator[tuple[int, dict[str, np.ndarray], float]]:
+    """(t of the state now seen, observation, seconds the policy took) after each of its injections in one episode, the
+    first with what it took to prepare; errors as `play`."""
+    if not loaded.suits(env.rules):
+        raise ValueError(f"policy {loaded.name} does not suit {env.spec.id if env.spec else env}")
+    observation, done, t = env.reset(seed=seed)[0], False, env.core.first
+    # The fifth of an episode's streams; three made the recording, the fourth its faults. A generator knows what it was
+    # seeded with, so the policy's is seeded with a number that says nothing of the episode.
+    stream = np.random.default_rng(np.random.SeedSequence(seed).spawn(5)[4])
+    random = np.random.default_rng(int(stream.integers(2**63)))
+    begin = time.perf_counter()
+    player = loaded.policy(env.rules, random, *[env.core] * loaded.privileged)
+    while not done:
+        action = player.act(observation)
+        seconds = time.perf_counter() - begin
+        observation, _, done, _, _ = env.step(action)
+        t += 1
+        yield t, observation, seconds
+        begin = time.perf_counter()
+
+
+@lru_cache(maxsize=4)
+def environment(env_id: str, kwargs: str, estimator: str = "full") -> InjectionEnv:
+    """Made once a process, so that its models are shared by all episodes; ``kwargs`` are JSON."""
+    if env_id not in INJECTION:
+        raise ValueError(f"env must be one of {', '.join(INJECTION)}; got {env_id!r}")
+    if estimator not in ("full", "reduced"):
+        raise ValueError(f"estimator must be 'full' or 'reduced', got {estimator!r}")
+    env = gym.make(env_id, disable_env_checker=True, observation="raw", estimator=estimator, **json.loads(kwargs))
+    return cast(InjectionEnv, env.unwrapped)
+
+
+def adaptivity_gap(table: pd.DataFrame, open_loop: Sequence[str]) -> tuple[float, float, float]:
+    """(best open-loop − clairvoyant) / (random − clairvoyant), mean errors each, with its 95 % bootstrap interval.
+
+    Parameters
+    ----------
+    table : DataFrame
+        Columns policy, seed and error, with the policies clairvoyant, random_pair and ``open_loop``, all on the same
+        episodes.
+    open_loop : sequence of str
+        Names; the one of them with the least mean error counts.
+
+    Returns
+    -------
+    gap, low, high
+    """
+    errors = table.pivot_table(index="seed", columns="policy", values="error")
+    needed = ["clairvoyant", "random_pair", *open_loop]
+    if not open_loop or set(needed) - set(errors) or errors[needed].isna().to_numpy().any():
+        raise ValueError("table must hold clairvoyant, random_pair and some open-loop policies on the same episodes; "
+                         f"got {', '.join(map(str, errors))}")
+    best = errors[list(open_loop)].mean().idxmin()
+    three = errors[[best, "random_pair", "clairvoyant"]].to_numpy()
+    drawn = np.random.default_rng(0).integers(len(three), size=(10_000, len(three)))
+    means = np.concatenate([three.mean(axis=0)[None], three[drawn].mean(axis=1)])
+    gaps = (means[:, 0] - means[:, 2]) / (means[:, 1] - means[:, 2])
+    low, high = np.percentile(gaps[1:], [2.5, 97.5])
+    return float(gaps[0]), float(low), float(high)

@@ -1,0 +1,210 @@
+"""Records: what one version of a method did in one environment, as JSON that says how to repeat it.
+
+The format is published in ``leaderboards/schema.json``, and a record is checked against it when it is written and when
+it is read. It carries the sha256 of its own content, so that a number changed by hand is noticed. That guards against
+accidents; whether a self-reported number is true is found out by running the method again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import warnings
+from collections.abc import Iterable
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+
+from eitbench._files import shipped, write_atomically
+from eitbench.bench.baselines import BOARDS as ESTIMATION_BOARDS
+from eitbench.data.seeds import name_seed, parse_seeds
+from eitbench.envs import ENTRY_POINTS
+
+SCHEMA = 2
+BOARDS = (*ESTIMATION_BOARDS, "injection")
+SHARED = ("board", "title", "parameters", "role", "privileged", "method_sha256", "checkpoint_sha256", "source")
+"""What all episodes of a record have in common, beside environment and method."""
+
+
+def write_record(folder: Path, record: dict[str, Any]) -> Path:
+    """Write a record into ``folder``, whole or not at all, and return its path; what had its name is replaced.
+
+    Raises
+    ------
+    ValueError
+        Naming the file and the fields, if it is not what the schema asks for.
+    """
+    record = sealed(record)
+    path = Path(folder) / _named_by_content(record)
+    _check(path, record)
+    write_atomically(path, _text(record).encode())
+    return path
+
+
+def read_record(path: Path) -> dict[str, Any]:
+    """A record as it was written.
+
+    Raises
+    ------
+    ValueError
+        Naming the file and the fields, if it cannot be read, is not what the schema asks for, was changed since it was
+        written, or has another name than its content asks for.
+    """
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse)
+    except (OSError, ValueError) as error:
+        raise ValueError(f"record {path} cannot be read: {error}") from None
+    _check(path, record)
+    if record["sha256"] != sealed(record)["sha256"]:
+        raise ValueError(f"record {path} was changed since it was written: its sha256 is no longer that of its content")
+    if path.name != file_name(record):
+        raise ValueError(f"record {path} must have the name {file_name(record)}, as its content asks for")
+    return record
+
+
+def read_records(folder: Path) -> list[dict[str, Any]]:
+    """All records of a folder, by file name; none if there is no such folder. Errors as `read_record`.
+
+    Records of an environment that is not registered, or no longer in that version, are left out with a warning.
+    """
+    records = []
+    for path in sorted(Path(folder).glob("*.json")):
+        record = read_record(path)
+        if record["environment"]["id"] in ENTRY_POINTS:
+            records.append(record)
+        else:
+            warnings.warn(f"record {path} is left out: there is no environment {record['environment']['id']}",
+                          stacklevel=2)
+    return records
+
+
+def sealed(record: dict[str, Any]) -> dict[str, Any]:
+    """The record with the ``sha256`` of its content: canonical JSON of all other fields."""
+    try:
+        content = json.loads(_json({key: value for key, value in record.items() if key != "sha256"}))
+    except (TypeError, ValueError) as error:                              # NaN, or something that is no JSON at all
+        raise ValueError(f"record cannot be written as JSON: {error}") from None
+    text = _json(content, separators=(",", ":"))
+    return content | {"sha256": hashlib.sha256(text.encode()).hexdigest()}
+
+
+def version(record: dict[str, Any]) -> str:
+    """Of the method: the first eight digits of its file's sha256."""
+    return record["method_sha256"][:8]
+
+
+def file_name(record: dict[str, Any]) -> str:
+    """``ENV--METHOD--VERSION.json``; records of other seeds than test have their split in it too."""
+    parts = [record["environment"]["name"], record["method"], version(record)]
+    return "--".join([*parts, *([] if record["split"] == "test" else [record["split"]])]) + ".json"
+
+
+def split_of(seed: str) -> str:
+    """``test`` of ``test:4``; ``own`` of a plain number."""
+    return seed.split(":")[0] if ":" in seed else "own"
+
+
+def alike(runs: Iterable[dict[str, Any]], *keys: str) -> list[list[dict[str, Any]]]:
+    """Runs grouped by code, machine and these ``keys``; the processes of a machine time its matrix product each."""
+    groups: dict[str, list[dict[str, Any]]] = {}
+    for run in runs:
+        machine = {key: value for key, value in run["machine"].items() if key != "matmul_seconds"}
+        what = [machine, *(run[key] for key in ("commit", "dirty", "versions", "blas", *keys))]
+        groups.setdefault(_json(what), []).append(run)
+    return list(groups.values())
+
+
+def finished(record: dict[str, Any]) -> str:
+    """When its last episode was, in UTC as ISO 8601 has it."""
+    return max(episode["finished"] for episode in record["episodes"])
+
+
+def newest(records: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Records that may stand on a board together, and the outdated ones, each in the given order.
+
+    Scores depend on the code of the environments (``source``), so a board is of one code only, each environment for
+    itself: that of the official record that was finished last; where none is official, of the last of all.
+    """
+    last: dict[str, tuple[bool, str, str]] = {}
+    for record in records:
+        name = record["environment"]["name"]
+        last[name] = max(last.get(name, (False, "", "")), (record["official"], finished(record), record["source"]))
+    current = [record["source"] == last[record["environment"]["name"]][2] for record in records]
+    return ([record for record, is_current in zip(records, current, strict=True) if is_current],
+            [record for record, is_current in zip(records, current, strict=True) if not is_current])
+
+
+def _check(path: Path, record: Any) -> None:
+    """``ValueError`` naming file and fields if a record is not as the schema says, or contradicts itself."""
+    wrong = [f"{error.json_path}: {_shortened(error.message)}" for error in sorted(
+        _validator().iter_errors(record), key=lambda error: error.json_path)] or _contradictions(record)
+    if wrong:
+        raise ValueError(f"record {path} is not valid: " + "; ".join(wrong[:5]))
+
+
+def _contradictions(record: dict[str, Any]) -> list[str]:
+    """What the schema cannot say: fields of a valid record that do not fit each other."""
+    wrong, id = [], record["environment"]["id"].replace("/", "-")
+    if record["environment"]["name"] != id and not record["environment"]["name"].startswith(f"{id}-"):
+        wrong.append(f"$.environment.name: must begin with {id}")
+    if record["seeds"] != [episode["seed"] for episode in record["episodes"]]:
+        wrong.append("$.seeds: must be those of the episodes, in their order")
+    wrong += [f"$.seeds: {seed!r} names no episode" for seed in record["seeds"] if not _names_an_episode(seed)]
+    if {split_of(seed) for seed in record["seeds"]} != {record["split"]}:
+        wrong.append(f"$.seeds: must all be of the split {record['split']}")
+    if record["official"] and any(run["commit"] is None or run["dirty"] for run in record["runs"]):
+        wrong.append("$.official: must be false where a run was not of a commit without changes")
+    for i, episode in enumerate(record["episodes"]):
+        if episode["run"] >= len(record["runs"]):
+            wrong.append(f"$.episodes[{i}].run: there are only {len(record['runs'])} runs")
+        steps = episode.get("step_errors")
+        if steps and not math.isclose(episode["scores"]["error"], sum(steps) / len(steps), rel_tol=1e-9):
+            wrong.append(f"$.episodes[{i}].scores.error: must be the mean of step_errors")
+    return wrong
+
+
+def _names_an_episode(seed: str) -> bool:
+    """Whether it lies within its split and is written as `name_seed` does: an episode has one name."""
+    try:
+        return name_seed(parse_seeds(seed)[0]) == seed
+    except ValueError:
+        return False
+
+
+@lru_cache(maxsize=1)
+def _validator() -> Any:
+    schema = json.loads((shipped("leaderboards") / "schema.json").read_text(encoding="utf-8"))
+    return jsonschema.Draft202012Validator(schema)
+
+
+def _named_by_content(record: dict[str, Any]) -> str:
+    try:
+        return file_name(record)
+    except (KeyError, TypeError):                     # the check will say which field is missing
+        return "(nameless)"
+
+
+def _text(record: dict[str, Any]) -> str:
+    """JSON with sorted keys, a line for each field, episode and run, so that changes can be read line by line."""
+    lines = []
+    for key, value in sorted(record.items()):
+        if key in ("episodes", "runs"):
+            lines.append(f" {_json(key)}: [\n  " + ",\n  ".join(map(_json, value)) + "\n ]")
+        else:
+            lines.append(f" {_json(key)}: {_json(value)}")
+    return "{\n" + ",\n".join(lines) + "\n}\n"
+
+
+def _json(value: Any, **how: Any) -> str:
+    return json.dumps(value, sort_keys=True, ensure_ascii=False, allow_nan=False, **how)
+
+
+def _refuse(constant: str) -> None:
+    raise ValueError(f"{constant} is not JSON")
+
+
+def _shortened(message: str) -> str:
+    return message if len(message) < 200 else f"{message[:90]} … {message[-90:]}"

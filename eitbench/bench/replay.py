@@ -1,0 +1,132 @@
+"""Play episodes of many records again, and say of each how far the numbers are from what it says."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+from tqdm import tqdm
+
+from eitbench import _check
+from eitbench._files import write_atomically
+from eitbench._parallel import in_parallel
+from eitbench.bench.records import read_record
+from eitbench.bench.run import run_episode
+from eitbench.bench.store import source_digest
+from eitbench.bench.verify import TOLERANCE, differences_of, job_of
+from eitbench.data.episodes import CACHE_VARIABLE
+from eitbench.data.seeds import parse_seeds
+from eitbench.report.summary import as_markdown
+
+
+class Replay(NamedTuple):
+    """One episode of one record, to be played again."""
+
+    record: Path
+    episode: int
+    """Its place in the record."""
+    outcome: Path
+    """Where what came out is kept."""
+
+
+def replays(records: Sequence[Path], episodes: int, seed: int, folder: Path) -> list[Replay]:
+    """``episodes`` drawn from each record with this ``seed``, environment by environment, cheap ones first.
+
+    Records of the same episodes have the same ones drawn, so that each is simulated once.
+    """
+    found: dict[str, list[tuple[float, Replay]]] = {}
+    for path in records:
+        record = read_record(path)
+        drawn = np.random.default_rng(seed).permutation(len(record["episodes"]))[:episodes]
+        for number in sorted(int(place) for place in drawn):
+            said = record["episodes"][number]
+            kept = folder / "outcomes" / f"{path.stem}--{said['seed'].replace(':', '-')}.json"
+            found.setdefault(record["environment"]["name"], []).append(
+                (said["seconds"], Replay(path, number, kept)))
+    cheap_first = sorted(found.values(), key=lambda timed: sum(seconds for seconds, _ in timed))
+    return [replay for timed in cheap_first for _, replay in sorted(timed, key=lambda pair: pair[0])]
+
+
+def verify_all(records: Sequence[Path], folder: Path, *, episodes: int = 1, seed: int = 0,
+               isolate: str = "others", n_jobs: int = 1, backend: str = "loky") -> pd.DataFrame:
+    """Play ``episodes`` of every record again.
+
+    What came out is kept in ``folder`` the moment it is there, with the simulated episodes; the same call with the
+    same code goes on from there.
+
+    Returns
+    -------
+    DataFrame
+        A row for each episode: record, environment, method, episode, score (that with the greatest relative
+        difference), difference, said and again (ẽ_c), problem (a sentence where it could not be played).
+    """
+    _check.integer("episodes", episodes, low=1)
+    todo = replays(records, episodes, seed, folder)
+    left = [(replay, isolate) for replay in todo if _kept(replay) is None]
+    before = os.environ.get(CACHE_VARIABLE)
+    os.environ[CACHE_VARIABLE] = str((folder / "cache").absolute())       # nothing that was there before is believed
+    try:
+        for _ in tqdm(in_parallel(_replay, left, n_jobs, backend), total=len(todo), initial=len(todo) - len(left),
+                      desc="playing again", unit="episode", disable=None):
+            pass
+    finally:
+        if before is None:
+            del os.environ[CACHE_VARIABLE]
+        else:
+            os.environ[CACHE_VARIABLE] = before
+    return pd.DataFrame([_kept(replay) for replay in todo]).drop(columns="identity")
+
+
+def _replay(replay: Replay, isolate: str) -> None:
+    record = read_record(replay.record)
+    said = record["episodes"][replay.episode]
+    outcome: dict[str, Any] = {
+        "identity": _identity(replay), "record": replay.record.name, "environment": record["environment"]["id"],
+        "method": record["method"], "episode": said["seed"], "score": "", "difference": 0.0,
+        "said": said.get("scores", {}).get("error"), "again": None, "problem": ""}
+    try:
+        job = job_of(record, None, isolate)._replace(seed=parse_seeds(said["seed"])[0])
+    except ValueError as error:
+        outcome["problem"] = str(error)
+    else:
+        again = json.loads(json.dumps(run_episode(job)[0]))
+        off = differences_of(said, again)
+        outcome["score"] = max(off, key=lambda name: off[name], default="")
+        outcome["difference"] = min(off.get(outcome["score"], 0.0), 1e300)
+        outcome["again"] = again.get("scores", {}).get("error")
+        outcome["problem"] = again.get("message", "") if again["status"] != said["status"] else ""
+    write_atomically(replay.outcome, json.dumps(outcome, indent=1).encode())
+
+
+def _kept(replay: Replay) -> dict[str, Any] | None:
+    """What came out, if it is there and of this code."""
+    try:
+        outcome = json.loads(replay.outcome.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return outcome if isinstance(outcome, dict) and outcome.get("identity") == _identity(replay) else None
+
+
+def _identity(replay: Replay) -> str:
+    content = hashlib.sha256(replay.record.read_bytes()).hexdigest()
+    return f"{zlib.crc32(content.encode() + source_digest().encode()):08x}"
+
+
+def by_environment(rows: pd.DataFrame, tolerance: float = TOLERANCE) -> str:
+    """Markdown: for each environment how many episodes are as their records say, and the greatest difference."""
+    lines = []
+    for name, group in rows.groupby("environment", sort=False):
+        worst = group.iloc[int(group["difference"].argmax())]
+        differs = (group["difference"] > tolerance) | (group["problem"] != "")
+        lines.append({"environment": str(name), "greatest difference in": f"{worst['score']} of {worst['method']}"
+                      if worst["difference"] else "none", "episodes": str(len(group)),
+                      "to the bit": str(int((group["difference"] == 0).sum())), "differ": str(int(differs.sum())),
+                      "relative": f"{worst['difference']:.1g}"})
+    return as_markdown(pd.DataFrame(lines), words=2)

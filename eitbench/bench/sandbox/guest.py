@@ -1,0 +1,126 @@
+"""The process in which somebody else's estimator or policy runs; `eitbench.bench.sandbox.host` starts it.
+
+It is told the environment's id and arguments, and then, step by step, what was measured. There is no episode, no truth
+and no seed here, and once the wall is up none of the files in which they might be kept can be opened.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from eitbench.bench.sandbox import wall, wire
+
+Reply = tuple[dict[str, Any], dict[str, np.ndarray]]
+
+
+def main() -> None:
+    """Answer one message after another until the other side hangs up."""
+    private, memory = Path(sys.argv[1]), int(sys.argv[2])
+    incoming, outgoing = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
+    silent = os.open(os.devnull, os.O_RDWR)
+    for stream in range(3):                                            # what the guest prints is no answer
+        os.dup2(silent, stream)
+    readable = wall.python_files()
+    wall.end_with_parent()
+    wall.limit_memory(memory)
+    closed = wall.close_files(readable, [private, Path(os.devnull)])
+    wall.refuse_calls()
+
+    def read(n: int) -> bytes:
+        content = incoming.read(n)
+        if len(content) < n:
+            raise EOFError
+        return content
+
+    def say(words: dict[str, Any], arrays: dict[str, np.ndarray] | None = None) -> None:
+        outgoing.write(wire.pack(words, arrays))
+        outgoing.flush()
+
+    say({"closed": closed, "readable": [str(place) for place in readable]})
+    answer: Callable[..., Reply] = _nothing
+    while True:
+        try:
+            words, arrays = wire.unpack(read)
+        except EOFError:
+            return
+        try:
+            if words["do"] == "play":
+                answer, about = _player(words)
+                say(about)
+            else:
+                say(*answer(words, arrays))
+        except (Exception, SystemExit) as error:
+            say({"error": f"{type(error).__name__}: {error}", "where": _where(error)})
+
+
+def _nothing(words: dict[str, Any], arrays: dict[str, np.ndarray]) -> Reply:
+    raise ValueError("the first message must be 'play'")
+
+
+def _player(words: dict[str, Any]) -> tuple[Callable[..., Reply], dict[str, Any]]:
+    """What answers from now on, and what the method says of itself."""
+    import gymnasium as gym
+    env: Any = gym.make(words["id"], disable_env_checker=True, **words["kwargs"]).unwrapped
+    about: dict[str, Any]
+    loaded: Any
+    if words["kind"] == "estimator":
+        from eitbench.bench.baselines import load_baseline
+        loaded = baseline = load_baseline(words["name"])
+        answer, about = _estimator(env.task, baseline), {"boards": baseline.boards, "suits": baseline.suits(env.task)}
+    else:
+        from eitbench.bench.policies import load_policy
+        loaded = policy = load_policy(words["name"])
+        answer, about = _policy(env.rules, policy), {"suits": policy.suits(env.rules)}
+    return answer, about | {name: getattr(loaded, name)
+                            for name in ("name", "title", "parameters", "role", "privileged")}
+
+
+def _estimator(task: Any, baseline: Any) -> Callable[..., Reply]:
+    estimator = None
+
+    def answer(words: dict[str, Any], arrays: dict[str, np.ndarray]) -> Reply:
+        nonlocal estimator
+        if words["do"] == "begin":
+            estimator = baseline.estimator(task)
+            return {}, {}
+        assert estimator is not None
+        estimate = estimator.update(arrays["voltages"], arrays["currents"])
+        if estimate is None:
+            return {"estimate": None}, {}
+        if not hasattr(estimate, "_asdict"):
+            return {"estimate": type(estimate).__name__}, {}
+        said = {key: np.asarray(value) for key, value in estimate._asdict().items() if value is not None}
+        return {"estimate": "Estimate"}, said
+
+    return answer
+
+
+def _policy(rules: Any, policy: Any) -> Callable[..., Reply]:
+    player = None
+
+    def answer(words: dict[str, Any], arrays: dict[str, np.ndarray]) -> Reply:
+        nonlocal player
+        if words["do"] == "begin":
+            player = policy.policy(rules, np.random.default_rng(words["random"]))
+            return {}, {}
+        assert player is not None
+        return {}, {"action": np.asarray(player.act(arrays))}
+
+    return answer
+
+
+def _where(error: BaseException) -> str:
+    """File and line where it was raised, without the folders of this machine."""
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{Path(last.filename).name}:{last.lineno}"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,257 @@
+"""Run somebody else's estimator or policy in a process of its own: `Guest`. What passes between is measured numbers.
+
+What this protects against, and what not, is in ``docs/trust.md``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import select
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from eitbench._files import PACKAGE
+from eitbench.bench.baselines import is_ours
+from eitbench.bench.sandbox import wire
+from eitbench.data.episodes import cache_folder
+
+MEMORY = 8 << 30
+"""bytes of address space that a guest may take"""
+PATIENCE = 600.0
+"""s that an answer may take; the first after an episode began may hold all preparations"""
+MODELS = ("outline.npz", "region.npz", "reduced-*.npz", "joint-*.npz")
+"""What the cache holds of a scenario, made without any episode; the files of an episode begin with its seed."""
+ARITHMETIC = ("OPENBLAS_", "MKL_", "OMP_", "NPY_", "NUMBA_CPU")
+"""Variables on which the last bits of numbers depend begin so."""
+
+
+class GuestError(RuntimeError):
+    """The guest raised an exception, broke a limit, or does not speak the language."""
+
+    where: str = "guest"
+
+
+class Guest:
+    """A process that plays one estimator or policy in one environment, episode after episode.
+
+    Parameters
+    ----------
+    kind : "estimator" or "policy"
+    id, kwargs
+        The environment, of which it makes its own, without an episode.
+    name : str
+        One of ours, or the path of a .py file or an agent's model.zip. A file that is not ours is copied into a folder
+        of the guest's own, which is the only place where it can write.
+    memory : int
+        bytes
+    patience : float
+        s
+
+    Raises
+    ------
+    GuestError
+        If the method cannot be loaded.
+    ValueError
+        If the cache folder lies where the guest can read.
+    """
+
+    def __init__(self, kind: str, id: str, kwargs: dict[str, Any], name: str, *, memory: int = MEMORY,
+                 patience: float = PATIENCE) -> None:
+        self._patience, self._over = patience, False
+        self.sha256 = ""
+        """Of the file that was copied; empty for one of ours."""
+        self._private = Path(tempfile.mkdtemp(prefix="eitbench-guest-"))
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "eitbench.bench.sandbox.guest", str(self._private), str(memory)],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,    # a terminal can be typed into
+            start_new_session=True, env=self._surroundings(id, kwargs), cwd=self._private)
+        try:
+            assert self._process.stdin is not None
+            os.set_blocking(self._process.stdin.fileno(), False)
+            wall = self._receive()[0]                                                    # no stranger's word yet
+            self.closed = bool(wall["closed"])
+            """Whether files are out of its reach."""
+            if self.closed:
+                _refuse_open_cache(wall["readable"])
+            self.about = self._ask({"do": "play", "kind": kind, "id": id, "kwargs": kwargs,
+                                    "name": self._copied(name)})[0]
+            """What the method's class says of itself: unchecked words of a stranger."""
+        except BaseException:
+            self.close()
+            raise
+
+    def begin(self, random: int = 0) -> None:
+        """A new episode: another estimator or policy, of the same class; a policy's generator is seeded with this."""
+        self._ask({"do": "begin", "random": random})
+
+    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Any:
+        """What the estimator makes of a measurement: an `Estimate` or None."""
+        from eitbench.worlds.task import Estimate
+        words, arrays = self._ask({"do": "update"}, {"voltages": voltages, "currents": currents})
+        if words.get("estimate") is None:
+            return None
+        if words["estimate"] != "Estimate":
+            raise GuestError("ValueError: Estimator.update must return an Estimate or None, got "
+                             f"{_plain(words['estimate'])}")
+        if not {"mean"} <= set(arrays) <= set(Estimate._fields):
+            raise GuestError(f"ValueError: Estimator.update must return an Estimate, got one of "
+                             f"{_plain(', '.join(arrays))}")
+        return Estimate(**arrays)
+
+    def act(self, observation: dict[str, np.ndarray]) -> Any:
+        """The policy's action."""
+        action = self._ask({"do": "act"}, observation)[1].get("action", np.zeros(0))
+        return int(action) if action.shape == () and action.dtype.kind in "iu" else action
+
+    @property
+    def alive(self) -> bool:
+        """Whether it can be asked: not after a crash, nonsense, or an answer that did not come in time."""
+        return self._process.poll() is None
+
+    @property
+    def peak_memory(self) -> int | None:
+        """bytes that it has held at most; None where that is not told."""
+        try:
+            status = Path(f"/proc/{self._process.pid}/status").read_text()
+        except OSError:
+            return None
+        return next((1024 * int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM")), None)
+
+    def close(self) -> None:
+        """End it and its children, and remove its folder."""
+        self._end()
+        for pipe in (self._process.stdin, self._process.stdout):
+            if pipe:
+                pipe.close()
+        shutil.rmtree(self._private, ignore_errors=True)
+
+    def __enter__(self) -> Guest:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 trace: TracebackType | None) -> None:
+        self.close()
+
+    def _surroundings(self, id: str, kwargs: dict[str, Any]) -> dict[str, str]:
+        """Environment variables; models that are kept in the cache, without a truth, are copied for the guest."""
+        from eitbench.data.episodes import CACHE_VARIABLE, folder
+        from eitbench.envs import scenario_of
+        cache, kernels = self._private / "cache", self._private / "kernels"
+        there = folder(scenario_of(id, kwargs))
+        (cache / there.name).mkdir(parents=True)
+        for model in (path for pattern in MODELS for path in there.glob(pattern)):
+            shutil.copy(model, cache / there.name)
+        _copy_kernels(kernels)
+        package = PACKAGE.parent
+        arithmetic = {name: value for name, value in os.environ.items() if name.startswith(ARITHMETIC)}
+        return arithmetic | {
+            "PATH": os.environ.get("PATH", ""), "HOME": str(self._private), "TMPDIR": str(self._private),
+            "PYTHONPATH": str(package), "PYTHONDONTWRITEBYTECODE": "1", "NUMBA_CACHE_DIR": str(kernels),
+            CACHE_VARIABLE: str(cache),
+        } | dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+
+    def _copied(self, name: str) -> str:
+        if not name.endswith((".py", ".zip")):
+            return name
+        if is_ours(name):                              # a copy would pass for a stranger's that has taken our name
+            return str(Path(name).resolve())
+        path, place = Path(name), self._private / "own"
+        place.mkdir()
+        beside: Sequence[str] = ("config.json", "sha256") if path.suffix == ".zip" else ()
+        for each in (path, *(path.with_name(other) for other in beside)):
+            if each.exists():
+                shutil.copy(each, place)
+        self.sha256 = hashlib.sha256((place / path.name).read_bytes()).hexdigest()
+        return str(place / path.name)
+
+    def _ask(self, words: dict[str, Any], arrays: dict[str, np.ndarray] | None = None,
+             ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        try:
+            self._send(wire.pack(words, arrays))
+            answer = self._receive()
+        except BaseException:                          # whatever it says from now on would answer another question
+            self._end()
+            raise
+        if "error" in answer[0]:
+            error = GuestError(_plain(answer[0]["error"]).replace(f"{self._private}{os.sep}own{os.sep}", ""))
+            error.where = _plain(answer[0].get("where"))
+            raise error
+        return answer
+
+    def _send(self, message: bytes) -> None:
+        assert self._process.stdin is not None
+        pipe, deadline, left = self._process.stdin.fileno(), time.monotonic() + self._patience, memoryview(message)
+        while left:                                    # a pipe that nobody reads is full some time
+            if not select.select([], [pipe], [], max(0.0, deadline - time.monotonic()))[1]:
+                raise GuestError(f"TimeoutError: a question was not read within {self._patience:g} s")
+            try:
+                left = left[os.write(pipe, left):]
+            except BrokenPipeError:
+                raise self._ended() from None
+
+    def _receive(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        assert self._process.stdout is not None
+        pipe, deadline = self._process.stdout.fileno(), time.monotonic() + self._patience
+
+        def read(n: int) -> bytes:
+            parts, left = [], n
+            while left:
+                if not select.select([pipe], [], [], max(0.0, deadline - time.monotonic()))[0]:
+                    raise GuestError(f"TimeoutError: no answer within {self._patience:g} s")
+                part = os.read(pipe, min(left, 1 << 20))
+                if not part:
+                    raise self._ended()
+                parts.append(part)
+                left -= len(part)
+            return b"".join(parts)
+
+        try:
+            return wire.unpack(read)
+        except ValueError as error:
+            raise GuestError(f"ValueError: {error}") from None
+
+    def _ended(self) -> GuestError:
+        return GuestError(f"ChildProcessError: its process ended with status {self._end()}, which is what a crash "
+                          "does, or a limit of memory")
+
+    def _end(self) -> int:
+        """Kill it and all processes of its session; its status."""
+        if not self._over:                             # only once: later the number may be another's
+            self._over = True
+            with suppress(ProcessLookupError, PermissionError):            # it has ended by itself
+                os.killpg(self._process.pid, signal.SIGKILL)
+        return self._process.wait()
+
+
+def _refuse_open_cache(readable: list[str]) -> None:
+    """``ValueError`` if the truths of episodes are kept in one of these places or beneath."""
+    cache = cache_folder().resolve()
+    if place := next((place for place in readable if cache.is_relative_to(Path(place).resolve())), None):
+        raise ValueError(f"the cache folder {cache} lies in {place}, which guests may read; let $EITBENCH_CACHE name "
+                         "another")
+
+
+def _plain(said: Any) -> str:
+    """What a guest said, as text that can be kept anywhere."""
+    return str(said)[:2000]
+
+
+def _copy_kernels(place: Path) -> None:
+    """numba's compiled kernels, where it will look for them: compiling takes some 20 s."""
+    folder = PACKAGE / "numerics"
+    there = place / f"{folder.name}_{hashlib.sha1(str(folder).encode()).hexdigest()}"
+    there.mkdir(parents=True)
+    for path in (folder / "__pycache__").glob("*.nb?"):
+        shutil.copy2(path, there)

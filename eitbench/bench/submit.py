@@ -1,0 +1,110 @@
+"""Play the test episodes with one method, or all of ours, and put what came out among the leaderboards' records."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from eitbench.bench import suites
+from eitbench.bench.records import file_name, read_record, split_of, write_record
+from eitbench.bench.run import Job, run_jobs
+from eitbench.bench.store import EpisodeStore, provenance, results_of, source_digest, unplayed
+from eitbench.data.seeds import name_seed
+from eitbench.envs import ENTRY_POINTS, INJECTION
+from eitbench.report.summary import seed_ranges
+
+
+def submit(method: str | None, environments: list[str], seeds: list[int] | None, store: EpisodeStore, to: Path, *,
+           policy: bool = False, official: bool = False, isolate: str = "others", n_jobs: int = 1,
+           backend: str = "loky", command: str = "") -> Iterator[Path]:
+    """Play what neither ``store`` nor a record holds yet, and write one record for each environment into the folder
+    ``to``.
+
+    Environment after environment, so that what was done when the run is interrupted has its records.
+
+    Parameters
+    ----------
+    method : str or None
+        Name or path of a baseline, or of a ``policy``. None: all of ours.
+    environments : list of str
+        With a method at least one, and all of them must be such that it plays them; without, by default all.
+    seeds : list of int
+        Of the test split; default: those of the full suite.
+    official : bool
+        Whether a maintainer runs it; else the records say that they are self-reported.
+    isolate : str
+        Whether the method runs in a process of its own; one of `suites.ISOLATE`.
+    n_jobs, backend, command
+        As in `run.run_jobs`.
+
+    Yields
+    ------
+    path
+        Of a record. All test episodes that the store, or a record there before, holds of this method and this code are
+        in them, those that failed too.
+
+    Raises
+    ------
+    ValueError
+        If a seed is not of the test split, the method does not play one of the environments, an official one is asked
+        for from a checkout with changes, or a record is not valid or would replace one of the same code that says more.
+    """
+    code = provenance()
+    if official and (code["commit"] is None or code["dirty"]):
+        raise ValueError("official must be False unless this is a commit without changes, got official=True "
+                         + ("outside a checkout" if code["commit"] is None else f"and changes to {code['commit'][:8]}"))
+    outside = [name_seed(seed) for seed in seeds or [] if split_of(name_seed(seed)) != "test"]
+    if outside:
+        raise ValueError(f"seeds of a submission must be of the test split, got {', '.join(outside)}")
+    if method is not None and not environments:
+        raise ValueError("env must name at least one environment to submit for")
+    asked = (_jobs(method, id, policy, seeds, isolate) for id in environments or ENTRY_POINTS)
+    for jobs in asked if method is None else list(asked):          # what does not fit is said before anything is played
+        before = list[dict[str, Any]]()
+        for job in {(job.environment, job.method): job for job in jobs}.values():
+            path = _path_of(Path(to), job)
+            if (earlier := _earlier(path, source_digest())) is not None:
+                _check_nothing_is_lost(path, earlier, official)
+                before += results_of(earlier) if earlier["official"] == official else []
+        run_jobs(unplayed(jobs, before), store, n_jobs=n_jobs, backend=backend, command=command)
+        played = {(job.environment.name, job.load().name) for job in jobs}
+        made = [record | {"official": official} for record in store.records(also=before)
+                if (record["environment"]["name"], record["method"]) in played and record["split"] == "test"]
+        for record in made:
+            path = Path(to) / file_name(record)
+            if (earlier := _earlier(path, record["source"])) is not None:
+                _check_nothing_is_lost(path, earlier, official, record["seeds"])
+        for record in made:
+            yield write_record(to, record)
+
+
+def _jobs(method: str | None, id: str, policy: bool, seeds: list[int] | None, isolate: str) -> list[Job]:
+    """What is to be played in one environment."""
+    methods = [] if method is None else [method]
+    if id in INJECTION if method is None else policy:
+        return suites.policy_jobs([id], methods, seeds, isolate=isolate)
+    return suites.jobs("full", [id], methods, seeds, isolate=isolate)
+
+
+def _path_of(to: Path, job: Job) -> Path:
+    """Where the record of a job's method will lie."""
+    method = job.load()
+    return to / file_name({"environment": {"name": job.environment.name}, "method": method.name,
+                           "method_sha256": method.sha256, "split": "test"})
+
+
+def _earlier(path: Path, source: str) -> dict[str, Any] | None:
+    """The record at ``path``, if it is one of the same code; an outdated one is played again."""
+    record = read_record(path) if path.exists() else None
+    return record if record is not None and record["source"] == source else None
+
+
+def _check_nothing_is_lost(path: Path, earlier: dict[str, Any], official: bool, seeds: list[str] | None = None) -> None:
+    """``ValueError`` if the record at ``path`` would lose what makes it worth more; before anything is played, without
+    ``seeds``, as far as is known then."""
+    missing = [] if seeds is None else [seed for seed in earlier["seeds"] if seed not in seeds]
+    lost = [*["its being official"] * (earlier["official"] and not official),
+            *([f"its episodes {seed_ranges(missing)}"] if missing else [])]
+    if lost:
+        raise ValueError(f"to must not hold a record that says more; {path} would lose {' and '.join(lost)}")

@@ -1,0 +1,126 @@
+"""What `eitbench run` runs when it is not told."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from eitbench.bench.baselines import Baseline, find_baseline, is_ours, load_baseline, own_baselines
+from eitbench.bench.policies import environment as injection_environment
+from eitbench.bench.policies import find_policy, load_policy, own_agents, own_policies
+from eitbench.bench.run import Environment, Job, board_of
+from eitbench.data.seeds import parse_seeds
+from eitbench.envs import ESTIMATION, INJECTION
+from eitbench.envs.estimation import EstimationEnv
+
+QUICK = ("eitbench/Pipe2D-v0", "eitbench/Pipe2DFixedLag-v0", "eitbench/Pipe2DSmoothing-v0")
+"""What the quick suite runs; the full one runs all that ask for estimates."""
+SEEDS = {"quick": "test:0-3", "full": "test:0-9"}
+POLICY_SEEDS = {"eitbench/Pipe2DInjectionFaults-v0": "test:0-49", "eitbench/Pipe2DInjectionBudget-v0": "test:0-49",
+                "eitbench/Pipe2DInjectionFlow-v0": "test:0-29"}
+"""Competitions have many, fewer where the estimator inside takes a minute an episode. Others: test:0-9."""
+FEWER_SEEDS = {"velocity": "test:0-5", "3d": "test:0-5"}
+"""In the full suite, where an episode takes a minute a method and more: with the flow asked for too, and in 3D. With
+fewer than six there would be no intervals and no ranks."""
+# An image at every step: minutes an episode.
+TOO_SLOW_FOR_QUICK = {("filter", "gauss_newton")}
+ISOLATE = ("never", "others", "always")
+"""Whose methods run in a process of their own."""
+
+
+def jobs(suite: str, environments: list[str], baselines: list[str], seeds: list[int] | None = None, *,
+         isolate: str = "others") -> list[Job]:
+    """Every named baseline (default: all of ours) on every named environment (default: the suite's), on ``seeds``
+    (default: the suite's), ordered by environment, method and seed. ``isolate`` is one of `ISOLATE`.
+
+    Raises
+    ------
+    ValueError
+        If an environment is not registered, a baseline does not exist, or no pair of them fits.
+    """
+    for baseline in baselines:
+        find_baseline(baseline)
+    todo, names = [], dict[str, str]()
+    environments = environments or list(QUICK if suite == "quick" else ESTIMATION)
+    for name in environments:
+        environment = Environment(name)
+        env = environment.make()
+        board, slow = board_of(env), _expensive(env)
+        numbers = seeds
+        if numbers is None:
+            numbers = parse_seeds(FEWER_SEEDS[slow] if slow and suite == "full" else SEEDS[suite])
+        suited = list[Job]()
+        for baseline in baselines or own_baselines():
+            skipped = suite == "quick" and not baselines and (board, baseline) in TOO_SLOW_FOR_QUICK
+            job = Job(environment, _absolute(baseline), 0, is_isolated(environment, baseline, isolate))
+            loaded = job.load()
+            assert isinstance(loaded, Baseline)
+            names[baseline] = loaded.name
+            if board in loaded.boards and not skipped and loaded.suits(env.task):
+                suited.append(job)
+        # Environment by environment, since models are kept for a few only, and a guest for one method.
+        todo += [job._replace(seed=seed) for job in suited for seed in numbers]
+    _distinct(names)
+    if not todo:
+        raise ValueError(f"none of the baselines {', '.join(baselines)} plays any of the environments "
+                         f"{', '.join(environments)}; see `eitbench list`")
+    return todo
+
+
+def policy_jobs(environments: list[str], policies: list[str], seeds: list[int] | None = None,
+                estimator: str = "full", *, isolate: str = "others") -> list[Job]:
+    """Every named policy (default: all of ours that suit, trained agents among them) in every named environment, on
+    ``seeds`` (default: those of `POLICY_SEEDS`), with this estimator inside. ``isolate`` is one of `ISOLATE`.
+
+    Raises
+    ------
+    ValueError
+        If an environment does not ask for injections, or a policy does not exist or suit one.
+    """
+    if estimator not in ("full", "reduced"):
+        raise ValueError(f"estimator must be 'full' or 'reduced', got {estimator!r}")
+    kwargs = "{}" if estimator == "full" else json.dumps({"estimator": estimator})
+    for policy in policies:
+        find_policy(policy)
+    todo, names = [], dict[str, str]()
+    for id in environments:
+        environment, rules = Environment(id, kwargs), injection_environment(id, "{}", "reduced").rules
+        for policy in policies or [*own_policies(), *own_agents(id)]:
+            job = Job(environment, _absolute(policy), 0, is_isolated(environment, policy, isolate))
+            loaded = job.load()
+            assert not isinstance(loaded, Baseline)
+            names[policy] = loaded.name
+            numbers = parse_seeds(POLICY_SEEDS.get(id, SEEDS["full"])) if seeds is None else seeds
+            if loaded.suits(rules):
+                todo += [job._replace(seed=seed) for seed in numbers]
+            elif policies:
+                raise ValueError(f"policy {loaded.name} does not suit {id}")
+    _distinct(names)
+    return todo
+
+
+def is_isolated(environment: Environment, method: str, isolate: str) -> bool:
+    """Whether a method plays in a process of its own; those of ours that are shown the truth never do."""
+    if isolate not in ISOLATE:
+        raise ValueError(f"isolate must be one of {', '.join(ISOLATE)}, got {isolate!r}")
+    if isolate != "always" or not is_ours(method):
+        return isolate != "never" and not is_ours(method)
+    return not (load_policy if environment.id in INJECTION else load_baseline)(method).privileged
+
+
+def _distinct(names: dict[str, str]) -> None:
+    """``ValueError`` if two of the methods, by the name of their file, would be kept under one name."""
+    first: dict[str, str] = {}
+    for file, name in names.items():
+        if first.setdefault(name, file) != file:
+            raise ValueError(f"{first[name]} and {file} have the same name, under which results are kept; rename one")
+
+
+def _expensive(env: EstimationEnv) -> str | None:
+    """Which of `FEWER_SEEDS` an environment is among."""
+    return "velocity" if env.task.velocity is not None else "3d" if env.task.mesh.dim == 3 else None
+
+
+def _absolute(method: str) -> str:
+    """A path that worker processes find too; a name as it is."""
+    return str(Path(method).absolute()) if method.endswith((".py", ".zip")) else method

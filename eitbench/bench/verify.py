@@ -1,0 +1,160 @@
+"""Whether a record is true: play some of its episodes again, or others that nobody could prepare for, and compare."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pandas as pd
+
+from eitbench import _check
+from eitbench.bench.baselines import find_baseline, load_baseline, own_baselines
+from eitbench.bench.policies import find_policy, load_policy, own_agents, own_policies
+from eitbench.bench.records import SHARED
+from eitbench.bench.run import Environment, Job, run_episode
+from eitbench.bench.sandbox import guests
+from eitbench.bench.store import source_digest
+from eitbench.bench.suites import is_isolated
+from eitbench.data.episodes import CACHE_VARIABLE
+from eitbench.data.seeds import parse_seeds
+from eitbench.envs import INJECTION
+from eitbench.report.summary import as_markdown
+
+TOLERANCE = 1e-6
+"""Relative difference of a score that is none, on one machine; sums are taken in another order on another."""
+UNCERTAIN = ("seconds_per_step",)
+"""Scores that do not repeat."""
+
+
+def job_of(record: dict[str, Any], file: str | None = None, isolate: str = "always") -> Job:
+    """What a record says was played, with the method in ``file`` (default: that of ours which has its name).
+
+    Raises
+    ------
+    ValueError
+        If there is no such method, it or the environment's code is not that of the record, or the record gives the
+        registered environment another name.
+    """
+    id = record["environment"]["id"]
+    kwargs = {key: value for key, value in record["environment"]["kwargs"].items()
+              if key != "observation" or id not in INJECTION}                  # what policies see is not a choice
+    environment = Environment(id)
+    if record["environment"]["name"] != environment.name:
+        if kwargs == gym.spec(id).kwargs | ({"estimator": "full"} if id in INJECTION else {}):
+            raise ValueError(f"the record's environment must be named {environment.name}, whose arguments it has, got "
+                             f"{record['environment']['name']}")
+        environment = Environment(id, json.dumps(kwargs))
+    method = _own(record) if file is None else str(Path(file).absolute())
+    if method is None:
+        raise ValueError(f"{record['method']} is none of ours: its file must be given, as --baseline or --policy")
+    path = (find_policy if id in INJECTION else find_baseline)(method)
+    wrong = [f"{what} is {found}, that of the record {record[field]}" for what, found, field in (
+        (f"the sha256 of {path.name}", hashlib.sha256(path.read_bytes()).hexdigest(), "method_sha256"),
+        ("the digest of the environments' code", source_digest(), "source")) if found != record[field]]
+    if wrong:
+        raise ValueError(f"what the record says cannot be played here: {'; '.join(wrong)}")
+    return Job(environment, method, 0, is_isolated(environment, method, isolate))
+
+
+def verify(record: dict[str, Any], job: Job, *, episodes: int = 3, seed: int = 0,
+           tolerance: float = TOLERANCE) -> tuple[str, list[str]]:
+    """Play some of a record's episodes again.
+
+    Parameters
+    ----------
+    record, job
+        As read, and what `job_of` makes of it.
+    episodes : int
+        How many, at least one; drawn from all of them, with this ``seed``.
+    tolerance : float
+        Relative difference of scores that is taken for none.
+
+    Returns
+    -------
+    table, differences
+        Markdown, and a sentence for each thing that is not as the record says.
+    """
+    _check.integer("episodes", episodes, low=1)
+    drawn = np.random.default_rng(seed).permutation(len(record["episodes"]))[:episodes]
+    rows, differences = [], list[str]()
+    for said in (record["episodes"][i] for i in sorted(drawn)):
+        again = json.loads(json.dumps(run_episode(job._replace(seed=parse_seeds(said["seed"])[0]))[0]))
+        wrong = differences_of(said, again)
+        differences += [f"{said['seed']}: {_difference(name, said, again)}"
+                        for name, off in wrong.items() if off > tolerance]
+        again["environment"]["name"] = record["environment"]["name"]             # arguments may stand in another order
+        differences += [f"{name} is {again[name]!r}, the record says {record[name]!r}"
+                        for name in (*SHARED, "environment", "method") if again[name] != record[name]]
+        worst = max(wrong, key=lambda name: wrong[name], default="")
+        rows.append({"episode": said["seed"], "greatest difference in": worst if wrong.get(worst) else "none",
+                     "relative": f"{wrong.get(worst, 0.0):.1g}", "record's ẽ_c": _value(said, "error"),
+                     "ẽ_c again": _value(again, "error")})
+    return as_markdown(pd.DataFrame(rows), words=2), list(dict.fromkeys(differences))
+
+
+@contextmanager
+def empty_cache() -> Iterator[None]:
+    """Within, nothing is taken from the cache folder: episodes and models are made anew, and thrown away."""
+    before = os.environ.get(CACHE_VARIABLE)
+    with tempfile.TemporaryDirectory(prefix="eitbench-verify-") as folder:
+        os.environ[CACHE_VARIABLE] = folder
+        try:
+            yield
+        finally:
+            guests.close()
+            if before is None:
+                del os.environ[CACHE_VARIABLE]
+            else:
+                os.environ[CACHE_VARIABLE] = before
+
+
+def _own(record: dict[str, Any]) -> str | None:
+    """Ours of the record's name."""
+    id, name = record["environment"]["id"], record["method"]
+    if id not in INJECTION:
+        return next((own for own in own_baselines() if load_baseline(own).name == name), None)
+    return next((own for own in [*own_policies(), *own_agents(id)] if load_policy(own).name == name), None)
+
+
+def differences_of(said: dict[str, Any], again: dict[str, Any]) -> dict[str, float]:
+    """Score -> relative difference between two results of an episode."""
+    if said["status"] != again["status"]:
+        return {"status": np.inf}
+    if said["status"] == "failed":
+        return {}
+    off = {name: _relative([said["scores"].get(name)], [again["scores"].get(name)])
+           for name in sorted({*said["scores"], *again["scores"]} - {*UNCERTAIN})}
+    return off | {"step_errors": _relative(said["step_errors"], again["step_errors"])}
+
+
+def _relative(a: list[float | None], b: list[float | None]) -> float:
+    """Greatest |a − b| / max(|a|, |b|); infinite where only one is a number."""
+    if len(a) != len(b):
+        return np.inf
+    return max(0.0 if x == y else np.inf if x is None or y is None else abs(x - y) / max(abs(x), abs(y))
+               for x, y in zip(a, b, strict=True))
+
+
+def _difference(name: str, said: dict[str, Any], again: dict[str, Any]) -> str:
+    """What one score is now and was then; of the errors of all steps, the one that has changed most."""
+    if name != "step_errors":
+        return f"{name} is {_value(again, name)}, the record says {_value(said, name)}"
+    now, then = again[name], said[name]
+    if len(now) != len(then):
+        return f"{name} are {len(now)}, the record has {len(then)}"
+    worst = max(range(len(now)), key=lambda k: _relative([now[k]], [then[k]]))
+    return f"{name}[{worst}] is {now[worst]}, the record says {then[worst]}"
+
+
+def _value(episode: dict[str, Any], name: str) -> str:
+    if name == "status" or episode["status"] == "failed":
+        return episode["status"] + (f" ({episode['message']})" if "message" in episode and name == "status" else "")
+    return str(episode["scores"].get(name))

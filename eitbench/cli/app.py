@@ -1,0 +1,360 @@
+"""The command line: `eitbench list | run | bank | train | policies | submit | verify | held-out | leaderboard |
+compare | render | reproduce`."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from eitbench.cli.options import CORES, Backend, Backends, Isolate, Isolation, Jobs, Out, clear_errors
+from eitbench.cli.studies import thesis
+from eitbench.cli.trust import held_out, verify
+
+app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, context_settings={
+    "help_option_names": ["-h", "--help"]}, help="""
+Benchmark estimators that see a flow only through voltages on the pipe's wall.
+
+A first look:  eitbench run  — runs our baselines on four test episodes, prints the table, writes results/index.html.
+""")
+
+
+
+class Suite(StrEnum):
+    """What to run when not told in detail."""
+
+    quick = "quick"
+    full = "full"
+
+
+class Algorithm(StrEnum):
+    """What may learn."""
+
+    ppo = "ppo"
+    dqn = "dqn"
+    sac = "sac"
+    recurrent_ppo = "recurrent_ppo"
+    maskable_ppo = "maskable_ppo"
+
+
+Figure = StrEnum("Figure", {re.sub(r"\W", "_", name).upper(): name for name in thesis().FIGURES})  # type: ignore[misc]
+
+
+RECORDS = Path("leaderboards/results")
+
+
+@app.command("list")
+def list_() -> None:
+    """Show the environments and the baselines, and which board each plays on."""
+    import gymnasium as gym
+
+    from eitbench.bench.baselines import load_baseline, own_baselines
+    from eitbench.bench.run import Environment, board_of
+    from eitbench.envs import ESTIMATION, INJECTION
+    typer.echo("environments")
+    for name in ESTIMATION:
+        env = Environment(name).make()
+        scenario = env.scenario
+        typer.echo(f"  {name:40} {board_of(env):10}  lag {env.lag}, {scenario.n_steps - scenario.warm_up} scored of "
+                   f"{scenario.n_steps} states, {env.action_space.shape[0]} numbers each")  # type: ignore[index]
+    for name in INJECTION:
+        core = gym.make(name).unwrapped.core  # type: ignore[attr-defined]
+        rules = core.rules
+        what = f"{len(rules.pairs)} electrode pairs" if rules.limit is None else f"{rules.limit} currents"
+        allowed = "" if rules.budget is None else f", {rules.budget} of them allowed"
+        typer.echo(f"  {name:40} injection   {what}, {core.length} injections{allowed}")
+    typer.echo("baselines")
+    for name in own_baselines():
+        baseline = load_baseline(name)
+        typer.echo(f"  {name:40} {', '.join(baseline.boards):30}  {baseline.title}")
+
+
+@app.command()
+def run(
+    suite: Annotated[Suite, typer.Option(help="quick: the 2D pipe, test:0-3, two minutes on two cores; full: every "
+                                              "environment, more seeds, methods that take long.")] = Suite.quick,
+    env: Annotated[list[str] | None, typer.Option(help="Environment id; may be repeated. Default: suite's.")] = None,
+    baseline: Annotated[list[str] | None, typer.Option(
+        help="Name of one of ours, or the path of your own .py file; may be repeated. Default: all of ours.")] = None,
+    seeds: Annotated[str | None, typer.Option(help="Episodes, as in dev:0-9 or test:3. Default: the suite's.")] = None,
+    isolate: Isolate = Isolation.others,
+    jobs: Jobs = CORES,
+    backend: Backends = Backend.loky,
+    out: Out = Path("results"),
+) -> None:
+    """Run baselines on environments, print the table and write the page.
+
+    Each episode is stored the moment it is done; the same command again resumes where it was interrupted.
+    """
+    from eitbench.bench import suites
+    from eitbench.bench.run import run_jobs
+    from eitbench.bench.store import EpisodeStore
+    with clear_errors():
+        todo = suites.jobs(suite.value, env or [], baseline or [], _numbers(seeds),
+                           isolate=isolate)
+        run_jobs(todo, EpisodeStore(out), n_jobs=jobs, backend=backend, command=_command())
+        _report(out)
+
+
+@app.command()
+def bank(
+    env: Annotated[str, typer.Option(help="Environment id.")] = "eitbench/Pipe2D-v0",
+    seeds: Annotated[str, typer.Option(help="Episodes, such as train:0-999.")] = "train:0-99",
+    jobs: Jobs = CORES,
+    backend: Backends = Backend.loky,
+) -> None:
+    """Simulate many episodes ahead of training and keep what an environment needs of them.
+
+    They lie, memory-mapped, in the cache folder ($EITBENCH_CACHE). The same command again resumes.
+    """
+    import shutil
+
+    from eitbench.data.bank import fill, missing_seeds, recording_bytes
+    from eitbench.data.episodes import folder
+    from eitbench.data.seeds import parse_seeds
+    from eitbench.envs import scenario_of
+    with clear_errors():
+        numbers, scenario = parse_seeds(seeds), scenario_of(env)
+    place, each = folder(scenario), recording_bytes(scenario)
+    try:
+        place.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise typer.BadParameter(f"recordings cannot be kept in {place}: {error}") from error
+    missing = len(missing_seeds(scenario, numbers))
+    typer.echo(f"{len(numbers)} episodes, {len(numbers) * each / 1e6:.0f} MB in {place}; {missing} to simulate")
+    free = shutil.disk_usage(place).free
+    if missing * each > free:
+        raise typer.BadParameter(f"seeds need {missing * each / 1e9:.1f} GB more, and {free / 1e9:.1f} GB are free")
+    with clear_errors():
+        made = fill(scenario, numbers, n_jobs=jobs, backend=backend)
+    typer.echo(f"{made} simulated, {len(numbers) - made} were there")
+
+
+@app.command()
+def train(
+    env: Annotated[str, typer.Option(help="Id of an injection environment.")],
+    algo: Annotated[Algorithm, typer.Option(help="Algorithm of stable-baselines3 or sb3-contrib.")] = Algorithm.ppo,
+    config: Annotated[Path, typer.Option(help="A YAML file such as those in baselines/rl.")] = Path(
+        "baselines/rl/ppo.yml"),
+    seed: Annotated[int, typer.Option(min=0, help="Of the training; episodes are drawn from the train split.")] = 0,
+    steps: Annotated[int | None, typer.Option(min=0, help="Steps in place of the configuration's total_steps.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder of the run. Default: "
+                                             "results/training/ENV/ALGO/seedK.")] = None,
+) -> None:
+    """Train an agent to choose injections.
+
+    The same command again goes on from the last checkpoint. The folder receives model.zip, config.json, monitor.csv,
+    evaluations.npz (scores on dev episodes) and logs for TensorBoard.
+    """
+    from dataclasses import replace
+    with clear_errors():
+        from eitbench.rl import training
+        asked = training.read_config(config)
+        folder = out or Path("results/training") / env.replace("/", "-") / algo.value / f"seed{seed}"
+        model = training.train(env, algo.value, asked if steps is None else replace(asked, total_steps=steps), seed,
+                               folder)
+    typer.echo(f"wrote {model}")
+
+
+@app.command()
+def policies(
+    env: Annotated[str, typer.Option(help="Id of an injection environment.")],
+    policy: Annotated[list[str] | None, typer.Option(
+        help="Name of one of ours, the path of your own .py file, or of an agent's model.zip; may be repeated. "
+             "Default: all of ours.")] = None,
+    seeds: Annotated[str | None, typer.Option(help="Episodes, such as dev:0-49. Default: those of the boards.")] = None,
+    estimator: Annotated[str, typer.Option(help="full: the exact filter, for scores; reduced: that of training.")] = (
+        "full"),
+    isolate: Isolate = Isolation.others,
+    jobs: Jobs = CORES,
+    backend: Backends = Backend.loky,
+    out: Out = Path("results"),
+    records: Annotated[Path | None, typer.Option(
+        exists=True, file_okay=False, help="Folder of records, such as leaderboards/results: what they hold of these "
+                                           "episodes is not played again.")] = None,
+) -> None:
+    """Play injection policies, print their scores and the environment's adaptivity gap.
+
+    Each episode is stored the moment it is done; the same command again resumes.
+    """
+    from eitbench.bench.run import run_jobs
+    from eitbench.bench.store import EpisodeStore, results_in, unplayed
+    from eitbench.bench.suites import policy_jobs
+    from eitbench.report.policy_table import policy_rows, policy_table
+    with clear_errors():
+        todo = policy_jobs([env], policy or [], _numbers(seeds), estimator, isolate=isolate)
+        before = results_in(records) if records else []
+    store = EpisodeStore(out)
+    with clear_errors():
+        run_jobs(unplayed(todo, before), store, n_jobs=jobs, backend=backend, command=_command())
+    asked = {job.load().name: job.load().privileged for job in todo}
+    rows = policy_rows(todo, [*before, *store.results()])
+    typer.echo(policy_table(rows, [name for name, privileged in asked.items() if privileged]))
+    _say_failures([record for record in store.write_records()
+                   if record["method"] in asked and record["environment"]["id"] == env])
+
+
+@app.command()
+def submit(
+    env: Annotated[list[str] | None, typer.Option(help="Environment id; may be repeated.")] = None,
+    baseline: Annotated[str | None, typer.Option(help="Name of one of ours, or the path of your own .py file.")] = None,
+    policy: Annotated[str | None, typer.Option(
+        help="The same of an injection policy, or the path of a trained agent's model.zip. Without any method: all of "
+             "ours, by default in all environments.")] = None,
+    seeds: Annotated[str | None, typer.Option(help="Test episodes, as in test:0-9. Default: those of the "
+                                                   "boards.")] = None,
+    official: Annotated[bool, typer.Option("--official", help="For maintainers: a run of theirs.")] = False,
+    isolate: Isolate = Isolation.others,
+    jobs: Jobs = CORES,
+    backend: Backends = Backend.loky,
+    out: Out = Path("results"),
+    to: Annotated[Path, typer.Option(help="Folder of the records.")] = RECORDS,
+) -> None:
+    """Play the test episodes with one baseline or policy, or all of ours, and write records for the leaderboards.
+
+    Episodes are stored in OUT the moment they are done; the same command again resumes.
+    """
+    from eitbench.bench.records import read_record
+    from eitbench.bench.store import EpisodeStore
+    from eitbench.bench.submit import submit
+    with clear_errors():
+        if baseline and policy:
+            raise ValueError("one of --baseline and --policy may be given, got both")
+        for path in submit(baseline or policy, env or [], _numbers(seeds),
+                           EpisodeStore(out), to, policy=policy is not None, official=official, isolate=isolate,
+                           n_jobs=jobs, backend=backend, command=_command()):
+            record = read_record(path)
+            failed = sum(episode["status"] != "ok" for episode in record["episodes"])
+            typer.echo(f"wrote {path}: {len(record['seeds'])} episodes" + (f", {failed} failed" if failed else ""))
+
+
+app.command()(verify)
+app.command("held-out")(held_out)
+
+
+@app.command()
+def leaderboard(
+    out: Out = Path("results"),
+    records: Annotated[Path | None, typer.Option(
+        help="Folder of the leaderboards' records, such as leaderboards/results: render leaderboard.csv, "
+             "leaderboard.md and the pages site/ beside it instead.")] = None,
+) -> None:
+    """Print the table and write the page again from the results stored in a folder."""
+    if records is None:
+        with clear_errors():
+            return _report(out)
+    from eitbench._files import write_atomically
+    from eitbench.bench.records import read_records
+    from eitbench.report.boards import boards, render
+    from eitbench.report.site import read_media, render_site, write_site
+    beside = records.parent
+    with clear_errors():
+        if not records.is_dir():
+            raise ValueError(f"records must be a folder that exists, got {records}")
+        found = read_records(records)
+        table = boards(found)
+        write_site(beside / "site", render_site(found, table, read_media(beside / "media")))
+    for name, text in render(found, table).items():
+        write_atomically(beside / name, text.encode())
+        typer.echo(f"wrote {beside / name}")
+    typer.echo(f"wrote {beside / 'site' / 'index.html'}")
+
+
+@app.command()
+def compare(
+    a: Annotated[str, typer.Argument(help="A record's file, or METHOD or METHOD@VERSION among the records.")],
+    b: Annotated[str, typer.Argument(help="The same of the other.")],
+    records: Annotated[Path, typer.Option(help="Folder of the records.")] = RECORDS,
+    html: Annotated[Path | None, typer.Option(help="Write a page too.")] = None,
+) -> None:
+    """Compare two methods seed by seed: differences with intervals, and how often the first is better."""
+    from eitbench._files import write_atomically
+    from eitbench.report import compare as comparison
+    with clear_errors():
+        ours, theirs = (comparison.find(name, records) for name in (a, b))
+        table = comparison.compare(ours, theirs)
+    names = comparison.names(ours[0], theirs[0])
+    typer.echo(comparison.markdown(table, *names))
+    if html is not None:
+        write_atomically(html, comparison.html(table, *names).encode())
+        typer.echo(f"\nwrote {html}")
+
+
+@app.command()
+def render(
+    env: Annotated[str, typer.Option(help="Environment id.")] = "eitbench/Pipe2D-v0",
+    baseline: Annotated[str, typer.Option(help="Name of one of ours, or the path of a .py file.")] = "kalman_filter",
+    policy: Annotated[str | None, typer.Option(
+        help="The same of an injection policy, or of an agent's model.zip, in place of a baseline where injections are "
+             "asked for.")] = None,
+    seed: Annotated[str, typer.Option(help="The episode, such as dev:0.")] = "dev:0",
+    step: Annotated[int | None, typer.Option(help="Only this state t, as a PNG.")] = None,
+    every: Annotated[int, typer.Option(min=1, help="Draw one state in so many.")] = 1,
+    out: Annotated[Path, typer.Option("--out", "-o", help="An animation .gif or .webp, or a .png with --step.")] = Path(
+        "results/episode.gif"),
+) -> None:
+    """Draw an episode: truth, estimate, its spread, electrodes and the injected pair."""
+    from eitbench.envs import INJECTION
+    from eitbench.report.animate import animate
+    with clear_errors():
+        if env in INJECTION and policy is None:
+            raise ValueError(f"policy must be given for {env}, which asks for injections")
+        typer.echo(f"wrote {animate(env, policy or baseline, seed, step, out, every=every)}")
+
+
+@app.command()
+def reproduce(
+    name: Annotated[Figure, typer.Argument(help="Figure or table of the thesis, or a study beside it.")],
+    seeds: Annotated[str | None, typer.Option(help="Episodes; pictures show the first, sweeps average over all. "
+                                                   "Default: dev:0-1; of the injection those of the boards.")] = None,
+    jobs: Jobs = CORES,
+    out: Out = Path("results/figures"),
+) -> None:
+    """Draw a figure of the thesis from our data, and say what agrees and what differs."""
+    with clear_errors():
+        path, remark = thesis().FIGURES[name.value](_numbers(seeds), jobs, out)
+    typer.echo(f"wrote {path}\n{remark}")
+
+
+def _numbers(seeds: str | None) -> list[int] | None:
+    """What is asked for; None if nothing is."""
+    from eitbench.data.seeds import parse_seeds
+    return None if seeds is None else parse_seeds(seeds)
+
+
+def _report(out: Path) -> None:
+    from eitbench._files import write_atomically
+    from eitbench.bench.store import EpisodeStore
+    from eitbench.report.page import write_page
+    from eitbench.report.summary import markdown, summary
+    store = EpisodeStore(out)
+    records = store.write_records()
+    if not records:
+        raise typer.BadParameter(f"no results in {out}; make some with `eitbench run`")
+    table = summary(records)
+    write_atomically(out / "leaderboard.md", (markdown(table) + "\n").encode())
+    typer.echo(markdown(table))
+    _say_failures(records)
+    write_page(store, records, table)
+    typer.echo(f"\nwrote {out / 'index.html'}")
+
+
+def _command() -> str:
+    """What was typed."""
+    return shlex.join(["eitbench", *sys.argv[1:]])
+
+
+def _say_failures(records: list[dict[str, Any]]) -> None:
+    for record in records:
+        for episode in record["episodes"]:
+            if episode["status"] != "ok":
+                typer.echo(f"failed: {record['method']} on {episode['seed']}: {episode['message']}", err=True)
+
+
+if __name__ == "__main__":
+    app()

@@ -1,0 +1,169 @@
+"""The estimators inside an injection environment where the flow is unknown: concentration and mean velocity together.
+
+Both are the joint extended Kalman filter of `baselines/joint_extended_kalman_filter.py`, but for two things. Voltages
+are linearised about the level of the first frame, as in the other injection environments, not about each estimate. And
+the velocity is kept within narrower bounds, so that a table of few velocities serves the one of reduced order.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from eitbench.estimation import FreeCovariance, JointFilter, KalmanFilter, initial_covariance
+from eitbench.estimation.onboard.operator import FullOperator
+from eitbench.estimation.onboard.reduced_operator import RANK, ReducedOperator, Shared, record_of_any, stored_model
+from eitbench.estimation.parameters import RANK_TOLERANCE
+from eitbench.estimation.reduced import ReducedFilter, learnt_of, main_directions
+from eitbench.estimation.reduced_joint import JointModel, JointTables, ReducedJointFilter, joint_model, joint_step
+from eitbench.worlds.task import make_task
+
+if TYPE_CHECKING:
+    from eitbench.physics.profiles import VelocityModel
+    from eitbench.worlds.base import Scenario
+    from eitbench.worlds.task import Task
+
+BOUNDS = (1 / 3, 2.0)
+"""Least and largest mean velocity that is believed, in parts of the one believed at first."""
+TABLE = 16
+"""Velocities within the bounds, evenly spaced, for which the reduced model is computed."""
+LEARNING = (0.6, 1.0, 1.4)
+"""Velocities, in parts of the one believed at first, at which the basis is learnt."""
+
+
+class JointFullOperator(FullOperator):
+    """Joint extended Kalman filters with their exact covariance, some 0.6 s a step each: what scored runs use."""
+
+    def _start(self, episodes: int) -> list[Any]:
+        task = self._shared.task
+        flow, prior = one_velocity(task), task.prior
+        nodal = task.evolution.state_noise_covariance(0.0, prior.nodal_std**2)
+        return [JointFilter(
+            lambda theta: task.transport.with_velocity(flow.field(theta)), flow.directions,
+            mean=np.ones(task.mesh.n_nodes), covariance=initial_covariance(task.mesh, prior),
+            parameters=np.array(flow.nominal), parameter_covariance=np.diag(np.square(flow.initial_std)),
+            walk_std=np.array(flow.walk_std), inflow=1.0, inflow_std=prior.inflow_std, nodal_noise=nodal,
+            profiles=flow.profiles, bounds=BOUNDS) for _ in range(episodes)]
+
+    def grid(self) -> tuple[np.ndarray, np.ndarray]:
+        patches, n = self._patches, self._patches.shape[1]
+        variance = [((patches @ filter_.covariance[:n, :n]) * patches).sum(axis=1) for filter_ in self._filters]
+        return self._patch_means(), self.concentration[:, None] * np.sqrt(variance)
+
+    def means(self) -> np.ndarray:
+        return self.concentration[:, None] * np.array([filter_.concentration for filter_ in self._filters])
+
+    def spreads(self) -> np.ndarray:
+        n = self._patches.shape[1]
+        variance = np.array([filter_.covariance.diagonal()[:n] for filter_ in self._filters])
+        return self.concentration[:, None] * np.sqrt(variance)
+
+    def flow(self) -> tuple[np.ndarray, np.ndarray] | None:
+        n = self._patches.shape[1]
+        return (np.array([filter_.parameters for filter_ in self._filters]),
+                np.sqrt([filter_.covariance.diagonal()[n:] for filter_ in self._filters]))
+
+
+class JointReducedOperator(ReducedOperator):
+    """Joint extended Kalman filters in reduced order, in single precision."""
+
+    _filter: ReducedJointFilter
+
+    @staticmethod
+    def _share(scenario: Scenario) -> Shared:
+        return _shared(scenario)
+
+    @property
+    def state(self) -> np.ndarray:
+        return self._filter.mean[:, :-1]
+
+    @property
+    def state_covariance(self) -> np.ndarray:
+        return self._filter.covariance[:, :-1, :-1]
+
+    def steps(self, count: int, along: np.ndarray | None = None) -> list[tuple[np.ndarray, np.ndarray]]:
+        shared, made = self._shared, []
+        assert isinstance(shared, JointShared)
+        mean = self._filter.mean[:1].astype(float)
+        for k in range(count):
+            mean = mean if along is None else along[k:k + 1]
+            transition, noise = joint_step(shared.tables, mean, shared.walk_std**2)
+            made.append((transition[0], noise[0]))
+            mean = np.concatenate([(transition[:, :-1, :-1] @ mean[:, :-1, None])[..., 0], mean[:, -1:]], axis=1)
+        return made
+
+    @property
+    def weight(self) -> np.ndarray | None:
+        return np.pad(self._shared.mass[1:, 1:], (0, 1))
+
+    def truth(self, entries: np.ndarray) -> np.ndarray:
+        flow = self._shared.flow  # type: ignore[attr-defined]
+        square = flow.profiles[:, 0]**2 @ flow.weights
+        return np.column_stack([super().truth(entries), entries["velocity_moment"][:, 0] / square])
+
+    def flow(self) -> tuple[np.ndarray, np.ndarray] | None:
+        variance = self._filter.covariance[:, -1, -1:].astype(float)
+        return self._filter.mean[:, -1:].astype(float), np.sqrt(variance)
+
+
+class JointShared(Shared):
+    """What all episodes of a scenario with an unknown mean velocity share."""
+
+    model: JointModel
+
+    def __init__(self, scenario: Scenario) -> None:
+        super().__init__(scenario)
+        self.flow = one_velocity(self.levels.task)
+        self.walk_std = self.flow.walk_std[0]
+        self.tables, self._single = JointTables(self.model), JointTables(self.model, np.float32)
+
+    @staticmethod
+    def _make(scenario: Scenario) -> Any:
+        return stored_model(scenario, "joint", JointModel, lambda: _make_model(scenario))
+
+    def start(self, episodes: int) -> ReducedFilter:
+        (nominal,), (std,) = self.flow.nominal, self.flow.initial_std
+        r = len(self.model.initial)
+        mean, covariance = np.zeros((episodes, r + 1)), np.zeros((episodes, r + 1, r + 1))
+        mean[:, r], covariance[:, :r, :r], covariance[:, r, r] = nominal, self.model.initial, std**2
+        return ReducedJointFilter(self._single, mean.astype(np.float32), covariance.astype(np.float32), self.walk_std,
+                                  (BOUNDS[0] * nominal, BOUNDS[1] * nominal))
+
+
+@lru_cache(maxsize=2)
+def _shared(scenario: Scenario) -> JointShared:
+    return JointShared(scenario)
+
+
+def one_velocity(task: Task) -> VelocityModel:
+    """The flow that is asked for; ``ValueError`` unless it has one parameter."""
+    if task.velocity is None or task.velocity.size != 1:
+        raise ValueError("scenario must have a flow with one unknown parameter, its mean velocity, got "
+                         f"{task.velocity!r}")
+    return task.velocity
+
+
+def _make_model(scenario: Scenario) -> JointModel:
+    """Some 45 s."""
+    from eitbench.numerics.fem import mass_matrix
+    task = make_task(scenario)
+    flow, prior = one_velocity(task), task.prior
+    mass, record = mass_matrix(task.mesh).toarray(), record_of_any(scenario, 45)
+    initial = initial_covariance(task.mesh, prior)
+    nodal = task.evolution.state_noise_covariance(0.0, prior.nodal_std**2)
+
+    def step(part: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """F, Y and Γ_w at a velocity; of the noise the nodal part stays what it is at first, as in `JointFilter`."""
+        F, Y = task.transport.with_velocity(flow.field([part * flow.nominal[0]])).transition()
+        return F, Y, prior.inflow_std**2 * (Y @ Y.T) + nodal
+
+    learnt = np.zeros_like(mass)
+    for part in LEARNING:
+        F, Y, noise = step(part)
+        learnt += learnt_of(KalmanFilter(F, Y.sum(axis=1), np.ones(len(F)), FreeCovariance(F, noise),
+                                         rank_tolerance=RANK_TOLERANCE), record, 10)
+    parts = np.linspace(*BOUNDS, TABLE)
+    return joint_model(main_directions(learnt, mass, min(RANK, len(mass))), mass, initial, parts * flow.nominal[0],
+                       (step(part)[::2] for part in parts))

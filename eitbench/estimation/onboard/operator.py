@@ -1,0 +1,222 @@
+"""What the estimators inside injection environments have in common: levels, linearisation, patches; and the full one.
+
+`eitbench.estimation.onboard.reduced_operator` holds the one of reduced order, which training runs on, and
+`eitbench.estimation.onboard.joint_operator` those for a flow that is to be estimated too.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from itertools import combinations
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+
+import numpy as np
+
+from eitbench.data.recordings import step_error
+from eitbench.data.regions import score_mass
+from eitbench.estimation import Observation, starting_filter
+from eitbench.estimation.gate import gated_update
+from eitbench.worlds.task import make_task
+
+if TYPE_CHECKING:
+    from eitbench.numerics.mesh import Mesh
+    from eitbench.worlds.base import Scenario
+
+LEVEL_STEP = 0.02
+"""ĉ_bh is rounded to steps of 2 %, so that what is linearised there serves many episodes."""
+LEVELS = np.arange(-50, 51)
+"""Numbers of steps from the expected concentration: from a third of it to three times as much."""
+PATCHES = 36
+"""On so many patches of the vessel an agent sees the estimate."""
+BROKEN = 30.0
+"""Standard deviations from a homogeneous liquid's voltage beyond which a reading says nothing of the level, where
+the instrument may be faulty."""
+
+
+def electrode_pairs(n_electrodes: int) -> np.ndarray:
+    """(L(L−1)/2, 2) electrodes where the current enters and leaves, in the order of the actions."""
+    return np.array(list(combinations(range(n_electrodes), 2)))
+
+
+def pair_currents(scenario: Scenario) -> np.ndarray:
+    """(pairs, L) currents in A (A/m in 2D) of every pair, as large as the scenario's largest."""
+    pairs = electrode_pairs(scenario.currents.shape[1])
+    currents = np.zeros((len(pairs), scenario.currents.shape[1]))
+    currents[np.arange(len(pairs)), pairs[:, 0]] = np.abs(scenario.currents).max()
+    currents[np.arange(len(pairs)), pairs[:, 1]] = -np.abs(scenario.currents).max()
+    return currents
+
+
+class Operator(Protocol):
+    """Estimators of B episodes. The parameters are those of Table 5.1, as in the Kalman filter baseline, with the ĉ_bh
+    of the first frame, in which they start from t = 0."""
+
+    concentration: np.ndarray
+    """(B,) ĉ_bh in mol/m³"""
+
+    def __init__(self, scenario: Scenario, frames: np.ndarray, *, gate: float, noise_floor: float) -> None:
+        """Take in the first frame, voltages (B, K, L) in V of the scenario's cycle."""
+        ...
+
+    def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """One time step on, with voltages (B, L) in V for currents (B, L), all zero where nothing was injected; returns
+        the innovations in predicted standard deviations and which readings were believed, both (B, L)."""
+        ...
+
+    def grid(self) -> tuple[np.ndarray, np.ndarray]:
+        """Mean and standard deviation (B, patches) in mol/m³ on the coarse grid."""
+        ...
+
+    def errors(self, moments: np.ndarray, deviations: np.ndarray, squares: np.ndarray) -> np.ndarray:
+        """Relative errors (5.12) of the present means, from what `project` makes of recorded moments (B, …)."""
+        ...
+
+    def means(self) -> np.ndarray:
+        """(B, n) estimates in mol/m³ on the task's mesh."""
+        ...
+
+    def spreads(self) -> np.ndarray:
+        """(B, n) their standard deviations in mol/m³."""
+        ...
+
+    def flow(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Velocity parameters θ and their standard deviations (B, k) in m/s, None where the flow is taken as known."""
+        ...
+
+    @staticmethod
+    def project(scenario: Scenario, moment: np.ndarray) -> np.ndarray:
+        """Moments over what counts (T, n), see `eitbench.data.regions.integrals`, as `errors` wants them."""
+        ...
+
+
+class Linearisation(NamedTuple):
+    """The voltages about one level; the state counts in parts of it, from it."""
+
+    concentration: float
+    """mol/m³"""
+    resistance: np.ndarray
+    """(L, L) 𝓡 of the homogeneous liquid"""
+    derivative: np.ndarray
+    """(L, L, k) of 𝓡 by the state"""
+
+    def observe(self, currents: np.ndarray, noise_std: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Computed voltages (L,), their noise (L,) and their derivatives (L, k) in parts of the noise.
+
+        Without a current the reading says nothing.
+        """
+        driven = np.flatnonzero(currents)
+        computed = currents @ self.resistance
+        if not len(driven):
+            return computed, np.ones_like(computed), np.zeros(self.derivative.shape[1:], self.derivative.dtype)
+        L, k = self.derivative.shape[1:]
+        matrix = (currents[driven].astype(self.derivative.dtype) @ self.derivative[driven].reshape(len(driven), -1))
+        return computed, noise_std, matrix.reshape(L, k) / noise_std[:, None].astype(matrix.dtype)
+
+
+class Levels:
+    """The homogeneous liquids in which a scenario's episodes may begin; shared by all of them."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self.scenario, self.task = scenario, make_task(scenario)
+        levels = scenario.expected_concentration * np.exp(LEVEL_STEP * LEVELS)
+        homogeneous = np.repeat(levels[:, None], self.task.mesh.n_nodes, axis=1)
+        self._homogeneous = scenario.currents @ self.task.observation.transfer_resistance(homogeneous)
+        self.linearised = lru_cache(maxsize=64)(self._linearised)
+        """number of a level -> (its concentration, 𝓡, derivatives (L, L, n) by the state); the last 64 are kept"""
+
+    def best(self, frame: np.ndarray, broken: float) -> int:
+        """Number of the level that fits the voltages (K, L) best, weighted as in `best_homogeneous`; readings further
+        than ``broken`` standard deviations away count as that far."""
+        off = (frame - self._homogeneous) / self.scenario.noise.std(frame if math.isinf(broken) else self._homogeneous)
+        return int(LEVELS[np.argmin(np.minimum(off**2, broken**2).sum(axis=(1, 2)))])
+
+    def noise_std(self, computed: np.ndarray, floor: float) -> np.ndarray:
+        """What the estimators take for the noise (V) of computed voltages (L,).
+
+        Readings near zero may have next to no noise; what the model leaves out would then count for knowledge.
+        """
+        return np.hypot(np.maximum(self.scenario.noise.std(computed), 1e-3 * np.abs(computed).max()), floor)
+
+    def _linearised(self, number: int) -> Linearisation:
+        c = self.scenario.expected_concentration * float(np.exp(LEVEL_STEP * number))
+        resistance, table = self.task.observation.resistance_derivatives(np.full(self.task.mesh.n_nodes, c))
+        return Linearisation(c, resistance, c * np.ascontiguousarray(np.moveaxis(table, 0, 2)))
+
+
+@lru_cache(maxsize=2)
+def levels_of(scenario: Scenario) -> Levels:
+    """Made once a process."""
+    return Levels(scenario)
+
+
+class FullOperator:
+    """The Kalman filter of the baselines with its exact covariance: what scored runs use."""
+
+    def __init__(self, scenario: Scenario, frames: np.ndarray, *, gate: float, noise_floor: float) -> None:
+        self._scenario, self._gate, self._floor = scenario, gate, noise_floor
+        self._shared = levels = levels_of(scenario)
+        broken = BROKEN if math.isfinite(gate) else math.inf
+        self._levels = [levels.linearised(levels.best(frame, broken)) for frame in frames]
+        self.concentration = np.array([level.concentration for level in self._levels])
+        self._filters = self._start(len(frames))
+        self._patches = patch_averages(levels.task.mesh)
+        for k, currents in enumerate(scenario.currents):
+            self.assimilate(frames[:, k], np.repeat(currents[None], len(frames), axis=0))
+
+    def _start(self, episodes: int) -> list[Any]:
+        """Filters at t = 0."""
+        task = self._shared.task
+        return [starting_filter(task.transport, task.prior, 1.0) for _ in range(episodes)]
+
+    def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        innovations, kept = np.zeros_like(voltages), np.ones(voltages.shape, dtype=bool)
+        for b, (filter_, level) in enumerate(zip(self._filters, self._levels, strict=True)):
+            filter_.predict()
+            if not currents[b].any():
+                continue
+            std = self._shared.noise_std(currents[b] @ level.resistance, self._floor)
+            computed, std, matrix = level.observe(currents[b], std)
+            value = (voltages[b] - computed) / std + matrix.sum(axis=1)      # the state is 1 where nothing deviates
+            innovations[b], kept[b] = gated_update(filter_, Observation(matrix, value, np.ones(len(value))), self._gate)
+        return innovations, kept
+
+    def grid(self) -> tuple[np.ndarray, np.ndarray]:
+        spread = np.array([np.sqrt(filter_.variance_of(self._patches)) for filter_ in self._filters])
+        return self._patch_means(), self.concentration[:, None] * spread
+
+    def _patch_means(self) -> np.ndarray:
+        # Episode by episode: the bits of one product of matrices would depend on how many play side by side.
+        return (self._patches @ self.means()[..., None])[..., 0]
+
+    def errors(self, moments: np.ndarray, deviations: np.ndarray, squares: np.ndarray) -> np.ndarray:
+        estimate = self.means() - self._scenario.background
+        return step_error(score_mass(self._scenario), estimate, moments, deviations, squares)
+
+    def means(self) -> np.ndarray:
+        return self.concentration[:, None] * np.array([filter_.mean for filter_ in self._filters])
+
+    def spreads(self) -> np.ndarray:
+        return self.concentration[:, None] * np.sqrt([filter_.variances() for filter_ in self._filters])
+
+    def flow(self) -> tuple[np.ndarray, np.ndarray] | None:
+        return None
+
+    @staticmethod
+    def project(scenario: Scenario, moment: np.ndarray) -> np.ndarray:
+        return np.asarray(moment)
+
+
+def patch_averages(mesh: Mesh) -> np.ndarray:
+    """(PATCHES, n) averages over the boxes of a grid, 12 × 3 in pipes and 6 × 6 in tanks, x first; a node counts by its
+    share of the mass matrix."""
+    from eitbench.numerics.fem import mass_matrix
+    points = mesh.points[:, :2]
+    low, high = points.min(axis=0), points.max(axis=0)
+    grid = (12, 3) if high[0] - low[0] > 2 * (high[1] - low[1]) else (6, 6)
+    column, row = np.minimum((points - low) / (high - low) * grid, np.array(grid) - 1).astype(int).T
+    averages = np.zeros((PATCHES, len(points)))
+    averages[row * grid[0] + column, np.arange(len(points))] = mass_matrix(mesh).sum(axis=0)
+    if not averages.any(axis=1).all():
+        raise ValueError(f"the task's mesh must have a node in each of {grid[0]} × {grid[1]} patches of the vessel")
+    return averages / averages.sum(axis=1, keepdims=True)

@@ -1,0 +1,210 @@
+"""The estimator inside an injection environment in reduced order, for many episodes at once: what training runs on."""
+
+from __future__ import annotations
+
+import io
+import math
+import zlib
+from collections.abc import Callable
+from functools import cache, lru_cache
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from eitbench._code import code_digest, package_files
+from eitbench._files import write_atomically
+from eitbench.data.episodes import folder, warn_not_kept
+from eitbench.data.recordings import outline
+from eitbench.data.regions import region_of, score_mass
+from eitbench.estimation import LinearisedObservations, Observation, starting_filter
+from eitbench.estimation.onboard.operator import BROKEN, Linearisation, levels_of, pair_currents, patch_averages
+from eitbench.estimation.reduced import ReducedFilter, ReducedModel, reduced_model
+from eitbench.worlds.task import make_task
+
+if TYPE_CHECKING:
+    from eitbench.worlds.base import Scenario
+
+RANK = 120
+Model = TypeVar("Model")
+
+
+class ReducedOperator:
+    """Kalman filters whose injections differ, in single precision, which halves the time; see `Operator`."""
+
+    def __init__(self, scenario: Scenario, frames: np.ndarray, *, gate: float, noise_floor: float) -> None:
+        self._shared = shared = self._share(scenario)
+        self._gate, self._floor = gate, noise_floor
+        broken = BROKEN if math.isfinite(gate) else math.inf
+        self.levels = [shared.level(shared.levels.best(frame, broken)) for frame in frames]
+        self.concentration = np.array([level.concentration for level in self.levels])
+        self._filter = shared.start(len(frames))
+        for k, currents in enumerate(scenario.currents):
+            self.assimilate(frames[:, k], np.repeat(currents[None], len(frames), axis=0))
+
+    @staticmethod
+    def _share(scenario: Scenario) -> Shared:
+        """What all episodes have in common; made once a process."""
+        return _shared(scenario)
+
+    def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        noise_std = self._shared.levels.noise_std
+        observed = [level.observe(current, noise_std(current @ level.resistance, self._floor))
+                    for level, current in zip(self.levels, currents, strict=True)]
+        computed, std, matrix = (np.array(part) for part in zip(*observed, strict=True))
+        residual = ((voltages - computed) / std).astype(np.float32) * currents.any(axis=1, keepdims=True)
+        self._filter.predict()
+        innovation, variance, kept = self._filter.update(matrix, residual, np.ones_like(residual), gate=self._gate)
+        return (innovation / np.sqrt(variance)).astype(float), kept
+
+    @property
+    def basis(self) -> np.ndarray:
+        """(n, r) Φ, in double precision."""
+        return self._shared.model.basis
+
+    @property
+    def state(self) -> np.ndarray:
+        """(B, r) present reduced concentrations."""
+        return self._filter.mean
+
+    @property
+    def state_covariance(self) -> np.ndarray:
+        """(B, r, r) their covariances."""
+        return self._filter.covariance
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """(B, s, s) of all that is estimated, the reduced concentration first."""
+        return self._filter.covariance
+
+    def steps(self, count: int, along: np.ndarray | None = None) -> list[tuple[np.ndarray, np.ndarray]]:
+        """How the first episode's deviations move in the next ``count`` steps, and their noise, (s, s) each; where that
+        depends on the state itself, about what is predicted or ``along`` (count, s), the states before each step."""
+        model = self._shared.model
+        return [(model.transition, model.noise)] * count
+
+    @property
+    def weight(self) -> np.ndarray | None:
+        """(s, s) W, with which tr(W P) is the expected squared error, integrated over what counts; None: identity."""
+        return None if region_of(self._shared.scenario) is None else self._shared.mass[1:, 1:]
+
+    def truth(self, entries: np.ndarray) -> np.ndarray:
+        """(T, s) what is estimated in the first episode, from its recording: for bounds only."""
+        shared, level = self._shared, self.concentration[0]
+        mass = outline(shared.scenario).mass
+        whole = 0.5 * (mass.sum(axis=0) + mass.sum(axis=1))                                 # ∫ of each node's function
+        beyond = (shared.background - level) * whole + entries["moment"]
+        return np.asarray(beyond @ self.basis / level)
+
+    def grid(self) -> tuple[np.ndarray, np.ndarray]:
+        patches = self._shared.patches
+        mean = 1.0 + (patches @ self.state[..., None])[..., 0]
+        variance = ((patches @ self.state_covariance) * patches).sum(axis=2, dtype=float)
+        return self.concentration[:, None] * mean, self.concentration[:, None] * np.sqrt(variance)
+
+    def errors(self, moments: np.ndarray, deviations: np.ndarray, squares: np.ndarray) -> np.ndarray:
+        shared = self._shared
+        state = np.concatenate([self.concentration[:, None] - shared.background,
+                                self.concentration[:, None] * self.state], axis=1)
+        quadratic = (state * (shared.mass @ state[..., None])[..., 0]).sum(axis=1)
+        return (quadratic - 2.0 * (state * moments).sum(axis=1) + deviations) / squares
+
+    def means(self) -> np.ndarray:
+        return self.concentration[:, None] * (1.0 + self.state @ self._shared.model.basis.T)
+
+    def spreads(self) -> np.ndarray:
+        basis = self._shared.model.basis
+        variance = ((basis @ self.state_covariance) * basis).sum(axis=2)
+        return self.concentration[:, None] * np.sqrt(variance)
+
+    def flow(self) -> tuple[np.ndarray, np.ndarray] | None:
+        return None
+
+    @classmethod
+    def project(cls, scenario: Scenario, moment: np.ndarray) -> np.ndarray:
+        return (moment @ cls._share(scenario).basis).astype(float)
+
+
+class Shared:
+    """What all episodes of a scenario share."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self.scenario, self.background, self.levels = scenario, scenario.background, levels_of(scenario)
+        self.model = self._make(scenario)
+        basis = np.column_stack([np.ones(len(self.model.basis)), self.model.basis])
+        half = score_mass(scenario)
+        self.mass = 0.5 * (basis.T @ (half @ basis) + basis.T @ (half.T @ basis))
+        self.basis = basis.astype(np.float32)
+        self.patches = (patch_averages(self.levels.task.mesh) @ self.model.basis).astype(np.float32)
+        self.level = cache(self._level)
+
+    @staticmethod
+    def _make(scenario: Scenario) -> Any:
+        return _stored_model(scenario)
+
+    def start(self, episodes: int) -> ReducedFilter:
+        """Filters at t = 0, in single precision."""
+        single = ReducedModel(*(array.astype(np.float32) for array in self.model))
+        r = len(single.transition)
+        return ReducedFilter(single, np.zeros((episodes, r), dtype=np.float32),
+                             np.repeat(single.initial[None], episodes, axis=0))
+
+    def _level(self, number: int) -> Linearisation:
+        concentration, resistance, derivative = self.levels.linearised(number)
+        return Linearisation(concentration, resistance, (derivative @ self.model.basis).astype(np.float32))
+
+
+@lru_cache(maxsize=2)
+def _shared(scenario: Scenario) -> Shared:
+    return Shared(scenario)
+
+
+def _stored_model(scenario: Scenario) -> ReducedModel:
+    """The reduced model, from the cache if it is there: making it takes half a minute."""
+    return stored_model(scenario, "reduced", ReducedModel, lambda: _make_model(scenario))
+
+
+def stored_model(scenario: Scenario, name: str, kind: type[Model], make: Callable[[], Model]) -> Model:
+    """A model, a named tuple of arrays, from the cache if one of this name is there; else it is made and kept."""
+    code = code_digest(package_files("estimation/*.py", "estimation/onboard/*operator.py", "worlds/task.py"))
+    path = folder(scenario) / f"{name}-{code[:16]}.npz"
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            model = kind(*(stored[name] for name in kind._fields))  # type: ignore[attr-defined]
+            if int(stored["checksum"]) == _checksum(model):
+                return model
+    except Exception:       # missing or damaged: an archive may raise anything
+        pass
+    with threadpool_limits(1):                             # as many threads as here, the same bits
+        model = make()
+    content = io.BytesIO()
+    np.savez(content, checksum=_checksum(model), **model._asdict())  # type: ignore[attr-defined]
+    try:
+        write_atomically(path, content.getvalue())
+    except OSError as error:
+        warn_not_kept(path.parent, error)
+    return model
+
+
+def _make_model(scenario: Scenario) -> ReducedModel:
+    from eitbench.numerics.fem import mass_matrix
+    task = make_task(scenario)
+    start = starting_filter(task.transport, task.prior, 1.0)
+    return reduced_model(start, mass_matrix(task.mesh).toarray(), record_of_any(scenario, 90),
+                         min(RANK, task.mesh.n_nodes))
+
+
+def record_of_any(scenario: Scenario, length: int) -> list[Observation]:
+    """A record of pairs at random, about the expected level and in parts of it."""
+    task, every, level = make_task(scenario), pair_currents(scenario), scenario.expected_concentration
+    currents = every[np.random.default_rng(0).integers(len(every), size=length)]
+    linear = LinearisedObservations(task.observation, task.noise, np.full(task.mesh.n_nodes, level))
+    record = []
+    for current in currents:
+        seen = linear(np.zeros(current.shape), current)
+        record.append(seen._replace(matrix=level * seen.matrix))
+    return record
+
+
+def _checksum(model: Any) -> int:
+    return zlib.crc32(b"".join(np.ascontiguousarray(array).tobytes() for array in model))

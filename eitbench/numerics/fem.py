@@ -1,0 +1,48 @@
+"""The bridge to scikit-fem, which assembles our forms at set-up time."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse as sp
+import skfem
+from skfem.helpers import dot, grad
+
+from eitbench.numerics.mesh import Mesh
+
+_ELEMENTS = {
+    (2, 1): skfem.ElementTriP1, (2, 2): skfem.ElementTriP2,
+    (3, 1): skfem.ElementTetP1, (3, 2): skfem.ElementTetP2,
+}
+
+
+def element(dim: int, order: int) -> skfem.Element:
+    """Lagrange element of first or second order on triangles or tetrahedra."""
+    if (dim, order) not in _ELEMENTS:
+        raise ValueError(f"order must be 1 or 2, got {order!r}")
+    return _ELEMENTS[dim, order]()
+
+
+def to_skfem(mesh: Mesh) -> skfem.Mesh:
+    """The same mesh, node by node, as a scikit-fem mesh."""
+    kind = skfem.MeshTri if mesh.dim == 2 else skfem.MeshTet
+    return kind(np.ascontiguousarray(mesh.points.T), np.ascontiguousarray(mesh.cells.T))
+
+
+@skfem.BilinearForm
+def _mass(u, v, _w):
+    return u * v
+
+
+@skfem.BilinearForm
+def _laplace(u, v, _w):
+    return dot(grad(u), grad(v))
+
+
+def mass_matrix(mesh: Mesh) -> sp.csr_array:
+    """(n, n) P1 mass matrix ∫φᵢφⱼ in m^d."""
+    return sp.csr_array(_mass.assemble(skfem.Basis(to_skfem(mesh), element(mesh.dim, 1), intorder=2)))
+
+
+def stiffness_matrix(mesh: Mesh) -> sp.csr_array:
+    """(n, n) P1 stiffness matrix ∫∇φᵢ·∇φⱼ in m^(d-2)."""
+    return sp.csr_array(_laplace.assemble(skfem.Basis(to_skfem(mesh), element(mesh.dim, 1), intorder=1)))

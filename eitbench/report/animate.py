@@ -1,0 +1,93 @@
+"""An episode as an animation or a single picture."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.colors import to_rgb
+from PIL import Image
+from threadpoolctl import threadpool_limits
+from tqdm import tqdm
+
+from eitbench import _check
+from eitbench.bench.policies import inject
+from eitbench.bench.run import Environment, Job, board_of, play
+from eitbench.bench.suites import is_isolated
+from eitbench.data.seeds import parse_seeds
+from eitbench.envs import INJECTION
+from eitbench.envs.rendering import FIELD_MAP, IDLE, SINK, SOURCE, SPREAD_MAP
+
+MOVING = (".gif", ".webp")
+"""Suffixes of animations."""
+
+
+def animate(environment: str, method: str, seed: str, step: int | None, path: Path, *,
+            every: int = 1, isolate: str = "others") -> Path:
+    """Play a baseline, or a policy, on one episode and draw its scored states into ``path``, one in ``every``, or only
+    state ``step``.
+
+    Raises
+    ------
+    ValueError
+        If the method cannot play the environment, or the path's suffix is not .gif or .webp (.png with ``step``).
+    """
+    suffixes = MOVING if step is None else (".png",)
+    if path.suffix not in suffixes:
+        raise ValueError(f"out must end in {' or '.join(suffixes)} {'without' if step is None else 'with'} step, got "
+                         f"{path.name}")
+    seeds = parse_seeds(seed)
+    if len(seeds) != 1:
+        raise ValueError(f"seed must name one episode, got {seed!r}")
+    played = Environment(environment)
+    with threadpool_limits(1):
+        loaded: Any = Job(played, method, seeds[0], is_isolated(played, method, isolate)).load()
+        env: Any
+        states: Iterator[tuple[Any, ...]]
+        if environment in INJECTION:
+            env = gym.make(environment, disable_env_checker=True, observation="raw", estimator="full",
+                                render_mode="rgb_array").unwrapped
+            begin, states = env.core.first + 1, inject(env, loaded, seeds[0])
+        else:
+            env = played.make(render_mode="rgb_array")
+            if board_of(env) not in loaded.boards:
+                raise ValueError(f"baseline {loaded.name} plays {', '.join(loaded.boards)}, but {environment} is a "
+                                 f"{board_of(env)} environment")
+            begin, states = 1, play(env, loaded, seeds[0])
+        first, last = env.scenario.warm_up + 1, env.scenario.n_steps
+        if step is not None:
+            first = last = _check.integer("step", step, low=begin, high=last)
+        frames = []
+        for t, *_ in tqdm(states, total=last, desc="drawing", unit="state", disable=None):
+            if first <= t <= last and (t - first) % every == 0:
+                frames.append(Image.fromarray(np.asarray(env.render())))
+            if t == last:
+                break
+    path.parent.mkdir(parents=True, exist_ok=True)
+    how: dict[str, Any] = {}
+    if path.suffix == ".gif":
+        palette = _palette()
+        frames = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+    elif path.suffix == ".webp":
+        how = {"quality": 30, "method": 6}                   # a fifth of the GIF, and the letters are still sharp
+    if step is None:
+        how |= {"save_all": True, "append_images": frames[1:], "loop": 0,
+                "duration": every * 1000 // env.metadata["render_fps"]}
+    frames[0].save(path, **how)
+    return path
+
+
+def _palette() -> Image.Image:
+    """The 256 colours of a frame: both colour maps, greys, and the electrodes; one for all frames keeps them steady."""
+    colours = [colormaps[name](np.linspace(0, 1, n))[:, :3] for name, n in ((FIELD_MAP, 120), (SPREAD_MAP, 100))]
+    greys = np.linspace(0, 1, 27)[:, None].repeat(3, axis=1)
+    pairs = [to_rgb(colour) for colour in (SOURCE, SINK, IDLE)]
+    halves = [tuple(0.5 + 0.5 * c for c in colour) for colour in pairs]              # at the edges of the bars
+    table = np.concatenate([*colours, greys, pairs, halves, halves])[:256]
+    image = Image.new("P", (1, 1))
+    image.putpalette((255 * table).round().astype(np.uint8).tobytes())
+    return image

@@ -1,0 +1,255 @@
+"""Leaderboards from records: ranks and intervals board by board, an aggregate for each class, as CSV and Markdown."""
+
+from __future__ import annotations
+
+import math
+from statistics import median
+from typing import Any, NamedTuple
+
+import pandas as pd
+
+from eitbench.bench.records import file_name, finished, newest, version
+from eitbench.bench.statistics import interquartile_mean, mean_over_environments, shared_ranks, stratified_bootstrap
+from eitbench.data.seeds import parse_seeds
+from eitbench.envs import ENTRY_POINTS
+from eitbench.report.summary import (
+    COLUMNS,
+    EXPLANATIONS,
+    as_markdown,
+    number,
+    place_of_world,
+    scores_by_seed,
+    seed_ranges,
+    summary_row,
+    with_interval,
+    world,
+)
+
+CLASSES = ("filter", "fixed-lag", "smoothing", "stationary", "injection")
+AT_REST = ("eitbench/StationaryTank2D-v0",)
+"""Environments whose target stands still: a class of their own, since nothing there has to be followed."""
+FLOOR = {"injection": "random_pair"}
+"""Whose episodes are the board's, and from whose error the gain is counted; on other boards `homogeneous`."""
+ALL = "all"
+"""Stands for the environment in the rows of an aggregate."""
+OTHERS = tuple(name for name in COLUMNS if name != "error")
+"""Scores that stand beside ranks, as means over the episodes."""
+FIELDS = ("class", "environment", "method", "version", "title", "rank", "note", "official", "seeds", "error",
+          "error_low", "error_high", "gain", "gain_low", "gain_high", *OTHERS, "matmuls_per_step", "peak_memory")
+NUMBERS = FIELDS[FIELDS.index("error"):]
+HEADINGS = {name: heading for name, heading in COLUMNS.items() if name != "error"} | {
+    "matmuls_per_step": "products/step", "peak_memory": "MB"}
+MORE = {
+    "rank": "one more than the number of methods that are significantly better; shared where none is. Floors, "
+            "references, privileged methods and those that have not finished every episode have none",
+    "by": "who ran it: the maintainers (official), or its author (self-reported)",
+    "ẽ_c": "relative estimation error (5.12), mean over episodes with its 95 % bootstrap interval; lower is better",
+    "gain": "1 − ẽ_c over that of the floor (homogeneous; random_pair) in the same episode: 0 as the floor, 1 perfect. "
+            "Interquartile mean with its 95 % bootstrap interval",
+    **{heading: EXPLANATIONS[heading] for heading in HEADINGS.values() if heading in EXPLANATIONS},
+    "products/step": "time per step in units of a 1000 × 1000 × 1000 matrix product on one thread of that processor, "
+                     "the median of all that were timed on it",
+    "MB": "memory that the method's own process held at most",
+}
+
+
+class Entry(NamedTuple):
+    """One record on its board."""
+
+    record: dict[str, Any]
+    """Cut down to the board's episodes."""
+    note: str
+    """Why it has no rank; empty if it competes."""
+    complete: bool
+    """Whether it finished every episode."""
+    gains: dict[str, float]
+    """Seed -> gain over the floor; empty without one."""
+
+    @property
+    def label(self) -> str:
+        """Name and version."""
+        return f"{self.record['method']}@{version(self.record)}"
+
+    @property
+    def errors(self) -> dict[str, float]:
+        """Seed -> ẽ_c."""
+        return scores_by_seed(self.record, "error")
+
+
+def boards(records: list[dict[str, Any]]) -> pd.DataFrame:
+    """All boards in one table of `FIELDS`, a row for each record that is not outdated, best first.
+
+    A board is an environment. Its episodes are those that its floor has played (without one, those that anybody has);
+    others are not looked at. After the boards of a class comes its aggregate, with ``environment`` `ALL`, if
+    there are several registered environments with a floor: of methods that have finished every episode of every one of
+    them. Environments with arguments of somebody's own have boards, and no part in it.
+    ``seconds_per_step`` is in ms of the fastest episode, ``voltage_discrepancy`` in mV², ``peak_memory`` in 10⁶ bytes.
+
+    Raises
+    ------
+    ValueError
+        If a record is of other seeds than test.
+    """
+    for record in records:
+        if record["split"] != "test":
+            raise ValueError(f"leaderboards are made of test seeds; {file_name(record)} has {record['split']} seeds")
+    current, _ = newest(records)
+    registered, products = {id.replace("/", "-") for id in ENTRY_POINTS}, _matrix_products(current)
+    rows: list[dict[str, Any]] = []
+    for name in CLASSES:
+        members = [record for record in current if class_of(record) == name]
+        environments = sorted({(place_of_world(world(r)), r["environment"]["name"]) for r in members})
+        played = {environment: _entries([r for r in members if r["environment"]["name"] == environment])
+                  for _, environment in environments}
+        for environment, entries in played.items():
+            rows += _board(environment, entries, current, products)
+        rows += _aggregate({environment: entries for environment, entries in played.items()
+                            if environment in registered and any(entry.gains for entry in entries)})
+    return pd.DataFrame(rows, columns=list(FIELDS)).astype({"rank": "Int64"} | dict.fromkeys(NUMBERS, float))
+
+
+def class_of(record: dict[str, Any]) -> str:
+    """Which of `CLASSES` a record belongs to."""
+    return "stationary" if record["environment"]["id"] in AT_REST else record["board"]
+
+
+def render(records: list[dict[str, Any]], table: pd.DataFrame | None = None) -> dict[str, str]:
+    """The content of ``leaderboard.csv`` and ``leaderboard.md``, by file name, from the records and, if it is made
+    already, their `boards`. The same records give the same text."""
+    table = boards(records) if table is None else table
+    return {"leaderboard.csv": table.to_csv(index=False, float_format="%.6g", lineterminator="\n"),
+            "leaderboard.md": _markdown(table, newest(records)[1])}
+
+
+def _entries(records: list[dict[str, Any]]) -> list[Entry]:
+    """The records of one environment on the board's episodes."""
+    floors = [record for record in records if record["method"] == FLOOR.get(record["board"], "homogeneous")]
+    floor = max(floors, key=lambda record: (record["official"], finished(record)), default=None)
+    seeds = {seed for record in ([floor] if floor else records) for seed in record["seeds"]}
+    zero = scores_by_seed(floor, "error") if floor else {}
+    entries = []
+    for whole in records:
+        record = whole | {"episodes": [episode for episode in whole["episodes"] if episode["seed"] in seeds],
+                          "seeds": [seed for seed in whole["seeds"] if seed in seeds]}
+        if not record["seeds"]:                                        # nothing that the board asks for
+            continue
+        errors = scores_by_seed(record, "error")
+        failed, missing = sum(e["status"] != "ok" for e in whole["episodes"]), len(seeds - set(record["seeds"]))
+        shortcomings = [f"{count} {what}" for count, what in ((failed, "failed"), (missing, "missing")) if count]
+        note = ", ".join([*filter(None, [record["role"]]), *["privileged"] * record["privileged"], *shortcomings])
+        gains = {seed: 1.0 - error / zero[seed] for seed, error in errors.items() if zero.get(seed)}
+        entries.append(Entry(record, note, not shortcomings, gains))
+    return entries
+
+
+def _board(environment: str, entries: list[Entry], current: list[dict[str, Any]],
+           products: dict[str, float]) -> list[dict[str, Any]]:
+    """Rows of one environment, by their mean error; after them who has not finished every episode."""
+    competing = {entry.label: {environment: entry.errors} for entry in entries if not entry.note}
+    ranks = shared_ranks(competing) if competing else {}
+    rows = []
+    for entry in sorted(entries, key=_place):
+        record, summarised = entry.record, summary_row(entry.record, current)
+        rows.append(_row(entry, environment, ranks.get(entry.label)) | {
+            "seeds": seed_ranges(record["seeds"]),
+            **_three("error", {environment: entry.errors}, mean_over_environments),
+            **_three("gain", {environment: entry.gains}, interquartile_mean),
+            **{name: None if summarised[name] is None else summarised[name][0] for name in OTHERS},
+            "matmuls_per_step": _in_products(record, products), "peak_memory": _peak(record)})
+    return rows
+
+
+def _place(entry: Entry) -> tuple[bool, float, str]:
+    errors = list(entry.errors.values())
+    return not entry.complete, mean_over_environments(errors) if errors else math.inf, entry.label
+
+
+def _aggregate(played: dict[str, list[Entry]]) -> list[dict[str, Any]]:
+    """Rows of the methods that have finished all of several environments, ordered and ranked by the interquartile mean
+    of their gains."""
+    if len(played) < 2:
+        return []
+    found = [{entry.label: entry for entry in entries if entry.complete and entry.gains} for entries in played.values()]
+    labels = [label for label in found[0] if all(label in entries for entries in found)]
+    gains = {label: {environment: entries[label].gains for environment, entries in zip(played, found, strict=True)}
+             for label in labels}
+    competing = {label: own for label, own in gains.items() if not found[0][label].note}
+    ranks = shared_ranks(competing, statistic=interquartile_mean, higher_is_better=True) if competing else {}
+    rows = []
+    for label in labels:
+        row = _row(found[0][label], ALL, ranks.get(label)) | _three("gain", gains[label], interquartile_mean)
+        rows.append(row | {"official": all(entries[label].record["official"] for entries in found)})
+    return sorted(rows, key=lambda row: (-row["gain"], row["method"], row["version"]))
+
+
+def _row(entry: Entry, environment: str, rank: int | None) -> dict[str, Any]:
+    record = entry.record
+    return {"class": class_of(record), "environment": environment, "method": record["method"],
+            "version": version(record), "title": record["title"], "rank": rank, "note": entry.note,
+            "official": record["official"]}
+
+
+def _three(name: str, scores: dict[str, dict[str, float]], statistic: Any) -> dict[str, float | None]:
+    """A statistic of environment -> seed -> score, and the ends of its interval, as far as there are any."""
+    if not all(scores.values()):
+        return dict.fromkeys((name, f"{name}_low", f"{name}_high"))
+    three = stratified_bootstrap({key: list(own.values()) for key, own in scores.items()}, statistic)
+    return dict(zip((name, f"{name}_low", f"{name}_high"),
+                    (value if math.isfinite(value) else None for value in three), strict=True))
+
+
+def _matrix_products(records: list[dict[str, Any]]) -> dict[str, float]:
+    """Processor -> time of a matrix product in s, the median of the runs: a single one depends on what runs beside."""
+    timed: dict[str, list[float]] = {}
+    for record in records:
+        for run in record["runs"]:
+            timed.setdefault(run["machine"]["processor"], []).append(run["machine"]["matmul_seconds"])
+    return {processor: median(seconds) for processor, seconds in timed.items()}
+
+
+def _in_products(record: dict[str, Any], products: dict[str, float]) -> float | None:
+    """Time per step of the fastest episode in units of the matrix product on its processor."""
+    return min((episode["scores"]["seconds_per_step"]
+                / products[record["runs"][episode["run"]]["machine"]["processor"]]
+                for episode in record["episodes"] if episode["status"] == "ok"), default=None)
+
+
+def _peak(record: dict[str, Any]) -> float | None:
+    return max((1e-6 * episode["peak_memory"] for episode in record["episodes"] if episode["peak_memory"]),
+               default=None)
+
+
+def _markdown(table: pd.DataFrame, outdated: list[dict[str, Any]]) -> str:
+    parts = ["# Leaderboards", "*Rendered from the records by `eitbench leaderboard --records leaderboards/results`; "
+             "[README.md](README.md) says how to add one.*"]
+    if table.empty:
+        parts.append("There are no records yet.")
+    for name, rows in table.groupby("class", sort=False):
+        parts.append(f"## {name}")
+        for environment, board in rows.groupby("environment", sort=False):
+            heading = "All environments" if environment == ALL else (
+                f"{environment}, {max(board['seeds'], key=lambda seeds: len(parse_seeds(seeds)))}")
+            parts += [f"### {heading}", as_markdown(_cells(board), words=3)]
+    if not table.empty:
+        parts += ["## What the columns say", "\n".join(f"- **{heading}**: {text}" for heading, text in MORE.items())]
+    if outdated:
+        parts += ["## Outdated records", "Made with another version of the environment; to be played again.\n\n"
+                  + "\n".join(f"- {file_name(record)}" for record in outdated)]
+    return "\n\n".join(parts) + "\n"
+
+
+def _cells(board: pd.DataFrame) -> pd.DataFrame:
+    """A board as text, without columns in which there is nothing."""
+    text = pd.DataFrame({
+        "rank": [note or str(rank) for rank, note in zip(board["rank"], board["note"], strict=True)],
+        "method": [f"{row['title']} ({row['method']} {row['version']})" for _, row in board.iterrows()],
+        "by": ["official" if official else "self-reported" for official in board["official"]],
+        **{heading: [_interval(*three) for three in board[[name, f"{name}_low", f"{name}_high"]].itertuples(False)]
+           for name, heading in (("error", "ẽ_c"), ("gain", "gain"))},
+        **{heading: ["–" if pd.isna(value) else number(value) for value in board[name]]
+           for name, heading in HEADINGS.items()}})
+    return text.loc[:, [bool((text[heading] != "–").any()) for heading in text]]
+
+
+def _interval(value: float, low: float, high: float) -> str:
+    return "–" if pd.isna(value) else with_interval(value, low, high)

@@ -1,0 +1,139 @@
+"""From the table of the boards to what the pages have in common: boards with their rows, names, and addresses."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+from urllib.parse import quote
+
+import pandas as pd
+
+from eitbench.bench.records import newest, version
+from eitbench.data.seeds import name_seed, parse_seeds
+from eitbench.envs import ENTRY_POINTS
+from eitbench.report.boards import ALL, boards
+
+
+class Row(NamedTuple):
+    """A method on a board."""
+
+    cells: dict[str, Any]
+    """Of `boards.FIELDS`; None where there is nothing."""
+    record: dict[str, Any] | None
+    """None in an aggregate."""
+    outdated: bool
+    colour: int
+    """The same wherever the board is drawn."""
+
+    @property
+    def label(self) -> str:
+        """Name and version."""
+        return f"{self.cells['method']}@{self.cells['version']}"
+
+    @property
+    def competes(self) -> bool:
+        """Whether it has a rank."""
+        return self.cells["rank"] is not None
+
+    @property
+    def unranked(self) -> bool:
+        """A floor, a reference, or shown the truth; not one that merely failed."""
+        return any(word in self.cells["note"] for word in ("floor", "reference", "privileged"))
+
+    def episodes(self) -> list[dict[str, Any]]:
+        """Those finished, of the board's seeds."""
+        seeds = {name_seed(seed) for seed in parse_seeds(self.cells["seeds"])}
+        return [episode for episode in (self.record or {"episodes": []})["episodes"]
+                if episode["status"] == "ok" and episode["seed"] in seeds]
+
+
+class Board(NamedTuple):
+    """One environment, or all of a class together."""
+
+    of_class: str
+    environment: str
+    title: str
+    rows: list[Row]
+    """Best first, the outdated ones last."""
+
+    @property
+    def is_aggregate(self) -> bool:
+        return self.environment == ALL
+
+    @property
+    def current(self) -> list[Row]:
+        """Without the outdated ones."""
+        return [row for row in self.rows if not row.outdated]
+
+    @property
+    def address(self) -> str:
+        """Of its page within the site."""
+        return f"environments/{quote(self.environment)}.html"
+
+    @property
+    def anchor(self) -> str:
+        """Of its table in the index."""
+        return f"board-{self.of_class}-{self.environment}"
+
+
+class Site(NamedTuple):
+    """All that the pages are made of."""
+
+    boards: list[Board]
+    """Class by class, the aggregate before the environments."""
+    records: list[dict[str, Any]]
+
+    @property
+    def classes(self) -> list[str]:
+        """Those that have boards, in order."""
+        return list(dict.fromkeys(board.of_class for board in self.boards))
+
+    @property
+    def methods(self) -> list[str]:
+        """Names, sorted."""
+        return sorted({record["method"] for record in self.records})
+
+
+def collect(records: list[dict[str, Any]], table: pd.DataFrame) -> Site:
+    """Boards of all records, the outdated ones among them, from the table of those that are not."""
+    by_key = {(record["environment"]["name"], record["method"], version(record)): record for record in records}
+    found: dict[tuple[str, str], list[Row]] = {}
+    for generation, rows in enumerate(_generations(records, table)):
+        for cells in rows.astype(object).where(rows.notna(), None).to_dict("records"):
+            if generation and cells["environment"] == ALL:           # what is outdated is not put together any more
+                continue
+            board = found.setdefault((cells["class"], cells["environment"]), [])
+            record = by_key.get((cells["environment"], cells["method"], cells["version"]))
+            changes = {"rank": None} if generation else {}
+            board.append(Row({str(key): value for key, value in cells.items()} | changes, record, generation > 0,
+                             len(board)))
+    titles = {record["environment"]["name"]: title_of(record) for record in records} | {ALL: "All environments"}
+    made = [Board(*key, titles[key[1]], rows) for key, rows in found.items()]
+    classes = list(dict.fromkeys(board.of_class for board in made))
+    made.sort(key=lambda board: (classes.index(board.of_class), not board.is_aggregate))
+    return Site(made, sorted(records, key=lambda r: (r["environment"]["name"], r["method"], version(r))))
+
+
+def title_of(record: dict[str, Any]) -> str:
+    """Of its environment: the id without the prefix, and what it was given if its name says that it was."""
+    environment = record["environment"]
+    if environment["name"] == environment["id"].replace("/", "-"):
+        return environment["id"].removeprefix("eitbench/")
+    usual = ENTRY_POINTS.get(environment["id"], ("", {}))[1]
+    given = [f"{key}={value}" for key, value in environment["kwargs"].items()
+             if value is not None and value != usual.get(key)]
+    return f"{environment['id'].removeprefix('eitbench/')} ({', '.join(given)})"
+
+
+def method_address(name: str) -> str:
+    """Of a method's page within the site."""
+    return f"methods/{quote(name)}.html"
+
+
+def _generations(records: list[dict[str, Any]], table: pd.DataFrame) -> list[pd.DataFrame]:
+    """The table, then one of what is outdated, one of what is older still, and so on: each environment of one code."""
+    tables, left = [table], newest(records)[1]
+    while left:
+        current, older = newest(left)
+        tables.append(boards(current))
+        left = older
+    return tables

@@ -1,0 +1,31 @@
+"""The first page: every board, class by class."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from eitbench.bench.records import finished
+from eitbench.report.site.collect import Site
+from eitbench.report.site.tables import explanations, table
+from eitbench.report.templates import template
+
+ABOUT = {
+    "filter": "Where is what now? The estimate of each moment, from the measurements until then.",
+    "fixed-lag": "The same a few measurements later.",
+    "smoothing": "Every moment, once the whole record is known.",
+    "stationary": "Targets that stand still.",
+    "injection": "Which current to inject next; a Kalman filter inside makes the estimate.",
+}
+"""What each class asks for."""
+
+
+def index_page(site: Site) -> str:
+    """The HTML of ``index.html``."""
+    made = {board.anchor: table(board, "", compact=True) for board in site.boards}
+    classes: list[dict[str, Any]] = [{
+        "name": name, "about": ABOUT[name],
+        "boards": [(board, made[board.anchor]) for board in site.boards if board.of_class == name],
+    } for name in site.classes]
+    return template("site/index.html.j2").render(
+        root="", classes=classes, n_records=len(site.records), n_methods=len(site.methods),
+        last=max(map(finished, site.records), default="")[:10], explanations=explanations(list(made.values())))

@@ -1,0 +1,158 @@
+"""The page of a method: where it stands on every board, what it is, how to play it again, and every episode."""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import json
+import shlex
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+
+from eitbench._files import shipped
+from eitbench.bench.records import alike, finished, version
+from eitbench.report import charts
+from eitbench.report.boards import HEADINGS
+from eitbench.report.site.collect import Board, Row, Site, title_of
+from eitbench.report.site.environment import markdown
+from eitbench.report.site.tables import Cell, Table, interval_cell, scale, three, value_cell
+from eitbench.report.summary import scores_by_seed, seed_ranges
+from eitbench.report.templates import template
+
+
+def method_page(site: Site, name: str) -> str:
+    """The HTML of the page of all versions of a method."""
+    standings = [(board, row) for board in site.boards for row in board.rows if row.cells["method"] == name]
+    records = sorted((record for record in site.records if record["method"] == name), key=finished, reverse=True)
+    versions = list(dict.fromkeys(map(version, records)))
+    return template("site/method.html.j2").render(
+        root="../", name=name, title=records[0]["title"], standings=_standings(standings),
+        intervals=_intervals(standings), versions=[_version([r for r in records if version(r) == each], site)
+                                                   for each in versions])
+
+
+def _standings(standings: list[tuple[Board, Row]]) -> Table:
+    """A row for each board."""
+    rows, several = [], len({row.cells["version"] for _, row in standings}) > 1
+    for board, row in standings:
+        competing = sum(other.competes for other in board.rows)
+        rank = row.cells["rank"]
+        link = f"../index.html#{board.anchor}" if board.is_aggregate else f"../{board.address}"
+        badges = (*filter(None, row.cells["note"].split(", ")), *["outdated"] * row.outdated)
+        rows.append(([Cell(board.title, board.title.casefold(), link=link, small=board.of_class, badges=badges),
+                      *[Cell(row.cells["version"], row.cells["version"])] * several,
+                      Cell("–") if rank is None else Cell(str(rank), float(rank), small=f"of {competing}"),
+                      *(interval_cell(row, score, scale(board, score)) for score in ("error", "gain")),
+                      value_cell(row.cells["seconds_per_step"])], ""))
+    return Table("Boards", ["board", *["version"] * several, "rank", "ẽ_c", "gain", "ms/step"], rows)
+
+
+def _intervals(standings: list[tuple[Board, Row]]) -> Markup:
+    """Gains on all boards, which are on one scale."""
+    colours: dict[str, int] = {}
+    series = [charts.Series(f"{board.title} · {board.of_class}" if board.is_aggregate else board.title,
+                            colours.setdefault(board.of_class, len(colours)), np.array(three(row, "gain")))
+              for board, row in standings if row.cells["gain"] is not None and not row.outdated]
+    return Markup(charts.intervals(series, "gain: 0 as the floor, 1 perfect", log=False, mark=0.0) if series else "")
+
+
+def _version(records: list[dict[str, Any]], site: Site) -> dict[str, Any]:
+    """What is said of one version: its file as far as it is ours and the same, and its records."""
+    record = records[0]
+    file = source_file(record)
+    return {"name": version(record), "sha256": record["method_sha256"], "checkpoint": record["checkpoint_sha256"],
+            "parameters": {key: json.dumps(value, ensure_ascii=False)
+                           for key, value in sorted(record["parameters"].items())},
+            "file": file, "docstring": docstring(record, file),
+            "records": [_record(each, site) for each in sorted(records, key=lambda r: r["environment"]["name"])]}
+
+
+def _record(record: dict[str, Any], site: Site) -> dict[str, Any]:
+    board, row = next(((board, row) for board in site.boards for row in board.rows if row.record is record),
+                      (None, None))                                  # it played none of the board's episodes
+    return {"title": title_of(record), "address": board and board.address, "official": record["official"],
+            "outdated": row is not None and row.outdated, "runs": _runs(record), "command": command(record),
+            "typed": sorted({run["command"] for run in record["runs"]}), "source": record["source"],
+            "episodes": _episodes(record),
+            "failures": [episode for episode in record["episodes"] if episode["status"] != "ok"]}
+
+
+def _runs(record: dict[str, Any]) -> list[dict[str, Any]]:
+    """Runs of one code on one machine as one, with ``products``, the times in ms that its processes took for theirs."""
+    return [group[0] | {"products": sorted(1000 * run["machine"]["matmul_seconds"] for run in group)}
+            for group in alike(record["runs"])]
+
+
+def _episodes(record: dict[str, Any]) -> Table:
+    """A row for each episode, with the scores that any of them has."""
+    scores = {name: values for name in ("error", *HEADINGS) if (values := scores_by_seed(record, name))}
+    rows = []
+    for i, episode in enumerate(record["episodes"]):
+        seed = episode["seed"]
+        cells = [value_cell(values.get(seed)) for values in scores.values()]
+        rows.append(([Cell(seed, float(i)), Cell(episode["status"], episode["status"]), *cells,
+                      Cell(episode["finished"][:10], episode["finished"])], ""))
+    headings = ["ẽ_c" if name == "error" else HEADINGS[name] for name in scores]
+    return Table(f"Episodes of {title_of(record)}", ["seed", "status", *headings, "played on"], rows)
+
+
+def command(record: dict[str, Any]) -> str:
+    """What plays the record's episodes again; empty if the environment was given arguments, which no command takes.
+
+    A file is named as it was when they were played.
+    """
+    if record["environment"]["name"] != record["environment"]["id"].replace("/", "-"):
+        return ""
+    kind = "--policy" if record["board"] == "injection" else "--baseline"
+    return shlex.join(["eitbench", "submit", kind, _argument(record), "--env", record["environment"]["id"],
+                       "--seeds", seed_ranges(record["seeds"]), "--to", "again"])
+
+
+def _argument(record: dict[str, Any]) -> str:
+    """The name of a method, or the path that was typed for it, without the folders of whoever typed it.
+
+    An agent's name says nothing of its file: where it is none of ours, the path is left to the reader.
+    """
+    for run in record["runs"]:
+        try:
+            words = shlex.split(run["command"])
+        except ValueError:                                            # a quote that does not end
+            continue
+        for word in words:
+            path = word.rpartition("=")[2]
+            if Path(path).stem == record["method"] and path.endswith(".py"):
+                return path if not Path(path).is_absolute() else Path(path).name
+    file = source_file(record)
+    if record["checkpoint_sha256"] is not None:
+        return file or "path/to/model.zip"
+    return record["method"]
+
+
+def source_file(record: dict[str, Any]) -> str:
+    """The method's file as it is named in this repository; empty if it is not there.
+
+    Of agents, whose names others may give to theirs, the very version only.
+    """
+    folder = shipped("baselines")
+    for path in (*folder.glob("*.py"), *folder.glob("injection/*.py"), *folder.glob("checkpoints/*/*/*/model.zip")):
+        name = path.stem if path.suffix == ".py" else f"{path.parent.parent.name}_{path.parent.name}"
+        same_world = path.suffix == ".py" or path.parents[2].name == record["environment"]["id"].replace("/", "-")
+        if name == record["method"] and same_world and (path.suffix == ".py" or _is_version(path, record)):
+            return f"baselines/{path.relative_to(folder).as_posix()}"
+    return ""
+
+
+def docstring(record: dict[str, Any], file: str) -> Markup:
+    """Of the method's file, if this repository still holds the very version that was played."""
+    path = shipped("baselines").parent / file
+    if path.suffix != ".py" or not _is_version(path, record):
+        return Markup()
+    return markdown(ast.get_docstring(ast.parse(path.read_bytes())) or "")
+
+
+def _is_version(path: Path, record: dict[str, Any]) -> bool:
+    """Whether the file is the one that was played."""
+    return hashlib.sha256(path.read_bytes()).hexdigest() == record["method_sha256"]

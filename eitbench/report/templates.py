@@ -1,0 +1,19 @@
+"""The templates of our pages: one environment, in which whatever a method calls itself is text and nothing more."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import jinja2
+
+
+def template(name: str) -> jinja2.Template:
+    """One of the templates beside this file."""
+    return _environment().get_template(name)
+
+
+@lru_cache(maxsize=1)
+def _environment() -> jinja2.Environment:
+    return jinja2.Environment(loader=jinja2.PackageLoader("eitbench.report", "."), autoescape=True,
+                              trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
+                              undefined=jinja2.StrictUndefined)

@@ -1,0 +1,1 @@
+"""Floor 8: learning to choose injections (extra ``rl``)."""

@@ -1,0 +1,97 @@
+"""Trained agents that play as policies do, from the folder that `eitbench train` leaves."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import sys
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from eitbench.bench.baselines import baseline_folder
+from eitbench.envs.injection_core import InjectionCore, Rules, operator_type, scaled
+from eitbench.estimation.onboard.console import Console
+
+
+class Agent:
+    """A policy that does what a model of stable-baselines3 thinks best; subclasses have the model.
+
+    Whatever filter is inside the environment, the agent is shown the one of reduced order with which it was trained,
+    and so injects the same.
+    """
+
+    model: ClassVar[Any]
+    masked: ClassVar[bool]
+
+    @classmethod
+    def suits(cls, rules: Rules) -> bool:
+        """Whether the world shows and takes arrays of the shapes that the model was trained on, whatever they mean."""
+        zeros = {name: np.zeros(space.shape or ()) for name, space in InjectionCore(rules, "reduced").space().items()}
+        return bool(cls.model.action_space == rules.action_space
+                    and cls.model.observation_space.shape == scaled(rules, zeros).shape)
+
+    def __init__(self, rules: Rules, random: np.random.Generator) -> None:
+        self.rules, self.memory = rules, None
+        self.console: Console | None = None
+
+    def act(self, observation: dict[str, np.ndarray]) -> Any:
+        begins = self.console is None
+        if self.console is None:
+            kind = operator_type(self.rules.scenario, "reduced")
+            assert kind is not None
+            self.console = Console(kind, self.rules, observation["frame"][None])
+        else:
+            self.console.take_in(observation["voltages"][None], observation["currents"][None])
+        observation = observation | {name: array[0] for name, array in self.console.shown().items()}
+        masks = {}
+        if self.masked:
+            spent = self.rules.budget is not None and observation["left"][1] == 0.0
+            masks["action_masks"] = np.arange(self.model.action_space.n) >= spent * (self.model.action_space.n - 1)
+        action, self.memory = self.model.predict(scaled(self.rules, observation), state=self.memory,
+                                                 episode_start=np.array([begins]), deterministic=True, **masks)
+        return action
+
+
+def load_agent(path: Path, content: bytes) -> tuple[str, str, type[Agent], dict[str, Any]]:
+    """Name, title, policy and parameters of the model.zip at ``path`` with this ``content``.
+
+    The name is ALGO_seedK for our own agents, and bears a mark of the configuration, ALGO_MARK_seedK, for all others.
+    A model is unpickled, so it is code: the folder must hold its ``sha256``, and a file that differs is not opened.
+
+    Raises
+    ------
+    ValueError
+        If ``config.json`` or ``sha256`` is missing beside it, or the file is not the one that was left there.
+    """
+    try:
+        asked = json.loads((path.parent / "config.json").read_text())
+        expected = (path.parent / "sha256").read_text().split()[0]
+    except (OSError, ValueError, IndexError) as error:
+        raise ValueError(f"policy {path} must lie beside the config.json and sha256 that `eitbench train` leaves: "
+                         f"{error}") from None
+    found = hashlib.sha256(content).hexdigest()
+    if found != expected:
+        raise ValueError(f"policy {path} must have the sha256 that lies beside it, {expected}; it has {found}")
+    from eitbench.rl import networks
+    from eitbench.rl.training import algorithm_of
+    sys.modules.setdefault("eitbench.pair_policy", networks)       # as older models name their networks' module
+    algo, seed = asked["algo"], asked["seed"]
+    model = algorithm_of(algo).load(io.BytesIO(content), device="cpu")
+    policy = type("Policy", (Agent,), {"model": model, "masked": algo.startswith("maskable")})
+    name = f"{algo}{'' if _is_shipped(asked, found) else '_' + _mark(asked)}_seed{seed}"
+    return name, f"{algo} trained with seed {seed}", policy, {"env": asked["env"], **asked["config"]}
+
+
+def _is_shipped(asked: dict[str, Any], sha256: str) -> bool:
+    """Whether it is one of our own agents, wherever its copy lies: a guest is given one."""
+    ours = baseline_folder() / "checkpoints" / asked["env"].replace("/", "-") / asked["algo"] / f"seed{asked['seed']}"
+    return (ours / "sha256").is_file() and (ours / "sha256").read_text().split()[:1] == [sha256]
+
+
+def _mark(asked: dict[str, Any]) -> str:
+    """Six digits for what was asked of the training but its seed, so that results of two configurations stay apart."""
+    words = json.dumps({name: value for name, value in asked.items() if name != "seed"}, sort_keys=True)
+    return hashlib.sha256(words.encode()).hexdigest()[:6]

@@ -1,0 +1,121 @@
+"""`Task`: all that an estimator may know about a scenario, and nothing of what happened in an episode."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from eitbench import _check
+from eitbench.worlds.base import Discretisation, Prior, Scenario
+
+if TYPE_CHECKING:
+    from eitbench.numerics.mesh import Mesh
+    from eitbench.physics.observation import ObservationModel, VoltageNoise
+    from eitbench.physics.profiles import VelocityModel
+    from eitbench.physics.transport import ConvectionDiffusion, EvolutionModel
+
+
+class Estimate(NamedTuple):
+    """What an estimator says about one state."""
+
+    mean: np.ndarray
+    """(n,) concentration at the nodes of `Task.mesh`, mol/m³."""
+    variance: np.ndarray | None = None
+    """(n,) its error variance, (mol/m³)²; None: the estimator makes no claim, and calibration is not scored."""
+    innovation: np.ndarray | None = None
+    """(L,) measured minus predicted voltages, V, before this measurement was used; for NIS."""
+    innovation_covariance: np.ndarray | None = None
+    """(L, L) its covariance, V²."""
+    velocity: np.ndarray | None = None
+    """(k,) parameters of the flow in m/s where `Task.velocity` asks for them; None: what is believed at first."""
+    velocity_variance: np.ndarray | None = None
+    """(k,) their error variance, m²/s²."""
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """The estimator's side of a scenario.
+
+    Parameters
+    ----------
+    transport : ConvectionDiffusion
+        The evolution model, on `mesh`.
+    observation : ObservationModel
+        Voltages for a concentration on `mesh`.
+    noise : VoltageNoise
+    currents : (K, L)
+        The injection cycle in A (A/m in 2D).
+    n_steps : int
+        Measurements in an episode, t = 1 … n_steps.
+    warm_up : int
+        States t ≤ warm_up are not scored.
+    lag : int
+        At measurement t the state t − lag is asked for: 0 filters, n_steps − 1 smooths over the whole record.
+    expected_concentration : float
+        Rough level in mol/m³, where the search for the best homogeneous estimate begins.
+    calibration : int
+        First injections, all but always within the warm-up, from which the best homogeneous estimate is found.
+    prior : Prior
+        What is believed of the target, in parts of the best homogeneous estimate (thesis Table 5.1).
+    velocity : VelocityModel or None
+        How the flow may be written where it is asked for too; ``transport`` then has the flow believed at first.
+    """
+
+    transport: ConvectionDiffusion
+    observation: ObservationModel
+    noise: VoltageNoise
+    currents: np.ndarray = field(repr=False)
+    n_steps: int
+    warm_up: int
+    lag: int
+    expected_concentration: float
+    calibration: int
+    prior: Prior
+    velocity: VelocityModel | None = None
+
+    @property
+    def mesh(self) -> Mesh:
+        """Where estimates live: the CD mesh."""
+        return self.transport.mesh
+
+    @property
+    def evolution(self) -> EvolutionModel:
+        """F, Y, H of the transport; computed on first use and shared by all tasks with the same model."""
+        return self.transport.evolution_model()
+
+
+def make_task(scenario: Scenario, lag: int | str = 0, **assumptions: Any) -> Task:
+    """The task of ``scenario``.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    lag : int or "all"
+        See `Task`; "all" means the whole record.
+    assumptions
+        Passed to ``scenario.model``: what the estimator wrongly believes, such as ``mean_velocity``.
+    """
+    steps = lag_steps(scenario, lag)
+    model = _model(scenario, tuple(sorted(assumptions.items())))
+    currents = scenario.currents
+    currents.setflags(write=False)                                # shared by all who play this task
+    return Task(model.transport, model.observation, scenario.noise, currents, scenario.n_steps,
+                scenario.warm_up, steps, scenario.expected_concentration, scenario.calibration, scenario.prior,
+                scenario.velocity_model)
+
+
+def lag_steps(scenario: Scenario, lag: int | str) -> int:
+    """``lag`` of `make_task` as a number; `ValueError` if it does not fit the scenario."""
+    last = scenario.n_steps - 1
+    if isinstance(lag, str) and lag != "all":
+        raise ValueError(f"lag must be 'all' or an integer from 0 to {last}, got {lag!r}")
+    return last if lag == "all" else _check.integer("lag", lag, low=0, high=last)
+
+
+@lru_cache(maxsize=4)
+def _model(scenario: Scenario, assumptions: tuple[tuple[str, Any], ...]) -> Discretisation:
+    """Built once a process; estimators keep what they derive from it with it."""
+    return scenario.model(**dict(assumptions))

@@ -1,0 +1,53 @@
+"""Our trained agents: each is whole, loads, and plays as it did when it was kept."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from eitbench.bench.baselines import baseline_folder
+from eitbench.bench.policies import load_policy, own_agents, play
+from eitbench.bench.run import Environment, Job, run_episode
+from eitbench.bench.sandbox import guests
+from eitbench.envs import INJECTION
+
+FOLDER = baseline_folder() / "checkpoints"
+AGENTS = [path for env in INJECTION for path in own_agents(env)]
+FIRST = 100_000
+"""The first dev episode, with which evaluations begin."""
+
+
+def test_every_checkpoint_is_an_agent_of_an_environment():
+    """None lies where nobody finds it, and all together stay small enough for git."""
+    assert sorted(AGENTS) == sorted(map(str, FOLDER.glob("**/model.zip")))
+    assert sum(path.stat().st_size for path in FOLDER.glob("**/*") if path.is_file()) < 20e6
+
+
+@pytest.mark.parametrize("path", AGENTS, ids=lambda path: "-".join(path.split("/")[-4:-1]))
+def test_an_agent_plays_as_it_did_when_it_was_kept(path):
+    """Its error in the first dev episode is that of its last evaluation; rounding may turn a close choice."""
+    folder, agent = FOLDER.joinpath(*path.split("/")[-4:-1]), load_policy(path)
+    asked = json.loads((folder / "config.json").read_text())
+    assert agent.name == f"{asked['algo']}_{folder.name}" and folder.parts[-2] == asked["algo"]
+    assert folder.parts[-3] == asked["env"].replace("/", "-") and asked["kwargs"] == {}
+    kept = np.load(folder / "evaluations.npz")
+    assert kept["steps"][0] == 0 and kept["steps"][-1] >= asked["config"]["total_steps"]
+    assert len((folder / "monitor.csv").read_text().splitlines()) > 100
+    error = play(asked["env"], {}, path, FIRST, "reduced")["error"]
+    np.testing.assert_allclose(error, kept["errors"][-1][0], rtol=0.02)
+
+
+@pytest.mark.skipif(not AGENTS, reason="needs the extra rl")
+def test_somebody_s_agent_plays_in_a_guest(tmp_path):
+    """A copy that lies elsewhere: unpickled in a process of its own, it does what it does here."""
+    folder = shutil.copytree(FOLDER.joinpath(*AGENTS[0].split("/")[-4:-1]), tmp_path / "theirs")
+    asked = json.loads((folder / "config.json").read_text())
+    job = Job(Environment(asked["env"], json.dumps({"estimator": "reduced"})), str(folder / "model.zip"), FIRST)
+    try:
+        here, there = (run_episode(job._replace(isolated=isolated))[0] for isolated in (False, True))
+    finally:
+        guests.close()
+    assert here["method"] == there["method"] == f"{asked['algo']}_seed{asked['seed']}"          # it is still ours
+    assert here["status"] == "ok" and here["step_errors"] == there["step_errors"]
+    assert here["checkpoint_sha256"] == there["checkpoint_sha256"] and there["peak_memory"] > 50e6

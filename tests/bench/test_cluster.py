@@ -1,0 +1,87 @@
+"""Runs on a cluster: the same records as here, and a worker that is killed costs nothing.
+
+Those of ray and dask need the extra cluster: `pip install -c constraints.txt -e '.[test,cluster]'`, then
+`python -m pytest -m cluster`.
+"""
+
+import importlib
+import importlib.util
+
+import pytest
+from tiny import FILTER, count, write_baseline
+
+from eitbench import _parallel
+from eitbench._parallel import BACKENDS, WorkerLost, in_parallel
+from eitbench.bench.run import Job, run_episode, run_jobs
+from eitbench.bench.store import EpisodeStore
+from eitbench.data.episodes import CACHE_VARIABLE
+
+CLUSTERS = {"ray": "ray", "dask": "distributed"}
+KILL = ("open({log!r}, 'a').write('made\\n'); "
+        "len(open({log!r}).readlines()) == 2 and os.kill(os.getpid(), 9)")
+"""The second estimator that is made kills its process."""
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path_factory, monkeypatch):
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path_factory.getbasetemp() / "episodes"))
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+
+
+def errors(store):
+    return {(result["method"], result["seed"]): result["step_errors"] for result in store.results()
+            if result["status"] == "ok"}
+
+
+@pytest.mark.cluster
+@pytest.mark.parametrize("backend", CLUSTERS)
+def test_a_cluster_plays_on_when_a_worker_is_killed(backend, tmp_path):
+    """Two workers, of which one is killed; every episode is there in the end, with the scores of this process."""
+    pytest.importorskip(CLUSTERS[backend])
+    log, store = tmp_path / "log", EpisodeStore(tmp_path / "results")
+    path = write_baseline(tmp_path, init=KILL.format(log=str(log)), update="return Estimate(self.level + voltages[0])")
+    jobs = [Job(FILTER, path, seed) for seed in (1, 2, 3, 4)]
+    run_jobs(jobs, store, n_jobs=2, backend=backend)
+    assert count(log) >= 5                                             # the killed one's work was begun again
+    assert errors(store) == {("mine", f"train:{job.seed}"): run_episode(job)[0]["step_errors"] for job in jobs}
+
+
+@pytest.mark.cluster
+@pytest.mark.parametrize("backend", CLUSTERS)
+def test_guests_play_in_a_cluster(backend, tmp_path):
+    """A stranger's file runs in guests of the workers."""
+    pytest.importorskip(CLUSTERS[backend])
+    store, path = EpisodeStore(tmp_path / "results"), write_baseline(tmp_path)
+    jobs = [Job(FILTER, path, seed, True) for seed in (1, 2)]
+    run_jobs(jobs, store, n_jobs=2, backend=backend)
+    assert all(result["peak_memory"] > 50e6 and result["run"]["isolation"] != "none" for result in store.results())
+    assert errors(store) == {("mine", f"train:{job.seed}"): run_episode(job._replace(isolated=False))[0]["step_errors"]
+                             for job in jobs}
+
+
+def test_here_a_killed_worker_ends_the_run_and_nothing_is_lost(tmp_path):
+    """The message says how to go on; the same run again plays what is missing."""
+    log, store = tmp_path / "log", EpisodeStore(tmp_path / "results")
+    path = write_baseline(tmp_path, init=KILL.format(log=str(log)))
+    jobs = [Job(FILTER, path, seed) for seed in (1, 2, 3)]
+    with pytest.raises(WorkerLost, match="the same command goes on from there"):
+        run_jobs(jobs, store, n_jobs=2)
+    finished = len(errors(store))
+    assert finished < 3
+    before = count(log)
+    run_jobs(jobs, store, n_jobs=2)
+    assert len(errors(store)) == 3 and count(log) == before + 3 - finished
+
+
+def test_backends_that_cannot_be_had(monkeypatch):
+    """Unknown, or not installed: a sentence."""
+    with pytest.raises(ValueError, match="backend must be one of loky, ray, dask, got 'slurm'"):
+        list(in_parallel(print, [(1,)], 1, "slurm"))
+    with monkeypatch.context() as patch, pytest.raises(ModuleNotFoundError):
+        patch.setattr(_parallel, "_with_ray", lambda *_: iter(importlib.import_module("ray_is_not_here")))
+        list(in_parallel(print, [(1,)], 1, "ray"))
+    for backend, package in CLUSTERS.items():
+        if not importlib.util.find_spec(package):
+            with pytest.raises(ValueError, match=f"backend {backend} needs {package}, which the extra cluster"):
+                list(in_parallel(print, [(1,)], 1, backend))
+    assert set(BACKENDS) == {"loky", *CLUSTERS}

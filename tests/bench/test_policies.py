@@ -1,0 +1,347 @@
+"""Injection policies: what they believe, that they play, and what becomes of their mistakes."""
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from eitbench.bench import policies
+from eitbench.bench.policies import adaptivity_gap, load_policy, own_policies, play
+from eitbench.bench.run import Environment, Job, run_jobs
+from eitbench.bench.store import EpisodeStore
+from eitbench.data.seeds import parse_seeds
+from eitbench.envs.injection import InjectionEnv
+from eitbench.envs.injection_core import Rules
+from eitbench.estimation.onboard.belief import Belief
+from eitbench.report import policy_table
+from eitbench.report.policy_table import policy_rows
+from eitbench.worlds import Pipe2D
+
+NAME = "eitbench/Pipe2DInjection-v0"
+CURRENTS, FAULTS, BUDGET = (f"eitbench/Pipe2DInjection{kind}-v0" for kind in ("Currents", "Faults", "Budget"))
+FLOW = "eitbench/Pipe2DInjectionFlow-v0"
+SHORT = {"scenario": {"scored_steps": 4, "mean_velocity": 16.0}}
+"""Sixteen electrodes and a short record."""
+KWARGS = {NAME: SHORT, CURRENTS: SHORT, FAULTS: SHORT, BUDGET: SHORT | {"budget": 3},
+          FLOW: {"scenario": SHORT["scenario"] | {"velocity_range": [15.0, 17.0]}},
+          "eitbench/RotatingTankInjection-v0": {"scenario": {"warm_up": 2, "scored_steps": 3}}}
+SEED = 5
+
+
+def environment(name: str) -> InjectionEnv:
+    return policies.environment(name, json.dumps(KWARGS[name]), "reduced")
+
+
+def actions_of(name: str, policy: str, monkeypatch) -> list[np.ndarray]:
+    """Everything that was injected in an episode."""
+    env, taken, step = environment(name), [], InjectionEnv.step
+    with monkeypatch.context() as patch:
+        patch.setattr(InjectionEnv, "step", lambda self, action: taken.append(np.array(action)) or step(self, action))
+        played = play(name, KWARGS[name], policy, SEED, "reduced")
+    assert len(taken) == env.core.length
+    budget = env.rules.budget
+    assert played["spent"] <= (len(taken) if budget is None else budget)
+    assert len(played["errors"]) == env.scenario.scored_steps
+    assert played["error"] == pytest.approx(np.mean(played["errors"]))
+    assert 0.0 < played["error"] < 1.0 and played["seconds_per_step"] >= 0.0
+    return taken
+
+
+def write_policy(folder, body: str = "def act(self, observation): return 7", name: str = "mine") -> str:
+    """The path of a policy file whose class has this body."""
+    path = folder / f"{name}.py"
+    path.write_text('"""Mine: always the same."""\nclass Policy:\n'
+                    f"    def __init__(self, rules, random): pass\n    {body}\n")
+    return str(path)
+
+
+# -- what a policy may believe ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", [NAME, FAULTS, BUDGET, FLOW])
+def test_belief_is_the_filter_inside(name):
+    """Followed from outside, the reduced filter is that of the environment, to the bit."""
+    env = environment(name)
+    observation, _ = env.reset(seed=SEED)
+    belief = Belief(env.rules, observation)
+    for pair in (7, 100, None if env.rules.budget else 3, 7):
+        predicted = belief.predicted()
+        observation, *_ = env.step(env.rules.action(pair))
+        belief.see(observation)
+        inside = env.core._operator
+        np.testing.assert_array_equal(belief.mean, inside.means()[0])
+        np.testing.assert_array_equal(belief._operator.covariance, inside.covariance)
+        if name == NAME:                         # what it foretells: nothing was left out
+            expected = inside.covariance[0].astype(float)
+            np.testing.assert_allclose(belief.after(predicted, pair), expected, atol=2e-5 * np.abs(expected).max())
+            assert belief.gains(predicted)[0][pair] == pytest.approx((predicted - expected).trace(), rel=1e-3)
+
+
+def test_unsound_electrodes_teach_nothing():
+    """Pairs with one of them gain nothing, the others less than with all readings, but more than nothing."""
+    env = environment(NAME)
+    belief = Belief(env.rules, env.reset(seed=SEED)[0])
+    predicted, sound = belief.predicted(), np.arange(16) != 3
+    every, fewer = belief.gains(predicted)[0], belief.gains(predicted, sound)[0]
+    touched = (env.rules.pairs == 3).any(axis=1)
+    assert not fewer[touched].any() and (fewer[~touched] > 0.0).all() and (fewer[~touched] < every[~touched]).all()
+    k = int(np.flatnonzero(~touched)[0])
+    assert fewer[k] == pytest.approx((predicted - belief.after(predicted, k, sound)).trace(), rel=1e-6)
+    assert (belief.after(predicted, int(np.flatnonzero(touched)[0]), sound) == predicted).all()
+
+
+def test_doubt_is_forgiven_to_those_who_rest():
+    """A failed injection casts doubt on both electrodes; it fades at rest, but for whoever reads interference."""
+    env = environment(FAULTS)
+    observation, _ = env.reset(seed=SEED)
+    belief, currents, doubt = Belief(env.rules, observation), np.zeros((2, 16)), np.zeros((2, 16))
+    assert belief.sound.all()
+    currents[0, [2, 9]], currents[1, [0, 15]], doubt[1, [2, 9]] = (1.0, -1.0), (1.0, -1.0), 0.36
+    belief.see(observation | {"currents": currents[0], "doubt": doubt})
+    assert np.flatnonzero(~belief.sound).tolist() == [2, 9]
+    doubt[0, 9] = 0.2                            # whoever rests is doubted as driver by the environment for ever
+    belief.see(observation | {"currents": currents[1], "doubt": doubt})
+    assert np.flatnonzero(~belief.sound).tolist() == [9]
+    np.testing.assert_allclose(belief.doubt[[2, 9]], [0.8 * 0.36, 0.8 * 0.36 + 0.2])
+    assert not {2, 9} & set(env.rules.pairs[belief.least_doubtful])
+
+
+def test_look_ahead_finds_the_best_plan():
+    """With a beam that holds every pair, depth 2 is the minimum over all plans; depth 1 is greedy."""
+    env = environment(NAME)
+    belief, sound = Belief(env.rules, env.reset(seed=SEED)[0]), np.arange(16) % 3 != 0
+    predicted = belief.predicted()
+    gains, costs = belief.gains(predicted, sound)[0], []
+    for pair, gain in enumerate(gains):
+        later = belief.predicted(belief.after(predicted, pair, sound))
+        costs.append(-gain + later.trace() - belief.gains(later, sound)[0].max())
+    assert belief.look_ahead(1, 4, sound) == gains.argmax()
+    assert belief.look_ahead(2, len(gains), sound) == np.argmin(costs)
+
+
+def test_beforehand_is_the_expected_liquid():
+    """A belief without data is linear about the expected level, and at the level both derivatives agree."""
+    env = environment(NAME)
+    belief = Belief.beforehand(env.rules)
+    assert belief._operator.concentration[0] == pytest.approx(env.scenario.expected_concentration, rel=1e-12)
+    level = belief._operator.concentration[0]
+    assert np.abs(belief.mean / level - 1.0).max() < 0.01
+    np.testing.assert_allclose(belief.relinearised(), belief.derivative, rtol=0.1,
+                               atol=0.02 * np.abs(belief.derivative).max())
+
+
+# -- rules ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", list(KWARGS))
+def test_the_action_of_a_pair_injects_it(name):
+    """In every world the pair's currents flow, and nothing flows where nothing is asked for."""
+    rules = environment(name).rules
+    action = rules.action(21)
+    assert rules.action_space.contains(np.int64(action) if rules.limit is None else action)
+    expected = np.zeros((1, 16))
+    expected[0, rules.pairs[21]] = rules.amplitude, -rules.amplitude
+    np.testing.assert_allclose(rules.currents(np.array([action])), expected, rtol=1e-6)
+    if rules.limit is None and rules.budget is None:
+        with pytest.raises(ValueError, match="pair must be a number: in a world without a budget each step injects"):
+            rules.action(None)
+    else:
+        assert not rules.currents(np.array([rules.action(None)])).any()
+
+
+@pytest.mark.parametrize("budget", [0, 1, 7, 30, 182, 500])
+def test_an_even_budget_is_spent_exactly(budget):
+    """So many injections, or one at each step; between two of them the same number of steps, give or take one."""
+    rules = Rules(Pipe2D(scored_steps=180), budget=budget)
+    steps = rules.scenario.n_steps - 16
+    when = np.flatnonzero([rules.spaced(np.array([left, 0.0])) for left in range(steps, 0, -1)])
+    assert len(when) == min(budget, steps)
+    assert len(when) < 2 or np.ptp(np.diff([-1, *when])) <= 1
+
+
+# -- playing ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", list(KWARGS))
+@pytest.mark.parametrize("policy", own_policies())
+def test_policies_play_what_they_suit(policy, name, monkeypatch):
+    """Valid actions, reproducible to the bit, within the budget; what does not suit is refused."""
+    env = environment(name)
+    if not load_policy(policy).suits(env.rules):
+        with pytest.raises(ValueError, match=f"policy {policy} does not suit {name}"):
+            play(name, KWARGS[name], policy, SEED, "reduced")
+        return
+    taken, again = (actions_of(name, policy, monkeypatch) for _ in range(2))
+    np.testing.assert_array_equal(taken, again)
+    dtype = np.float32 if env.rules.limit else np.int64
+    assert all(env.action_space.contains(action.astype(dtype)) for action in taken)
+
+
+def test_scores_are_those_of_the_exact_filter():
+    """The mean error under the full estimator is that of its own estimates, step by step."""
+    played = play(NAME, SHORT, "best_pair", SEED)
+    env = policies.environment(NAME, json.dumps(SHORT), "full")
+    env.reset(seed=SEED)
+    errors = []
+    for _ in range(env.core.length):
+        env.step(7)
+        assert (env.error is None) == (env.core.t <= env.scenario.warm_up)
+        errors += [env.core.errors()[0]] * (env.error is not None)
+    assert played["errors"] == errors
+
+
+def test_only_the_clairvoyant_is_privileged():
+    """All others play from observations."""
+    assert [name for name in own_policies() if load_policy(name).privileged] == ["clairvoyant"]
+    assert {name: load_policy(name).role for name in own_policies() if load_policy(name).role} == {
+        "clairvoyant": "reference", "random_pair": "floor"}
+    assert {"random_pair", "best_pair", "schedule", "greedy_a", "event_triggered"} < set(own_policies())
+
+
+def jobs_of(policies: list[str], seeds: str, **kwargs) -> list[Job]:
+    return [Job(Environment(NAME, json.dumps(SHORT | kwargs)), policy, seed)
+            for policy in policies for seed in parse_seeds(seeds)]
+
+
+def test_played_episodes_are_kept(tmp_path, monkeypatch):
+    """A record of the format that baselines have; what is there is not played again, but for what was cut short."""
+    store = EpisodeStore(tmp_path / "new")
+    todo = jobs_of(["opposite", "adjacent"], "dev:1,0", estimator="reduced")
+    run_jobs(todo, store, command="eitbench policies")
+    rows = policy_rows(todo, store.results())
+    assert sorted(zip(rows["policy"], rows["seed"], strict=True)) == [
+        (policy, seed) for policy in ("adjacent", "opposite") for seed in ("dev:0", "dev:1")]
+    played = play(NAME, SHORT, "adjacent", parse_seeds("dev:0")[0], "reduced")
+    assert rows.set_index(["policy", "seed"])["error"]["adjacent", "dev:0"] == played["error"]
+    record, _ = store.write_records()
+    assert (record["board"], record["method"], record["seeds"]) == ("injection", "adjacent", ["dev:0", "dev:1"])
+    assert record["environment"]["kwargs"]["estimator"] == "reduced"
+    assert record["episodes"][0]["scores"]["spent"] == played["spent"] > 0
+    assert record["episodes"][0]["step_errors"] == played["errors"]
+
+    next(store.folder.glob("episodes/*/opposite/dev-1.json")).write_text("{")
+    again = []
+    monkeypatch.setattr(policies, "play", lambda *job: again.append(job) or play(*job))
+    run_jobs(todo, store)
+    pd.testing.assert_frame_equal(policy_rows(todo, store.results()).drop(columns="seconds_per_step"),
+                                  rows.drop(columns="seconds_per_step"))
+    assert len(again) == 1
+    exact = jobs_of(["opposite"], "dev:1")
+    run_jobs(exact, store)
+    assert len(policy_rows(exact, store.results())) == 1 and [job[-1] for job in again] == ["reduced", "full"]
+
+
+def test_copies_under_two_names_keep_their_rows(tmp_path):
+    """The same text under another name is another policy, though its episodes have the same identity."""
+    copies = [write_policy(tmp_path, "def act(self, observation): return 3", name) for name in ("one", "two")]
+    todo, store = jobs_of(copies, "dev:0", estimator="reduced"), EpisodeStore(tmp_path / "results")
+    run_jobs(todo, store)
+    assert todo[0].identity() == todo[1].identity()
+    assert list(policy_rows(todo, store.results())["policy"]) == ["one", "two"]
+
+
+def test_a_mistake_is_the_result_of_its_policy(tmp_path):
+    """An episode that fails is recorded with its reason, and has no row; the privileged and the floor are marked."""
+    store = EpisodeStore(tmp_path)
+    bad = write_policy(tmp_path, "def act(self, observation): return 0.5", "bad")
+    run_jobs(jobs_of([bad, "random_pair"], "dev:0", estimator="reduced"), store)
+    failed, floor = store.write_records()
+    assert "action must be an integer" in failed["episodes"][0]["message"] and failed["role"] is None
+    assert floor["episodes"][0]["status"] == "ok" and floor["role"] == "floor"
+    rows = policy_rows(jobs_of([bad], "dev:0", estimator="reduced"), store.results())
+    assert policy_table.policy_table(rows, []) == "no episode was finished"
+
+
+def test_table_pairs_the_episodes():
+    """Mean errors in order, and differences to the best that is not privileged with the interval of paired episodes."""
+    errors = {"clairvoyant": [1.0, 2.0, 3.0], "best_pair": [2.0, 3.1, 4.0], "random_pair": [3.0, 4.1, 5.2]}
+    rows = pd.DataFrame([{"policy": name, "seed": f"dev:{k}", "error": error, "spent": 5, "seconds_per_step": 0.001}
+                         for name, each in errors.items() for k, error in enumerate(each)])
+    lines = policy_table.policy_table(rows, ["clairvoyant"]).splitlines()
+    names = [line.split("|")[1].strip() for line in lines[2:5]]
+    assert names == ["clairvoyant (privileged)", "best_pair", "random_pair"]
+    # 1.0667 on average with a standard deviation of 0.1155: half the interval is 4.303·0.1155/√3
+    assert "1.1 ± 0.3" in lines[4] and "–" in lines[3] and "gap 0.49" in lines[-1]
+    # Agents of two trainings, 1.7 and 2.3 on average, are one policy.
+    agents = pd.DataFrame([{"policy": f"ppo_seed{k}", "seed": f"dev:{j}", "error": 1.7 + 0.6 * k + 0.1 * j, "spent": 5,
+                            "seconds_per_step": 0.001} for k in range(2) for j in range(3)])
+    lines = policy_table.policy_table(pd.concat([rows, agents]), ["clairvoyant"]).splitlines()
+    assert lines[3].startswith("| ppo | 2.1 ") and "ppo_seed" not in str(lines) and "gap 0.49" in lines[-1]
+
+
+def test_who_failed_comes_after_who_did_not():
+    """Two easy episodes do not make a best policy of one that failed in the hard one; the table says how many count."""
+    rows = pd.DataFrame([{"policy": name, "seed": f"dev:{k}", "error": error, "spent": 5, "seconds_per_step": 0.001}
+                         for name, each in {"bold": [1.0, 2.0], "sound": [1.1, 2.1, 9.0]}.items()
+                         for k, error in enumerate(each)])
+    lines = policy_table.policy_table(rows, []).splitlines()
+    assert lines[0].startswith("| policy | ẽ_c | worse than sound by |")
+    assert lines[2].startswith("| sound | ") and lines[3].startswith("| bold (2 of 3 episodes) | ")
+
+
+# -- mistakes ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("body", "message"), [
+    ("x = 1", r"mine\.py must define a class Policy with a method act\(observation\)"),
+    ("privileged = 1\n    def act(self, observation): ...", "Policy.privileged must be True or False, got 1"),
+    ("parameters = {'a': {1}}\n    def act(self, observation): ...", "Policy.parameters must be a dict fit for JSON"),
+    ("role = 'best'\n    def act(self, observation): ...", "Policy.role must be None, .*, got 'best'"),
+    ("parameters = 3\n    def act(self, observation): ...", "Policy.parameters must be a dict fit for JSON"),
+    ("1 / 0", r"mine\.py cannot be loaded: ZeroDivisionError"),
+])
+def test_wrong_files_are_named(tmp_path, body, message):
+    """What came and what was expected."""
+    with pytest.raises(ValueError, match=message):
+        load_policy(write_policy(tmp_path, body))
+
+
+def test_wrong_names_are_named(tmp_path):
+    """Of policies, environments and estimators."""
+    with pytest.raises(ValueError, match=r"policy must be the path of .*, or one of adjacent, .*; got 'lucky'"):
+        load_policy("lucky")
+    with pytest.raises(ValueError, match="has the name of one of ours"):
+        load_policy(write_policy(tmp_path, name="adjacent"))
+    with pytest.raises(ValueError, match=r"env must be one of .*; got 'eitbench/Pipe2D-v0'"):
+        play("eitbench/Pipe2D-v0", {}, "adjacent", 1)
+    with pytest.raises(ValueError, match="estimator must be 'full' or 'reduced', got 'none'"):
+        play(NAME, SHORT, "adjacent", 1, "none")
+
+
+def test_anybodys_file_plays(tmp_path):
+    """Its title is its docstring's first words; a wrong action is named."""
+    loaded = load_policy(path := write_policy(tmp_path))
+    assert (loaded.name, loaded.title, loaded.privileged, loaded.parameters) == ("mine", "Mine", False, {})
+    played = play(NAME, SHORT, path, SEED, "reduced")
+    assert played["errors"] == play(NAME, SHORT, "best_pair", SEED, "reduced")["errors"]
+    with pytest.raises(ValueError, match="action must be an integer"):
+        play(NAME, SHORT, write_policy(tmp_path, "def act(self, observation): return 0.5", "wrong"), SEED, "reduced")
+
+
+# -- adaptivity gap ---------------------------------------------------------------------------------------------------
+
+
+def hand_made(**errors: list[float]) -> pd.DataFrame:
+    rows = [{"policy": policy, "seed": f"dev:{k}", "error": error}
+            for policy, each in errors.items() for k, error in enumerate(each)]
+    return pd.DataFrame(rows)
+
+
+def test_adaptivity_gap_is_the_formula():
+    """(2 − 1)/(5 − 1) on a table made by hand; the open-loop policy that is better in the mean counts."""
+    table = hand_made(clairvoyant=[1.0, 1.0], random_pair=[4.0, 6.0], a=[1.5, 2.5], b=[1.0, 9.0], spy=[0.0, 0.0])
+    gap, low, high = adaptivity_gap(table, ["b", "a"])
+    assert gap == 0.25
+    assert (low, high) == (pytest.approx(0.5 / 3.0), pytest.approx(1.5 / 5.0))      # both episodes the same
+    assert adaptivity_gap(table, ["a", "b"]) == (gap, low, high)
+    same = hand_made(clairvoyant=[1.0] * 9, random_pair=[5.0] * 9, a=[2.0] * 9)
+    assert adaptivity_gap(same, ["a"]) == (0.25, 0.25, 0.25)
+
+
+@pytest.mark.parametrize("open_loop", [[], ["c"]])
+def test_a_table_with_gaps_is_refused(open_loop):
+    """Every policy that counts has played every episode."""
+    table = hand_made(clairvoyant=[1.0, 1.0], random_pair=[4.0, 6.0], c=[2.0])
+    with pytest.raises(ValueError, match="table must hold clairvoyant, random_pair and some open-loop policies"):
+        adaptivity_gap(table, open_loop)

@@ -1,0 +1,349 @@
+"""Running baselines: what estimators are shown, what becomes of their mistakes, and whether the scores are true."""
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize_scalar
+from tiny import FILTER, FIXED_LAG, SCENARIO, SMOOTHING, count, counting, write_baseline
+
+from eitbench.bench import run
+from eitbench.bench.run import Environment, Job, board_of, play_and_collect, run_episode, run_jobs
+from eitbench.bench.store import EpisodeStore
+from eitbench.data.episodes import CACHE_VARIABLE, simulate, truth_discretisation
+from eitbench.worlds import Pipe2D
+from eitbench.worlds.task import Estimate, Task
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path_factory, monkeypatch):
+    """One cache of episodes for all tests of this session."""
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path_factory.getbasetemp() / "episodes"))
+
+
+@pytest.fixture
+def store(tmp_path):
+    return EpisodeStore(tmp_path / "results")
+
+
+def scores_of(result):
+    """All that must repeat: scores and step errors, but not the clock."""
+    return {**result["scores"], "seconds_per_step": None, "steps": result["step_errors"]}
+
+
+def baseline_of(update, boards=("filter",)):
+    """A `Baseline` that was never a file; ``update(task, i, voltages, currents)`` says what it thinks."""
+    class Estimator:
+        def __init__(self, *arguments):
+            (self.task,), self.i = arguments, 0
+
+        def update(self, *arguments):
+            self.i += 1
+            return update(self.task, self.i, *arguments)
+
+    return run.Baseline("made_here", "Made here", Path(), "0" * 64, boards, {}, Estimator)
+
+
+# -- mistakes of baselines --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("update", "message"), [
+    ("raise RuntimeError('the pump is off')", "RuntimeError: the pump is off"),
+    ("return Estimate(self.level * np.nan)", "must be finite"),
+    ("return Estimate(self.level[:-1])", r"shape \(1701,\), got \(1700,\)"),
+    ("return Estimate(self.level[:, None])", r"shape \(1701,\), got \(1701, 1\)"),
+    ("return Estimate('thirty')", "must be an array of numbers"),
+    ("return Estimate(1e9 * self.level)", "must lie within ±250"),
+    ("return None", "t = 1 it returned None"),
+    ("return Estimate(self.level, -self.level)", "variance must be finite, ≥ 0"),
+    ("return Estimate(self.level, np.inf * self.level)", "variance must be finite"),
+    ("return Estimate(self.level, self.level[:5])", r"variance .* shape \(1701,\), got shape \(5,\)"),
+    ("return self.level", "must return an Estimate"),
+    ("return Estimate(self.level, None, voltages, np.full((4, 4), np.nan))", "innovation"),
+    ("return Estimate(self.level, None, voltages[:2], np.eye(4))", "innovation"),
+    ("return Estimate(self.level, None, voltages, -np.eye(4))", "covariance must be positive definite"),
+    ("return Estimate(self.level, None, voltages, np.ones((4, 4)))", "covariance must be positive definite"),
+])
+def test_a_mistake_is_the_result_of_its_baseline_only(update, message, store, tmp_path):
+    """Whatever a baseline does wrong is recorded with the reason; the run goes on, and others score as ever."""
+    good, bad = write_baseline(tmp_path, "good"), write_baseline(tmp_path, "bad", update=update)
+    run_jobs([Job(FILTER, bad, 1), Job(FILTER, good, 1)], store)
+    failed, fine = sorted(store.results(), key=lambda result: result["status"])
+    assert (failed["method"], failed["status"], fine["status"]) == ("bad", "failed", "ok")
+    assert re.search(message, failed["message"])
+    assert scores_of(fine) == scores_of(run_episode(Job(FILTER, good, 1))[0])
+
+
+@pytest.mark.parametrize("init", ["raise MemoryError('too large')", "self.level = task.truth"])
+def test_a_mistake_in_the_constructor(init, store, tmp_path):
+    """An estimator that cannot even be made fails like any other."""
+    run_jobs([Job(FILTER, write_baseline(tmp_path, init=init), 1)], store)
+    (result,) = store.results()
+    assert result["status"] == "failed" and ("too large" in result["message"] or "truth" in result["message"])
+
+
+def test_nothing_but_the_scored_states_must_be_claimed(tmp_path):
+    """Without a variance in the warm-up the scored states' claims count; with one missing later, none does."""
+    late = "return Estimate(self.level, None if self.calls <= {} else 0 * self.level + 4.0)"
+    claimed, unclaimed = (run_episode(Job(FILTER, write_baseline(tmp_path, update=late.format(first)), 1))[0]["scores"]
+                          for first in (2, 3))
+    calibration = ("crps", "coverage_50", "coverage_90", "spread_ratio")
+    assert all(claimed[name] is not None for name in calibration)
+    assert all(unclaimed[name] is None for name in calibration)
+    assert claimed["nis"] is None and unclaimed["error"] == claimed["error"]
+
+
+# -- what estimators are shown ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("environment", [FILTER, SMOOTHING], ids=["filter", "smoothing"])
+def test_estimators_see_the_task_and_measurements_only(environment):
+    """One argument makes it: the task. Two feed it: voltages and currents. No reward, no info, no environment."""
+    env, seen = environment.make(), []
+    env.reveal = None                                           # is not even called
+
+    def update(*arguments):
+        seen.append(arguments)
+        return Estimate(np.full(1701, 30.0))
+
+    play_and_collect(env, baseline_of(update), 3)
+    assert len(seen) == env.task.n_steps + env.task.lag
+    observation, _ = env.reset(seed=3)
+    for task, _, *measurement in seen:
+        assert type(task) is Task and task is env.task
+        for values, expected in zip(measurement, observation.values(), strict=True):
+            assert type(values) is np.ndarray and not np.shares_memory(values, task.currents)
+            np.testing.assert_array_equal(values, expected)
+        observation, *_ = env.step(np.full(1701, 30.0))
+
+
+BIASED = Environment("eitbench/Pipe2DSmoothing-v0",
+                     json.dumps({"scenario": SCENARIO, "assumed_mean_velocity": 30.0}))
+
+
+@pytest.mark.parametrize("environment", [FILTER, FIXED_LAG, SMOOTHING, BIASED],
+                         ids=["filter", "fixed-lag", "smoothing", "biased"])
+def test_reference_with_the_true_model(environment):
+    """Whatever a board asks for and believes, the reference says what the smoother with the true velocity says."""
+    reference, _ = run_episode(Job(environment, "true_model_smoother", 3))
+    smoother, _ = run_episode(Job(SMOOTHING, "fixed_interval_smoother", 3))
+    assert (reference["role"], reference["privileged"]) == ("reference", True)
+    np.testing.assert_allclose(reference["step_errors"], smoother["step_errors"], rtol=1e-6)
+
+
+def test_reference_in_a_flow_that_changes():
+    """Told the flow of every step it errs less than the filter that is told the first guess, and knows the flow."""
+    scenario = {**SCENARIO, "scored_steps": 12, "velocity_range": [30.0, 60.0]}
+    world = Environment("eitbench/Pipe2DTimeVaryingVelocity-v0", json.dumps({"scenario": scenario}))
+    reference, guessing = (run_episode(Job(world, name, 3))[0]["scores"]
+                           for name in ("true_model_smoother", "kalman_filter"))
+    assert reference["error"] < 0.9 * guessing["error"]
+    assert reference["velocity_error"] < 1e-20 < guessing["velocity_error"]
+
+
+def test_what_estimators_do_to_their_arrays_changes_nothing(tmp_path):
+    """Overwriting measurements, or what was returned before, alters neither scores nor stored estimates."""
+    said = "self.level[:] = 28.0 + self.calls; {}; {}; return Estimate(self.level, self.variance, self.nu, self.S)"
+    init = "self.variance, self.nu, self.S = 4 + self.level, np.ones(4), np.eye(4)"
+    new = "self.level, self.nu, self.S = self.level.copy(), voltages * self.calls, np.eye(4) / self.calls"
+    reuse = "self.nu[:], self.S[:] = voltages * self.calls, np.eye(4) / self.calls"
+    outcomes = [run_episode(Job(FILTER, write_baseline(tmp_path, init=init, update=said.format(*update)), 1))
+                for update in ((new, "pass"), (reuse, "voltages[:] = np.nan; currents[:] = 7.0"))]
+    (polite, fields), (rude, rude_fields) = outcomes
+    assert scores_of(rude) == scores_of(polite) and polite["scores"]["nis"] > 0
+    np.testing.assert_array_equal(rude_fields["mean"], fields["mean"])
+
+
+def test_estimators_cannot_spoil_the_task_for_others(tmp_path):
+    """A baseline that writes into the shared injection pattern harms, if anybody, itself."""
+    good = write_baseline(tmp_path, "good")
+    before = scores_of(run_episode(Job(FILTER, good, 1))[0])
+    run_episode(Job(FILTER, write_baseline(tmp_path, "vandal", init="task.currents[:] *= 3.0"), 1))
+    try:
+        assert scores_of(run_episode(Job(FILTER, good, 1))[0]) == before
+    finally:
+        run._environment.cache_clear()                                 # what a vandal broke is no other test's affair
+
+
+@pytest.mark.parametrize(("environment", "board"), [(FILTER, "filter"), (FIXED_LAG, "fixed-lag"),
+                                                    (SMOOTHING, "smoothing")], ids=lambda value: str(value)[:9])
+def test_estimates_are_taken_for_the_state_that_was_asked_for(environment, board):
+    """At step i the state t = i − lag is asked for: on each board what was said of t stands at t."""
+    env = environment.make()
+    assert board_of(env) == board
+
+    def update(task, i, *_):
+        return Estimate(np.full(1701, 20.0 + i - task.lag)) if i > task.lag else None
+
+    played = play_and_collect(env, baseline_of(update), 3)
+    np.testing.assert_array_equal(played.means, np.repeat(20.0 + np.arange(1, 6)[:, None], 1701, axis=1))
+    assert played.voltages.shape == played.currents.shape == (5, 4) and len(played.seconds) == 5 + env.task.lag
+
+
+def test_only_estimation_environments_are_played():
+    """Another environment of gymnasium is refused by name."""
+    with pytest.raises(ValueError, match="env must be one of"):
+        Environment("CartPole-v1").make()
+
+
+# -- scores -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def tilted(tmp_path_factory):
+    """Result, estimates and true episode of a baseline whose field is exact in single precision, as it is stored."""
+    folder = tmp_path_factory.mktemp("tilted")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(CACHE_VARIABLE, str(folder))
+        path = write_baseline(folder, init="self.x, self.y = task.mesh.points.T", update=(
+            "return Estimate(np.float32(30 + 2 * np.sin(self.calls + 9 * self.x) + 40 * self.y).astype(float))"))
+        store = EpisodeStore(folder)
+        run_jobs([Job(FILTER, path, 4)], store)
+        (result,) = store.results()
+        return result, store.fields(result)["mean"].astype(float), simulate(Pipe2D(**SCENARIO), 4)
+
+
+def squared(mesh, values):
+    """∫f² of P1 fields (T, n) by the exact rule on each triangle, area/6·(a² + b² + c² + ab + bc + ca)."""
+    a, b, c = (values[:, corner] for corner in mesh.cells.T)
+    p, q, r = mesh.points[mesh.cells].transpose(1, 0, 2)
+    area = 0.5 * np.abs((q - p)[:, 0] * (r - p)[:, 1] - (q - p)[:, 1] * (r - p)[:, 0])
+    return (a * a + b * b + c * c + a * b + b * c + c * a) @ area / 6
+
+
+def interpolated(mesh, values, points):
+    """P1 fields (T, n) at points (k, 2): each point tries every triangle and takes the one it lies deepest in."""
+    p, q, r = mesh.points[mesh.cells].transpose(1, 0, 2)
+    to_barycentric = np.linalg.inv(np.stack([q - p, r - p], axis=2))
+    result = np.empty((len(values), len(points)))
+    for k, point in enumerate(points):
+        s, t = np.einsum("cij,cj->ic", to_barycentric, point - p)
+        weights = np.stack([1 - s - t, s, t])
+        cell = weights.min(axis=0).argmax()
+        result[:, k] = values[:, mesh.cells[cell]] @ weights[:, cell]
+    return result
+
+
+def test_scores_can_be_recomputed_from_what_is_stored(tilted):
+    """Relative and contrast error follow from the stored estimates and the simulated truth, by other code."""
+    result, means, episode = tilted
+    env = FILTER.make()
+    mesh, truth = truth_discretisation(env.scenario).transport.mesh, episode.concentration[1:].astype(float)
+    error = squared(mesh, interpolated(env.task.mesh, means, mesh.points) - truth)[2:]
+    steps = error / squared(mesh, truth)[2:]
+    np.testing.assert_allclose(result["step_errors"], steps, rtol=1e-9)
+    assert result["scores"]["error"] == pytest.approx(steps.mean(), rel=1e-9)
+
+    currents = np.array([env.task.currents[i % 2] for i in range(5)])
+    voltages = np.array([episode.voltages(i + 1, currents[i], env.scenario) for i in range(5)])
+
+    def misfit(level):
+        computed = env.task.observation.voltages(np.full(1701, level), currents)
+        return (((voltages - computed) / env.scenario.noise.std(voltages))**2).sum()
+
+    homogeneous = minimize_scalar(misfit, bounds=(20.0, 40.0), method="bounded", options={"xatol": 1e-7}).x
+    contrast = (error / squared(mesh, truth - homogeneous)[2:]).mean()
+    assert result["scores"]["contrast_error"] == pytest.approx(contrast, rel=1e-5)
+    computed = np.array([env.task.observation.voltages(means[i], currents[i:i + 1])[0] for i in range(5)])
+    assert result["scores"]["voltage_discrepancy"] == pytest.approx(((voltages - computed)[2:]**2).mean(), rel=1e-9)
+
+
+def test_minus_the_mean_reward_is_the_error(tilted):
+    """What the environment pays, from moments in single precision, is what the leaderboard reports."""
+    result, means, _ = tilted
+    env = FILTER.make()
+    env.reset(seed=4)
+    rewards = [env.step(mean)[1] for mean in means]
+    assert rewards[:2] == [0.0, 0.0]
+    assert -np.mean(rewards[2:]) == pytest.approx(result["scores"]["error"], rel=1e-7)
+    np.testing.assert_allclose(result["step_errors"], -np.array(rewards[2:]), rtol=1e-7)
+
+
+# -- resuming ---------------------------------------------------------------------------------------------------------
+
+
+def test_second_run_does_nothing(store, tmp_path):
+    """Finished episodes are not played again; failed ones are, and so is everything once the file has changed."""
+    log = tmp_path / "log"
+    path = write_baseline(tmp_path, init=counting(log))
+    jobs = [Job(FILTER, path, seed) for seed in (1, 2)]
+    run_jobs(jobs, store)
+    before = {file: file.read_bytes() for file in store.folder.rglob("*.*")}
+    run_jobs(jobs, store)
+    assert count(log) == 2 and {file: file.read_bytes() for file in store.folder.rglob("*.*")} == before
+
+    write_baseline(tmp_path, init=counting(log), update="raise RuntimeError('changed')")
+    run_jobs(jobs, store)
+    run_jobs(jobs[:1], store)
+    assert count(log) == 5 and all("changed" in result["message"] for result in store.results())
+
+
+def test_identity_names_all_that_matters(tmp_path, monkeypatch):
+    """Environment, its arguments, seed, baseline file and our own code each make another outcome."""
+    path = write_baseline(tmp_path)
+    same, *others = (Job(FILTER, path, 1), Job(FIXED_LAG, path, 1), Job(Environment(FILTER.id), path, 1),
+                     Job(FILTER, path, 2), Job(FILTER, write_baseline(tmp_path, "other", doc="Other."), 1))
+    assert Job(FILTER, path, 1).identity() == same.identity()
+    identities = {same.identity(), *(other.identity() for other in others)}
+    monkeypatch.setattr(run, "source_digest", lambda: "older code")
+    assert len(identities | {same.identity()}) == 6
+
+
+@pytest.mark.parametrize("how", ["KeyboardInterrupt", "SIGKILL"])
+def test_interrupted_run_resumes(how, store, tmp_path):
+    """Ctrl-C, or a kill without warning, in the third of four episodes: two are kept, and two remain to be done."""
+    log, armed = tmp_path / "log", tmp_path / "armed"
+    armed.touch()
+    stop = "raise KeyboardInterrupt" if how == "KeyboardInterrupt" else "os.kill(os.getpid(), 9)"
+    update = f"if Path({str(armed)!r}).exists() and len(open({str(log)!r}).readlines()) == 3: {stop}"
+    path = write_baseline(tmp_path, init=counting(log), update=f"{update}\n        return Estimate(self.level)")
+    jobs = [Job(FILTER, path, seed) for seed in (1, 2, 3, 4)]
+    if how == "KeyboardInterrupt":
+        with pytest.raises(KeyboardInterrupt):
+            run_jobs(jobs, store)
+    else:
+        assert in_another_process(jobs, store).wait() == -9
+    assert sum(result["status"] == "ok" for result in store.results()) == 2
+    armed.unlink()
+    run_jobs(jobs, store)
+    assert count(log) == 3 + 2 and len(list(store.results())) == 4
+    assert not [file for file in store.folder.rglob("*") if file.name.startswith(".")]
+
+
+def in_another_process(jobs, store):
+    """A started process that runs these jobs."""
+    plain = [[list(job.environment), job.method, job.seed] for job in jobs]
+    program = ("from pathlib import Path; from eitbench.bench.run import *\n"
+               f"jobs = [Job(Environment(*environment), *rest) for environment, *rest in {plain!r}]\n"
+               f"run_jobs(jobs, EpisodeStore(Path({str(store.folder)!r})))")
+    return subprocess.Popen([sys.executable, "-c", program])
+
+
+def test_two_runs_into_one_folder_lose_nothing(store, tmp_path):
+    """Two processes that provably run at once, different baselines, all the episodes of both."""
+    wait = ("(Path({folder!r}) / self.task_name).touch()\n"
+            "        import time; end = time.monotonic() + 120\n"
+            "        while len(list(Path({folder!r}).iterdir())) < 2:\n"
+            "            assert time.monotonic() < end, 'the other run never came'\n"
+            "            time.sleep(0.02)")
+    meeting = tmp_path / "meeting"
+    meeting.mkdir()
+    paths = [write_baseline(tmp_path, name, init=f"self.task_name = {name!r}; "
+                            + wait.format(folder=str(meeting))) for name in ("first", "second")]
+    running = [in_another_process([Job(FILTER, path, seed) for seed in (1, 2, 3)], store) for path in paths]
+    assert [process.wait() for process in running] == [0, 0]
+    assert {(r["method"], r["seed"], r["status"]) for r in store.results()} == {
+        (name, f"train:{seed}", "ok") for name in ("first", "second") for seed in (1, 2, 3)}
+    assert all(store.fields(result)["mean"].shape == (5, 1701) for result in store.results())
+
+
+def test_processes_change_nothing_but_the_time(store, tmp_path):
+    """Two workers and one give the same scores."""
+    path = write_baseline(tmp_path, update="return Estimate(self.level + voltages.sum() + voltages[0])")
+    jobs = [Job(FILTER, path, seed) for seed in (1, 2)]
+    run_jobs(jobs, store, n_jobs=2)
+    assert [scores_of(result) for result in store.results()] == [scores_of(run_episode(job)[0]) for job in jobs]

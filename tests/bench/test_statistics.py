@@ -1,0 +1,387 @@
+"""Statistics of a board: against numbers done by hand, brute force, and what intervals are for: coverage."""
+
+import json
+import math
+import os
+import subprocess
+import sys
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from eitbench.bench.statistics import (
+    interquartile_mean,
+    mean_over_environments,
+    paired_difference,
+    paired_probability_of_improvement,
+    probability_of_improvement,
+    shared_ranks,
+    stratified_bootstrap,
+    tail,
+)
+
+
+def seeded(values, split="test"):
+    """Seed -> score: one environment of one method."""
+    return {f"{split}:{i}": float(value) for i, value in enumerate(values)}
+
+
+def shuffled(scores, random):
+    """The same scores, environments and seeds listed in another order."""
+    return {environment: {str(seed): own[seed] for seed in random.permutation(list(own))}
+            for environment, own in reversed(scores.items())}
+
+
+def two_methods(seed=5):
+    """Scores of two methods on shared hard and easy episodes of three environments, some of them equal."""
+    random = np.random.default_rng(seed)
+    a, b = {}, {}
+    for environment, n in (("pipe", 12), ("tank", 20), ("obstacle", 9)):
+        hardness = random.lognormal(0.0, 1.0, n)
+        a[environment] = seeded(np.round(hardness + random.normal(0.0, 0.3, n), 1))
+        b[environment] = seeded(np.round(hardness + random.normal(0.1, 0.3, n), 1))
+    return a, b
+
+
+def plain(scores):
+    """Environment -> list of scores."""
+    return {environment: list(own.values()) for environment, own in scores.items()}
+
+
+# -- interquartile mean -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("scores", "expected"), [
+    ([5.0], 5.0),                                           # 0 of 1 left out at either end
+    ([1.0, 6.0], 3.5),
+    ([1.0, 2.0, 9.0], 4.0),                                 # 0 of 3: the mean
+    ([9.0, 2.0, 100.0, 4.0], 6.5),                          # 1 of 4: (4 + 9)/2
+    ([-50.0, 1.0, 2.0, 6.0, 100.0], 3.0),                   # 1 of 5: (1 + 2 + 6)/3
+    ([-9.0, 1.0, 2.0, 3.0, 6.0, 99.0], 3.0),                # 1 of 6: (1 + 2 + 3 + 6)/4
+    ([-9.0, 1.0, 2.0, 3.0, 4.0, 10.0, 99.0], 4.0),          # 1 of 7: (1 + 2 + 3 + 4 + 10)/5
+    ([-9.0, -8.0, 1.0, 2.0, 3.0, 4.0, 98.0, 99.0], 2.5),    # 2 of 8: (1 + 2 + 3 + 4)/4
+])
+def test_interquartile_mean_by_hand(scores, expected):
+    """A quarter of the scores, rounded down, is left out at either end."""
+    assert interquartile_mean(scores) == pytest.approx(expected, rel=1e-15)
+    assert interquartile_mean(scores[::-1]) == pytest.approx(expected, rel=1e-15)
+
+
+@pytest.mark.parametrize("n", range(1, 30))
+def test_interquartile_mean_is_scipys(n):
+    """The 25 % trimmed mean, of the environments pooled and for any number of draws at once."""
+    scores = np.random.default_rng(n).normal(size=(4, n))
+    assert interquartile_mean(scores) == pytest.approx(stats.trim_mean(scores, 0.25, axis=1), rel=1e-12)
+    assert interquartile_mean(*scores) == pytest.approx(stats.trim_mean(scores, 0.25, axis=None), rel=1e-12)
+
+
+def test_interquartile_mean_pools_and_the_mean_does_not():
+    """Pooled 0, 0, 0, 0, 0, 0, 4, 8: the middle four are 0. The mean of the means 0 and 6 is 3."""
+    assert interquartile_mean([0.0] * 6, [4.0, 8.0]) == 0.0
+    assert mean_over_environments([0.0] * 6, [4.0, 8.0]) == 3.0
+
+
+# -- bootstrap --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("n", "statistic", "expected"), [
+    (6, mean_over_environments, 0.932), (10, mean_over_environments, 0.944), (30, mean_over_environments, 0.950),
+    (6, interquartile_mean, 0.955), (10, interquartile_mean, 0.972), (30, interquartile_mean, 0.959)])
+def test_coverage(n, statistic, expected):
+    """Intervals that hold the truth, of 1000 data sets of n normal numbers: as of 6000 others, to 3 standard errors.
+
+    Not cut as Student's t would they are too few: 0.854, 0.902 and 0.938 for the mean, 0.904, 0.937 and 0.948.
+    """
+    repeats, random = 1000, np.random.default_rng(11)
+    held = 0
+    for _ in range(repeats):
+        _, low, high = stratified_bootstrap({"pipe": random.normal(3.0, 2.0, n)}, statistic, draws=1000)
+        held += low <= 3.0 <= high
+    assert held / repeats == pytest.approx(expected, abs=3 * math.sqrt(expected * (1 - expected) / repeats))
+
+
+def test_coverage_over_environments():
+    """Strata of different size, mean and spread: the mean of their means, of 400 data sets, 95 % within ± 3.3 %.
+
+    Pooled resampling would take the distance between environments for noise and cover always.
+    """
+    random, held, width = np.random.default_rng(12), 0, []
+    for _ in range(400):
+        scores = {"a": random.normal(0.0, 1.0, 30), "b": random.normal(50.0, 2.0, 40), "c": random.normal(9.0, 1.0, 25)}
+        _, low, high = stratified_bootstrap(scores, mean_over_environments, draws=1000)
+        held += low <= 59 / 3 <= high
+        width.append(high - low)
+    assert held / 400 == pytest.approx(0.95, abs=0.033)
+    expected = 2 * stats.t(92).ppf(0.975) / 3 * math.sqrt(1 / 30 + 4 / 40 + 1 / 25)
+    assert np.mean(width) == pytest.approx(expected, rel=0.03)
+
+
+@pytest.mark.parametrize("statistic", [interquartile_mean, mean_over_environments])
+def test_constant_environments_have_no_interval(statistic):
+    """Nothing is uncertain about two environments that always score 0.25 and 0.75, however far apart they are."""
+    scores = {"pipe": [0.25] * 8, "tank": [0.75] * 8}
+    assert stratified_bootstrap(scores, statistic) == (0.5, 0.5, 0.5)
+
+
+def test_too_few_episodes_claim_nothing():
+    """Five episodes, or one alone in its environment, give no interval; six do."""
+    a, b = np.arange(5.0), np.arange(10.0)
+    assert stratified_bootstrap({"pipe": a}, mean_over_environments) == (2.0, -math.inf, math.inf)
+    assert stratified_bootstrap({"pipe": [1.0], "tank": b}, mean_over_environments)[1:] == (-math.inf, math.inf)
+    value, low, high = stratified_bootstrap({"pipe": a[:2], "tank": b[:4]}, mean_over_environments)
+    assert value == 1.0 and 0.0 <= low < 1.0 < high <= 2.0
+    few = {"pipe": a}
+    assert probability_of_improvement(few, {"pipe": b + 5}) == (1.0, 0.0, 1.0)
+    assert probability_of_improvement({"pipe": b + 5}, few) == (0.0, 0.0, 1.0)
+    assert paired_probability_of_improvement({"pipe": seeded(a)}, {"pipe": seeded(a + 1)}) == (1.0, 0.0, 1.0)
+
+
+def everything():
+    """Each kind of interval once."""
+    a, b = two_methods()
+    return [stratified_bootstrap(plain(a), interquartile_mean), stratified_bootstrap(plain(a), mean_over_environments),
+            paired_difference(a, b), paired_probability_of_improvement(a, b),
+            probability_of_improvement(plain(a), plain(b))]
+
+
+def test_the_same_numbers_in_another_process():
+    """To the last bit, whatever the hashes of the names are there; another seed gives other intervals."""
+    here = json.loads(json.dumps(everything()))
+    code = "import json; from test_statistics import everything; print(json.dumps(everything()))"
+    environment = os.environ | {"PYTHONHASHSEED": "1", "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+    done = subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parent, env=environment, capture_output=True,
+                          text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout) == here
+    a, b = two_methods()
+    assert paired_difference(a, b, seed=1)[0] == here[2][0] and paired_difference(a, b, seed=1)[1:] != here[2][1:]
+
+
+@pytest.mark.parametrize("order", range(3))
+def test_the_order_of_episodes_does_not_matter(order):
+    """Pairs are found by their seeds, and the intervals are the same to the last bit."""
+    random = np.random.default_rng(order)
+    a, b = two_methods()
+    one, other = shuffled(a, random), shuffled(b, random)
+    assert list(one["pipe"]) != list(a["pipe"])
+    assert paired_difference(one, other) == paired_difference(a, b)
+    assert paired_probability_of_improvement(one, other) == paired_probability_of_improvement(a, b)
+    assert probability_of_improvement(plain(one), plain(other)) == probability_of_improvement(plain(a), plain(b))
+    for statistic in (interquartile_mean, mean_over_environments):
+        assert stratified_bootstrap(plain(one), statistic) == stratified_bootstrap(plain(a), statistic)
+
+
+# -- pairs ------------------------------------------------------------------------------------------------------------
+
+
+def test_what_is_hard_for_both_cancels():
+    """1/4 worse on every one of very different episodes is exactly that; unpaired nothing would be seen."""
+    b = {"pipe": seeded(2.0 ** np.arange(10)), "tank": seeded(3.0 * np.arange(7))}
+    a = {environment: {seed: score + 0.25 for seed, score in reversed(own.items())} for environment, own in b.items()}
+    assert paired_difference(a, b) == (0.25, 0.25, 0.25)
+    assert paired_difference(b, a) == (-0.25, -0.25, -0.25)
+    assert paired_probability_of_improvement(b, a) == (1.0, 1.0, 1.0)
+    assert 0.5 < probability_of_improvement(plain(b), plain(a))[0] < 0.7
+
+
+def test_paired_interval_is_scipys():
+    """One environment: scipy's paired bootstrap percentile interval of the mean difference, to Monte-Carlo error, cut
+    where the half-width of the mean of 40 normal numbers is Student's."""
+    random = np.random.default_rng(3)
+    x, y = random.normal(0.0, 1.0, (2, 40))
+    cut = stats.norm.sf(stats.t(39).ppf(0.975) * math.sqrt(40 / 39))
+    theirs = stats.bootstrap((x, y), lambda x, y, axis: (x - y).mean(axis=axis), paired=True, method="percentile",
+                             confidence_level=1 - 2 * cut, n_resamples=20_000,
+                             rng=np.random.default_rng(4)).confidence_interval
+    value, low, high = paired_difference({"pipe": seeded(x)}, {"pipe": seeded(y)}, draws=20_000)
+    assert value == pytest.approx((x - y).mean(), rel=1e-12)
+    sd = (x - y).std() / math.sqrt(40)                           # Monte-Carlo error of an end of the interval: 0.02 sd
+    assert (low, high) == pytest.approx(tuple(theirs), abs=4 * math.sqrt(2) * 0.02 * sd)
+
+
+def test_paired_difference_of_interquartile_means():
+    """The difference of the two statistics, as a loop that draws the same episodes for both, to Monte-Carlo error."""
+    a, b = two_methods()
+    random, differences = np.random.default_rng(6), []
+    for _ in range(4000):
+        drawn = {name: random.choice(list(own), len(own)) for name, own in a.items()}
+        x, y = (interquartile_mean(*[[scores[name][seed] for seed in seeds] for name, seeds in drawn.items()])
+                for scores in (a, b))
+        differences.append(x - y)
+    value, low, high = paired_difference(a, b, statistic=interquartile_mean)
+    assert value == interquartile_mean(*plain(a).values()) - interquartile_mean(*plain(b).values())
+    cut = tail([12, 20, 9])
+    theirs = tuple(np.percentile(differences, [cut, 100 - cut]))
+    assert (low, high) == pytest.approx(theirs, abs=4 * 0.05 * np.std(differences))
+    assert paired_difference(shuffled(a, random), shuffled(b, random), statistic=interquartile_mean) == (
+        value, low, high)
+    same = paired_difference(a, b, statistic=mean_over_environments)
+    assert same == paired_difference(a, b) and same[0] != value
+
+
+def test_only_shared_seeds_count():
+    """Scores on other seeds change nothing, however bad they are; environments weigh the same."""
+    a = {"pipe": seeded(np.arange(8.0)), "tank": seeded(np.arange(6.0))}
+    b = {"pipe": seeded([3.0] * 8)}
+    b["tank"] = {seed: score - 2.0 for seed, score in a["tank"].items()}
+    expected = paired_difference(a, b)
+    assert expected[0] == pytest.approx((0.5 + 2.0) / 2)
+    more = {"pipe": a["pipe"] | {"test:99": 1e6}, "tank": {"dev:1": 1e6} | a["tank"]}
+    assert paired_difference(more, b) == expected
+    assert paired_difference(a, {"pipe": b["pipe"] | {"test:98": -1e6}, "tank": b["tank"]}) == expected
+
+
+def test_paired_share():
+    """Better in 3 of 8 and equal in 2: (3 + 1)/8, and 1 in the other environment; higher may be better."""
+    a, b = [0, 0, 0, 1, 1, 2, 2, 2], [1, 1, 1, 1, 1, 1, 1, 1]
+    one, other = {"pipe": seeded(a), "tank": seeded([0] * 4)}, {"pipe": seeded(b), "tank": seeded([1] * 4)}
+    assert paired_probability_of_improvement(one, other)[0] == 0.75
+    assert paired_probability_of_improvement(one, other, higher_is_better=True)[0] == 0.25
+    assert paired_probability_of_improvement(one, one) == (0.5, 0.5, 0.5)
+
+
+# -- probability of improvement ---------------------------------------------------------------------------------------
+
+
+def brute(a, b, better):
+    """Over all combinations of each environment."""
+    return np.mean([np.mean([1.0 if better(x, y) else 0.5 if x == y else 0.0 for x, y in product(a[name], b[name])])
+                    for name in a])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_probability_of_improvement_by_brute_force(seed):
+    """All pairs, ties ½, the mean of environments of different size; and as scipy's Mann–Whitney U."""
+    random = np.random.default_rng(seed)
+    a = {name: random.integers(0, 6, n).astype(float) for name, n in (("pipe", 5), ("tank", 11))}
+    b = {name: random.integers(1, 7, n).astype(float) for name, n in (("tank", 4), ("pipe", 8))}
+    assert probability_of_improvement(a, b)[0] == pytest.approx(brute(a, b, lambda x, y: x < y), rel=1e-14)
+    higher = probability_of_improvement(a, b, higher_is_better=True)[0]
+    assert higher == pytest.approx(brute(a, b, lambda x, y: x > y), rel=1e-14)
+    assert higher == pytest.approx(np.mean([stats.mannwhitneyu(a[name], b[name]).statistic / a[name].size / b[name].size
+                                            for name in a]), rel=1e-14)
+
+
+def test_interval_of_the_probability_of_improvement():
+    """As a loop that resamples both methods within each environment and counts, to Monte-Carlo error."""
+    random = np.random.default_rng(8)
+    a = {"pipe": random.normal(0.0, 1.0, 12), "tank": np.round(random.normal(0.0, 1.0, 7))}
+    b = {"pipe": random.normal(0.7, 1.0, 9), "tank": np.round(random.normal(0.5, 1.0, 10))}
+    shares = []
+    for _ in range(4000):
+        x, y = ({name: random.choice(own, own.size) for name, own in scores.items()} for scores in (a, b))
+        shares.append(np.mean([(0.5 + 0.5 * np.sign(y[name] - x[name][:, None])).mean() for name in a]))
+    _, low, high = probability_of_improvement(a, b)
+    # The 2.1 % point of 4000 nearly normal draws is known to 0.045 of their spread, that of 10,000 to 0.029.
+    cut = tail([12, 7, 9, 10])
+    assert (low, high) == pytest.approx(tuple(np.percentile(shares, [cut, 100 - cut])), abs=4 * 0.054 * np.std(shares))
+
+
+# -- ranks ------------------------------------------------------------------------------------------------------------
+
+
+NOISE = np.tile([-1.0, 1.0], 6)
+
+
+def board(**methods):
+    """Method -> its scores in a single environment."""
+    return {method: {"pipe": seeded(scores)} for method, scores in methods.items()}
+
+
+def test_clear_ranks():
+    """Each worse than the one before on every episode: 1, 2, 3, best first. Higher may be better."""
+    scores = board(c=NOISE + 3, a=NOISE + 1, b=NOISE + 2)
+    assert list(shared_ranks(scores).items()) == [("a", 1), ("b", 2), ("c", 3)]
+    assert list(shared_ranks(scores, higher_is_better=True).items()) == [("c", 1), ("b", 2), ("a", 3)]
+
+
+def test_shared_ranks():
+    """Two that cannot be told apart share rank 1, and the one that both beat is third; equal scores share."""
+    scores = board(last=10 + 0 * NOISE, a=0.1 * NOISE, b=0.01 - 0.1 * NOISE)
+    assert list(shared_ranks(scores).items()) == [("a", 1), ("b", 1), ("last", 3)]
+    assert list(shared_ranks(board(c=NOISE + 1, b=NOISE, a=NOISE)).items()) == [("a", 1), ("b", 1), ("c", 3)]
+    assert shared_ranks(board(a=NOISE)) == {"a": 1} and shared_ranks({}) == {}
+
+
+def test_pairs_decide_and_not_overlap():
+    """The intervals of the scores overlap widely, but one is better by a little on every episode."""
+    assert shared_ranks(board(a=100 * NOISE, b=100 * NOISE + 0.5)) == {"a": 1, "b": 2}
+
+
+def test_not_transitive():
+    """a and b cannot be told apart, nor b and c, but a is better than c: ranks 1, 1, 2."""
+    scores = board(a=0 * NOISE, b=0.5 + 1.5 * NOISE, c=1 + 0 * NOISE)
+    for one, other in (("a", "b"), ("b", "c")):
+        _, low, high = paired_difference(scores[one], scores[other])
+        assert low < 0 < high
+    assert list(shared_ranks(scores).items()) == [("a", 1), ("b", 1), ("c", 2)]
+
+
+def test_ranks_need_not_rise_along_the_means():
+    """A scattered method stands below one of rank 2, and nobody was shown to be better than it."""
+    scores = board(a=0 * NOISE, b=0.1 + 0 * NOISE, c=0.5 + 3 * NOISE)
+    assert list(shared_ranks(scores).items()) == [("a", 1), ("b", 2), ("c", 1)]
+
+
+def test_ranks_by_another_statistic():
+    """A single disaster decides the mean, and not the interquartile mean; the order follows."""
+    scores = board(a=np.zeros(24), b=np.r_[np.full(23, -1.0), 100.0])
+    assert list(shared_ranks(scores)) == ["a", "b"]
+    assert list(shared_ranks(scores, statistic=interquartile_mean).items()) == [("b", 1), ("a", 2)]
+
+
+def test_the_unranked_cost_nobody_a_rank():
+    """A clairvoyant is shown in its place, without a rank; the next one is first. So is a floor."""
+    scores = board(clairvoyant=NOISE, a=NOISE + 1, floor=NOISE + 2, b=NOISE + 3)
+    ranks = shared_ranks(scores, {"clairvoyant", "floor"})
+    assert list(ranks.items()) == [("clairvoyant", None), ("a", 1), ("floor", None), ("b", 2)]
+
+
+def test_environments_weigh_the_same():
+    """Better by 1 in 6 episodes and worse by 0.5 in 60: better, though the sum over episodes says otherwise."""
+    a = {"pipe": seeded(np.zeros(6)), "tank": seeded(np.full(60, 0.5))}
+    b = {"pipe": seeded(np.ones(6)), "tank": seeded(np.zeros(60))}
+    assert list(shared_ranks({"b": b, "a": a}).items()) == [("a", 1), ("b", 2)]
+
+
+def test_four_episodes_rank_nobody():
+    """Better on all of four episodes is no evidence: one of two equal methods is, in one board of eight."""
+    assert shared_ranks(board(a=NOISE[:4], b=NOISE[:4] + 1)) == {"a": 1, "b": 1}
+
+
+def test_a_method_below_may_be_the_better_one():
+    """b has the worse mean, since it alone played a hard episode; on the shared ones it is better."""
+    scores = board(a=np.ones(8), b=np.zeros(8))
+    scores["b"]["pipe"]["test:99"] = 100.0
+    assert list(shared_ranks(scores).items()) == [("a", 2), ("b", 1)]
+
+
+# -- what cannot be computed ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("call", "message"), [
+    (lambda: interquartile_mean(), "scores must hold"),
+    (lambda: interquartile_mean([]), "scores must hold"),
+    (lambda: mean_over_environments([1.0], []), "scores must hold"),
+    (lambda: stratified_bootstrap({}, interquartile_mean), "scores_by_stratum must hold"),
+    (lambda: stratified_bootstrap({"pipe": []}, interquartile_mean), "scores_by_stratum must hold"),
+    (lambda: stratified_bootstrap({"pipe": np.ones((3, 3))}, interquartile_mean), "scores_by_stratum must hold"),
+    (lambda: stratified_bootstrap({"pipe": [1.0, math.nan]}, interquartile_mean), "scores_by_stratum must hold finite"),
+    (lambda: stratified_bootstrap({"pipe": NOISE}, np.mean), "statistic must reduce the last axis only"),
+    (lambda: stratified_bootstrap({"pipe": NOISE}, interquartile_mean, draws=0), "draws must be at least 1"),
+    (lambda: paired_difference({"pipe": seeded(NOISE)}, {"pipe": seeded(NOISE, "dev")}), "a and b must share a seed"),
+    (lambda: paired_difference({"pipe": seeded(NOISE)}, {"tank": seeded(NOISE)}), "environments must be the same"),
+    (lambda: paired_difference({}, {}), "a and b must hold scores of at least one environment"),
+    (lambda: paired_difference({"pipe": {"a": math.inf}}, {"pipe": {"a": math.inf}}), "a and b must hold finite"),
+    (lambda: probability_of_improvement({"pipe": NOISE}, {"pipe": NOISE, "tank": NOISE}), "environments must be"),
+    (lambda: probability_of_improvement({"pipe": [1.0]}, {"pipe": []}), "b must hold"),
+    (lambda: shared_ranks(board(a=NOISE) | {"b": {"tank": seeded(NOISE)}}), "environments must be the same"),
+    (lambda: shared_ranks({"a": {"pipe": {}}}), "scores must hold"),
+])
+def test_errors_name_the_argument(call, message):
+    """What cannot be computed says why."""
+    with pytest.raises(ValueError, match=message):
+        call()

@@ -1,0 +1,290 @@
+"""Results on disk: whole or not at all, nobody's lost, and records that say all that is needed to repeat them."""
+
+import json
+import math
+import platform
+import re
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny import FILTER, FIXED_LAG, RUN, SCENARIO, sha, strict, write_baseline
+
+from eitbench._files import PACKAGE
+from eitbench.bench import store as store_module
+from eitbench.bench.run import Environment, Job, run_jobs
+from eitbench.bench.store import EpisodeStore, machine, provenance, results_of, source_digest
+from eitbench.data.episodes import CACHE_VARIABLE
+from eitbench.data.seeds import name_seed
+
+ENV, COMMAND = "eitbench/Pipe2D-v0", "eitbench run --seeds train:1-2"
+
+
+@pytest.fixture(autouse=True)
+def surroundings(tmp_path_factory, monkeypatch):
+    """One cache of episodes for the session, and a commit that doesn't depend on where the tests run."""
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path_factory.getbasetemp() / "episodes"))
+    monkeypatch.setattr(store_module, "_git", lambda *words: "c0ffee" if "rev-parse" in words else "")
+    provenance.cache_clear()
+    yield
+    provenance.cache_clear()
+
+
+@pytest.fixture
+def store(tmp_path):
+    return EpisodeStore(tmp_path / "results")
+
+
+def result(seed=1, method="mine", **changes):
+    """A result such as `run_episode` makes."""
+    return {"identity": "abc", "seed": name_seed(seed), "method": method, "title": "Mine", "parameters": {},
+            "role": None, "privileged": False, "method_sha256": sha("mine"), "checkpoint_sha256": None,
+            "board": "filter", "environment": {"id": ENV, "name": "eitbench-Pipe2D-v0", "kwargs": {}},
+            "source": sha("code"), "finished": "2025-01-01T00:00:00+00:00", "status": "ok", "peak_memory": None,
+            "scores": {"error": 0.1, "seconds_per_step": 0.01}, "step_errors": [0.1], "seconds": 1.0,
+            "run": RUN} | changes
+
+
+def put(store, made, fields=None):
+    """Store a result where it belongs."""
+    seed = int(made["seed"].removeprefix("train:"))
+    store.put(made["environment"]["name"], made["method"], seed, made, fields or {})
+
+
+# -- episodes ---------------------------------------------------------------------------------------------------------
+
+
+def test_round_trip(store):
+    """Results and estimates come back as they were put, for every baseline and seed."""
+    mean = np.random.default_rng(1).normal(size=(5, 7)).astype(np.float32)
+    for baseline, seed in (("mine", 1), ("mine", 2), ("yours", 1)):
+        put(store, result(seed, baseline), {"mean": seed * mean})
+    found = list(store.results())
+    assert sorted((r["method"], r["seed"]) for r in found) == [
+        ("mine", "train:1"), ("mine", "train:2"), ("yours", "train:1")]
+    assert result(2) in found
+    np.testing.assert_array_equal(store.fields(result(2))["mean"], 2 * mean)
+
+
+def test_only_a_success_of_the_same_identity_is_held(store):
+    """What failed, was made by other code, or belongs to another seed counts as not done."""
+    put(store, result())
+    put(store, result(2, status="failed"))
+    assert store.holds(ENV, "mine", 1, "abc")
+    assert not store.holds(ENV, "mine", 1, "abd")
+    assert not store.holds(ENV, "mine", 2, "abc")
+    assert not store.holds(ENV, "mine", 3, "abc")
+    assert not store.holds(ENV, "yours", 1, "abc")
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe\x00", b"[]", b"{}", b"3"])
+def test_damaged_results_are_passed_over(content, store):
+    """A file that is no result is neither believed nor an obstacle; the next run replaces it."""
+    put(store, result(1))
+    put(store, result(2))
+    damaged = store.folder / "episodes" / "eitbench-Pipe2D-v0" / "mine" / "train-1.json"
+    damaged.write_bytes(content)
+    assert [r["seed"] for r in store.results()] == ["train:2"]
+    assert not store.holds(ENV, "mine", 1, "abc")
+    assert [record["seeds"] for record in store.write_records()] == [["train:2"]]
+
+
+@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
+def test_no_number_that_json_lacks_is_written(number, store):
+    """NaN and Infinity are refused before anything is replaced."""
+    put(store, result())
+    with pytest.raises(ValueError, match="JSON"):
+        put(store, result(scores={"error": number}))
+    assert [r["scores"]["error"] for r in store.results()] == [0.1]
+
+
+def test_writers_at_once_lose_nothing(store):
+    """Eight threads, sixty-four episodes and a reader that never meets half a file."""
+    together, seen = threading.Barrier(9), []
+
+    def write(worker):
+        together.wait()
+        for seed in range(8):
+            put(store, result(8 * worker + seed, f"baseline{worker % 2}"), {"mean": np.ones((2, 2))})
+
+    def read():
+        together.wait()
+        for _ in range(20):
+            seen.extend(len(record["episodes"]) for record in store.write_records())
+
+    threads = [threading.Thread(target=write, args=(worker,)) for worker in range(8)] + [threading.Thread(target=read)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(list(store.results())) == 64 and max(seen, default=0) <= 32
+    assert [len(record["episodes"]) for record in store.write_records()] == [32, 32]
+    assert not [path for path in store.folder.rglob(".*") if path.is_file()]
+
+
+# -- records ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def played(tmp_path_factory):
+    """A folder in which one baseline has played two episodes, and failed in a third."""
+    folder = tmp_path_factory.mktemp("played")
+    provenance.cache_clear()
+    update = "assert voltages[0] != 0 or Path('x').exists(), 'silent'\n        return Estimate(self.level)"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(CACHE_VARIABLE, str(folder / "cache"))
+        patch.setattr(store_module, "_git", lambda *words: "c0ffee" if "rev-parse" in words else "")
+        mine = write_baseline(folder, update=update, parameters="{'alpha': 0.5, 'order': [1, 2]}")
+        bad = write_baseline(folder, "bad", update="raise RuntimeError('no')")
+        run_jobs([Job(FILTER, path, seed) for path in (mine, bad) for seed in (1, 2)], EpisodeStore(folder),
+                 command=COMMAND)
+    return EpisodeStore(folder)
+
+
+def test_record_says_how_to_repeat_it(played):
+    """Environment with arguments, baseline with parameters and hash, command, seeds, versions, commit, machine."""
+    bad, mine = sorted(played.write_records(), key=lambda record: record["method"])
+    assert mine["environment"]["id"] == ENV and mine["environment"]["kwargs"]["scenario"] == SCENARIO
+    assert (mine["method"], mine["title"], mine["board"]) == ("mine", "Mine", "filter")
+    assert mine["parameters"] == {"alpha": 0.5, "order": [1, 2]}
+    assert len(mine["method_sha256"]) == 64 and mine["method_sha256"] != bad["method_sha256"]
+    assert mine["source"] == source_digest() and mine["schema"] == store_module.SCHEMA == 2
+    assert mine["seeds"] == ["train:1", "train:2"] and mine["split"] == "train"
+    (run,) = mine["runs"]
+    assert run["command"] == COMMAND and [episode["run"] for episode in mine["episodes"]] == [0, 0]
+    assert run["commit"] == "c0ffee" and run["dirty"] is False
+    assert run["versions"]["numpy"] == np.__version__ and run["versions"]["python"] == platform.python_version()
+    assert {"eitbench", "scipy", "gymnasium", "scikit-fem", "stable-baselines3", "torch"} <= run["versions"].keys()
+    assert None not in run["versions"].values()
+    assert run["machine"]["processor"] and run["machine"]["cores"] >= 1 and run["machine"]["blas_threads"] == 1
+
+
+def test_record_holds_every_episode(played):
+    """Scores, the error of each scored step, and time; or the reason of a failure."""
+    bad, mine = sorted(played.write_records(), key=lambda record: record["method"])
+    for episode in mine["episodes"]:
+        assert episode["status"] == "ok" and episode["seconds"] > 0 and episode["finished"]
+        assert {"error", "contrast_error", "voltage_discrepancy", "velocity_error", "nis", "crps", "coverage_50",
+                "coverage_90", "spread_ratio", "seconds_per_step"} == episode["scores"].keys()
+        assert len(episode["step_errors"]) == 3
+        assert episode["scores"]["error"] == pytest.approx(np.mean(episode["step_errors"]), rel=1e-12)
+    assert [episode["message"] for episode in bad["episodes"]] == 2 * ["RuntimeError: no"]
+    # where it went wrong, but not in whose folder
+    assert all(re.fullmatch(r"bad\.py:\d+", episode["where"]) for episode in bad["episodes"])
+    assert not any("scores" in episode for episode in bad["episodes"])
+
+
+def test_every_file_is_strict_json(played):
+    """What lies on disk is what was returned, without NaN or Infinity, so that any language can read it."""
+    records = played.write_records()
+    on_disk = [strict(path.read_text()) for path in sorted((played.folder / "records").iterdir())]
+    assert sorted(records, key=lambda record: record["method"]) == on_disk and len(on_disk) == 2
+    assert len([strict(path.read_text()) for path in played.folder.glob("episodes/*/*/*.json")]) == 4
+
+
+def test_each_episode_keeps_the_run_that_made_it(store):
+    """Episodes of several runs stand in one record, which names every run and says which made which."""
+    put(store, result(1))
+    put(store, result(2, run=RUN | {"command": "later"}))
+    put(store, result(3))
+    (record,) = store.write_records()
+    assert [run["command"] for run in record["runs"]] == [RUN["command"], "later"]
+    assert [episode["run"] for episode in record["episodes"]] == [0, 1, 0]
+
+
+def test_splits_are_not_mixed(store):
+    """Development and training seeds never enter the record of another split."""
+    put(store, result(1))
+    dev = name_seed(100_001)
+    store.put(ENV, "mine", 100_001, result(1) | {"seed": dev}, {})
+    assert sorted(tuple(record["seeds"]) for record in store.write_records()) == [("dev:1",), ("train:1",)]
+
+
+@pytest.mark.parametrize("what", ["source", "method_sha256"])
+def test_versions_of_code_are_not_mixed(what, store):
+    """Only episodes of the code that ran last make the record; the older ones join again when they are replayed."""
+    for seed in (1, 2, 3):
+        put(store, result(seed, **{what: sha("old")}))
+    put(store, result(2, **{what: sha("new")}, finished="2025-01-02T00:00:00+00:00"))
+    (record,) = store.write_records()
+    assert record[what] == sha("new") and record["seeds"] == ["train:2"]
+    put(store, result(1, **{what: sha("new")}, finished="2025-01-02T00:01:00+00:00"))
+    assert [record["seeds"] for record in store.write_records()] == [["train:1", "train:2"]]
+
+
+def test_seeds_are_in_numerical_order(store):
+    """train:9 comes before train:10."""
+    for seed in (10, 9, 100):
+        put(store, result(seed))
+    assert [record["seeds"] for record in store.write_records()] == [["train:9", "train:10", "train:100"]]
+
+
+def test_arguments_of_an_environment_make_other_records(store, tmp_path):
+    """The same id with other keyword arguments is another world: neither results nor records overwrite each other."""
+    path = write_baseline(tmp_path)
+    wider = Environment(FILTER.id, json.dumps({"scenario": SCENARIO | {"noise_relative": 0.02}}))
+    run_jobs([Job(environment, path, 1) for environment in (FILTER, wider, FIXED_LAG)], store)
+    records = store.write_records()
+    noise = [record["environment"]["kwargs"]["scenario"].get("noise_relative") for record in records]
+    assert sorted(noise, key=str) == [0.02, None, None]
+    assert len(list((store.folder / "records").iterdir())) == 3
+
+
+def test_an_invalid_record_is_left_out(store):
+    """With a warning that names it; the others are written."""
+    put(store, result())
+    put(store, result(method="mad", scores={"error": 0.1, "seconds_per_step": -1.0}))
+    with pytest.warns(UserWarning, match=r"left out: .*--mad--.*seconds_per_step"):
+        (written,) = store.write_records()
+    assert written["method"] == "mine" and len(list((store.folder / "records").iterdir())) == 1
+
+
+def test_a_record_names_the_machine_that_played(store, tmp_path, monkeypatch):
+    """Not the one that started the run: the processes of a cluster may be elsewhere. Those of one machine
+    say the same."""
+    monkeypatch.setattr(store_module, "matmul_seconds", lambda: 123.0)      # here, and not in the processes
+    jobs = [Job(FILTER, write_baseline(tmp_path), seed) for seed in (1, 2)]
+    for node, elsewhere in ((platform.node(), False), ("another", True)):
+        machine.cache_clear()
+        monkeypatch.setattr(platform, "node", lambda node=node: node)
+        run_jobs(jobs, EpisodeStore(tmp_path / node), n_jobs=2)
+        seconds = {result["run"]["machine"]["matmul_seconds"] for result in EpisodeStore(tmp_path / node).results()}
+        assert seconds == {123.0} if not elsewhere else 123.0 not in seconds
+    machine.cache_clear()
+
+
+@pytest.mark.parametrize("name", ["data/bank.py", "data/seeds.py", "rl/networks.py", "rl/agents.py",
+                                  "envs/estimation.py"])
+def test_the_source_is_all_that_scores_depend_on(name, monkeypatch):
+    """A change in any of these files makes another digest."""
+    changed, read, before = PACKAGE / name, Path.read_bytes, source_digest()
+    assert changed.exists()
+    source_digest.cache_clear()
+    monkeypatch.setattr(Path, "read_bytes", lambda path: read(path) + b"#\n" * (path == changed))
+    after = source_digest()
+    source_digest.cache_clear()
+    assert after != before
+
+
+def test_provenance_without_git(monkeypatch):
+    """Outside a repository there is no commit to name, and that is no error."""
+    monkeypatch.undo()
+    monkeypatch.setenv("PATH", "")
+    provenance.cache_clear()
+    assert (provenance()["commit"], provenance()["dirty"]) == (None, None)
+    provenance.cache_clear()
+
+
+def test_other_results_fill_what_is_missing_or_failed(store):
+    """An episode that was played well here stays; results of other code do not come in with it."""
+    failed = {"status": "failed", "message": "broke", "where": "mine.py:1", "scores": None}
+    put(store, result(1, seconds=2.0))
+    put(store, result(2) | failed)
+    others = [result(1, seconds=9.0), result(2, seconds=3.0), result(3, seconds=4.0),
+              result(4, source=sha("older"), finished="2024-01-01T00:00:00+00:00")]
+    (record,) = store.records(also=others)
+    assert [(row["seed"], row["seconds"]) for row in record["episodes"]] == [
+        ("train:1", 2.0), ("train:2", 3.0), ("train:3", 4.0)]
+    (same,) = EpisodeStore(store.folder / "empty").records(also=results_of(record))
+    assert same == record

@@ -1,0 +1,290 @@
+"""Submitting: test episodes are played, and their records written, failures and all; `eitbench` does it by command."""
+
+import re
+
+import gymnasium as gym
+import pytest
+from short import FIELDS
+from tiny import FILTER, SCENARIO, SMOOTHING, count, counting, write_baseline
+from typer.testing import CliRunner
+
+from eitbench.bench import load, policies, run, suites
+from eitbench.bench import store as store_module
+from eitbench.bench.records import read_record, read_records, write_record
+from eitbench.bench.store import EpisodeStore, provenance
+from eitbench.bench.submit import submit
+from eitbench.cli import app
+from eitbench.data import bank
+from eitbench.data.episodes import CACHE_VARIABLE
+from eitbench.data.seeds import parse_seeds
+
+INJECTION = "eitbench/Pipe2DInjection-v0"
+TEST = parse_seeds("test:0-1")
+
+
+@pytest.fixture(autouse=True)
+def tiny_world(monkeypatch, tmp_path, tmp_path_factory):
+    """The registered environments play tiny worlds, in an empty folder, from a clean commit."""
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path_factory.getbasetemp() / "episodes"))
+    monkeypatch.setattr(store_module, "_git", lambda *words: "c0ffee" if "rev-parse" in words else "")
+    for name in (FILTER.id, SMOOTHING.id):
+        monkeypatch.setitem(gym.registry[name].kwargs, "scenario", SCENARIO)
+    monkeypatch.setitem(gym.registry[INJECTION].kwargs, "scenario", FIELDS["Pipe2DInjection"])
+    monkeypatch.chdir(tmp_path)
+    for cached in (run._environment, policies.environment, provenance):
+        cached.cache_clear()
+    yield
+    for cached in (run._environment, policies.environment, provenance):
+        cached.cache_clear()
+
+
+def eitbench(*arguments):
+    """What the command does: exit code, standard output, standard error without boxes and line breaks."""
+    done = CliRunner().invoke(app, list(arguments))
+    if done.exception is not None and not isinstance(done.exception, SystemExit):
+        raise done.exception
+    return done.exit_code, done.stdout, re.sub(r"[│╭╮╰╯─\s]+", " ", done.stderr)
+
+
+def test_a_submission_is_a_record_an_environment(tmp_path):
+    """Self-reported unless said otherwise; the same again plays nothing, and official is a matter of the flag."""
+    log = tmp_path / "log"
+    mine, store, to = write_baseline(tmp_path, init=counting(log)), EpisodeStore(tmp_path / "results"), tmp_path / "to"
+    paths = list(submit(mine, [FILTER.id, SMOOTHING.id], TEST, store, to, isolate="never",
+                        command="eitbench submit"))
+    first, second = (read_record(path) for path in paths)
+    assert (first["board"], second["board"]) == ("filter", "smoothing") and count(log) == 4
+    assert first["seeds"] == ["test:0", "test:1"] and not first["official"] and first["split"] == "test"
+    assert first["runs"][0]["command"] == "eitbench submit"
+    assert first["runs"][0]["machine"]["matmul_seconds"] == store_module.matmul_seconds() > 0
+    assert sorted(path.name for path in to.iterdir()) == sorted(path.name for path in paths)
+    again = list(submit(mine, [FILTER.id], TEST, store, to, official=True, isolate="never"))
+    assert again == paths[:1] and count(log) == 4 and read_record(again[0])["official"]
+    assert [record["official"] for record in read_records(to)] == [True, False]
+
+
+def test_all_of_ours_by_one_command(tmp_path, monkeypatch):
+    """Those that play, environment after environment: what is done has its record when a later one is interrupted."""
+    monkeypatch.setattr(suites, "own_baselines", lambda: ["homogeneous", "fixed_interval_smoother"])
+    monkeypatch.setattr(suites, "own_policies", lambda: ["random_pair", "event_triggered"])
+    monkeypatch.setattr(suites, "own_agents", lambda id: [])
+    made = submit(None, [FILTER.id, INJECTION], TEST[:1], EpisodeStore(tmp_path / "r"), tmp_path / "to")
+    assert "--homogeneous--" in next(made).name
+    assert [path.name.split("--")[1] for path in (tmp_path / "to").iterdir()] == ["homogeneous"]
+    assert [path.name.split("--")[:2] for path in made] == [[INJECTION.replace("/", "-"), "random_pair"]]
+
+
+def test_failures_are_submitted_too(tmp_path):
+    """Nothing is dropped: who fails in one episode has a record that says so."""
+    fails = write_baseline(tmp_path, update="assert self.calls < 2, 'dry'\n        return Estimate(self.level)")
+    (path,) = submit(fails, [FILTER.id], TEST, EpisodeStore(tmp_path), tmp_path / "to", isolate="never")
+    episodes = read_record(path)["episodes"]
+    assert [(e["status"], e["message"]) for e in episodes] == 2 * [("failed", "AssertionError: dry")]
+    assert load(tmp_path / "to")["value"].isna().all() and len(load(tmp_path / "to")) == 2
+
+
+def test_policies_are_submitted_alike(tmp_path):
+    """The very same format."""
+    (path,) = submit("random_pair", [INJECTION], TEST[:1], EpisodeStore(tmp_path), tmp_path / "to", policy=True)
+    record = read_record(path)
+    assert (record["board"], record["role"], record["seeds"]) == ("injection", "floor", ["test:0"])
+    assert record["environment"]["kwargs"]["estimator"] == "full" and record["episodes"][0]["scores"]["spent"] > 0
+
+
+def test_policies_by_command(tmp_path):
+    """`policies` prints scores and resumes; what it played stands in the table and on the page of `leaderboard`."""
+    command = ("policies", "--env", INJECTION, "--policy", "adjacent", "--policy", "random_pair", "--policy",
+               "clairvoyant", "--seeds", "test:0-1", "--estimator", "reduced", "-j", "1")
+    code, said, _ = eitbench(*command)
+    assert code == 0 and "| clairvoyant (privileged) |" in said and "adaptivity gap" in said
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.glob("results/episodes/*/*/*.json")}
+    assert len(before) == 6 and eitbench(*command)[1].endswith(said)
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+    assert eitbench("run", "--env", FILTER.id, "--baseline", "homogeneous", "--seeds", "test:0", "-j", "1")[0] == 0
+    code, said, _ = eitbench("leaderboard")
+    assert code == 0 and said.count("| Pipe2DInjection | injection |") == 3
+    assert "estimator=reduced" in said and "injections" in said.splitlines()[0]
+    page = (tmp_path / "results" / "index.html").read_text(encoding="utf-8")
+    assert page.count("<section") == 2 and "Pipe2DInjection" in page
+
+
+def test_policies_in_records_are_not_played_again(tmp_path):
+    """The table is that of all the episodes; only those that no record holds are played."""
+    policy, short = ("--env", INJECTION, "--policy", "adjacent"), ("-j", "1", "-o")
+    assert eitbench("submit", *policy, "--seeds", "test:0", *short, "first")[0] == 0
+    code, said, _ = eitbench("policies", *policy, "--seeds", "test:0-1", "--records", "leaderboards/results", *short,
+                             "rest")
+    assert code == 0 and [path.name for path in tmp_path.glob("rest/episodes/*/*/*.json")] == ["test-1.json"]
+    (score,) = re.findall(r"\| adjacent \| ([^|]+) \|", said)
+    assert f"| adjacent | {score} |" in eitbench("policies", *policy, "--seeds", "test:0-1", *short, "all")[1]
+    code, _, complaint = eitbench("policies", *policy, "--records", "nowhere", *short, "none")
+    assert code == 2 and "'nowhere' does not exist" in complaint
+
+
+@pytest.mark.parametrize(("environments", "seeds", "message"), [
+    ([FILTER.id], "dev:0", "seeds of a submission must be of the test split, got dev:0"),
+    ([FILTER.id], "7", "must be of the test split, got train:7"),
+    ([FILTER.id], "400000", "must be of the test split, got 400000"),
+    ([], "test:0", "env must name at least one environment"),
+    ([FILTER.id, SMOOTHING.id], "test:0", f"none of the baselines kalman_filter plays any .* {SMOOTHING.id}"),
+    (["eitbench/Pipe4D-v0"], "test:0", "env must be one of"),
+])
+def test_what_cannot_be_submitted(environments, seeds, message, tmp_path):
+    """Nothing is played, and nothing written."""
+    with pytest.raises(ValueError, match=message):
+        next(submit("kalman_filter", environments, parse_seeds(seeds), EpisodeStore(tmp_path / "r"), tmp_path / "to"))
+    assert not (tmp_path / "r").exists() and not (tmp_path / "to").exists()
+
+
+def test_official_needs_a_clean_commit(tmp_path, monkeypatch):
+    """It is said before anything is played, and so stands in nobody's way once the changes are committed."""
+    to = tmp_path / "to"
+
+    def official():
+        provenance.cache_clear()
+        return list(submit("homogeneous", [FILTER.id], TEST[:1], EpisodeStore(tmp_path / "r"), to, official=True))
+
+    for commit, message in (("c0ffee", "and changes to c0ffee"), (None, "outside a checkout")):
+        with monkeypatch.context() as patch, pytest.raises(ValueError, match=f"official must be False .*{message}"):
+            patch.setattr(store_module, "_git", lambda *words, commit=commit: commit)
+            official()
+        assert not (tmp_path / "r").exists() and not to.exists()
+    (path,) = official()
+    assert read_record(path)["official"]
+
+
+def test_what_says_more_is_not_replaced(tmp_path):
+    """By a record that is no longer official, or has fewer episodes; an outdated one is, and any by one with more."""
+    to = tmp_path / "to"
+
+    def submitted(results, seeds, **how):
+        (path,) = submit("homogeneous", [FILTER.id], seeds, EpisodeStore(tmp_path / results), to, **how)
+        return read_record(path)
+
+    first = submitted("a", TEST)
+    with pytest.raises(ValueError, match=r"to must not hold a record that says more; .*homogeneous.* lose its episodes "
+                                         "test:1$"):
+        submitted("b", TEST[:1], official=True)
+    assert read_records(to) == [first]
+    first = submitted("a", TEST, official=True)
+    with pytest.raises(ValueError, match=r"to must not hold a record that says more; .* lose its being official$"):
+        submitted("c", TEST)
+    assert read_records(to) == [first] and not (tmp_path / "c").exists()               # it is said before it is played
+    write_record(to, first | {"source": "0" * 64})
+    assert submitted("b", TEST[:1])["seeds"] == ["test:0"]
+
+
+@pytest.mark.parametrize("official", [False, True])
+def test_a_record_is_extended(official, tmp_path):
+    """By what another folder's run plays beside it: what is in the record is neither played again nor lost."""
+    log, to = tmp_path / "log", tmp_path / "to"
+    mine = write_baseline(tmp_path, init=counting(log))
+
+    def submitted(results, seeds):
+        (path,) = submit(mine, [FILTER.id], parse_seeds(seeds), EpisodeStore(tmp_path / results), to, isolate="never",
+                         official=official, command=f"submit {seeds}")
+        return read_record(path)
+
+    first = submitted("a", "test:10")
+    both = submitted("b", "test:9-10")
+    assert count(log) == 2 and both["seeds"] == ["test:9", "test:10"] and both["official"] == official
+    assert [run["command"] for run in both["runs"]] == ["submit test:9-10", "submit test:10"]
+    assert both["episodes"][1] == first["episodes"][0] | {"run": 1}
+    assert submitted("c", "test:9-10") == both and count(log) == 2
+
+
+def test_an_invalid_record_is_in_nobody_s_way(tmp_path, monkeypatch):
+    """What another method claimed, and no schema allows, is left out of the table and the page."""
+    monkeypatch.setattr(run, "score", lambda env, played, score=run.score: _with_negative_nis(score(env, played)))
+    submitted = ("--env", FILTER.id, "--seeds", "test:0", "-j", "1")
+    with pytest.warns(UserWarning, match=r"left out: .*homogeneous.* is not valid: .*nis"):
+        code, _, complaint = eitbench("run", "--baseline", "homogeneous", *submitted)
+    assert code == 2 and "no results in results" in complaint
+    code, _, complaint = eitbench("submit", "--baseline", "homogeneous", *submitted)
+    assert code == 2 and "is not valid" in complaint and not (tmp_path / "leaderboards").exists()
+    monkeypatch.undo()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(gym.registry[FILTER.id].kwargs, "scenario", SCENARIO)
+    with pytest.warns(UserWarning, match="left out"):
+        assert eitbench("run", "--baseline", "persistence", *submitted)[0] == 0
+    assert eitbench("submit", "--baseline", "persistence", *submitted)[0] == 0
+
+
+def _with_negative_nis(scored):
+    outcome = dict(scored)
+    return outcome | {"scores": outcome["scores"] | {"nis": -1.0}}
+
+
+def test_mistyped_records_delete_nothing(tmp_path):
+    """Neither beside a folder that does not exist, nor in a folder site/ that is somebody else's."""
+    kept = tmp_path / "site" / "index.html"
+    kept.parent.mkdir()
+    kept.write_text("mine")
+    (tmp_path / "results").mkdir()
+    for records, message in (("result", "records must be a folder that exists, got result"),
+                             ("results", "folder must be empty or hold a site of the leaderboards")):
+        code, _, complaint = eitbench("leaderboard", "--records", records)
+        assert code == 2 and message in complaint
+        assert {path.name for path in tmp_path.iterdir()} == {"site", "results"} and kept.read_text() == "mine"
+
+
+@pytest.mark.parametrize("arguments", [
+    ("policies", "--env", INJECTION, "--policy", "adjacent", "--seeds", "test:0"),
+    ("submit", "--env", INJECTION, "--policy", "adjacent", "--seeds", "test:0"),
+    ("bank", "--env", INJECTION, "--seeds", "train:77")])
+def test_the_backend_is_that_of_the_recordings_too(arguments, monkeypatch):
+    """Whatever plays or records says that it is not installed, and names it."""
+    asked = []
+
+    def in_parallel(function, work, n_jobs, backend="loky"):
+        asked.append(backend)
+        raise ValueError("backend ray is not here")
+
+    monkeypatch.setattr(bank, "in_parallel", in_parallel)
+    monkeypatch.setenv(CACHE_VARIABLE, "empty")
+    code, _, complaint = eitbench(*arguments, "-j", "1", "--backend", "ray")
+    assert code == 2 and "backend ray is not here" in complaint and asked == ["ray"]
+
+
+def test_from_a_file_to_the_boards_by_command(tmp_path):
+    """submit, leaderboard and compare, as README says."""
+    write_baseline(tmp_path)
+    common = ("--env", FILTER.id, "--seeds", "test:0-6", "-j", "1")
+    code, said, _ = eitbench("submit", "--baseline", "mine.py", *common)
+    assert code == 0 and re.fullmatch(
+        r"wrote leaderboards/results/eitbench-Pipe2D-v0--mine--\w{8}\.json: 7 episodes\n", said)
+    assert eitbench("submit", "--baseline", "homogeneous", *common)[0] == 0
+    assert eitbench("submit", "--policy", "random_pair", "--env", INJECTION, "--seeds", "test:0", "-j", "1")[0] == 0
+    code, said, _ = eitbench("leaderboard", "--records", "leaderboards/results")
+    assert said.splitlines() == [f"wrote leaderboards/{name}" for name in (
+        "leaderboard.csv", "leaderboard.md", "site/index.html")]
+    assert "Mine" in (tmp_path / "leaderboards" / "site" / "methods" / "mine.html").read_text(encoding="utf-8")
+    text = (tmp_path / "leaderboards" / "leaderboard.md").read_text(encoding="utf-8")
+    assert re.search(r"\| 1 +\| Mine \(mine \w{8}\) +\| self-reported \|", text)
+    assert "## injection" in text and "| floor |" in text
+
+    code, said, _ = eitbench("compare", "mine", "homogeneous", "--html", "pair.html")
+    assert code == 0 and "eitbench-Pipe2D-v0" in said and "wrote pair.html" in said
+    assert "mine and homogeneous" in (tmp_path / "pair.html").read_text(encoding="utf-8")
+    record = next(tmp_path.glob("leaderboards/results/*mine*"))
+    assert eitbench("compare", str(record), "homogeneous")[1].splitlines()[:3] == said.splitlines()[:3]
+
+    record.write_text(record.read_text().replace('"official": false', '"official": true'))
+    code, _, complaint = eitbench("leaderboard", "--records", "leaderboards/results")
+    assert code == 2 and "was changed since it was written" in complaint
+
+
+@pytest.mark.parametrize(("arguments", "message"), [
+    (["submit", "--env", FILTER.id, "--baseline", "homogeneous", "--policy", "adjacent"], "may be given, got both"),
+    (["submit", "--baseline", "homogeneous"], "env must name at least one environment"),
+    (["submit", "--env", INJECTION, "--baseline", "homogeneous"], "does not ask for estimates"),
+    (["submit", "--env", FILTER.id, "--policy", "adjacent"], "env must be one of eitbench/Pipe2DInjection-v0"),
+    (["submit", "--env", FILTER.id, "--baseline", "homogeneous", "--seeds", "dev:0"], "must be of the test split"),
+    (["compare", "mine", "yours"], "there is no record of mine in leaderboards/results"),
+    (["compare", "mine.json", "yours"], "record mine.json cannot be read"),
+])
+def test_mistakes_are_explained(arguments, message, tmp_path):
+    """Exit code 2 and a sentence; nothing is written."""
+    code, said, complaint = eitbench(*arguments)
+    assert code == 2 and said == "" and message in complaint
+    assert not list(tmp_path.iterdir())

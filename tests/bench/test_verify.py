@@ -1,0 +1,330 @@
+"""Verifying: honest records pass, and whoever changed a number, a file or the cache is found out."""
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from short import FIELDS
+from tiny import FILTER, SCENARIO, write_baseline
+from typer.testing import CliRunner
+
+from eitbench.bench import held_out, policies, run
+from eitbench.bench import store as store_module
+from eitbench.bench import verify as verification
+from eitbench.bench.records import read_record, write_record
+from eitbench.bench.sandbox import guests, host, wire
+from eitbench.bench.sandbox.wall import landlock_version
+from eitbench.cli import app
+from eitbench.data.episodes import CACHE_VARIABLE, cache_folder, folder, simulate
+from eitbench.data.seeds import SPLITS, parse_seeds
+from eitbench.worlds import Pipe2D
+
+INJECTION = "eitbench/Pipe2DInjection-v0"
+SALT = bytes(range(32))
+walled = pytest.mark.skipif(not landlock_version(), reason="this kernel has no Landlock")
+
+
+@pytest.fixture(autouse=True)
+def tiny_world(monkeypatch, tmp_path, tmp_path_factory):
+    """The registered environments play tiny worlds, in an empty folder."""
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path_factory.getbasetemp() / "episodes"))
+    monkeypatch.setattr(store_module, "_git", lambda *words: None)
+    monkeypatch.setitem(gym.registry[FILTER.id].kwargs, "scenario", SCENARIO)
+    monkeypatch.setitem(gym.registry[INJECTION].kwargs, "scenario", FIELDS["Pipe2DInjection"])
+    monkeypatch.setattr(held_out, "PUBLISHED", tmp_path / "leaderboards" / "held_out.json")
+    monkeypatch.chdir(tmp_path)
+    cached = (run._environment, policies.environment, store_module.provenance)
+    for each in cached:
+        each.cache_clear()
+    yield
+    guests.close()
+    for each in cached:
+        each.cache_clear()
+
+
+def eitbench(*arguments):
+    """Exit code, standard output, and standard error without boxes and line breaks."""
+    done = CliRunner().invoke(app, list(map(str, arguments)))
+    if done.exception is not None and not isinstance(done.exception, SystemExit):
+        raise done.exception
+    return done.exit_code, done.stdout, re.sub(r"[│╭╮╰╯─\s]+", " ", done.stderr)
+
+
+def submitted(method, *more, env=FILTER.id, kind="--baseline"):
+    """The path of a record that is made as README says."""
+    code, said, complaint = eitbench("submit", kind, method, "--env", env, "-j", 1, "--to", "records", *more)
+    assert code == 0, complaint
+    return Path(said.split(":")[0].removeprefix("wrote "))
+
+
+def forged(path, change, to="forged"):
+    """The record with a changed content and the digest that goes with it."""
+    record = json.loads(path.read_text())
+    change(record)
+    return write_record(Path(to), record)
+
+
+def better(record):
+    for episode in record["episodes"]:
+        episode["step_errors"] = [0.9 * error for error in episode["step_errors"]]
+        episode["scores"]["error"] = float(np.mean(episode["step_errors"]))
+
+
+@pytest.fixture
+def mine(tmp_path):
+    return write_baseline(tmp_path, parameters="{'pair': (1, 2)}",
+                          update="return Estimate(self.level + voltages.sum(), self.level, voltages, np.eye(4))")
+
+
+def test_an_honest_record_is_verified(mine):
+    """In a guest, from episodes that are simulated again; which of them, the seed says."""
+    path = submitted(mine, "--seeds", "test:0-3")
+    code, said, complaint = eitbench("verify", path, "--baseline", mine, "--episodes", 2, "--seed", 5)
+    assert (code, complaint) == (0, "") and "as it says" in said and "--seed 5" in said
+    drawn = re.findall(r"test:\d", said)
+    assert len(drawn) == 2 and said.count("| none") == 2
+    assert eitbench("verify", path, "--baseline", mine, "--episodes", 2, "--seed", 5)[1] == said
+    seeds = {tuple(re.findall(r"test:\d", verification.verify(*claim, episodes=2, seed=seed)[0]))
+             for claim in [(read_record(path), verification.job_of(read_record(path), mine))] for seed in range(4)}
+    assert len(seeds) > 1
+    with pytest.raises(ValueError, match="episodes must be an integer of at least 1, got 0"):
+        verification.verify({}, None, episodes=0)
+
+
+def test_ours_are_known_by_name(tmp_path):
+    """Policies, privileged ones and failures too; arguments of one's own are those of the record."""
+    for name in ("random_pair", "clairvoyant"):
+        assert eitbench("policies", "--env", INJECTION, "--policy", name, "--seeds", "dev:0", "--estimator", "reduced",
+                        "-j", 1)[0] == 0
+        (path,) = tmp_path.glob(f"results/records/*--{name}--*")
+        code, said, complaint = eitbench("verify", path)
+        assert code == 0 and "dev:0" in said, complaint
+    fails = write_baseline(tmp_path, "fails", update="if voltages[0] != 0.0: raise ValueError('dry')")
+    path = submitted(fails, "--seeds", "test:0")
+    assert eitbench("verify", path, "--baseline", fails)[0] == 0
+    code, _, complaint = eitbench("verify", path)
+    assert code == 1 and "fails is none of ours: its file must be given" in complaint
+
+
+@walled
+def test_a_stranger_s_policy_is_submitted_and_verified(tmp_path):
+    """In guests both times, by the same random numbers; the record says so."""
+    mine = tmp_path / "by_lot.py"
+    mine.write_text('"""Mine."""\nclass Policy:\n    def __init__(self, rules, random):\n'
+                    '        self.draw = lambda: int(random.integers(rules.action_space.n))\n'
+                    '    def act(self, observation):\n        return self.draw()\n')
+    path = submitted(mine, "--seeds", "test:0", env=INJECTION, kind="--policy")
+    record = read_record(path)
+    assert record["runs"][0]["isolation"] == "landlock" and record["episodes"][0]["peak_memory"] > 50e6
+    code, said, complaint = eitbench("verify", path, "--policy", mine)
+    assert code == 0 and "isolation landlock" in said, complaint
+
+
+def test_changed_numbers_are_found(mine, tmp_path):
+    """By hand: the digest. With the digest: the episodes say otherwise, whatever was changed."""
+    path = submitted(mine, "--seeds", "test:0")
+    by_hand = tmp_path / "by_hand" / path.name
+    by_hand.parent.mkdir()
+    by_hand.write_text(path.read_text().replace('"parameters": {"pair": [1, 2]}', '"parameters": {"pair": [1, 3]}'))
+    code, _, complaint = eitbench("verify", by_hand, "--baseline", mine)
+    assert code == 1 and "was changed since it was written" in complaint
+
+    def other(name, value):
+        return lambda record: record["episodes"][0]["scores"].update({name: value})
+
+    def failed(record):
+        episode = record["episodes"][0]
+        del episode["scores"], episode["step_errors"]
+        episode |= {"status": "failed", "message": "RuntimeError: oh", "where": "mine.py:1"}
+
+    def redistributed(record):
+        steps = record["episodes"][0]["step_errors"]
+        record["episodes"][0]["step_errors"] = [steps[0] + 1e-4, steps[1] - 1e-4, *steps[2:]]
+
+    for change, message in (
+            (better, r"test:0: error is 0\.\d+, the record says 0\.\d+"), (other("nis", 1.0), "test:0: nis is"),
+            (other("crps", None), "test:0: crps is"), (redistributed, r"test:0: step_errors\[[01]\] is"),
+            (failed, r"test:0: status is ok, the record says failed \(RuntimeError: oh\)"),
+            (lambda record: record.update(title="Theirs"), "title is 'Mine', the record says 'Theirs'"),
+            (lambda record: record["environment"]["kwargs"].update(scenario=SCENARIO | {"mean_velocity": 60.0}),
+             "environment is")):
+        code, said, complaint = eitbench("verify", forged(path, change), "--baseline", mine)
+        assert code == 1 and re.search(message, complaint) and "as it says" not in said, (message, complaint)
+    invented = forged(path, lambda record: record["environment"].update(name=f"{path.name.split('--')[0]}-deadbeef"))
+    code, _, complaint = eitbench("verify", invented, "--baseline", mine)
+    assert code == 1 and "the record's environment must be named eitbench-Pipe2D-v0, whose arguments" in complaint
+    slower = forged(path, other("seconds_per_step", 1e-9))
+    assert eitbench("verify", slower, "--baseline", mine)[0] == 0        # a clock is no proof of anything
+
+
+def test_the_tolerance_is_what_it_says(mine):
+    """A relative difference of 1e-4 is none where 1e-3 is allowed."""
+    path = submitted(mine, "--seeds", "test:0")
+
+    def slightly(record):
+        scores = record["episodes"][0]["scores"]
+        scores["nis"] *= 1.0 + 1e-4
+
+    other = forged(path, slightly)
+    assert eitbench("verify", other, "--baseline", mine)[0] == 1
+    assert eitbench("verify", other, "--baseline", mine, "--tolerance", "1e-3")[0] == 0
+    assert eitbench("verify", other, "--baseline", mine, "--tolerance", "5e-5")[0] == 1
+
+
+def test_another_file_or_other_code_is_named_and_not_played(mine, tmp_path, monkeypatch):
+    """Their scores would say nothing of the record's."""
+    path = submitted(mine, "--seeds", "test:0")
+    changed = write_baseline(tmp_path / "changed", update="raise RuntimeError('played')")
+    code, said, complaint = eitbench("verify", path, "--baseline", changed)
+    assert code == 1 and said == "" and "the sha256 of mine.py is" in complaint and "digest" not in complaint
+    monkeypatch.setattr(verification, "source_digest", lambda: "0" * 64)
+    code, said, complaint = eitbench("verify", path, "--baseline", mine)
+    assert code == 1 and said == "" and f"the digest of the environments' code is {'0' * 64}" in complaint
+
+
+def test_the_cache_is_not_believed(mine, tmp_path, monkeypatch):
+    """A cache in which test:0 is another, easier episode makes a better score, but no record that holds."""
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+    scenario, seed = Pipe2D(**SCENARIO), parse_seeds("test:0")[0]
+    honest = simulate(scenario, seed, progress=False)
+    flat = honest._replace(concentration=np.full_like(honest.concentration, scenario.expected_concentration))
+    shutil.rmtree(folder(scenario))
+    with monkeypatch.context() as patch:
+        patch.setattr("eitbench.data.episodes._simulate", lambda *_: flat)
+        path = submitted(mine, "--seeds", "test:0")
+    assert list(folder(scenario).glob("*.truth.npz"))
+    code, _, complaint = eitbench("verify", path, "--baseline", mine)
+    assert code == 1 and "test:0: error is" in complaint
+    assert cache_folder() == tmp_path / "cache"
+
+
+# -- held-out episodes ------------------------------------------------------------------------------------------------
+
+
+def test_held_out_seeds_are_the_formula():
+    """SHA-256 of salt and number, outside the public ranges; by coreutils: the first of bytes 0 … 31 is e0bc…"""
+    import hashlib
+    seeds = held_out.held_out_seeds(SALT, 50)
+    assert seeds[1] == int(hashlib.sha256(SALT + bytes(7) + b"\1").hexdigest(), 16) % 2**63
+    assert len(set(seeds)) == 50 and max(split.stop for split in SPLITS.values()) <= min(seeds) < max(seeds) < 2**63
+    assert held_out.held_out_seeds(SALT, 3) == seeds[:3] and held_out.held_out_seeds(SALT[::-1], 3) != seeds[:3]
+
+
+def test_a_salt_is_its_owner_s_and_its_hash_everybody_s(tmp_path):
+    """A file that others cannot read, and never overwrites another; the published hash decides which salt counts."""
+    code, said, _ = eitbench("held-out", "--new", "salt")
+    assert code == 0 and (tmp_path / "salt").stat().st_mode & 0o777 == 0o600
+    salt = held_out.read_salt(tmp_path / "salt")
+    told = json.loads((tmp_path / "leaderboards" / "held_out.json").read_text())
+    assert told == {"salt_sha256": held_out.hash_of(salt)} and told["salt_sha256"] in said and salt.hex() not in said
+    code, _, complaint = eitbench("held-out", "--new", "next")
+    assert code == 2 and "to begin a new season, remove that file in a commit" in complaint
+    assert not (tmp_path / "next").exists()
+    with pytest.raises(ValueError, match="cannot be written"):
+        held_out.new_salt(tmp_path / "salt")
+    assert held_out.read_salt(tmp_path / "salt") == salt
+    (tmp_path / "words").write_text("hello")
+    held_out.new_salt(tmp_path / "other")
+    held_out.new_salt(package := Path(run.__file__).parent / "test_salt.tmp")
+    try:
+        with pytest.raises(ValueError, match="which guests may read"):
+            held_out.read_salt(package)
+    finally:
+        package.unlink()
+    for name, change, message in (("other", 0o600, "has the hash"), ("salt", 0o640, "readable by its owner only"),
+                                  ("words", 0o600, "salt .*words must hold hexadecimal digits"),
+                                  ("none", None, "cannot be read")):
+        if change:
+            (tmp_path / name).chmod(change)
+        with pytest.raises(ValueError, match=message):
+            held_out.read_salt(tmp_path / name)
+
+
+def test_the_published_hash_is_found_from_everywhere(tmp_path):
+    """It is that of the checkout or the installed package, not of the working folder."""
+    program = "from eitbench.bench.held_out import PUBLISHED; print(PUBLISHED)"
+    said = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, text=True, capture_output=True, check=True)
+    assert Path(said.stdout.strip()) == Path(run.__file__).parents[2] / "leaderboards" / "held_out.json"
+
+
+@walled
+def test_held_out_episodes_tell_the_honest_from_the_prepared(mine, tmp_path, monkeypatch):
+    """The record's own error again; that of a record which holds on public episodes only is another."""
+    public = submitted(mine, "--seeds", "test:0-7")
+    submitted("homogeneous", "--seeds", "test:0-7")
+    monkeypatch.setattr(held_out.secrets, "token_bytes", bytes)      # zeros: one salt in twenty is bad luck
+    digest = held_out.new_salt(tmp_path / "salt")
+    claim = ("--episodes", 0, "--held-out", 6, "--salt-file", "salt", "--baseline", mine)
+    code, said, complaint = eitbench("verify", public, *claim)
+    assert code == 0 and digest in said, complaint
+    lines = {line.split("|")[1].strip(): line for line in said.splitlines() if line.startswith("| ")}
+    assert re.search(r"\| +8 \|.*\(.* to .*\).*\(.* to .*\)", lines["record"]) and "| 6 |" in re.sub(" +", " ", said)
+
+    def much_better(record):
+        for _ in range(10):
+            better(record)
+
+    code, said, complaint = eitbench("verify", forged(public, much_better), *claim)
+    assert code == 1 and re.search(r"ẽ_c of held-out episodes differs from the record's by 0\.\d+ \(0", complaint)
+
+    code, said, complaint = eitbench("verify", forged(public, much_better, to="records"), *claim)
+    assert code == 1 and "| gain over homogeneous |" in re.sub(" +", " ", said)
+    assert re.search(r"gain over homogeneous of held-out episodes differs from the record's by -0\.\d+ \(-", complaint)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(run, "landlock_version", lambda: 0)
+        code, _, complaint = eitbench("verify", public, *claim)
+        assert code == 1 and "behind a wall only" in complaint
+    code, _, complaint = eitbench("verify", public, *claim, "--isolate", "never")
+    assert code == 1 and "behind a wall only" in complaint
+
+
+@walled
+def test_held_out_seeds_stay_here(mine, tmp_path, monkeypatch):
+    """Neither a message to a guest, nor its command line or surroundings, nor what is printed has one, or the salt."""
+    path = submitted(mine, "--seeds", "test:0-3")
+    monkeypatch.setattr(held_out.secrets, "token_bytes", bytes)      # zeros: one salt in twenty is bad luck
+    held_out.new_salt(tmp_path / "salt")
+    seeds = held_out.held_out_seeds(salt := held_out.read_salt(tmp_path / "salt"), 2)
+    passed, popen, pack = [], host.subprocess.Popen, wire.pack
+
+    def started(command, **rest):
+        passed.append(repr((command, rest["env"], rest["cwd"])).encode())
+        return popen(command, **rest)
+
+    def packed(*message):
+        passed.append(pack(*message))
+        return passed[-1]
+
+    monkeypatch.setattr(host.subprocess, "Popen", started)
+    monkeypatch.setattr(wire, "pack", packed)
+    played = []
+    monkeypatch.setattr(held_out, "run_episode", lambda job: played.append(job.seed) or run.run_episode(job))
+    code, said, complaint = eitbench("verify", path, "--episodes", 0, "--held-out", 2, "--salt-file", "salt",
+                                     "--baseline", mine)
+    assert code == 0, complaint
+    assert played == 2 * seeds and sum(b'"update"' in message for message in passed) == 2 * 5
+    for secret in (*(str(seed) for seed in seeds), *(f"{seed:x}" for seed in seeds), salt.hex()):
+        assert secret not in said + complaint and not any(secret.encode() in message for message in passed)
+    for secret in (salt, *(seed.to_bytes(8, order) for seed in seeds for order in ("little", "big"))):
+        assert not any(secret in message for message in passed)
+
+
+@pytest.mark.parametrize(("arguments", "message"), [
+    (["--held-out", "3"], "--held-out and --salt-file belong together"),
+    (["--salt-file", "salt"], "--held-out and --salt-file belong together"),
+    (["--episodes", "0"], "--episodes must be at least 1 where no --held-out episodes are played, got 0"),
+    (["--baseline", "a.py", "--policy", "b.py"], "only one of --baseline and --policy"),
+])
+def test_mistakes_are_explained(arguments, message):
+    """Exit code 2, unlike that of an untrue record."""
+    code, said, complaint = eitbench("verify", "record.json", *arguments)
+    assert code == 2 and said == "" and message in complaint
+    code, _, complaint = eitbench("verify", "record.json")
+    assert code == 1 and "record record.json cannot be read" in complaint

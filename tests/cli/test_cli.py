@@ -1,0 +1,240 @@
+"""The command line, as a newcomer uses it: what it runs, what it writes, and what it says of mistakes."""
+
+import json
+import re
+import runpy
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import pytest
+from short import PLAIN, world
+from typer.testing import CliRunner
+
+from eitbench.bench import run, store, suites
+from eitbench.bench.baselines import own_baselines
+from eitbench.cli import app
+from eitbench.data.episodes import CACHE_VARIABLE
+from eitbench.data.seeds import parse_seeds
+from eitbench.envs import ENTRY_POINTS, ESTIMATION
+
+ROOT = Path(__file__).parents[2]
+PIPE, INJECTION = "eitbench/Pipe2D-v0", "eitbench/Pipe2DInjection-v0"
+COMMANDS = ("list", "run", "bank", "train", "policies", "submit", "verify", "held-out", "leaderboard", "compare",
+            "render", "reproduce")
+TINY = {"mean_velocity": 45.0, "scored_steps": 3, "electrodes_per_wall": 2, "frame": 2}
+"""A fast fluid flushes the pipe in two steps: an episode of five takes a third of a second."""
+
+MINE = '''"""My method: the expected level everywhere."""
+import numpy as np
+from eitbench import Estimate
+
+class Estimator:
+    def __init__(self, task):
+        self.level = np.full(task.mesh.n_nodes, task.expected_concentration)
+
+    def update(self, voltages, currents):
+        return Estimate(self.level)
+'''
+
+
+@pytest.fixture(autouse=True)
+def tiny_world(monkeypatch, tmp_path, tmp_path_factory):
+    """The registered environments play tiny worlds, in an empty folder; git is left alone."""
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path_factory.getbasetemp() / "episodes"))
+    monkeypatch.setattr(store, "_git", lambda *words: None)
+    for name in ENTRY_POINTS:
+        for argument, value in ({"scenario": TINY} if name in PLAIN else world(name)).items():
+            monkeypatch.setitem(gym.registry[name].kwargs, argument, value)
+    monkeypatch.setitem(gym.registry["eitbench/Pipe2DFixedLag-v0"].kwargs, "lag", 2)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.py").write_text(MINE)
+    run._environment.cache_clear()
+    yield
+    run._environment.cache_clear()
+
+
+def eitbench(*arguments):
+    """What the command does: exit code, standard output, standard error without boxes and line breaks."""
+    done = CliRunner().invoke(app, list(arguments))
+    if done.exception is not None and not isinstance(done.exception, SystemExit):
+        raise done.exception                                           # a user would see a traceback
+    return done.exit_code, done.stdout, re.sub(r"[│╭╮╰╯─\s]+", " ", done.stderr)
+
+
+def run_mine(*more):
+    """`eitbench run` of the file mine.py on the first board."""
+    return eitbench("run", "--env", PIPE, "--baseline", "mine.py", "--seeds", "dev:0-1", "-j", "1", *more)
+
+
+# -- run and leaderboard ----------------------------------------------------------------------------------------------
+
+
+def test_ten_lines_of_ones_own_get_a_table_and_a_page(tmp_path):
+    """A user's file is run, scored and shown beside ours: on the terminal, as Markdown, HTML and JSON."""
+    assert len(MINE.splitlines()) <= 10
+    code, said, _ = run_mine("--baseline", "homogeneous")
+    assert code == 0 and "My method" in said and "Best homogeneous estimate" in said
+    results = tmp_path / "results"
+    table = (results / "leaderboard.md").read_text(encoding="utf-8")
+    assert table.strip() in said and len(table.splitlines()) == 4
+    assert "My method" in (results / "index.html").read_text(encoding="utf-8")
+    assert "wrote results/index.html" in said
+    (path,) = (results / "records").glob("eitbench-Pipe2D-v0--mine--*--dev.json")
+    record = json.loads(path.read_text(encoding="utf-8"))
+    assert record["seeds"] == ["dev:0", "dev:1"] and record["environment"]["id"] == PIPE
+    assert all(episode["status"] == "ok" for episode in record["episodes"])
+
+
+def test_failing_baseline_is_reported(tmp_path):
+    """A baseline that raises fails its episodes: the reason on standard error, exit code 0, and the table for all."""
+    (tmp_path / "bad.py").write_text(MINE.replace("return Estimate(self.level)", "raise RuntimeError('oh no')"))
+    code, said, complaint = run_mine("--baseline", "bad.py")
+    assert code == 0 and "dev:0-1, 2 failed" in said
+    assert "failed: bad on dev:0: RuntimeError: oh no" in complaint and "failed: mine" not in complaint
+
+
+def test_same_command_resumes(tmp_path):
+    """The second time nothing is played; one seed more is one episode more."""
+    assert run_mine()[0] == 0
+    before = sorted(path.stat().st_mtime_ns for path in (tmp_path / "results" / "episodes").rglob("*.json"))
+    _, said, complaint = run_mine()
+    assert "2 of 2 episodes are already there" in said + complaint
+    run_mine("--seeds", "dev:0-2")
+    after = sorted(path.stat().st_mtime_ns for path in (tmp_path / "results" / "episodes").rglob("*.json"))
+    assert len(before) == 2 and len(after) == 3 and after[:2] == before
+
+
+def test_leaderboard_writes_the_same_again(tmp_path):
+    """`leaderboard` needs only the stored episodes."""
+    _, said, _ = run_mine("-o", "mine/results")
+    folder = tmp_path / "mine" / "results"
+    table = (folder / "leaderboard.md").read_bytes()
+    for name in ("leaderboard.md", "index.html"):
+        (folder / name).unlink()
+    assert eitbench("leaderboard", "-o", "mine/results")[:2] == (0, said)
+    assert (folder / "leaderboard.md").read_bytes() == table and (folder / "index.html").exists()
+
+
+def test_every_board_by_default(tmp_path):
+    """Without --env a baseline plays every environment of the quick suite that is of its boards."""
+    (tmp_path / "mine.py").write_text(MINE.replace("class Estimator:", "class Estimator:\n"
+                                                   "    boards = ('filter', 'fixed-lag', 'smoothing')"))
+    code, said, _ = eitbench("run", "--baseline", "mine.py", "--seeds", "dev:0", "-j", "1")
+    assert code == 0 and [said.count(f"| {board} ") for board in ("filter", "fixed-lag", "smoothing")] == [1, 1, 1]
+
+
+def test_suites():
+    """full is every environment; quick the plain pipe on fewer seeds, but for the one method that takes minutes."""
+    quick, full = (suites.jobs(suite, [], [], [1]) for suite in ("quick", "full"))
+    plain = set(PLAIN) & set(ESTIMATION)
+    assert {job.environment.id for job in quick} == plain and len(plain) == 3
+    assert {job.environment.id for job in full} == set(ESTIMATION)
+    missing = {job for job in full if job.environment.id in plain} - set(quick)
+    assert missing == {suites.Job(suites.Environment(PIPE), "gauss_newton", 1)} and set(quick) < set(full)
+    assert {job.method for job in full} == set(own_baselines())
+    assert set(parse_seeds(suites.SEEDS["quick"])) < set(parse_seeds(suites.SEEDS["full"]))
+    assert min(parse_seeds(suites.SEEDS["full"])) == 200_000
+    asked_for = suites.jobs("quick", [PIPE], ["gauss_newton"], [1, 2])
+    assert [job.seed for job in asked_for] == [1, 2]
+
+
+# -- help -------------------------------------------------------------------------------------------------------------
+
+
+def test_list():
+    """Every environment with its board, every baseline with its boards and title."""
+    code, said, _ = eitbench("list")
+    assert code == 0
+    lines = {line.split()[0]: line for line in said.splitlines()}
+    assert lines.keys() >= {*ENTRY_POINTS, *own_baselines()}
+    assert "smoothing" in lines["eitbench/Pipe2DSmoothing-v0"] and "3 scored of 5" in lines[PIPE]
+    assert "filter, smoothing" in lines["gauss_newton"] and "Stationary Gauss–Newton" in lines["gauss_newton"]
+
+
+@pytest.mark.parametrize("command", ["", *COMMANDS])
+@pytest.mark.parametrize("flag", ["--help", "-h"])
+def test_help(command, flag):
+    """Each command explains itself, and every option of it."""
+    code, said, _ = eitbench(*filter(None, [command, flag]))
+    assert code == 0 and "Usage" in said
+    if not command:
+        assert all(name in said for name in COMMANDS)
+    for option in re.findall(r"^ ?│ *\*? *(?:--[\w-]+.*|-\w .*)$", said, flags=re.MULTILINE):
+        assert re.search(r"[A-Za-z]+ [A-Za-z]+", option), option
+
+
+def test_module_can_be_run(monkeypatch, capsys):
+    """`python -m eitbench.cli --help` is the same program."""
+    monkeypatch.setattr(sys, "argv", ["eitbench", "--help"])
+    monkeypatch.delitem(sys.modules, "eitbench.cli")
+    with pytest.raises(SystemExit) as done:
+        runpy.run_module("eitbench.cli", run_name="__main__")
+    assert done.value.code == 0 and "leaderboard" in capsys.readouterr().out
+
+
+def test_documented_commands_are_commands():
+    """Every `eitbench …` of our documents, on a line of its own or within one, names a command and options that exist;
+    so says their help."""
+    named, helps = dict[str, set[str]](), dict[str, str]()
+    for path in (ROOT / "README.md", ROOT / "leaderboards" / "README.md", *(ROOT / "docs").glob("*.md")):
+        text = path.read_text(encoding="utf-8").replace("\\\n", "")
+        blocks = re.findall(r"```sh\n(.*?)```", text, re.DOTALL)
+        lines = re.findall(r"^.*?\beitbench (.*)$", "\n".join(blocks), re.MULTILINE)
+        for words in lines + re.findall(r"`eitbench ([^`]*)`", text):
+            command, *rest = words.split("#")[0].split()
+            named.setdefault(command, set()).update(word for word in rest if word.startswith("--"))
+            helps.setdefault(command, eitbench(command, "--help")[1])
+    assert named.keys() == set(COMMANDS)
+    for command, options in named.items():
+        assert all(re.search(rf"{option}\b", helps[command]) for option in options), (command, options)
+
+
+# -- mistakes ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("arguments", "message"), [
+    (["run", "--seeds", "exam:1"], "seeds must name one of the splits train, dev, test, got 'exam:1'"),
+    (["run", "--seeds", "dev:1-"], "seeds must look like 'test:0-4'"),
+    (["run", "--seeds", "dev:4-2"], "must increase"),
+    (["run", "--seeds", "", "--baseline", "mine.py", "-j", "1"], "seeds must look like"),
+    (["run", "--env", "eitbench/Pipe4D-v0"], "env must be one of eitbench/Pipe2D-v0"),
+    (["run", "--baseline", "kalman"], "one of extended_kalman_filter"),
+    (["run", "--baseline", "nowhere.py"], "got 'nowhere.py'"),
+    (["run", "--baseline", "mine.py", "--baseline", "other/mine.py", "--seeds", "1", "-j", "1"], "other/mine.py"),
+    (["run", "--baseline", "empty.py"], "empty.py must define a class Estimator with a method update"),
+    (["run", "--baseline", "broken.py"], "broken.py"),
+    (["run", "--baseline", "mine.py", "--env", "eitbench/Pipe2DSmoothing-v0"], "none of the baselines mine.py plays"),
+    (["run", "--suite", "slow"], "quick"),
+    (["run", "-j", "0"], "--jobs"),
+    (["run", "--sedes", "dev:1"], "--seeds"),
+    (["leaderboard", "-o", "nothing"], "no results in nothing; make some with `eitbench run`"),
+    (["render", "--seed", "dev:x"], "seeds must look like"),
+    (["render", "--step", "3"], "out must end in .png with step"),
+    (["render", "--baseline", "fixed_interval_smoother"], "plays smoothing, but eitbench/Pipe2D-v0 is a filter"),
+    (["render", "--env", INJECTION], f"policy must be given for {INJECTION}"),
+    (["render", "--env", INJECTION, "--policy", "random_pair", "--step", "1", "-o", "a.png"],
+     "step must be an integer of at least 3 and at most 5, got 1"),
+    (["reproduce", "fig9.9"], "fig5.4"),
+    (["reproduce", "fig5.4", "--seeds", "exam:1"], "seeds must name"),
+    (["reproduce", "injection", "--seeds", "exam:1"], "seeds must name"),
+    (["rnu"], "No such command"),
+])
+def test_mistakes_are_explained(arguments, message, tmp_path):
+    """Exit code 2 and a sentence that names the argument; no traceback, and nothing is written."""
+    (tmp_path / "empty.py").write_text("")
+    (tmp_path / "broken.py").write_text("class Estimator(:")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "mine.py").write_text(MINE)
+    code, said, complaint = eitbench(*arguments)
+    assert code == 2 and said == ""
+    assert message in complaint and "Traceback" not in complaint
+    assert not (tmp_path / "results").exists() and not (tmp_path / "nothing").exists()
+
+
+def test_a_missing_extra_is_named(monkeypatch, tmp_path):
+    """Without what training needs, exit code 1 and the name of what to install."""
+    monkeypatch.setitem(sys.modules, "yaml", None)
+    code, said, complaint = eitbench("train", "--env", INJECTION)
+    assert code == 1 and said == "" and "need the extra rl, pip install -e '.[rl]'" in complaint
+    assert not (tmp_path / "results").exists()

@@ -1,0 +1,69 @@
+"""Public seeds: disjoint ranges, and text that names them."""
+
+from itertools import combinations
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from eitbench.data.seeds import SPLITS, name_seed, parse_seeds
+
+numbers = st.integers(0, 99_999)
+unhurried = settings(deadline=None)                                                     # a busy machine is no failure
+
+
+def test_splits_are_disjoint():
+    """What is learned on, chosen on and reported on never meet."""
+    assert list(SPLITS) == ["train", "dev", "test"]
+    for a, b in combinations(SPLITS.values(), 2):
+        assert not set(a) & set(b)
+
+
+def test_examples_of_the_docstring():
+    """Numbers count from the beginning of their split; without a split they are the seeds themselves."""
+    assert parse_seeds("test:0-4") == [200_000, 200_001, 200_002, 200_003, 200_004]
+    assert parse_seeds("dev:3") == [100_003]
+    assert parse_seeds("dev:0-2,15") == [100_000, 100_001, 100_002, 100_015]
+    assert parse_seeds("17") == [17]
+    assert parse_seeds("17, 300017") == [17, 300_017]
+
+
+@unhurried
+@given(st.integers(0, 2**31 - 1))
+def test_names_are_parsed_back(seed):
+    """`parse_seeds` undoes `name_seed` for every seed, inside and outside the splits."""
+    assert parse_seeds(name_seed(seed)) == [seed]
+
+
+@unhurried
+@given(st.sampled_from(list(SPLITS)), numbers)
+def test_names_are_made_of_what_was_parsed(split, number):
+    """`name_seed` undoes `parse_seeds` within a split, and the seed lies in it."""
+    (seed,) = parse_seeds(f"{split}:{number}")
+    assert seed in SPLITS[split]
+    assert name_seed(seed) == f"{split}:{number}"
+
+
+@unhurried
+@given(st.sampled_from(list(SPLITS)), st.lists(st.tuples(numbers, st.integers(0, 20)), min_size=1, max_size=5))
+def test_parts_add_up_without_repeats(split, parts):
+    """A list of ranges holds each of its numbers once, in the order of first mention."""
+    spans = [(first, min(first + more, 99_999)) for first, more in parts]
+    text = f"{split}:" + ",".join(f"{first}-{last}" if last > first else f"{first}" for first, last in spans)
+    expected = [SPLITS[split].start + i for first, last in spans for i in range(first, last + 1)]
+    seeds = parse_seeds(text)
+    assert len(seeds) == len(set(seeds))
+    assert seeds == sorted(set(expected), key=expected.index)
+
+
+@pytest.mark.parametrize(("text", "message"), [
+    ("", "look like"), ("test:", "look like"), ("test:-3", "look like"), ("test:1,,2", "look like"),
+    ("test:1.5", "look like"), ("a", "look like"), ("exam:3", "one of the splits"), (":3", "one of the splits"),
+    ("dev:test:3", "one of the splits"), ("test:4-1", "must increase"), ("test:100000", "stay below 100000"),
+    ("dev:99999-100000", "stay below 100000"), (str(2**31), "stay below 2147483648"),
+])
+def test_errors_say_what_was_expected(text, message):
+    """Other forms, unknown splits and numbers beyond a split are refused, quoting the text."""
+    with pytest.raises(ValueError, match=message) as caught:
+        parse_seeds(text)
+    assert repr(text) in str(caught.value)

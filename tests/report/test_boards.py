@@ -1,0 +1,326 @@
+"""Leaderboards: ranks and means against numbers done by hand, one story in the table, CSV and Markdown, up to date."""
+
+import io
+import json
+import re
+import subprocess
+import sys
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from tiny import BOARD_IDS, RUN, record, sha
+
+import eitbench
+from eitbench.bench import load
+from eitbench.bench.records import read_records, write_record
+from eitbench.bench.statistics import interquartile_mean, stratified_bootstrap
+from eitbench.report.boards import ALL, FIELDS, boards, class_of, render
+
+ROOT = Path(__file__).parents[2]
+FLOOR = [0.20, 0.24, 0.22, 0.26, 0.18, 0.30, 0.25, 0.21]
+TANK = "eitbench/RotatingTank2D-v0"
+
+
+def times(factor, errors=FLOOR):
+    """Errors of a method that is so much better in every episode."""
+    return [factor * error for error in errors]
+
+
+def floor(**changes):
+    return record("homogeneous", FLOOR, role="floor", **changes)
+
+
+def table_of(*records):
+    """The rows of boards, by method, of the one board that there is."""
+    return boards(list(records)).set_index("method")
+
+
+# -- up to date -------------------------------------------------------------------------------------------------------
+
+
+def test_published_files_are_rendered_from_the_records():
+    """`eitbench leaderboard --records leaderboards/results` would change nothing."""
+    for name, text in render(read_records(ROOT / "leaderboards" / "results")).items():
+        published = (ROOT / "leaderboards" / name).read_text(encoding="utf-8")
+        assert published == text, f"{name} is out of date: run `eitbench leaderboard --records leaderboards/results`"
+
+
+def test_a_record_more_makes_other_files(tmp_path):
+    """So the test above fails when somebody adds a record and does not render."""
+    before = render([])
+    after = render([floor()])
+    assert before.keys() == after.keys() == {"leaderboard.csv", "leaderboard.md"}
+    assert all(before[name] != after[name] != render([floor(official=True)])[name] for name in before)
+    assert "There are no records yet" in before["leaderboard.md"]
+    assert before["leaderboard.csv"] == ",".join(FIELDS) + "\n"
+
+
+def test_rendering_does_not_depend_on_the_order_or_the_process(tmp_path):
+    """The same records give the same text, in another process too."""
+    records = [floor(), record("a", times(0.5)), record("b", times(0.4)), record("a", times(0.3), id=TANK)]
+    for each in records:
+        write_record(tmp_path, each)
+    expected = render(read_records(tmp_path))
+    assert render(list(reversed(records))) == expected
+    code = ("import json, sys; from pathlib import Path; from eitbench.report.boards import render; "
+            "from eitbench.bench.records import read_records; "
+            "print(json.dumps(render(read_records(Path(sys.argv[1])))))")
+    done = subprocess.run([sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True, check=True)
+    assert json.loads(done.stdout) == expected
+
+
+# -- numbers ----------------------------------------------------------------------------------------------------------
+
+
+def test_ranks_and_means_by_hand():
+    """a halves the floor's error in each episode, b nearly so, c is worse: 1, 2 and 3; the floor has none."""
+    table = table_of(floor(), record("c", times(0.8)), record("a", times(0.5)), record("b", times(0.51)))
+    assert list(table.index) == ["a", "b", "c", "homogeneous"]
+    assert list(table["rank"][:3]) == [1, 2, 3] and table["rank"].isna()["homogeneous"]
+    assert list(table["note"]) == ["", "", "", "floor"]
+    assert table["error"]["homogeneous"] == pytest.approx(0.2325) and table["error"]["a"] == pytest.approx(0.11625)
+    assert table["gain"]["a"] == pytest.approx(0.5) and table["gain"]["homogeneous"] == 0.0
+    assert table["gain_low"]["a"] == pytest.approx(0.5) == table["gain_high"]["a"]      # the same in each episode
+    value, low, high = stratified_bootstrap({"x": FLOOR}, lambda x: x.mean(axis=-1))
+    assert tuple(table.loc["homogeneous", ["error", "error_low", "error_high"]]) == pytest.approx((value, low, high))
+
+
+def test_what_cannot_be_told_apart_shares_a_rank():
+    """Now one is better and now the other: both have rank 1."""
+    wobble = [1, -1, 1, -1, -1, 1, 1, -1]
+    a, b = ([0.1 + sign * 0.01 * w for w in wobble] for sign in (1, -1))
+    assert list(table_of(floor(), record("a", a), record("b", b))["rank"][:2]) == [1, 1]
+
+
+def test_gain_is_the_interquartile_mean():
+    """Of 1 − e/floor in the same episodes: of eight gains the two lowest and the two highest are left out."""
+    gains = [0.9, -3.0, 0.5, 0.4, 0.6, 0.7, 0.99, 0.1]
+    errors = [floor * (1 - gain) for floor, gain in zip(FLOOR, gains, strict=True)]
+    table = table_of(floor(), record("a", errors))
+    assert table["gain"]["a"] == pytest.approx((0.4 + 0.5 + 0.6 + 0.7) / 4)
+    assert table["gain_low"]["a"] < table["gain"]["a"] < table["gain_high"]["a"]
+
+
+def test_few_episodes_have_no_interval():
+    """Five are too few to claim one; nobody is then shown to be better."""
+    table = table_of(record("homogeneous", FLOOR[:5], role="floor"), record("a", times(0.1, FLOOR[:5])),
+                     record("b", times(0.9, FLOOR[:5])))
+    assert table[["error_low", "error_high", "gain_low", "gain_high"]].isna().all(axis=None)
+    assert list(table["rank"][:2]) == [1, 1]
+    assert "0.22" in render([record("homogeneous", FLOOR[:5], role="floor")])["leaderboard.md"]
+
+
+def test_who_has_no_rank():
+    """Floors, references, privileged ones, whoever failed or left out an episode: listed, and count for nobody's."""
+    table = table_of(floor(), record("reference", times(0.01), role="reference"),
+                     record("seer", times(0.02), privileged=True, role="reference"), record("all", times(0.9)),
+                     record("failing", [*times(0.1)[:7], None]), record("few", times(0.1)[:7]))
+    assert dict(table["note"]) == {"homogeneous": "floor", "reference": "reference", "seer": "reference, privileged",
+                                   "failing": "1 failed", "few": "1 missing", "all": ""}
+    assert dict(table["rank"].dropna()) == {"all": 1}
+    assert list(table.index) == ["reference", "seer", "all", "homogeneous", "failing", "few"]
+    assert table["error"]["failing"] == pytest.approx(np.mean(times(0.1)[:7]))
+
+
+def test_the_episodes_are_those_of_the_floor():
+    """More seeds than the floor's change neither a mean nor who is complete; a failure among them does."""
+    more = {f"test:{i}": error for i, error in enumerate([*times(0.5), 9.0, 9.0])}
+    table = table_of(floor(), record("a", more), record("b", times(0.6)), record("c", more | {"test:9": None}),
+                     record("elsewhere", {"test:50": 0.001}))
+    assert table["error"]["a"] == pytest.approx(0.11625) and dict(table["rank"].dropna()) == {"a": 1, "b": 2}
+    assert table["note"]["c"] == "1 failed" and set(table["seeds"]) == {"test:0-7"} and "elsewhere" not in table.index
+
+
+def test_aggregate_of_a_class():
+    """Ranked by the gains over all environments, of methods that are complete in each; pooled interquartile mean."""
+    pipe, tank = [0.5 + 0.01 * i for i in range(8)], [0.3 + 0.02 * i for i in range(8)]
+
+    def made(gains):
+        return [floor * (1 - gain) for floor, gain in zip(FLOOR, gains, strict=True)]
+
+    records = [floor(), floor(id=TANK), record("a", made(pipe)), record("a", made(tank), id=TANK, official=True),
+               record("b", made([gain - 0.1 for gain in pipe])), record("b", made(tank), id=TANK),
+               record("once", made(pipe)), record("b", times(0.1), board="smoothing")]
+    table = boards(records)
+    total = table[table["environment"] == ALL].set_index("method")
+    assert list(total["class"].unique()) == ["filter"] and list(total.index) == ["a", "b", "homogeneous"]
+    assert list(total["rank"][:2]) == [1, 2] and total["note"]["homogeneous"] == "floor"
+    pooled = np.sort([*pipe, *tank])
+    assert total["gain"]["a"] == pytest.approx(pooled[4:12].mean())
+    three = stratified_bootstrap({"eitbench-Pipe2D-v0": pipe, "eitbench-RotatingTank2D-v0": tank}, interquartile_mean)
+    assert tuple(total.loc["a", ["gain", "gain_low", "gain_high"]]) == pytest.approx(three)
+    assert total["error"].isna().all() and not total["official"].any()
+
+
+def test_an_environment_with_arguments_has_no_part_in_an_aggregate():
+    """It would shut out all who did not play it: two records with an invented name, and one method is left."""
+    honest = [floor(), floor(id=TANK), *(record(name, times(0.5), id=id) for name in "ab"
+                                         for id in (BOARD_IDS["filter"], TANK))]
+    name = "eitbench-Pipe2D-v0-deadbeef"
+    invented = [each | {"environment": each["environment"] | {"name": name}}
+                for each in (floor(), record("b", times(0.9)))]
+    table = boards([*honest, *invented])
+    assert set(table[table["environment"] == ALL]["method"]) == {"a", "b", "homogeneous"}
+    assert set(table[table["environment"] == name]["method"]) == {"b", "homogeneous"}
+
+
+def test_an_aggregate_is_ranked_by_what_orders_it():
+    """By the interquartile mean of gains, which a disaster leaves as it is; a board of one environment by the mean."""
+    def made(gains):
+        return [floor * (1 - gain) for floor, gain in zip(FLOOR, gains, strict=True)]
+
+    pipe = BOARD_IDS["filter"]
+    records = [floor(), floor(id=TANK), record("daring", made([0.9] * 7 + [-9.0])),
+               record("daring", made([0.9] * 8), id=TANK)]
+    records += [record(name, made([gain] * 8), id=id) for name, gain in (("steady", 0.6), ("slow", 0.3))
+                for id in (pipe, TANK)]
+    table = boards(records)
+    total, one = (table[table["environment"] == name].set_index("method") for name in (ALL, pipe.replace("/", "-")))
+    assert list(total.index) == ["daring", "steady", "slow", "homogeneous"]
+    assert dict(total["rank"].dropna()) == {"daring": 1, "steady": 2, "slow": 3}
+    assert list(one.index[:2]) == ["steady", "slow"] and dict(one["rank"].dropna()) == {
+        "steady": 1, "slow": 2, "daring": 1}                           # too scattered to be beaten
+
+
+def test_targets_at_rest_are_a_class_of_their_own():
+    """They are not averaged with those that flow."""
+    assert class_of(record("a", [0.1], id="eitbench/StationaryTank2D-v0")) == "stationary"
+    assert [class_of(record("a", [0.1], board=board)) for board in BOARD_IDS] == list(BOARD_IDS)
+
+
+def test_injection_counts_from_the_random_pair():
+    """The floor of policies."""
+    table = table_of(record("random_pair", FLOOR, board="injection", role="floor"),
+                     record("greedy_a", times(0.25), board="injection", scores={"spent": 40}))
+    assert table["gain"]["greedy_a"] == pytest.approx(0.75) and table["spent"]["greedy_a"] == 40
+    assert set(table["class"]) == {"injection"}
+
+
+def test_time_in_products_and_memory():
+    """The fastest episode, in units of its own processor's matrix product, the median of all; 10⁶ bytes at most."""
+    mine = record("a", FLOOR, scores={"seconds_per_step": 0.02})
+    slow = RUN | {"machine": RUN["machine"] | {"processor": "An old abacus", "matmul_seconds": 0.2}}
+    episodes = [episode | {"run": i % 2, "peak_memory": 10**8 + i} for i, episode in enumerate(mine["episodes"])]
+    table = table_of(floor(), record("a", FLOOR, runs=[RUN, slow], episodes=episodes))
+    assert tuple(table.loc["a", ["seconds_per_step", "matmuls_per_step"]]) == pytest.approx((20, 0.1))
+    busy = RUN | {"machine": RUN["machine"] | {"matmul_seconds": 0.5}}             # another took 0.05
+    timed = {"scores": {"seconds_per_step": 0.02}}
+    b, c = record("b", FLOOR, runs=[busy], **timed), record("c", FLOOR, runs=[RUN], **timed)
+    one = table_of(floor(), b, c)["matmuls_per_step"]
+    assert one["b"] == one["c"] == pytest.approx(0.4)
+    assert table["peak_memory"]["a"] == pytest.approx(100.000007) and pd.isna(table["peak_memory"]["homogeneous"])
+
+
+def test_only_test_seeds():
+    """Development scores are no leaderboard's."""
+    with pytest.raises(ValueError, match=r"made of test seeds; eitbench-Pipe2D-v0--a--\w+--dev\.json has dev"):
+        boards([record("a", {"dev:0": 0.1})])
+
+
+def test_old_code_is_listed_and_not_mixed():
+    """Neither rank nor gain of the new board know of old records; the Markdown names them."""
+    old = record("a", times(0.1), source="old", finished="2024-01-01")
+    records = [floor(), record("b", times(0.5)), old]
+    assert set(boards(records)["method"]) == {"homogeneous", "b"} and boards(records)["rank"].max() == 1
+    text = render(records)["leaderboard.md"]
+    assert f"- eitbench-Pipe2D-v0--a--{sha('a1')[:8]}.json" in text.split("## Outdated records")[1]
+    assert "Outdated" not in render(records[:2])["leaderboard.md"]
+
+
+# -- one story --------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A folder of records on three boards."""
+    random = np.random.default_rng(7)
+    three = random.uniform(0.1, 0.2, (3, 8)).tolist()
+    for each in (floor(official=True), floor(id=TANK), record("a", three[0], scores={"nis": 1.5}),
+                 record("b", [*three[1][:7], None]), record("a", three[2], id=TANK),
+                 record("random_pair", FLOOR, board="injection", role="floor", scores={"spent": 3}),
+                 record("a", times(0.1), source="old", finished="2020-01-01", version="0")):
+        write_record(tmp_path, each)
+    return tmp_path
+
+
+def test_csv_and_markdown_agree_with_the_episodes(folder):
+    """Means of the CSV are those of the tidy table, and the Markdown shows them, rounded."""
+    texts, frame = render(read_records(folder)), load(folder)
+    table = pd.read_csv(io.StringIO(texts["leaderboard.csv"]), keep_default_na=True)
+    frame = frame[~frame["outdated"]]
+    rows = table[table["environment"] != ALL]
+    assert len(rows) == len(frame[["environment", "method"]].drop_duplicates()) == 6
+    for _, row in rows.iterrows():
+        own = frame[(frame["environment"] == row["environment"]) & (frame["method"] == row["method"])]
+        means = own.groupby("metric")["value"].mean()
+        assert row["error"] == pytest.approx(means["error"], rel=1e-5)
+        if "nis" in means:
+            assert row["nis"] == pytest.approx(means["nis"], rel=1e-5)
+        section = texts["leaderboard.md"].split(f"### {row['environment']}")[1].split("###")[0]
+        (line,) = [line for line in section.splitlines() if f"({row['method']} {row['version']})" in line]
+        shown = float(re.search(r"\| +(0\.\d+)", line)[1])
+        assert shown == pytest.approx(row["error"], rel=0.1)
+        assert line.split("|")[1].strip() == (f"{row['rank']:.0f}" if row["rank"] > 0 else row["note"])
+        assert line.split("|")[3].strip() == ("official" if row["official"] else "self-reported")
+    assert "All environments" in texts["leaderboard.md"] and (table["environment"] == ALL).sum() == 2
+
+
+def test_markdown_is_made_of_tables(folder):
+    """Each has as many cells in every line, whatever a title contains."""
+    write_record(folder, record("odd", times(0.2), title="mine | yours"))
+    lines = render(read_records(folder))["leaderboard.md"].splitlines()
+    widths = [len(re.findall(r"(?<!\\)\|", line)) for line in lines if line.startswith("|")]
+    assert len(widths) > 10 and any("mine \\| yours" in line for line in lines)
+    for a, b in pairwise(lines):
+        if a.startswith("|") and b.startswith("|"):
+            assert len(re.findall(r"(?<!\\)\|", a)) == len(re.findall(r"(?<!\\)\|", b))
+
+
+def test_load_is_tidy(folder):
+    """A row for each score of each episode; failures are there, outdated ones are marked, none of it is mixed up."""
+    frame = eitbench.bench.load(folder)
+    assert not frame.duplicated(["environment", "method", "version", "seed", "metric"]).any()
+    errors = frame[(frame["metric"] == "error") & (frame["environment"] == "eitbench-Pipe2D-v0")]
+    assert errors.groupby(["method", "version"]).size().to_dict() == {
+        (method, sha(method + version)[:8]): 8 for method, version in (("homogeneous", "1"), ("a", "1"), ("b", "1"),
+                                                                       ("a", "0"))}
+    failed = frame[frame["status"] == "failed"]
+    assert list(failed["method"]) == ["b"] and failed["value"].isna().all() and list(failed["seed"]) == ["test:7"]
+    assert set(frame[frame["outdated"]]["version"]) == {sha("a0")[:8]}
+    ours = frame[(frame["method"] == "homogeneous") & (frame["metric"] == "error") & frame["official"]]
+    assert list(ours["value"]) == FLOOR and set(ours["role"]) == {"floor"}
+    mine = record("isolated", [0.1, None])
+    mine["episodes"] = [episode | {"peak_memory": 10**8} for episode in mine["episodes"]]
+    write_record(folder, mine)
+    alone = eitbench.bench.load(folder).query("method == 'isolated'")
+    assert list(alone[alone["status"] == "failed"]["metric"]) == ["error"]        # a single row, whatever it held
+    assert dict(alone[alone["status"] == "ok"].set_index("metric")["value"])["peak_memory"] == 1e8
+    spent = frame[frame["metric"] == "spent"]
+    assert set(spent["board"]) == {"injection"} and set(spent["value"]) == {3.0}
+
+
+def test_load_of_nothing(tmp_path):
+    """Columns without rows; and by default the published records."""
+    frame = load(tmp_path)
+    assert frame.empty and "metric" in frame[~frame["outdated"]].columns
+    example = [sys.executable, str(ROOT / "docs" / "read_leaderboards.py"), str(tmp_path)]
+    done = subprocess.run(example, check=True, capture_output=True, text=True)
+    assert done.stdout.startswith("0 scores of 0 methods")
+    published = read_records(ROOT / "leaderboards" / "results")
+    assert set(load()["environment"]) == {record["environment"]["name"] for record in published}
+
+
+def test_the_example_in_the_docs_runs(folder):
+    """docs/read_leaderboards.py on these records: it prints each version's mean, the best first."""
+    write_record(folder, record("a", times(0.8), version="2"))
+    done = subprocess.run([sys.executable, str(ROOT / "docs" / "read_leaderboards.py"), str(folder)], check=True,
+                          capture_output=True, text=True)
+    frame = load(folder)
+    frame = frame[(frame["metric"] == "error") & ~frame["outdated"] & (frame["environment"] == "eitbench-Pipe2D-v0")]
+    best = frame.groupby(["method", "version"])["value"].mean().sort_values()
+    lines = done.stdout.split("eitbench-Pipe2D-v0")[1].splitlines()[2:6]
+    assert [tuple(line.split()[:2]) for line in lines] == list(best.index) and len(lines) == 4
+    assert [float(line.split()[2]) for line in lines] == pytest.approx(list(best), abs=5e-5)

@@ -1,0 +1,130 @@
+"""Two methods compared: the numbers are those of the statistics, on the episodes that both have."""
+
+import math
+import re
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from tiny import record, sha
+
+from eitbench.bench.records import write_record
+from eitbench.bench.statistics import paired_difference, paired_probability_of_improvement
+from eitbench.report.compare import cells, compare, find, html, markdown, names
+from eitbench.report.summary import scores_by_seed
+
+TANK = "eitbench/RotatingTank2D-v0"
+PIPE_NAME, TANK_NAME = "eitbench-Pipe2D-v0", "eitbench-RotatingTank2D-v0"
+
+
+def two_methods():
+    """a is better in the tank, and in the pipe perhaps."""
+    random = np.random.default_rng(3)
+    hard = random.lognormal(-2.0, 0.5, (2, 12))
+    a, b = hard * random.uniform(0.8, 1.1, (2, 12)), hard * random.uniform(0.9, 1.2, (2, 12))
+    b[1] += 0.1
+    return [[record(name, errors.tolist(), **({"id": TANK} if i else {})) for i, errors in enumerate(both)]
+            for name, both in (("a", a), ("b", b))]
+
+
+def errors_of(records):
+    return {each["environment"]["name"]: scores_by_seed(each, "error") for each in records}
+
+
+def test_numbers_are_those_of_the_statistics():
+    """Environment by environment and over all: differences, shares, and their intervals."""
+    a, b = two_methods()
+    table = compare(a, b).set_index("environment")
+    assert list(table.index) == [PIPE_NAME, TANK_NAME, "all"] and list(table["episodes"]) == [12, 12, 24]
+    x, y = errors_of(a), errors_of(b)
+    for name, these in ((PIPE_NAME, [PIPE_NAME]), (TANK_NAME, [TANK_NAME]), ("all", [PIPE_NAME, TANK_NAME])):
+        own, other = ({each: scores[each] for each in these} for scores in (x, y))
+        assert tuple(table.loc[name, ["difference", "low", "high"]]) == paired_difference(own, other)
+        assert tuple(table.loc[name, ["better", "better_low", "better_high"]]) == (
+            paired_probability_of_improvement(own, other))
+        assert table["a"][name] == pytest.approx(np.mean([np.mean(list(s.values())) for s in own.values()]))
+        assert table["a"][name] - table["b"][name] == pytest.approx(table["difference"][name])
+    assert table["high"][TANK_NAME] < 0 < table["better_low"][TANK_NAME]
+    swapped = compare(b, a).set_index("environment")
+    np.testing.assert_allclose(swapped["difference"], -table["difference"])
+    np.testing.assert_allclose(swapped["better"], 1 - table["better"])
+
+
+def test_only_shared_episodes_count():
+    """By hand: of three seeds each they share one without a failure."""
+    a = [record("a", {"test:0": 0.1, "test:1": None, "test:2": 0.3})]
+    b = [record("b", {"test:0": 0.4, "test:1": 0.1, "test:3": 0.3}), record("b", [0.1], id=TANK)]
+    (row,) = compare(a, b).to_dict("records")
+    assert (row["episodes"], row["a"], row["b"], row["better"]) == (1, 0.1, 0.4, 1.0)
+    dev = [record(name, {"dev:0": error}) for name, error in (("a", 0.2), ("b", 0.1))]
+    table = compare([*a, dev[0]], [dev[1], *b])
+    assert list(table["environment"]) == [PIPE_NAME, f"{PIPE_NAME} (dev seeds)", "all"]
+    assert row["difference"] == pytest.approx(-0.3) and (row["low"], row["high"]) == (-math.inf, math.inf)
+
+
+def test_what_cannot_be_compared():
+    """Other environments, other seeds, other code."""
+    a = [record("a", [0.1])]
+    for b in ([record("b", [0.1], id=TANK)], [record("b", {"test:9": 0.1})], [record("b", {"dev:0": 0.1})],
+              [record("b", [None])]):
+        with pytest.raises(ValueError, match="no environment in which both have finished an episode"):
+            compare(a, b)
+    with pytest.raises(ValueError, match="eitbench-Pipe2D-v0 was played with different versions"):
+        compare(a, [record("b", [0.1], source="other")])
+
+
+def test_records_are_found_by_name_version_and_file(tmp_path):
+    """A name is enough where there is one version of it."""
+    a, (b, _) = two_methods()
+    paths = [write_record(tmp_path, each) for each in [*a, b]]
+    assert find("a", tmp_path) == a and find(f"a@{sha('a1')[:4]}", tmp_path) == a
+    assert find(str(paths[2]), tmp_path / "nowhere") == [b]
+    write_record(tmp_path, newer := record("a", [0.1], version="2"))
+    with pytest.raises(ValueError, match=rf"a fits several versions: a@{sha('a2')[:8]}, a@{sha('a1')[:8]}"):
+        find("a", tmp_path)
+    assert find(f"a@{sha('a2')[:8]}", tmp_path) == [newer]
+    assert names(newer, a[0]) == (f"a@{sha('a2')[:8]}", f"a@{sha('a1')[:8]}") and names(newer, b) == ("a", "b")
+    with pytest.raises(ValueError, match="there is no record of c in"):
+        find("c", tmp_path)
+
+
+def test_words_follow_from_the_intervals():
+    """The verdict names who is better, if anybody; the Markdown is a table of the same text."""
+    a, b = two_methods()
+    table = compare(a, b)
+    text = cells(table, "mine", "yours")
+    assert text["verdict"][1] == "mine" and cells(compare(b, a), "yours", "mine")["verdict"][1] == "mine"
+    low, high = table["low"][0], table["high"][0]
+    assert text["verdict"][0] == ("mine" if high < 0 else "yours" if low > 0 else "–")
+    assert re.fullmatch(r"-0\.\d+ \(-0\.\d+ to -0\.\d+\)", text["difference"][1])
+    assert re.fullmatch(r"\d+ % \(\d+ to \d+ %\)", text["mine better"][0])
+    lines = markdown(table, "mine", "yours").splitlines()
+    assert len(lines) == 5 and len({len(line) for line in lines}) == 1 and all(
+        cell in lines[3] for cell in text.iloc[1])
+    few = cells(compare([record("a", [0.1])], [record("b", [0.4])]), "a", "b")
+    assert (few["verdict"][0], few["a better"][0], few["difference"][0]) == ("–", "100 %", "-0.3")
+
+
+def test_long_names_may_break():
+    """After an underscore, in headings and cells, and nowhere inside of a tag."""
+    a, b = two_methods()
+    page = html(compare(a, b), "my_long_name", "x")
+    assert '<th scope="col">ẽ_c of my_<wbr/>long_<wbr/>name</th>' in page
+    assert "<td>my_<wbr/>long_<wbr/>name</td>" in page and "&lt;wbr" not in page
+
+
+def test_page_needs_nothing_else():
+    """Self-contained, well-formed, with every number of the table; whatever a method is called is text."""
+    a, b = two_methods()
+    table, evil = compare(a, b), "<script>alert(1)</script>"
+    page = html(table, evil, "yours")
+    assert "<script" not in page and not re.search(r"(src|href)=|url\(|@import", page)
+    body = page[page.index("<body>"):page.index("</body>")].replace("&nbsp;", " ") + "</body>"
+    tree = ElementTree.fromstring(body)
+    shown = [text for cell in tree.iter("td") if (text := "".join(cell.itertext()).strip())]
+    assert shown == cells(table, evil, "yours").to_numpy().ravel().tolist()
+    circles = [float(circle.get("cx")) for circle in tree.iter("circle")]
+    assert [x < 50 for x in circles] == [difference < 0 for difference in table["difference"]]
+    assert len(list(tree.iter("line"))) == 2 * 3
+    few = html(compare([record("a", [0.1])], [record("b", [0.4])]), "a", "b")
+    assert few.count("<line") == 1 and 'cx="5.00"' in few                # no interval, and the only difference

@@ -1,0 +1,176 @@
+"""The site in a real browser: sorting, filtering, following a link, the theme, and a phone's width."""
+
+import re
+from pathlib import Path
+
+import pytest
+from browser import Browser, executable
+from tiny import several_boards
+
+from eitbench.report.boards import boards
+from eitbench.report.site import render_site, write_site
+
+pytestmark = pytest.mark.skipif(executable() is None, reason="there is no Chromium or Chrome on the PATH")
+STYLE = Path(__file__).parents[2] / "eitbench" / "report" / "style.css"
+BOARD = "#board-filter-eitbench-Pipe2D-v0"
+ENVIRONMENT, METHOD = "environments/eitbench-Pipe2D-v0.html", "methods/a.html"
+"""One page of each kind, beside the index."""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    made, records = tmp_path_factory.mktemp("site"), several_boards()
+    write_site(made, render_site(records, boards(records)))
+    return made
+
+
+@pytest.fixture(scope="module")
+def tab(tmp_path_factory):
+    """One browser for all tests; they may not leave complaints in its console, nor go out."""
+    with Browser(tmp_path_factory.mktemp("profile")) as browser:
+        yield browser
+        assert browser.errors == []
+        assert browser.addresses and all(address.startswith("file:") for address in browser.addresses)
+
+
+@pytest.fixture
+def index(tab, folder):
+    """The index, wide and light, without memories."""
+    tab.size(1200)
+    tab.prefer(prefers_color_scheme="light")
+    tab.open((folder / "index.html").as_uri())
+    tab.js("localStorage.clear()")
+    tab.open((folder / "index.html").as_uri())
+    return tab
+
+
+def column(tab, number, attribute="textContent"):
+    """What a column of the board shows, from top to bottom."""
+    return tab.js(f"[...document.querySelectorAll('{BOARD} tbody tr')].filter(row => row.checkVisibility())"
+                  f".map(row => row.cells[{number}].{attribute}.trim())")
+
+
+def headings(tab):
+    return tab.js(f"[...document.querySelectorAll('{BOARD} thead th')].map(cell => cell.textContent)")
+
+
+def test_sort_by_click_and_by_keyboard(index):
+    """Up, down, and up again by another column; who has no value stays last; aria-sort says what is done."""
+    place = headings(index).index("ms/step")
+    header = f"{BOARD} thead th:nth-child({place + 1})"
+    before = column(index, 1)
+    index.click(f"{header} button")
+    times = [float(text) for text in column(index, place)]
+    assert times == sorted(times) and index.js(f"document.querySelector('{header}').ariaSort") == "ascending"
+    index.click(f"{header} button")
+    assert [float(text) for text in column(index, place)] == times[::-1]
+    assert index.js(f"document.querySelector('{header}').ariaSort") == "descending"
+
+    index.js(f"document.querySelector('{BOARD} thead th button').focus({{focusVisible: true}})")
+    assert index.js("getComputedStyle(document.activeElement).outlineStyle") == "solid"
+    index.press("Enter")
+    ranks = column(index, 0)
+    known = [int(re.match(r"\d+", rank)[0]) for rank in ranks if rank != "–"]
+    assert known == sorted(known) and ranks[len(known):] == ["–"] * (len(ranks) - len(known)) and "–" in ranks
+    assert index.js(f"[...document.querySelectorAll('{BOARD} th')].filter(cell => cell.ariaSort).length") == 1
+    index.press("Tab")
+    index.press(" ")
+    assert index.js(f"document.querySelector('{BOARD} thead th:nth-child(2)').ariaSort") == "ascending"
+    assert sorted(column(index, 1)) == sorted(before)
+
+
+def test_filter_by_words_and_by_kind(index):
+    """Words are looked for in methods and environments; each toggle hides what it names; the count says how many."""
+    everybody = len(column(index, 1))
+    index.js("document.querySelector('input[type=search]').focus()")
+    index.type("TWIN tank")
+    assert index.js("document.querySelector('output').textContent").startswith("1 of ")
+    shown = index.js("[...document.querySelectorAll('.block')].filter(block => block.checkVisibility())"
+                     ".map(block => block.id)")
+    assert shown == ["board-filter-eitbench-RotatingTank2D-v0"]
+    assert not index.js("document.querySelector('#class-injection').checkVisibility()")
+    for _ in "TWIN tank":
+        index.press("Backspace")
+    assert len(column(index, 1)) == everybody
+
+    index.click("input[name=outdated]")
+    assert len(column(index, 1)) == everybody + 1 and "outdated" in column(index, 1)[-1]
+    index.click("input[name=unranked]")
+    names = " ".join(column(index, 1))
+    assert "floor" not in names and "reference" not in names and "failing" in names
+    index.click("input[name='self-reported']")
+    assert len(column(index, 1)) == 1 and "twin" in column(index, 1)[0]
+
+
+def test_open_a_method(index):
+    """A click leads to its page; its episodes open by keyboard; the way back is a link."""
+    index.click(f"{BOARD} tbody a", loads=True)
+    assert "/methods/" in index.js("location.pathname")
+    assert index.js("document.querySelector('h1').textContent") in ("A", "Twin", "Seer")
+    index.js("document.querySelector('summary').focus()")
+    index.press("Enter")
+    assert index.js("document.querySelector('details').open && document.querySelector('details table').rows.length") > 8
+    index.click("header nav a", loads=True)
+    assert index.js("location.pathname").endswith("index.html")
+
+
+def test_dark_by_preference_and_by_choice(index, folder):
+    """The page follows the system until somebody chooses, and then remembers."""
+    def paper():
+        return index.js("getComputedStyle(document.body).backgroundColor")
+
+    light = paper()
+    index.prefer(prefers_color_scheme="dark")
+    dark = paper()
+    assert light != dark
+    index.wait("document.querySelector('.theme').ariaPressed === 'true'")
+    index.click(".theme")
+    assert paper() == light and index.js("document.querySelector('.theme').ariaPressed") == "false"
+    index.open((folder / METHOD).as_uri())
+    assert paper() == light
+    index.js("document.querySelector('.theme').focus()")
+    index.press(" ")
+    assert paper() == dark
+    index.prefer(prefers_color_scheme="light")
+    assert paper() == dark
+
+
+@pytest.mark.parametrize("page", ["index.html", ENVIRONMENT, METHOD])
+@pytest.mark.parametrize("width", [380, 1200])
+def test_nothing_overflows(tab, folder, page, width):
+    """On a phone too: what is wide scrolls within its container, which the keyboard reaches."""
+    tab.size(width)
+    tab.open((folder / page).as_uri())
+    tab.js("document.querySelectorAll('details').forEach(details => { details.open = true; })")
+    assert tab.js("document.documentElement.scrollWidth") == width
+    assert tab.js("[...document.querySelectorAll('table, pre, figure > div > svg')]"
+                  ".every(it => it.closest('.card[tabindex=\"0\"][role=region][aria-label]'))")
+    wide = tab.js("[...document.querySelectorAll('.card')].filter(card => card.scrollWidth > card.clientWidth).length")
+    assert wide > 0 or width > 380
+
+
+def test_less_motion_where_it_is_asked_for(tab, folder):
+    """Links jump instead of gliding."""
+    tab.open((folder / "index.html").as_uri())
+    for wish, behaviour in (("reduce", "auto"), ("no-preference", "smooth")):
+        tab.prefer(prefers_reduced_motion=wish)
+        assert tab.js("getComputedStyle(document.documentElement).scrollBehavior") == behaviour
+
+
+def luminance(colour):
+    """WCAG's, of #rrggbb."""
+    parts = [int(colour[i:i + 2], 16) / 255 for i in (1, 3, 5)]
+    linear = [part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts]
+    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+
+@pytest.mark.parametrize("scheme", [0, 1], ids=["light", "dark"])
+def test_contrast(scheme):
+    """Text 4.5 to 1 and lines of charts 3 to 1 (WCAG AA), on paper and on cards."""
+    colours = {name: pair[scheme] for name, *pair in re.findall(
+        r"--(\w+): light-dark\((#\w{6}), (#\w{6})\)", STYLE.read_text())}
+    for ground in ("paper", "card"):
+        for name, colour in colours.items():
+            least = 4.5 if name in ("ink", "soft", "accent", "c8") else 3.0 if re.fullmatch(r"c\d+", name) else 0.0
+            bright, dim = sorted((luminance(colour), luminance(colours[ground])), reverse=True)
+            assert (bright + 0.05) / (dim + 0.05) >= least, (name, ground)

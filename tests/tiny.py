@@ -1,0 +1,124 @@
+"""A world whose episodes take a moment, and baselines written by a user of tomorrow."""
+
+import hashlib
+import json
+from pathlib import Path
+
+from eitbench.bench.records import SCHEMA, sealed, split_of
+from eitbench.bench.run import Environment
+
+SCENARIO = {"mean_velocity": 45.0, "scored_steps": 3, "electrodes_per_wall": 2, "frame": 2}
+"""A fast fluid flushes the pipe in two steps: five measurements, the last three states are scored."""
+
+FILTER = Environment("eitbench/Pipe2D-v0", json.dumps({"scenario": SCENARIO}))
+FIXED_LAG = Environment("eitbench/Pipe2DFixedLag-v0", json.dumps({"scenario": SCENARIO, "lag": 2}))
+SMOOTHING = Environment("eitbench/Pipe2DSmoothing-v0", json.dumps({"scenario": SCENARIO}))
+
+RUN = {"command": "eitbench run", "blas": "scipy-openblas", "commit": "c0ffee", "dirty": False,
+       "versions": {"python": "3.12.1", "eitbench": "0.1.0", "numpy": "2.4.6", "scipy": "1.17.1",
+                    "stable-baselines3": None, "torch": None},
+       "machine": {"processor": "An abacus", "cores": 2, "system": "Linux", "blas_threads": 1, "matmul_seconds": 0.05}}
+BOARD_IDS = {"filter": "eitbench/Pipe2D-v0", "fixed-lag": "eitbench/Pipe2DFixedLag-v0",
+             "smoothing": "eitbench/Pipe2DSmoothing-v0", "injection": "eitbench/Pipe2DInjection-v0"}
+
+SOURCE = '''"""{doc}"""
+import os
+from pathlib import Path
+
+import numpy as np
+
+from eitbench import Estimate, Task
+
+
+class Estimator:
+    boards = ("filter", "fixed-lag", "smoothing")
+    parameters = {parameters}
+
+    def __init__(self, task: Task) -> None:
+        self.task, self.level, self.calls = task, np.full(task.mesh.n_nodes, 29.0), 0
+        {init}
+
+    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
+        self.calls += 1
+        {update}
+'''
+
+
+def write_baseline(folder: Path, name: str = "mine", *, doc: str = "Mine: the same everywhere.", init: str = "pass",
+                   update: str = "return Estimate(self.level)", parameters: str = "{}") -> str:
+    """The path of a baseline file with these statements in its methods."""
+    path = Path(folder) / f"{name}.py"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(SOURCE.format(doc=doc, init=init, update=update, parameters=parameters))
+    return str(path)
+
+
+def counting(log: Path) -> str:
+    """A statement that adds a line to ``log``: one for each estimator made."""
+    return f"open({str(log)!r}, 'a').write('made\\n')"
+
+
+def count(log: Path) -> int:
+    """Lines in ``log``."""
+    return len(log.read_text().splitlines()) if log.exists() else 0
+
+
+def strict(text: str):
+    """JSON as the standard has it: no NaN, no Infinity."""
+    def refuse(constant):
+        raise ValueError(f"{constant} is not JSON")
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def sha(text: str) -> str:
+    """A hash that looks like one."""
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def episode(seed: str, error: float | None, *, seconds_per_step: float = 0.01, **scores) -> dict:
+    """An episode of a record; a failed one without an error."""
+    shared = {"identity": "abc", "seed": seed, "finished": "2025-01-01T00:00:00+00:00", "seconds": 1.0,
+              "peak_memory": None, "run": 0}
+    if error is None:
+        return shared | {"status": "failed", "message": "RuntimeError: oh", "where": "mine.py:3"}
+    return shared | {"status": "ok", "step_errors": [error],
+                     "scores": {"error": error, "seconds_per_step": seconds_per_step} | scores}
+
+
+def record(method: str, errors: dict[str, float | None] | list[float | None], *, board: str = "filter",
+           id: str | None = None, source: str = "code", version: str = "1", finished: str = "2025-01-01", scores=None,
+           **changes) -> dict:
+    """A valid record of these errors by seed; those of a list are of test:0, test:1 and so on."""
+    id = id or BOARD_IDS[board]
+    errors = errors if isinstance(errors, dict) else {f"test:{i}": error for i, error in enumerate(errors)}
+    episodes = [episode(seed, error, **(scores or {})) | {"finished": f"{finished}T00:00:00+00:00"}
+                for seed, error in errors.items()]
+    return sealed({
+        "schema": SCHEMA, "environment": {"id": id, "name": id.replace("/", "-"), "kwargs": {}}, "board": board,
+        "method": method, "title": method.replace("_", " ").capitalize(), "parameters": {}, "role": None,
+        "privileged": False, "official": False, "method_sha256": sha(method + version), "checkpoint_sha256": None,
+        "source": sha(source), "split": split_of(next(iter(errors))), "seeds": list(errors), "runs": [RUN],
+        "episodes": episodes} | changes)
+
+
+def several_boards() -> list[dict]:
+    """As real ones may be: three worlds, floors, a reference, shared ranks, a failure, an outdated one, odd names."""
+    tank, floor = "eitbench/RotatingTank2D-v0", [0.20, 0.24, 0.22, 0.26, 0.18, 0.30, 0.25, 0.21]
+
+    def of(factor: float) -> list[float]:
+        return [factor * error * (1 + 0.05 * (-1) ** i) for i, error in enumerate(floor)]
+
+    claims = {"coverage_50": 0.4, "coverage_90": 0.8, "spread_ratio": 0.7, "nis": 1.2}
+    records = [record("homogeneous", floor, role="floor", official=True),
+               record("homogeneous", floor, id=tank, role="floor", official=True),
+               record("random_pair", floor, board="injection", role="floor", scores={"spent": 40})]
+    for id in (BOARD_IDS["filter"], tank):
+        records += [record("a", of(0.5), id=id, scores=claims | {"seconds_per_step": 0.02}),
+                    record("twin", of(0.5), id=id, scores={"seconds_per_step": 0.05}, official=True)]
+    return [*records, record("b", of(0.7), scores={"seconds_per_step": 0.004}, parameters={"window": 3}),
+            record("failing", [*of(0.6)[:7], None]), record("seer", of(0.1), role="reference", privileged=True),
+            record("a", of(0.45), source="old", version="0", finished="2020-01-01"),
+            record("<i>\"odd\"", of(0.8), title="Odd <script>alert(1)</script> & | \"co\"", runs=[RUN | {
+                "command": "eitbench submit --baseline '<b>it' --env x"}]),
+            record("greedy_a", of(0.4), board="injection", scores={"spent": 30})]

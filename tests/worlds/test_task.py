@@ -1,0 +1,167 @@
+"""`Task`: what an estimator may know; above all, nothing of what happened."""
+
+import functools
+import types
+from dataclasses import FrozenInstanceError, replace
+
+import numpy as np
+import pytest
+
+from eitbench.data.episodes import CACHE_VARIABLE, Episode, simulate, truth_discretisation
+from eitbench.envs.pipe2d import Pipe2DEnv
+from eitbench.worlds import Pipe2D
+from eitbench.worlds.base import Discretisation
+from eitbench.worlds.task import make_task
+
+FIELDS = {"mean_velocity": 45.0, "scored_steps": 3, "electrodes_per_wall": 2, "frame": 2}
+TINY = Pipe2D(**FIELDS)
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path, monkeypatch):
+    """A cache folder of its own for each test."""
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+# -- lag and assumptions ----------------------------------------------------------------------------------------------
+
+
+def test_says_what_the_scenario_says():
+    """Times, currents, noise and level are the scenario's; estimates live on the CD mesh of its model."""
+    task = make_task(TINY)
+    assert (task.n_steps, task.warm_up, task.lag, task.expected_concentration) == (5, 2, 0, 25.0)
+    np.testing.assert_array_equal(task.currents, TINY.currents)
+    assert task.noise == TINY.noise
+    # The rough level is no disguised truth: as an estimate it would beat the homogeneous one.
+    assert Pipe2D().expected_concentration != Pipe2D().background
+    assert task.mesh is task.transport.mesh and task.mesh.n_nodes == 1701
+
+
+@pytest.mark.parametrize(("lag", "steps"), [(0, 0), (2, 2), (np.int64(4), 4), ("all", 4)])
+def test_lag(lag, steps):
+    """A number of steps, or the whole record: then the first state is asked for after the last measurement."""
+    assert make_task(TINY, lag).lag == steps
+
+
+@pytest.mark.parametrize("lag", [-1, 5, 1.5, True, None, "some", "2", ""])
+def test_wrong_lags(lag):
+    """What is no number of steps within the record is refused, with the range and what came."""
+    with pytest.raises(ValueError, match=r"lag must be .*integer.* 0 .* 4") as caught:
+        make_task(TINY, lag)
+    assert repr(lag) in str(caught.value)
+
+
+def test_wrong_assumptions():
+    """What the model does not take, or cannot believe, is refused by name."""
+    with pytest.raises(TypeError, match="viscosity"):
+        make_task(TINY, viscosity=1.0)
+    with pytest.raises(ValueError, match="mean_velocity"):
+        make_task(TINY, mean_velocity=-1.0)
+
+
+def test_models_are_shared_and_tasks_frozen():
+    """Lags share one model, so that F is computed once; other worlds and beliefs have their own."""
+    task = make_task(TINY)
+    assert make_task(TINY, "all").transport is task.transport
+    assert make_task(replace(TINY, diffusivity=1e-3)).transport is not task.transport
+    assert make_task(TINY, mean_velocity=60.0).transport is not task.transport
+    with pytest.raises(FrozenInstanceError):
+        task.lag = 3
+
+
+def test_assumed_velocity_changes_the_model_not_the_world(cache):
+    """A wrong belief moves the model's fluid elsewhere; the episode and its voltages stay as they were."""
+    right, wrong = (Pipe2DEnv(scenario=FIELDS, assumed_mean_velocity=velocity) for velocity in (None, 60.0))
+    rng = np.random.default_rng(2)
+    c = rng.uniform(20.0, 40.0, 1701)
+    moved = [env.task.transport.step(c, 30.0, 30.0) for env in (right, wrong)]
+    assert np.abs(moved[0] - moved[1]).max() > 1.0
+    silence = np.full(1701, 30.0)
+    for seen, expected in zip(played(wrong, silence), played(right, silence), strict=True):
+        np.testing.assert_array_equal(seen, expected)
+    assert len(list(cache.rglob("*.truth.npz"))) == len(list(cache.rglob("*.npy"))) == 1
+
+
+def played(env, action):
+    """Voltages, currents and reward of a whole episode."""
+    observation, _ = env.reset(seed=3)
+    done = False
+    while not done:
+        seen = [observation["voltages"], observation["currents"]]
+        observation, reward, done, _, _ = env.step(action)
+        yield np.concatenate([*seen, [reward]])
+
+
+# -- nothing of the truth ---------------------------------------------------------------------------------------------
+
+
+def reachable(start):
+    """Every object that can be reached from ``start`` by attributes, items and closures."""
+    found, waiting = {}, [start]
+    while waiting:
+        thing = waiting.pop()
+        if id(thing) in found or isinstance(thing, (type, types.ModuleType)):
+            continue
+        found[id(thing)] = thing
+        if isinstance(thing, np.ndarray):
+            waiting += [] if thing.base is None else [thing.base]
+            waiting += list(thing.ravel()) if thing.dtype == object else []
+        elif isinstance(thing, dict):
+            waiting += [*thing.keys(), *thing.values()]
+        elif isinstance(thing, (list, tuple, set, frozenset)):
+            waiting += list(thing)
+        elif isinstance(thing, types.MethodType):
+            waiting += [thing.__self__, thing.__func__]
+        elif isinstance(thing, functools.partial):
+            waiting += [thing.func, thing.args, thing.keywords]
+        elif isinstance(thing, types.FunctionType):               # its globals lead everywhere, so they say nothing
+            waiting += [cell.cell_contents for cell in thing.__closure__ or ()] + [thing.__defaults__]
+        waiting += [vars(thing)] if hasattr(thing, "__dict__") else []
+        slots = [name for kind in type(thing).__mro__ for name in getattr(kind, "__slots__", ())]
+        waiting += [getattr(thing, name) for name in slots if isinstance(name, str) and hasattr(thing, name)]
+    return list(found.values())
+
+
+def sizes(discretisation):
+    """Lengths that arrays on these meshes have."""
+    transport, observation = discretisation
+    return {transport.mesh.n_nodes, len(transport.mesh.cells), len(observation.cem.mesh.points),
+            len(observation.cem.mesh.cells), observation.cem.n_unknowns}
+
+
+def traces_of_truth(task, scenario):
+    """What in ``task`` tells of the truth: episodes, scenarios, the fine discretisation, arrays of its size."""
+    truth = truth_discretisation(scenario)
+    its_own = {id(thing) for thing in reachable(truth) if isinstance(thing, np.ndarray)}
+    fine = sizes(truth)
+    return [thing for thing in reachable(task)
+            if isinstance(thing, (Episode, Pipe2D)) or id(thing) in its_own
+            or (isinstance(thing, np.ndarray) and not fine.isdisjoint({*thing.shape, thing.size}))]
+
+
+def test_task_holds_nothing_of_the_truth():
+    """Not even while an episode is under way, nor through caches and closures."""
+    assert sizes(truth_discretisation(TINY)).isdisjoint(sizes(Discretisation(*TINY.model())))
+    env = Pipe2DEnv(scenario=FIELDS, lag=1)
+    for _ in played(env, np.full(1701, 30.0)):
+        assert traces_of_truth(env.task, TINY) == []
+    assert len([thing for thing in reachable(env.task) if isinstance(thing, np.ndarray)]) > 20
+
+
+@pytest.mark.parametrize("hide", [
+    lambda task, episode: replace(task, noise=episode),
+    lambda task, episode: replace(task, noise=lambda: episode),
+    lambda task, episode: replace(task, currents=[{"kept": (episode.concentration[1:],)}]),
+    lambda task, episode: replace(task, noise=functools.partial(max, TINY)),
+    lambda task, episode: replace(task, observation=truth_discretisation(TINY).observation),
+], ids=["attribute", "closure", "container", "scenario", "fine model"])
+def test_the_search_finds_what_is_hidden(hide):
+    """The search above is worth something: a truth that is put into a task is found."""
+    assert traces_of_truth(hide(make_task(TINY), simulate(TINY, 3)), TINY)
+
+
+def test_wrong_belief_does_not_tell_the_right_one():
+    """A task that assumes 60 m/s holds no number 45, nor a flow of that velocity."""
+    task = make_task(TINY, mean_velocity=60.0)
+    assert not [thing for thing in reachable(task) if isinstance(thing, (int, float)) and thing == 45.0]
