@@ -1,31 +1,36 @@
 """eitbench: process tomography as Gymnasium environments, with honest baselines and scores.
 
-Importing it registers the environments ``eitbench/…-v0``; nothing heavy is loaded before something is used.
+Importing it registers the environments ``eitbench/…-v0`` and those of installed packages; nothing heavy is loaded before
+something is used.
 """
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from eitbench.envs import register_all
+from eitbench.worlds.registry import register, register_installed
 
 if TYPE_CHECKING:
     from eitbench.data.episodes import Episode, simulate
+    from eitbench.envs.injection_core import Rules
+    from eitbench.envs.pages import page
     from eitbench.worlds.task import Estimate, Task, make_task
+    from eitbench.worlds.world import World
 
 __version__ = "0.1.0"
-__all__ = ["Episode", "Estimate", "Task", "make_task", "simulate"]
+__all__ = ["Episode", "Estimate", "Rules", "Task", "World", "make_task", "page", "register", "simulate"]
 
-register_all()
+_LATER = {"Estimate": "worlds.task", "Task": "worlds.task", "make_task": "worlds.task", "World": "worlds.world",
+          "Episode": "data.episodes", "simulate": "data.episodes", "Rules": "envs.injection_core",
+          "page": "envs.pages"}
+"""Where the public names lie that are loaded on first use."""
+
+register_installed()
 
 
 def __getattr__(name: str) -> Any:
-    """Load the three nouns, their makers and the leaderboards on first use."""
-    if name in ("Estimate", "Task", "make_task"):
-        from eitbench.worlds import task
-        return getattr(task, name)
-    if name in ("Episode", "simulate"):
-        from eitbench.data import episodes
-        return getattr(episodes, name)
+    """Load the public nouns, their makers and the leaderboards on first use."""
+    if name in _LATER:
+        return getattr(import_module(f"eitbench.{_LATER[name]}"), name)
     if name == "leaderboard":
         return import_module("eitbench.bench")
     raise AttributeError(f"module 'eitbench' has no attribute {name!r}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import hashlib
+import inspect
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -19,6 +20,14 @@ def code_digest(files: Iterable[Path]) -> str:
 def package_files(*patterns: str) -> list[Path]:
     """Files of this package that match, in order."""
     return sorted(file for pattern in patterns for file in PACKAGE.glob(pattern))
+
+
+def file_of(kind: type) -> Path | None:
+    """Where a class is written; a class typed into a session is nowhere."""
+    try:
+        return Path(inspect.getfile(kind))
+    except (OSError, TypeError):
+        return None
 
 
 def _without_docstrings(file: Path) -> bytes:

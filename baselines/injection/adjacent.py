@@ -10,7 +10,7 @@ from eitbench.envs.injection_core import Rules
 
 class Policy:
     def __init__(self, rules: Rules, random: np.random.Generator) -> None:
-        self.rules, L = rules, rules.scenario.currents.shape[1]
+        self.rules, L = rules, rules.world.currents.shape[1]
         numbers = {frozenset(pair): k for k, pair in enumerate(rules.pairs.tolist())}
         self.cycle = cycle(numbers[frozenset(pair)] for pair in ((i, (i + 1) % L) for i in range(L)))
 

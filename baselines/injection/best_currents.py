@@ -15,8 +15,8 @@ class Policy:
 
     @classmethod
     def suits(cls, rules: Rules) -> bool:
-        electrodes = rules.scenario.currents.shape[1]
-        return (rules.world, rules.limit, electrodes) == (
+        electrodes = rules.world.currents.shape[1]
+        return (rules.name, rules.limit, electrodes) == (
             cls.parameters["world"], cls.parameters["limit"], len(cls.parameters["currents"]))
 
     def __init__(self, rules: Rules, random: np.random.Generator) -> None:

@@ -21,12 +21,12 @@ class Policy:
     @classmethod
     def suits(cls, rules: Rules) -> bool:
         pairs = rules.pairs.tolist()
-        return rules.world in cls.parameters["cycle"] and all(
-            pair in pairs for pair in cls.parameters["cycle"][rules.world])
+        return rules.name in cls.parameters["cycle"] and all(
+            pair in pairs for pair in cls.parameters["cycle"][rules.name])
 
     def __init__(self, rules: Rules, random: np.random.Generator) -> None:
         pairs = rules.pairs.tolist()
-        self.rules, self.cycle = rules, cycle(pairs.index(pair) for pair in self.parameters["cycle"][rules.world])
+        self.rules, self.cycle = rules, cycle(pairs.index(pair) for pair in self.parameters["cycle"][rules.name])
 
     def act(self, observation: dict[str, np.ndarray]) -> Any:
         now = self.rules.spaced(observation["left"])

@@ -18,10 +18,10 @@ class Policy:
 
     @classmethod
     def suits(cls, rules: Rules) -> bool:
-        return cls.parameters["pair"].get(rules.world) in rules.pairs.tolist()
+        return cls.parameters["pair"].get(rules.name) in rules.pairs.tolist()
 
     def __init__(self, rules: Rules, random: np.random.Generator) -> None:
-        self.rules, self.pair = rules, rules.pairs.tolist().index(self.parameters["pair"][rules.world])
+        self.rules, self.pair = rules, rules.pairs.tolist().index(self.parameters["pair"][rules.name])
 
     def act(self, observation: dict[str, np.ndarray]) -> Any:
         return self.rules.action(self.pair if self.rules.spaced(observation["left"]) else None)

@@ -32,11 +32,11 @@ class Policy:
 
     def __init__(self, rules: Rules, random: np.random.Generator, core: InjectionCore) -> None:
         self.rules, self.core = rules, core
-        if rules.scenario.velocity_model is not None and rules.budget is None:
+        if rules.world.velocity_model is not None and rules.budget is None:
             self.plan = iter(self.changing().tolist())
             return
         pairs, every = rules.pairs.tolist(), np.ones(core.length, dtype=int)
-        best = load_policy("best_pair").parameters["pair"].get(rules.world)
+        best = load_policy("best_pair").parameters["pair"].get(rules.name)
         fixed = sorted({pairs.index(pair) for pair in [*self.parameters["fixed_pairs"], best] if pair in pairs})
         if rules.budget is None:
             any_currents = load_policy("best_currents")
@@ -63,8 +63,8 @@ class Policy:
         fault."""
         core = self.core
         belief, covariance = Belief(self.rules, {name: array[0] for name, array in core.observe().items()}), None
-        if self.rules.scenario.velocity_model is not None:
-            belief.told(recording(self.rules.scenario, core.seeds[0])[core.t - 1:])
+        if self.rules.world.velocity_model is not None:
+            belief.told(recording(self.rules.world, core.seeds[0])[core.t - 1:])
         plan = np.empty(core.length, dtype=int)
         for k in range(core.length):
             sound = (core.t + k + 1 < core.faults.broken_from[0]) & (core.faults.resistance[0] == 0.0)

@@ -20,7 +20,7 @@ class Policy:
     def __init__(self, rules: Rules, random: np.random.Generator) -> None:
         self.rules = rules
         self.belief: Belief | None = None
-        known = rules.scenario.velocity_model is None
+        known = rules.world.velocity_model is None
         self.rest = 0 if known else min(self.parameters["rest"], len(rules.pairs) // 2)
         self.recent: list[int] = []
 

@@ -21,7 +21,7 @@ class Policy:
 
     @classmethod
     def suits(cls, rules: Rules) -> bool:
-        return rules.scenario.velocity_model is None
+        return rules.world.velocity_model is None
 
     def __init__(self, rules: Rules, random: np.random.Generator) -> None:
         self.rules, self.plan = rules, iter(plan_of(rules))
@@ -34,7 +34,7 @@ class Policy:
 def plan_of(rules: Rules) -> tuple[int | None, ...]:
     """The pair of each step, None for no injection."""
     belief = Belief.beforehand(rules)
-    steps = rules.scenario.n_steps - len(rules.scenario.currents)
+    steps = rules.world.n_steps - len(rules.world.currents)
     plan: list[int | None] = [-1 if rules.spaced(np.array([steps - k])) else None for k in range(steps)]
     states: list[np.ndarray | None] = [None] * (steps + 1)     # before each step; None is the one after the first frame
 

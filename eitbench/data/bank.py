@@ -19,23 +19,23 @@ from eitbench.data.recordings import (
     recording_type,
     store_recording,
 )
-from eitbench.data.regions import are_kept, integrals_path, make_integrals, region_of, store_integrals
+from eitbench.data.regions import are_kept, integrals_path, make_integrals, store_integrals
 
 if TYPE_CHECKING:
-    from eitbench.worlds.base import Scenario
+    from eitbench.worlds.world import World
 
 TOGETHER = 8
 """Episodes that are simulated side by side."""
 
 
-def recording_bytes(scenario: Scenario) -> int:
+def recording_bytes(world: World) -> int:
     """Size of one recording on disk, with what lies beside it, but for headers of a few hundred bytes."""
-    n = outline(scenario).mass.shape[0]
-    beside = 0 if region_of(scenario) is None else 4 * n + 16                                # see `Integrals`
-    return scenario.n_steps * (recording_type(scenario, n).itemsize + beside)
+    n = outline(world).mass.shape[0]
+    beside = 0 if world.region is None else 4 * n + 16                                # see `Integrals`
+    return world.n_steps * (recording_type(world, n).itemsize + beside)
 
 
-def fill(scenario: Scenario, seeds: Sequence[int], *, n_jobs: int = 1, backend: str = "loky") -> int:
+def fill(world: World, seeds: Sequence[int], *, n_jobs: int = 1, backend: str = "loky") -> int:
     """Make the recordings that are missing, in ``n_jobs`` processes, and return their number.
 
     ``backend`` is one of `eitbench._parallel.BACKENDS`, of which those of a cluster need the cache folder on all
@@ -44,10 +44,10 @@ def fill(scenario: Scenario, seeds: Sequence[int], *, n_jobs: int = 1, backend: 
     Each is stored as soon as it is done; after an interruption the same call goes on where it was. Only what an
     environment needs is kept: the truth, five times as large, is simulated anew should anybody ask for it.
     """
-    n_jobs, missing = _check.integer("n_jobs", n_jobs, low=1), missing_seeds(scenario, seeds)
+    n_jobs, missing = _check.integer("n_jobs", n_jobs, low=1), missing_seeds(world, seeds)
     together = max(1, min(TOGETHER, -(-len(missing) // n_jobs)))
     # The folder is found out here: a worker may live in another environment than its parent does by now.
-    groups = [(scenario, group, [(recording_path(scenario, seed), integrals_path(scenario, seed)) for seed in group])
+    groups = [(world, group, [(recording_path(world, seed), integrals_path(world, seed)) for seed in group])
               for group in (missing[k:k + together] for k in range(0, len(missing), together))]
     with tqdm(total=len(missing), desc="recording", unit="episode", disable=None) as bar:
         for done in in_parallel(_record, groups, n_jobs, backend):
@@ -55,16 +55,16 @@ def fill(scenario: Scenario, seeds: Sequence[int], *, n_jobs: int = 1, backend: 
     return len(missing)
 
 
-def missing_seeds(scenario: Scenario, seeds: Sequence[int]) -> list[int]:
+def missing_seeds(world: World, seeds: Sequence[int]) -> list[int]:
     """Those of ``seeds`` without a sound recording."""
     checked = [_check.integer("seeds", seed, low=0) for seed in seeds]
-    return [seed for seed in dict.fromkeys(checked) if not (is_recorded(scenario, seed) and are_kept(scenario, seed))]
+    return [seed for seed in dict.fromkeys(checked) if not (is_recorded(world, seed) and are_kept(world, seed))]
 
 
-def _record(scenario: Scenario, seeds: Sequence[int], paths: Sequence[tuple[Path, Path]]) -> int:
-    episodes = simulate_together(scenario, seeds, progress=False)
+def _record(world: World, seeds: Sequence[int], paths: Sequence[tuple[Path, Path]]) -> int:
+    episodes = simulate_together(world, seeds, progress=False)
     for seed, (path, beside), episode in zip(seeds, paths, episodes, strict=True):
-        if region_of(scenario) is not None:
-            store_integrals(beside, seed, make_integrals(scenario, episode))
-        store_recording(path, make_recording(scenario, seed, episode))
+        if world.region is not None:
+            store_integrals(beside, seed, make_integrals(world, episode))
+        store_recording(path, make_recording(world, seed, episode))
     return len(seeds)

@@ -1,7 +1,7 @@
 """Recordings: what an environment plays and scores an episode from, without any mesh of the truth.
 
 The score (5.12) needs of the truth only two integrals a step and one vector on the estimator's nodes. With P the
-interpolation to the truth's nodes, M its mass matrix, and everything counted from the scenario's background,
+interpolation to the truth's nodes, M its mass matrix, and everything counted from the world's background,
     ∫(ĉ − c)² = ĉᵀ M̃ ĉ − 2 ĉᵀ b_t + d_t,      M̃ = Pᵀ M P,   b_t = Pᵀ M c_t,   d_t = c_tᵀ M c_t.
 """
 
@@ -18,17 +18,23 @@ import numpy as np
 
 from eitbench import _check
 from eitbench._files import write_atomically
-from eitbench.data.episodes import Episode, folder, simulate, truth_discretisation, warn_not_kept
+from eitbench.data import store
+from eitbench.data.episodes import Episode, simulate, truth_discretisation
+from eitbench.worlds.streams import randomness
 
 if TYPE_CHECKING:
     import scipy.sparse as sp
 
     from eitbench.physics.profiles import VelocityModel
-    from eitbench.worlds.base import Scenario
+    from eitbench.worlds.instrument import Faults
+    from eitbench.worlds.world import World
+
+SPARSE = ("data", "indices", "indptr")
+"""Arrays that hold a sparse matrix."""
 
 
 class Outline(NamedTuple):
-    """What all episodes of a scenario have in common, as far as playing and scoring need it."""
+    """What all episodes of a world have in common, as far as playing and scoring need it."""
 
     mass: sp.csr_array
     """(n, n) upper triangle of M̃ in m² (m³ in 3D), entries beside the diagonal doubled: ĉᵀ·mass·ĉ = ĉᵀ M̃ ĉ."""
@@ -36,7 +42,7 @@ class Outline(NamedTuple):
     """V, of the cycle's injections into liquid of the expected concentration."""
 
 
-def recording(scenario: Scenario, seed: int) -> np.ndarray:
+def recording(world: World, seed: int) -> np.ndarray:
     """The recording of an episode, from the cache if it is there; else it is simulated.
 
     Returns
@@ -53,37 +59,37 @@ def recording(scenario: Scenario, seed: int) -> np.ndarray:
     ``checksum``             of all these bytes
     """
     seed = _check.integer("seed", seed, low=0)
-    path = recording_path(scenario, seed)
-    stored = _load(scenario, seed)
+    path = recording_path(world, seed)
+    stored = _load(world, seed)
     if stored is None:
-        stored = make_recording(scenario, seed, simulate(scenario, seed))
+        stored = make_recording(world, seed, simulate(world, seed))
         try:
             store_recording(path, stored)
         except OSError as error:
-            warn_not_kept(path.parent, error)
+            store.warn_not_kept(path.parent, error)
     return stored
 
 
-def recording_path(scenario: Scenario, seed: int) -> Path:
+def recording_path(world: World, seed: int) -> Path:
     """Where the recording of an episode is kept."""
-    return folder(scenario) / f"{seed}.npy"
+    return store.folder(world) / f"{seed}.npy"
 
 
-def is_recorded(scenario: Scenario, seed: int) -> bool:
+def is_recorded(world: World, seed: int) -> bool:
     """Whether a sound recording is there."""
-    return _load(scenario, seed) is not None
+    return _load(world, seed) is not None
 
 
-def make_recording(scenario: Scenario, seed: int, episode: Episode) -> np.ndarray:
+def make_recording(world: World, seed: int, episode: Episode) -> np.ndarray:
     """The recording of ``episode``, which `simulate` gives for this seed."""
-    interpolation, mass = score_operators(scenario)
+    interpolation, mass = score_operators(world)
     c = episode.concentration[1:].astype(float)
-    deviation = c - scenario.background
+    deviation = c - world.background
     weighted = mass @ deviation.T
-    n_steps = len(episode.noise)
-    velocity = scenario.velocity_model
-    entries = np.zeros(n_steps, recording_type(scenario, interpolation.shape[1]))
-    entries["transfer_resistance"], entries["noise"] = episode.transfer_resistance, episode.noise
+    velocity = world.velocity_model
+    entries = np.zeros(len(episode.noise), recording_type(world, interpolation.shape[1]))
+    entries["transfer_resistance"] = episode.transfer_resistance
+    entries["noise"] = episode.noise
     entries["moment"] = (interpolation.T @ weighted).T
     entries["deviation"] = np.einsum("tn,nt->t", deviation, weighted)
     entries["square"] = np.einsum("tn,nt->t", c, mass @ c.T)
@@ -102,55 +108,71 @@ def store_recording(path: Path, entries: np.ndarray) -> None:
     write_atomically(path, content.getvalue())
 
 
-def recording_type(scenario: Scenario, n_nodes: int) -> np.dtype:
+def recording_type(world: World, n_nodes: int) -> np.dtype:
     """Of one step of a recording with so many nodes in the estimators' mesh."""
-    n_electrodes, velocity = scenario.currents.shape[1], scenario.velocity_model
+    n_electrodes = world.vessel.n_electrodes
+    velocity = world.velocity_model
     flow = [] if velocity is None else [("velocity_moment", "<f8", (velocity.size,)), ("velocity_square", "<f8")]
     return np.dtype([("transfer_resistance", "<f8", (n_electrodes, n_electrodes)), ("noise", "<f8", (n_electrodes,)),
                      ("moment", "<f4", (n_nodes,)), ("deviation", "<f8"), ("square", "<f8"), *flow,
                      ("checksum", "<u4")])
 
 
+def outline(world: World) -> Outline:
+    """The outline of a world, from the cache if it is there."""
+    return _outline(world.fluid)
+
+
 @lru_cache(maxsize=4)
-def outline(scenario: Scenario) -> Outline:
-    """The outline of a scenario, from the cache if it is there."""
+def _outline(fluid: World) -> Outline:
+    def make() -> dict[str, np.ndarray]:
+        interpolation, mass = score_operators(fluid)
+        half = doubled_triangle(interpolation.T @ mass @ interpolation)
+        level = np.full(half.shape[0], fluid.expected_concentration)
+        largest = np.abs(fluid.model().observation.voltages(level, fluid.currents)).max()
+        return {name: getattr(half, name) for name in SPARSE} | {"largest": np.array(largest)}
+
+    stored = store.kept(store.folder(fluid) / "outline.npz", (*SPARSE, "largest"), make)
+    return Outline(sparse_of(stored), float(stored["largest"]))
+
+
+def doubled_triangle(full: sp.csr_array) -> sp.csr_array:
+    """The upper triangle of a symmetric matrix, its entries beside the diagonal doubled."""
     import scipy.sparse as sp
-    path = folder(scenario) / "outline.npz"
-    stored = _load_outline(path)
-    if stored is None:
-        interpolation, mass = score_operators(scenario)
-        full = sp.csr_array(interpolation.T @ mass @ interpolation)
-        half = sp.csr_array(sp.triu(full) + sp.triu(full, 1))
-        n_nodes, model = full.shape[0], scenario.model()
-        level = np.full(n_nodes, scenario.expected_concentration)
-        largest = np.abs(model.observation.voltages(level, scenario.currents)).max()
-        arrays = (half.data, half.indices, half.indptr, np.array(largest))
-        content = io.BytesIO()
-        np.savez(content, *arrays, checksum=zlib.crc32(b"".join(array.tobytes() for array in arrays)))
-        try:
-            write_atomically(path, content.getvalue())
-        except OSError as error:
-            warn_not_kept(path.parent, error)
-        stored = half.data, half.indices, half.indptr, largest
-    data, indices, indptr, largest = stored
-    data.setflags(write=False)                             # shared by all environments
-    return Outline(sp.csr_array((data, indices, indptr), shape=(len(indptr) - 1,) * 2), float(largest))
+    return sp.csr_array(sp.triu(full) + sp.triu(full, 1))
+
+
+def sparse_of(arrays: dict[str, np.ndarray] | store.Mapping[str, np.ndarray]) -> sp.csr_array:
+    """The square matrix that `SPARSE` arrays hold; read-only, since all environments share it."""
+    import scipy.sparse as sp
+    data, indices, indptr = (arrays[name] for name in SPARSE)
+    data.setflags(write=False)
+    return sp.csr_array((data, indices, indptr), shape=(len(indptr) - 1,) * 2)
+
+
+def score_operators(world: World) -> tuple[sp.csr_array, sp.csr_array]:
+    """(interpolation from the model's CD mesh to the truth's, the truth's mass matrix)."""
+    return _score_operators(world.fluid)
 
 
 @lru_cache(maxsize=2)
-def score_operators(scenario: Scenario) -> tuple[sp.csr_array, sp.csr_array]:
-    """(interpolation from the model's CD mesh to the truth's, the truth's mass matrix)."""
+def _score_operators(fluid: World) -> tuple[sp.csr_array, sp.csr_array]:
     from eitbench.numerics.fem import mass_matrix
-    truth = truth_discretisation(scenario).transport.mesh
-    return scenario.model().transport.mesh.interpolation_to(truth.points), mass_matrix(truth)
+    truth = truth_discretisation(fluid).transport.mesh
+    return fluid.vessel.carrier(fine=False)[0].interpolation_to(truth.points), mass_matrix(truth)
 
 
-def cycle_voltages(scenario: Scenario, entries: np.ndarray) -> np.ndarray:
-    """(T, L) noisy voltages in V of the scenario's injection cycle."""
-    cycle = scenario.currents
-    currents = cycle[np.arange(len(entries)) % len(cycle)]
-    clean = np.einsum("tml,tl->tm", entries["transfer_resistance"], currents)
-    return clean + scenario.noise.std(clean) * entries["noise"]
+def faults_of(world: World, seed: int) -> Faults:
+    """What is wrong with the instrument in an episode."""
+    return world.instrument.draw(randomness(seed).faults, world.vessel.n_electrodes, world.n_steps)
+
+
+def cycle_voltages(world: World, seed: int, entries: np.ndarray) -> np.ndarray:
+    """(T, L) noisy voltages in V of the world's injection cycle in the episode of this seed."""
+    cycle = world.currents
+    steps = np.arange(len(entries))
+    return world.instrument.measure(faults_of(world, seed), steps + 1, entries["transfer_resistance"],
+                                    cycle[steps % len(cycle)], entries["noise"])
 
 
 def step_error(mass: sp.csr_array, estimate: np.ndarray, moment: np.ndarray, deviation: np.ndarray | float,
@@ -173,8 +195,9 @@ _sound: dict[Path, tuple[int, int]] = {}
 """Files this process has read whole and found in order: size and time of change."""
 
 
-def _load(scenario: Scenario, seed: int) -> np.ndarray | None:
-    path, (kind, header, length) = recording_path(scenario, seed), _layout(scenario)
+def _load(world: World, seed: int) -> np.ndarray | None:
+    path = recording_path(world, seed)
+    kind, header, length = _layout(world.fluid)
     try:
         status = os.stat(path)
         entries = np.asarray(np.memmap(path, kind, "r", len(header), (length,)))
@@ -189,24 +212,15 @@ def _load(scenario: Scenario, seed: int) -> np.ndarray | None:
 
 
 @lru_cache(maxsize=16)
-def _layout(scenario: Scenario) -> tuple[np.dtype, bytes, int]:
+def _layout(fluid: World) -> tuple[np.dtype, bytes, int]:
     """Of a recording's file: the type of a step, what numpy writes before the first, and their number."""
-    kind, content = recording_type(scenario, outline(scenario).mass.shape[0]), io.BytesIO()
-    np.save(content, np.zeros(scenario.n_steps, kind))
-    return kind, content.getvalue()[:-scenario.n_steps * kind.itemsize], scenario.n_steps
+    kind = recording_type(fluid, outline(fluid).mass.shape[0])
+    content = io.BytesIO()
+    np.save(content, np.zeros(fluid.n_steps, kind))
+    return kind, content.getvalue()[:-fluid.n_steps * kind.itemsize], fluid.n_steps
 
 
 def _checksums(entries: np.ndarray, seed: int) -> np.ndarray:
     """Of each step's bytes, and of the seed: a file under another's name is not believed."""
     raw = np.ascontiguousarray(entries).view(np.uint8).reshape(len(entries), -1)[:, :-4]
     return np.array([zlib.crc32(row.data, seed) for row in raw], dtype=np.uint32)
-
-
-def _load_outline(path: Path) -> tuple | None:
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            arrays = tuple(stored[f"arr_{k}"] for k in range(4))
-            sound = int(stored["checksum"]) == zlib.crc32(b"".join(array.tobytes() for array in arrays))
-            return arrays if sound else None
-    except Exception:       # a damaged archive may raise anything
-        return None

@@ -9,17 +9,20 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from gymnasium.utils import EzPickle
 
 from eitbench import _check
 from eitbench.data.recordings import cycle_voltages, outline, recording, step_error, velocity_error
-from eitbench.worlds.base import Discretisation
+from eitbench.data.regions import integrals, score_mass
+from eitbench.worlds.registry import entry
+from eitbench.worlds.streams import randomness
 from eitbench.worlds.task import Task, lag_steps, make_task
+from eitbench.worlds.world import Discretisation, World
 
 if TYPE_CHECKING:
     from eitbench.data.episodes import Episode
     from eitbench.numerics.mesh import Mesh
-    from eitbench.physics.transport import ConvectionDiffusion
-    from eitbench.worlds.base import Scenario
+    from eitbench.physics.transport import Transport
 
 Observation = dict[str, np.ndarray]
 
@@ -31,14 +34,14 @@ class Revealed(NamedTuple):
     """(T, L) V, the whole record"""
     currents: np.ndarray
     """(T, L) A (A/m in 2D)"""
-    transport: Callable[[int], ConvectionDiffusion]
+    transport: Callable[[int], Transport]
     """t = 1 … T -> the model, on the task's mesh, with the flow that there really is from t − 1 to t"""
     velocity: np.ndarray
     """(T, p) axial velocity in m/s at `VelocityModel.points`; p = 0 where the flow is not asked for"""
 
 
-class EstimationEnv(gym.Env[Observation, np.ndarray]):
-    """One episode of a scenario, seen through its voltages; the action is the estimate.
+class EstimationEnv(gym.Env[Observation, np.ndarray], EzPickle):
+    """One episode of a world, seen through its voltages; the action is the estimate.
 
     At step i = 1, 2, … the agent has seen the measurements up to min(i, T) and says what it thinks of the state
     t = i − lag. Steps with t < 1 ask for nothing (the action is ignored); after the T-th measurement voltages and
@@ -49,11 +52,14 @@ class EstimationEnv(gym.Env[Observation, np.ndarray]):
 
     Parameters
     ----------
-    scenario : Scenario
-    lag : int or "all"
-        See `Task`.
-    assumptions : dict, optional
-        What the task's model wrongly believes; see `make_task`.
+    name : str
+        A registered id; `eitbench.worlds.register`.
+    world : dict, optional
+        Numbers of the world's parts to change, as in ``{"instrument": {"noise_relative": 0.02}}``; see `World.changed`.
+    lag : int or "all", optional
+        See `Task`; default: that of the id.
+    assume : dict, optional
+        What the task's model wrongly believes of the flow; see `World.model`.
     episodes : int
         How many training episodes an unseeded ``reset`` draws from.
     render_mode : None or "rgb_array"
@@ -61,40 +67,37 @@ class EstimationEnv(gym.Env[Observation, np.ndarray]):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 8}  # noqa: RUF012 (gymnasium's own form)
 
-    def __init__(self, scenario: Scenario, *, lag: int | str = 0, assumptions: dict[str, Any] | None = None,
-                 episodes: int = 1000, render_mode: str | None = None) -> None:
+    def __init__(self, name: str, *, world: dict[str, Any] | None = None, lag: int | str | None = None,
+                 assume: dict[str, Any] | None = None, episodes: int = 1000, render_mode: str | None = None) -> None:
+        EzPickle.__init__(self, name, world=world, lag=lag, assume=assume, episodes=episodes, render_mode=render_mode)
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode must be None or one of {self.metadata['render_modes']}, got {render_mode!r}")
         self.render_mode = render_mode
         self.episodes = _check.integer("episodes", episodes, low=1)
         self.spread: np.ndarray | None = None
         """(n,) standard deviation in mol/m³ to draw beside the estimate, for whoever has one."""
-        self.scenario = scenario
-        """The world played; estimators are given `task` instead."""
-        self.lag = lag_steps(scenario, lag)
-        """See `Task`."""
-        self._assumptions = assumptions or {}
-        self._currents = cycle_currents(scenario, self.lag)
+        self.world, self.lag, self._assumed = asked_for(name, world, lag, assume)
+        self._currents = cycle_currents(self.world, self.lag)
         self.observation_space: spaces.Dict  # type: ignore[assignment]
-        self.observation_space, self.action_space = estimation_spaces(scenario)
-        self._n_nodes = outline(scenario).mass.shape[0]
+        self.observation_space, self.action_space = estimation_spaces(self.world)
+        self._n_nodes = outline(self.world).mass.shape[0]
         self._seed: int | None = None
         self._step = 0
 
     @cached_property
     def task(self) -> Task:
         """What the agent may know; its models are built on first use, since playing needs none of them."""
-        return make_task(self.scenario, self.lag, **self._assumptions)
+        return make_task(self.world, self.lag, **self._assumed)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None,
               ) -> tuple[Observation, dict[str, Any]]:
         """Begin the episode with this seed (see `eitbench.data.seeds`), or without one a random training episode."""
         super().reset(seed=seed)
         self._seed = int(self.np_random.integers(self.episodes)) if seed is None else seed
-        self._entries = recording(self.scenario, self._seed)
-        self._moments = self._entries["moment"]
+        self._entries = recording(self.world, self._seed)
+        self._integrals = integrals(self.world, self._seed)
         self._voltages = np.zeros_like(self._currents)
-        self._voltages[:self.scenario.n_steps] = cycle_voltages(self.scenario, self._entries)
+        self._voltages[:self.world.n_steps] = cycle_voltages(self.world, self._seed, self._entries)
         self._step = 1
         self.spread = None
         self._last: np.ndarray | None = None
@@ -105,7 +108,7 @@ class EstimationEnv(gym.Env[Observation, np.ndarray]):
 
         ``ValueError`` if it is not in the action space.
         """
-        last_step = self.scenario.n_steps + self.lag
+        last_step = self.world.n_steps + self.lag
         if self._seed is None or self._step > last_step:
             raise gym.error.ResetNeeded("call reset() before step(), and again when an episode has ended")
         action = checked_actions(action, self.action_space, self._n_nodes)  # type: ignore[arg-type]
@@ -114,11 +117,13 @@ class EstimationEnv(gym.Env[Observation, np.ndarray]):
         reward = 0.0
         if t >= 1:
             self._last = estimate.copy()
-        if t > self.scenario.warm_up:
-            entry, velocity = self._entries[t - 1], self.scenario.velocity_model
-            reward = -float(step_error(outline(self.scenario).mass, estimate - self.scenario.background,
-                                       self._moments[t - 1], entry["deviation"], entry["square"]))
+        if t > self.world.warm_up:
+            moments, deviations, squares = self._integrals
+            reward = -float(step_error(score_mass(self.world), estimate - self.world.background, moments[t - 1],
+                                       deviations[t - 1], squares[t - 1]))
+            velocity = self.world.velocity_model
             if velocity is not None:
+                entry = self._entries[t - 1]
                 reward -= float(velocity_error(velocity, parameters, entry["velocity_moment"],
                                                entry["velocity_square"]))
         self._step += 1
@@ -130,12 +135,12 @@ class EstimationEnv(gym.Env[Observation, np.ndarray]):
             gym.logger.warn("render() needs gym.make(..., render_mode='rgb_array')")
             return None
         from eitbench.envs.rendering import draw_frame
-        t = min(max(self._step - 1 - self.lag, 0), self.scenario.n_steps)
+        t = min(max(self._step - 1 - self.lag, 0), self.world.n_steps)
         concentration = self._episode("render").concentration[t]
         level = np.full(self.task.mesh.n_nodes, self.task.expected_concentration)
         return draw_frame(self.task, self.truth_mesh(), concentration, level if self._last is None else self._last,
                           self.spread, self._currents[t - 1] if t else np.zeros_like(self._currents[0]),
-                          t * self.scenario.time_step)
+                          t * self.world.time_step)
 
     def truth(self) -> np.ndarray:
         """(T, n_truth) concentration in mol/m³ of this episode, t = 1 … T; for scoring, never for agents."""
@@ -147,24 +152,24 @@ class EstimationEnv(gym.Env[Observation, np.ndarray]):
 
     def reveal(self) -> Revealed:
         """This episode's record and flow; for references, never for agents."""
-        from eitbench.data.episodes import randomness
         if self._seed is None:
             raise gym.error.ResetNeeded("call reset() before reveal()")
-        n_steps, told_nothing_wrong = self.scenario.n_steps, make_task(self.scenario, self.lag)
+        n_steps = self.world.n_steps
+        told_nothing_wrong = make_task(self.world, self.lag)
         model = Discretisation(told_nothing_wrong.transport, told_nothing_wrong.observation)
         return Revealed(self._voltages[:n_steps].copy(), self._currents[:n_steps].copy(),
-                        self.scenario.true_transport(model, randomness(self._seed).flow), self.true_velocity().copy())
+                        self.world.true_transport(model, randomness(self._seed).flow), self.true_velocity().copy())
 
     def truth_mesh(self) -> Mesh:
         """The mesh of `truth`."""
         from eitbench.data.episodes import truth_discretisation
-        return truth_discretisation(self.scenario).transport.mesh
+        return truth_discretisation(self.world).transport.mesh
 
     def _episode(self, asked_by: str) -> Episode:
         from eitbench.data.episodes import simulate
         if self._seed is None:
             raise gym.error.ResetNeeded(f"call reset() before {asked_by}()")
-        return simulate(self.scenario, self._seed)
+        return simulate(self.world, self._seed)
 
     def _observe(self) -> Observation:
         if self._step > len(self._voltages):
@@ -172,24 +177,37 @@ class EstimationEnv(gym.Env[Observation, np.ndarray]):
         return {"voltages": self._voltages[self._step - 1].copy(), "currents": self._currents[self._step - 1].copy()}
 
 
-def estimation_spaces(scenario: Scenario) -> tuple[spaces.Dict, spaces.Box]:
+def asked_for(name: str, changes: dict[str, Any] | None, lag: int | str | None,
+              assumed: dict[str, Any] | None) -> tuple[World, int, dict[str, Any]]:
+    """The world, the lag, and what models believe, of an id and the arguments given for it; ``ValueError`` if one of
+    them is not allowed."""
+    registered = entry(name)
+    world = registered.world.changed(changes)
+    if lag is None:
+        lag = registered.settings.get("lag", 0)
+    believed = dict(registered.settings.get("assume", {}) if assumed is None else assumed)
+    world.flow.check_assumed(world, believed)
+    return world, lag_steps(world, lag), believed
+
+
+def estimation_spaces(world: World) -> tuple[spaces.Dict, spaces.Box]:
     """What one environment shows and takes."""
-    stage, level = outline(scenario), scenario.expected_concentration
-    largest_voltage, largest_current = 100.0 * stage.largest_voltage, np.abs(scenario.currents).max()
-    shape = scenario.currents.shape[1:]
+    stage, level = outline(world), world.expected_concentration
+    largest_voltage, largest_current = 100.0 * stage.largest_voltage, np.abs(world.currents).max()
+    shape = world.currents.shape[1:]
     observed = spaces.Dict({"voltages": spaces.Box(-largest_voltage, largest_voltage, shape, np.float64),
                             "currents": spaces.Box(-largest_current, largest_current, shape, np.float64)})
-    limit, velocity = np.full(stage.mass.shape[0], 10.0 * level), scenario.velocity_model
+    limit, velocity = np.full(stage.mass.shape[0], 10.0 * level), world.velocity_model
     if velocity is not None:
         limit = np.append(limit, np.full(velocity.size, 10.0 * max(velocity.nominal)))
     return observed, spaces.Box(-limit, limit, dtype=np.float64)
 
 
-def cycle_currents(scenario: Scenario, lag: int) -> np.ndarray:
+def cycle_currents(world: World, lag: int) -> np.ndarray:
     """(T + lag, L) currents of every step: the cycle, then none."""
-    cycle = scenario.currents
-    currents = np.zeros((scenario.n_steps + lag, cycle.shape[1]))
-    currents[:scenario.n_steps] = cycle[np.arange(scenario.n_steps) % len(cycle)]
+    cycle = world.currents
+    currents = np.zeros((world.n_steps + lag, cycle.shape[1]))
+    currents[:world.n_steps] = cycle[np.arange(world.n_steps) % len(cycle)]
     return currents
 
 

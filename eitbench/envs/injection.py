@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from gymnasium.utils import EzPickle
 
 from eitbench import _check
-from eitbench.data.regions import region_of
 from eitbench.envs.injection_core import FURTHEST, InjectionCore, Rules, scaled
 from eitbench.envs.lockstep import LockstepVectorEnv
+from eitbench.worlds.registry import entry
 from eitbench.worlds.task import Task, make_task
 
 if TYPE_CHECKING:
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 OBSERVATIONS = ("scaled", "raw")
 
 
-class InjectionEnv(gym.Env[Any, Any]):
+class InjectionEnv(gym.Env[Any, Any], EzPickle):
     """One episode in which the agent chooses every injection.
 
     The reward is, for scored states, by how much the estimate's relative error ∫(ĉ_t − c_t)² / ∫c_t² lies below that of
@@ -30,14 +31,20 @@ class InjectionEnv(gym.Env[Any, Any]):
 
     Parameters
     ----------
-    rules : Rules
+    name : str
+        A registered id; `eitbench.worlds.register`.
+    world : dict, optional
+        Numbers of the world's parts to change, as in ``{"schedule": {"budget": 20}}``; see `World.changed`.
     estimator : "reduced", "full" or "none"
         "reduced": a Kalman filter of reduced order, for training. "full": the exact one, for scores. The first frame
-        is measured with the scenario's own cycle, from which ĉ_bh and the filter's parameters follow; the agent takes
+        is measured with the world's own cycle, from which ĉ_bh and the filter's parameters follow; the agent takes
         over after it. "none": the agent chooses all injections, sees noisy voltages, and is paid nothing: for
         estimators and rewards of one's own.
     observation : "scaled" or "raw"
         One array with entries of about −1 to 1 (`scaled`), or a dict in SI units.
+    gate : float, optional
+        The filter leaves out readings further from its prediction than so many standard deviations; default: as the id
+        says, or none.
     episodes : int
         How many training episodes an unseeded ``reset`` draws from.
     render_mode : "rgb_array" or None
@@ -45,14 +52,18 @@ class InjectionEnv(gym.Env[Any, Any]):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 8}  # noqa: RUF012 (gymnasium's own form)
 
-    def __init__(self, rules: Rules, *, estimator: str = "reduced", observation: str = "scaled", episodes: int = 1000,
+    def __init__(self, name: str, *, world: dict[str, Any] | None = None, estimator: str = "reduced",
+                 observation: str = "scaled", gate: float | None = None, episodes: int = 1000,
                  render_mode: str | None = None) -> None:
+        EzPickle.__init__(self, name, world=world, estimator=estimator, observation=observation, gate=gate,
+                          episodes=episodes, render_mode=render_mode)
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be 'rgb_array' or None, got {render_mode!r}")
         self.render_mode = render_mode
         self.episodes = _check.integer("episodes", episodes, low=1)
-        self.rules, self.scenario = rules, rules.scenario
-        self._core = InjectionCore(rules, estimator)
+        self.rules = asked_for(name, world, gate, estimator)
+        self.world = self.rules.world
+        self._core = InjectionCore(self.rules, estimator)
         self._scaled = check_observation(observation, estimator)
         self.observation_space, self.action_space = spaces_of(self._core, self._scaled)
         self._step, self._seed = 0, -1
@@ -60,7 +71,7 @@ class InjectionEnv(gym.Env[Any, Any]):
     @cached_property
     def task(self) -> Task:
         """What an estimator of one's own may know; built on first use."""
-        return make_task(self.scenario)
+        return make_task(self.world)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin the episode with this seed (see `eitbench.data.seeds`), or without one a random training episode."""
@@ -92,9 +103,9 @@ class InjectionEnv(gym.Env[Any, Any]):
         from eitbench.data.episodes import simulate, truth_discretisation
         from eitbench.envs.rendering import draw_frame
         mean, spread, t = *self._core.estimate(), self._core.first + self._step - 1
-        truth = simulate(self.scenario, self._seed).concentration[t].astype(float)
-        return draw_frame(self.task, truth_discretisation(self.scenario).transport.mesh, truth, mean[0], spread[0],
-                          self._core.last_currents[0], t * self.scenario.time_step, region_of(self.scenario))
+        truth = simulate(self.world, self._seed).concentration[t].astype(float)
+        return draw_frame(self.task, truth_discretisation(self.world).transport.mesh, truth, mean[0], spread[0],
+                          self._core.last_currents[0], t * self.world.time_step, self.world.region)
 
     def action_masks(self) -> np.ndarray:
         """(actions,) which numbered actions do something: with the budget spent only the last, no injection."""
@@ -107,12 +118,21 @@ class InjectionEnv(gym.Env[Any, Any]):
 
     @property
     def error(self) -> float | None:
-        """Relative error (5.12) of the present estimate; None if this state is not scored."""
-        return float(self._core.errors()[0]) if self._core.t > self.scenario.warm_up else None
+        """Relative error (5.12) of the present estimate; None if this state is not scored, or nothing estimates."""
+        error = float(self._core.errors()[0])
+        return None if np.isnan(error) else error
 
     def _observe(self) -> Any:
         seen = {name: array[0] for name, array in self._core.observe().items()}
         return scaled(self.rules, seen) if self._scaled else seen
+
+
+def asked_for(name: str, changes: dict[str, Any] | None, gate: float | None, estimator: str) -> Rules:
+    """The rules of an id and the arguments given for it; ``ValueError`` if one of them is not allowed."""
+    registered = entry(name)
+    if gate is None:
+        gate = registered.settings.get("gate", np.inf)
+    return Rules(registered.world.changed(changes), gate, has_frame=estimator != "none")
 
 
 def check_observation(observation: str, estimator: str) -> bool:
@@ -140,10 +160,13 @@ class InjectionVectorEnv(LockstepVectorEnv):
         How many cores the estimators may use; give BLAS one thread then. The numbers do not depend on it.
     """
 
-    def __init__(self, rules: Rules, num_envs: int, *, estimator: str = "reduced", observation: str = "scaled",
+    def __init__(self, name: str, *, num_envs: int = 1, world: dict[str, Any] | None = None,
+                 estimator: str = "reduced", observation: str = "scaled", gate: float | None = None,
                  episodes: int = 1000, threads: int = 1) -> None:
         super().__init__(num_envs, episodes)
-        self.rules, self.scenario, threads = rules, rules.scenario, _check.integer("threads", threads, low=1)
+        threads = _check.integer("threads", threads, low=1)
+        self.rules = rules = asked_for(name, world, gate, estimator)
+        self.world = rules.world
         # The covariances of sixteen filters stay within a core's own memory.
         size = num_envs if estimator == "none" else max(1, min(16, -(-num_envs // threads)))
         self._parts = [slice(first, first + size) for first in range(0, num_envs, size)]

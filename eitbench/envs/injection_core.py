@@ -3,32 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium import spaces
 
 from eitbench import _check
-from eitbench.data.recordings import outline, recording
+from eitbench.data.recordings import faults_of, outline, recording
 from eitbench.data.regions import integrals, score_mass
 from eitbench.estimation.onboard.console import Console
 from eitbench.estimation.onboard.joint_operator import JointFullOperator, JointReducedOperator
-from eitbench.estimation.onboard.operator import PATCHES, FullOperator, Operator, electrode_pairs, pair_currents
+from eitbench.estimation.onboard.operator import FullOperator, Operator, electrode_pairs, pair_currents
 from eitbench.estimation.onboard.reduced_operator import ReducedOperator
 from eitbench.worlds.instrument import Faults, Instrument
 
 if TYPE_CHECKING:
     from eitbench.envs.estimation import Observation
-    from eitbench.worlds.base import Scenario
+    from eitbench.worlds.world import World
 
 FURTHEST = 5.0
 """Largest entry of a scaled observation."""
 OPERATORS: dict[str, tuple[type[Operator], type[Operator]] | None] = {
     "reduced": (ReducedOperator, JointReducedOperator), "full": (FullOperator, JointFullOperator), "none": None}
 """Estimators by name: where the flow is known, and where its mean velocity is to be estimated too."""
-LIMITS = ("L1", "L2", "Linf")
-"""Norms that may bound the currents."""
 RECENT = 4
 """Injections that an observation remembers."""
 
@@ -39,65 +37,72 @@ class Rules:
 
     Parameters
     ----------
-    scenario : Scenario
-    instrument : Instrument
-    limit : str or None
-        None: an action is the number of an electrode pair. "L1", "L2" or "Linf": it is L currents in parts of the
-        scenario's, of which the mean is taken away, and which are scaled down to the norm of a pair if they exceed it.
-    budget : int or None
-        How many injections the agent may make in an episode, where it may also inject nothing.
+    world : World
+        Its instrument's ``limit`` says whether an action is the number of an electrode pair (None), or L currents in
+        parts of the instrument's, of which the mean is taken away, and which are scaled down to the norm of a pair if
+        they exceed it. Its schedule's ``budget`` says how many injections the agent may make in an episode, where it
+        may also inject nothing.
     gate : float
         The estimator leaves out readings further from the prediction than this many standard deviations.
+    has_frame : bool
+        Whether the first frame is measured before the agent's first injection.
     """
 
-    scenario: Scenario
-    instrument: Instrument = field(default_factory=Instrument)
-    limit: str | None = None
-    budget: int | None = None
+    world: World
     gate: float = np.inf
+    has_frame: bool = True
 
     def __post_init__(self) -> None:
-        if self.limit is not None and self.limit not in LIMITS:
-            raise ValueError(f"limit must be one of {', '.join(LIMITS)}, got {self.limit!r}")
-        if self.budget is not None:
-            _check.integer("budget", self.budget, low=0)
         _check.number("gate", min(self.gate, 1e300), low=0.0, open_low=True)
-        most, L = self.instrument.most, self.scenario.currents.shape[1]
-        if most > L - 2:
-            raise ValueError(f"dead, failing and loose must leave two electrodes sound, got up to {most} of {L}")
+
+    @property
+    def instrument(self) -> Instrument:
+        """The world's."""
+        return self.world.instrument
+
+    @property
+    def limit(self) -> str | None:
+        """Norm that bounds the currents, or None: actions are numbers of pairs."""
+        return self.world.instrument.limit
+
+    @property
+    def budget(self) -> int | None:
+        """Injections that the agent may make, or None: it injects at every step."""
+        return self.world.schedule.budget
 
     @property
     def pairs(self) -> np.ndarray:
         """(pairs, 2) electrodes where the current of each numbered action enters and leaves."""
-        return electrode_pairs(self.scenario.currents.shape[1])
+        return electrode_pairs(self.world.currents.shape[1])
 
     @property
     def amplitude(self) -> float:
         """A (A/m in 2D); of a pair's current."""
-        return float(np.abs(self.scenario.currents).max())
+        return float(np.abs(self.world.currents).max())
 
     @property
     def table(self) -> np.ndarray:
         """(actions, L) currents of each numbered action; the last is no current, where there is a budget."""
-        pairs = pair_currents(self.scenario)
+        pairs = pair_currents(self.world)
         return pairs if self.budget is None else np.concatenate([pairs, np.zeros((1, pairs.shape[1]))])
 
     @property
     def action_space(self) -> spaces.Discrete | spaces.Box:
         if self.limit is None:
             return spaces.Discrete(len(self.pairs) + (self.budget is not None))
-        return spaces.Box(-1.0, 1.0, self.scenario.currents.shape[1:], np.float32)
+        return spaces.Box(-1.0, 1.0, self.world.currents.shape[1:], np.float32)
 
     @property
-    def world(self) -> str:
-        """What was found by search is kept under: the scenario's name, and whether there are faults or a budget."""
-        faults, budget = " with faults" * (self.instrument.most > 0), " with a budget" * (self.budget is not None)
-        return type(self.scenario).__name__ + faults + budget
+    def name(self) -> str:
+        """What was found by search is kept under: the world's name, and whether there are faults or a budget."""
+        faults = " with faults" * (self.instrument.most > 0)
+        budget = " with a budget" * (self.budget is not None)
+        return self.world.name + faults + budget
 
     def action(self, pair: int | None) -> Any:
         """The action that injects the pair of this number, or nothing (None, which needs a budget or currents)."""
         if self.limit is not None:
-            currents = np.zeros(self.scenario.currents.shape[1], dtype=np.float32)
+            currents = np.zeros(self.world.currents.shape[1], dtype=np.float32)
             if pair is not None:
                 currents[self.pairs[pair]] = 1.0, -1.0
             return currents
@@ -108,11 +113,11 @@ class Rules:
     def spaced(self, left: np.ndarray) -> bool:
         """Whether a budget that is spread evenly is spent at this step; ``left`` as observed. Always without a budget.
 
-        The first frame has just been measured, so that the first injection comes at the end of its interval.
+        The first injection comes at the end of its interval.
         """
         if self.budget is None:
             return True
-        steps = self.scenario.n_steps - len(self.scenario.currents)
+        steps = self.world.n_steps - self.has_frame * len(self.world.currents)
         k = steps - int(left[0])
         return (k + 1) * self.budget // steps > k * self.budget // steps
 
@@ -128,12 +133,12 @@ class Rules:
         return self.amplitude * free * (pair / np.maximum(size, pair))
 
 
-def operator_type(scenario: Scenario, estimator: str) -> type[Operator] | None:
-    """The estimator of this name for a scenario; ``ValueError`` if there is none."""
+def operator_type(world: World, estimator: str) -> type[Operator] | None:
+    """The estimator of this name for a world; ``ValueError`` if there is none."""
     if estimator not in OPERATORS:
         raise ValueError(f"estimator must be one of {', '.join(OPERATORS)}, got {estimator!r}")
     known = OPERATORS[estimator]
-    return None if known is None else known[scenario.velocity_model is not None]
+    return None if known is None else known[world.velocity_model is not None]
 
 
 def scaled(rules: Rules, observation: Observation) -> np.ndarray:
@@ -143,13 +148,13 @@ def scaled(rules: Rules, observation: Observation) -> np.ndarray:
     flow is estimated its velocity and that one's std; all as in the raw observation but for the scale, the first frame
     left out.
     """
-    scenario, level = rules.scenario, rules.scenario.expected_concentration
-    left = np.array([scenario.n_steps, rules.budget or 1][:observation["left"].shape[-1]])
-    parts = [observation["voltages"] / outline(scenario).largest_voltage, observation["recent"] / rules.amplitude,
+    world, level = rules.world, rules.world.expected_concentration
+    left = np.array([world.n_steps, rules.budget or 1][:observation["left"].shape[-1]])
+    parts = [observation["voltages"] / outline(world).largest_voltage, observation["recent"] / rules.amplitude,
              observation["innovations"] / 3.0, 2.0 * (observation["mean"] / level - 1.0),
-             observation["std"] / (scenario.prior.inflow_std * level), observation["doubt"], observation["left"] / left]
-    if scenario.velocity_model is not None:
-        flow = scenario.velocity_model
+             observation["std"] / (world.prior.inflow_std * level), observation["doubt"], observation["left"] / left]
+    if world.velocity_model is not None:
+        flow = world.velocity_model
         parts += [2.0 * (observation["velocity"] / flow.nominal - 1.0), observation["velocity_std"] / flow.initial_std]
     batch = observation["voltages"].shape[:-1]
     flat = np.concatenate([part.reshape(*batch, -1) for part in parts], axis=-1)
@@ -167,40 +172,41 @@ class InjectionCore:
     """
 
     def __init__(self, rules: Rules, estimator: str) -> None:
-        self.rules, self.scenario = rules, rules.scenario
-        self._operator_type = operator_type(rules.scenario, estimator)
+        self.rules, self.world = rules, rules.world
+        self._operator_type = operator_type(rules.world, estimator)
         self._table = rules.table if rules.limit is None else None
-        self.first = len(self.scenario.currents) if self._operator_type else 0
-        """Injections of the scenario's cycle before the agent's first."""
-        self.length = self.scenario.n_steps - self.first
+        self.first = len(self.world.currents) if self._operator_type else 0
+        """Injections of the world's cycle before the agent's first."""
+        self.length = self.world.n_steps - self.first
 
     def space(self) -> spaces.Dict:
         """What one environment shows, in SI units."""
-        scenario, rules = self.scenario, self.rules
-        L, level = scenario.currents.shape[1], scenario.expected_concentration
-        largest, current = 1e3 * outline(scenario).largest_voltage, 1.5 * rules.amplitude      # "L2" goes up to √2
+        world, rules = self.world, self.rules
+        L, level = world.currents.shape[1], world.expected_concentration
+        largest, current = 1e3 * outline(world).largest_voltage, 1.5 * rules.amplitude      # "L2" goes up to √2
         shown: dict[str, spaces.Space] = {"voltages": spaces.Box(-largest, largest, (L,), np.float64),
                                           "currents": spaces.Box(-current, current, (L,), np.float64)}
         if self._operator_type:
-            patches = (PATCHES,)
+            columns, rows = world.vessel.patches
+            patches = (columns * rows,)
             shown |= {"recent": spaces.Box(-current, current, (RECENT, L), np.float64),
                       "frame": spaces.Box(-largest, largest, (self.first, L), np.float64),
                       "innovations": spaces.Box(-1e6, 1e6, (L,), np.float64),
                       "mean": spaces.Box(-1e3 * level, 1e3 * level, patches, np.float64),
                       "std": spaces.Box(0.0, 1e3 * level, patches, np.float64),
                       "doubt": spaces.Box(0.0, 1.0, (2, L), np.float64)}
-            if scenario.velocity_model is not None:
-                k, fastest = scenario.velocity_model.size, 100.0 * max(scenario.velocity_model.nominal)
+            if world.velocity_model is not None:
+                k, fastest = world.velocity_model.size, 100.0 * max(world.velocity_model.nominal)
                 shown |= {"velocity": spaces.Box(-fastest, fastest, (k,), np.float64),
                           "velocity_std": spaces.Box(0.0, fastest, (k,), np.float64)}
-        left = [scenario.n_steps] if rules.budget is None else [scenario.n_steps, rules.budget]
+        left = [world.n_steps] if rules.budget is None else [world.n_steps, rules.budget]
         shown["left"] = spaces.Box(np.zeros(len(left)), np.array(left, dtype=float), dtype=np.float64)
         return spaces.Dict(shown)
 
     def begin(self, seeds: Sequence[int]) -> None:
         """Play these episodes up to the agent's first injection."""
-        scenario, rules, B, L = self.scenario, self.rules, len(seeds), self.scenario.currents.shape[1]
-        T = scenario.n_steps
+        world, rules, B, L = self.world, self.rules, len(seeds), self.world.currents.shape[1]
+        T = world.n_steps
         self.seeds, self._t, self._spent = tuple(seeds), self.first, np.zeros(B, dtype=int)
         self._resistance, self._draws = np.empty((T, B, L, L)), np.empty((T, B, L))
         self._deviations, self._squares, totals = np.empty((3, B, T))
@@ -208,34 +214,32 @@ class InjectionCore:
         self._recent = np.zeros((B, RECENT, L))
         moments, faults = [], []
         for k, seed in enumerate(seeds):     # all is copied: a mapped file is open, and there may be more than may be
-            entries = recording(scenario, seed)
+            entries = recording(world, seed)
             self._resistance[:, k], self._draws[:, k] = entries["transfer_resistance"], entries["noise"]
-            moment, self._deviations[k], self._squares[k] = integrals(scenario, seed)
+            moment, self._deviations[k], self._squares[k] = integrals(world, seed)
             totals[k] = moment.sum(axis=1, dtype=float)
-            # The fourth of an episode's streams; the first three made the recording.
-            faults.append(rules.instrument.draw(np.random.default_rng(np.random.SeedSequence(seed).spawn(4)[3]), L, T))
+            faults.append(faults_of(world, seed))
             if self._operator_type:
-                moments.append(self._operator_type.project(scenario, moment))
+                moments.append(self._operator_type.project(world, moment))
         self._faults = Faults(*(np.array(part) for part in zip(*faults, strict=True)))
         if not self._operator_type:
             return
         self._moments = np.array(moments)
         self._frames = np.stack([self._measure(k, np.repeat(cycle[None], B, axis=0))
-                                 for k, cycle in enumerate(scenario.currents)], axis=1)
+                                 for k, cycle in enumerate(world.currents)], axis=1)
         self._console = Console(self._operator_type, rules, self._frames)
         self._operator = self._console.operator
         self._voltages = self._frames[:, -1].copy()
-        self._currents = np.repeat(scenario.currents[-1:], B, axis=0)
+        self._currents = np.repeat(world.currents[-1:], B, axis=0)
         for k in range(RECENT):
-            self._recent[:, k] = scenario.currents[(self.first - 1 - k) % self.first]
-        level = self._operator.concentration[:, None] - scenario.background
-        area = score_mass(scenario).sum()
+            self._recent[:, k] = world.currents[(self.first - 1 - k) % self.first]
+        level = self._operator.concentration[:, None] - world.background
+        area = score_mass(world).sum()
         self._homogeneous = (area * level**2 - 2.0 * level * totals + self._deviations) / self._squares
 
     def _measure(self, k: int, currents: np.ndarray) -> np.ndarray:
         """(B, L) voltages of injection t = k + 1."""
-        return self.rules.instrument.measure(self._faults, k + 1, self.scenario.noise, self._resistance[k], currents,
-                                             self._draws[k])
+        return self.rules.instrument.measure(self._faults, k + 1, self._resistance[k], currents, self._draws[k])
 
     def act(self, actions: np.ndarray) -> np.ndarray:
         """Inject what actions (B,) or (B, L) ask for and return the rewards (B,)."""
@@ -249,12 +253,18 @@ class InjectionCore:
         if not self._operator_type:
             return np.zeros(len(currents))
         self._console.take_in(self._voltages, currents)
-        k = self._t - 1
-        return np.nan_to_num(self._homogeneous[:, k] - self.errors())
+        if self._t <= self.world.warm_up:
+            return np.zeros(len(currents))
+        rewards = self._homogeneous[:, self._t - 1] - self.errors()
+        if not np.isfinite(rewards).all():
+            broken = [seed for seed, reward in zip(self.seeds, rewards, strict=True) if not np.isfinite(reward)]
+            raise FloatingPointError(f"the estimate of state {self._t} is not finite in the episodes {broken}")
+        return np.asarray(rewards)
 
     def errors(self) -> np.ndarray:
-        """(B,) relative errors (5.12) of the present estimates, not a number where the state is not scored."""
-        if self._t <= self.scenario.warm_up:
+        """(B,) relative errors (5.12) of the present estimates, not a number where the state is not scored, or nothing
+        estimates."""
+        if self._t <= self.world.warm_up or not self._operator_type:
             return np.full(len(self._spent), np.nan)
         k = self._t - 1
         return self._operator.errors(self._moments[:, k], self._deviations[:, k], self._squares[:, k])
@@ -262,7 +272,7 @@ class InjectionCore:
     def estimate(self) -> tuple[np.ndarray, np.ndarray]:
         """Present means and standard deviations (B, n) in mol/m³; without an estimator the expected level and zero."""
         if not self._operator_type:
-            n, level = outline(self.scenario).mass.shape[0], self.scenario.expected_concentration
+            n, level = outline(self.world).mass.shape[0], self.world.expected_concentration
             return np.full((len(self._spent), n), level), np.zeros((len(self._spent), n))
         return self._operator.means(), self._operator.spreads()
 
@@ -300,7 +310,7 @@ class InjectionCore:
         shown = {"voltages": self._voltages.copy(), "currents": self._currents.copy()}
         if self._operator_type:
             shown |= {"recent": self._recent.copy(), "frame": self._frames.copy()} | self._console.shown()
-        left = [np.full(len(self._spent), float(self.scenario.n_steps - self._t))]
+        left = [np.full(len(self._spent), float(self.world.n_steps - self._t))]
         if self.rules.budget is not None:
             left.append(self.rules.budget - self._spent.astype(float))
         return shown | {"left": np.stack(left, axis=1)}

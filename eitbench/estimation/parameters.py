@@ -15,11 +15,11 @@ from eitbench.physics.rest import AtRest
 
 if TYPE_CHECKING:
     from eitbench.numerics.mesh import Mesh
-    from eitbench.physics.transport import ConvectionDiffusion
-    from eitbench.worlds.base import Prior
+    from eitbench.physics.transport import Transport
+    from eitbench.worlds.world import Prior
 
 
-def starting_filter(transport: ConvectionDiffusion | AtRest, prior: Prior, c_bh: float,
+def starting_filter(transport: Transport, prior: Prior, c_bh: float,
                     ) -> KalmanFilter | ClosedVesselFilter:
     """A Kalman filter for the target's motion at t = 0, with the parameters of Table 5.1.
 
@@ -50,7 +50,7 @@ RANK_TOLERANCE = 1e-4
 the time where n = 3,003 (``docs/pipe3d.md``)."""
 
 
-def table_5_1(transport: ConvectionDiffusion, prior: Prior, c_bh: float, *,
+def table_5_1(transport: Transport, prior: Prior, c_bh: float, *,
               rank_tolerance: float = RANK_TOLERANCE) -> KalmanFilter:
     """The Kalman filter of c⁺ = F c + Y c_in + w, where the fluid flows through; arguments as in `starting_filter`.
 
@@ -106,12 +106,12 @@ def _smooth(mesh: Mesh, length: float, std: float) -> np.ndarray:
 
 
 @lru_cache(maxsize=12)
-def _free_covariance(transport: ConvectionDiffusion, prior: Prior) -> FreeCovariance:
+def _free_covariance(transport: Transport, prior: Prior) -> FreeCovariance:
     return FreeCovariance(transport.evolution_model().F, _state_noise(transport, prior),
                           initial_covariance(transport.mesh, prior))
 
 
 @lru_cache(maxsize=4)
-def _state_noise(transport: ConvectionDiffusion, prior: Prior) -> np.ndarray:
+def _state_noise(transport: Transport, prior: Prior) -> np.ndarray:
     """Γ_w (5.16) for ĉ_bh = 1."""
     return transport.evolution_model().state_noise_covariance(prior.inflow_std**2, prior.nodal_std**2)

@@ -9,11 +9,12 @@ import numpy as np
 
 if TYPE_CHECKING:
     from eitbench.numerics.mesh import Mesh
+    from eitbench.physics.transport import EvolutionModel
 
 
 @dataclass(frozen=True, eq=False)
 class AtRest:
-    """Stands where a scenario else has a `ConvectionDiffusion`: nothing flows, spreads or enters.
+    """A `Transport` in which nothing flows, spreads or enters.
 
     Parameters
     ----------
@@ -35,3 +36,13 @@ class AtRest:
              ) -> np.ndarray:
         """The same concentration; there is no inlet for an inflow to enter by."""
         return np.array(c, dtype=float)
+
+    def evolution_model(self) -> EvolutionModel:
+        """F = I without any inlet; nodal noise adds up as it is."""
+        from eitbench.physics.transport import EvolutionModel  # finite elements: not needed to play recordings
+        identity = np.eye(self.mesh.n_nodes)
+        return EvolutionModel(identity, np.zeros((self.mesh.n_nodes, 0)), identity)
+
+    def transition(self) -> tuple[np.ndarray, np.ndarray]:
+        """F and Y of `evolution_model`."""
+        return self.evolution_model()[:2]

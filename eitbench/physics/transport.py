@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import scipy.sparse as sp
@@ -33,6 +33,37 @@ class EvolutionModel(NamedTuple):
     def state_noise_covariance(self, inflow_variance: float, nodal_variance: float) -> np.ndarray:
         """Γ_w = Y Γ_η Yᵀ + H Γ_e Hᵀ (thesis 5.16) for Γ_η = inflow_variance·I and Γ_e = nodal_variance·I; (n, n)."""
         return inflow_variance * (self.Y @ self.Y.T) + nodal_variance * (self.H @ self.H.T)
+
+
+class Transport(Protocol):
+    """How a concentration moves in a time step: `ConvectionDiffusion`, or `eitbench.physics.rest.AtRest`."""
+
+    @property
+    def mesh(self) -> Mesh:
+        """Where the concentration lives."""
+        ...
+
+    @property
+    def time_step(self) -> float:
+        """Time between two states in s."""
+        ...
+
+    @property
+    def inlet(self) -> np.ndarray:
+        """(n_inlet,) int, nodes where the concentration is given."""
+        ...
+
+    def step(self, c: np.ndarray, inflow_before: np.ndarray | float, inflow_after: np.ndarray | float) -> np.ndarray:
+        """The concentration (n,) or (n, batch) one time step later."""
+        ...
+
+    def evolution_model(self) -> EvolutionModel:
+        """F, Y and H of (5.14–5.16) as dense matrices."""
+        ...
+
+    def transition(self) -> tuple[np.ndarray, np.ndarray]:
+        """F and Y of it."""
+        ...
 
 
 class ConvectionDiffusion:

@@ -40,7 +40,7 @@ class Agent:
     def act(self, observation: dict[str, np.ndarray]) -> Any:
         begins = self.console is None
         if self.console is None:
-            kind = operator_type(self.rules.scenario, "reduced")
+            kind = operator_type(self.rules.world, "reduced")
             assert kind is not None
             self.console = Console(kind, self.rules, observation["frame"][None])
         else:

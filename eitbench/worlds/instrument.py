@@ -10,6 +10,9 @@ import numpy as np
 from eitbench import _check
 from eitbench.physics.observation import VoltageNoise
 
+LIMITS = ("L1", "L2", "Linf")
+"""Norms that may bound the currents."""
+
 
 class Faults(NamedTuple):
     """What is wrong in one episode; nobody announces it."""
@@ -21,10 +24,16 @@ class Faults(NamedTuple):
     noise_factor: np.ndarray
     """(L,) by which an electrode's noise exceeds a sound one's"""
 
+    @classmethod
+    def none(cls, n_electrodes: int) -> Faults:
+        """Of an instrument that is sound."""
+        never = np.full(n_electrodes, np.iinfo(np.int64).max)
+        return cls(never, np.zeros(n_electrodes), np.ones(n_electrodes))
+
 
 @dataclass(frozen=True)
 class Instrument:
-    """Current sources and voltmeters; by default sound ones. All numbers are ours.
+    """Current sources and voltmeters; by default sound ones. [T]: the thesis' number; all others are ours.
 
     A broken wire leaves the electrode in place, so the field is that of an electrode without net current: the transfer
     resistances of the episode stay exact. A current that would have to pass a broken wire does not flow at all, and
@@ -32,8 +41,17 @@ class Instrument:
     while current flows through it, and it is noisy.
     """
 
+    current: float = 0.1
+    """A (A/m in 2D); with relative noise the amplitude does not matter [ours]"""
+    noise_relative: float = 0.01
+    """std in parts of the reading [T]"""
+    noise_of_largest: float = 0.001
+    """std in parts of the largest voltage [T]"""
     noise_floor: float = 0.0
     """V; std of an absolute noise beside the relative one"""
+    limit: str | None = None
+    """what an agent may ask for. None: pairs of electrodes. "L1", "L2" or "Linf": a current for each electrode, scaled
+    down to this norm of a pair's currents where it exceeds it"""
     dead: tuple[int, int] = (0, 0)
     """least and most electrodes whose wire is broken from the beginning"""
     failing: tuple[int, int] = (0, 0)
@@ -48,6 +66,11 @@ class Instrument:
     """V; std of what a broken wire reads"""
 
     def __post_init__(self) -> None:
+        _check.number("current", self.current, low=0.0, open_low=True, units="A")
+        for name in ("noise_relative", "noise_of_largest"):
+            _check.number(name, getattr(self, name), low=0.0)
+        if self.limit is not None and self.limit not in LIMITS:
+            raise ValueError(f"limit must be one of {', '.join(LIMITS)}, got {self.limit!r}")
         for name, units in (("noise_floor", "V"), ("interference", "V")):
             _check.number(name, getattr(self, name), low=0.0, units=units)
         _check.number("loose_noise", self.loose_noise, low=1.0)
@@ -67,33 +90,46 @@ class Instrument:
         """The most electrodes that have a fault."""
         return self.dead[1] + self.failing[1] + self.loose[1]
 
+    @property
+    def noise(self) -> VoltageNoise:
+        """Of a sound electrode's reading, without the floor."""
+        return VoltageNoise(self.noise_relative, self.noise_of_largest)
+
+    @property
+    def believed_noise(self) -> VoltageNoise:
+        """What estimators take for the noise of a reading: with the floor, of faults nothing."""
+        return VoltageNoise(self.noise_relative, self.noise_of_largest, self.noise_floor)
+
     def draw(self, random: np.random.Generator, n_electrodes: int, n_steps: int) -> Faults:
         """The faults of one episode: which electrodes, and when in t = 1 … n_steps wires break."""
         order = random.permutation(n_electrodes)
-        dead, failing, loose = (int(random.integers(low, high + 1)) for low, high in
-                                (self.dead, self.failing, self.loose))
+        ranges = (self.dead, self.failing, self.loose)
+        dead, failing, loose = (int(random.integers(low, high + 1)) for low, high in ranges)
         broken = np.full(n_electrodes, n_steps + 1)
         broken[order[:dead]] = 0
         broken[order[dead:dead + failing]] = random.integers(1, n_steps + 1, failing)
         shaky = order[dead + failing:dead + failing + loose]
-        resistance, factor = np.zeros(n_electrodes), np.ones(n_electrodes)
-        resistance[shaky], factor[shaky] = random.uniform(*self.loose_resistance, loose), self.loose_noise
+        resistance = np.zeros(n_electrodes)
+        resistance[shaky] = random.uniform(*self.loose_resistance, loose)
+        factor = np.ones(n_electrodes)
+        factor[shaky] = self.loose_noise
         return Faults(broken, resistance, factor)
 
-    def measure(self, faults: Faults, t: int, noise: VoltageNoise, transfer_resistance: np.ndarray,
-                currents: np.ndarray, draws: np.ndarray) -> np.ndarray:
-        """Voltages (B, L) in V at step t of B episodes.
+    def measure(self, faults: Faults, t: np.ndarray | int, transfer_resistance: np.ndarray, currents: np.ndarray,
+                draws: np.ndarray) -> np.ndarray:
+        """Voltages (B, L) in V: 𝓡 I, and noise; of B episodes at step ``t``, or at steps t (B,) of one.
 
         Parameters
         ----------
         faults : Faults
-            Its arrays stacked, (B, L).
+            Its arrays (B, L), or (L,) for all.
+        t : int or (B,)
         transfer_resistance, currents, draws : (B, L, L), (B, L), (B, L)
             𝓡, the currents asked for in A (A/m in 2D), and standard normal numbers.
         """
-        broken = t >= faults.broken_from
+        broken = np.asarray(t)[..., None] >= faults.broken_from
         flows = ~(broken & (currents != 0.0)).any(axis=1, keepdims=True)
         driven = currents * flows
         clean = (transfer_resistance @ driven[..., None])[..., 0] + faults.resistance * driven
-        std = np.hypot(noise.std(clean) * faults.noise_factor, self.noise_floor)
+        std = np.hypot(self.noise.std(clean) * faults.noise_factor, self.noise_floor)
         return np.where(broken, self.interference * draws, clean + std * draws)

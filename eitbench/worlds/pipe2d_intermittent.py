@@ -1,41 +1,24 @@
 """The thesis' 2D pipe when slugs are rare: most of the time there is nothing to see."""
 
-from __future__ import annotations
+from eitbench.worlds.flows import LaminarFlow
+from eitbench.worlds.registry import register
+from eitbench.worlds.schedule import Schedule
+from eitbench.worlds.slugs import NowAndThen, Slugs
+from eitbench.worlds.vessels import PlanePipe
+from eitbench.worlds.world import World
 
-import math
-from dataclasses import dataclass
+PIPE_2D_INTERMITTENT = World(
+    "Pipe2DIntermittent", PlanePipe(), LaminarFlow(),
+    Slugs(strength=(0.35, 0.60), arrivals=NowAndThen(interval=0.10, wait=0.20)),
+    schedule=Schedule(scored_steps=180, budget=30))
+"""Strong slugs, about three in the injections that are scored; all numbers are ours."""
 
-import numpy as np
+register(PIPE_2D_INTERMITTENT, "eitbench/Pipe2DInjectionBudget-v0", track="injection", seeds="test:0-49", about="""
+The pipe of `eitbench/Pipe2D-v0` when slugs are rare: strong ones come one at a time, at times nobody foresees, about
+three in an episode. The agent may inject at one step in six only, so it has to notice that a slug has come and then
+look closely, and to keep something for the next one. Once the budget is spent every action is no injection
+(`action_masks`); within it injections cost nothing. Where nothing is injected `voltages` are the amplifiers' noise
+(here none) and `innovations` zero. The first frame does not count against the budget.
 
-from eitbench import _check
-from eitbench.worlds.pipe2d import Pipe2D
-
-
-@dataclass(frozen=True)
-class Pipe2DIntermittent(Pipe2D):
-    """`Pipe2D` with strong slugs that come one at a time, at times nobody foresees; all numbers are ours.
-
-    Between two slugs lies at least ``slug_interval``, and then for every moment the same probability that the next one
-    comes: how long it has been quiet says nothing of what will be.
-    """
-
-    scored_steps: int = 180
-    """injections scored: about three slugs"""
-    slug_interval: float = 0.10
-    """s; least time between the centres of two slugs: the first has left the pipe"""
-    slug_wait: float = 0.20
-    """s; mean time beyond that"""
-    slug_strength: tuple[float, float] = (0.35, 0.60)
-    """|ln(c/background)| at a slug's centre, either sign"""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _check.number("slug_wait", self.slug_wait, low=0.0, open_low=True, units="s")
-
-    def draw_arrivals(self, rng: np.random.Generator, begin: float, end: float) -> np.ndarray:
-        n = math.ceil((end - begin) / self.slug_interval) + 1
-        # The first wait is shortened at random: the record begins anywhere between two slugs.
-        waits = self.slug_interval + rng.exponential(self.slug_wait, n)
-        waits[0] *= rng.uniform()
-        when = begin + np.cumsum(waits)
-        return when[when < end]
+The adaptivity gap is 0.46, with a 95 % interval from 0.41 to 0.51 over 50 dev episodes (`docs/injection.md`).
+""")

@@ -1,4 +1,4 @@
-"""`Task`: all that an estimator may know about a scenario, and nothing of what happened in an episode."""
+"""`Task`: all that an estimator may know about a world, and nothing of what happened in an episode."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from eitbench import _check
-from eitbench.worlds.base import Discretisation, Prior, Scenario
+from eitbench.worlds.world import Discretisation, Prior, Vessel, World
 
 if TYPE_CHECKING:
     from eitbench.numerics.mesh import Mesh
     from eitbench.physics.observation import ObservationModel, VoltageNoise
     from eitbench.physics.profiles import VelocityModel
-    from eitbench.physics.transport import ConvectionDiffusion, EvolutionModel
+    from eitbench.physics.transport import EvolutionModel, Transport
 
 
 class Estimate(NamedTuple):
@@ -37,11 +37,11 @@ class Estimate(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """The estimator's side of a scenario.
+    """The estimator's side of a world.
 
     Parameters
     ----------
-    transport : ConvectionDiffusion
+    transport : Transport
         The evolution model, on `mesh`.
     observation : ObservationModel
         Voltages for a concentration on `mesh`.
@@ -62,9 +62,11 @@ class Task:
         What is believed of the target, in parts of the best homogeneous estimate (thesis Table 5.1).
     velocity : VelocityModel or None
         How the flow may be written where it is asked for too; ``transport`` then has the flow believed at first.
+    vessel : Vessel
+        Its sizes and electrodes.
     """
 
-    transport: ConvectionDiffusion
+    transport: Transport
     observation: ObservationModel
     noise: VoltageNoise
     currents: np.ndarray = field(repr=False)
@@ -75,6 +77,7 @@ class Task:
     calibration: int
     prior: Prior
     velocity: VelocityModel | None = None
+    vessel: Vessel | None = None
 
     @property
     def mesh(self) -> Mesh:
@@ -87,35 +90,35 @@ class Task:
         return self.transport.evolution_model()
 
 
-def make_task(scenario: Scenario, lag: int | str = 0, **assumptions: Any) -> Task:
-    """The task of ``scenario``.
+def make_task(world: World, lag: int | str = 0, **assumed: Any) -> Task:
+    """The task of ``world``.
 
     Parameters
     ----------
-    scenario : Scenario
+    world : World
     lag : int or "all"
         See `Task`; "all" means the whole record.
-    assumptions
-        Passed to ``scenario.model``: what the estimator wrongly believes, such as ``mean_velocity``.
+    assumed
+        What the estimator wrongly believes of the flow, such as ``mean_velocity``; see `World.model`.
     """
-    steps = lag_steps(scenario, lag)
-    model = _model(scenario, tuple(sorted(assumptions.items())))
-    currents = scenario.currents
+    steps = lag_steps(world, lag)
+    model = _model(world.fluid, tuple(sorted(assumed.items())))
+    currents = world.currents
     currents.setflags(write=False)                                # shared by all who play this task
-    return Task(model.transport, model.observation, scenario.noise, currents, scenario.n_steps,
-                scenario.warm_up, steps, scenario.expected_concentration, scenario.calibration, scenario.prior,
-                scenario.velocity_model)
+    return Task(model.transport, model.observation, world.instrument.believed_noise, currents, world.n_steps,
+                world.warm_up, steps, world.expected_concentration, world.calibration, world.prior,
+                world.velocity_model, world.vessel)
 
 
-def lag_steps(scenario: Scenario, lag: int | str) -> int:
-    """``lag`` of `make_task` as a number; `ValueError` if it does not fit the scenario."""
-    last = scenario.n_steps - 1
+def lag_steps(world: World, lag: int | str) -> int:
+    """``lag`` of `make_task` as a number; `ValueError` if it does not fit the world."""
+    last = world.n_steps - 1
     if isinstance(lag, str) and lag != "all":
         raise ValueError(f"lag must be 'all' or an integer from 0 to {last}, got {lag!r}")
     return last if lag == "all" else _check.integer("lag", lag, low=0, high=last)
 
 
 @lru_cache(maxsize=4)
-def _model(scenario: Scenario, assumptions: tuple[tuple[str, Any], ...]) -> Discretisation:
+def _model(fluid: World, assumed: tuple[tuple[str, Any], ...]) -> Discretisation:
     """Built once a process; estimators keep what they derive from it with it."""
-    return scenario.model(**dict(assumptions))
+    return fluid.model(**dict(assumed))

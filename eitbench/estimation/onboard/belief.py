@@ -40,8 +40,8 @@ class Belief:
 
     def __init__(self, rules: Rules, observation: Observation) -> None:
         self.rules = rules
-        kind = JointReducedOperator if rules.scenario.velocity_model is not None else ReducedOperator
-        self._operator = kind(rules.scenario, observation["frame"][None], gate=rules.gate,
+        kind = JointReducedOperator if rules.world.velocity_model is not None else ReducedOperator
+        self._operator = kind(rules.world, observation["frame"][None], gate=rules.gate,
                               noise_floor=rules.instrument.noise_floor)
         self._along: np.ndarray | None = None
         self._steps: list[tuple[np.ndarray, np.ndarray]] = []
@@ -52,7 +52,7 @@ class Belief:
     @classmethod
     def beforehand(cls, rules: Rules) -> Belief:
         """Before any episode: as if a first frame without fault or noise had been measured in the expected liquid."""
-        frame = rules.scenario.currents @ levels_of(rules.scenario).linearised(0).resistance
+        frame = rules.world.currents @ levels_of(rules.world).linearised(0).resistance
         return cls(rules, {"frame": frame, "doubt": np.zeros((2, frame.shape[1]))})
 
     @classmethod
@@ -193,7 +193,7 @@ class Belief:
 
     def relinearised(self) -> np.ndarray:
         """(L, L, s) of 𝓡 by the state, about the present estimate; some 10 ms."""
-        levels = levels_of(self.rules.scenario)
+        levels = levels_of(self.rules.world)
         positive = np.maximum(self.mean, 0.1 * self._operator.concentration[0])     # a conductivity is
         _, table = levels.task.observation.resistance_derivatives(positive)
         return self._with_flow(self._operator.concentration[0] * np.tensordot(table, self._operator.basis, axes=(0, 0)))
@@ -214,6 +214,6 @@ def _noise_variance(rules: Rules, concentration: float, resistance: bytes) -> np
     """(pairs, L) of the voltages of each pair, per current squared."""
     i, j = rules.pairs.T
     R = np.frombuffer(resistance).reshape(rules.pairs.max() + 1, -1)
-    levels = levels_of(rules.scenario)
+    levels = levels_of(rules.world)
     std = [levels.noise_std(rules.amplitude * column, rules.instrument.noise_floor) for column in R[i] - R[j]]
     return (np.array(std) / rules.amplitude)**2

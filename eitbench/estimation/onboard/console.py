@@ -27,7 +27,7 @@ class Console:
     """
 
     def __init__(self, kind: type[Operator], rules: Rules, frames: np.ndarray) -> None:
-        self.operator = kind(rules.scenario, frames, gate=rules.gate, noise_floor=rules.instrument.noise_floor)
+        self.operator = kind(rules.world, frames, gate=rules.gate, noise_floor=rules.instrument.noise_floor)
         B, _, L = frames.shape
         self._innovations, self._doubt = np.zeros((B, L)), np.zeros((B, 2, L))
 

@@ -22,8 +22,8 @@ from eitbench.worlds.task import make_task
 
 if TYPE_CHECKING:
     from eitbench.physics.profiles import VelocityModel
-    from eitbench.worlds.base import Scenario
     from eitbench.worlds.task import Task
+    from eitbench.worlds.world import World
 
 BOUNDS = (1 / 3, 2.0)
 """Least and largest mean velocity that is believed, in parts of the one believed at first."""
@@ -72,8 +72,8 @@ class JointReducedOperator(ReducedOperator):
     _filter: ReducedJointFilter
 
     @staticmethod
-    def _share(scenario: Scenario) -> Shared:
-        return _shared(scenario)
+    def _share(world: World) -> Shared:
+        return _shared(world.sound)
 
     @property
     def state(self) -> np.ndarray:
@@ -109,19 +109,19 @@ class JointReducedOperator(ReducedOperator):
 
 
 class JointShared(Shared):
-    """What all episodes of a scenario with an unknown mean velocity share."""
+    """What all episodes of a world with an unknown mean velocity share."""
 
     model: JointModel
 
-    def __init__(self, scenario: Scenario) -> None:
-        super().__init__(scenario)
+    def __init__(self, world: World) -> None:
+        super().__init__(world)
         self.flow = one_velocity(self.levels.task)
         self.walk_std = self.flow.walk_std[0]
         self.tables, self._single = JointTables(self.model), JointTables(self.model, np.float32)
 
     @staticmethod
-    def _make(scenario: Scenario) -> Any:
-        return stored_model(scenario, "joint", JointModel, lambda: _make_model(scenario))
+    def _make(world: World) -> Any:
+        return stored_model(world, "joint", JointModel, lambda: _make_model(world))
 
     def start(self, episodes: int) -> ReducedFilter:
         (nominal,), (std,) = self.flow.nominal, self.flow.initial_std
@@ -132,25 +132,23 @@ class JointShared(Shared):
                                   (BOUNDS[0] * nominal, BOUNDS[1] * nominal))
 
 
-@lru_cache(maxsize=2)
-def _shared(scenario: Scenario) -> JointShared:
-    return JointShared(scenario)
+_shared = lru_cache(maxsize=2)(JointShared)
 
 
 def one_velocity(task: Task) -> VelocityModel:
     """The flow that is asked for; ``ValueError`` unless it has one parameter."""
     if task.velocity is None or task.velocity.size != 1:
-        raise ValueError("scenario must have a flow with one unknown parameter, its mean velocity, got "
+        raise ValueError("world must have a flow with one unknown parameter, its mean velocity, got "
                          f"{task.velocity!r}")
     return task.velocity
 
 
-def _make_model(scenario: Scenario) -> JointModel:
+def _make_model(world: World) -> JointModel:
     """Some 45 s."""
     from eitbench.numerics.fem import mass_matrix
-    task = make_task(scenario)
+    task = make_task(world)
     flow, prior = one_velocity(task), task.prior
-    mass, record = mass_matrix(task.mesh).toarray(), record_of_any(scenario, 45)
+    mass, record = mass_matrix(task.mesh).toarray(), record_of_any(world, 45)
     initial = initial_covariance(task.mesh, prior)
     nodal = task.evolution.state_noise_covariance(0.0, prior.nodal_std**2)
 

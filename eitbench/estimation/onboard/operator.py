@@ -21,14 +21,12 @@ from eitbench.worlds.task import make_task
 
 if TYPE_CHECKING:
     from eitbench.numerics.mesh import Mesh
-    from eitbench.worlds.base import Scenario
+    from eitbench.worlds.world import World
 
 LEVEL_STEP = 0.02
 """ĉ_bh is rounded to steps of 2 %, so that what is linearised there serves many episodes."""
 LEVELS = np.arange(-50, 51)
 """Numbers of steps from the expected concentration: from a third of it to three times as much."""
-PATCHES = 36
-"""On so many patches of the vessel an agent sees the estimate."""
 BROKEN = 30.0
 """Standard deviations from a homogeneous liquid's voltage beyond which a reading says nothing of the level, where
 the instrument may be faulty."""
@@ -39,12 +37,12 @@ def electrode_pairs(n_electrodes: int) -> np.ndarray:
     return np.array(list(combinations(range(n_electrodes), 2)))
 
 
-def pair_currents(scenario: Scenario) -> np.ndarray:
-    """(pairs, L) currents in A (A/m in 2D) of every pair, as large as the scenario's largest."""
-    pairs = electrode_pairs(scenario.currents.shape[1])
-    currents = np.zeros((len(pairs), scenario.currents.shape[1]))
-    currents[np.arange(len(pairs)), pairs[:, 0]] = np.abs(scenario.currents).max()
-    currents[np.arange(len(pairs)), pairs[:, 1]] = -np.abs(scenario.currents).max()
+def pair_currents(world: World) -> np.ndarray:
+    """(pairs, L) currents in A (A/m in 2D) of every pair, as large as the world's largest."""
+    pairs = electrode_pairs(world.currents.shape[1])
+    currents = np.zeros((len(pairs), world.currents.shape[1]))
+    currents[np.arange(len(pairs)), pairs[:, 0]] = np.abs(world.currents).max()
+    currents[np.arange(len(pairs)), pairs[:, 1]] = -np.abs(world.currents).max()
     return currents
 
 
@@ -55,8 +53,8 @@ class Operator(Protocol):
     concentration: np.ndarray
     """(B,) ĉ_bh in mol/m³"""
 
-    def __init__(self, scenario: Scenario, frames: np.ndarray, *, gate: float, noise_floor: float) -> None:
-        """Take in the first frame, voltages (B, K, L) in V of the scenario's cycle."""
+    def __init__(self, world: World, frames: np.ndarray, *, gate: float, noise_floor: float) -> None:
+        """Take in the first frame, voltages (B, K, L) in V of the world's cycle."""
         ...
 
     def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -85,7 +83,7 @@ class Operator(Protocol):
         ...
 
     @staticmethod
-    def project(scenario: Scenario, moment: np.ndarray) -> np.ndarray:
+    def project(world: World, moment: np.ndarray) -> np.ndarray:
         """Moments over what counts (T, n), see `eitbench.data.regions.integrals`, as `errors` wants them."""
         ...
 
@@ -115,20 +113,21 @@ class Linearisation(NamedTuple):
 
 
 class Levels:
-    """The homogeneous liquids in which a scenario's episodes may begin; shared by all of them."""
+    """The homogeneous liquids in which a world's episodes may begin; shared by all of them."""
 
-    def __init__(self, scenario: Scenario) -> None:
-        self.scenario, self.task = scenario, make_task(scenario)
-        levels = scenario.expected_concentration * np.exp(LEVEL_STEP * LEVELS)
+    def __init__(self, world: World) -> None:
+        self.world = world
+        self.task = make_task(world)
+        levels = world.expected_concentration * np.exp(LEVEL_STEP * LEVELS)
         homogeneous = np.repeat(levels[:, None], self.task.mesh.n_nodes, axis=1)
-        self._homogeneous = scenario.currents @ self.task.observation.transfer_resistance(homogeneous)
+        self._homogeneous = world.currents @ self.task.observation.transfer_resistance(homogeneous)
         self.linearised = lru_cache(maxsize=64)(self._linearised)
         """number of a level -> (its concentration, 𝓡, derivatives (L, L, n) by the state); the last 64 are kept"""
 
     def best(self, frame: np.ndarray, broken: float) -> int:
         """Number of the level that fits the voltages (K, L) best, weighted as in `best_homogeneous`; readings further
         than ``broken`` standard deviations away count as that far."""
-        off = (frame - self._homogeneous) / self.scenario.noise.std(frame if math.isinf(broken) else self._homogeneous)
+        off = (frame - self._homogeneous) / self.world.noise.std(frame if math.isinf(broken) else self._homogeneous)
         return int(LEVELS[np.argmin(np.minimum(off**2, broken**2).sum(axis=(1, 2)))])
 
     def noise_std(self, computed: np.ndarray, floor: float) -> np.ndarray:
@@ -136,32 +135,34 @@ class Levels:
 
         Readings near zero may have next to no noise; what the model leaves out would then count for knowledge.
         """
-        return np.hypot(np.maximum(self.scenario.noise.std(computed), 1e-3 * np.abs(computed).max()), floor)
+        return np.hypot(np.maximum(self.world.noise.std(computed), 1e-3 * np.abs(computed).max()), floor)
 
     def _linearised(self, number: int) -> Linearisation:
-        c = self.scenario.expected_concentration * float(np.exp(LEVEL_STEP * number))
+        c = self.world.expected_concentration * float(np.exp(LEVEL_STEP * number))
         resistance, table = self.task.observation.resistance_derivatives(np.full(self.task.mesh.n_nodes, c))
         return Linearisation(c, resistance, c * np.ascontiguousarray(np.moveaxis(table, 0, 2)))
 
 
-@lru_cache(maxsize=2)
-def levels_of(scenario: Scenario) -> Levels:
-    """Made once a process."""
-    return Levels(scenario)
+_levels = lru_cache(maxsize=2)(Levels)
+
+
+def levels_of(world: World) -> Levels:
+    """Made once a process for all worlds that differ in what is broken only."""
+    return _levels(world.sound)
 
 
 class FullOperator:
     """The Kalman filter of the baselines with its exact covariance: what scored runs use."""
 
-    def __init__(self, scenario: Scenario, frames: np.ndarray, *, gate: float, noise_floor: float) -> None:
-        self._scenario, self._gate, self._floor = scenario, gate, noise_floor
-        self._shared = levels = levels_of(scenario)
+    def __init__(self, world: World, frames: np.ndarray, *, gate: float, noise_floor: float) -> None:
+        self._scenario, self._gate, self._floor = world, gate, noise_floor
+        self._shared = levels = levels_of(world)
         broken = BROKEN if math.isfinite(gate) else math.inf
         self._levels = [levels.linearised(levels.best(frame, broken)) for frame in frames]
         self.concentration = np.array([level.concentration for level in self._levels])
         self._filters = self._start(len(frames))
-        self._patches = patch_averages(levels.task.mesh)
-        for k, currents in enumerate(scenario.currents):
+        self._patches = patch_averages(levels.task.mesh, world.vessel.patches)
+        for k, currents in enumerate(world.currents):
             self.assimilate(frames[:, k], np.repeat(currents[None], len(frames), axis=0))
 
     def _start(self, episodes: int) -> list[Any]:
@@ -203,19 +204,19 @@ class FullOperator:
         return None
 
     @staticmethod
-    def project(scenario: Scenario, moment: np.ndarray) -> np.ndarray:
+    def project(world: World, moment: np.ndarray) -> np.ndarray:
         return np.asarray(moment)
 
 
-def patch_averages(mesh: Mesh) -> np.ndarray:
-    """(PATCHES, n) averages over the boxes of a grid, 12 × 3 in pipes and 6 × 6 in tanks, x first; a node counts by its
-    share of the mass matrix."""
+def patch_averages(mesh: Mesh, grid: tuple[int, int]) -> np.ndarray:
+    """(patches, n) averages over the boxes of a grid, so many along x and y, x first; a node counts by its share of the
+    mass matrix. ``ValueError`` if there is a box without a node."""
     from eitbench.numerics.fem import mass_matrix
     points = mesh.points[:, :2]
-    low, high = points.min(axis=0), points.max(axis=0)
-    grid = (12, 3) if high[0] - low[0] > 2 * (high[1] - low[1]) else (6, 6)
+    low = points.min(axis=0)
+    high = points.max(axis=0)
     column, row = np.minimum((points - low) / (high - low) * grid, np.array(grid) - 1).astype(int).T
-    averages = np.zeros((PATCHES, len(points)))
+    averages = np.zeros((grid[0] * grid[1], len(points)))
     averages[row * grid[0] + column, np.arange(len(points))] = mass_matrix(mesh).sum(axis=0)
     if not averages.any(axis=1).all():
         raise ValueError(f"the task's mesh must have a node in each of {grid[0]} × {grid[1]} patches of the vessel")

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import io
+import hashlib
 import math
-import zlib
 from collections.abc import Callable
 from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -13,17 +12,16 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from eitbench._code import code_digest, package_files
-from eitbench._files import write_atomically
-from eitbench.data.episodes import folder, warn_not_kept
+from eitbench.data import store
 from eitbench.data.recordings import outline
-from eitbench.data.regions import region_of, score_mass
+from eitbench.data.regions import score_mass
 from eitbench.estimation import LinearisedObservations, Observation, starting_filter
 from eitbench.estimation.onboard.operator import BROKEN, Linearisation, levels_of, pair_currents, patch_averages
 from eitbench.estimation.reduced import ReducedFilter, ReducedModel, reduced_model
 from eitbench.worlds.task import make_task
 
 if TYPE_CHECKING:
-    from eitbench.worlds.base import Scenario
+    from eitbench.worlds.world import World
 
 RANK = 120
 Model = TypeVar("Model")
@@ -32,20 +30,20 @@ Model = TypeVar("Model")
 class ReducedOperator:
     """Kalman filters whose injections differ, in single precision, which halves the time; see `Operator`."""
 
-    def __init__(self, scenario: Scenario, frames: np.ndarray, *, gate: float, noise_floor: float) -> None:
-        self._shared = shared = self._share(scenario)
+    def __init__(self, world: World, frames: np.ndarray, *, gate: float, noise_floor: float) -> None:
+        self._shared = shared = self._share(world)
         self._gate, self._floor = gate, noise_floor
         broken = BROKEN if math.isfinite(gate) else math.inf
         self.levels = [shared.level(shared.levels.best(frame, broken)) for frame in frames]
         self.concentration = np.array([level.concentration for level in self.levels])
         self._filter = shared.start(len(frames))
-        for k, currents in enumerate(scenario.currents):
+        for k, currents in enumerate(world.currents):
             self.assimilate(frames[:, k], np.repeat(currents[None], len(frames), axis=0))
 
     @staticmethod
-    def _share(scenario: Scenario) -> Shared:
+    def _share(world: World) -> Shared:
         """What all episodes have in common; made once a process."""
-        return _shared(scenario)
+        return _shared(world.sound)
 
     def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         noise_std = self._shared.levels.noise_std
@@ -86,12 +84,12 @@ class ReducedOperator:
     @property
     def weight(self) -> np.ndarray | None:
         """(s, s) W, with which tr(W P) is the expected squared error, integrated over what counts; None: identity."""
-        return None if region_of(self._shared.scenario) is None else self._shared.mass[1:, 1:]
+        return None if self._shared.world.region is None else self._shared.mass[1:, 1:]
 
     def truth(self, entries: np.ndarray) -> np.ndarray:
         """(T, s) what is estimated in the first episode, from its recording: for bounds only."""
         shared, level = self._shared, self.concentration[0]
-        mass = outline(shared.scenario).mass
+        mass = outline(shared.world).mass
         whole = 0.5 * (mass.sum(axis=0) + mass.sum(axis=1))                                 # ∫ of each node's function
         beyond = (shared.background - level) * whole + entries["moment"]
         return np.asarray(beyond @ self.basis / level)
@@ -121,26 +119,27 @@ class ReducedOperator:
         return None
 
     @classmethod
-    def project(cls, scenario: Scenario, moment: np.ndarray) -> np.ndarray:
-        return (moment @ cls._share(scenario).basis).astype(float)
+    def project(cls, world: World, moment: np.ndarray) -> np.ndarray:
+        return (moment @ cls._share(world).basis).astype(float)
 
 
 class Shared:
-    """What all episodes of a scenario share."""
+    """What all episodes of a world share."""
 
-    def __init__(self, scenario: Scenario) -> None:
-        self.scenario, self.background, self.levels = scenario, scenario.background, levels_of(scenario)
-        self.model = self._make(scenario)
+    def __init__(self, world: World) -> None:
+        self.world, self.background, self.levels = world, world.background, levels_of(world)
+        self.model = self._make(world)
         basis = np.column_stack([np.ones(len(self.model.basis)), self.model.basis])
-        half = score_mass(scenario)
+        half = score_mass(world)
         self.mass = 0.5 * (basis.T @ (half @ basis) + basis.T @ (half.T @ basis))
         self.basis = basis.astype(np.float32)
-        self.patches = (patch_averages(self.levels.task.mesh) @ self.model.basis).astype(np.float32)
+        averages = patch_averages(self.levels.task.mesh, world.vessel.patches)
+        self.patches = (averages @ self.model.basis).astype(np.float32)
         self.level = cache(self._level)
 
     @staticmethod
-    def _make(scenario: Scenario) -> Any:
-        return _stored_model(scenario)
+    def _make(world: World) -> Any:
+        return _stored_model(world)
 
     def start(self, episodes: int) -> ReducedFilter:
         """Filters at t = 0, in single precision."""
@@ -154,49 +153,38 @@ class Shared:
         return Linearisation(concentration, resistance, (derivative @ self.model.basis).astype(np.float32))
 
 
-@lru_cache(maxsize=2)
-def _shared(scenario: Scenario) -> Shared:
-    return Shared(scenario)
+_shared = lru_cache(maxsize=2)(Shared)
 
 
-def _stored_model(scenario: Scenario) -> ReducedModel:
+def _stored_model(world: World) -> ReducedModel:
     """The reduced model, from the cache if it is there: making it takes half a minute."""
-    return stored_model(scenario, "reduced", ReducedModel, lambda: _make_model(scenario))
+    return stored_model(world, "reduced", ReducedModel, lambda: _make_model(world))
 
 
-def stored_model(scenario: Scenario, name: str, kind: type[Model], make: Callable[[], Model]) -> Model:
+def stored_model(world: World, name: str, kind: type[Model], make: Callable[[], Model]) -> Model:
     """A model, a named tuple of arrays, from the cache if one of this name is there; else it is made and kept."""
     code = code_digest(package_files("estimation/*.py", "estimation/onboard/*operator.py", "worlds/task.py"))
-    path = folder(scenario) / f"{name}-{code[:16]}.npz"
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            model = kind(*(stored[name] for name in kind._fields))  # type: ignore[attr-defined]
-            if int(stored["checksum"]) == _checksum(model):
-                return model
-    except Exception:       # missing or damaged: an archive may raise anything
-        pass
-    with threadpool_limits(1):                             # as many threads as here, the same bits
-        model = make()
-    content = io.BytesIO()
-    np.savez(content, checksum=_checksum(model), **model._asdict())  # type: ignore[attr-defined]
-    try:
-        write_atomically(path, content.getvalue())
-    except OSError as error:
-        warn_not_kept(path.parent, error)
-    return model
+    whose = hashlib.sha256(f"{code} {store.described(world.sound)}".encode()).hexdigest()
+    path = store.folder(world) / f"{name}-{whose[:16]}.npz"
+
+    def made() -> dict[str, np.ndarray]:
+        with threadpool_limits(1):                         # as many threads as here, the same bits
+            return make()._asdict()  # type: ignore[attr-defined, no-any-return]
+
+    return kind(**store.kept(path, kind._fields, made))  # type: ignore[attr-defined]
 
 
-def _make_model(scenario: Scenario) -> ReducedModel:
+def _make_model(world: World) -> ReducedModel:
     from eitbench.numerics.fem import mass_matrix
-    task = make_task(scenario)
+    task = make_task(world)
     start = starting_filter(task.transport, task.prior, 1.0)
-    return reduced_model(start, mass_matrix(task.mesh).toarray(), record_of_any(scenario, 90),
+    return reduced_model(start, mass_matrix(task.mesh).toarray(), record_of_any(world, 90),
                          min(RANK, task.mesh.n_nodes))
 
 
-def record_of_any(scenario: Scenario, length: int) -> list[Observation]:
+def record_of_any(world: World, length: int) -> list[Observation]:
     """A record of pairs at random, about the expected level and in parts of it."""
-    task, every, level = make_task(scenario), pair_currents(scenario), scenario.expected_concentration
+    task, every, level = make_task(world), pair_currents(world), world.expected_concentration
     currents = every[np.random.default_rng(0).integers(len(every), size=length)]
     linear = LinearisedObservations(task.observation, task.noise, np.full(task.mesh.n_nodes, level))
     record = []
@@ -204,7 +192,3 @@ def record_of_any(scenario: Scenario, length: int) -> list[Observation]:
         seen = linear(np.zeros(current.shape), current)
         record.append(seen._replace(matrix=level * seen.matrix))
     return record
-
-
-def _checksum(model: Any) -> int:
-    return zlib.crc32(b"".join(np.ascontiguousarray(array).tobytes() for array in model))

@@ -1,0 +1,160 @@
+"""Bodies in a round tank: a ball that the fluid carries round, and metal cylinders that stand still."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from eitbench import _check
+from eitbench.worlds.world import Discretisation, History, Target, World
+
+if TYPE_CHECKING:
+    from eitbench.worlds.streams import Randomness
+
+PATH_SUBSTEPS = 16
+"""Runge–Kutta steps of the ball's path in a time step."""
+EDGE = 0.003
+"""m within which a body goes over into the liquid."""
+BALL_POINTS = np.concatenate([np.zeros((1, 2)), np.sqrt(2 / 3) * np.stack(
+    [np.cos(np.arange(6) * np.pi / 3), np.sin(np.arange(6) * np.pi / 3)], axis=1)])
+"""Where the flow is averaged over a disc of radius one, …"""
+BALL_WEIGHTS = np.array([1 / 4, *[1 / 8] * 6])
+"""… and with which weights: exact for polynomials of the fifth degree (Abramowitz & Stegun 25.4.61)."""
+
+
+@dataclass(frozen=True)
+class Ball(Target):
+    """A rigid ball (a disc, in 2D) that hardly conducts; its centre moves with the fluid's mean velocity over its area
+    (thesis 7.1). All numbers are ours."""
+
+    background: float = 30.0
+    """mol/m³, about 0.3 S/m: weak saline"""
+    radius: float = 0.022
+    """m"""
+    concentration: float = 1.5
+    """mol/m³: a twentieth of the background; a P1 conductivity has to stay positive"""
+    start_radius: tuple[float, float] = (0.25, 0.48)
+    """where the ball begins, in parts of the tank's radius; the angle is any"""
+
+    is_carried = False
+
+    def __post_init__(self) -> None:
+        for name, units in (("background", "mol/m³"), ("radius", "m"), ("concentration", "mol/m³")):
+            _check.number(name, getattr(self, name), low=0.0, open_low=True, units=units)
+        low, high = _check.array("start_radius", self.start_radius, (2,))
+        if not 0 <= low <= high:
+            raise ValueError(f"start_radius must be a range 0 ≤ low ≤ high, got {self.start_radius!r}")
+
+    def check(self, world: World) -> None:
+        """``ValueError`` if it does not fit into the vessel."""
+        if self.start_radius[1] * world.vessel.radius + self.radius > world.vessel.radius:
+            raise ValueError("target.start_radius must be a range 0 ≤ low ≤ high that keeps the ball inside the tank, "
+                             f"got {self.start_radius!r}")
+
+    def path(self, world: World, random: np.random.Generator) -> np.ndarray:
+        """(T + 1, 2) centre of the ball in m, t = 0 … T."""
+        flow = world.flow.nominal(world, fine=True)
+        ball = self.radius * BALL_POINTS
+        angle = random.uniform(0.0, 2.0 * np.pi)
+        distance = world.vessel.radius * random.uniform(*self.start_radius)
+        centre = distance * np.array([np.cos(angle), np.sin(angle)])
+        furthest = world.vessel.radius - self.radius
+        dt = world.time_step / PATH_SUBSTEPS
+        path = []
+
+        def velocity(place: np.ndarray) -> np.ndarray:
+            return BALL_WEIGHTS @ flow(place + ball)
+
+        for step in range(world.n_steps * PATH_SUBSTEPS + 1):
+            if step % PATH_SUBSTEPS == 0:
+                path.append(centre)
+            first = velocity(centre)
+            second = velocity(centre + 0.5 * dt * first)
+            third = velocity(centre + 0.5 * dt * second)
+            centre = centre + dt / 6.0 * (first + 2.0 * second + 2.0 * third + velocity(centre + dt * third))
+            centre = centre * min(1.0, furthest / max(np.hypot(*centre), 1e-12))          # it cannot enter the wall
+        return np.array(path)
+
+    def evolve(self, world: World, episodes: Sequence[Randomness], truth: Discretisation,
+               tick: Callable[[int], object], last: int) -> Iterator[History]:
+        points = truth.transport.mesh.points
+        for episode in episodes:
+            path = self.path(world, episode.flow)[:last + 1]
+            ball = np.array([disc_indicator(points, centre, self.radius, EDGE) for centre in path])
+            tick(world.n_steps)
+            yield History(self.background + (self.concentration - self.background) * ball, np.empty((last, 0)))
+
+
+@dataclass(frozen=True)
+class Cylinders(Target):
+    """Two metal cylinders that stand still, drawn anew for each episode (thesis 7.2, Fig. 7.4).
+
+    [T]: the thesis; [ours]: our choice.
+    """
+
+    background: float = 30.0
+    """mol/m³, about 0.3 S/m: weak saline [ours]"""
+    large_radius: tuple[float, float] = (0.026, 0.032)
+    """m; the larger cylinder [T: one is larger; ours: the sizes]"""
+    small_radius: tuple[float, float] = (0.018, 0.022)
+    """m; the smaller one [ours]"""
+    furthest: float = 0.7
+    """how far from the middle a cylinder's centre may stand, in parts of the tank's radius [ours]"""
+    gap: float = 0.05
+    """m at least between the cylinders' walls [ours]"""
+    metal: float = 5.0
+    """concentration of the metal in parts of the background: its surface resists, and from five-fold on EIT hardly
+    tells how well a small thing conducts [ours]"""
+
+    is_carried = False
+
+    def __post_init__(self) -> None:
+        for name, units in (("background", "mol/m³"), ("metal", ""), ("gap", "m")):
+            _check.number(name, getattr(self, name), low=0.0, open_low=True, units=units)
+        if self.small_radius[1] > self.large_radius[1]:
+            raise ValueError(f"small_radius must not reach beyond large_radius, got {self.small_radius!r} and "
+                             f"{self.large_radius!r} m")
+
+    def check(self, world: World) -> None:
+        """``ValueError`` if they do not fit into the vessel."""
+        tank = world.vessel.radius
+        for name in ("large_radius", "small_radius"):
+            low, high = _check.array(f"target.{name}", getattr(self, name), (2,), units="m")
+            if not 0 < low <= high < 0.3 * tank:
+                raise ValueError(f"target.{name} must be a range 0 < low ≤ high < 0.3·radius in m, got "
+                                 f"{getattr(self, name)!r}")
+        _check.integer("vessel.n_electrodes", world.vessel.n_electrodes, low=8)
+        _check.number("target.furthest", self.furthest, low=0.5, high=1.0 - self.large_radius[1] / tank)
+        apart = self.large_radius[1] + self.small_radius[1] + self.gap
+        if apart > 1.6 * self.furthest * tank:                  # else places would be drawn again and again
+            raise ValueError(f"target.gap must leave room for both cylinders: with it their centres are {apart:g} m "
+                             f"apart, of {1.6 * self.furthest * tank:g} m that furthest allows; got {self.gap!r} m")
+
+    def draw(self, world: World, random: np.random.Generator) -> list[tuple[np.ndarray, float]]:
+        """(centre (2,), radius) of both cylinders in m, the larger first."""
+        radii = random.uniform(*self.large_radius), random.uniform(*self.small_radius)
+        while True:
+            distance = self.furthest * world.vessel.radius * np.sqrt(random.uniform(size=2))
+            angle = random.uniform(0.0, 2.0 * np.pi, size=2)
+            centres = distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+            if np.hypot(*(centres[0] - centres[1])) > sum(radii) + self.gap:
+                return list(zip(centres, radii, strict=True))
+
+    def evolve(self, world: World, episodes: Sequence[Randomness], truth: Discretisation,
+               tick: Callable[[int], object], last: int) -> Iterator[History]:
+        points = truth.transport.mesh.points
+        for episode in episodes:
+            metal = np.sum([disc_indicator(points, centre, radius, EDGE)
+                            for centre, radius in self.draw(world, episode.flow)], axis=0)
+            concentration = self.background * (1.0 + (self.metal - 1.0) * metal)
+            tick(world.n_steps)
+            yield History(np.repeat(concentration[None], last + 1, axis=0), np.empty((last, 0)))
+
+
+def disc_indicator(points: np.ndarray, centre: np.ndarray, radius: float, edge: float) -> np.ndarray:
+    """1 inside a disc, 0 outside, going over within about ``edge`` (m); (k,) for points (k, 2)."""
+    distance = np.hypot(*(points - centre).T)
+    return np.asarray(0.5 * (1.0 - np.tanh((distance - radius) / (0.5 * edge))))

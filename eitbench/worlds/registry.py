@@ -1,0 +1,120 @@
+"""The worlds that can be played, by their ids: ours, those of installed packages, and those a script registers."""
+
+from __future__ import annotations
+
+import json
+import re
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib import import_module
+from importlib.metadata import entry_points
+from typing import Any
+
+import gymnasium as gym
+
+from eitbench.worlds.world import World
+
+GROUP = "eitbench.worlds"
+"""Entry points of installed packages: modules that call `register` when they are imported."""
+ENTRY_POINTS = {"estimation": "eitbench.envs.estimation:Estimation", "injection": "eitbench.envs.injection:Injection"}
+"""Track -> where its classes …Env and …VectorEnv lie."""
+SETTINGS = {"estimation": ("lag", "assume"), "injection": ("gate",)}
+"""Track -> what an id may fix of its environment, beside the world."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A registered id: which world is played, and what is asked."""
+
+    id: str
+    """``namespace/Name-vN``"""
+    world: World
+    track: str
+    """estimation or injection"""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """of the environment, JSON-ready; one of `SETTINGS`"""
+    about: str = ""
+    """Markdown: what the page of the environment says first"""
+    seeds: str = "test:0-9"
+    """the episodes of its board"""
+
+
+_entries: dict[str, Entry] = {}
+_by_hand: set[str] = set()
+"""Ids that neither we nor an installed package registered: other processes must be told of them."""
+
+
+def register(world: World, id: str, *, track: str = "estimation", about: str = "", seeds: str = "test:0-9",
+             **settings: Any) -> None:
+    """Make a world playable under an id, for `gymnasium.make` and for everything here.
+
+    Parameters
+    ----------
+    world : World
+    id : str
+        ``namespace/Name-vN``. Other numbers are another version.
+    track : "estimation" or "injection"
+        Whether the agent says what the concentration is, or what to inject next.
+    about : str
+        Markdown, for the environment's page.
+    seeds : str
+        The test episodes of its board.
+    settings
+        Of the environment: ``lag`` and ``assume`` where estimates are asked for, ``gate`` where injections are.
+
+    Raises
+    ------
+    ValueError
+        If the id has another form or belongs to another world, or a setting is unknown.
+    """
+    if not re.fullmatch(r"[\w.-]+/[\w.-]+-v\d+", id):
+        raise ValueError(f"id must look like 'namespace/Name-v0', got {id!r}")
+    if track not in ENTRY_POINTS:
+        raise ValueError(f"track must be one of {', '.join(ENTRY_POINTS)}, got {track!r}")
+    if unknown := sorted(set(settings) - set(SETTINGS[track])):
+        raise ValueError(f"settings of the track {track} are {', '.join(SETTINGS[track])}; got {', '.join(unknown)}")
+    json.dumps(settings)
+    entry = Entry(id, world, track, settings, about, seeds)
+    if id in _entries and _entries[id] != entry:
+        raise ValueError(f"id {id} belongs to another world already; take another name or version")
+    _entries[id] = entry
+    _by_hand.add(id)
+    if id not in gym.registry:
+        place = ENTRY_POINTS[track]
+        gym.register(id, entry_point=f"{place}Env", vector_entry_point=f"{place}VectorEnv", kwargs={"name": id})
+
+
+def entries() -> dict[str, Entry]:
+    """All of them by id, in the order in which they were registered."""
+    return dict(_entries)
+
+
+def entry(id: str) -> Entry:
+    """The entry of this id; ``ValueError`` naming all, if there is none."""
+    if id not in _entries:
+        raise ValueError(f"env must be one of {', '.join(_entries)}; got {id!r}")
+    return _entries[id]
+
+
+def registered_by_hand() -> list[Entry]:
+    """Entries that another process does not know by itself."""
+    return [_entries[id] for id in sorted(_by_hand)]
+
+
+def take_over(told: list[Entry]) -> None:
+    """Register what another process has registered by hand."""
+    for each in told:
+        if _entries.get(each.id) != each:
+            register(each.world, each.id, track=each.track, about=each.about, seeds=each.seeds, **each.settings)
+
+
+def register_installed() -> None:
+    """Register our worlds, and those of installed packages; one that fails is left out with a warning."""
+    import_module("eitbench.worlds.ours")
+    for point in entry_points(group=GROUP):
+        try:
+            point.load()
+        except Exception as error:          # somebody else's package must not break ours
+            warnings.warn(f"worlds of {point.value} are left out: {type(error).__name__}: {error}", stacklevel=2)
+    _by_hand.clear()

@@ -1,0 +1,125 @@
+"""When something is injected and read, and which currents those are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from eitbench import _check
+
+if TYPE_CHECKING:
+    from eitbench.worlds.vessels import PlanePipe, RoundPipe, RoundTank
+
+
+class Pattern(Protocol):
+    """The cycle of injections, in parts of the instrument's current. A frozen dataclass of plain numbers."""
+
+    def __call__(self, vessel: Any) -> np.ndarray:
+        """(K, L), each row summing to zero."""
+        ...
+
+
+@dataclass(frozen=True)
+class AcrossAndAslant:
+    """Straight across a plane pipe, then aslant, three electrodes further down [ours].
+
+    Successive injections are far apart, so that each part of the pipe is seen anew before the fluid has left it.
+    Electrodes 0 … L/2−1 lie on the lower wall, L/2 … L−1 on the upper one, both along the flow.
+    """
+
+    frame: int = 16
+    """injections a frame [T]"""
+
+    def __post_init__(self) -> None:
+        _check.integer("frame", self.frame, low=1)
+
+    def __call__(self, vessel: PlanePipe) -> np.ndarray:
+        per_wall = vessel.electrodes_per_wall
+        currents = np.zeros((self.frame, 2 * per_wall))
+        for k in range(self.frame):
+            lower = (3 * (k // 2) + 4 * (k % 2)) % per_wall
+            upper = per_wall + (lower + 3 * (k % 2)) % per_wall
+            currents[k, lower] = 1.0
+            currents[k, upper] = -1.0
+        return currents
+
+
+@dataclass(frozen=True)
+class RingsInTurn:
+    """Straight across a ring of a round pipe, then aslant into the next ring down the flow [ours].
+
+    The rings take turns, and the angle moves on by three places each time. Electrode number = ring·(electrodes per
+    ring) + place around.
+    """
+
+    frame: int = 16
+    """injections a frame [T]"""
+
+    def __post_init__(self) -> None:
+        _check.integer("frame", self.frame, low=1)
+
+    def __call__(self, vessel: RoundPipe) -> np.ndarray:
+        per_ring = vessel.electrodes_per_ring
+        rings = vessel.electrode_rings
+        currents = np.zeros((self.frame, per_ring * rings))
+        for k in range(self.frame):
+            ring = (k // 2 + (k % 2) * (rings // 2)) % rings
+            place = 3 * k % per_ring
+            further = (ring + k % 2) % rings
+            currents[k, ring * per_ring + place] += 1.0
+            currents[k, further * per_ring + (place + per_ring // 2) % per_ring] -= 1.0
+        return currents
+
+
+@dataclass(frozen=True)
+class OnePair:
+    """The same pair of electrodes all the time: number 0, and the one opposite [T: one pair; ours: which]."""
+
+    def __call__(self, vessel: RoundTank) -> np.ndarray:
+        return _pair(vessel, 0, vessel.n_electrodes // 2)[None]
+
+
+@dataclass(frozen=True)
+class AroundTheTank:
+    """Eight injections straight across a tank, then eight aslant, each far from the one before [ours]."""
+
+    def __call__(self, vessel: RoundTank) -> np.ndarray:
+        half = vessel.n_electrodes // 2
+        across = [_pair(vessel, 3 * k, 3 * k + half) for k in range(8)]
+        aslant = [_pair(vessel, 6 * k + k // 4, 6 * k + k // 4 + half - 3) for k in range(8)]
+        return np.array(across + aslant)
+
+
+def _pair(vessel: RoundTank, source: int, sink: int) -> np.ndarray:
+    """(L,): current enters at one electrode and leaves at another, numbers modulo L."""
+    currents = np.zeros(vessel.n_electrodes)
+    currents[source % vessel.n_electrodes] += 1.0
+    currents[sink % vessel.n_electrodes] -= 1.0
+    return currents
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """When something is injected and read."""
+
+    time_step: float = 5e-3
+    """s between two injections [T]"""
+    scored_steps: int = 80
+    """injections scored: five frames [ours]"""
+    pattern: Pattern = field(default_factory=AcrossAndAslant)
+    """the cycle of injections"""
+    warm_up: int | None = None
+    """injections not scored; None: the mean flow flushes the vessel once, and there is a whole frame"""
+    calibration: int | None = None
+    """first injections, from which ĉ_bh is found; None: a whole turn of the pattern"""
+    budget: int | None = None
+    """injections that an agent may make, where it may also inject nothing; None: it injects at every step"""
+
+    def __post_init__(self) -> None:
+        _check.number("time_step", self.time_step, low=0.0, open_low=True, units="s")
+        _check.integer("scored_steps", self.scored_steps, low=1)
+        for name, low in (("warm_up", 0), ("calibration", 1), ("budget", 0)):
+            if getattr(self, name) is not None:
+                _check.integer(name, getattr(self, name), low=low)

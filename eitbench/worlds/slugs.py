@@ -1,0 +1,160 @@
+"""Slugs: liquid of higher or lower concentration that enters at random and is carried through a pipe."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from eitbench import _check
+from eitbench.worlds.world import Discretisation, History, Target, World
+
+if TYPE_CHECKING:
+    from eitbench.physics.transport import Transport
+    from eitbench.worlds.streams import Randomness
+
+Inflow = Callable[[np.ndarray, float], np.ndarray]
+"""(points (k, d) in m, time in s) -> concentration (k,) in mol/m³"""
+KEPT = 48
+"""Transport models of a fine mesh that are kept: a wandering flow comes back to the same velocities."""
+
+
+class Arrivals(Protocol):
+    """When slugs come. A frozen dataclass of plain numbers."""
+
+    def draw(self, random: np.random.Generator, begin: float, end: float) -> np.ndarray:
+        """Times in s at which slugs' centres pass the inlet."""
+        ...
+
+
+@dataclass(frozen=True)
+class OneInEach:
+    """One slug in each interval, at random within it."""
+
+    interval: float = 0.020
+    """s [ours]"""
+
+    def __post_init__(self) -> None:
+        _check.number("interval", self.interval, low=0.0, open_low=True, units="s")
+
+    def draw(self, random: np.random.Generator, begin: float, end: float) -> np.ndarray:
+        n = math.ceil((end - begin) / self.interval)
+        return begin + (np.arange(n) + random.uniform(0.0, 1.0, n)) * self.interval
+
+
+@dataclass(frozen=True)
+class NowAndThen:
+    """Slugs one at a time, at times nobody foresees; all numbers are ours.
+
+    Between two lies at least ``interval``, and then for every moment the same probability that the next one comes: how
+    long it has been quiet says nothing of what will be.
+    """
+
+    interval: float = 0.10
+    """s; least time between the centres of two slugs: the first has left the pipe"""
+    wait: float = 0.20
+    """s; mean time beyond that"""
+
+    def __post_init__(self) -> None:
+        _check.number("interval", self.interval, low=0.0, open_low=True, units="s")
+        _check.number("wait", self.wait, low=0.0, open_low=True, units="s")
+
+    def draw(self, random: np.random.Generator, begin: float, end: float) -> np.ndarray:
+        n = math.ceil((end - begin) / self.interval) + 1
+        # The first wait is shortened at random: the record begins anywhere between two slugs.
+        waits = self.interval + random.exponential(self.wait, n)
+        waits[0] *= random.uniform()
+        when = begin + np.cumsum(waits)
+        return when[when < end]
+
+
+@dataclass(frozen=True)
+class Slugs(Target):
+    """Slugs of both signs, Gaussian across the pipe and in time: c_in = background·exp(Σ ±a·g(r)·g(t)) [ours]."""
+
+    background: float = 30.0
+    """mol/m³, about 0.3 S/m: weak saline"""
+    strength: tuple[float, float] = (0.22, 0.40)
+    """|ln(c/background)| at a slug's centre, either sign"""
+    duration: tuple[float, float] = (6e-3, 14e-3)
+    """s, standard deviation in time of a slug's Gaussian"""
+    width: tuple[float, float] = (0.010, 0.025)
+    """m, standard deviation across the pipe"""
+    arrivals: Arrivals = field(default_factory=OneInEach)
+    """when they come"""
+
+    is_carried = True
+
+    def __post_init__(self) -> None:
+        _check.number("background", self.background, low=0.0, open_low=True, units="mol/m³")
+        for name, units in (("strength", ""), ("duration", "s"), ("width", "m")):
+            low, high = _check.array(name, getattr(self, name), (2,), units=units)
+            if not 0 < low <= high:
+                raise ValueError(f"{name} must be a range 0 < low ≤ high, got {getattr(self, name)!r}")
+
+    def draw_inflow(self, world: World, random: np.random.Generator) -> Inflow:
+        """What enters in one episode."""
+        begin = -world.lead_in * world.time_step - 0.05
+        end = world.n_steps * world.time_step + 0.05
+        when = self.arrivals.draw(random, begin, end)
+        n = len(when)
+        where = world.vessel.draw_places(random, n)
+        strength = random.choice([-1.0, 1.0], n) * random.uniform(*self.strength, n)
+        duration = random.uniform(*self.duration, n)
+        width = random.uniform(*self.width, n)
+
+        def inflow(points: np.ndarray, time: float) -> np.ndarray:
+            distance = world.vessel.across(points)[:, None] - where                        # (k, n, d − 1)
+            bell = np.exp(-0.5 * ((distance / width[:, None])**2).sum(axis=2))
+            strengths = strength * np.exp(-0.5 * ((time - when) / duration)**2)
+            return np.asarray(self.background * np.exp(bell @ strengths))
+
+        return inflow
+
+    def evolve(self, world: World, episodes: Sequence[Randomness], truth: Discretisation,
+               tick: Callable[[int], object], last: int) -> Iterator[History]:
+        flows = [world.flow.draw(world, episode.flow) for episode in episodes]
+        inflows = [self.draw_inflow(world, episode.inflow) for episode in episodes]
+        if flows[0] is None:                                    # one flow carries all of them together
+            for concentration in carry(world, lambda t: truth.transport, inflows, tick, last):
+                yield History(concentration, np.empty((last, 0)))
+            return
+
+        @lru_cache(maxsize=KEPT)
+        def transport(velocity: object) -> Transport:
+            return truth.transport.with_velocity(velocity)  # type: ignore[attr-defined]
+
+        model = world.velocity_model
+        points = np.empty(0) if model is None else model.points
+        for flow, inflow in zip(flows, inflows, strict=True):
+            assert flow is not None
+            (concentration,) = carry(world, lambda t: transport(flow(t)), [inflow], tick, last)  # noqa: B023
+            yield History(concentration, np.array([flow(t).profile(points) for t in range(1, last + 1)]))
+
+
+def carry(world: World, transport_at: Callable[[int], Transport], inflows: Sequence[Inflow],
+          tick: Callable[[int], object], last: int) -> np.ndarray:
+    """Concentrations (B, last + 1, n) in mol/m³ that B inflows make in one flow, t = 0 … last.
+
+    ``transport_at(t)`` moves the fluid from t − 1 to t, perhaps in several steps of its own; its mesh and inlet do
+    not change. The vessel holds the background when the lead-in begins. ``tick`` as in `Target.evolve`.
+    """
+    first = transport_at(1 - world.lead_in)
+    inlet = first.mesh.points[first.inlet]
+    states = np.empty((len(inflows), last + 1, first.mesh.n_nodes))
+    c = np.full((first.mesh.n_nodes, len(inflows)), world.background)
+    for t in range(-world.lead_in + 1, last + 1):
+        transport = transport_at(t)
+        dt = transport.time_step
+        for k in range(round(world.time_step / dt)):
+            before = (t - 1) * world.time_step + k * dt
+            c = transport.step(c, *(np.stack([inflow(inlet, time) for inflow in inflows], axis=1)
+                                    for time in (before, before + dt)))
+        if t >= 0:
+            states[:, t] = c.T
+        tick(len(inflows))
+    return states

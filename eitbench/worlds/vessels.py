@@ -1,0 +1,314 @@
+"""What holds the liquid: plane and round pipes, and flat round tanks, with the electrodes on their walls."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from eitbench import _check
+from eitbench.physics.flow import PlaneChannelFlow, RoundPipeFlow
+
+if TYPE_CHECKING:
+    from eitbench.numerics.mesh import Mesh
+    from eitbench.physics.cem import CompleteElectrodeModel
+
+
+@dataclass(frozen=True)
+class Bulge:
+    """A dent of a plane pipe's lower wall, electrodes and all: y = −R + h·exp(−((x − x₀)/w)²). All numbers are ours."""
+
+    height: float = 0.02
+    """h in m: a fifth of the pipe's width"""
+    position: float = 0.10
+    """x₀ in m"""
+    width: float = 0.025
+    """w in m"""
+
+    def __post_init__(self) -> None:
+        for name in ("height", "position", "width"):
+            _check.number(name, getattr(self, name), low=0.0, open_low=True, units="m")
+        if self.position < 3 * self.width:
+            raise ValueError("position must be at least three times width, so that the inlet is straight; got "
+                             f"{self.position!r} and {self.width!r} m")
+
+    def __call__(self, x: np.ndarray) -> np.ndarray:
+        """m by which the wall is raised at ``x`` in m."""
+        return np.asarray(self.height * np.exp(-((x - self.position) / self.width)**2))
+
+
+@dataclass(frozen=True)
+class PlanePipe:
+    """A straight plane channel along x between walls y = ±R, or one with a bulge in its lower wall.
+
+    [T]: the thesis' number (5.1.1); [ours]: our choice.
+    """
+
+    length: float = 0.40
+    """m [T]"""
+    half_width: float = 0.05
+    """R in m [T]"""
+    electrodes_per_wall: int = 8
+    """16 in all, on both walls [ours]"""
+    electrode_cover: float = 0.5
+    """part of the wall that electrodes cover, evenly spaced [ours]"""
+    contact_impedance: float = 2e-3
+    """z in Ω·m² [ours]"""
+    molar_conductivity: float = 0.01
+    """Λ in S·m²/mol; σ = Λc is linear [T], the slope is about that of NaCl [ours]"""
+    bulge: Bulge | None = None
+    """of the lower wall"""
+
+    patches = (12, 3)
+    is_long = True
+    parts_of_a_step = 2
+    lines = 40                           # parts of its length whose ends are lines of both carriers' meshes
+
+    def __post_init__(self) -> None:
+        for name, units in (("length", "m"), ("half_width", "m"), ("contact_impedance", "Ω·m²"),
+                            ("molar_conductivity", "S·m²/mol")):
+            _check.number(name, getattr(self, name), low=0.0, open_low=True, units=units)
+        _check.number("electrode_cover", self.electrode_cover, low=0.0, high=0.95, open_low=True)
+        _check.integer("electrodes_per_wall", self.electrodes_per_wall, low=2)
+        if self.bulge is not None:
+            _check.number("bulge.height", self.bulge.height, high=self.half_width, units="m")
+
+    @property
+    def n_electrodes(self) -> int:
+        """0 … L/2−1 lie on the lower wall, L/2 … L−1 on the upper one, both along the flow."""
+        return 2 * self.electrodes_per_wall
+
+    @property
+    def electrode_spans(self) -> np.ndarray:
+        """(electrodes_per_wall, 2) start and end in m along the wall."""
+        pitch = self.length / self.electrodes_per_wall
+        centres = (np.arange(self.electrodes_per_wall) + 0.5) * pitch
+        return centres[:, None] + 0.5 * self.electrode_cover * pitch * np.array([-1.0, 1.0])
+
+    def electrodes(self, mesh: Mesh) -> list[np.ndarray]:
+        """Boundary facets of each electrode on an EIT mesh of the straight pipe with nodes at the electrodes' edges."""
+        tiny = 1e-9 * self.length
+        x, y = mesh.points.T
+        places = [(wall, *span) for wall in (-self.half_width, self.half_width) for span in self.electrode_spans]
+        inside = [(np.abs(y - wall) < tiny) & (x > begin - tiny) & (x < end + tiny) for wall, begin, end in places]
+        return [mesh.facets_where(lambda points, those=those: those) for those in inside]  # type: ignore[misc]
+
+    def laminar(self, mean_velocity: float) -> PlaneChannelFlow:
+        """Laminar flow through the straight pipe with this mean velocity in m/s."""
+        return PlaneChannelFlow(mean_velocity, self.half_width)
+
+    def across(self, points: np.ndarray) -> np.ndarray:
+        """(k, 1) coordinates across the pipe of points (k, 2), in m."""
+        return points[:, 1:2]
+
+    def draw_places(self, random: np.random.Generator, n: int) -> np.ndarray:
+        """(n, 1) places on the inlet in m, as `across` counts them, within 0.7 R of the axis."""
+        return random.uniform(-0.7, 0.7, n)[:, None] * self.half_width
+
+    def substeps(self, fine: bool) -> int:
+        return 16 if fine else 8
+
+    def carrier(self, fine: bool) -> tuple[Mesh, np.ndarray]:
+        """10,251 nodes for the truth, 1,701 for the model."""
+        from eitbench.numerics.mesh import rectangle_mesh  # finite elements: not needed to play recordings
+        along, across = (200, 50) if fine else (80, 20)
+        mesh = rectangle_mesh(np.linspace(0.0, self.length, along + 1),
+                              np.linspace(-self.half_width, self.half_width, across + 1))
+        return self.shaped(mesh), np.arange(across + 1)
+
+    def electrode_model(self, fine: bool) -> CompleteElectrodeModel:
+        """About 18,000 unknowns for the truth, 4,600 for the model."""
+        from eitbench.numerics.mesh import graded_pipe_mesh
+        from eitbench.physics.cem import CompleteElectrodeModel
+        at_electrodes, across = (10, 28) if fine else (5, 14)
+        straight = graded_pipe_mesh(self.length, self.half_width, self.electrode_spans, at_electrodes, across)
+        return CompleteElectrodeModel(self.shaped(straight), self.electrodes(straight), self.contact_impedance)
+
+    def lower_wall(self, x: np.ndarray) -> np.ndarray:
+        """y of the lower wall in m at ``x`` in m."""
+        return (0.0 if self.bulge is None else self.bulge(x)) - self.half_width * np.ones_like(x)
+
+    def shaped(self, mesh: Mesh) -> Mesh:
+        """A mesh of the straight pipe, bent to this pipe's walls."""
+        if self.bulge is None:
+            return mesh
+        from eitbench.numerics.mesh import Mesh
+        x, y = mesh.points.T
+        R = self.half_width
+        low = self.bulge(x) - R
+        return Mesh(np.stack([x, low + (y + R) * (R - low) / (2.0 * R)], axis=1), mesh.cells)
+
+
+@dataclass(frozen=True)
+class RoundPipe:
+    """A straight round pipe along z, with rings of electrodes on its wall (thesis 5.2, Fig. 5.10).
+
+    The page at hand shows the figure only: sizes and electrodes are ours. Contact impedance is per area.
+    """
+
+    length: float = 0.40
+    """m [T: of the 2D pipe]"""
+    radius: float = 0.05
+    """R in m [ours: as in 2D]"""
+    electrode_rings: int = 4
+    """rings of electrodes along the pipe [ours]"""
+    electrodes_per_ring: int = 8
+    """32 electrodes in all [ours]"""
+    electrode_length: float = 0.04
+    """m along the pipe [ours]"""
+    electrode_cover: float = 0.5
+    """part of a ring that electrodes cover, evenly spaced [ours]"""
+    contact_impedance: float = 2e-3
+    """z in Ω·m² [ours]"""
+    molar_conductivity: float = 0.01
+    """Λ in S·m²/mol; σ = Λc [ours]"""
+    potential_order: int = 2
+    """of the elements for the potential. At equal numbers of unknowns P1 errs three times as much, by more than the
+    noise: ``docs/pipe3d.md``"""
+
+    patches = (6, 6)
+    is_long = True
+    parts_of_a_step = 2
+
+    def __post_init__(self) -> None:
+        for name, units in (("length", "m"), ("radius", "m"), ("electrode_length", "m"),
+                            ("contact_impedance", "Ω·m²"), ("molar_conductivity", "S·m²/mol")):
+            _check.number(name, getattr(self, name), low=0.0, open_low=True, units=units)
+        _check.number("electrode_cover", self.electrode_cover, low=0.0, high=0.95, open_low=True)
+        _check.integer("electrode_rings", self.electrode_rings, low=1)
+        _check.integer("electrodes_per_ring", self.electrodes_per_ring, low=4)
+        _check.integer("potential_order", self.potential_order, low=1, high=2)
+        if self.electrode_length * self.electrode_rings >= 0.95 * self.length:
+            raise ValueError(f"electrode_length must leave gaps between {self.electrode_rings} rings on {self.length} "
+                             f"m of pipe, got {self.electrode_length!r} m")
+
+    @property
+    def n_electrodes(self) -> int:
+        """Ring by ring, down the flow."""
+        return self.electrode_rings * self.electrodes_per_ring
+
+    @property
+    def spans_around(self) -> np.ndarray:
+        """(electrodes_per_ring, 2) first and last angle of each electrode of a ring in rad."""
+        return _spans_around(self.electrodes_per_ring, self.electrode_cover)
+
+    @property
+    def spans_along(self) -> np.ndarray:
+        """(electrode_rings, 2) where each ring begins and ends along the pipe, m."""
+        centres = (np.arange(self.electrode_rings) + 0.5) * self.length / self.electrode_rings
+        return centres[:, None] + 0.5 * self.electrode_length * np.array([-1.0, 1.0])
+
+    def electrodes(self, mesh: Mesh) -> list[np.ndarray]:
+        """Boundary facets of each electrode, ring by ring, on an EIT mesh whose nodes include the electrodes' edges."""
+        z = mesh.points[:, 2]
+        tiny = 1e-9 * self.length
+        facets = []
+        for begin, end in self.spans_along:
+            ring = (z > begin - tiny) & (z < end + tiny)
+            facets += _electrodes_around(mesh, self.radius, self.spans_around, ring)
+        return facets
+
+    def laminar(self, mean_velocity: float) -> RoundPipeFlow:
+        """Laminar flow with this mean velocity in m/s."""
+        return RoundPipeFlow(mean_velocity, self.radius)
+
+    def across(self, points: np.ndarray) -> np.ndarray:
+        """(k, 2) coordinates across the pipe of points (k, 3), in m."""
+        return points[:, :2]
+
+    def draw_places(self, random: np.random.Generator, n: int) -> np.ndarray:
+        """(n, 2) places on the inlet in m, as `across` counts them, within 0.7 R of the axis."""
+        distance = 0.7 * self.radius * np.sqrt(random.uniform(size=n))
+        angle = random.uniform(0.0, 2.0 * np.pi, n)
+        return distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+    def substeps(self, fine: bool) -> int:
+        return 8
+
+    def carrier(self, fine: bool) -> tuple[Mesh, np.ndarray]:
+        """13,689 nodes for the truth, 3,003 for the model."""
+        from eitbench.numerics.round import extrude, uniform_disc  # finite elements: not needed to play recordings
+        rings, layers = (7, 80) if fine else (5, 32)
+        section = uniform_disc(self.radius, rings)
+        return extrude(section, np.linspace(0.0, self.length, layers + 1)), np.arange(section.n_nodes)
+
+    def electrode_model(self, fine: bool) -> CompleteElectrodeModel:
+        """About 42,000 unknowns for the truth, 21,000 for the model."""
+        from eitbench.numerics.round import round_pipe_mesh
+        from eitbench.physics.cem import CompleteElectrodeModel
+        at_electrodes, rings, grading = ((4, 5), 5, (2.5, 1.75, 2.5)) if fine else ((3, 4), 4, (2.5, 1.5, 2.5))
+        mesh = round_pipe_mesh(self.length, self.radius, self.spans_around, self.spans_along, at_electrodes, rings,
+                               grading)
+        return CompleteElectrodeModel(mesh, self.electrodes(mesh), self.contact_impedance, self.potential_order)
+
+
+@dataclass(frozen=True)
+class RoundTank:
+    """A flat round tank with electrodes around its wall (thesis ch. 7). All numbers are ours."""
+
+    radius: float = 0.14
+    """m"""
+    n_electrodes: int = 16
+    """around the wall; number 0 at angle 0, counted counter-clockwise"""
+    electrode_cover: float = 0.5
+    """part of the wall that electrodes cover, evenly spaced"""
+    contact_impedance: float = 2e-3
+    """z in Ω·m²"""
+    molar_conductivity: float = 0.01
+    """Λ in S·m²/mol; σ = Λc"""
+
+    patches = (6, 6)
+    is_long = False
+    parts_of_a_step = 1
+
+    def __post_init__(self) -> None:
+        for name, units in (("radius", "m"), ("contact_impedance", "Ω·m²"), ("molar_conductivity", "S·m²/mol")):
+            _check.number(name, getattr(self, name), low=0.0, open_low=True, units=units)
+        _check.number("electrode_cover", self.electrode_cover, low=0.0, high=0.95, open_low=True)
+        _check.integer("n_electrodes", self.n_electrodes, low=4)
+
+    @property
+    def electrode_spans(self) -> np.ndarray:
+        """(L, 2) first and last angle of each electrode in rad."""
+        return _spans_around(self.n_electrodes, self.electrode_cover)
+
+    def electrodes(self, mesh: Mesh) -> list[np.ndarray]:
+        """Boundary facets of each electrode on an EIT mesh whose nodes include the electrodes' edges."""
+        return _electrodes_around(mesh, self.radius, self.electrode_spans)
+
+    def substeps(self, fine: bool) -> int:
+        return 8
+
+    def carrier(self, fine: bool) -> tuple[Mesh, np.ndarray]:
+        """4,921 nodes for the truth, 1,261 for the model; nothing flows in."""
+        from eitbench.numerics.round import uniform_disc  # not needed to play recordings
+        return uniform_disc(self.radius, 40 if fine else 20), np.empty(0, dtype=int)
+
+    def electrode_model(self, fine: bool) -> CompleteElectrodeModel:
+        """About 9,300 unknowns for the truth, 3,100 for the model."""
+        from eitbench.numerics.round import electrode_disc
+        from eitbench.physics.cem import CompleteElectrodeModel
+        at_electrodes, rings = (8, 22) if fine else (4, 13)
+        mesh = electrode_disc(self.radius, self.electrode_spans, at_electrodes, rings)
+        return CompleteElectrodeModel(mesh, self.electrodes(mesh), self.contact_impedance)
+
+
+def _spans_around(count: int, cover: float) -> np.ndarray:
+    """(count, 2) first and last angle in rad of electrodes evenly spaced around a wall."""
+    pitch = 2.0 * np.pi / count
+    return pitch * (np.arange(count)[:, None] + 0.5 * cover * np.array([-1.0, 1.0]))
+
+
+def _electrodes_around(mesh: Mesh, radius: float, spans: np.ndarray, where: np.ndarray | bool = True,
+                       ) -> list[np.ndarray]:
+    """Boundary facets of electrodes at these angles of a round wall, at the nodes ``where``."""
+    x, y = mesh.points[:, :2].T
+    angle = np.arctan2(y, x)
+    wall = (np.hypot(x, y) > (1.0 - 1e-9) * radius) & where
+    facets = []
+    for first, last in spans:
+        off_centre = np.abs(np.mod(angle - 0.5 * (first + last) + np.pi, 2.0 * np.pi) - np.pi)
+        inside = wall & (off_centre < 0.5 * (last - first) + 1e-9)
+        facets.append(mesh.facets_where(lambda points, inside=inside: inside))  # type: ignore[misc]
+    return facets

@@ -1,0 +1,409 @@
+"""A world: vessel × flow × target × instrument × schedule, and what is believed of it beforehand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+
+import numpy as np
+
+from eitbench import _check
+from eitbench.physics.observation import LinearConductivity, ObservationModel, VoltageNoise
+from eitbench.worlds.instrument import Instrument
+from eitbench.worlds.schedule import Schedule
+
+if TYPE_CHECKING:
+    from eitbench.numerics.mesh import Mesh
+    from eitbench.physics.cem import CompleteElectrodeModel
+    from eitbench.physics.profiles import SkewedChannelFlow, VelocityModel
+    from eitbench.physics.transport import Transport, VelocityField
+    from eitbench.worlds.streams import Randomness
+
+
+class Discretisation(NamedTuple):
+    """A world on meshes: how the concentration moves and how it is seen."""
+
+    transport: Transport
+    observation: ObservationModel
+
+
+class History(NamedTuple):
+    """What moved in one episode."""
+
+    concentration: np.ndarray
+    """(T + 1, n) mol/m³ at the nodes of the truth's CD mesh, t = 0 … T"""
+    velocity: np.ndarray
+    """(T, p) m/s at `VelocityModel.points`, t = 1 … T; p = 0 where nobody is asked for the flow"""
+
+
+class Vessel(Protocol):
+    """What holds the liquid, with the electrodes on its wall. A frozen dataclass of plain numbers in SI units."""
+
+    @property
+    def contact_impedance(self) -> float:
+        """z in Ω·m²."""
+        ...
+
+    @property
+    def molar_conductivity(self) -> float:
+        """Λ in S·m²/mol; σ = Λc."""
+        ...
+
+    @property
+    def n_electrodes(self) -> int:
+        """L."""
+        ...
+
+    @property
+    def patches(self) -> tuple[int, int]:
+        """Along x and y: the coarse grid on which an agent sees an estimate."""
+        ...
+
+    @property
+    def is_long(self) -> bool:
+        """Whether pictures of it are laid one below the other."""
+        ...
+
+    def carrier(self, fine: bool) -> tuple[Mesh, np.ndarray]:
+        """The mesh on which concentration moves, ``fine`` for the truth, and the numbers of its inlet's nodes."""
+        ...
+
+    @property
+    def parts_of_a_step(self) -> int:
+        """Steps of the truth's transport in a time step."""
+        ...
+
+    def substeps(self, fine: bool) -> int:
+        """Crank–Nicolson steps in each of them, or in a time step of the model."""
+        ...
+
+    def electrode_model(self, fine: bool) -> CompleteElectrodeModel:
+        """The complete electrode model, on a mesh of its own."""
+        ...
+
+
+class Flow(Protocol):
+    """How the fluid moves. A frozen dataclass of plain numbers in SI units; what is said here holds where it says
+    nothing else."""
+
+    @property
+    def diffusivity(self) -> float:
+        """κ in m²/s; of the estimators' model where the truth is not carried."""
+        ...
+
+    def nominal(self, world: World, fine: bool) -> VelocityField | None:
+        """The velocity with which the truth (``fine``) and the estimators' model are built; None: nothing moves."""
+        ...
+
+    def check_assumed(self, world: World, assumed: Mapping[str, Any]) -> None:
+        """``ValueError`` if `believed` knows nothing of what is assumed; at no cost."""
+        refuse_assumptions(assumed, ())
+
+    def believed(self, world: World, **assumed: Any) -> VelocityField | None:
+        """The velocity of the estimators' model; ``assumed`` is what they are told instead, by name."""
+        self.check_assumed(world, assumed)
+        return self.nominal(world, fine=False)
+
+    def flush_steps(self, world: World) -> int:
+        """Time steps in which the mean flow passes through the vessel; 0 where nothing does."""
+        return 0
+
+    def lead_in(self, world: World) -> int:
+        """Time steps that the fluid flows before t = 0: the slowest flow has flushed the vessel."""
+        return self.flush_steps(world)
+
+    def velocity_model(self, world: World) -> VelocityModel | None:
+        """How the flow may be written where it is to be estimated too."""
+        return None
+
+    def draw(self, world: World, random: np.random.Generator) -> Callable[[int], SkewedChannelFlow] | None:
+        """t -> the flow from t − 1 to t in one episode; None where that is the nominal one in all of them."""
+        return None
+
+    def true_transport(self, world: World, model: Discretisation, random: np.random.Generator,
+                       ) -> Callable[[int], Transport]:
+        """See `World.true_transport`."""
+        drawn = self.draw(world, random)
+        if drawn is None:
+            return lambda t: model.transport
+        from eitbench.physics.transport import ConvectionDiffusion
+        assert isinstance(model.transport, ConvectionDiffusion)
+        at = lru_cache(maxsize=1)(model.transport.with_velocity)
+        return lambda t: at(drawn(t))
+
+
+def refuse_assumptions(assumed: Mapping[str, Any], known: Sequence[str]) -> None:
+    """``ValueError`` if estimators are told something that this flow knows nothing of."""
+    for name in assumed:
+        if name not in known:
+            there = f"there are {', '.join(known)}" if known else "this world has nothing to assume"
+            raise ValueError(f"assume has no {name!r}; {there}")
+
+
+class Target(Protocol):
+    """What is to be seen. A frozen dataclass of plain numbers in SI units."""
+
+    @property
+    def background(self) -> float:
+        """Concentration (mol/m³) that fills the vessel at first."""
+        ...
+
+    @property
+    def is_carried(self) -> bool:
+        """Whether the truth is concentration that the fluid carries; else the target has a way of its own."""
+        ...
+
+    def evolve(self, world: World, episodes: Sequence[Randomness], truth: Discretisation,
+               tick: Callable[[int], object], last: int) -> Iterator[History]:
+        """What moves in each episode up to state ``last``. Its numbers do not depend on the others, to the bit.
+
+        ``tick(k)`` is called when k more steps of one episode are done.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is believed before anything is measured; standard deviations in parts of ĉ_bh (thesis Table 5.1)."""
+
+    expected_concentration: float = 25.0
+    """mol/m³; a rough level, deliberately not the background [ours]"""
+    inflow_std: float = 1 / 4
+    """of the inflow noise η [T]"""
+    nodal_std: float = 1 / 50
+    """of the nodal noise e [ours; illegible in the table]"""
+    initial_std: float = 1 / 4
+    """of the initial state [ours; illegible in the table]"""
+    initial_length: float = 0.0
+    """m over which the initial state is smooth; 0: nodes are independent"""
+
+    def __post_init__(self) -> None:
+        _check.number("expected_concentration", self.expected_concentration, low=0.0, open_low=True, units="mol/m³")
+        for name in ("inflow_std", "nodal_std", "initial_std"):
+            _check.number(name, getattr(self, name), low=0.0)
+        _check.number("initial_length", self.initial_length, low=0.0, units="m")
+
+
+@dataclass(frozen=True)
+class World:
+    """What is simulated into episodes: parts that can be swapped, each a frozen dataclass of plain numbers.
+
+    Parameters
+    ----------
+    name : str
+        Under which its episodes are kept.
+    vessel, flow, target, instrument, schedule
+        See `Vessel`, `Flow`, `Target`, `Instrument`, `Schedule`.
+    prior : Prior
+        What estimators are told to believe.
+    region : (float, float) or None
+        m along the vessel's first axis; only errors between these cross-sections count. None: the whole vessel.
+    """
+
+    name: str
+    vessel: Vessel
+    flow: Flow
+    target: Target
+    instrument: Instrument = field(default_factory=Instrument)
+    schedule: Schedule = field(default_factory=Schedule)
+    prior: Prior = field(default_factory=Prior)
+    region: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        for part in (self.vessel, self.flow, self.target):
+            if hasattr(part, "check"):
+                part.check(self)
+        if self.instrument.most > self.vessel.n_electrodes - 2:
+            raise ValueError("instrument: dead, failing and loose must leave two electrodes sound, got up to "
+                             f"{self.instrument.most} of {self.vessel.n_electrodes}")
+        if self.region is not None:
+            self._check_region(self.region)
+
+    def _check_region(self, region: tuple[float, float]) -> None:
+        lines = getattr(self.vessel, "lines", None)
+        if lines is None:
+            raise ValueError(f"region must be None in a {type(self.vessel).__name__}, got {region!r}")
+        length = self.vessel.length
+        low, high = ends = _check.array("region", region, (2,), units="m")
+        parts = lines * ends / length
+        if not 0 <= low < high <= length or np.abs(parts - parts.round()).max() > 1e-6:
+            raise ValueError(f"region must be a range 0 ≤ begin < end ≤ {length:g} m with ends at multiples of "
+                             f"{length / lines:g} m, lines of both meshes, got {region!r}")
+
+    # -- time --
+
+    @property
+    def time_step(self) -> float:
+        """s between two injections."""
+        return self.schedule.time_step
+
+    @property
+    def flush_steps(self) -> int:
+        """Time steps in which the mean flow passes through the vessel."""
+        return self.flow.flush_steps(self)
+
+    @property
+    def lead_in(self) -> int:
+        """Time steps that the fluid flows before t = 0."""
+        return self.flow.lead_in(self)
+
+    @property
+    def warm_up(self) -> int:
+        """Injections that are measured but not scored: by default the mean flow flushes the vessel once, and there is
+        a whole turn of the pattern."""
+        if self.schedule.warm_up is not None:
+            return self.schedule.warm_up
+        return max(self.flush_steps, len(self.currents))
+
+    @property
+    def n_steps(self) -> int:
+        """Injections measured, t = 1 … n_steps."""
+        return self.warm_up + self.schedule.scored_steps
+
+    @property
+    def calibration(self) -> int:
+        """First injections, from which an estimator finds ĉ_bh."""
+        return self.schedule.calibration or len(self.currents)
+
+    # -- what is injected and read --
+
+    @property
+    def currents(self) -> np.ndarray:
+        """(K, L) injection cycle in A (A/m in 2D); injection t uses row (t − 1) mod K."""
+        return self._currents.copy()
+
+    @cached_property
+    def _currents(self) -> np.ndarray:
+        return self.instrument.current * self.schedule.pattern(self.vessel)
+
+    @property
+    def noise(self) -> VoltageNoise:
+        """Of a sound electrode's reading."""
+        return self.instrument.noise
+
+    # -- what is believed --
+
+    @property
+    def background(self) -> float:
+        """Concentration (mol/m³) that fills the vessel when the lead-in begins."""
+        return self.target.background
+
+    @property
+    def expected_concentration(self) -> float:
+        """Rough level in mol/m³ that an operator would expect; not the background."""
+        return self.prior.expected_concentration
+
+    @property
+    def velocity_model(self) -> VelocityModel | None:
+        """How the flow may be written where it is to be estimated too."""
+        return self.flow.velocity_model(self)
+
+    # -- discretisations --
+
+    def truth(self) -> Discretisation:
+        """The fine one that is simulated."""
+        velocity = self.flow.nominal(self, fine=True) if self.target.is_carried else None
+        return self._discretise(velocity, fine=True)
+
+    def model(self, **assumed: Any) -> Discretisation:
+        """The coarser one that estimators are given.
+
+        ``assumed`` is what they wrongly believe of the flow; `Flow.believed` says what there is. ``ValueError`` if it
+        has nothing of this name.
+        """
+        return self._discretise(self.flow.believed(self, **assumed), fine=False)
+
+    def true_transport(self, model: Discretisation, flow: np.random.Generator) -> Callable[[int], Transport]:
+        """t -> what moves an episode's concentration from t − 1 to t, on the estimators' mesh; for references only.
+
+        ``model`` is what estimators are given when they are told nothing wrong, ``flow`` the episode's fresh stream.
+        """
+        return self.flow.true_transport(self, model, flow)
+
+    def evolve(self, episodes: Sequence[Randomness], truth: Discretisation, tick: Callable[[int], object],
+               last: int | None = None) -> Iterator[History]:
+        """What moves in each episode, up to state ``last`` (default: all); see `Target.evolve`."""
+        return self.target.evolve(self, episodes, truth, tick, self.n_steps if last is None else last)
+
+    def _discretise(self, velocity: VelocityField | None, fine: bool) -> Discretisation:
+        from eitbench.physics.rest import AtRest  # finite elements: not needed to play recordings
+        from eitbench.physics.transport import ConvectionDiffusion
+        mesh, inlet = self.vessel.carrier(fine)
+        transport: Transport
+        if velocity is None:
+            transport = AtRest(mesh, self.time_step)
+        else:
+            parts = self.vessel.parts_of_a_step if fine else 1
+            transport = ConvectionDiffusion(mesh, velocity, self.flow.diffusivity, self.time_step / parts,
+                                            substeps=self.vessel.substeps(fine), inlet=inlet)
+        cem = self.vessel.electrode_model(fine)
+        observation = ObservationModel(cem, mesh.interpolation_to(cem.mesh.points),
+                                       LinearConductivity(self.vessel.molar_conductivity),
+                                       1e-2 * self.expected_concentration)
+        return Discretisation(transport, observation)
+
+    def __hash__(self) -> int:
+        return self._hash
+
+    @cached_property
+    def _hash(self) -> int:
+        return hash(tuple(getattr(self, each.name) for each in fields(self)))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what is derived: a hash holds in its own process only."""
+        return {each.name: getattr(self, each.name) for each in fields(self)}
+
+    # -- variants --
+
+    def changed(self, changes: Mapping[str, Any] | None) -> World:
+        """This world with some numbers changed, as in ``{"instrument": {"noise_relative": 0.02}}``.
+
+        Raises
+        ------
+        ValueError
+            Naming what there is, if a part or a number has another name, or what is allowed, if it is out of range.
+        """
+        if changes is None:
+            return self
+        if not isinstance(changes, Mapping):
+            raise ValueError(f"world must be a dict of parts and their numbers, got {changes!r}")
+        if "name" in changes:
+            raise ValueError("world must not change its name, under which its episodes are kept")
+        return _changed(self, changes, "world")
+
+    @cached_property
+    def sound(self) -> World:
+        """What a filter depends on that believes in an instrument without faults and floor: variants share theirs."""
+        instrument = Instrument(current=self.instrument.current, noise_relative=self.instrument.noise_relative,
+                                noise_of_largest=self.instrument.noise_of_largest)
+        return replace(self, instrument=instrument, schedule=replace(self.schedule, budget=None))
+
+    @cached_property
+    def fluid(self) -> World:
+        """What the truth depends on: this world with a sound instrument, so that variants share their episodes."""
+        return replace(self, instrument=Instrument(current=self.instrument.current),
+                       prior=Prior(self.expected_concentration), schedule=replace(self.schedule, budget=None))
+
+
+def _changed(part: Any, changes: Mapping[str, Any], where: str) -> Any:
+    known = [each.name for each in fields(part) if not (isinstance(part, World) and each.name == "name")]
+    made: dict[str, Any] = {}
+    for name, value in changes.items():
+        if name not in known:
+            raise ValueError(f"{where} has no {name!r}; there are {', '.join(known)}")
+        old = getattr(part, name)
+        if is_dataclass(old) and isinstance(value, Mapping):
+            made[name] = _changed(old, value, f"{where}.{name}")
+        elif is_dataclass(old) and not is_dataclass(value):
+            raise ValueError(f"{where}.{name} must be a dict of its numbers, got {value!r}")
+        else:
+            made[name] = tuple(value) if isinstance(value, list) else value
+    try:
+        return replace(part, **made)
+    except TypeError as error:
+        raise ValueError(f"{where} cannot be changed to {dict(changes)!r}: {error}") from None
+    except ValueError as error:
+        message = str(error)
+        raise ValueError(message if message.startswith(where) else f"{where}: {message}") from None
