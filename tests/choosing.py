@@ -2,27 +2,29 @@
 
 import gymnasium as gym
 import numpy as np
+from short import merged
 
 import eitbench  # noqa: F401 (registers)
 
 NAME = "eitbench/Pipe2DInjection-v0"
 CURRENTS, FAULTS, BUDGET = (f"eitbench/Pipe2DInjection{kind}-v0" for kind in ("Currents", "Faults", "Budget"))
-# Sixteen electrodes and a short record; fewer electrodes would leave too little to learn from.
-SHORT = {"scored_steps": 4, "mean_velocity": 16.0}
 TANK, FLOW = "eitbench/RotatingTankInjection-v0", "eitbench/Pipe2DInjectionFlow-v0"
+# Sixteen electrodes and a short record; fewer electrodes would leave too little to learn from.
+SHORT = {"flow": {"mean_velocity": 16.0}, "schedule": {"scored_steps": 4}}
 
 
-def make(estimator: str = "none", name: str = NAME, observation: str = "raw", longer: dict = {}, **kwargs,  # noqa: B006
-         ) -> gym.Env:
-    return gym.make(name, estimator=estimator, scenario=world(name) | longer, observation=observation,
+def make(estimator: str = "none", name: str = NAME, observation: str = "raw", longer: dict | None = None,
+         **kwargs) -> gym.Env:
+    """An environment with a short world, in which ``longer`` changes some more numbers."""
+    return gym.make(name, estimator=estimator, world=merged(world(name), longer or {}), observation=observation,
                     **kwargs)
 
 
 def world(name: str) -> dict:
-    """Fields of the scenario that leave the agent few steps."""
+    """Changes of the world that leave the agent few steps."""
     if name == FLOW:
-        return SHORT | {"velocity_range": [15.0, 17.0]}
-    return {"warm_up": 2, "scored_steps": 3} if name == TANK else SHORT
+        return merged(SHORT, {"flow": {"velocity_range": [15.0, 17.0]}})
+    return {"schedule": {"warm_up": 2, "scored_steps": 3}} if name == TANK else SHORT
 
 
 def play(env: gym.Env, seed: int, actions: np.ndarray) -> list[tuple]:

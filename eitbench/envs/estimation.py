@@ -77,10 +77,12 @@ class EstimationEnv(gym.Env[Observation, np.ndarray], EzPickle):
         self.spread: np.ndarray | None = None
         """(n,) standard deviation in mol/m³ to draw beside the estimate, for whoever has one."""
         self.world, self.lag, self._assumed = asked_for(name, world, lag, assume)
+        # The world played; estimators are given `task` instead.
         self._currents = cycle_currents(self.world, self.lag)
         self.observation_space: spaces.Dict  # type: ignore[assignment]
         self.observation_space, self.action_space = estimation_spaces(self.world)
-        self._n_nodes = outline(self.world).mass.shape[0]
+        self.n_nodes = outline(self.world).mass.shape[0]
+        """Of the mesh on which estimates live."""
         self._seed: int | None = None
         self._step = 0
 
@@ -111,8 +113,8 @@ class EstimationEnv(gym.Env[Observation, np.ndarray], EzPickle):
         last_step = self.world.n_steps + self.lag
         if self._seed is None or self._step > last_step:
             raise gym.error.ResetNeeded("call reset() before step(), and again when an episode has ended")
-        action = checked_actions(action, self.action_space, self._n_nodes)  # type: ignore[arg-type]
-        estimate, parameters = np.split(action, [self._n_nodes])
+        action = checked_actions(action, self.action_space, self.n_nodes)  # type: ignore[arg-type]
+        estimate, parameters = np.split(action, [self.n_nodes])
         t = self._step - self.lag
         reward = 0.0
         if t >= 1:

@@ -82,8 +82,8 @@ def draw_frame(task: Task, truth_mesh: Mesh, truth: np.ndarray, estimate: np.nda
     """
     low, high = colour_range(task)
     spread_high = max(0.25, task.prior.initial_std) * task.expected_concentration
-    size = np.ptp(task.mesh.points, axis=0)
-    solid, tank = task.mesh.dim == 3, size[0] < 2 * size[1] and task.mesh.dim == 2
+    solid = task.mesh.dim == 3
+    tank = task.vessel is not None and not task.vessel.is_long
     figure = Figure(figsize=(12.0, 4.4) if tank else (12.0, 6.4) if solid else (8.0, 6.4), dpi=100,
                     layout="constrained")
     canvas = FigureCanvasAgg(figure)

@@ -17,8 +17,10 @@ from eitbench.worlds.world import World
 
 GROUP = "eitbench.worlds"
 """Entry points of installed packages: modules that call `register` when they are imported."""
-ENTRY_POINTS = {"estimation": "eitbench.envs.estimation:Estimation", "injection": "eitbench.envs.injection:Injection"}
-"""Track -> where its classes …Env and …VectorEnv lie."""
+CLASSES = {
+    "estimation": ("eitbench.envs.estimation:EstimationEnv", "eitbench.envs.estimation_vector:EstimationVectorEnv"),
+    "injection": ("eitbench.envs.injection:InjectionEnv", "eitbench.envs.injection:InjectionVectorEnv")}
+"""Track -> its environment, one at a time and vectorised."""
 SETTINGS = {"estimation": ("lag", "assume"), "injection": ("gate",)}
 """Track -> what an id may fix of its environment, beside the world."""
 
@@ -70,8 +72,8 @@ def register(world: World, id: str, *, track: str = "estimation", about: str = "
     """
     if not re.fullmatch(r"[\w.-]+/[\w.-]+-v\d+", id):
         raise ValueError(f"id must look like 'namespace/Name-v0', got {id!r}")
-    if track not in ENTRY_POINTS:
-        raise ValueError(f"track must be one of {', '.join(ENTRY_POINTS)}, got {track!r}")
+    if track not in CLASSES:
+        raise ValueError(f"track must be one of {', '.join(CLASSES)}, got {track!r}")
     if unknown := sorted(set(settings) - set(SETTINGS[track])):
         raise ValueError(f"settings of the track {track} are {', '.join(SETTINGS[track])}; got {', '.join(unknown)}")
     json.dumps(settings)
@@ -81,8 +83,8 @@ def register(world: World, id: str, *, track: str = "estimation", about: str = "
     _entries[id] = entry
     _by_hand.add(id)
     if id not in gym.registry:
-        place = ENTRY_POINTS[track]
-        gym.register(id, entry_point=f"{place}Env", vector_entry_point=f"{place}VectorEnv", kwargs={"name": id})
+        single, many = CLASSES[track]
+        gym.register(id, entry_point=single, vector_entry_point=many, kwargs={"name": id})
 
 
 def entries() -> dict[str, Entry]:

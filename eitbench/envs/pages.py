@@ -1,0 +1,146 @@
+"""The page of an environment: what the world says of itself, and the sizes of what its objects really are."""
+
+from __future__ import annotations
+
+from dataclasses import fields, is_dataclass
+from typing import Any
+
+import gymnasium as gym
+from gymnasium import spaces
+
+from eitbench.envs.estimation import EstimationEnv
+from eitbench.envs.injection import InjectionEnv
+from eitbench.worlds.registry import entry
+from eitbench.worlds.world import World
+
+MEANINGS = {
+    "voltages": "measured electrode potentials against their mean, V, with noise",
+    "currents": "injected currents, A (in 2D A per metre of depth), summing to zero",
+    "recent": "the last of these, the last first",
+    "frame": "voltages of the first frame; not in the scaled observation",
+    "innovations": "measured less predicted, in predicted standard deviations",
+    "mean": "estimate on {columns} × {rows} patches, x first, mol/m³",
+    "std": "its standard deviation, mol/m³",
+    "doubt": "how often lately an electrode's readings were not believed, and injections it drove",
+    "velocity": "estimated mean velocity, m/s",
+    "velocity_std": "its standard deviation, m/s",
+    "left": "steps left, and where there is a budget injections left",
+}
+"""Of the entries of an observation."""
+ESTIMATION_ARGUMENTS = """
+| name | default | meaning |
+|---|---|---|
+| `lag` | {lag} | an integer from 0 to {last}, or "all" (= {last}): whole record first |
+| `assume` | None | dict of what the task's model wrongly believes of the flow |
+| `world` | None | dict of numbers to change, as in `{{"instrument": {{"noise_relative": 0.02}}}}`; see below |
+| `episodes` | 1000 | number of training episodes for unseeded resets |
+| `render_mode` | None | "rgb_array": truth, estimate, spread and active pair |
+"""
+INJECTION_ARGUMENTS = """
+| name | default | meaning |
+|---|---|---|
+| `estimator` | "reduced" | "reduced": a filter with few states, for training; "full": the exact one; "none" |
+| `observation` | "scaled" | or "raw" |
+| `gate` | {gate} | standard deviations beyond which the filter does not believe a reading; None: it believes all |
+| `world` | None | dict of numbers to change, as in `{{"schedule": {{"budget": 20}}}}`; see below |
+| `episodes` | 1000 | number of training episodes for unseeded resets |
+| `render_mode` | None | "rgb_array": truth, estimate, spread, injection |
+| `threads` | 1 | vectorised only: cores that the filters may use; give BLAS one thread then |
+"""
+
+
+def page(id: str) -> str:
+    """Markdown: what a registered environment asks for, shows, pays, and takes; ``ValueError`` if there is none."""
+    registered = entry(id)
+    env: Any = gym.make(id, disable_env_checker=True).unwrapped
+    parts = _estimation(env) if registered.track == "estimation" else _injection(env)
+    numbers = _numbers(registered.world)
+    sections = {"Description": registered.about.strip(), **parts, "Numbers of the world": numbers}
+    return "\n\n".join(f"## {heading}\n\n{text.strip()}" for heading, text in sections.items()) + "\n"
+
+
+def _estimation(env: EstimationEnv) -> dict[str, str]:
+    world = env.world
+    velocity = world.velocity_model
+    asked = f"the estimate at the {env.n_nodes:,} nodes of `task.mesh`, mol/m³"
+    reward = "−∫(ĉ_t − c_t)² dΩ / ∫c_t² dΩ"
+    if velocity is not None:
+        asked += f"; after it the flow's parameters θ ({velocity.size}), m/s"
+        reward += " − ∫(v̂_t − v_t)² dy / ∫v_t² dy"
+    first = world.warm_up + 1
+    return {
+        "Action space": f"`{_short(env.action_space)}`: {asked}. Ignored while nothing is asked for yet.",
+        "Observation space": f"`Dict`, zeros once the record has been played:\n\n{_table(env.observation_space, world)}",
+        "Reward": f"{reward} for the {world.schedule.scored_steps} scored states t = {first} … {world.n_steps}, else 0: "
+                  "minus the mean of the first term over the scored states is ẽ_c (thesis 5.12).",
+        "Starting state": f"{_flowing(world)}`reset(seed=s)` plays episode s (train, dev and test have ranges of their "
+                          "own); without a seed a random one of the first `episodes` training episodes. The first use "
+                          "of a seed simulates its truth, which is then kept on disk; `eitbench bank` does so for many "
+                          "seeds ahead of time.",
+        "Episode end": f"Terminated after {world.n_steps + env.lag} steps. Never truncated.",
+        "Arguments": ESTIMATION_ARGUMENTS.format(lag=env.lag, last=world.n_steps - 1)}
+
+
+def _injection(env: InjectionEnv) -> dict[str, str]:
+    world = env.world
+    rules = env.rules
+    if isinstance(env.action_space, spaces.Discrete):
+        actions = (f"`Discrete({env.action_space.n})`: electrode pairs (0, 1), (0, 2), … (`electrode_pairs`); current "
+                   "enters at the first and leaves at the second.")
+        actions += " The last action is no injection." if rules.budget is not None else ""
+    else:
+        actions = f"`{_short(env.action_space)}`: a current for each electrode, in parts of the instrument's."
+    raw = env.core.space()
+    over = "" if world.region is None else f" over {world.region[0]:g} … {world.region[1]:g} m along the pipe"
+    alone = world.n_steps
+    return {
+        "Action space": actions,
+        "Observation space": f"`{_short(env.observation_space)}`, about between −1 and 1; with `observation=\"raw\"` a "
+                             f"dict in SI units, `float64`:\n\n{_table(raw, world)}\n\nWith `estimator=\"none\"` "
+                             "`voltages`, `currents` and `left` only, raw.",
+        "Reward": f"For the {world.schedule.scored_steps} scored states, else 0: ∫(ĉ_bh − c_t)² dΩ / ∫c_t² dΩ − "
+                  f"∫(ĉ_t − c_t)² dΩ / ∫c_t² dΩ{over}, by how much the error lies below that of the homogeneous "
+                  "estimate, which no injection can change. The score is ẽ_c (thesis 5.12), the mean of the second "
+                  "term. With `estimator=\"none\"` the reward is always 0.",
+        "Starting state": f"{_flowing(world)}The first {env.core.first} injections are the world's own cycle; the agent "
+                          "takes over after them. With `estimator=\"none\"` it chooses from the first one on.",
+        "Episode end": f"Terminated after {env.core.length} steps ({alone} with `estimator=\"none\"`). Never truncated.",
+        "Arguments": INJECTION_ARGUMENTS.format(gate=f"{rules.gate:g}" if rules.gate < 1e300 else None)}
+
+
+def _flowing(world: World) -> str:
+    return f"The fluid has been flowing for {world.lead_in} time steps. " if world.lead_in else ""
+
+
+def _short(space: gym.Space) -> str:
+    """A space without its thousands of bounds."""
+    if not isinstance(space, spaces.Box):
+        return str(space)
+    low, high = float(space.low.min()), float(space.high.max())
+    return f"Box({low:.4g}, {high:.4g}, {space.shape}, {space.dtype})"
+
+
+def _table(space: spaces.Dict, world: World) -> str:
+    columns, rows = world.vessel.patches
+    lines = [f"| `{name}` | {inner.shape} | {MEANINGS[name].format(columns=columns, rows=rows)} |"
+             for name, inner in space.items()]
+    return "\n".join(["| key | shape | meaning |", "|---|---|---|", *lines])
+
+
+def _numbers(world: World) -> str:
+    """Every number of every part, by the names that the argument ``world`` takes."""
+    lines = ["| name | value |", "|---|---|"]
+    for each in fields(world):
+        value = getattr(world, each.name)
+        if each.name == "name":
+            continue
+        lines += _rows(each.name, value)
+    return "\n".join(lines)
+
+
+def _rows(name: str, value: Any) -> list[str]:
+    if is_dataclass(value):
+        kind = f"| `{name}` | {type(value).__name__} |"
+        return [kind, *(row for each in fields(value) for row in _rows(f"{name}.{each.name}",
+                                                                       getattr(value, each.name)))]
+    return [f"| `{name}` | {list(value) if isinstance(value, tuple) else value} |"]
