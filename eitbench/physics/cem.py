@@ -1,4 +1,4 @@
-"""Electrical impedance tomography with the complete electrode model (CEM; problem.md §2, thesis ch. 4).
+"""Electrical impedance tomography with the complete electrode model (CEM; thesis ch. 4).
 
 ∇·(σ∇u) = 0 in Ω,  u + z_l σ ∂u/∂n = U_l on electrode e_l,  ∫_{e_l} σ ∂u/∂n = I_l,  σ ∂u/∂n = 0 elsewhere,  ΣI = ΣU = 0.
 """

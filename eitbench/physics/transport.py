@@ -1,4 +1,4 @@
-"""Convection-diffusion: ∂c/∂t = ∇·(κ∇c) − v·∇c, c given on the inlet, ∂c/∂n = 0 elsewhere (problem.md §1)."""
+"""Convection-diffusion: ∂c/∂t = ∇·(κ∇c) − v·∇c, c given on the inlet, ∂c/∂n = 0 elsewhere (thesis ch. 3; ``docs/methods.md``, 1)."""
 
 from __future__ import annotations
 
