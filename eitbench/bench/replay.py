@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from eitbench import _check
 from eitbench._files import write_atomically
-from eitbench._parallel import in_parallel
+from eitbench.data.parallel import in_parallel
 from eitbench.bench.records import read_record
 from eitbench.bench.run import run_episode
 from eitbench.bench.store import source_digest
