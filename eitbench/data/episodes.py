@@ -25,7 +25,6 @@ from tqdm import tqdm
 from eitbench import _check
 from eitbench._code import code_digest, package_files
 from eitbench._files import write_atomically
-from eitbench.numerics._backend import backend_version
 from eitbench.worlds.base import Discretisation, Randomness, Scenario
 
 CACHE_VARIABLE = "EITBENCH_CACHE"
@@ -141,7 +140,8 @@ def identity(scenario: Scenario) -> dict[str, Any]:
     """All that the numbers depend on but the seed: scenario, the code that simulates, and the libraries beneath it."""
     kind = type(scenario)
     return {"scenario": f"{kind.__module__}.{kind.__qualname__}", "fields": asdict(scenario),  # type: ignore
-            "code": _code_digest(), "world": _source_digest(kind), "factorisation": backend_version(),
+            "code": _code_digest(), "world": _source_digest(kind),
+            "factorisation": f"numba {version('numba')}",
             "numpy": np.__version__, "scipy": scipy.__version__, "scikit-fem": version("scikit-fem")}
 
 
