@@ -2,11 +2,31 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
 from eitbench.physics._backend import Backend, kernels, scratch, use_compiled
+
+ByRows = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Pointers, indices and values of a sparse matrix, as the kernels want it."""
+
+
+class Factors(NamedTuple):
+    """L and U, for those who substitute themselves."""
+
+    row_place: np.ndarray
+    """(n,) at which place in the order of elimination each row stands"""
+    column_place: np.ndarray
+    """(n,) and each column"""
+    lower: ByRows
+    """(n, n) L without its diagonal, which is 1"""
+    upper: ByRows
+    """(n, n) U without its diagonal"""
+    scale: np.ndarray
+    """(n,) the inverse of U's diagonal"""
 
 
 class SparseLU:
@@ -25,6 +45,8 @@ class SparseLU:
     ----------
     batch : int
         How many right-hand sides are best given at once.
+    factors : Factors
+        Where compiled kernels solve.
     """
 
     def __init__(self, matrix: sp.csr_array, backend: Backend = "auto") -> None:
@@ -35,8 +57,9 @@ class SparseLU:
             self._solve = factors.solve
             return
         L, U = sp.csr_array(sp.tril(factors.L, -1)), sp.csr_array(sp.triu(factors.U, 1))
-        self._arrays = (factors.perm_r.astype(np.int64), factors.perm_c.astype(np.int64),
-                        L.indptr, L.indices, L.data, U.indptr, U.indices, U.data, 1.0 / factors.U.diagonal())
+        self.factors = Factors(factors.perm_r.astype(np.int64), factors.perm_c.astype(np.int64),
+                               (L.indptr, L.indices, L.data), (U.indptr, U.indices, U.data),
+                               1.0 / factors.U.diagonal())
 
     def solve(self, right: np.ndarray) -> np.ndarray:
         """A⁻¹ b for (n, k)."""
@@ -46,10 +69,11 @@ class SparseLU:
             for column in range(k):                       # SuperLU's bits depend on how many are solved together
                 result[:, column] = self._solve(right[:, column])
             return result
+        rows, columns, lower, upper, scale = self.factors
         eight, work, solution = scratch(3 * 8 * n).reshape(3, -1)
         for first in range(0, k, 8):
             block = right[:, first:first + 8]
             eight.reshape(n, 8)[:, :block.shape[1]] = block
-            kernels().solve_lu(*self._arrays, eight, work, solution)
+            kernels().solve_lu(rows, columns, *lower, *upper, scale, eight, work, solution)
             result[:, first:first + 8] = solution.reshape(n, 8)[:, :block.shape[1]]
         return result

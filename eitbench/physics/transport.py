@@ -16,8 +16,11 @@ from eitbench.physics._backend import Backend
 from eitbench.physics.fem import element, to_skfem
 from eitbench.physics.mesh import Mesh
 from eitbench.physics.sparse_lu import SparseLU
+from eitbench.physics.substeps import WideSubsteps
 
 VelocityField = Callable[[np.ndarray], np.ndarray]
+MANY = 16
+"""From so many columns on they go through the sub-steps side by side."""
 
 
 class EvolutionModel(NamedTuple):
@@ -174,6 +177,11 @@ class ConvectionDiffusion:
         return self._transition
 
     @cached_property
+    def _wide(self) -> WideSubsteps:
+        return WideSubsteps(self._solver, self._mass, self._explicit, self._implicit_inlet, self._free, self.inlet,
+                            self.substeps, self.substeps / self.time_step)
+
+    @cached_property
     def _transition(self) -> tuple[np.ndarray, np.ndarray]:
         n, m = self.mesh.n_nodes, len(self.inlet)
         identity = np.eye(n)
@@ -195,8 +203,10 @@ class ConvectionDiffusion:
                  source: np.ndarray | None = None) -> np.ndarray:
         """All sub-steps on (n, batch) columns, perhaps with a nodal source of so much concentration a second."""
         loads: Iterable[np.ndarray | float] = self._no_loads()
-        if source is not None:
-            load = self._mass @ source
+        load = None if source is None else self._mass @ source
+        if c.shape[1] >= MANY and self._solver.batch > 1:
+            return self._wide.advance(c, before, after, load)
+        if load is not None:
             loads = [0.5 * load, 0.5 * load] + [load] * (self.substeps - 1)
         *_, last = self._substeps(c, before, after, loads)
         return last
