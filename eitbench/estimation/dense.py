@@ -14,8 +14,9 @@ from eitbench.estimation.kalman import Expected, Observation, expected
 
 _BLOCK = 128
 """columns copied at once when a triangle is mirrored: small enough for the processor's cache"""
-_PANEL = 256
-"""columns that a transition given as a callable is handed at once: what it makes in between stays in the cache"""
+_PANEL = 64
+"""columns that a transition given as a callable is handed at once; few, so that they stay in the
+cache, but not so few that the calls count"""
 
 Transition = np.ndarray | Callable[[np.ndarray], np.ndarray]
 """F (n, n), or X (n, k) -> F X."""
@@ -37,8 +38,8 @@ class Filtered(NamedTuple):
 class DenseKalmanFilter:
     """The Kalman filter of c⁺ = F c + s + w with any F at each step, in about 3n³ operations a prediction.
 
-    Where F X costs far less than the product of full matrices, as where F is what solves with a sparse matrix make of
-    X, F is better given as a callable: a prediction then costs two such products with n columns.
+    Where F X costs far less than a product of full matrices, such as solves with a sparse matrix,
+    F is better given as a callable: a prediction then costs F X twice, for n columns.
 
     `KalmanFilter` is far cheaper, but wants a constant F and a covariance with a limit. Where F = I (a target at rest,
     a closed vessel) a prediction costs next to nothing here; an update costs O(n² m) in any case. The covariance stays

@@ -17,7 +17,8 @@ VelocityField = Callable[[np.ndarray], np.ndarray]
 class _Transport(Protocol):
     inlet: np.ndarray
 
-    def step(self, c: np.ndarray, inflow_before: np.ndarray | float, inflow_after: np.ndarray | float) -> np.ndarray: ...
+    def step(self, c: np.ndarray, inflow_before: np.ndarray | float,
+             inflow_after: np.ndarray | float) -> np.ndarray: ...
 
     def velocity_derivatives(self, c: np.ndarray, inflow_before: np.ndarray | float, inflow_after: np.ndarray | float,
                              directions: Sequence[VelocityField]) -> tuple[np.ndarray, np.ndarray]: ...
@@ -130,7 +131,7 @@ class JointFilter:
         after, by_theta = transport.velocity_derivatives(c, c[inlet], self._inflow, self.directions)
 
         def carried(X: np.ndarray) -> np.ndarray:
-            """[[F, ∂c⁺/∂θ], [0, I]] X; a step of the transport with its sparse matrices costs far less than F."""
+            """[[F, ∂c⁺/∂θ], [0, I]] X; with its sparse matrices a step costs far less than F."""
             moved = transport.step(X[:n], X[inlet], 0.0)
             moved += by_theta @ X[n:]
             return np.concatenate([moved, X[n:]])

@@ -22,8 +22,8 @@ from numba.extending import intrinsic, models, register_model
 
 WIDTH = 8
 WIDE = 32
-"""Lanes where a kernel is given hundreds of right-hand sides. The additions of one lane wait for each other, those of
-several registers do not; more would not fit the registers of processors that hold four doubles in each."""
+"""Lanes where there are hundreds of right-hand sides: a lane's additions wait for each other, so
+several registers are added to at once; more do not fit where one holds four doubles."""
 
 
 class Lanes(types.Type):
@@ -73,7 +73,8 @@ splat, splat_wide = (_splatter(Lanes(width)) for width in (WIDTH, WIDE))
 def store(_typing, array, index, vector):
     """array[index : index + width] = vector"""
     def code(context, builder, signature, arguments):
-        written = builder.store(arguments[2], _address(context, builder, signature, arguments, vector))
+        address = _address(context, builder, signature, arguments, vector)
+        written = builder.store(arguments[2], address)
         written.align = 8
         return context.get_dummy_value()
     return types.void(array, types.intp, vector), code
@@ -360,43 +361,3 @@ def solve_lu(row_place, column_place, lower_pointer, lower_index, lower, upper_p
         store(work, i * WIDTH, times(total, splat(scale[i])))
     for i in range(n):
         store(solution, i * WIDTH, load(work, column_place[i] * WIDTH))
-
-
-@njit(cache=True)
-def substep_wide(explicit, rate, inlet, weight, lower, upper, scale, place, state, inflow, source, work):
-    """A c⁺ = rate·(E c) − I c_in + weight·f for WIDE columns side by side, all flattened; c⁺ takes the place of c.
-
-    E (columns as in ``state``), I (columns as in ``inflow``), L and U are (pointers, indices, values) by rows in the
-    order of elimination, as is f (``source``); the i-th unknown eliminated stands at place[i] of ``state``. U has the
-    diagonal 1/``scale``. With weight 0 there is no f.
-    """
-    n = len(scale)
-    for i in range(n):
-        total = times(splat_wide(rate), _row_product(explicit, i, state))
-        total = plus(total, times(splat_wide(-1.0), _row_product(inlet, i, inflow)))
-        if weight != 0.0:
-            total = plus(total, times(splat_wide(weight), load_wide(source, i * WIDE)))
-        store(work, i * WIDE, _less_row_product(total, lower, i, work))
-    for i in range(n - 1, -1, -1):
-        total = times(_less_row_product(load_wide(work, i * WIDE), upper, i, work), splat_wide(scale[i]))
-        store(work, i * WIDE, total)
-        store(state, place[i] * WIDE, total)
-
-
-@njit(inline="always")
-def _row_product(matrix, i, columns):
-    """Rounded as scipy rounds it: product and sum apart."""
-    pointer, index, value = matrix
-    total = splat_wide(0.0)
-    for e in range(pointer[i], pointer[i + 1]):
-        total = plus(total, times(splat_wide(value[e]), load_wide(columns, index[e] * WIDE)))
-    return total
-
-
-@njit(inline="always")
-def _less_row_product(total, matrix, i, columns):
-    """Rounded as `solve_lu` rounds it."""
-    pointer, index, value = matrix
-    for e in range(pointer[i], pointer[i + 1]):
-        total = subtract_product(total, splat_wide(value[e]), load_wide(columns, index[e] * WIDE))
-    return total

@@ -1,19 +1,19 @@
-"""Sub-steps of a linear evolution for hundreds of columns: those of a transition matrix or a covariance."""
+"""Sub-steps of a linear evolution for hundreds of columns, such as those of a covariance."""
 
 from __future__ import annotations
 
 import numpy as np
 import scipy.sparse as sp
 
-from eitbench.physics._backend import kernels, scratch
+from eitbench.physics._backend import scratch
 from eitbench.physics.sparse_lu import ByRows, SparseLU
 
 
 class WideSubsteps:
-    """Sub-steps A c⁺ = E c − I c_in + f at the free nodes, the first two of them A c⁺ = r M c − I c_in + f/2.
+    """Sub-steps A c⁺ = E c − I c_in + f of the free nodes; the first two: A c⁺ = r M c − I c_in + f/2.
 
-    A few columns at a time go through all sub-steps, so that they stay in the processor's cache, and a substitution
-    takes all of them at once. Each column becomes what it would be alone, to the bit.
+    A few columns at a time go through all sub-steps, so that they stay in the processor's cache,
+    and a substitution takes all of them at once. Each becomes what it would be alone, to the bit.
 
     Parameters
     ----------
@@ -26,7 +26,7 @@ class WideSubsteps:
     free, inlet : (n_free,) and (n_inlet,) int
         Nodes that A solves for, and those where the concentration is given.
     substeps : int
-        How many take the inflow from its old value to the new one; the first is taken as two halves.
+        How many take the inflow from its old value to the new one; the first is two halves.
     rate : float
         r in 1/s.
     """
@@ -34,15 +34,16 @@ class WideSubsteps:
     def __init__(self, solver: SparseLU, mass: sp.csr_matrix, explicit: sp.csr_matrix,
                  implicit_inlet: sp.csr_matrix, free: np.ndarray, inlet: np.ndarray, substeps: int,
                  rate: float) -> None:
-        rows, columns, self._lower, self._upper, self._scale = solver.factors
-        self._rows = np.argsort(rows)
-        self._place = free[np.argsort(columns)]
-        self._mass = _by_rows(mass[self._rows])
-        self._explicit = _by_rows(explicit[self._rows])
-        self._implicit_inlet = _by_rows(implicit_inlet[self._rows])
+        row_place, column_place, lower, upper, scale = solver.factors
+        matrices = [_by_rows(matrix) for matrix in (mass, explicit, implicit_inlet)]
+        unknown = free[np.argsort(column_place)]
+        factors = (lower, upper, scale, row_place)
+        self._arguments = (*matrices, *factors, unknown, inlet, substeps, rate)
         self._inlet = inlet
         self._substeps = substeps
-        self._rate = rate
+        n_free = len(free)
+        n_inlet = len(inlet)
+        self._rows = (n_free + n_inlet, n_inlet, n_inlet, n_inlet, n_free, n_free)
 
     def advance(self, c: np.ndarray, before: np.ndarray, after: np.ndarray,
                 source: np.ndarray | None = None) -> np.ndarray:
@@ -61,31 +62,25 @@ class WideSubsteps:
         -------
         (n, k) at the end.
         """
-        width = kernels().WIDE
-        sizes = np.array([len(c), len(self._inlet), len(self._place), len(self._place)]) * width
-        memory = scratch(int(sizes.sum()))
-        memory[:] = 0.0                          # a last panel that is not full holds no numbers left by others
-        state, inflow, load, work = np.split(memory, np.cumsum(sizes)[:-1])
-        slope = (after - before) / self._substeps
-        weight = float(source is not None)
+        from eitbench.physics._wide_kernels import WIDE, advance_wide
+        memory = scratch(sum(self._rows) * WIDE).reshape(-1, WIDE)
+        memory[:] = 0.0                    # a panel that is not full holds nothing left by others
+        blocks = np.split(memory, np.cumsum(self._rows)[:-1])
+        state, first, slope, _, load, _ = blocks
+        flat = [block.reshape(-1) for block in blocks]
         result = np.empty(c.shape)
-        for first in range(0, c.shape[1], width):
-            panel = slice(first, first + width)
-            used = min(width, c.shape[1] - first)
-            columns, given = state.reshape(-1, width), inflow.reshape(-1, width)
-            columns[:, :used] = c[:, panel]
-            columns[self._inlet, :used] = before[:, panel]
+        for begin in range(0, c.shape[1], WIDE):
+            panel = slice(begin, begin + WIDE)
+            used = slice(min(WIDE, c.shape[1] - begin))
+            state[:, used] = c[:, panel]
+            state[self._inlet, used] = before[:, panel]
+            first[:, used] = before[:, panel]
+            slope[:, used] = (after[:, panel] - before[:, panel]) / self._substeps
             if source is not None:
-                load.reshape(-1, width)[:, :used] = source[self._rows, panel]
-            for k in range(self._substeps + 1):
-                halved = k < 2
-                given[:, :used] = before[:, panel] + (k or 0.5) * slope[:, panel]
-                kernels().substep_wide(self._mass if halved else self._explicit, self._rate if halved else 1.0,
-                                       self._implicit_inlet, 0.5 * weight if halved else weight, self._lower,
-                                       self._upper, self._scale, self._place, state, inflow, load, work)
-                columns[self._inlet] = given
-            columns[self._inlet, :used] = after[:, panel]
-            result[:, panel] = columns[:, :used]
+                load[:, used] = source[:, panel]
+            advance_wide(*self._arguments, *flat[:5], source is not None, flat[5])
+            state[self._inlet, used] = after[:, panel]
+            result[:, panel] = state[:, used]
         return result
 
 

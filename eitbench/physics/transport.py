@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -178,8 +178,8 @@ class ConvectionDiffusion:
 
     @cached_property
     def _wide(self) -> WideSubsteps:
-        return WideSubsteps(self._solver, self._mass, self._explicit, self._implicit_inlet, self._free, self.inlet,
-                            self.substeps, self.substeps / self.time_step)
+        return WideSubsteps(self._solver, self._mass, self._explicit, self._implicit_inlet,
+                            self._free, self.inlet, self.substeps, self.substeps / self.time_step)
 
     @cached_property
     def _transition(self) -> tuple[np.ndarray, np.ndarray]:
@@ -264,6 +264,7 @@ def _velocity_at(velocity: VelocityField, x: np.ndarray, name: str = "velocity")
 # -- SUPG -------------------------------------------------------------------------------------------------------------
 
 
+@lru_cache(maxsize=8)
 def _supg_basis(mesh: Mesh) -> skfem.Basis:
     return skfem.Basis(to_skfem(mesh), element(mesh.dim, 1), intorder=4)
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from eitbench.physics._backend import scratch
 from eitbench.physics.flow import PlaneChannelFlow
 from eitbench.physics.mesh import rectangle_mesh
 from eitbench.physics.transport import MANY, ConvectionDiffusion, _supg_matrices
@@ -26,7 +27,7 @@ def columns(k):
 
 
 def dense_step(c, before, after, source):
-    """The scheme as written in `ConvectionDiffusion`, with full matrices; a source (91, k) a second."""
+    """The scheme that `ConvectionDiffusion` describes, with full matrices; source (91, k) a second."""
     M, K = (matrix.toarray() for matrix in _supg_matrices(MESH, FLOW, SETTINGS["diffusivity"]))
     dt = SETTINGS["time_step"] / SETTINGS["substeps"]
     free = np.arange(INLET, N)
@@ -79,8 +80,7 @@ def test_evolution_model_is_that_of_full_matrices():
 
 
 def test_memory_used_before_leaves_no_trace():
-    """Numbers left in the working memory, even ones that are none, do not enter a panel that is not full."""
-    from eitbench.physics._backend import scratch
+    """What is left in working memory, even NaN, does not enter a panel that is not full."""
     arguments = columns(33)
     expected = channel().step(*arguments)
     scratch(10**5)[:] = np.nan
