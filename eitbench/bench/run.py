@@ -20,7 +20,6 @@ from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from eitbench import _check
-from eitbench.data.parallel import in_parallel
 from eitbench.bench import policies
 from eitbench.bench.baselines import BOARDS, Baseline, load_baseline
 from eitbench.bench.sandbox import guests
@@ -30,6 +29,7 @@ from eitbench.bench.score import Played, score
 from eitbench.bench.store import EpisodeStore, machine, provenance, source_digest
 from eitbench.data.bank import fill
 from eitbench.data.episodes import simulate
+from eitbench.data.parallel import in_parallel
 from eitbench.data.seeds import name_seed
 from eitbench.envs import ENTRY_POINTS, INJECTION
 from eitbench.envs.estimation import EstimationEnv

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 from tqdm import tqdm
 
 from eitbench import _check
-from eitbench.data.parallel import in_parallel
 from eitbench.data.episodes import simulate_together
+from eitbench.data.parallel import in_parallel
 from eitbench.data.recordings import (
     is_recorded,
     make_recording,

@@ -25,65 +25,72 @@ from numba.core import cgutils
 from numba.extending import intrinsic, models, register_model
 
 WIDTH = 8
-_VECTOR = ir.VectorType(ir.DoubleType(), WIDTH)
+WIDE = 32
+"""Lanes where there are hundreds of right-hand sides: a lane's additions wait for each other, so
+several registers are added to at once; more do not fit where one holds four doubles."""
 
 
 class Lanes(types.Type):
-    """<8 x double>, held in registers."""
+    """<width x double>, held in registers."""
 
-    def __init__(self) -> None:
-        super().__init__(name=f"Lanes{WIDTH}")
-
-
-lanes = Lanes()
+    def __init__(self, width: int) -> None:
+        self.width, self.vector = width, ir.VectorType(ir.DoubleType(), width)
+        super().__init__(name=f"Lanes{width}")
 
 
 @register_model(Lanes)
 class _LanesModel(models.PrimitiveModel):
     def __init__(self, manager, kind):
-        super().__init__(manager, kind, _VECTOR)
+        super().__init__(manager, kind, kind.vector)
 
 
-@intrinsic
-def load(_typing, array, index):
-    """array[index : index + 8]"""
-    def code(context, builder, signature, arguments):
-        vector = builder.load(_address(context, builder, signature, arguments))
-        vector.align = 8
-        return vector
-    return lanes(array, types.intp), code
+def _loader(lanes):
+    @intrinsic
+    def load(_typing, array, index):
+        """array[index : index + width]"""
+        def code(context, builder, signature, arguments):
+            vector = builder.load(_address(context, builder, signature, arguments, lanes))
+            vector.align = 8
+            return vector
+        return lanes(array, types.intp), code
+    return load
+
+
+def _splatter(lanes):
+    @intrinsic
+    def splat(_typing, number):
+        """The same number in every lane."""
+        def code(_context, builder, _signature, arguments):
+            nothing = ir.Constant(lanes.vector, ir.Undefined)
+            first = builder.insert_element(nothing, arguments[0], ir.Constant(ir.IntType(32), 0))
+            zeros = ir.Constant(ir.VectorType(ir.IntType(32), lanes.width), [0] * lanes.width)
+            return builder.shuffle_vector(first, nothing, zeros)
+        return lanes(types.float64), code
+    return splat
+
+
+load, load_wide = (_loader(Lanes(width)) for width in (WIDTH, WIDE))
+splat, splat_wide = (_splatter(Lanes(width)) for width in (WIDTH, WIDE))
 
 
 @intrinsic
 def store(_typing, array, index, vector):
-    """array[index : index + 8] = vector"""
+    """array[index : index + width] = vector"""
     def code(context, builder, signature, arguments):
-        written = builder.store(arguments[2], _address(context, builder, signature, arguments))
+        address = _address(context, builder, signature, arguments, vector)
+        written = builder.store(arguments[2], address)
         written.align = 8
         return context.get_dummy_value()
-    return types.void(array, types.intp, lanes), code
-
-
-@intrinsic
-def splat(_typing, number):
-    """The same number in every lane."""
-    def code(_context, builder, _signature, arguments):
-        nothing = ir.Constant(_VECTOR, ir.Undefined)
-        first = builder.insert_element(nothing, arguments[0], ir.Constant(ir.IntType(32), 0))
-        zeros = ir.Constant(ir.VectorType(ir.IntType(32), WIDTH), [0] * WIDTH)
-        return builder.shuffle_vector(first, nothing, zeros)
-    return lanes(types.float64), code
+    return types.void(array, types.intp, vector), code
 
 
 @intrinsic
 def subtract_product(_typing, total, a, b):
     """total − a·b"""
     def code(_context, builder, _signature, arguments):
-        total, a, b = arguments
-        kind = ir.FunctionType(_VECTOR, [_VECTOR] * 3)
-        fma = cgutils.get_or_insert_function(builder.module, kind, f"llvm.fma.v{WIDTH}f64")
-        return builder.call(fma, [builder.fneg(a), b, total])
-    return lanes(lanes, lanes, lanes), code
+        fma = _function(builder, "fma", total, 3)
+        return builder.call(fma, [builder.fneg(arguments[1]), arguments[2], arguments[0]])
+    return total(total, a, b), code
 
 
 @intrinsic
@@ -91,22 +98,34 @@ def times(_typing, a, b):
     """a·b"""
     def code(_context, builder, _signature, arguments):
         return builder.fmul(*arguments)
-    return lanes(lanes, lanes), code
+    return a(a, b), code
+
+
+@intrinsic
+def plus(_typing, a, b):
+    """a + b"""
+    def code(_context, builder, _signature, arguments):
+        return builder.fadd(*arguments)
+    return a(a, b), code
 
 
 @intrinsic
 def inverse_root(_typing, a):
     """1/√a"""
     def code(_context, builder, _signature, arguments):
-        root = cgutils.get_or_insert_function(builder.module, ir.FunctionType(_VECTOR, [_VECTOR]),
-                                              f"llvm.sqrt.v{WIDTH}f64")
-        return builder.fdiv(ir.Constant(_VECTOR, [1.0] * WIDTH), builder.call(root, arguments))
-    return lanes(lanes), code
+        root = builder.call(_function(builder, "sqrt", a, 1), arguments)
+        return builder.fdiv(ir.Constant(a.vector, [1.0] * a.width), root)
+    return a(a), code
 
 
-def _address(context, builder, signature, arguments):
+def _address(context, builder, signature, arguments, lanes):
     array = context.make_array(signature.args[0])(context, builder, arguments[0])
-    return builder.bitcast(builder.gep(array.data, [arguments[1]]), _VECTOR.as_pointer())
+    return builder.bitcast(builder.gep(array.data, [arguments[1]]), lanes.vector.as_pointer())
+
+
+def _function(builder, name, lanes, count):
+    kind = ir.FunctionType(lanes.vector, [lanes.vector] * count)
+    return cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v{lanes.width}f64")
 
 
 # -- kernels --------------------------------------------------------------------------------------

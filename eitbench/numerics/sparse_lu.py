@@ -2,12 +2,32 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
 from eitbench.numerics.compiled import compiled_kernels
 from eitbench.numerics.memory import scratch
+
+ByRows = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Pointers, indices and values of a sparse matrix, as the kernels want it."""
+
+
+class Factors(NamedTuple):
+    """L and U, for those who substitute themselves."""
+
+    row_place: np.ndarray
+    """(n,) at which place in the order of elimination each row stands"""
+    column_place: np.ndarray
+    """(n,) and each column"""
+    lower: ByRows
+    """(n, n) L without its diagonal, which is 1"""
+    upper: ByRows
+    """(n, n) U without its diagonal"""
+    scale: np.ndarray
+    """(n,) the inverse of U's diagonal"""
 
 
 class SparseLU:
@@ -20,6 +40,11 @@ class SparseLU:
     ----------
     matrix : (n, n) sparse
         With a symmetric pattern and a large diagonal: nothing is pivoted.
+
+    Attributes
+    ----------
+    factors : Factors
+        For those who substitute themselves.
     """
 
     def __init__(self, matrix: sp.csr_array) -> None:
@@ -27,18 +52,19 @@ class SparseLU:
                        options={"SymmetricMode": True})
         L = sp.csr_array(sp.tril(factors.L, -1))
         U = sp.csr_array(sp.triu(factors.U, 1))
-        self._arrays = (factors.perm_r.astype(np.int64), factors.perm_c.astype(np.int64),
-                        L.indptr, L.indices, L.data, U.indptr, U.indices, U.data,
-                        1.0 / factors.U.diagonal())
+        self.factors = Factors(factors.perm_r.astype(np.int64), factors.perm_c.astype(np.int64),
+                               (L.indptr, L.indices, L.data), (U.indptr, U.indices, U.data),
+                               1.0 / factors.U.diagonal())
 
     def solve(self, right: np.ndarray) -> np.ndarray:
         """A⁻¹ b for (n, k)."""
         n, k = right.shape
         result = np.empty((n, k))
+        rows, columns, lower, upper, scale = self.factors
         eight, work, solution = scratch(3 * 8 * n).reshape(3, -1)
         for first in range(0, k, 8):
             block = right[:, first:first + 8]
             eight.reshape(n, 8)[:, :block.shape[1]] = block
-            compiled_kernels().solve_lu(*self._arrays, eight, work, solution)
+            compiled_kernels().solve_lu(rows, columns, *lower, *upper, scale, eight, work, solution)
             result[:, first:first + 8] = solution.reshape(n, 8)[:, :block.shape[1]]
         return result
