@@ -74,7 +74,7 @@ def test_a_world_of_it_is_played(vessel, monkeypatch):
 def test_another_file_is_refused(files, vessel):
     """The world names the file by its hash; a group that is missing is named."""
     changed = RoundMeshVessel(files["fine"][0], "0" * 64, *files["coarse"][:2], 8)
-    with pytest.raises(ValueError, match="fine.msh: must be the file with SHA-256 0000"):
+    with pytest.raises(ValueError, match=r"fine\.msh: must be the file with SHA-256 0000"):
         changed.carrier(True)
     many = RoundMeshVessel(*files["fine"][:2], *files["coarse"][:2], 9)
     with pytest.raises(ValueError, match="must have a group for each electrode, got none for electrode 8"):
