@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 
 from eitbench._files import write_atomically
 from eitbench.bench.records import alike
-from eitbench.bench.run import Environment
 from eitbench.bench.store import EpisodeStore
+from eitbench.bench.tracks import Environment
 from eitbench.data.seeds import parse_seeds
 from eitbench.envs.rendering import FIELD_MAP, colour_range, draw_field
 from eitbench.numerics.mesh import Mesh
@@ -119,7 +119,7 @@ def _snapshots(store: EpisodeStore, records: list[dict[str, Any]]) -> dict[str, 
     except FileNotFoundError:                                      # only the records were kept
         return None
     world = chosen[0]["environment"]
-    env = Environment(world["id"], json.dumps(world["kwargs"])).make()
+    env: Any = Environment(world["id"], json.dumps(world["kwargs"])).make()
     env.reset(seed=parse_seeds(seed)[0])
     task, truth = env.task, env.truth()
     times = task.warm_up + np.linspace(0.12, 0.88, 4) * (task.n_steps - task.warm_up)

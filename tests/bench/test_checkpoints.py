@@ -8,8 +8,9 @@ import pytest
 
 from eitbench.bench.baselines import baseline_folder
 from eitbench.bench.policies import load_policy, own_agents, play
-from eitbench.bench.run import Environment, Job, run_episode
+from eitbench.bench.run import Job, run_episode
 from eitbench.bench.sandbox import guests
+from eitbench.bench.tracks import Environment
 from eitbench.envs import INJECTION
 
 FOLDER = baseline_folder() / "checkpoints"

@@ -12,8 +12,9 @@ from scipy.optimize import minimize_scalar
 from tiny import FILTER, FIXED_LAG, SCENARIO, SMOOTHING, count, counting, write_baseline
 
 from eitbench.bench import run
-from eitbench.bench.run import Environment, Job, board_of, play_and_collect, run_episode, run_jobs
+from eitbench.bench.run import Job, play_and_collect, run_episode, run_jobs
 from eitbench.bench.store import EpisodeStore
+from eitbench.bench.tracks import Environment, board_of
 from eitbench.data.episodes import CACHE_VARIABLE, simulate, truth_discretisation
 from eitbench.worlds import Pipe2D
 from eitbench.worlds.task import Estimate, Task

@@ -11,7 +11,7 @@ import pytest
 from short import PLAIN, world
 from typer.testing import CliRunner
 
-from eitbench.bench import run, store, suites
+from eitbench.bench import run, store, suites, tracks
 from eitbench.bench.baselines import own_baselines
 from eitbench.cli import app
 from eitbench.data.episodes import CACHE_VARIABLE
@@ -20,8 +20,8 @@ from eitbench.envs import ENTRY_POINTS, ESTIMATION
 
 ROOT = Path(__file__).parents[2]
 PIPE, INJECTION = "eitbench/Pipe2D-v0", "eitbench/Pipe2DInjection-v0"
-COMMANDS = ("list", "run", "bank", "train", "policies", "submit", "verify", "held-out", "leaderboard", "compare",
-            "render", "reproduce")
+COMMANDS = ("list", "run", "bank", "train", "policies", "submit", "verify", "held-out", "migrate", "leaderboard",
+            "compare", "render", "reproduce")
 TINY = {"mean_velocity": 45.0, "scored_steps": 3, "electrodes_per_wall": 2, "frame": 2}
 """A fast fluid flushes the pipe in two steps: an episode of five takes a third of a second."""
 
@@ -133,8 +133,8 @@ def test_suites():
     missing = {job for job in full if job.environment.id in plain} - set(quick)
     assert missing == {suites.Job(suites.Environment(PIPE), "gauss_newton", 1)} and set(quick) < set(full)
     assert {job.method for job in full} == set(own_baselines())
-    assert set(parse_seeds(suites.SEEDS["quick"])) < set(parse_seeds(suites.SEEDS["full"]))
-    assert min(parse_seeds(suites.SEEDS["full"])) == 200_000
+    assert set(parse_seeds(tracks.SEEDS["quick"])) < set(parse_seeds(tracks.SEEDS["full"]))
+    assert min(parse_seeds(tracks.SEEDS["full"])) == 200_000
     asked_for = suites.jobs("quick", [PIPE], ["gauss_newton"], [1, 2])
     assert [job.seed for job in asked_for] == [1, 2]
 

@@ -17,8 +17,9 @@ from tiny import FILTER, SCENARIO, SMOOTHING, write_baseline
 
 from eitbench.bench import run
 from eitbench.bench import store as store_module
-from eitbench.bench.run import Environment, Job, run_jobs
+from eitbench.bench.run import Job, run_jobs
 from eitbench.bench.store import EpisodeStore
+from eitbench.bench.tracks import Environment
 from eitbench.data.episodes import CACHE_VARIABLE
 from eitbench.numerics.round import extrude, uniform_disc
 from eitbench.report import charts, page
@@ -211,8 +212,10 @@ def test_snapshots_are_of_the_world_that_was_played(made, monkeypatch):
 
     monkeypatch.setenv(CACHE_VARIABLE, str(folder / "cache"))
     monkeypatch.setattr(page, "Environment", Watched)
-    page._snapshots(EpisodeStore(folder), [record for record in records if record["board"] == "filter"][:2])
-    assert asked[0].get("scenario") == SCENARIO
+    given = {"kwargs": {"scenario": SCENARIO}}
+    page._snapshots(EpisodeStore(folder), [record | {"environment": record["environment"] | given}
+                                           for record in records if record["board"] == "filter"][:2])
+    assert asked == [{"scenario": SCENARIO}]
 
 
 @pytest.mark.parametrize("values", [[0.1], [0.1, 0.1], [0.2, 0.0, 0.3]], ids=["one step", "constant", "a zero"])
@@ -245,6 +248,8 @@ def test_perfect_scores_have_intervals(values):
 def test_other_seeds_do_not_take_the_snapshots_away(made, monkeypatch):
     """A method played on dev seeds beside ours on others, as README suggests: the pictures are still there."""
     folder, records, _ = made
+    for name in (FILTER.id, SMOOTHING.id):
+        monkeypatch.setitem(gym.registry[name].kwargs, "scenario", SCENARIO)
     monkeypatch.setattr(page, "SHOWN", (("homogeneous", "filter"), ("homogeneous", "smoothing")))
     others = [record | {"split": "own", "seeds": ["300001"],
                         "episodes": [episode | {"seed": "300001"} for episode in record["episodes"][:1]]}

@@ -188,7 +188,7 @@ def test_its_children_end_with_it(end, tmp_path):
 
 def test_a_question_that_is_not_read_is_too_late(tmp_path):
     """A guest may answer in advance and read nothing; the pipe is full some time."""
-    ahead = ("from eitbench.bench import wire\n        os.write(4, wire.pack({}))\n"
+    ahead = ("from eitbench.bench.sandbox import wire\n        os.write(4, wire.pack({}))\n"
              "        while True: os.write(4, wire.pack({'estimate': None}))")
     with Guest("estimator", FILTER.id, KWARGS, write_baseline(tmp_path, init=ahead)) as guest:
         guest.begin()
