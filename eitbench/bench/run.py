@@ -219,11 +219,11 @@ def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1, backend: 
     for job in todo:
         env = _environment(job.environment)
         if isinstance(env, InjectionEnv):
-            recordings.setdefault(env.scenario, []).append(job.seed)
+            recordings.setdefault(env.world, []).append(job.seed)
         else:
-            truths.setdefault((env.scenario, job.seed), job)
-    for scenario, seeds in recordings.items():
-        fill(scenario, seeds, n_jobs=n_jobs, backend=backend)
+            truths.setdefault((env.world, job.seed), job)
+    for world, seeds in recordings.items():
+        fill(world, seeds, n_jobs=n_jobs, backend=backend)
     run, home = {"command": command, **provenance(), "machine": machine()}, platform.node()
     guests.close()                                  # that of `Job.load`; the workers have their own
     try:
@@ -237,7 +237,7 @@ def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1, backend: 
 
 
 def _simulate_job(job: Job) -> None:
-    simulate(_environment(job.environment).scenario, job.seed, progress=False)
+    simulate(_environment(job.environment).world, job.seed, progress=False)
 
 
 def _run_job(job: Job, store: EpisodeStore, run: dict[str, Any], home: str) -> None:

@@ -6,15 +6,14 @@ All that the benchmark knows of ids is in this file.
 from __future__ import annotations
 
 import hashlib
-import importlib
-import inspect
 import json
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium as gym
 
 from eitbench.data.seeds import parse_seeds
-from eitbench.envs import ENTRY_POINTS, INJECTION
+from eitbench.envs.pages import page
+from eitbench.worlds.registry import entries, entry
 
 if TYPE_CHECKING:
     from eitbench.envs.estimation import EstimationEnv
@@ -27,8 +26,6 @@ BOARDS = {"estimation": ("filter", "fixed-lag", "smoothing"), "injection": ("inj
 ALL_BOARDS = tuple(board for boards in BOARDS.values() for board in boards)
 CLASSES = ("filter", "fixed-lag", "smoothing", "stationary", "injection")
 """What is ranked together: the boards, and targets that stand still apart."""
-AT_REST = ("eitbench/StationaryTank2D-v0",)
-"""Environments whose target stands still: nothing there has to be followed."""
 FLOORS = {"estimation": "homogeneous", "injection": "random_pair"}
 """Whose episodes are the board's, and from whose error the gain is counted."""
 KINDS = {"estimation": "estimator", "injection": "policy"}
@@ -38,16 +35,7 @@ ESTIMATORS = ("full", "reduced")
 
 QUICK = ("eitbench/Pipe2D-v0", "eitbench/Pipe2DFixedLag-v0", "eitbench/Pipe2DSmoothing-v0")
 """What the quick suite runs; the full one runs all that ask for estimates."""
-SEEDS = {"quick": "test:0-3", "full": "test:0-9"}
-MORE_SEEDS = {
-    "eitbench/Pipe2DInjectionFaults-v0": "test:0-49",
-    "eitbench/Pipe2DInjectionBudget-v0": "test:0-49",
-    "eitbench/Pipe2DInjectionFlow-v0": "test:0-29",
-}
-"""Competitions have many, fewer where the estimator inside takes a minute an episode."""
-FEW_SEEDS = "test:0-5"
-"""In the full suite, where an episode takes a minute a method and more: with the flow asked for too,
-and in 3D. With fewer than six there would be no intervals and no ranks."""
+QUICK_SEEDS = "test:0-3"
 
 
 class Environment(NamedTuple):
@@ -93,19 +81,17 @@ class Environment(NamedTuple):
         """Arguments that make an environment without an estimator inside, for who needs to know only
         what is allowed."""
         without = {"estimator": "none"} if self.track == "injection" else {}
-        return registered(self.id) | json.loads(self.kwargs) | without
+        return json.loads(self.kwargs) | without
 
 
 def ids(track: str | None = None) -> list[str]:
     """Registered environments of one track, or of all, as they were registered."""
-    return [id for id in ENTRY_POINTS if track is None or track_of(id) == track]
+    return [id for id, each in entries().items() if track in (None, each.track)]
 
 
 def track_of(id: str) -> str:
     """One of `TRACKS`; ``ValueError`` if there is no environment of this id."""
-    if id not in ENTRY_POINTS:
-        raise ValueError(f"env must be one of {', '.join(ENTRY_POINTS)}; got {id!r}")
-    return "injection" if id in INJECTION else "estimation"
+    return entry(id).track
 
 
 def check_track(id: str, track: str) -> None:
@@ -117,18 +103,19 @@ def check_track(id: str, track: str) -> None:
 
 
 def registered(id: str) -> dict[str, Any]:
-    """Keyword arguments that an id was registered with; none for one that is not registered."""
-    specification = gym.registry.get(id)
-    return dict(specification.kwargs) if specification is not None else {}
+    """Arguments that an id was registered with; none for one that is not registered."""
+    each = entries().get(id)
+    if each is None:
+        return {}
+    played = {"estimator": "full", "observation": "raw"} if each.track == "injection" else {}
+    return played | dict(each.settings)
 
 
 def changed(id: str, kwargs: dict[str, Any]) -> dict[str, Any]:
     """The arguments that make another world than the registered one, or other beliefs about it."""
-    usual = registered(id)
-    if id in INJECTION:
-        usual = {"estimator": "full", "observation": "raw"} | usual
-    return {key: value for key, value in kwargs.items()
-            if key not in usual or json.dumps(value) != json.dumps(usual[key])}
+    usual = {"world": {}} | registered(id)
+    return {key: value for key, value in kwargs.items() if value is not None
+            and (key not in usual or json.dumps(value) != json.dumps(usual[key]))}
 
 
 def named(id: str, given: dict[str, Any]) -> str:
@@ -145,7 +132,7 @@ def board_of(env: EstimationEnv | InjectionEnv) -> str:
         return "injection"
     if lag == 0:
         return "filter"
-    return "smoothing" if lag == env.scenario.n_steps - 1 else "fixed-lag"
+    return "smoothing" if lag == env.world.n_steps - 1 else "fixed-lag"
 
 
 def track_of_board(board: str) -> str:
@@ -155,24 +142,16 @@ def track_of_board(board: str) -> str:
 
 def class_of(id: str, board: str) -> str:
     """Which of `CLASSES` a board of an environment belongs to."""
-    return "stationary" if id in AT_REST else board
+    each = entries().get(id)
+    at_rest = each is not None and getattr(each.world.target, "stands_still", False)
+    return "stationary" if at_rest else board
 
 
 def default_seeds(env: EstimationEnv | InjectionEnv, id: str, suite: str = "full") -> list[int]:
     """Seeds that are played in an environment when nobody says which."""
-    if suite == "full" and id in MORE_SEEDS:
-        return parse_seeds(MORE_SEEDS[id])
-    if suite == "full" and track_of(id) == "estimation" and _is_expensive(env):
-        return parse_seeds(FEW_SEEDS)
-    return parse_seeds(SEEDS[suite])
+    return parse_seeds(QUICK_SEEDS if suite == "quick" else entry(id).seeds)
 
 
 def documentation(id: str) -> str:
-    """Docstring of an environment's class."""
-    module, name = ENTRY_POINTS[id][0].split(":")
-    return inspect.getdoc(getattr(importlib.import_module(module), f"{name}Env")) or ""
-
-
-def _is_expensive(env: Any) -> bool:
-    """Whether an episode takes a method a minute and more."""
-    return env.task.velocity is not None or env.task.mesh.dim == 3
+    """Page of an environment, as Markdown."""
+    return page(id)

@@ -22,8 +22,8 @@ from eitbench.bench.run import Job, run_episode
 from eitbench.bench.sandbox import guests
 from eitbench.bench.suites import is_isolated
 from eitbench.bench.tracks import Environment, track_of
-from eitbench.data.episodes import CACHE_VARIABLE
 from eitbench.data.seeds import parse_seeds
+from eitbench.data.store import CACHE_VARIABLE
 from eitbench.report.summary import as_markdown
 
 OF_OURS = ("board", "role", "privileged")

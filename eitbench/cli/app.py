@@ -58,9 +58,9 @@ def list_() -> None:
     typer.echo("environments")
     for name in ids("estimation"):
         env: Any = Environment(name).make()
-        scenario = env.scenario
-        typer.echo(f"  {name:40} {board_of(env):10}  lag {env.lag}, {scenario.n_steps - scenario.warm_up} scored of "
-                   f"{scenario.n_steps} states, {env.action_space.shape[0]} numbers each")
+        world = env.world
+        typer.echo(f"  {name:40} {board_of(env):10}  lag {env.lag}, {world.n_steps - world.warm_up} scored of "
+                   f"{world.n_steps} states, {env.action_space.shape[0]} numbers each")
     for name in ids("injection"):
         core = gym.make(name).unwrapped.core  # type: ignore[attr-defined]
         rules = core.rules
@@ -114,23 +114,24 @@ def bank(
     import shutil
 
     from eitbench.data.bank import fill, missing_seeds, recording_bytes
-    from eitbench.data.episodes import folder
     from eitbench.data.seeds import parse_seeds
-    from eitbench.envs import scenario_of
+    from eitbench.data.store import folder
+    from eitbench.worlds.registry import entry
     with clear_errors():
-        numbers, scenario = parse_seeds(seeds), scenario_of(env)
-    place, each = folder(scenario), recording_bytes(scenario)
+        numbers = parse_seeds(seeds)
+        world = entry(env).world
+    place, each = folder(world), recording_bytes(world)
     try:
         place.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise typer.BadParameter(f"recordings cannot be kept in {place}: {error}") from error
-    missing = len(missing_seeds(scenario, numbers))
+    missing = len(missing_seeds(world, numbers))
     typer.echo(f"{len(numbers)} episodes, {len(numbers) * each / 1e6:.0f} MB in {place}; {missing} to simulate")
     free = shutil.disk_usage(place).free
     if missing * each > free:
         raise typer.BadParameter(f"seeds need {missing * each / 1e9:.1f} GB more, and {free / 1e9:.1f} GB are free")
     with clear_errors():
-        made = fill(scenario, numbers, n_jobs=jobs, backend=backend)
+        made = fill(world, numbers, n_jobs=jobs, backend=backend)
     typer.echo(f"{made} simulated, {len(numbers) - made} were there")
 
 

@@ -54,7 +54,7 @@ def animate(environment: str, method: str, seed: str, step: int | None, path: Pa
                 raise ValueError(f"baseline {loaded.name} plays {', '.join(loaded.boards)}, but {environment} is a "
                                  f"{board_of(env)} environment")
             begin, states = 1, play(env, loaded, seeds[0])
-        first, last = env.scenario.warm_up + 1, env.scenario.n_steps
+        first, last = env.world.warm_up + 1, env.world.n_steps
         if step is not None:
             first = last = _check.integer("step", step, low=begin, high=last)
         frames = []

@@ -134,9 +134,8 @@ def _snapshots(store: EpisodeStore, records: list[dict[str, Any]]) -> dict[str, 
 
 
 def _is_tank(task: Task) -> bool:
-    """Pipes are long, and something flows through them; tanks are as wide as they are long."""
-    length, width = np.ptp(task.mesh.points, axis=0)[:2]
-    return task.mesh.dim == 2 and bool(length < 2 * width)
+    """Whether pictures of it stand side by side; those of long vessels lie one below the other."""
+    return task.vessel is not None and not task.vessel.is_long
 
 
 def _size(task: Task) -> str:

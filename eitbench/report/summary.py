@@ -41,8 +41,8 @@ _TEXT = ("environment", "board", "method", "seeds")
 """Columns of words; the others are numbers."""
 _WHERE_ASKED = ("velocity_error", "spent")
 """Scores whose column is there only if anybody has them."""
-_NOT_THE_WORLD = ("lag", "episodes", "render_mode", "observation", "estimator")
-"""Arguments of an environment that its episodes do not depend on, beside those of what is believed."""
+_NOT_THE_WORLD = ("lag", "assume", "gate", "episodes", "render_mode", "observation", "estimator")
+"""Arguments of an environment that its episodes do not depend on."""
 _UNIT = {"seconds_per_step": 1e3, "voltage_discrepancy": 1e6}
 
 
@@ -114,13 +114,13 @@ def world(record: dict[str, Any]) -> str:
     """What the lagged siblings of an environment share, whatever is believed of it: ``Pipe2D (scored_steps=3)``."""
     environment = record["environment"]
     changed = {key: value for key, value in environment["kwargs"].items()
-               if value is not None and key not in _NOT_THE_WORLD and not key.startswith("assumed_")}
-    changed |= changed.pop("scenario", {})
+               if value is not None and key not in _NOT_THE_WORLD}
+    changed |= changed.pop("world", {})
     return _kind(environment["id"]) + (f" ({_arguments(changed)})" if changed else "")
 
 
 def method(record: dict[str, Any]) -> str:
-    """The method's title, and what it was made to believe: ``Linearised Kalman filter, assumed_flow=real``."""
+    """The method's title, and what it was made to believe: ``Linearised Kalman filter, assume={"flow": "real"}``."""
     return ", ".join([record["title"], *filter(None, [_arguments(_beliefs(record))])])
 
 
@@ -140,7 +140,7 @@ def place_of_world(name: str) -> tuple[int, str]:
 def _beliefs(record: dict[str, Any]) -> dict[str, Any]:
     """Arguments that change the task's model and leave the truth as it is."""
     return {key: value for key, value in record["environment"]["kwargs"].items()
-            if (key.startswith("assumed_") and value is not None) or (key, value) == ("estimator", "reduced")}
+            if (key in ("assume", "gate") and value) or (key, value) == ("estimator", "reduced")}
 
 
 def _arguments(arguments: dict[str, Any]) -> str:
