@@ -7,12 +7,13 @@ from pathlib import Path
 from eitbench.bench.records import SCHEMA, sealed, split_of
 from eitbench.bench.tracks import Environment
 
-SCENARIO = {"mean_velocity": 45.0, "scored_steps": 3, "electrodes_per_wall": 2, "frame": 2}
+SCENARIO = {"flow": {"mean_velocity": 45.0}, "schedule": {"scored_steps": 3, "pattern": {"frame": 2}},
+            "vessel": {"electrodes_per_wall": 2}}
 """A fast fluid flushes the pipe in two steps: five measurements, the last three states are scored."""
 
-FILTER = Environment("eitbench/Pipe2D-v0", json.dumps({"scenario": SCENARIO}))
-FIXED_LAG = Environment("eitbench/Pipe2DFixedLag-v0", json.dumps({"scenario": SCENARIO, "lag": 2}))
-SMOOTHING = Environment("eitbench/Pipe2DSmoothing-v0", json.dumps({"scenario": SCENARIO}))
+FILTER = Environment("eitbench/Pipe2D-v0", json.dumps({"world": SCENARIO}))
+FIXED_LAG = Environment("eitbench/Pipe2DFixedLag-v0", json.dumps({"world": SCENARIO, "lag": 2}))
+SMOOTHING = Environment("eitbench/Pipe2DSmoothing-v0", json.dumps({"world": SCENARIO}))
 
 RUN = {"command": "eitbench run", "blas": "scipy-openblas", "commit": "c0ffee", "dirty": False,
        "source": hashlib.sha256(b"code").hexdigest(),

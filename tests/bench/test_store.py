@@ -16,8 +16,8 @@ from eitbench.bench import store as store_module
 from eitbench.bench.run import Job, run_jobs
 from eitbench.bench.store import EpisodeStore, machine, provenance, results_of, source_digest
 from eitbench.bench.tracks import Environment
-from eitbench.data.episodes import CACHE_VARIABLE
 from eitbench.data.seeds import name_seed
+from eitbench.data.store import CACHE_VARIABLE
 
 ENV, COMMAND = "eitbench/Pipe2D-v0", "eitbench run --seeds train:1-2"
 
@@ -147,7 +147,7 @@ def played(tmp_path_factory):
 def test_record_says_how_to_repeat_it(played):
     """Environment with arguments, baseline with parameters and hash, command, seeds, versions, commit, machine."""
     bad, mine = sorted(played.write_records(), key=lambda record: record["method"])
-    assert mine["environment"]["id"] == ENV and mine["environment"]["kwargs"]["scenario"] == SCENARIO
+    assert mine["environment"]["id"] == ENV and mine["environment"]["kwargs"]["world"] == SCENARIO
     assert (mine["method"], mine["title"], mine["board"]) == ("mine", "Mine", "filter")
     assert mine["parameters"] == {"alpha": 0.5, "order": [1, 2]}
     assert len(mine["method_sha256"]) == 64 and mine["method_sha256"] != bad["method_sha256"]
@@ -233,10 +233,10 @@ def test_seeds_are_in_numerical_order(store):
 def test_arguments_of_an_environment_make_other_records(store, tmp_path):
     """The same id with other keyword arguments is another world: neither results nor records overwrite each other."""
     path = write_baseline(tmp_path)
-    wider = Environment(FILTER.id, json.dumps({"scenario": SCENARIO | {"noise_relative": 0.02}}))
+    wider = Environment(FILTER.id, json.dumps({"world": SCENARIO | {"instrument": {"noise_relative": 0.02}}}))
     run_jobs([Job(environment, path, 1) for environment in (FILTER, wider, FIXED_LAG)], store)
     records = store.write_records()
-    noise = [record["environment"]["kwargs"]["scenario"].get("noise_relative") for record in records]
+    noise = [record["environment"]["kwargs"]["world"].get("instrument", {}).get("noise_relative") for record in records]
     assert sorted(noise, key=str) == [0.02, None, None]
     assert len(list((store.folder / "records").iterdir())) == 3
 

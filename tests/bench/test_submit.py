@@ -3,9 +3,8 @@
 import json
 import re
 
-import gymnasium as gym
 import pytest
-from short import FIELDS
+from short import PIPE, shorten
 from tiny import FILTER, SCENARIO, SMOOTHING, count, counting, write_baseline
 from typer.testing import CliRunner
 
@@ -16,8 +15,8 @@ from eitbench.bench.store import EpisodeStore, provenance
 from eitbench.bench.submit import submit
 from eitbench.cli import app
 from eitbench.data import bank
-from eitbench.data.episodes import CACHE_VARIABLE
 from eitbench.data.seeds import parse_seeds
+from eitbench.data.store import CACHE_VARIABLE
 
 INJECTION = "eitbench/Pipe2DInjection-v0"
 TEST = parse_seeds("test:0-1")
@@ -29,8 +28,8 @@ def tiny_world(monkeypatch, tmp_path, tmp_path_factory):
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path_factory.getbasetemp() / "episodes"))
     monkeypatch.setattr(store_module, "_git", lambda *words: "c0ffee" if "rev-parse" in words else "")
     for name in (FILTER.id, SMOOTHING.id):
-        monkeypatch.setitem(gym.registry[name].kwargs, "scenario", SCENARIO)
-    monkeypatch.setitem(gym.registry[INJECTION].kwargs, "scenario", FIELDS["Pipe2DInjection"])
+        shorten(monkeypatch, {name: SCENARIO})
+    shorten(monkeypatch, {INJECTION: PIPE})
     monkeypatch.chdir(tmp_path)
     for cached in (run._environment, policies.environment, provenance):
         cached.cache_clear()
@@ -243,7 +242,7 @@ def test_an_invalid_record_is_in_nobody_s_way(tmp_path, monkeypatch):
     assert code == 2 and "is not valid" in complaint and not (tmp_path / "leaderboards").exists()
     monkeypatch.undo()
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(gym.registry[FILTER.id].kwargs, "scenario", SCENARIO)
+    shorten(monkeypatch, {FILTER.id: SCENARIO})
     with pytest.warns(UserWarning, match="left out"):
         assert eitbench("run", "--baseline", "persistence", *submitted)[0] == 0
     assert eitbench("submit", "--baseline", "persistence", *submitted)[0] == 0

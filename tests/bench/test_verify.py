@@ -7,10 +7,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-import gymnasium as gym
 import numpy as np
 import pytest
-from short import FIELDS
+from short import PIPE, merged, shorten
 from tiny import FILTER, SCENARIO, write_baseline
 from typer.testing import CliRunner
 
@@ -22,9 +21,10 @@ from eitbench.bench.sandbox import guests, host, wire
 from eitbench.bench.sandbox.wall import landlock_version
 from eitbench.bench.tracks import named
 from eitbench.cli import app
-from eitbench.data.episodes import CACHE_VARIABLE, cache_folder, folder, simulate
+from eitbench.data.episodes import simulate
 from eitbench.data.seeds import SPLITS, parse_seeds
-from eitbench.worlds import Pipe2D
+from eitbench.data.store import CACHE_VARIABLE, cache_folder, folder
+from eitbench.worlds.pipe2d import PIPE_2D
 
 INJECTION = "eitbench/Pipe2DInjection-v0"
 SALT = bytes(range(32))
@@ -36,8 +36,7 @@ def tiny_world(monkeypatch, tmp_path, tmp_path_factory):
     """The registered environments play tiny worlds, in an empty folder."""
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path_factory.getbasetemp() / "episodes"))
     monkeypatch.setattr(store_module, "_git", lambda *words: None)
-    monkeypatch.setitem(gym.registry[FILTER.id].kwargs, "scenario", SCENARIO)
-    monkeypatch.setitem(gym.registry[INJECTION].kwargs, "scenario", FIELDS["Pipe2DInjection"])
+    shorten(monkeypatch, {FILTER.id: SCENARIO, INJECTION: PIPE})
     monkeypatch.setattr(held_out, "PUBLISHED", tmp_path / "leaderboards" / "held_out.json")
     monkeypatch.chdir(tmp_path)
     cached = (run._environment, policies.environment, store_module.provenance)
@@ -149,7 +148,7 @@ def test_changed_numbers_are_found(mine, tmp_path):
         record["episodes"][0]["step_errors"] = [steps[0] + 1e-4, steps[1] - 1e-4, *steps[2:]]
 
     def elsewhere(record):
-        given = {"scenario": SCENARIO | {"mean_velocity": 60.0}}
+        given = {"world": merged(SCENARIO, {"flow": {"mean_velocity": 60.0}})}
         record["environment"].update(kwargs=given, name=named(FILTER.id, given))
 
     for change, message in (
@@ -207,7 +206,7 @@ def test_numbers_decide_and_not_the_text(tmp_path, monkeypatch):
 def test_the_cache_is_not_believed(mine, tmp_path, monkeypatch):
     """A cache in which test:0 is another, easier episode makes a better score, but no record that holds."""
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
-    scenario, seed = Pipe2D(**SCENARIO), parse_seeds("test:0")[0]
+    scenario, seed = PIPE_2D.changed(SCENARIO), parse_seeds("test:0")[0]
     honest = simulate(scenario, seed, progress=False)
     flat = honest._replace(concentration=np.full_like(honest.concentration, scenario.expected_concentration))
     shutil.rmtree(folder(scenario))

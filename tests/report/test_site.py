@@ -19,7 +19,7 @@ from test_page import Page, svgs
 from tiny import RUN, record, several_boards
 
 from eitbench.bench.records import read_records, write_record
-from eitbench.envs import ENTRY_POINTS
+from eitbench.bench.tracks import ids
 from eitbench.report import charts
 from eitbench.report.boards import ALL, boards
 from eitbench.report.site import read_media, render_site, write_site
@@ -243,7 +243,7 @@ def test_docstrings_are_of_the_version_that_was_played(pages):
 
 def test_every_environment_has_its_docstring():
     """Description first, then tables; headings below the page's."""
-    for id in ENTRY_POINTS:
+    for id in ids():
         first, rest = documentation(id)
         assert len(first) > 100 and "<table>" in rest and "<h3>Reward</h3>" in rest and "<h2>" not in first + rest, id
 

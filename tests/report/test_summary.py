@@ -131,7 +131,7 @@ def test_skill_needs_its_anchors():
     mine = record("mine", "filter", FLOOR)
     for others in ([], ANCHORS[:1], ANCHORS[1:]):
         assert row([*others, mine], "mine", "filter")["skill"] is None
-    elsewhere = record("mine", "filter", FLOOR, kwargs={"scenario": {"scored_steps": 16}})
+    elsewhere = record("mine", "filter", FLOOR, kwargs={"world": {"schedule": {"scored_steps": 16}}})
     assert row([*ANCHORS, elsewhere], "mine", "filter")["skill"] is None
 
 
@@ -161,9 +161,11 @@ def test_anchors_look_back_on_the_longest_record(official):
 
 @pytest.mark.parametrize(("id", "kwargs", "world"), [
     ("eitbench/Pipe2DFixedLag-v0", {"lag": 4}, "Pipe2D"),
-    ("eitbench/Pipe3DSmoothing-v0", {"lag": "all", "scenario": None}, "Pipe3D"),
-    ("eitbench/Pipe2D-v0", {"scenario": {"scored_steps": 3}}, "Pipe2D (scored_steps=3)"),
-    ("eitbench/Pipe2DSmoothing-v0", {"scenario": {"scored_steps": 3, "frame": 2}}, "Pipe2D (frame=2, scored_steps=3)"),
+    ("eitbench/Pipe3DSmoothing-v0", {"lag": "all", "world": None}, "Pipe3D"),
+    ("eitbench/Pipe2D-v0", {"world": {"schedule": {"scored_steps": 3}}},
+     'Pipe2D (schedule={"scored_steps": 3})'),
+    ("eitbench/Pipe2DSmoothing-v0", {"world": {"region": None, "flow": {"diffusivity": 1e-3}}},
+     'Pipe2D (flow={"diffusivity": 0.001}, region=null)'),
     ("eitbench/Pipe2DUnknownVelocity-v0", {}, "Pipe2DUnknownVelocity"),
     ("eitbench/Pipe2DUnknownVelocity-v0", {"flow": "skewed"}, "Pipe2DUnknownVelocity (flow=skewed)"),
     ("eitbench/Pipe2DBiasedVelocity-v0", {"true_mean_velocity": 4.5, "assumed_profile": "plug", "episodes": 2},

@@ -22,7 +22,7 @@ from eitbench.bench.sandbox import guests, host
 from eitbench.bench.sandbox.wall import landlock_version
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.tracks import Environment
-from eitbench.data.episodes import CACHE_VARIABLE
+from eitbench.data.store import CACHE_VARIABLE
 
 INJECTION = Environment("eitbench/Pipe2DInjection-v0", json.dumps({"scenario": PIPE, "estimator": "reduced"}))
 WALL = "landlock" if landlock_version() else "process"

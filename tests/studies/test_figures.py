@@ -14,7 +14,7 @@ from PIL import Image
 from eitbench.bench.baselines import load_baseline
 from eitbench.bench.tracks import MORE_SEEDS
 from eitbench.cli.studies import NAME, thesis
-from eitbench.data.episodes import CACHE_VARIABLE
+from eitbench.data.store import CACHE_VARIABLE
 from eitbench.data.seeds import name_seed
 from eitbench.envs.pipe2d import Pipe2DEnv
 from eitbench.envs.pipe2d_obstacle import Pipe2DObstacleEnv
