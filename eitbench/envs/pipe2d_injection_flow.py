@@ -63,7 +63,7 @@ class Pipe2DInjectionFlowEnv(InjectionEnv, EzPickle):
     | `estimator`, `observation`, `episodes`, `render_mode`, `threads` | | as in `Pipe2DInjection-v0` |
 
     Both filters linearise the voltages about the level of the first frame. `estimator="full"` takes some
-    0.15 s a step. Each region has its own recordings. The first use of a scenario makes the reduced model (a minute).
+    0.6 s a step. Each region has its own recordings. The first use of a scenario makes the reduced model (a minute).
 
     ## Version history
 
