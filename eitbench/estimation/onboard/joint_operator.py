@@ -34,7 +34,7 @@ LEARNING = (0.6, 1.0, 1.4)
 
 
 class JointFullOperator(FullOperator):
-    """Joint extended Kalman filters with their exact covariance, some 0.6 s a step each: what scored runs use."""
+    """Joint extended Kalman filters with their exact covariance, some 0.15 s a step each: what scored runs use."""
 
     def _start(self, episodes: int) -> list[Any]:
         task = self._shared.task
