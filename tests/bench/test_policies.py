@@ -18,7 +18,7 @@ from eitbench.envs.injection_core import Rules
 from eitbench.estimation.onboard.belief import Belief
 from eitbench.report import policy_table
 from eitbench.report.policy_table import policy_rows
-from eitbench.worlds import Pipe2D
+from eitbench.worlds.pipe2d import PIPE_2D
 
 NAME = "eitbench/Pipe2DInjection-v0"
 CURRENTS, FAULTS, BUDGET = (f"eitbench/Pipe2DInjection{kind}-v0" for kind in ("Currents", "Faults", "Budget"))

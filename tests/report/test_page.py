@@ -248,7 +248,7 @@ def test_other_seeds_do_not_take_the_snapshots_away(made, monkeypatch):
     """A method played on dev seeds beside ours on others, as README suggests: the pictures are still there."""
     folder, records, _ = made
     for name in (FILTER.id, SMOOTHING.id):
-        monkeyshorten(patch, {name: SCENARIO})
+        shorten(monkeypatch, {name: SCENARIO})
     monkeypatch.setattr(page, "SHOWN", (("homogeneous", "filter"), ("homogeneous", "smoothing")))
     others = [record | {"split": "own", "seeds": ["300001"],
                         "episodes": [episode | {"seed": "300001"} for episode in record["episodes"][:1]]}
