@@ -163,9 +163,9 @@ def test_anchors_look_back_on_the_longest_record(official):
     ("eitbench/Pipe2DFixedLag-v0", {"lag": 4}, "Pipe2D"),
     ("eitbench/Pipe3DSmoothing-v0", {"lag": "all", "world": None}, "Pipe3D"),
     ("eitbench/Pipe2D-v0", {"world": {"schedule": {"scored_steps": 3}}},
-     'Pipe2D (schedule={"scored_steps": 3})'),
+     "Pipe2D (schedule.scored_steps=3)"),
     ("eitbench/Pipe2DSmoothing-v0", {"world": {"region": None, "flow": {"diffusivity": 1e-3}}},
-     'Pipe2D (flow={"diffusivity": 0.001}, region=null)'),
+     "Pipe2D (flow.diffusivity=0.001, region=null)"),
     ("eitbench/Pipe2DUnknownVelocity-v0", {}, "Pipe2DUnknownVelocity"),
     ("eitbench/Pipe2DUnknownVelocity-v0", {"flow": "skewed"}, "Pipe2DUnknownVelocity (flow=skewed)"),
     ("eitbench/Pipe2DBiasedVelocity-v0", {"world": {"region": None}, "assume": {"profile": "plug"}, "episodes": 2},
@@ -183,7 +183,7 @@ def test_beliefs_stand_beside_the_method():
     """Two rows of the same method and world are told apart by what it was made to believe."""
     rows = [record("mine", "filter", [0.1], kwargs={"assume": {"flow": "real"}, "lag": None}),
             record("mine", "filter", [0.2])]
-    assert list(summary(rows)["method"]) == ['mine, assume={"flow": "real"}', "mine"]
+    assert list(summary(rows)["method"]) == ["mine, assume.flow=real", "mine"]
 
 
 def several():
