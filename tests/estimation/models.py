@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from eitbench.estimation import FreeCovariance, KalmanFilter, LinearisedObservations, Observation, table_5_1
-from eitbench.worlds.pipe2d import Pipe2D
+from eitbench.worlds.pipe2d import PIPE_2D
 
 
 class LinearGaussian(NamedTuple):
@@ -115,22 +115,28 @@ def pipe(steps=5):
 
     The full matrices are put together from Table 5.1 here, the filter by ``table_5_1``.
     """
-    c_bh, rng, scenario = 30.0, np.random.default_rng(11), Pipe2D()
-    transport, observation = scenario.model()
+    c_bh = 30.0
+    rng = np.random.default_rng(11)
+    transport, observation = PIPE_2D.model()
     evolution = transport.evolution_model()
     F, Y, H = evolution
     n, m = len(F), Y.shape[1]
     model = LinearGaussian(F, Y @ np.full(m, c_bh), evolution.state_noise_covariance((c_bh / 4)**2, (c_bh / 50)**2),
                            np.full(n, c_bh), (c_bh / 4)**2 * np.eye(n))
-    linearised = LinearisedObservations(observation, scenario.noise, np.full(n, c_bh))
-    c, observations = c_bh * rng.uniform(0.9, 1.1, n), []
+    linearised = LinearisedObservations(observation, PIPE_2D.noise, np.full(n, c_bh))
+    c = c_bh * rng.uniform(0.9, 1.1, n)
+    observations = []
     for t in range(steps):
         c = F @ c + Y @ (c_bh * rng.uniform(0.8, 1.2, m)) + H @ (c_bh / 50 * rng.normal(size=n))
-        blank = linearised(np.zeros(2 * scenario.electrodes_per_wall), scenario.currents[t])
+        blank = linearised(np.zeros(PIPE_2D.vessel.n_electrodes), PIPE_2D.currents[t])
         noise = rng.normal(size=len(blank.value)) * np.sqrt(blank.noise_variance)
         observations.append(blank._replace(value=blank.matrix @ c + noise))
     exact = dense_filter(model, observations)
-    return model, lambda: table_5_1(transport, scenario.prior, c_bh, rank_tolerance=1e-6), observations, exact
+
+    def make_filter():
+        return table_5_1(transport, PIPE_2D.prior, c_bh, rank_tolerance=1e-6)
+
+    return model, make_filter, observations, exact
 
 
 # -- nonlinear observations -------------------------------------------------------------------------------------------
