@@ -7,7 +7,7 @@ import pytest
 
 from eitbench.physics.flow import PlaneChannelFlow
 from eitbench.physics.profiles import SkewedChannelFlow, VelocityModel, parabola
-from eitbench.worlds import Pipe2DSkewedVelocity
+from eitbench.worlds.pipe2d_skewed import PIPE_2D_SKEWED
 
 R = 0.05
 MODEL = VelocityModel(R, ((1.5, 0.0, -1.5), (0.0, 2.0), (0.5, 0.25, 0.0, -0.75)), (4.0, 0.0, 1.0), (1.0, 2.0, 3.0),
@@ -120,10 +120,10 @@ def test_basis_of_the_skewed_pipe_holds_its_truth_well_but_not_exactly(k):
 
     No inverse crime, and yet the model is good enough to be worth estimating; of the mean velocity it tells within 1 %.
     """
-    scenario = Pipe2DSkewedVelocity()
-    assert scenario.skewness_range[0] <= abs(k) <= scenario.skewness_range[1]
-    model = scenario.velocity_model
-    true = SkewedChannelFlow(4.5, scenario.half_width, k).profile(model.points)
+    low, high = PIPE_2D_SKEWED.flow.skewness_range
+    assert low <= abs(k) <= high
+    model = PIPE_2D_SKEWED.velocity_model
+    true = SkewedChannelFlow(4.5, PIPE_2D_SKEWED.vessel.half_width, k).profile(model.points)
     root = np.sqrt(model.weights)
 
     def misfit(profiles):
@@ -138,7 +138,7 @@ def test_basis_of_the_skewed_pipe_holds_its_truth_well_but_not_exactly(k):
 
 def test_skewed_basis_rests_on_the_walls_and_only_the_first_carries_fluid():
     """φ_k(±1) = 0; the mean of the parabola is 1, that of the others 0, so that θ_1 is the mean velocity."""
-    model = Pipe2DSkewedVelocity().velocity_model
+    model = PIPE_2D_SKEWED.velocity_model
     for direction in model.directions:
         np.testing.assert_allclose(direction(np.array([[0.1, -R], [0.2, R]])), 0.0, atol=1e-14)
     np.testing.assert_allclose(model.weights @ model.profiles / (2.0 * R), [1.0, 0.0, 0.0], atol=1e-14)
