@@ -12,8 +12,8 @@ from eitbench.estimation import LinearisedObservations, gauss_newton, smoothness
 from eitbench.numerics.fem import mass_matrix, stiffness_matrix
 from eitbench.numerics.mesh import rectangle_mesh
 from eitbench.numerics.round import uniform_disc
-from eitbench.worlds import StationaryTank2D
-from eitbench.worlds.tank2d import disc_indicator
+from eitbench.worlds.bodies import disc_indicator
+from eitbench.worlds.stationary_tank import STATIONARY_TANK_2D
 from eitbench.worlds.task import make_task
 
 LENGTH, STD = 0.1, 2.0
@@ -104,8 +104,7 @@ C_BH = 32.0
 @lru_cache(maxsize=1)
 def frame():
     """The tank's task, and one frame of its voltages, as the model itself computes them for a disc, with noise."""
-    scenario = StationaryTank2D()
-    task = make_task(scenario)
+    task = make_task(STATIONARY_TANK_2D)
     rng = np.random.default_rng(4)
     target = 30.0 * (1.0 + disc_indicator(task.mesh.points, np.array([0.05, 0.02]), 0.03, 0.01))
     clean = task.observation.voltages(target, task.currents)
