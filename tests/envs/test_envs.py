@@ -1,0 +1,172 @@
+"""What every registered environment that asks for estimates promises, tested over the registry."""
+
+import gc
+import json
+import os
+import pickle
+import subprocess
+import sys
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from estimating import ESTIMATION, PIPE, make, noise_actions, play
+from gymnasium.utils.env_checker import check_env
+from short import SHORT, short
+from stable_baselines3.common.env_checker import check_env as check_env_sb3
+
+from eitbench.data.episodes import Episode
+from eitbench.data.store import CACHE_VARIABLE
+from eitbench.envs.estimation import EstimationEnv
+from eitbench.worlds import Flow, Target, World, entries
+
+
+@pytest.fixture(scope="module", params=ESTIMATION)
+def name(request):
+    """Every id; all tests of one id run in a row, while its meshes are kept."""
+    return request.param
+
+
+def test_every_id_has_a_short_version():
+    """And every short version an id: whoever registers an environment has it tested here."""
+    used = [short(id)["world"] for id in entries()]
+    for changes in SHORT.values():
+        assert any(changes is each for each in used)
+
+
+def test_gymnasium_checker_passes(name):
+    """Spaces, seeding, returned types and rendering are as gymnasium demands."""
+    check_env(make(name, render_mode="rgb_array").unwrapped)
+
+
+@pytest.mark.filterwarnings(
+    "ignore:We recommend you to use a symmetric and normalized Box action space")
+def test_stable_baselines3_checker_passes(name):
+    """Stable-baselines3 can wrap it."""
+    check_env_sb3(make(name).unwrapped)
+
+
+def test_spec_travels_as_json(name):
+    """An environment is made again from its specification in JSON."""
+    env = make(name)
+    again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
+    assert json.loads(again.spec.to_json()) == json.loads(env.spec.to_json())
+    assert again.unwrapped.world == env.unwrapped.world
+    assert again.unwrapped.task.lag == env.unwrapped.task.lag
+
+
+def test_world_is_that_of_the_id_but_for_the_changes(name):
+    """The lag is the id's, unless another is given."""
+    registered = entries()[name]
+    env = make(name).unwrapped
+    assert env.world == registered.world.changed(short(name)["world"]) != registered.world
+    lag = registered.settings.get("lag", 0)
+    assert env.lag == (env.world.n_steps - 1 if lag == "all" else lag)
+    assert make(name, lag=1).unwrapped.lag == make(name, lag=1).unwrapped.task.lag == 1
+
+
+def test_pickled_environment_plays_the_same(name):
+    """Pickling keeps the arguments; the copy plays the same episode to the last bit."""
+    env = make(name)
+    assert_same_play(env, pickle.loads(pickle.dumps(env)))
+
+
+def test_two_environments_agree_to_the_bit(name):
+    """Same seed and actions, same observations and rewards."""
+    assert_same_play(make(name), make(name))
+
+
+def assert_same_play(one: gym.Env, other: gym.Env) -> None:
+    actions = noise_actions(one)
+    for a, b in zip(play(one, 1, actions), play(other, 1, actions), strict=True):
+        for key in ("voltages", "currents"):
+            np.testing.assert_array_equal(a[0][key], b[0][key])
+        assert a[1:] == b[1:]
+
+
+@pytest.mark.parametrize("id", [PIPE, "eitbench/Pipe2DTimeVaryingVelocity-v0",
+                                "eitbench/RotatingTank2D-v0"])
+def test_same_observation_in_another_process(id, tmp_path):
+    """The seed decides, not the process: another one, which finds nothing in its cache, simulates the same bits."""
+    code = ("import gymnasium as gym, eitbench\n"
+            f"observation, _ = gym.make({id!r}, **{short(id)!r}).reset(seed=1)\n"
+            "print(observation['voltages'].tobytes().hex())")
+    other = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True,
+                           check=True, env=os.environ | {CACHE_VARIABLE: str(tmp_path)})
+    assert make(id).reset(seed=1)[0]["voltages"].tobytes().hex() == other.stdout.strip()
+
+
+def test_unseeded_resets_follow_the_first_seed(name):
+    """After a seeded reset, unseeded ones draw training episodes from np_random alone; each of them comes."""
+    one, other = (make(name) for _ in range(2))
+    for env in (one, other):
+        env.reset(seed=1)
+    drawn = [[env.reset()[0]["voltages"].tobytes() for _ in range(16)] for env in (one, other)]
+    assert drawn[0] == drawn[1]
+    assert set(drawn[0]) == {one.reset(seed=seed)[0]["voltages"].tobytes() for seed in (0, 1)}
+
+
+def test_types_and_lengths(name):
+    """Python floats and bools, fresh arrays, scalars in info, and T + lag steps."""
+    env = make(name)
+    steps = play(env, 1, noise_actions(env))
+    task = env.unwrapped.task
+    assert len(steps) - 1 == task.n_steps + task.lag
+    for observation, reward, terminated, truncated, info in steps:
+        assert type(reward) is float
+        assert type(terminated) is bool
+        assert type(truncated) is bool
+        assert env.observation_space.contains(observation)
+        assert all(np.isscalar(value) for value in info.values())
+    arrays = [array for step in steps for array in step[0].values()]
+    assert len({array.__array_interface__["data"][0] for array in arrays}) == len(arrays)
+    with pytest.raises(gym.error.ResetNeeded):
+        env.unwrapped.step(noise_actions(env)[0])
+
+
+def test_truth_is_not_within_reach_of_observation_or_info(name):
+    """Nothing reachable from what an agent is handed holds the episode, the world that is played or an array of the
+    truth's size."""
+    env = make(name)
+    handed = [step[0] | step[4] for step in play(env, 1, noise_actions(env))]
+    handed.append(env.unwrapped.task)
+    n_truth = env.unwrapped.truth_mesh().n_nodes
+    seen = set()
+    stack = list(handed)
+    while stack:
+        thing = stack.pop()
+        if id(thing) in seen or isinstance(thing, (type, type(sys), str, bytes)):
+            continue
+        if callable(thing) and not hasattr(thing, "__dict__"):
+            continue
+        seen.add(id(thing))
+        assert not isinstance(thing, (Episode, EstimationEnv))
+        assert not {World, Flow, Target} & set(type(thing).__mro__)
+        if isinstance(thing, np.ndarray):
+            assert n_truth not in thing.shape
+            continue
+        stack += vars(thing).values() if hasattr(thing, "__dict__") else gc.get_referents(thing)
+    assert len(seen) > 50                      # the walk did go into the task
+
+
+def test_frames_show_truth_estimate_and_spread(name):
+    """The picture changes with the estimate, with the spread and with the time."""
+    env = make(name, render_mode="rgb_array")
+    base = env.unwrapped
+    env.reset(seed=1)
+    first = env.render()
+    assert first.dtype == np.uint8
+    assert first.ndim == 3
+    assert first.shape[2] == 3
+
+    def after(level: float) -> np.ndarray:
+        env.reset(seed=1)
+        for action in np.full((1 + base.lag, *env.action_space.shape), level):
+            env.step(action)
+        return env.render()
+
+    bright = after(44.0)
+    flat = after(30.0)
+    base.spread = np.full(base.n_nodes, 4.0)
+    spread = env.render()
+    assert len({picture.tobytes() for picture in (first, flat, spread, bright)}) == 4
