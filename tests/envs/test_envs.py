@@ -87,7 +87,8 @@ def assert_same_play(one: gym.Env, other: gym.Env) -> None:
 @pytest.mark.parametrize("id", [PIPE, "eitbench/Pipe2DTimeVaryingVelocity-v0",
                                 "eitbench/RotatingTank2D-v0"])
 def test_same_observation_in_another_process(id, tmp_path):
-    """The seed decides, not the process: another one, which finds nothing in its cache, simulates the same bits."""
+    """The seed decides, not the process: another one, which finds nothing in its cache, simulates
+    the same bits."""
     code = ("import gymnasium as gym, eitbench\n"
             f"observation, _ = gym.make({id!r}, **{short(id)!r}).reset(seed=1)\n"
             "print(observation['voltages'].tobytes().hex())")
@@ -97,7 +98,8 @@ def test_same_observation_in_another_process(id, tmp_path):
 
 
 def test_unseeded_resets_follow_the_first_seed(name):
-    """After a seeded reset, unseeded ones draw training episodes from np_random alone; each of them comes."""
+    """After a seeded reset, unseeded ones draw training episodes from np_random alone; each of them
+    comes."""
     one, other = (make(name) for _ in range(2))
     for env in (one, other):
         env.reset(seed=1)
@@ -125,8 +127,8 @@ def test_types_and_lengths(name):
 
 
 def test_truth_is_not_within_reach_of_observation_or_info(name):
-    """Nothing reachable from what an agent is handed holds the episode, the world that is played or an array of the
-    truth's size."""
+    """Nothing reachable from what an agent is handed holds the episode, the world that is played or
+    an array of the truth's size."""
     env = make(name)
     handed = [step[0] | step[4] for step in play(env, 1, noise_actions(env))]
     handed.append(env.unwrapped.task)
