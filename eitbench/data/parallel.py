@@ -1,0 +1,99 @@
+"""Work spread over processes, each with one BLAS thread: more of them only get into each other's way."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import nullcontext
+from typing import Any, TypeVar
+
+from eitbench.worlds.registry import Entry, registered_by_hand, take_over
+
+BACKENDS = ("loky", "ray", "dask")
+"""Who starts the processes: joblib on this machine, or a cluster."""
+
+Result = TypeVar("Result")
+
+
+class WorkerLost(RuntimeError):
+    """A process ended before its work was done."""
+
+
+def in_parallel(function: Callable[..., Result], arguments: Sequence[tuple], n_jobs: int,
+                backend: str = "loky") -> Iterator[Result]:
+    """Results of ``function(*each)``, as they come.
+
+    ``ray`` and ``dask`` give the work to the cluster that $RAY_ADDRESS or $DASK_SCHEDULER_ADDRESS names, and without
+    one to ``n_jobs`` processes here. When one of their processes is killed another takes up its work.
+
+    Raises
+    ------
+    ValueError
+        If there is no such backend, or what it needs is not installed.
+    WorkerLost
+        If a process was killed and nobody took up its work.
+    """
+    if backend not in BACKENDS:
+        raise ValueError(f"backend must be one of {', '.join(BACKENDS)}, got {backend!r}")
+    n_jobs = max(1, min(n_jobs, len(arguments)))
+    try:
+        run = {"loky": _with_joblib, "ray": _with_ray, "dask": _with_dask}[backend]
+        yield from run(function, arguments, n_jobs)
+    except ModuleNotFoundError as error:
+        if error.name not in ("ray", "distributed", "dask"):
+            raise
+        raise ValueError(f"backend {backend} needs {error.name}, which the extra cluster installs") from None
+
+
+def _with_joblib(function: Callable[..., Result], arguments: Sequence[tuple], n_jobs: int, config: Any = None,
+                 lost: type[BaseException] = BrokenProcessPool) -> Iterator[Result]:
+    from joblib import Parallel, delayed
+    try:
+        with config or nullcontext(), Parallel(n_jobs=n_jobs, return_as="generator_unordered", batch_size=1,
+                                               pre_dispatch=n_jobs) as parallel:
+            told = registered_by_hand()
+            yield from parallel(delayed(_pinned)(told, function, *each) for each in arguments)
+    except lost as error:
+        raise _explained(error) from error
+
+
+def _with_dask(function: Callable[..., Result], arguments: Sequence[tuple], n_jobs: int) -> Iterator[Result]:
+    import distributed
+    from joblib import parallel_config
+    where = os.environ.get("DASK_SCHEDULER_ADDRESS")
+    local = {"n_workers": n_jobs, "threads_per_worker": 1, "dashboard_address": None}
+    with distributed.Client(where) if where else distributed.Client(**local) as client:
+        yield from _with_joblib(function, arguments, n_jobs, parallel_config("dask", client=client),
+                                distributed.KilledWorker)
+
+
+def _with_ray(function: Callable[..., Result], arguments: Sequence[tuple], n_jobs: int) -> Iterator[Result]:
+    """Without joblib: its backend for ray gives all results at the end, and none if a process was killed."""
+    import ray
+    here = {} if "RAY_ADDRESS" in os.environ else {"num_cpus": n_jobs, "include_dashboard": False}
+    if ours := not ray.is_initialized():
+        ray.init(log_to_driver=False, **here)
+    try:
+        waiting = [ray.remote(_pinned).remote(registered_by_hand(), function, *each) for each in arguments]
+        while waiting:
+            done, waiting = ray.wait(waiting)
+            yield from ray.get(done)
+    except (ray.exceptions.WorkerCrashedError, ray.exceptions.NodeDiedError, ray.exceptions.OutOfMemoryError) as error:
+        raise _explained(error) from error
+    finally:
+        if ours:
+            ray.shutdown()
+
+
+def _explained(error: BaseException) -> WorkerLost:
+    return WorkerLost(f"a process was lost, killed perhaps for want of memory ({type(error).__name__}); what was "
+                      "finished is kept, and the same command goes on from there")
+
+
+def _pinned(told: list[Entry], function: Callable[..., Result], *arguments: Any) -> Result:
+    """Called in another process, which is ``told`` of the worlds that a script has registered."""
+    from threadpoolctl import threadpool_limits
+    take_over(told)
+    with threadpool_limits(1):
+        return function(*arguments)

@@ -1,0 +1,378 @@
+"""Compiled kernels: sparse Cholesky and LU factors on a fixed pattern, and products of gradients.
+
+All that needs numba is in this file; `eitbench.numerics.compiled` imports it when it is needed.
+
+The factor is stored in supernodes, runs of columns with the same pattern below them: supernode s
+holds the columns start[s] … start[s+1]−1 and the rows rows[first_row[s] : first_row[s+1]], as a
+dense panel, column after column, from panel[s] on. Of the last supernode only its right-hand side
+is made: the Schur complement of all before.
+
+Loops over eight neighbours inside one array are not vectorised by the compiler, since it cannot
+know that they do not overlap. So the kernels speak of eight doubles at a time, in a type that
+numba lacks and a handful of intrinsics for it; the same arithmetic then runs 3 to 5 times faster.
+They stand in this file because numba keeps compiled code by the file of the kernel: elsewhere, a
+change in them would go unnoticed.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from llvmlite import ir
+from numba import njit, types
+from numba.core import cgutils
+from numba.extending import intrinsic, models, register_model
+
+WIDTH = 8
+WIDE = 32
+"""Lanes where there are hundreds of right-hand sides: a lane's additions wait for each other, so
+several registers are added to at once; more do not fit where one holds four doubles."""
+
+
+class Lanes(types.Type):
+    """<width x double>, held in registers."""
+
+    def __init__(self, width: int) -> None:
+        self.width, self.vector = width, ir.VectorType(ir.DoubleType(), width)
+        super().__init__(name=f"Lanes{width}")
+
+
+@register_model(Lanes)
+class _LanesModel(models.PrimitiveModel):
+    def __init__(self, manager, kind):
+        super().__init__(manager, kind, kind.vector)
+
+
+def _loader(lanes):
+    @intrinsic
+    def load(_typing, array, index):
+        """array[index : index + width]"""
+        def code(context, builder, signature, arguments):
+            vector = builder.load(_address(context, builder, signature, arguments, lanes))
+            vector.align = 8
+            return vector
+        return lanes(array, types.intp), code
+    return load
+
+
+def _splatter(lanes):
+    @intrinsic
+    def splat(_typing, number):
+        """The same number in every lane."""
+        def code(_context, builder, _signature, arguments):
+            nothing = ir.Constant(lanes.vector, ir.Undefined)
+            first = builder.insert_element(nothing, arguments[0], ir.Constant(ir.IntType(32), 0))
+            zeros = ir.Constant(ir.VectorType(ir.IntType(32), lanes.width), [0] * lanes.width)
+            return builder.shuffle_vector(first, nothing, zeros)
+        return lanes(types.float64), code
+    return splat
+
+
+load, load_wide = (_loader(Lanes(width)) for width in (WIDTH, WIDE))
+splat, splat_wide = (_splatter(Lanes(width)) for width in (WIDTH, WIDE))
+
+
+@intrinsic
+def store(_typing, array, index, vector):
+    """array[index : index + width] = vector"""
+    def code(context, builder, signature, arguments):
+        address = _address(context, builder, signature, arguments, vector)
+        written = builder.store(arguments[2], address)
+        written.align = 8
+        return context.get_dummy_value()
+    return types.void(array, types.intp, vector), code
+
+
+@intrinsic
+def subtract_product(_typing, total, a, b):
+    """total − a·b"""
+    def code(_context, builder, _signature, arguments):
+        fma = _function(builder, "fma", total, 3)
+        return builder.call(fma, [builder.fneg(arguments[1]), arguments[2], arguments[0]])
+    return total(total, a, b), code
+
+
+@intrinsic
+def times(_typing, a, b):
+    """a·b"""
+    def code(_context, builder, _signature, arguments):
+        return builder.fmul(*arguments)
+    return a(a, b), code
+
+
+@intrinsic
+def plus(_typing, a, b):
+    """a + b"""
+    def code(_context, builder, _signature, arguments):
+        return builder.fadd(*arguments)
+    return a(a, b), code
+
+
+@intrinsic
+def inverse_root(_typing, a):
+    """1/√a"""
+    def code(_context, builder, _signature, arguments):
+        root = builder.call(_function(builder, "sqrt", a, 1), arguments)
+        return builder.fdiv(ir.Constant(a.vector, [1.0] * a.width), root)
+    return a(a), code
+
+
+def _address(context, builder, signature, arguments, lanes):
+    array = context.make_array(signature.args[0])(context, builder, arguments[0])
+    return builder.bitcast(builder.gep(array.data, [arguments[1]]), lanes.vector.as_pointer())
+
+
+def _function(builder, name, lanes, count):
+    kind = ir.FunctionType(lanes.vector, [lanes.vector] * count)
+    return cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v{lanes.width}f64")
+
+
+# -- kernels --------------------------------------------------------------------------------------
+
+
+@njit(cache=True)
+def factorise(start, first_row, rows, panel, owner, first_entry, slot, values, factor):
+    """Left-looking supernodal Cholesky; lower entries ``values`` go to ``factor``'s ``slot``."""
+    n_super = len(start) - 1
+    head, after, done = np.full(n_super, -1), np.full(n_super, -1), np.zeros(n_super, np.int64)
+    place, target = np.empty(len(owner), np.int64), np.empty(len(owner), np.int64)
+    column, second = np.empty(len(owner) + WIDTH), np.empty(len(owner) + WIDTH)
+    for s in range(n_super):
+        width, height, here = start[s + 1] - start[s], first_row[s + 1] - first_row[s], panel[s]
+        for i in range(height):
+            place[rows[first_row[s] + i]] = i
+        for i in range(here, here + height * width):
+            factor[i] = 0.0
+        for e in range(first_entry[s], first_entry[s + 1]):
+            factor[slot[e]] = values[e]
+        d = head[s]                              # earlier supernodes with rows among these columns
+        while d >= 0:
+            following = after[d]
+            rows_d, height_d, there = first_row[d], first_row[d + 1] - first_row[d], panel[d]
+            begin = end = done[d]
+            for a in range(begin, height_d):
+                target[a] = place[rows[rows_d + a]]
+                if rows[rows_d + a] < start[s + 1]:
+                    end = a + 1
+            width_d = start[d + 1] - start[d]
+            for b in range(begin, end, 2):      # two columns at a time: what is loaded serves both
+                twin = min(b + 1, end - 1)
+                # may read beyond the panel, into numbers that are not used
+                for a in range(b, height_d, WIDTH):
+                    total = splat(0.0)
+                    other = splat(0.0)
+                    k = there
+                    for _ in range(width_d):
+                        rows_here = load(factor, k + a)
+                        total = subtract_product(total, rows_here, splat(factor[k + b]))
+                        other = subtract_product(other, rows_here, splat(factor[k + twin]))
+                        k += height_d
+                    store(column, a, total)
+                    store(second, a, other)
+                to = here + target[b] * height
+                for a in range(b, height_d):
+                    factor[to + target[a]] += column[a]
+                if twin > b:
+                    to = here + target[twin] * height
+                    for a in range(twin, height_d):
+                        factor[to + target[a]] += second[a]
+            _enlist(d, end, rows_d, height_d, rows, owner, head, after, done)
+            d = following
+        if s == n_super - 1:
+            break
+        for p in range(width):
+            j = here + p * height
+            for i in range(p, height, WIDTH):
+                total = load(factor, j + i)
+                k = here
+                for _ in range(p):
+                    total = subtract_product(total, load(factor, k + i), splat(factor[k + p]))
+                    k += height
+                if i + WIDTH <= height:
+                    store(factor, j + i, total)
+                else:
+                    store(column, 0, total)
+                    for r in range(i, height):
+                        factor[j + r] = column[r - i]
+            scale = 1.0 / math.sqrt(factor[j + p])
+            for i in range(p, height):
+                factor[j + i] *= scale
+        _enlist(s, width, first_row[s], height, rows, owner, head, after, done)
+
+
+@njit(inline="always")
+def _enlist(s, end, rows_s, height, rows, owner, head, after, done):
+    """Supernode s is done with its first ``end`` rows: the owner of the next one will need it."""
+    done[s] = end
+    if end < height:
+        next_one = owner[rows[rows_s + end]]
+        after[s] = head[next_one]
+        head[next_one] = s
+
+
+@njit(cache=True)
+def condense_lanes(start, first_row, rows, panel, children, first_entry, slot, values, front,
+                   stack):
+    """The Schur complements of eight matrices side by side, left in ``front``.
+
+    The values of the eight lie next to each other. Multifrontal: the factor itself is not kept.
+    What a supernode leaves to its ancestors waits on a stack until its parent takes it, so that
+    all work is done in memory that the caches hold.
+    """
+    n_super = len(start) - 1
+    place, target = np.empty(start[-1], np.int64), np.empty(start[-1], np.int64)
+    begins, waiting = np.zeros(n_super + 1, np.int64), np.zeros(n_super, np.int64)
+    depth = 0
+    for s in range(n_super):
+        width, height = start[s + 1] - start[s], first_row[s + 1] - first_row[s]
+        for i in range(height):
+            place[rows[first_row[s] + i]] = i
+        for j in range(height):
+            for i in range(j * height + j, (j + 1) * height):
+                store(front, i * WIDTH, splat(0.0))
+        for e in range(first_entry[s], first_entry[s + 1]):
+            store(front, (slot[e] - panel[s]) * WIDTH, load(values, e * WIDTH))
+        for _ in range(children[s]):
+            depth -= 1
+            d, at = waiting[depth], begins[depth]
+            left = first_row[d] + start[d + 1] - start[d]
+            size = first_row[d + 1] - left
+            for i in range(size):
+                target[i] = place[rows[left + i]]
+            for j in range(size):
+                for i in range(j, size):
+                    to = (target[j] * height + target[i]) * WIDTH
+                    left_over = load(stack, at * WIDTH)
+                    store(front, to, subtract_product(load(front, to), splat(-1.0), left_over))
+                    at += 1
+        if s == n_super - 1:
+            break
+        for p in range(width):
+            j = p * height
+            for i in range(p, height):
+                total = load(front, (j + i) * WIDTH)
+                k = 0
+                for _ in range(p):
+                    pivot = load(front, (k + p) * WIDTH)
+                    total = subtract_product(total, load(front, (k + i) * WIDTH), pivot)
+                    k += height
+                store(front, (j + i) * WIDTH, total)
+            scale = inverse_root(load(front, (j + p) * WIDTH))
+            for i in range(p, height):
+                store(front, (j + i) * WIDTH, times(load(front, (j + i) * WIDTH), scale))
+        at = begins[depth]
+        waiting[depth] = s
+        for j in range(width, height):
+            for i in range(j, height, 2):          # two rows at a time: what is loaded serves both
+                twin = min(i + 1, height - 1)
+                total = load(front, (j * height + i) * WIDTH)
+                other = load(front, (j * height + twin) * WIDTH)
+                k = 0
+                for _ in range(width):
+                    pivot = load(front, (k + j) * WIDTH)
+                    total = subtract_product(total, load(front, (k + i) * WIDTH), pivot)
+                    other = subtract_product(other, load(front, (k + twin) * WIDTH), pivot)
+                    k += height
+                store(stack, at * WIDTH, total)
+                store(stack, (at + 1) * WIDTH, other)    # if there is none it is overwritten
+                at += 2 if twin > i else 1
+        depth += 1
+        begins[depth] = at
+
+
+@njit(cache=True)
+def substitute_back(start, first_row, rows, panel, factor, solution):
+    """Solve Lᵀ x = 0 upwards from the last supernode's rows of ``solution`` (n, 8·k)."""
+    n_super = len(start) - 1
+    width = solution.shape[1]
+    flat = solution.reshape(-1)
+    for s in range(n_super - 2, -1, -1):
+        height, first = first_row[s + 1] - first_row[s], first_row[s]
+        for p in range(start[s + 1] - start[s] - 1, -1, -1):
+            column = panel[s] + p * height
+            scale = splat(1.0 / factor[column + p])
+            for lane in range(0, width, WIDTH):
+                total = splat(0.0)
+                for i in range(p + 1, height):
+                    above = load(flat, rows[first + i] * width + lane)
+                    total = subtract_product(total, splat(factor[column + i]), above)
+                store(flat, (start[s] + p) * width + lane, times(total, scale))
+
+
+@njit(cache=True)
+def subtract_gradient_products(cells, unknowns, gradient, fields, table, G):
+    """Subtract `Sensitivity`'s integrals from ``table``, cell by cell.
+
+    Weighted gradients by a cell's unknowns (cells, vertices·dim, unknowns a cell); fields
+    (unknowns, width) and table (nodes, width, width), with width in multiples of eight; ``G`` is
+    room for twice (vertices, dim, width).
+    """
+    n_cells, n_vertices = cells.shape
+    n_rows, n_local = gradient.shape[1:]
+    dim, width = n_rows // n_vertices, fields.shape[1]
+    u, out = fields.reshape(-1), table.reshape(-1)
+    size = dim * width                                   # numbers a vertex
+    shifted = n_vertices * size                          # where S + G_j begins, behind the G_j
+    for c in range(n_cells):
+        for r in range(n_rows):
+            for i in range(0, width, WIDTH):
+                total = splat(0.0)
+                for k in range(n_local):
+                    value = load(u, unknowns[c, k] * width + i)
+                    total = subtract_product(total, splat(-gradient[c, r, k]), value)
+                store(G, r * width + i, total)
+        for i in range(0, size, WIDTH):
+            total = splat(0.0)
+            for v in range(n_vertices):
+                total = subtract_product(total, splat(-1.0), load(G, v * size + i))
+            for j in range(n_vertices):
+                to = j * size + i
+                store(G, shifted + to, subtract_product(total, splat(-1.0), load(G, to)))
+        for m in range(width):
+            for l in range(0, width, 2 * WIDTH):         # sixteen at a time, if there are so many
+                twin = min(l + WIDTH, width - WIDTH)
+                everywhere, everywhere_twin = splat(0.0), splat(0.0)
+                i = 0
+                for _ in range(n_rows):
+                    left = splat(G[i + m])
+                    everywhere = subtract_product(everywhere, left, load(G, i + l))
+                    everywhere_twin = subtract_product(everywhere_twin, left, load(G, i + twin))
+                    i += width
+                for j in range(n_vertices):
+                    to = (cells[c, j] * width + m) * width
+                    total = subtract_product(load(out, to + l), splat(-1.0), everywhere)
+                    other = subtract_product(load(out, to + twin), splat(-1.0), everywhere_twin)
+                    i = j * size
+                    for _ in range(dim):
+                        for part in (i, shifted + i):
+                            left = splat(G[part + m])
+                            total = subtract_product(total, left, load(G, part + l))
+                            other = subtract_product(other, left, load(G, part + twin))
+                        i += width
+                    store(out, to + l, total)
+                    store(out, to + twin, other)
+
+
+@njit(cache=True)
+def solve_lu(row_place, column_place, lower_pointer, lower_index, lower, upper_pointer,
+             upper_index, upper, scale, right, work, solution):
+    """Solve A x = b for eight right-hand sides (n, 8).
+
+    L and U are given by rows; their diagonals are 1 and 1/``scale``.
+    """
+    n = len(scale)
+    for i in range(n):
+        store(work, row_place[i] * WIDTH, load(right, i * WIDTH))
+    for i in range(n):
+        total = load(work, i * WIDTH)
+        for e in range(lower_pointer[i], lower_pointer[i + 1]):
+            total = subtract_product(total, splat(lower[e]), load(work, lower_index[e] * WIDTH))
+        store(work, i * WIDTH, total)
+    for i in range(n - 1, -1, -1):
+        total = load(work, i * WIDTH)
+        for e in range(upper_pointer[i], upper_pointer[i + 1]):
+            total = subtract_product(total, splat(upper[e]), load(work, upper_index[e] * WIDTH))
+        store(work, i * WIDTH, times(total, splat(scale[i])))
+    for i in range(n):
+        store(solution, i * WIDTH, load(work, column_place[i] * WIDTH))
