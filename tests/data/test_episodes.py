@@ -10,7 +10,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from scipy.stats import kstest
-
 from short import merged
 from tiny_worlds import CHANGES, TINY
 
@@ -91,7 +90,8 @@ def test_other_processes_same_bits_and_share_one_file(fresh, cache):
                "import hashlib\n"
                f"episode = simulate(PIPE_2D.changed({CHANGES!r}), 7)\n"
                "print(hashlib.sha256(b''.join(array.tobytes() for array in episode)).hexdigest())")
-    running = [subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) for _ in range(2)]
+    running = [subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
+               for _ in range(2)]
     digests = [process.communicate()[0].strip() for process in running]
     here = hashlib.sha256(b"".join(array.tobytes() for array in fresh)).hexdigest()
     assert digests == [here, here]
@@ -118,7 +118,8 @@ def test_cached_equals_fresh(fresh, monkeypatch):
 def test_seeds_differ_in_flow_and_noise(fresh):
     """Another seed is another inflow, hence other voltages, and other noise."""
     other = simulate(TINY, 8, cache=False)
-    assert all((mine != theirs).mean() > 0.9 for mine, theirs in zip(fresh[:3], other[:3], strict=True))
+    assert all((mine != theirs).mean() > 0.9 for mine,
+               theirs in zip(fresh[:3], other[:3], strict=True))
 
 
 def test_numbers_depend_on_the_world_not_on_the_cache(counted, cache):
@@ -213,7 +214,8 @@ def test_resistances_belong_to_the_concentrations(fresh):
     for t in (1, 5):
         expected = observation.transfer_resistance(fresh.concentration[t].astype(float))
         # Concentrations are kept in single precision, resistances as computed.
-        np.testing.assert_allclose(fresh.transfer_resistance[t - 1], expected, atol=1e-6 * np.abs(expected).max())
+        np.testing.assert_allclose(fresh.transfer_resistance[t - 1], expected,
+                                   atol=1e-6 * np.abs(expected).max())
 
 
 def test_voltages_follow_the_noise_formula(fresh):
@@ -221,15 +223,18 @@ def test_voltages_follow_the_noise_formula(fresh):
     for."""
     for step, currents in itertools.product((1, 2, 5), TINY.currents):
         clean = fresh.transfer_resistance[step - 1] @ currents
-        noisy = clean + np.sqrt((0.01 * clean)**2 + (0.001 * np.abs(clean).max())**2) * fresh.noise[step - 1]
+        noisy = clean + np.sqrt((0.01 * clean)**2
+                                + (0.001 * np.abs(clean).max())**2) * fresh.noise[step - 1]
         np.testing.assert_allclose(fresh.voltages(step, currents, TINY), noisy, rtol=1e-12)
 
 
 def test_noise_is_standard_normal(monkeypatch):
     """48,000 draws of one long episode: N(0, 1), and independent from one reading or step to the
     next."""
-    electrodes = SimpleNamespace(cem=SimpleNamespace(n_electrodes=16), transfer_resistance=lambda c: np.eye(16))
-    still = SimpleNamespace(mesh=SimpleNamespace(points=np.zeros((1, 2)), n_nodes=1), inlet=np.array([0]),
+    electrodes = SimpleNamespace(cem=SimpleNamespace(n_electrodes=16),
+                                 transfer_resistance=lambda c: np.eye(16))
+    still = SimpleNamespace(mesh=SimpleNamespace(points=np.zeros((1, 2)), n_nodes=1),
+                            inlet=np.array([0]),
                             # the flow takes no part in this
                             time_step=2.5e-3, step=lambda c, *_: c)
     monkeypatch.setattr(episodes, "truth_discretisation",
@@ -270,7 +275,8 @@ def test_inflow_has_slugs_of_both_signs_from_beginning_to_end():
     """Every episode sees concentration rise and fall by a tenth and more; on average it does
     neither, at any time."""
     level = inflows()
-    assert (level.max(axis=(1, 2)) > np.log(1.1)).all() and (level.min(axis=(1, 2)) < np.log(0.9)).all()
+    assert (level.max(axis=(1, 2)) > np.log(1.1)).all()
+    assert (level.min(axis=(1, 2)) < np.log(0.9)).all()
     assert abs(level.mean()) < 0.05
     activity = np.sqrt((level**2).mean(axis=(0, 1)))                # over time
     assert activity[:40].mean() > 0.6 * activity.mean()
