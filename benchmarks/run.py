@@ -28,12 +28,13 @@ INTRODUCTION = """# Speed
 Ours against others, measured in the same run, everything on one thread. A ratio is our time in parts of the
 reference's, or, where it says faster, the reverse. Each time is the fastest of several calls, between which the
 candidates take turns; references that run for seconds run once or twice. Results are compared with the reference's
-before, except with pyEIT, whose model differs. On a machine that others share, a ratio may differ by a third from run
-to run. *Limited by* says what our time goes into, *ceiling* how much we reach of what this machine can do at best,
-measured in the same process. Targets were set before measuring.
+before, except with pyEIT, whose model differs. *Ours with scipy's SuperLU and sparse products* is the
+reference in `tests/references.py`. On a machine that others share, a ratio may differ by a third
+from run to run. *Limited by* says what our time goes into, *ceiling* how much we reach of what this
+machine can do at best, measured in the same process. Targets were set before measuring.
 
 ```sh
-python3 -m venv peers && peers/bin/pip install -c constraints.txt -e '.[fast]' -r benchmarks/requirements.txt
+python3 -m venv peers && peers/bin/pip install -c constraints.txt -e . -r benchmarks/requirements.txt
 peers/bin/python benchmarks/run.py            # or only some: run.py forward
 ```
 

@@ -10,15 +10,14 @@ import time
 from collections.abc import Iterator
 
 import numpy as np
-import scipy.sparse as sp
 from common import Row, compare, quantity
+from forward import system_matrix
+from references import reference_flow
 from solvers import refactorisations
 
 from eitbench.data.bank import recording_bytes
 from eitbench.data.episodes import simulate, simulate_together, truth_discretisation
-from eitbench.physics.cem import CompleteElectrodeModel
 from eitbench.physics.flow import PlaneChannelFlow
-from eitbench.physics.transport import ConvectionDiffusion
 from eitbench.worlds import Pipe2D
 
 SCENARIO = Pipe2D()
@@ -28,15 +27,14 @@ BANK = 256
 def rows() -> Iterator[Row]:
     transport, observation = truth_discretisation(SCENARIO)
     cem = observation.cem
-    n, n_steps = transport.mesh.n_nodes, SCENARIO.n_steps
-    plain = CompleteElectrodeModel(cem.mesh, cem.electrodes, cem.contact_impedance, backend="scipy")
-    entries = plain._assemble(np.full(cem.mesh.n_nodes, 0.3)), (plain._system.rows, plain._system.columns)
-    peers, _ = refactorisations(sp.csc_matrix(entries, shape=(plain.n_unknowns, plain.n_unknowns)))
-    flow = ConvectionDiffusion(transport.mesh, PlaneChannelFlow(SCENARIO.mean_velocity, SCENARIO.half_width),
-                               SCENARIO.diffusivity, transport.time_step, substeps=transport.substeps,
-                               inlet=transport.inlet, backend="scipy")
+    n = transport.mesh.n_nodes
+    n_steps = SCENARIO.n_steps
+    peers, _ = refactorisations(system_matrix(cem, np.full(cem.mesh.n_nodes, 0.3)))
+    velocity = PlaneChannelFlow(SCENARIO.mean_velocity, SCENARIO.half_width)
+    flow = reference_flow(transport.mesh, velocity, SCENARIO.diffusivity, transport.time_step,
+                          substeps=transport.substeps, inlet=transport.inlet)
     right = np.ones(n - len(transport.inlet))
-    times = compare({**peers, "solve": lambda: flow._solver._solve(right)}, 5)
+    times = compare({**peers, "solve": lambda: flow._solver.factors.solve(right)}, 5)
     solve = times.pop("solve")
     name = min(times, key=lambda peer: times[peer])
     n_solves = (n_steps + SCENARIO.lead_in) * round(SCENARIO.time_step / transport.time_step) * (transport.substeps + 1)

@@ -1,4 +1,4 @@
-"""Scores: arrays in, numbers out (problem.md §4). Lower is better unless said; `E` is the relative error (5.12)."""
+"""Scores: arrays in, numbers out (``docs/methods.md``, 4). Lower is better unless said; `E` is the relative error (5.12)."""
 
 from __future__ import annotations
 

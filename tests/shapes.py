@@ -158,7 +158,7 @@ class DenseSolution(NamedTuple):
 
 def dense_solution(mesh: Mesh, electrodes: list[np.ndarray], z: np.ndarray, order: int, sigma: np.ndarray,
                    currents: np.ndarray) -> DenseSolution:
-    """The saddle-point system of problem.md §2 with ΣU = 0 as a row of its own."""
+    """The saddle-point system of the complete electrode model with ΣU = 0 as a row of its own."""
     d = mesh.dim
     number: dict[tuple[int, ...], int] = {(i,): i for i in range(mesh.n_nodes)}
 

@@ -20,7 +20,6 @@ from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from eitbench import _check
-from eitbench._parallel import in_parallel
 from eitbench.bench import policies
 from eitbench.bench.baselines import BOARDS, Baseline, load_baseline
 from eitbench.bench.sandbox import guests
@@ -30,6 +29,7 @@ from eitbench.bench.score import Played, score
 from eitbench.bench.store import EpisodeStore, machine, provenance, source_digest
 from eitbench.data.bank import fill
 from eitbench.data.episodes import simulate
+from eitbench.data.parallel import in_parallel
 from eitbench.data.seeds import name_seed
 from eitbench.envs import ENTRY_POINTS, INJECTION
 from eitbench.envs.estimation import EstimationEnv
@@ -237,9 +237,9 @@ def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1, backend: 
              command: str = "") -> None:
     """Run all jobs that ``store`` does not hold yet, in ``n_jobs`` processes with one BLAS thread each.
 
-    Each process stores an episode the moment it is done. ``backend`` is one of `eitbench._parallel.BACKENDS`, of which
+    Each process stores an episode the moment it is done. ``backend`` is one of `eitbench.data.parallel.BACKENDS`, of which
     those of a cluster need the folders of ``store`` and cache on all its machines; ``command`` is what the results will
-    name as the command that made them. Errors as `eitbench._parallel.in_parallel`.
+    name as the command that made them. Errors as `eitbench.data.parallel.in_parallel`.
     """
     todo = [job for job in jobs
             if not store.holds(job.environment.name, job.load().name, job.seed, job.identity())]

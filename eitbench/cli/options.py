@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from eitbench._parallel import WorkerLost
+from eitbench.data.parallel import WorkerLost
 
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 Out = Annotated[Path, typer.Option("--out", "-o", help="Folder of the results.")]

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 from tqdm import tqdm
 
 from eitbench import _check
-from eitbench._parallel import in_parallel
 from eitbench.data.episodes import simulate_together
+from eitbench.data.parallel import in_parallel
 from eitbench.data.recordings import (
     is_recorded,
     make_recording,
@@ -38,7 +38,7 @@ def recording_bytes(world: World) -> int:
 def fill(world: World, seeds: Sequence[int], *, n_jobs: int = 1, backend: str = "loky") -> int:
     """Make the recordings that are missing, in ``n_jobs`` processes, and return their number.
 
-    ``backend`` is one of `eitbench._parallel.BACKENDS`, of which those of a cluster need the cache folder on all
+    ``backend`` is one of `eitbench.data.parallel.BACKENDS`, of which those of a cluster need the cache folder on all
     machines.
 
     Each is stored as soon as it is done; after an interruption the same call goes on where it was. Only what an

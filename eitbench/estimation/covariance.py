@@ -6,7 +6,7 @@ import numpy as np
 
 
 class FreeCovariance:
-    """Π_t for t = 0, 1, …, from which measurements then subtract: P = Π − Z Zᵀ (problem.md §7).
+    """Π_t for t = 0, 1, …, from which measurements then subtract: P = Π − Z Zᵀ (``docs/methods.md``, 5).
 
     Π_t depends on no data, so it is computed once and shared by all episodes. It is kept as Π_t = Π_∞ + U D Uᵀ with
     D = diag(±1): what is left of the initial covariance, U ← F U, loses rank quickly because the flow carries it away

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -13,6 +14,12 @@ from eitbench.estimation.kalman import Expected, Observation, expected
 
 _BLOCK = 128
 """columns copied at once when a triangle is mirrored: small enough for the processor's cache"""
+_PANEL = 64
+"""columns that a transition given as a callable is handed at once; few, so that they stay in the
+cache, but not so few that the calls count"""
+
+Transition = np.ndarray | Callable[[np.ndarray], np.ndarray]
+"""F (n, n), or X (n, k) -> F X."""
 
 
 class Filtered(NamedTuple):
@@ -30,6 +37,9 @@ class Filtered(NamedTuple):
 
 class DenseKalmanFilter:
     """The Kalman filter of c⁺ = F c + s + w with any F at each step, in about 3n³ operations a prediction.
+
+    Where F X costs far less than a product of full matrices, such as solves with a sparse matrix,
+    F is better given as a callable: a prediction then costs F X twice, for n columns.
 
     `KalmanFilter` is far cheaper, but wants a constant F and a covariance with a limit. Where F = I (a target at rest,
     a closed vessel) a prediction costs next to nothing here; an update costs O(n² m) in any case. The covariance stays
@@ -62,14 +72,14 @@ class DenseKalmanFilter:
         self.covariance = np.ascontiguousarray(0.5 * (covariance + covariance.T))
         self._work = np.empty((n, n))
 
-    def predict(self, transition: np.ndarray | None = None, forcing: np.ndarray | None = None,
+    def predict(self, transition: Transition | None = None, forcing: np.ndarray | None = None,
                 noise: np.ndarray | None = None, *, mean: np.ndarray | None = None) -> None:
         """Move one time step on.
 
         Parameters
         ----------
-        transition : (n, n), optional
-            F; by default I.
+        transition : (n, n) or callable, optional
+            F, or X (n, k) -> F X for any k; by default I.
         forcing : (n,), optional
             s, by default 0.
         noise : (n, n), optional
@@ -82,12 +92,14 @@ class DenseKalmanFilter:
         n = len(self.mean)
         for name, value, shape in (("transition", transition, (n, n)), ("forcing", forcing, (n,)),
                                    ("noise", noise, (n, n)), ("mean", mean, (n,))):
-            if value is not None and np.shape(value) != shape:
+            if value is not None and not callable(value) and np.shape(value) != shape:
                 raise ValueError(f"{name} must have shape {shape}, got {np.shape(value)}")
         if mean is None:
-            mean = (self.mean if transition is None else transition @ self.mean) + (0.0 if forcing is None else forcing)
+            mean = self._moved_mean(transition) + (0.0 if forcing is None else forcing)
         self.mean = np.array(mean, dtype=float)
-        if transition is not None:
+        if callable(transition):
+            self._transform_by_columns(transition)
+        elif transition is not None:
             self._transform(transition)
         if noise is not None:
             self.covariance += noise
@@ -118,6 +130,13 @@ class DenseKalmanFilter:
         """Present variances (k,) of linear functionals of the state, (k, n)."""
         return ((functionals @ self.covariance) * functionals).sum(axis=1)
 
+    def _moved_mean(self, transition: Transition | None) -> np.ndarray:
+        if transition is None:
+            return self.mean
+        if callable(transition):
+            return transition(self.mean[:, None])[:, 0]
+        return transition @ self.mean
+
     def _transform(self, F: np.ndarray) -> None:
         """P ← F P Fᵀ by triangles: with P = L + Lᵀ and B = F L it is B Fᵀ + F Bᵀ, of which one half is computed."""
         P, B = self.covariance, self._work
@@ -127,8 +146,22 @@ class DenseKalmanFilter:
         # BLAS thinks in columns and sees each array transposed: Lᵀ Fᵀ, from the lower triangle of Pᵀ.
         blas.dtrmm(1.0, P.T, B.T, lower=1, trans_a=1, overwrite_b=1)
         blas.dsyr2k(1.0, np.asfortranarray(F.T), B.T, beta=0.0, c=P.T, trans=1, lower=1, overwrite_c=1)
-        edges = [*range(0, len(P), _BLOCK), len(P)]
-        for begin, end in pairwise(edges):                        # the lower triangle of Pᵀ is the upper one of P
-            P[begin:end, :begin] = P[:begin, begin:end].T
-            corner = np.triu(P[begin:end, begin:end])
-            P[begin:end, begin:end] = corner + np.triu(corner, 1).T
+        _mirror(P)
+
+    def _transform_by_columns(self, apply: Callable[[np.ndarray], np.ndarray]) -> None:
+        """P ← F P Fᵀ as F (F P)ᵀ, of which the upper triangle is kept."""
+        P, B = self.covariance, self._work
+        panels = [slice(begin, begin + _PANEL) for begin in range(0, len(P), _PANEL)]
+        for panel in panels:
+            B[:, panel] = apply(P[:, panel])
+        for panel in panels:
+            P[:panel.stop, panel] = apply(B[panel].T)[:panel.stop]
+        _mirror(P)
+
+
+def _mirror(P: np.ndarray) -> None:
+    """Copy the upper triangle of a square matrix to the lower one."""
+    for begin, end in pairwise([*range(0, len(P), _BLOCK), len(P)]):
+        P[begin:end, :begin] = P[:begin, begin:end].T
+        corner = np.triu(P[begin:end, begin:end])
+        P[begin:end, begin:end] = corner + np.triu(corner, 1).T

@@ -1,7 +1,7 @@
 """Which injection teaches most: criteria of optimal design for a Gaussian state, over all electrode pairs at once.
 
 The voltages are bilinear in the pair that drives and the electrode that is read, so one table of products of the
-covariance serves every pair (problem.md §7).
+covariance serves every pair (``docs/methods.md``, 8).
 """
 
 from __future__ import annotations

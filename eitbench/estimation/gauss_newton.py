@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
 import scipy.sparse as sp
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cho_factor, cho_solve, lu_factor, lu_solve
+
+from eitbench.numerics.sparse_lu import SparseLU
 
 
 class _ObservationModel(Protocol):
@@ -36,27 +40,86 @@ def gauss_newton(model: _ObservationModel, voltages: np.ndarray, currents: np.nd
     -------
     (n,) concentration in mol/m³; the best found so far if ``max_iterations`` run out or no step lowers the objective.
     """
-    dense = penalty.toarray() if sp.issparse(penalty) else np.asarray(penalty)
+    normal = _NormalEquations(penalty)
     weight = (1.0 / noise_std).ravel()
     c = np.array(start, dtype=float)
 
     def misfit(c: np.ndarray, computed: np.ndarray) -> float:
-        return float((((voltages - computed).ravel() * weight)**2).sum() + c @ (dense @ c))
+        return float((((voltages - computed).ravel() * weight)**2).sum() + c @ (penalty @ c))
 
+    computed, jacobian = model.linearise(c, currents)
     for _ in range(max_iterations):
-        computed, jacobian = model.linearise(c, currents)
         A = jacobian.reshape(-1, len(c)) * weight[:, None]
         residual = (voltages - computed).ravel() * weight
-        gradient = A.T @ residual - dense @ c
-        direction = cho_solve(cho_factor(A.T @ A + dense), gradient)
+        gradient = A.T @ residual - penalty @ c
+        direction = normal.solve(A, gradient)
         now = misfit(c, computed)
         last = gradient @ direction < tolerance * now
         length = 1.0
-        while not misfit(c + length * direction, model.voltages(c + length * direction, currents)) <= now:
+        while True:
+            trial = c + length * direction
+            if last:
+                computed = model.voltages(trial, currents)
+            else:       # one factorisation gives the voltages and the derivatives for the next step
+                computed, jacobian = model.linearise(trial, currents)
+            if misfit(trial, computed) <= now:
+                break
             length *= 0.5
             if length < 1e-4:
                 return c
-        c = c + length * direction
+        c = trial
         if last:
             break
     return c
+
+
+class _NormalEquations:
+    """(AᵀA + P) x = g for one P (n, n), positive semidefinite, and any A (m, n).
+
+    Where P is sparse and A has far fewer rows than columns, x = P₀⁻¹g − W (C + V W)⁻¹ Wᵀg with
+    P₀ = P + ρ e eᵀ, V = (A; √ρ eᵀ), C = diag(1, …, 1, −1) and W = P₀⁻¹Vᵀ (Woodbury). The unit
+    vector e is there for penalties of gradients, which leave a constant free. If P leaves more free,
+    P₀ is singular, or a residual stays; then, and for all others, AᵀA + P is factorised whole.
+    """
+
+    def __init__(self, penalty: Any) -> None:
+        self._penalty = penalty
+
+    def solve(self, A: np.ndarray, g: np.ndarray) -> np.ndarray:
+        """x (n,) for g (n,)."""
+        if sp.issparse(self._penalty) and 3 * len(A) < len(g) and self._grounded is not None:
+            apply = self._by_woodbury(A, self._grounded)
+            x = apply(g)
+            x += apply(self._residual(A, g, x))                     # what cancelled in the first
+            if np.linalg.norm(self._residual(A, g, x)) <= 1e-10 * np.linalg.norm(g):
+                return x
+        return cho_solve(cho_factor(A.T @ A + self._dense), g)
+
+    def _residual(self, A: np.ndarray, g: np.ndarray, x: np.ndarray) -> np.ndarray:
+        return g - A.T @ (A @ x) - self._penalty @ x
+
+    def _by_woodbury(self, A: np.ndarray, grounded: SparseLU) -> Callable[[np.ndarray], np.ndarray]:
+        held = np.zeros((1, A.shape[1]))
+        held[0, 0] = np.sqrt(self._ground)
+        V = np.concatenate([A, held])
+        W = grounded.solve(V.T)
+        core = lu_factor(V @ W + np.diag(np.append(np.ones(len(A)), -1.0)))
+        return lambda g: grounded.solve(g[:, None])[:, 0] - W @ lu_solve(core, W.T @ g)
+
+    @cached_property
+    def _dense(self) -> np.ndarray:
+        return self._penalty.toarray() if sp.issparse(self._penalty) else np.asarray(self._penalty)
+
+    @cached_property
+    def _ground(self) -> float:
+        """ρ."""
+        return float(self._penalty.diagonal().max())
+
+    @cached_property
+    def _grounded(self) -> SparseLU | None:
+        """P₀, held at the first node; None if it is singular."""
+        n = self._penalty.shape[0]
+        try:
+            return SparseLU(self._penalty + sp.csr_array(([self._ground], ([0], [0])), shape=(n, n)))
+        except RuntimeError:
+            return None

@@ -17,7 +17,8 @@ VelocityField = Callable[[np.ndarray], np.ndarray]
 class _Transport(Protocol):
     inlet: np.ndarray
 
-    def transition(self) -> tuple[np.ndarray, np.ndarray]: ...
+    def step(self, c: np.ndarray, inflow_before: np.ndarray | float,
+             inflow_after: np.ndarray | float) -> np.ndarray: ...
 
     def velocity_derivatives(self, c: np.ndarray, inflow_before: np.ndarray | float, inflow_after: np.ndarray | float,
                              directions: Sequence[VelocityField]) -> tuple[np.ndarray, np.ndarray]: ...
@@ -104,7 +105,7 @@ class JointFilter:
         joint[:n, :n] = _check.array("covariance", covariance, (n, n))
         joint[n:, n:] = _check.array("parameter_covariance", parameter_covariance, (k, k))
         self._filter = DenseKalmanFilter(np.concatenate([c, self._start]), joint)
-        self._transition, self._noise = np.eye(n + k), np.zeros((n + k, n + k))
+        self._noise = np.zeros((n + k, n + k))
         self._noise[n:, n:] = np.diag(walk**2)
 
     @property
@@ -126,14 +127,19 @@ class JointFilter:
         """Move one time step on with the velocity estimated so far."""
         n, c, theta = self._n, self.concentration, self.parameters
         transport = self.transport_at(theta)
-        # k is small: as one matrix the whole costs hardly more than F alone.
-        self._transition[:n, :n], Y = transport.transition()
-        after, self._transition[:n, n:] = transport.velocity_derivatives(c, c[transport.inlet], self._inflow,
-                                                                         self.directions)
-        Y = self._inflow_std * Y
+        inlet = transport.inlet
+        after, by_theta = transport.velocity_derivatives(c, c[inlet], self._inflow, self.directions)
+
+        def carried(X: np.ndarray) -> np.ndarray:
+            """[[F, ∂c⁺/∂θ], [0, I]] X; with its sparse matrices a step costs far less than F."""
+            moved = transport.step(X[:n], X[inlet], 0.0)
+            moved += by_theta @ X[n:]
+            return np.concatenate([moved, X[n:]])
+
+        Y = transport.step(np.zeros((n, len(inlet))), 0.0, self._inflow_std * np.eye(len(inlet)))
         np.matmul(Y, Y.T, out=self._noise[:n, :n])
         self._noise[:n, :n] += self._nodal_noise
-        self._filter.predict(self._transition, noise=self._noise, mean=np.concatenate([after, theta]))
+        self._filter.predict(carried, noise=self._noise, mean=np.concatenate([after, theta]))
 
     def update(self, observation: Observation) -> JointStep:
         """Take in one measurement of the present concentration, linearised at `concentration` (see `linearised`)."""

@@ -1,4 +1,4 @@
-"""Kalman filtering of a large state seen through few measurements, exactly: P = Π − Z Zᵀ (problem.md §7)."""
+"""Kalman filtering of a large state seen through few measurements, exactly: P = Π − Z Zᵀ (``docs/methods.md``, 5)."""
 
 from __future__ import annotations
 

@@ -40,7 +40,8 @@ def starting_filter(transport: Transport, prior: Prior, c_bh: float,
     mean = np.full(transport.mesh.n_nodes, c_bh)
     initial = initial_covariance(transport.mesh, prior)
     if isinstance(transport, AtRest):
-        return ClosedVesselFilter(mean, c_bh**2 * initial, None, None)
+        walk = (c_bh * prior.nodal_std)**2
+        return ClosedVesselFilter(mean, c_bh**2 * initial, None, walk * np.eye(len(mean)) if walk else None)
     noise = c_bh**2 * _state_noise(transport, prior)
     return ClosedVesselFilter(mean, c_bh**2 * initial, transport.evolution_model().F, noise)
 

@@ -1,4 +1,4 @@
-"""Smoothing without inverses of n×n matrices and without storing any (Bryson & Frazier 1963; problem.md §7)."""
+"""Smoothing without inverses of n×n matrices and without storing any (Bryson & Frazier 1963; ``docs/methods.md``, 6)."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def smoothed_means(start: _Moving, observations: Iterable[Observation]) -> np.nd
     """Means c_{t|T} (T, n) of a filter that stands at t = 0, whose motion may change from step to step.
 
     The adjoint λ_t = Hᵀ S⁻¹ ν + (I − K H)ᵀ Fᵀ_{t+1} λ_{t+1} runs back over the innovations, and the smoothed state
-    follows forwards from c_{0|T} = c_{0|0} + Γ_{0|0} F₁ᵀ λ_1 as c_t = F_t c_{t−1} + s_t + Γ_w λ_t (problem.md §7):
+    follows forwards from c_{0|T} = c_{0|0} + Γ_{0|0} F₁ᵀ λ_1 as c_t = F_t c_{t−1} + s_t + Γ_w λ_t (``docs/methods.md``, 6):
     without variances, and without a covariance being kept.
     """
     mean, steps = start.mean, []

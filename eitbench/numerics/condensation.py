@@ -1,20 +1,21 @@
 """Sparse symmetric positive definite systems, seen from their last few unknowns.
 
-Of K = [[A, B], [Bᵀ, C]] the electrodes ask only for (C − Bᵀ A⁻¹ B)⁻¹, the block of K⁻¹ that belongs to them. With
-their unknowns ordered last, the Schur complement is what a Cholesky factorisation has left when it comes to them: no
-substitution is needed, and every injection is served at the price of one factorisation.
+Of K = [[A, B], [Bᵀ, C]] the electrodes ask only for (C − Bᵀ A⁻¹ B)⁻¹, the block of K⁻¹ that belongs
+to them. With their unknowns ordered last, the Schur complement is what a Cholesky factorisation has
+left when it comes to them: no substitution is needed, and every injection is served at the price of
+one factorisation.
 
-Two ways to the same numbers: compiled kernels (numba), 4 to 8 times as fast, and scipy's SuperLU wherever numba is
-not installed. Both order the unknowns once for a fixed pattern: by minimum degree, or in 3D by nested dissection.
+The unknowns are ordered once for a fixed pattern: by minimum degree, or in 3D by nested dissection.
 """
 
 from __future__ import annotations
 
 import numpy as np
 import scipy.sparse as sp
-from scipy.sparse.linalg import SuperLU, splu
+from scipy.sparse.linalg import splu
 
-from eitbench.numerics._backend import Backend, kernels, scratch, use_compiled
+from eitbench.numerics.compiled import compiled_kernels
+from eitbench.numerics.memory import scratch
 
 _LEAF = 200
 """Unknowns of a part of the body that is not cut any more."""
@@ -22,25 +23,18 @@ _WIDEST = 1200
 """Rows of a front up to which eight matrices side by side stay in the processor's own memory."""
 
 
-def condensation(pattern: sp.csc_array, n_ports: int, backend: Backend = "auto",
-                 places: np.ndarray | None = None) -> Condensation | CompiledCondensation:
-    """The fastest installed way to condense matrices of this pattern onto their last ``n_ports`` unknowns.
+class Condensation:
+    """Matrices of one pattern, condensed onto their last unknowns by compiled Cholesky kernels.
 
     Parameters
     ----------
     pattern : (n, n) sparse
         Symmetric, with a full diagonal.
     n_ports : int
-    backend : "auto", "compiled" or "scipy"
     places : (n − n_ports, d), optional
-        Where the unknowns lie; if given, they are ordered by nested dissection. In 3D that takes a half of the
-        operations of minimum degree, and less on large meshes; in 2D minimum degree is better.
-    """
-    return (CompiledCondensation if use_compiled(backend) else Condensation)(pattern, n_ports, places)
-
-
-class Condensation:
-    """Condensation by scipy's SuperLU.
+        Where the unknowns lie; if given, they are ordered by nested dissection. In 3D that takes a
+        half of the operations of minimum degree, and less on large meshes; in 2D minimum degree is
+        better.
 
     Attributes
     ----------
@@ -50,45 +44,15 @@ class Condensation:
         How many matrices are best given at once.
     """
 
-    compiled = False
-    batch = 1
-
-    def __init__(self, pattern: sp.csc_array, n_ports: int, places: np.ndarray | None = None) -> None:
-        self.n, self.n_ports = pattern.shape[0], n_ports
-        self._place = _ordered(pattern, n_ports, places)
-        self._order = np.argsort(self._place)
-        permuted = _permuted(pattern, self._place)
-        self._indices, self._indptr = permuted.indices, permuted.indptr
-        self.rows = self._order[permuted.indices]
-        self.columns = self._order[np.repeat(np.arange(self.n), np.diff(permuted.indptr))]
-        self._loads = np.eye(self.n, n_ports, -(self.n - n_ports))
-
-    def port_inverse(self, values: np.ndarray) -> np.ndarray:
-        """The ports' block of K⁻¹: (m, m) for values (k,), (b, m, m) for values (k, b)."""
-        if values.ndim == 1:
-            return self._factorised(values).solve(self._loads)[-self.n_ports:]
-        return np.stack([self.port_inverse(column) for column in values.T])
-
-    def port_columns(self, values: np.ndarray) -> np.ndarray:
-        """The ports' columns of K⁻¹, (n, m), for values (k,)."""
-        return self._factorised(values).solve(self._loads)[self._place]
-
-    def _factorised(self, values: np.ndarray) -> SuperLU:
-        matrix = sp.csc_matrix((values, self._indices, self._indptr), shape=(self.n, self.n))
-        return splu(matrix, permc_spec="NATURAL", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-
-
-class CompiledCondensation:
-    """Condensation by compiled supernodal Cholesky kernels; attributes and methods as in `Condensation`."""
-
-    compiled = True
-
-    def __init__(self, pattern: sp.csc_array, n_ports: int, places: np.ndarray | None = None) -> None:
-        self.n, self.n_ports = pattern.shape[0], n_ports
+    def __init__(self, pattern: sp.csc_array, n_ports: int,
+                 places: np.ndarray | None = None) -> None:
+        self.n = pattern.shape[0]
+        self.n_ports = n_ports
         place = _ordered(pattern, n_ports, places)
         filled = _filled(_permuted(pattern, place))
         rank = _postorder(_parents(filled), n_ports)
-        place, filled = rank[place], _permuted(filled, rank)
+        place = rank[place]
+        filled = _permuted(filled, rank)
         permuted = _permuted(pattern, place)
         self._place = place
         self._symbolic = _supernodes(filled, n_ports)
@@ -107,11 +71,15 @@ class CompiledCondensation:
         self.batch = 8 if self._front_size <= _WIDEST**2 else 1
 
     def port_inverse(self, values: np.ndarray) -> np.ndarray:
-        """The ports' block of K⁻¹: (m, m) for values (k,), (b, m, m) for values (k, b); b is padded to eights."""
+        """The ports' block of K⁻¹: (m, m) for values (k,), (b, m, m) for values (k, b).
+
+        b is padded to eights.
+        """
         if values.ndim == 1:
             return np.linalg.inv(self._schur(self._factorise(values)))
         if self.batch == 1:
-            return np.stack([self.port_inverse(column) for column in np.ascontiguousarray(values.T)])
+            columns = np.ascontiguousarray(values.T)
+            return np.stack([self.port_inverse(column) for column in columns])
         b = values.shape[1]
         result = np.empty((b, self.n_ports, self.n_ports))
         start, first_row, rows, panel, _ = self._symbolic
@@ -120,9 +88,10 @@ class CompiledCondensation:
         for first in range(0, b, self.batch):
             block = values[:, first:first + self.batch]
             padding = np.repeat(block[:, -1:], self.batch - block.shape[1], axis=1)
-            eight = np.ascontiguousarray(np.concatenate([block, padding], axis=1) if padding.size else block)
-            kernels().condense_lanes(start, first_row, rows, panel, self._children, self._first_entry, self._slot,
-                                         eight.ravel(), front, stack)
+            eight = np.concatenate([block, padding], axis=1) if padding.size else block
+            compiled_kernels().condense_lanes(
+                start, first_row, rows, panel, self._children, self._first_entry, self._slot,
+                np.ascontiguousarray(eight).ravel(), front, stack)
             schur = self._symmetric(front[:self.n_ports**2 * self.batch].reshape(-1, self.batch).T)
             result[first:first + self.batch] = np.linalg.inv(schur[:block.shape[1]])
         return result
@@ -133,12 +102,12 @@ class CompiledCondensation:
         solution = np.zeros((self.n, -(-self.n_ports // 8) * 8))
         solution[-self.n_ports:, :self.n_ports] = np.linalg.inv(self._schur(factor))
         start, first_row, rows, panel, _ = self._symbolic
-        kernels().substitute_back(start, first_row, rows, panel, factor, solution)
+        compiled_kernels().substitute_back(start, first_row, rows, panel, factor, solution)
         return solution[self._place, :self.n_ports]
 
     def _factorise(self, values: np.ndarray) -> np.ndarray:
-        factor = scratch(self._symbolic[3][-1] + 8)               # the kernel reads a few numbers beyond the end
-        kernels().factorise(*self._symbolic, self._first_entry, self._slot, values, factor)
+        factor = scratch(self._symbolic[3][-1] + 8)  # the kernel reads a few numbers beyond the end
+        compiled_kernels().factorise(*self._symbolic, self._first_entry, self._slot, values, factor)
         return factor
 
     def _schur(self, factor: np.ndarray) -> np.ndarray:
@@ -152,13 +121,14 @@ class CompiledCondensation:
 
 
 def _filled(pattern: sp.csc_array) -> sp.csc_array:
-    """The pattern of the Cholesky factor, as SuperLU finds it for a matrix on which nothing cancels."""
-    factors = splu(sp.csc_matrix(_diagonally_dominant(pattern)), permc_spec="NATURAL", diag_pivot_thresh=0.0,
-                   options={"SymmetricMode": True})
-    back = np.argsort(factors.perm_c)             # SuperLU may have postordered the elimination tree
+    """The Cholesky factor's pattern, as SuperLU finds it for a matrix on which nothing cancels."""
+    factors = splu(sp.csc_matrix(_diagonally_dominant(pattern)), permc_spec="NATURAL",
+                   diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    back = np.argsort(factors.perm_c)      # SuperLU may have postordered the elimination tree
     lower = factors.L.tocoo()
     i, j = back[lower.row], back[lower.col]
-    filled = sp.csc_array((np.ones(lower.nnz), (np.maximum(i, j), np.minimum(i, j))), shape=pattern.shape)
+    places = np.maximum(i, j), np.minimum(i, j)
+    filled = sp.csc_array((np.ones(lower.nnz), places), shape=pattern.shape)
     filled.sort_indices()
     return filled
 
@@ -170,7 +140,10 @@ def _parents(filled: sp.csc_array) -> np.ndarray:
 
 
 def _postorder(parents: np.ndarray, n_last: int) -> np.ndarray:
-    """New position of each column, such that every subtree is consecutive; the ``n_last`` last columns stay."""
+    """New position of each column, such that every subtree is consecutive.
+
+    The ``n_last`` last columns stay.
+    """
     n = len(parents) - n_last
     parent = [p if 0 <= p < n else n for p in parents[:n].tolist()]
     size = [1] * n + [0]
@@ -185,7 +158,10 @@ def _postorder(parents: np.ndarray, n_last: int) -> np.ndarray:
 
 
 def _supernodes(filled: sp.csc_array, n_last: int) -> tuple[np.ndarray, ...]:
-    """start, first_row, rows, panel, owner as in `_kernels`; the ``n_last`` last columns are one supernode."""
+    """start, first_row, rows, panel, owner as in `eitbench.numerics.kernels`.
+
+    The ``n_last`` last columns are one supernode.
+    """
     n, count = filled.shape[0], np.diff(filled.indptr)
     begins = np.ones(n, dtype=bool)
     begins[1:] = (_parents(filled)[:-1] != np.arange(1, n)) | (count[:-1] != count[1:] + 1)
@@ -201,11 +177,12 @@ def _supernodes(filled: sp.csc_array, n_last: int) -> tuple[np.ndarray, ...]:
     return start, first_row, rows, panel, np.repeat(np.arange(len(width)), width)
 
 
-def _multifrontal_sizes(start: np.ndarray, first_row: np.ndarray, rows: np.ndarray, _panel: np.ndarray,
-                        owner: np.ndarray) -> tuple[np.ndarray, int, int]:
-    """Children of each supernode in the elimination tree, entries of the largest front, and of the fullest stack."""
+def _multifrontal_sizes(start: np.ndarray, first_row: np.ndarray, rows: np.ndarray,
+                        _panel: np.ndarray, owner: np.ndarray) -> tuple[np.ndarray, int, int]:
+    """Children of each supernode in the elimination tree, and entries of the largest front and of
+    the fullest stack."""
     width, height = np.diff(start), np.diff(first_row)
-    parent = owner[rows[first_row[:-2] + width[:-1]]]               # the owner of the first row below
+    parent = owner[rows[first_row[:-2] + width[:-1]]]             # the owner of the first row below
     children = np.bincount(parent, minlength=len(width))
     left = (height - width) * (height - width + 1) // 2
     waiting: list[int] = []
@@ -227,9 +204,10 @@ def _ordered(pattern: sp.csc_array, n_ports: int, places: np.ndarray | None) -> 
 
 
 def _nested_dissection(pattern: sp.csc_array, places: np.ndarray) -> np.ndarray:
-    """Position of each unknown when a body is cut in two again and again, and every cut comes after its two sides.
+    """Position of each unknown when a body is cut in two again and again.
 
-    Each cut is the smallest of some across the axes of ``places`` (n, d).
+    Every cut comes after its two sides; it is the smallest of some across the axes of ``places``
+    (n, d).
     """
     graph = sp.csr_array(pattern)
     order: list[np.ndarray] = []
@@ -240,16 +218,18 @@ def _nested_dissection(pattern: sp.csc_array, places: np.ndarray) -> np.ndarray:
         if done or len(part) <= _LEAF:
             order.append(part[np.argsort(_minimum_degree(sp.csc_array(within)))])
             continue
-        best, smallest = None, np.inf
+        best = None
+        smallest = np.inf
         for along in places[part].T:
             for share in (0.4, 0.45, 0.5, 0.55, 0.6):
                 low = along <= np.quantile(along, share) + 1e-9 * np.ptp(along)
                 for side in (low, ~low):
                     cut = side & ((within @ (~side).astype(float)) > 0)
                     rest = np.array([(low & ~cut).sum(), (~low & ~cut).sum()])
-                    cost = cut.sum() * (2 * rest.max() / len(part))                # small, and in the middle
+                    cost = cut.sum() * (2 * rest.max() / len(part))      # small, and in the middle
                     if rest.min() > 0 and cost < smallest:
-                        best, smallest = (part[low & ~cut], part[~low & ~cut], part[cut]), cost
+                        best = (part[low & ~cut], part[~low & ~cut], part[cut])
+                        smallest = cost
         if best is None:
             waiting.append((part, True))
         else:
@@ -261,13 +241,15 @@ def _nested_dissection(pattern: sp.csc_array, places: np.ndarray) -> np.ndarray:
 
 def _minimum_degree(pattern: sp.csc_array) -> np.ndarray:
     """Position of each unknown in a fill-reducing order."""
-    return splu(sp.csc_matrix(_diagonally_dominant(pattern)), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
-                options={"SymmetricMode": True}).perm_c.astype(np.int64)
+    factors = splu(sp.csc_matrix(_diagonally_dominant(pattern)), permc_spec="MMD_AT_PLUS_A",
+                   diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    return factors.perm_c.astype(np.int64)
 
 
 def _permuted(pattern: sp.csc_array, place: np.ndarray) -> sp.csc_array:
     coo = pattern.tocoo()
-    permuted = sp.csc_array((np.ones(coo.nnz), (place[coo.row], place[coo.col])), shape=pattern.shape)
+    permuted = sp.csc_array((np.ones(coo.nnz), (place[coo.row], place[coo.col])),
+                            shape=pattern.shape)
     permuted.sort_indices()
     return permuted
 

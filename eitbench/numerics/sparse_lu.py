@@ -2,54 +2,69 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
-from eitbench.numerics._backend import Backend, kernels, scratch, use_compiled
+from eitbench.numerics.compiled import compiled_kernels
+from eitbench.numerics.memory import scratch
+
+ByRows = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Pointers, indices and values of a sparse matrix, as the kernels want it."""
+
+
+class Factors(NamedTuple):
+    """L and U, for those who substitute themselves."""
+
+    row_place: np.ndarray
+    """(n,) at which place in the order of elimination each row stands"""
+    column_place: np.ndarray
+    """(n,) and each column"""
+    lower: ByRows
+    """(n, n) L without its diagonal, which is 1"""
+    upper: ByRows
+    """(n, n) U without its diagonal"""
+    scale: np.ndarray
+    """(n,) the inverse of U's diagonal"""
 
 
 class SparseLU:
     """A = L U in an order by minimum degree on A + Aᵀ, which suits the matrices of finite elements.
 
-    The compiled substitution takes eight right-hand sides in the time of one, and gives a right-hand side the same
-    bits whatever stands beside it.
+    The compiled substitution takes eight right-hand sides in the time of one, and gives a
+    right-hand side the same bits whatever stands beside it.
 
     Parameters
     ----------
     matrix : (n, n) sparse
         With a symmetric pattern and a large diagonal: nothing is pivoted.
-    backend : "auto", "compiled" or "scipy"
 
     Attributes
     ----------
-    batch : int
-        How many right-hand sides are best given at once.
+    factors : Factors
+        For those who substitute themselves.
     """
 
-    def __init__(self, matrix: sp.csr_array, backend: Backend = "auto") -> None:
-        self.batch = 8 if use_compiled(backend) else 1
+    def __init__(self, matrix: sp.csr_array) -> None:
         factors = splu(sp.csc_matrix(matrix), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
                        options={"SymmetricMode": True})
-        if self.batch == 1:
-            self._solve = factors.solve
-            return
-        L, U = sp.csr_array(sp.tril(factors.L, -1)), sp.csr_array(sp.triu(factors.U, 1))
-        self._arrays = (factors.perm_r.astype(np.int64), factors.perm_c.astype(np.int64),
-                        L.indptr, L.indices, L.data, U.indptr, U.indices, U.data, 1.0 / factors.U.diagonal())
+        L = sp.csr_array(sp.tril(factors.L, -1))
+        U = sp.csr_array(sp.triu(factors.U, 1))
+        self.factors = Factors(factors.perm_r.astype(np.int64), factors.perm_c.astype(np.int64),
+                               (L.indptr, L.indices, L.data), (U.indptr, U.indices, U.data),
+                               1.0 / factors.U.diagonal())
 
     def solve(self, right: np.ndarray) -> np.ndarray:
         """A⁻¹ b for (n, k)."""
         n, k = right.shape
         result = np.empty((n, k))
-        if self.batch == 1:
-            for column in range(k):                       # SuperLU's bits depend on how many are solved together
-                result[:, column] = self._solve(right[:, column])
-            return result
+        rows, columns, lower, upper, scale = self.factors
         eight, work, solution = scratch(3 * 8 * n).reshape(3, -1)
         for first in range(0, k, 8):
             block = right[:, first:first + 8]
             eight.reshape(n, 8)[:, :block.shape[1]] = block
-            kernels().solve_lu(*self._arrays, eight, work, solution)
+            compiled_kernels().solve_lu(rows, columns, *lower, *upper, scale, eight, work, solution)
             result[:, first:first + 8] = solution.reshape(n, 8)[:, :block.shape[1]]
         return result

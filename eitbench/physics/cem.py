@@ -1,4 +1,4 @@
-"""Electrical impedance tomography with the complete electrode model (CEM; problem.md §2, thesis ch. 4).
+"""Electrical impedance tomography with the complete electrode model (CEM; thesis ch. 4).
 
 ∇·(σ∇u) = 0 in Ω,  u + z_l σ ∂u/∂n = U_l on electrode e_l,  ∫_{e_l} σ ∂u/∂n = I_l,  σ ∂u/∂n = 0 elsewhere,  ΣI = ΣU = 0.
 """
@@ -14,8 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from skfem.helpers import dot, grad
 
 from eitbench import _check
-from eitbench.numerics._backend import Backend
-from eitbench.numerics.condensation import condensation
+from eitbench.numerics.condensation import Condensation
 from eitbench.numerics.fem import element, to_skfem
 from eitbench.numerics.mesh import Mesh
 from eitbench.physics.sensitivity import Sensitivity
@@ -38,8 +37,6 @@ class CompleteElectrodeModel:
     order : int
         1 or 2: polynomial order of the potential. First order is wrong by several noise standard deviations on meshes
         of a few thousand unknowns.
-    backend : "auto", "compiled" or "scipy"
-        What factorises; see `eitbench.numerics.condensation`.
 
     Raises
     ------
@@ -48,8 +45,8 @@ class CompleteElectrodeModel:
         share a facet, or a contact impedance is not positive.
     """
 
-    def __init__(self, mesh: Mesh, electrodes: Sequence[np.ndarray], contact_impedance: float | np.ndarray,
-                 order: int = 2, backend: Backend = "auto") -> None:
+    def __init__(self, mesh: Mesh, electrodes: Sequence[np.ndarray],
+                 contact_impedance: float | np.ndarray, order: int = 2) -> None:
         self.mesh = mesh
         self.order = order
         self.electrodes = _checked_electrodes(mesh, electrodes)
@@ -63,7 +60,7 @@ class CompleteElectrodeModel:
         contact, rows, columns, derivatives = self._contact_terms(basis), *_conduction(basis)
         # The last electrode is grounded: without its row and column the system is symmetric positive definite.
         pattern = sp.coo_array((np.ones(len(rows)), (rows, columns)), shape=contact.shape).tocsc()
-        system = condensation((pattern + abs(contact))[:-1, :-1].tocsc(), n_electrodes - 1, backend,
+        system = Condensation((pattern + abs(contact))[:-1, :-1].tocsc(), n_electrodes - 1,
                               places=basis.doflocs.T if mesh.dim == 3 else None)
         self._system = system
         self.n_unknowns = system.n
@@ -74,7 +71,7 @@ class CompleteElectrodeModel:
         self._constant = contact[system.rows, system.columns]
         # Mean-free currents and potentials: P = I − 11ᵀ/L on both sides of the grounded solution.
         self._centre = (np.eye(n_electrodes) - 1.0 / n_electrodes)[:, :-1]
-        self._sensitivity = Sensitivity(basis, compiled=self._system.compiled)
+        self._sensitivity = Sensitivity(basis)
 
     # -- public ---------------------------------------------------------------------------------------------------
 

@@ -1,57 +1,54 @@
-"""−∫ φ_j ∇w_m·∇w_l for all nodes j and all pairs of fields: what a conductivity at node j changes in every voltage."""
+"""−∫ φ_j ∇w_m·∇w_l for all nodes j and all pairs of fields.
+
+It is what a conductivity at node j changes in every voltage.
+"""
 
 from __future__ import annotations
 
 import numpy as np
-import scipy.sparse as sp
 import skfem
 
-from eitbench.numerics._backend import aligned_zeros, kernels, scratch
+from eitbench.numerics.compiled import compiled_kernels
+from eitbench.numerics.memory import aligned_zeros, scratch
 
 
 class Sensitivity:
-    """The products of the gradients of several potentials, tested with the mesh's hat functions; exact.
+    """The products of the gradients of several potentials, tested with the mesh's hat functions.
 
-    The gradient of a potential of first or second order is linear on a simplex, so its values at the vertices hold all
-    of it, and the integrals of products of three hat functions are known: with w = |T|/((d+1)(d+2)(d+3)),
-    ∫ λ_j λ_v λ_v' = w (1 + [j=v] + [j=v'] + [v=v'] + 2[j=v=v']). With G_v the gradient at vertex v and S = Σ_v G_v,
+    Exact: the gradient of a potential of first or second order is linear on a simplex, so its
+    values at the vertices hold all of it, and the integrals of products of three hat functions are
+    known: with w = |T|/((d+1)(d+2)(d+3)),
+    ∫ λ_j λ_v λ_v' = w (1 + [j=v] + [j=v'] + [v=v'] + 2[j=v=v']). With G_v the gradient at vertex v
+    and S = Σ_v G_v,
     ∫ φ_j ∇w_m·∇w_l = w ((S + G_j)_m·(S + G_j)_l + Σ_v G_vm·G_vl + G_jm·G_jl).
 
     Parameters
     ----------
     basis : skfem.CellBasis
         Of the potential.
-    compiled : bool
-        Use the numba kernel.
     """
 
-    def __init__(self, basis: skfem.CellBasis, *, compiled: bool) -> None:
-        dim, n_cells = basis.mesh.dim(), basis.mesh.nelements
-        self.compiled = compiled
+    def __init__(self, basis: skfem.CellBasis) -> None:
+        dim = basis.mesh.dim()
         self._cells = np.ascontiguousarray(basis.mesh.t.T.astype(np.int64))
         self._unknowns = np.ascontiguousarray(basis.element_dofs.T.astype(np.int64))
         corners = np.hstack([np.zeros((dim, 1)), np.eye(dim)])
-        at_corners = skfem.Basis(basis.mesh, basis.elem, quadrature=(corners, np.full(dim + 1, 1.0 / (dim + 1))))
+        at_corners = skfem.Basis(basis.mesh, basis.elem,
+                                 quadrature=(corners, np.full(dim + 1, 1.0 / (dim + 1))))
         gradient = np.stack([phi[0].grad.transpose(1, 2, 0) for phi in at_corners.basis], axis=-1)
+        gradient = gradient.reshape(basis.mesh.nelements, -1, gradient.shape[-1])
         weight = basis.dx.sum(axis=1) / ((dim + 1) * (dim + 2) * (dim + 3))
         # (cells, vertices·dim, unknowns a cell), times √w
-        self._gradient = np.sqrt(weight)[:, None, None] * gradient.reshape(n_cells, -1, gradient.shape[-1])
+        self._gradient = np.sqrt(weight)[:, None, None] * gradient
 
     def __call__(self, fields: np.ndarray) -> np.ndarray:
         """−∫ φ_j ∇w_m·∇w_l as (n_nodes, k, k), for potentials w (n_potential, k)."""
-        n_cells, n_vertices = self._cells.shape
-        k, n_nodes = fields.shape[1], self._cells.max() + 1
-        if self.compiled:
-            width = -(-k // 8) * 8
-            padded, table = aligned_zeros((len(fields), width)), aligned_zeros((n_nodes, width, width))
-            padded[:, :k] = fields
-            room = scratch(2 * self._gradient.shape[1] * width)
-            kernels().subtract_gradient_products(self._cells, self._unknowns, self._gradient, padded, table, room)
-            return table[:, :k, :k]
-        gradients = (self._gradient @ fields[self._unknowns]).reshape(n_cells, n_vertices, n_vertices - 1, k)
-        shifted = gradients + gradients.sum(axis=1, keepdims=True)
-        own = np.swapaxes(gradients, 2, 3) @ gradients
-        local = np.swapaxes(shifted, 2, 3) @ shifted + own + own.sum(axis=1, keepdims=True)
-        corner = np.arange(self._cells.size)
-        gather = sp.csr_array((np.full(self._cells.size, -1.0), (self._cells.ravel(), corner)))
-        return (gather @ local.reshape(-1, k * k)).reshape(n_nodes, k, k)
+        k = fields.shape[1]
+        width = -(-k // 8) * 8
+        padded = aligned_zeros((len(fields), width))
+        padded[:, :k] = fields
+        table = aligned_zeros((self._cells.max() + 1, width, width))
+        room = scratch(2 * self._gradient.shape[1] * width)
+        compiled_kernels().subtract_gradient_products(self._cells, self._unknowns, self._gradient,
+                                                      padded, table, room)
+        return table[:, :k, :k]

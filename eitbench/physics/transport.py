@@ -1,9 +1,12 @@
-"""Convection-diffusion: ∂c/∂t = ∇·(κ∇c) − v·∇c, c given on the inlet, ∂c/∂n = 0 elsewhere (problem.md §1)."""
+"""Convection-diffusion (thesis ch. 3): ∂c/∂t = ∇·(κ∇c) − v·∇c, c given on the inlet, ∂c/∂n = 0 elsewhere.
+
+The discretisation is that of ``docs/methods.md``, 1.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -12,12 +15,14 @@ import skfem
 from skfem.helpers import dot, grad
 
 from eitbench import _check
-from eitbench.numerics._backend import Backend
 from eitbench.numerics.fem import element, to_skfem
 from eitbench.numerics.mesh import Mesh
 from eitbench.numerics.sparse_lu import SparseLU
+from eitbench.physics.substeps import WideSubsteps
 
 VelocityField = Callable[[np.ndarray], np.ndarray]
+MANY = 16
+"""From so many columns on they go through the sub-steps side by side."""
 
 
 class EvolutionModel(NamedTuple):
@@ -90,8 +95,6 @@ class ConvectionDiffusion:
         Crank–Nicolson steps per time step, ≥ 1.
     inlet : (n_inlet,) int, optional
         Nodes where the concentration is given; default: nodes of the boundary facets through which fluid enters.
-    backend : "auto", "compiled" or "scipy"
-        What solves; see `eitbench.numerics.sparse_lu`.
 
     Raises
     ------
@@ -100,7 +103,7 @@ class ConvectionDiffusion:
     """
 
     def __init__(self, mesh: Mesh, velocity: VelocityField, diffusivity: float, time_step: float, *,
-                 substeps: int = 8, inlet: np.ndarray | None = None, backend: Backend = "auto") -> None:
+                 substeps: int = 8, inlet: np.ndarray | None = None) -> None:
         self.mesh = mesh
         self.diffusivity = _check.number("diffusivity", diffusivity, low=0.0, open_low=True, units="m²/s")
         self.time_step = _check.number("time_step", time_step, low=0.0, open_low=True, units="s")
@@ -110,21 +113,21 @@ class ConvectionDiffusion:
             raise ValueError(f"inlet must hold integer node numbers, got {np.asarray(inlet).dtype}")
         if self.inlet.size and (self.inlet[0] < 0 or self.inlet[-1] >= mesh.n_nodes):
             raise ValueError(f"inlet must hold node numbers in [0, {mesh.n_nodes - 1}], got {self.inlet}")
-        self._velocity, self._backend = velocity, backend
+        self._velocity = velocity
         mass, transport = _supg_matrices(mesh, velocity, self.diffusivity)
         dt = self.time_step / self.substeps
         implicit, explicit = mass / dt + 0.5 * transport, mass / dt - 0.5 * transport
         self._free = np.setdiff1d(np.arange(mesh.n_nodes), self.inlet)
         free, inlet_ = self._free, self.inlet
-        self._solver = SparseLU(implicit[free][:, free], backend)
+        self._solver = SparseLU(implicit[free][:, free])
         self._explicit = sp.csr_matrix(explicit[free])
         self._implicit_inlet = sp.csr_matrix(implicit[free][:, inlet_])
         self._mass = sp.csr_matrix(mass[free])
 
     def with_velocity(self, velocity: VelocityField) -> ConvectionDiffusion:
         """The same model with another velocity, its inlet nodes the same."""
-        return ConvectionDiffusion(self.mesh, velocity, self.diffusivity, self.time_step, substeps=self.substeps,
-                                   inlet=self.inlet, backend=self._backend)
+        return ConvectionDiffusion(self.mesh, velocity, self.diffusivity, self.time_step,
+                                   substeps=self.substeps, inlet=self.inlet)
 
     def step(self, c: np.ndarray, inflow_before: np.ndarray | float, inflow_after: np.ndarray | float) -> np.ndarray:
         """The concentration one time step later.
@@ -205,6 +208,11 @@ class ConvectionDiffusion:
         return self._transition
 
     @cached_property
+    def _wide(self) -> WideSubsteps:
+        return WideSubsteps(self._solver, self._mass, self._explicit, self._implicit_inlet,
+                            self._free, self.inlet, self.substeps, self.substeps / self.time_step)
+
+    @cached_property
     def _transition(self) -> tuple[np.ndarray, np.ndarray]:
         n, m = self.mesh.n_nodes, len(self.inlet)
         identity = np.eye(n)
@@ -226,8 +234,10 @@ class ConvectionDiffusion:
                  source: np.ndarray | None = None) -> np.ndarray:
         """All sub-steps on (n, batch) columns, perhaps with a nodal source of so much concentration a second."""
         loads: Iterable[np.ndarray | float] = self._no_loads()
-        if source is not None:
-            load = self._mass @ source
+        load = None if source is None else self._mass @ source
+        if c.shape[1] >= MANY:
+            return self._wide.advance(c, before, after, load)
+        if load is not None:
             loads = [0.5 * load, 0.5 * load] + [load] * (self.substeps - 1)
         *_, last = self._substeps(c, before, after, loads)
         return last
@@ -285,6 +295,7 @@ def _velocity_at(velocity: VelocityField, x: np.ndarray, name: str = "velocity")
 # -- SUPG -------------------------------------------------------------------------------------------------------------
 
 
+@lru_cache(maxsize=8)
 def _supg_basis(mesh: Mesh) -> skfem.Basis:
     return skfem.Basis(to_skfem(mesh), element(mesh.dim, 1), intorder=4)
 

@@ -43,6 +43,7 @@ from eitbench.envs.injection import InjectionEnv, InjectionVectorEnv
 from eitbench.rl.imitation import check_imitation, imitate, suited
 from eitbench.rl.networks import MaskablePairPolicy, PairPolicy
 from eitbench.rl.vec_env import InjectionVecEnv
+from eitbench.worlds.registry import entries, entry
 
 ALGORITHMS = ("ppo", "dqn", "sac", "recurrent_ppo", "maskable_ppo")
 OURS = {"policy", "env", "seed", "device", "tensorboard_log", "_init_setup_model"}
@@ -188,9 +189,9 @@ def vector_env(env: str, kwargs: dict[str, Any] | None, config: Config, n_envs: 
                ) -> InjectionVectorEnv:
     """The environments side by side; ``ValueError`` if ``env`` does not ask for injections, or ``kwargs`` hold what
     training itself decides."""
-    from eitbench.envs import INJECTION
-    if env not in INJECTION:
-        raise ValueError(f"env must be one of {', '.join(INJECTION)}; got {env!r}")
+    if entry(env).track != "injection":
+        asks = [id for id, each in entries().items() if each.track == "injection"]
+        raise ValueError(f"env must be one of {', '.join(asks)}; got {env!r}")
     if taken := {"episodes", "observation", "estimator"} & set(kwargs or {}):
         raise ValueError("kwargs must not hold episodes, which the configuration says, nor observation and estimator, "
                          f"which training decides; got {', '.join(sorted(taken))}")

@@ -82,9 +82,14 @@ def register(world: World, id: str, *, track: str = "estimation", about: str = "
         raise ValueError(f"id {id} belongs to another world already; take another name or version")
     _entries[id] = entry
     _by_hand.add(id)
-    if id not in gym.registry:
-        single, many = CLASSES[track]
-        gym.register(id, entry_point=single, vector_entry_point=many, kwargs={"name": id})
+    _make_known(entry)
+
+
+def _make_known(entry: Entry) -> None:
+    """To `gymnasium.make`."""
+    if entry.id not in gym.registry:
+        single, many = CLASSES[entry.track]
+        gym.register(entry.id, entry_point=single, vector_entry_point=many, kwargs={"name": entry.id})
 
 
 def entries() -> dict[str, Entry]:
@@ -107,8 +112,8 @@ def registered_by_hand() -> list[Entry]:
 def take_over(told: list[Entry]) -> None:
     """Register what another process has registered by hand."""
     for each in told:
-        if _entries.get(each.id) != each:
-            register(each.world, each.id, track=each.track, about=each.about, seeds=each.seeds, **each.settings)
+        _entries[each.id] = each
+        _make_known(each)
 
 
 def register_installed() -> None:

@@ -10,8 +10,8 @@ import importlib.util
 import pytest
 from tiny import FILTER, count, write_baseline
 
-from eitbench import _parallel
-from eitbench._parallel import BACKENDS, WorkerLost, in_parallel
+from eitbench.data import parallel
+from eitbench.data.parallel import BACKENDS, WorkerLost, in_parallel
 from eitbench.bench.run import Job, run_episode, run_jobs
 from eitbench.bench.store import EpisodeStore
 from eitbench.data.episodes import CACHE_VARIABLE

@@ -36,6 +36,25 @@ def test_equals_the_textbook(n, noise):
         np.testing.assert_allclose(step.innovation_covariance, S, atol=1e-10 * np.abs(S).max())
 
 
+@pytest.mark.parametrize("n", [14, 300, 530], ids=["small", "two panels", "three panels"])
+def test_transition_as_a_callable_equals_the_textbook(n):
+    """F as what it makes of columns: means and covariances to 1e-10, F P Fᵀ symmetric to the bit."""
+    rng = np.random.default_rng(10)
+    model = random_model(rng, n)
+    _, observations = draw(model, random_design(rng, n, 3), rng)
+    filter_ = DenseKalmanFilter(model.mean, model.covariance)
+    reference = dense_filter(model, observations)
+    for observation, (_, filtered) in zip(observations, reference, strict=True):
+        filter_.predict(lambda X: model.F @ X, model.s)
+        np.testing.assert_array_equal(filter_.covariance, filter_.covariance.T)
+        filter_.predict(noise=model.Q)
+        step = filter_.update(observation)
+        scale = np.abs(filtered.mean).max()
+        np.testing.assert_allclose(step.mean, filtered.mean, atol=1e-10 * scale)
+        scale = np.abs(filtered.covariance).max()
+        np.testing.assert_allclose(filter_.covariance, filtered.covariance, atol=1e-10 * scale)
+
+
 def test_target_at_rest_is_the_batch_estimate():
     """F = I without noise: after K measurements the estimate is the one from all at once, in information form."""
     rng, n = np.random.default_rng(4), 40

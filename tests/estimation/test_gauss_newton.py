@@ -61,6 +61,48 @@ def test_linear_model_gives_tikhonovs_solution(kind):
     np.testing.assert_allclose(found, expected, atol=1e-8)
 
 
+def path_penalty(n, free=()):
+    """Σ (x_i − x_j)² along a path and a few chords, sparse; nodes ``free`` are in no term."""
+    rng = np.random.default_rng(3)
+    kept = np.setdiff1d(np.arange(n), free)
+    edges = np.concatenate([np.stack([kept[:-1], kept[1:]], axis=1), rng.choice(kept, (n // 4, 2))])
+    edges = edges[edges[:, 0] != edges[:, 1]]
+    D = np.zeros((len(edges), n))
+    D[np.arange(len(edges)), edges[:, 0]] = 1.0
+    D[np.arange(len(edges)), edges[:, 1]] = -1.0
+    return sp.csr_array(D.T @ D)
+
+
+@pytest.mark.parametrize("free", [(), (5, 40)], ids=["constants", "two nodes more"])
+def test_few_readings_and_a_sparse_penalty_give_tikhonovs_solution(free):
+    """60 nodes, 8 readings: the same whether the penalty leaves only constants free or more."""
+    rng, n = np.random.default_rng(4), 60
+    J = rng.normal(size=(8, n)) + 1.0
+    penalty = 0.3 * path_penalty(n, free)
+    voltages = rng.normal(size=(2, 4))
+    std = rng.uniform(0.1, 2.0, (2, 4))
+    W = np.diag(1 / std.ravel()**2)
+    expected = np.linalg.solve(J.T @ W @ J + penalty.toarray(), J.T @ W @ voltages.ravel())
+    found = gauss_newton(Linear(J.reshape(2, 4, n)), voltages, np.zeros((2, 4)), std, penalty,
+                         100 * rng.normal(size=n), tolerance=1e-12)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-8 * np.abs(expected).max())
+
+
+def test_sparse_and_full_penalties_give_the_same_image():
+    """Of a real observation model, to 1e-8; the sparse one takes another way there."""
+    n, model = small_tank()
+    rng = np.random.default_rng(5)
+    currents = np.array([[1.0, -1.0, 0.0, 0.0], [0.0, 1.0, 0.0, -1.0]])
+    voltages = model.voltages(rng.uniform(20.0, 40.0, n), currents)
+    std = np.full(voltages.shape, 0.01 * np.abs(voltages).max())
+    penalty = 1e-2 * path_penalty(n)
+    assert 3 * voltages.size <= n
+    images = [gauss_newton(model, voltages, currents, std, kind, np.full(n, 30.0))
+              for kind in (penalty, penalty.toarray())]
+    assert np.ptp(images[0]) > 0.1
+    np.testing.assert_allclose(*images, rtol=1e-8)
+
+
 def test_nonlinear_model_ends_where_the_gradient_vanishes():
     """The objective's gradient, by central differences, is nothing beside the one at the start; scipy agrees."""
     rng = np.random.default_rng(1)

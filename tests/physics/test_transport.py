@@ -311,7 +311,7 @@ def test_state_noise_covariance_holds_both_noises():
 
 
 def test_pipe_forgets_at_the_measured_rate():
-    """The spectral radius of the pipe's F is about 0.72 (problem.md §7).
+    """The spectral radius of the pipe's F is about 0.72.
 
     F is so far from normal that rounding moves its eigenvalues in the second digit: F gives 0.717, Fᵀ 0.705.
     """

@@ -1,13 +1,17 @@
-"""Compiled kernels: sparse Cholesky factors on a fixed pattern, and products of gradients.
+"""Compiled kernels: sparse Cholesky and LU factors on a fixed pattern, and products of gradients.
 
-The factor is stored in supernodes, runs of columns with the same pattern below them: supernode s holds the columns
-start[s] … start[s+1]−1 and the rows rows[first_row[s] : first_row[s+1]], as a dense panel, column after column, from
-panel[s] on. Of the last supernode only its right-hand side is made: the Schur complement of all before.
+All that needs numba is in this file; `eitbench.numerics.compiled` imports it when it is needed.
 
-Loops over eight neighbours inside one array are not vectorised by the compiler, since it cannot know that they do not
-overlap. So the kernels speak of eight doubles at a time, in a type that numba lacks and a handful of intrinsics for it;
-the same arithmetic then runs 3 to 5 times faster. They stand in this file because numba keeps compiled code by the
-file of the kernel: elsewhere, a change in them would go unnoticed.
+The factor is stored in supernodes, runs of columns with the same pattern below them: supernode s
+holds the columns start[s] … start[s+1]−1 and the rows rows[first_row[s] : first_row[s+1]], as a
+dense panel, column after column, from panel[s] on. Of the last supernode only its right-hand side
+is made: the Schur complement of all before.
+
+Loops over eight neighbours inside one array are not vectorised by the compiler, since it cannot
+know that they do not overlap. So the kernels speak of eight doubles at a time, in a type that
+numba lacks and a handful of intrinsics for it; the same arithmetic then runs 3 to 5 times faster.
+They stand in this file because numba keeps compiled code by the file of the kernel: elsewhere, a
+change in them would go unnoticed.
 """
 
 from __future__ import annotations
@@ -21,64 +25,72 @@ from numba.core import cgutils
 from numba.extending import intrinsic, models, register_model
 
 WIDTH = 8
-_VECTOR = ir.VectorType(ir.DoubleType(), WIDTH)
+WIDE = 32
+"""Lanes where there are hundreds of right-hand sides: a lane's additions wait for each other, so
+several registers are added to at once; more do not fit where one holds four doubles."""
 
 
 class Lanes(types.Type):
-    """<8 x double>, held in registers."""
+    """<width x double>, held in registers."""
 
-    def __init__(self) -> None:
-        super().__init__(name=f"Lanes{WIDTH}")
-
-
-lanes = Lanes()
+    def __init__(self, width: int) -> None:
+        self.width, self.vector = width, ir.VectorType(ir.DoubleType(), width)
+        super().__init__(name=f"Lanes{width}")
 
 
 @register_model(Lanes)
 class _LanesModel(models.PrimitiveModel):
     def __init__(self, manager, kind):
-        super().__init__(manager, kind, _VECTOR)
+        super().__init__(manager, kind, kind.vector)
 
 
-@intrinsic
-def load(_typing, array, index):
-    """array[index : index + 8]"""
-    def code(context, builder, signature, arguments):
-        vector = builder.load(_address(context, builder, signature, arguments))
-        vector.align = 8
-        return vector
-    return lanes(array, types.intp), code
+def _loader(lanes):
+    @intrinsic
+    def load(_typing, array, index):
+        """array[index : index + width]"""
+        def code(context, builder, signature, arguments):
+            vector = builder.load(_address(context, builder, signature, arguments, lanes))
+            vector.align = 8
+            return vector
+        return lanes(array, types.intp), code
+    return load
+
+
+def _splatter(lanes):
+    @intrinsic
+    def splat(_typing, number):
+        """The same number in every lane."""
+        def code(_context, builder, _signature, arguments):
+            nothing = ir.Constant(lanes.vector, ir.Undefined)
+            first = builder.insert_element(nothing, arguments[0], ir.Constant(ir.IntType(32), 0))
+            zeros = ir.Constant(ir.VectorType(ir.IntType(32), lanes.width), [0] * lanes.width)
+            return builder.shuffle_vector(first, nothing, zeros)
+        return lanes(types.float64), code
+    return splat
+
+
+load, load_wide = (_loader(Lanes(width)) for width in (WIDTH, WIDE))
+splat, splat_wide = (_splatter(Lanes(width)) for width in (WIDTH, WIDE))
 
 
 @intrinsic
 def store(_typing, array, index, vector):
-    """array[index : index + 8] = vector"""
+    """array[index : index + width] = vector"""
     def code(context, builder, signature, arguments):
-        written = builder.store(arguments[2], _address(context, builder, signature, arguments))
+        address = _address(context, builder, signature, arguments, vector)
+        written = builder.store(arguments[2], address)
         written.align = 8
         return context.get_dummy_value()
-    return types.void(array, types.intp, lanes), code
-
-
-@intrinsic
-def splat(_typing, number):
-    """The same number in every lane."""
-    def code(_context, builder, _signature, arguments):
-        nothing = ir.Constant(_VECTOR, ir.Undefined)
-        first = builder.insert_element(nothing, arguments[0], ir.Constant(ir.IntType(32), 0))
-        return builder.shuffle_vector(first, nothing, ir.Constant(ir.VectorType(ir.IntType(32), WIDTH), [0] * WIDTH))
-    return lanes(types.float64), code
+    return types.void(array, types.intp, vector), code
 
 
 @intrinsic
 def subtract_product(_typing, total, a, b):
     """total − a·b"""
     def code(_context, builder, _signature, arguments):
-        total, a, b = arguments
-        fma = cgutils.get_or_insert_function(builder.module, ir.FunctionType(_VECTOR, [_VECTOR] * 3),
-                                             f"llvm.fma.v{WIDTH}f64")
-        return builder.call(fma, [builder.fneg(a), b, total])
-    return lanes(lanes, lanes, lanes), code
+        fma = _function(builder, "fma", total, 3)
+        return builder.call(fma, [builder.fneg(arguments[1]), arguments[2], arguments[0]])
+    return total(total, a, b), code
 
 
 @intrinsic
@@ -86,30 +98,42 @@ def times(_typing, a, b):
     """a·b"""
     def code(_context, builder, _signature, arguments):
         return builder.fmul(*arguments)
-    return lanes(lanes, lanes), code
+    return a(a, b), code
+
+
+@intrinsic
+def plus(_typing, a, b):
+    """a + b"""
+    def code(_context, builder, _signature, arguments):
+        return builder.fadd(*arguments)
+    return a(a, b), code
 
 
 @intrinsic
 def inverse_root(_typing, a):
     """1/√a"""
     def code(_context, builder, _signature, arguments):
-        root = cgutils.get_or_insert_function(builder.module, ir.FunctionType(_VECTOR, [_VECTOR]),
-                                              f"llvm.sqrt.v{WIDTH}f64")
-        return builder.fdiv(ir.Constant(_VECTOR, [1.0] * WIDTH), builder.call(root, arguments))
-    return lanes(lanes), code
+        root = builder.call(_function(builder, "sqrt", a, 1), arguments)
+        return builder.fdiv(ir.Constant(a.vector, [1.0] * a.width), root)
+    return a(a), code
 
 
-def _address(context, builder, signature, arguments):
+def _address(context, builder, signature, arguments, lanes):
     array = context.make_array(signature.args[0])(context, builder, arguments[0])
-    return builder.bitcast(builder.gep(array.data, [arguments[1]]), _VECTOR.as_pointer())
+    return builder.bitcast(builder.gep(array.data, [arguments[1]]), lanes.vector.as_pointer())
 
 
-# -- kernels ----------------------------------------------------------------------------------------------------------
+def _function(builder, name, lanes, count):
+    kind = ir.FunctionType(lanes.vector, [lanes.vector] * count)
+    return cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v{lanes.width}f64")
+
+
+# -- kernels --------------------------------------------------------------------------------------
 
 
 @njit(cache=True)
 def factorise(start, first_row, rows, panel, owner, first_entry, slot, values, factor):
-    """Left-looking supernodal Cholesky; lower entries ``values`` go to the places ``slot`` of ``factor``."""
+    """Left-looking supernodal Cholesky; lower entries ``values`` go to ``factor``'s ``slot``."""
     n_super = len(start) - 1
     head, after, done = np.full(n_super, -1), np.full(n_super, -1), np.zeros(n_super, np.int64)
     place, target = np.empty(len(owner), np.int64), np.empty(len(owner), np.int64)
@@ -122,7 +146,7 @@ def factorise(start, first_row, rows, panel, owner, first_entry, slot, values, f
             factor[i] = 0.0
         for e in range(first_entry[s], first_entry[s + 1]):
             factor[slot[e]] = values[e]
-        d = head[s]                                    # earlier supernodes with rows among these columns
+        d = head[s]                              # earlier supernodes with rows among these columns
         while d >= 0:
             following = after[d]
             rows_d, height_d, there = first_row[d], first_row[d + 1] - first_row[d], panel[d]
@@ -132,9 +156,10 @@ def factorise(start, first_row, rows, panel, owner, first_entry, slot, values, f
                 if rows[rows_d + a] < start[s + 1]:
                     end = a + 1
             width_d = start[d + 1] - start[d]
-            for b in range(begin, end, 2):             # two columns at a time: what is loaded serves both
+            for b in range(begin, end, 2):      # two columns at a time: what is loaded serves both
                 twin = min(b + 1, end - 1)
-                for a in range(b, height_d, WIDTH):    # may read beyond the panel, into numbers that are not used
+                # may read beyond the panel, into numbers that are not used
+                for a in range(b, height_d, WIDTH):
                     total = splat(0.0)
                     other = splat(0.0)
                     k = there
@@ -178,7 +203,7 @@ def factorise(start, first_row, rows, panel, owner, first_entry, slot, values, f
 
 @njit(inline="always")
 def _enlist(s, end, rows_s, height, rows, owner, head, after, done):
-    """Supernode s is finished with its first ``end`` rows: the owner of the next one will need it."""
+    """Supernode s is done with its first ``end`` rows: the owner of the next one will need it."""
     done[s] = end
     if end < height:
         next_one = owner[rows[rows_s + end]]
@@ -187,11 +212,13 @@ def _enlist(s, end, rows_s, height, rows, owner, head, after, done):
 
 
 @njit(cache=True)
-def condense_lanes(start, first_row, rows, panel, children, first_entry, slot, values, front, stack):
-    """The Schur complements of eight matrices side by side, whose values lie next to each other; left in ``front``.
+def condense_lanes(start, first_row, rows, panel, children, first_entry, slot, values, front,
+                   stack):
+    """The Schur complements of eight matrices side by side, left in ``front``.
 
-    Multifrontal: the factor itself is not kept. What a supernode leaves to its ancestors waits on a stack until its
-    parent takes it, so that all work is done in memory that the caches hold.
+    The values of the eight lie next to each other. Multifrontal: the factor itself is not kept.
+    What a supernode leaves to its ancestors waits on a stack until its parent takes it, so that
+    all work is done in memory that the caches hold.
     """
     n_super = len(start) - 1
     place, target = np.empty(start[-1], np.int64), np.empty(start[-1], np.int64)
@@ -216,7 +243,8 @@ def condense_lanes(start, first_row, rows, panel, children, first_entry, slot, v
             for j in range(size):
                 for i in range(j, size):
                     to = (target[j] * height + target[i]) * WIDTH
-                    store(front, to, subtract_product(load(front, to), splat(-1.0), load(stack, at * WIDTH)))
+                    left_over = load(stack, at * WIDTH)
+                    store(front, to, subtract_product(load(front, to), splat(-1.0), left_over))
                     at += 1
         if s == n_super - 1:
             break
@@ -226,7 +254,8 @@ def condense_lanes(start, first_row, rows, panel, children, first_entry, slot, v
                 total = load(front, (j + i) * WIDTH)
                 k = 0
                 for _ in range(p):
-                    total = subtract_product(total, load(front, (k + i) * WIDTH), load(front, (k + p) * WIDTH))
+                    pivot = load(front, (k + p) * WIDTH)
+                    total = subtract_product(total, load(front, (k + i) * WIDTH), pivot)
                     k += height
                 store(front, (j + i) * WIDTH, total)
             scale = inverse_root(load(front, (j + p) * WIDTH))
@@ -235,9 +264,10 @@ def condense_lanes(start, first_row, rows, panel, children, first_entry, slot, v
         at = begins[depth]
         waiting[depth] = s
         for j in range(width, height):
-            for i in range(j, height, 2):                # two rows at a time: what is loaded serves both
+            for i in range(j, height, 2):          # two rows at a time: what is loaded serves both
                 twin = min(i + 1, height - 1)
-                total, other = load(front, (j * height + i) * WIDTH), load(front, (j * height + twin) * WIDTH)
+                total = load(front, (j * height + i) * WIDTH)
+                other = load(front, (j * height + twin) * WIDTH)
                 k = 0
                 for _ in range(width):
                     pivot = load(front, (k + j) * WIDTH)
@@ -253,7 +283,7 @@ def condense_lanes(start, first_row, rows, panel, children, first_entry, slot, v
 
 @njit(cache=True)
 def substitute_back(start, first_row, rows, panel, factor, solution):
-    """Solve Lᵀ x = 0 upwards from the last supernode's rows of ``solution``, (n, 8·k) flattened per 8·k."""
+    """Solve Lᵀ x = 0 upwards from the last supernode's rows of ``solution`` (n, 8·k)."""
     n_super = len(start) - 1
     width = solution.shape[1]
     flat = solution.reshape(-1)
@@ -274,21 +304,23 @@ def substitute_back(start, first_row, rows, panel, factor, solution):
 def subtract_gradient_products(cells, unknowns, gradient, fields, table, G):
     """Subtract `Sensitivity`'s integrals from ``table``, cell by cell.
 
-    Weighted gradients by a cell's unknowns (cells, vertices·dim, unknowns a cell); fields (unknowns, width) and table
-    (nodes, width, width), with width in multiples of eight; ``G`` is room for twice (vertices, dim, width).
+    Weighted gradients by a cell's unknowns (cells, vertices·dim, unknowns a cell); fields
+    (unknowns, width) and table (nodes, width, width), with width in multiples of eight; ``G`` is
+    room for twice (vertices, dim, width).
     """
     n_cells, n_vertices = cells.shape
     n_rows, n_local = gradient.shape[1:]
     dim, width = n_rows // n_vertices, fields.shape[1]
     u, out = fields.reshape(-1), table.reshape(-1)
-    size = dim * width                                           # numbers a vertex
-    shifted = n_vertices * size                                  # where S + G_j begins, behind the G_j
+    size = dim * width                                   # numbers a vertex
+    shifted = n_vertices * size                          # where S + G_j begins, behind the G_j
     for c in range(n_cells):
         for r in range(n_rows):
             for i in range(0, width, WIDTH):
                 total = splat(0.0)
                 for k in range(n_local):
-                    total = subtract_product(total, splat(-gradient[c, r, k]), load(u, unknowns[c, k] * width + i))
+                    value = load(u, unknowns[c, k] * width + i)
+                    total = subtract_product(total, splat(-gradient[c, r, k]), value)
                 store(G, r * width + i, total)
         for i in range(0, size, WIDTH):
             total = splat(0.0)
@@ -298,7 +330,7 @@ def subtract_gradient_products(cells, unknowns, gradient, fields, table, G):
                 to = j * size + i
                 store(G, shifted + to, subtract_product(total, splat(-1.0), load(G, to)))
         for m in range(width):
-            for l in range(0, width, 2 * WIDTH):                 # sixteen at a time, if there are so many
+            for l in range(0, width, 2 * WIDTH):         # sixteen at a time, if there are so many
                 twin = min(l + WIDTH, width - WIDTH)
                 everywhere, everywhere_twin = splat(0.0), splat(0.0)
                 i = 0
@@ -323,9 +355,12 @@ def subtract_gradient_products(cells, unknowns, gradient, fields, table, G):
 
 
 @njit(cache=True)
-def solve_lu(row_place, column_place, lower_pointer, lower_index, lower, upper_pointer, upper_index, upper, scale,
-             right, work, solution):
-    """Solve A x = b for eight right-hand sides (n, 8), with L and U by rows, their diagonals 1 and 1/``scale``."""
+def solve_lu(row_place, column_place, lower_pointer, lower_index, lower, upper_pointer,
+             upper_index, upper, scale, right, work, solution):
+    """Solve A x = b for eight right-hand sides (n, 8).
+
+    L and U are given by rows; their diagonals are 1 and 1/``scale``.
+    """
     n = len(scale)
     for i in range(n):
         store(work, row_place[i] * WIDTH, load(right, i * WIDTH))

@@ -8,6 +8,8 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import nullcontext
 from typing import Any, TypeVar
 
+from eitbench.worlds.registry import Entry, registered_by_hand, take_over
+
 BACKENDS = ("loky", "ray", "dask")
 """Who starts the processes: joblib on this machine, or a cluster."""
 
@@ -50,7 +52,8 @@ def _with_joblib(function: Callable[..., Result], arguments: Sequence[tuple], n_
     try:
         with config or nullcontext(), Parallel(n_jobs=n_jobs, return_as="generator_unordered", batch_size=1,
                                                pre_dispatch=n_jobs) as parallel:
-            yield from parallel(delayed(_pinned)(function, *each) for each in arguments)
+            told = registered_by_hand()
+            yield from parallel(delayed(_pinned)(told, function, *each) for each in arguments)
     except lost as error:
         raise _explained(error) from error
 
@@ -72,7 +75,7 @@ def _with_ray(function: Callable[..., Result], arguments: Sequence[tuple], n_job
     if ours := not ray.is_initialized():
         ray.init(log_to_driver=False, **here)
     try:
-        waiting = [ray.remote(_pinned).remote(function, *each) for each in arguments]
+        waiting = [ray.remote(_pinned).remote(registered_by_hand(), function, *each) for each in arguments]
         while waiting:
             done, waiting = ray.wait(waiting)
             yield from ray.get(done)
@@ -88,7 +91,9 @@ def _explained(error: BaseException) -> WorkerLost:
                       "finished is kept, and the same command goes on from there")
 
 
-def _pinned(function: Callable[..., Result], *arguments: Any) -> Result:
+def _pinned(told: list[Entry], function: Callable[..., Result], *arguments: Any) -> Result:
+    """Called in another process, which is ``told`` of the worlds that a script has registered."""
     from threadpoolctl import threadpool_limits
+    take_over(told)
     with threadpool_limits(1):
         return function(*arguments)

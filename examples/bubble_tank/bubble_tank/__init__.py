@@ -1,0 +1,1 @@
+"""A world, a method and a score for eitbench, from outside."""

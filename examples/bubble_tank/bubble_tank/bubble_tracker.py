@@ -1,0 +1,33 @@
+"""Bubble tracker: a Kalman filter whose estimate is cut off above, since a bubble conducts less than its liquid."""
+
+import numpy as np
+
+from eitbench import Estimate, Task
+from eitbench.estimation import FirstFrame, LinearisedObservations, starting_filter
+
+
+class Estimator:
+    boards = ("filter",)
+
+    def __init__(self, task: Task) -> None:
+        self.task = task
+        self.first = FirstFrame(task)
+        self.filter = None
+
+    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate:
+        if self.filter is None:
+            if self.first.add(voltages, currents):
+                self.start()
+            return Estimate(self.first.mean)
+        return self.take_in(voltages, currents)
+
+    def start(self) -> None:
+        self.filter = starting_filter(self.task.transport, self.task.prior, self.first.c_bh)
+        self.linear = LinearisedObservations(self.task.observation, self.task.noise, self.first.mean)
+        for measurement in self.first.measurements:
+            self.take_in(*measurement)
+
+    def take_in(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate:
+        self.filter.predict()
+        step = self.filter.update(self.linear(voltages, currents))
+        return Estimate(np.clip(step.mean, 0.0, 1.05 * self.first.c_bh), step.variance)

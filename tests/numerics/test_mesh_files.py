@@ -1,0 +1,313 @@
+"""Meshes and groups of facets from files: round trips, files as gmsh writes them, and refusals."""
+
+import hashlib
+import re
+from pathlib import Path
+
+import meshio
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from shapes import end_facets, shaken_box, shaken_rectangle
+
+from eitbench.numerics.mesh import Mesh
+from eitbench.numerics.mesh_files import read_mesh, write_mesh
+from eitbench.physics.cem import CompleteElectrodeModel
+from eitbench.physics.transport import inlet_nodes
+
+SIZE = np.array([1.0, 0.8, 0.6])
+MESHES = {2: shaken_rectangle(*SIZE[:2], (6, 5), np.random.default_rng(11)),
+          3: shaken_box(SIZE, (3, 4, 3), np.random.default_rng(12))}
+
+in_both_dimensions = pytest.mark.parametrize("dim", [2, 3])
+
+
+def groups_of(mesh: Mesh) -> dict[str, np.ndarray]:
+    """Both ends, the rest of the boundary, and all of it once more."""
+    left, right = end_facets(mesh)
+    ends = {tuple(facet) for facet in np.concatenate([left, right]).tolist()}
+    rest = [facet for facet in mesh.boundary_facets.tolist() if tuple(facet) not in ends]
+    return {"inlet": left, "electrode 1": right, "walls": np.array(rest),
+            "everything (∂Ω)": mesh.boundary_facets}
+
+
+# -- round trips ----------------------------------------------------------------------------------
+
+
+@in_both_dimensions
+def test_round_trip(dim, tmp_path):
+    """Nodes to the bit, cells and groups are those that were written, in whatever order."""
+    mesh = MESHES[dim]
+    groups = groups_of(mesh)
+    turned = {name: np.random.default_rng(0).permutation(facets[:, ::-1])
+              for name, facets in groups.items()}
+    write_mesh(tmp_path / "box.msh", mesh, turned)
+    read = read_mesh(tmp_path / "box.msh")
+    assert_array_equal(read.mesh.points, mesh.points)
+    assert_array_equal(read.mesh.cells, mesh.cells)
+    assert_allclose(read.mesh.volumes.sum(), SIZE[:dim].prod(), rtol=1e-13)
+    assert list(read.groups) == list(groups)
+    for name, facets in groups.items():
+        assert_array_equal(read.groups[name], facets)
+        assert np.issubdtype(read.groups[name].dtype, np.integer)
+
+
+@in_both_dimensions
+def test_scale(dim, tmp_path):
+    """A drawing in millimetres: lengths are divided by a thousand, numbers stay."""
+    mesh = MESHES[dim]
+    write_mesh(str(tmp_path / "box.msh"), Mesh(1e3 * mesh.points, mesh.cells), groups_of(mesh))
+    read = read_mesh(str(tmp_path / "box.msh"), scale=1e-3)
+    assert_allclose(read.mesh.points, mesh.points, rtol=1e-15)
+    assert_allclose(read.mesh.volumes.sum(), SIZE[:dim].prod(), rtol=1e-13)
+    assert_array_equal(read.groups["inlet"], end_facets(mesh)[0])
+
+
+@in_both_dimensions
+@pytest.mark.parametrize(("format", "ending", "binary"), [
+    ("gmsh22", "msh", True), ("gmsh22", "msh", False), ("vtk", "vtk", True), ("vtu", "vtu", True)])
+def test_other_formats(dim, format, ending, binary, tmp_path):
+    """What meshio reads is read; a file without groups has none."""
+    mesh = MESHES[dim]
+    file = tmp_path / f"box.{ending}"
+    points = np.pad(mesh.points, ((0, 0), (0, 3 - dim)))
+    meshio.Mesh(points, [("triangle" if dim == 2 else "tetra", mesh.cells)]).write(
+        file, file_format=format, binary=binary)
+    read = read_mesh(file)
+    assert_array_equal(read.mesh.points, mesh.points)
+    assert_array_equal(read.mesh.cells, mesh.cells)
+    assert read.groups == {}
+
+
+@pytest.mark.parametrize("turn", [str.lower, str.upper])
+def test_the_right_file_is_read(turn, tmp_path):
+    """A SHA-256 in either case; of another file it names both."""
+    write_mesh(tmp_path / "box.msh", MESHES[2])
+    sha256 = hashlib.sha256((tmp_path / "box.msh").read_bytes()).hexdigest()
+    assert read_mesh(tmp_path / "box.msh", turn(sha256)).mesh.n_nodes == MESHES[2].n_nodes
+    other = "0" * 64
+    with pytest.raises(ValueError, match=f"box.msh: must be .* SHA-256 {other}, got .* {sha256}"):
+        read_mesh(tmp_path / "box.msh", other)
+
+
+# -- files as gmsh writes them --------------------------------------------------------------------
+
+SQUARE = """$MeshFormat
+2.2 0 8
+$EndMeshFormat
+$PhysicalNames
+4
+0 9 "corner"
+1 1 "electrode 1"
+1 2 "walls"
+2 3 "fluid"
+$EndPhysicalNames
+$Nodes
+6
+10 0.5 0.5 0
+20 0 0 0
+30 2 0 0
+40 2 1 0
+50 0 1 0
+60 7 7 7
+$EndNodes
+$Elements
+7
+1 15 2 9 1 20
+2 1 2 1 1 30 20
+3 1 2 2 2 40 30
+4 1 2 2 2 50 20
+5 1 2 1 3 40 50
+6 2 2 3 1 20 30 40
+7 2 2 3 1 20 40 50
+$EndElements
+"""
+"""2 × 1, with centres of circles that are no nodes, sparse node numbers and a named corner."""
+
+SQUARE_41 = """$MeshFormat
+4.1 0 8
+$EndMeshFormat
+$PhysicalNames
+3
+1 1 "electrode 1"
+1 2 "walls"
+2 3 "fluid"
+$EndPhysicalNames
+$Entities
+1 2 1 0
+1 0.5 0.5 0 0
+1 0 0 0 2 1 0 2 1 2 0
+2 0 0 0 2 1 0 1 -2 0
+1 0 0 0 2 1 0 1 3 2 1 2
+$EndEntities
+$Nodes
+2 5 10 50
+0 1 0 1
+10
+0.5 0.5 0
+2 1 0 4
+20
+30
+40
+50
+0 0 0
+2 0 0
+2 1 0
+0 1 0
+$EndNodes
+$Elements
+3 6 1 6
+1 1 1 2
+1 30 20
+2 40 50
+1 2 1 2
+3 40 30
+4 50 20
+2 1 2 2
+5 20 30 40
+6 20 40 50
+$EndElements
+"""
+"""The same, where the first curve is in both groups and the second turned round in its group."""
+
+
+def written(folder: Path, text: str) -> Path:
+    file = folder / "square.msh"
+    file.write_text(text)
+    return file
+
+
+def test_gmsh_22(tmp_path):
+    """Unused nodes are left out, the others keep their order; facets go by their group's name."""
+    mesh, groups = read_mesh(written(tmp_path, SQUARE))
+    assert_array_equal(mesh.points, [[0, 0], [2, 0], [2, 1], [0, 1]])
+    assert_array_equal(mesh.cells, [[0, 1, 2], [0, 2, 3]])
+    assert mesh.volumes.sum() == 2.0
+    assert list(groups) == ["electrode 1", "walls"]
+    assert_array_equal(groups["electrode 1"], [[0, 1], [2, 3]])
+    assert_array_equal(groups["walls"], [[0, 3], [1, 2]])
+
+
+def test_gmsh_41(tmp_path):
+    """A curve may be in two groups, and run against its group's direction."""
+    mesh, groups = read_mesh(written(tmp_path, SQUARE_41))
+    assert_array_equal(mesh.points, [[0, 0], [2, 0], [2, 1], [0, 1]])
+    assert_array_equal(mesh.cells, [[0, 1, 2], [0, 2, 3]])
+    assert_array_equal(groups["electrode 1"], [[0, 1], [2, 3]])
+    assert_array_equal(groups["walls"], mesh.boundary_facets)
+
+
+def test_a_cell_of_two_groups_is_one_cell(tmp_path):
+    """gmsh 2.2 writes it twice."""
+    twice = SQUARE.replace("$Elements\n7\n", "$Elements\n8\n").replace(
+        "$EndElements", "8 2 2 8 1 40 50 20\n$EndElements")
+    mesh, groups = read_mesh(written(tmp_path, twice))
+    assert_array_equal(mesh.cells, [[0, 1, 2], [0, 2, 3]])
+    assert len(groups["walls"]) == 2
+
+
+# -- what is done with them -----------------------------------------------------------------------
+
+
+@in_both_dimensions
+def test_electrode_model_and_inlet(dim, tmp_path):
+    """On the mesh from the file 𝓡 has the bits that it has on the mesh that was written."""
+    mesh = MESHES[dim]
+    left, right = end_facets(mesh)
+    top = mesh.facets_where(lambda p: p[:, 1] > SIZE[1] - 1e-9)
+    write_mesh(tmp_path / "box.msh", mesh, {"left": left, "right": right, "top": top})
+    read = read_mesh(tmp_path / "box.msh")
+    sigma = np.random.default_rng(1).uniform(0.2, 0.5, mesh.n_nodes)
+    impedance = np.array([1e-2, 2e-2, 3e-2])
+    there = CompleteElectrodeModel(mesh, [left, right, top], impedance)
+    back = CompleteElectrodeModel(read.mesh, list(read.groups.values()), impedance)
+    assert_array_equal(back.transfer_resistance(sigma), there.transfer_resistance(sigma))
+    for ours, expected in zip(back.transfer_resistance_derivatives(sigma),
+                              there.transfer_resistance_derivatives(sigma), strict=True):
+        assert_array_equal(ours, expected)
+    along = np.eye(dim)[0]
+    nodes = inlet_nodes(read.mesh, lambda points: np.tile(along, (len(points), 1)))
+    assert_array_equal(np.unique(read.groups["left"]), nodes)
+
+
+# -- what is refused ------------------------------------------------------------------------------
+
+TRIANGLES = "6 2 2 3 1 20 30 40\n7 2 2 3 1 20 40 50\n"
+
+
+def with_elements(*elements: str) -> str:
+    """`SQUARE` with these instead of its triangles."""
+    lines = [f"{6 + k} {element}\n" for k, element in enumerate(elements)]
+    counted = SQUARE.replace("$Elements\n7\n", f"$Elements\n{5 + len(elements)}\n")
+    return counted.replace(TRIANGLES, "".join(lines))
+
+
+@pytest.mark.parametrize(("text", "match"), [
+    (with_elements(), "must hold triangles or tetrahedra, got line, vertex"),
+    (with_elements("3 2 3 1 20 30 40 50"), "must hold triangles or tetrahedra, got line, quad"),
+    (with_elements("2 2 3 1 20 30 40", "3 2 3 1 20 40 50 10"),
+     "nothing but triangles.* got line, quad"),
+    (with_elements("4 2 3 1 20 30 50 60", "5 2 3 1 20 30 40 50 20 30 40 50"),
+     "nothing but triangles.* got hexahedron, line, tetra"),
+    (with_elements("9 2 3 1 20 30 40 10 10 10"), "first order, with straight sides, got triangle6"),
+    (with_elements("2 2 3 1 20 30 40", "8 2 1 1 20 30 10"), "first order, .* got line3"),
+    (with_elements("2 2 3 1 20 30 40", "2 2 3 1 20 40 60"),
+     "in the plane z = 0, got z from 0 to 7"),
+    (with_elements("2 2 3 1 20 30 30"), "cells must have a positive volume"),
+    (with_elements("2 2 3 1 20 30 40"),
+     r"group 'electrode 1' must lie on the boundary, got 1 of 2 facets that do not, "
+     r"the first with its nodes at \[\[2.0, 1.0\], \[0.0, 1.0\]\] m"),
+    (SQUARE.replace("3 1 2 2 2 40 30", "3 1 2 2 2 40 20"),
+     "group 'walls' must lie on the boundary, got 1 of 2"),
+    (SQUARE.replace('1 2 "walls"\n', "").replace("Names\n4", "Names\n3"),
+     "groups of boundary facets must have a name, .* got group 2 without one"),
+    (SQUARE.replace('2 3 "fluid"', '2 3 "walls"'), "must have a name, which no group of another"),
+    (SQUARE.replace('0 9 "corner"', '1 9 "outlet"'), "group 'outlet' must hold facets, got none"),
+    (SQUARE[:-80], "must be a whole mesh file in a format that meshio knows"),
+    (SQUARE.replace("2.2 0 8", "1.0 0 8"), "cannot be read .*Need mesh format"),
+    ("a picture of a pipe", "must be a whole mesh file"), ("", "must be a whole mesh file"),
+])
+def test_files_that_are_refused(text, match, tmp_path, capsys):
+    """What came and what was expected, after the name of the file; nothing is printed."""
+    file = written(tmp_path, text)
+    with pytest.raises(ValueError, match=f"^{re.escape(str(file))}: .*{match}"):
+        read_mesh(file)
+    assert capsys.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("name", ["pipe.msh", "pipe.vtu", "", "pipe.xyzzy"])
+def test_files_that_are_not_there(name, tmp_path):
+    """Nor is a folder a file, and an ending that meshio does not know is named."""
+    with pytest.raises(ValueError, match="there is no such file"):
+        read_mesh(tmp_path / name)
+    if name:
+        (tmp_path / name).write_text("nonsense")
+        with pytest.raises(ValueError, match=rf"{name}: must be a whole mesh file in a format"):
+            read_mesh(tmp_path / name)
+
+
+@pytest.mark.parametrize("scale", [0.0, -1.0, np.nan, "mm"])
+def test_scales_that_are_refused(scale, tmp_path):
+    with pytest.raises(ValueError, match="scale must be a"):
+        read_mesh(written(tmp_path, SQUARE), scale=scale)
+
+
+@pytest.mark.parametrize(("name", "facets", "match"), [
+    ("", [[0, 1]], "groups must have names of printable characters"),
+    ('my "inlet"', [[0, 1]], "groups must have names of printable characters"),
+    ("two\nlines", [[0, 1]], "groups must have names of printable characters"),
+    (3, [[0, 1]], "groups must have names of printable characters"),
+    ("wall", np.zeros((0, 2), int), r"group 'wall' must be integers of shape \(n_facets ≥ 1, 2\)"),
+    ("wall", [[0.0, 1.0]], "group 'wall' must be integers"),
+    ("wall", [0, 1], "group 'wall' must be integers"),
+    ("wall", [[0, 1], [8, 7]], r"must lie on the mesh's boundary, got facet \(7, 8\)"),
+])
+def test_groups_that_cannot_be_written(name, facets, match, tmp_path):
+    with pytest.raises(ValueError, match=match):
+        write_mesh(tmp_path / "box.msh", MESHES[2], {name: facets})
+    assert not list(tmp_path.iterdir())
+
+
+def test_only_gmsh_is_written(tmp_path):
+    with pytest.raises(ValueError, match=r"box\.vtu: the name of the file must end with \.msh"):
+        write_mesh(tmp_path / "box.vtu", MESHES[2])

@@ -1,0 +1,81 @@
+"""A vessel from mesh files: the same physics as one that is built, and clear words for what is missing."""
+
+import hashlib
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from eitbench.numerics.mesh_files import write_mesh
+from eitbench.numerics.round import electrode_disc
+from eitbench.physics.cem import CompleteElectrodeModel
+from eitbench.worlds import World, register, registry
+from eitbench.worlds.bodies import Cylinders
+from eitbench.worlds.flows import NoFlow
+from eitbench.worlds.mesh_vessel import MeshVessel
+from eitbench.worlds.schedule import AroundTheTank, Schedule
+from eitbench.worlds.vessels import RoundTank
+
+TANK = RoundTank(n_electrodes=8)
+
+
+class RoundMeshVessel(MeshVessel):
+    """As a test needs it: the cylinders ask for the tank's radius."""
+
+    radius = TANK.radius
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """Path and hash of a fine and a coarse mesh of the round tank, and the meshes themselves."""
+    folder = tmp_path_factory.mktemp("meshes")
+    made = {}
+    for name, size in (("fine", (4, 10)), ("coarse", (2, 6))):
+        mesh = electrode_disc(TANK.radius, TANK.electrode_spans, *size)
+        groups = {f"electrode {l}": facets for l, facets in enumerate(TANK.electrodes(mesh))}
+        path = folder / f"{name}.msh"
+        write_mesh(path, mesh, groups)
+        made[name] = str(path), hashlib.sha256(path.read_bytes()).hexdigest(), mesh
+    return made
+
+
+@pytest.fixture
+def vessel(files):
+    (fine, fine_hash, _), (coarse, coarse_hash, _) = files["fine"], files["coarse"]
+    return RoundMeshVessel(fine, fine_hash, coarse, coarse_hash, 8)
+
+
+def test_electrodes_are_those_of_the_groups(files, vessel):
+    """The transfer resistance is that of a model made from the same mesh in memory, to the bit."""
+    for fine, name in ((True, "fine"), (False, "coarse")):
+        mesh = files[name][2]
+        direct = CompleteElectrodeModel(mesh, TANK.electrodes(mesh), vessel.contact_impedance)
+        sigma = 0.3 + 0.1 * np.sin(40.0 * mesh.points[:, 0])
+        np.testing.assert_array_equal(vessel.electrode_model(fine).transfer_resistance(sigma),
+                                      direct.transfer_resistance(sigma))
+        np.testing.assert_array_equal(vessel.carrier(fine)[0].points, mesh.points)
+
+
+def test_a_world_of_it_is_played(vessel, monkeypatch):
+    """Registered by a script it plays as any other; no inlet, so that nothing flows in."""
+    monkeypatch.setattr(registry, "_entries", dict(registry._entries))
+    world = World("Meshed", vessel, NoFlow(), Cylinders(), schedule=Schedule(
+        time_step=0.02, scored_steps=4, pattern=AroundTheTank(), warm_up=0, calibration=1))
+    register(world, "test/Meshed-v0")
+    env = gym.make("test/Meshed-v0")
+    observation, _ = env.reset(seed=1)
+    assert observation["voltages"].shape == (8,) and len(vessel.carrier(False)[1]) == 0
+    level = np.full(env.action_space.shape, 30.0)
+    rewards = [env.step(level)[1] for _ in range(4)]
+    assert all(-5.0 < reward < 0.0 for reward in rewards)
+    gym.registry.pop("test/Meshed-v0")
+
+
+def test_another_file_is_refused(files, vessel):
+    """The world names the file by its hash; a group that is missing is named."""
+    changed = RoundMeshVessel(files["fine"][0], "0" * 64, *files["coarse"][:2], 8)
+    with pytest.raises(ValueError, match=r"fine\.msh: must be the file with SHA-256 0000"):
+        changed.carrier(True)
+    many = RoundMeshVessel(*files["fine"][:2], *files["coarse"][:2], 9)
+    with pytest.raises(ValueError, match="must have a group for each electrode, got none for electrode 8"):
+        many.electrode_model(False)
