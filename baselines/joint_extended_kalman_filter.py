@@ -39,7 +39,7 @@ class Estimator:
         transport, prior, flow = self.task.transport, self.task.prior, self.task.velocity
         assert flow is not None
         return JointFilter(
-            lambda theta: transport.with_velocity(flow.field(theta)), flow.directions,
+            self.task.transport_at, flow.directions,
             mean=self.first.mean, covariance=c_bh**2 * initial_covariance(transport.mesh, prior),
             parameters=np.array(flow.nominal), parameter_covariance=np.diag(np.square(flow.initial_std)),
             walk_std=np.array(flow.walk_std), inflow=c_bh, inflow_std=prior.inflow_std * c_bh,

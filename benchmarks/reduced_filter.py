@@ -12,7 +12,8 @@ from tqdm import tqdm
 
 from eitbench._files import shipped
 from eitbench.bench.records import read_records
-from eitbench.bench.run import Environment, Job, run_episode
+from eitbench.bench.run import Job, run_episode
+from eitbench.bench.tracks import Environment
 from eitbench.bench.verify import job_of
 from eitbench.data.seeds import parse_seeds
 from eitbench.report.summary import mean_and_interval, rounded, scores_by_seed, seed_ranges

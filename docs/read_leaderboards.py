@@ -7,7 +7,7 @@ import sys
 
 from eitbench.bench import load
 
-# One row for each score of each episode; of another version of the environments' code, none.
+# One row for each score of each episode; of earlier versions of our methods, none.
 frame = load(*sys.argv[1:])
 frame = frame[~frame["outdated"]]
 print(f"{len(frame)} scores of {frame['method'].nunique()} methods in {frame['environment'].nunique()} environments")

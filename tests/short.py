@@ -1,6 +1,8 @@
 """A short world for every id: what is promised does not depend on the length of a record."""
 
-from eitbench.worlds import entries, entry
+from dataclasses import replace
+
+from eitbench.worlds import entries, entry, registry
 
 PLAIN = [name for name, each in entries().items() if each.world == entry("eitbench/Pipe2D-v0").world]
 """Ids that play the thesis' pipe as it is."""
@@ -52,3 +54,11 @@ def world(name: str) -> dict:
 def short(name: str) -> dict:
     """And its training episodes few."""
     return world(name) | {"episodes": 2}
+
+
+def shorten(monkeypatch, changes: dict[str, dict]) -> None:
+    """Let registered ids play other worlds, in other processes too: id -> changes of the world."""
+    for name, each in changes.items():
+        made = replace(entry(name), world=entry(name).world.changed(each))
+        monkeypatch.setitem(registry._entries, name, made)
+    monkeypatch.setattr(registry, "_by_hand", registry._by_hand | set(changes))

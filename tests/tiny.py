@@ -5,16 +5,18 @@ import json
 from pathlib import Path
 
 from eitbench.bench.records import SCHEMA, sealed, split_of
-from eitbench.bench.run import Environment
+from eitbench.bench.tracks import Environment
 
-SCENARIO = {"mean_velocity": 45.0, "scored_steps": 3, "electrodes_per_wall": 2, "frame": 2}
+SCENARIO = {"flow": {"mean_velocity": 45.0}, "schedule": {"scored_steps": 3, "pattern": {"frame": 2}},
+            "vessel": {"electrodes_per_wall": 2}}
 """A fast fluid flushes the pipe in two steps: five measurements, the last three states are scored."""
 
-FILTER = Environment("eitbench/Pipe2D-v0", json.dumps({"scenario": SCENARIO}))
-FIXED_LAG = Environment("eitbench/Pipe2DFixedLag-v0", json.dumps({"scenario": SCENARIO, "lag": 2}))
-SMOOTHING = Environment("eitbench/Pipe2DSmoothing-v0", json.dumps({"scenario": SCENARIO}))
+FILTER = Environment("eitbench/Pipe2D-v0", json.dumps({"world": SCENARIO}))
+FIXED_LAG = Environment("eitbench/Pipe2DFixedLag-v0", json.dumps({"world": SCENARIO, "lag": 2}))
+SMOOTHING = Environment("eitbench/Pipe2DSmoothing-v0", json.dumps({"world": SCENARIO}))
 
 RUN = {"command": "eitbench run", "blas": "scipy-openblas", "commit": "c0ffee", "dirty": False,
+       "source": hashlib.sha256(b"code").hexdigest(),
        "versions": {"python": "3.12.1", "eitbench": "0.1.0", "numpy": "2.4.6", "scipy": "1.17.1",
                     "stable-baselines3": None, "torch": None},
        "machine": {"processor": "An abacus", "cores": 2, "system": "Linux", "blas_threads": 1, "matmul_seconds": 0.05}}
@@ -87,9 +89,10 @@ def episode(seed: str, error: float | None, *, seconds_per_step: float = 0.01, *
 
 
 def record(method: str, errors: dict[str, float | None] | list[float | None], *, board: str = "filter",
-           id: str | None = None, source: str = "code", version: str = "1", finished: str = "2025-01-01", scores=None,
+           id: str | None = None, version: str = "1", finished: str = "2025-01-01", scores=None,
            **changes) -> dict:
-    """A valid record of these errors by seed; those of a list are of test:0, test:1 and so on."""
+    """A valid record of these errors by seed; those of a list are of test:0, test:1 and so on. Version v1, v2, … is one
+    of ours, of any other the file has another sha256."""
     id = id or BOARD_IDS[board]
     errors = errors if isinstance(errors, dict) else {f"test:{i}": error for i, error in enumerate(errors)}
     episodes = [episode(seed, error, **(scores or {})) | {"finished": f"{finished}T00:00:00+00:00"}
@@ -98,7 +101,8 @@ def record(method: str, errors: dict[str, float | None] | list[float | None], *,
         "schema": SCHEMA, "environment": {"id": id, "name": id.replace("/", "-"), "kwargs": {}}, "board": board,
         "method": method, "title": method.replace("_", " ").capitalize(), "parameters": {}, "role": None,
         "privileged": False, "official": False, "method_sha256": sha(method + version), "checkpoint_sha256": None,
-        "source": sha(source), "split": split_of(next(iter(errors))), "seeds": list(errors), "runs": [RUN],
+        "version": version if version.startswith("v") else sha(method + version)[:8],
+        "split": split_of(next(iter(errors))), "seeds": list(errors), "runs": [RUN],
         "episodes": episodes} | changes)
 
 
@@ -114,11 +118,11 @@ def several_boards() -> list[dict]:
                record("homogeneous", floor, id=tank, role="floor", official=True),
                record("random_pair", floor, board="injection", role="floor", scores={"spent": 40})]
     for id in (BOARD_IDS["filter"], tank):
-        records += [record("a", of(0.5), id=id, scores=claims | {"seconds_per_step": 0.02}),
+        records += [record("a", of(0.5), id=id, version="v2", scores=claims | {"seconds_per_step": 0.02}),
                     record("twin", of(0.5), id=id, scores={"seconds_per_step": 0.05}, official=True)]
     return [*records, record("b", of(0.7), scores={"seconds_per_step": 0.004}, parameters={"window": 3}),
             record("failing", [*of(0.6)[:7], None]), record("seer", of(0.1), role="reference", privileged=True),
-            record("a", of(0.45), source="old", version="0", finished="2020-01-01"),
+            record("a", of(0.45), version="v1", finished="2020-01-01"),
             record("<i>\"odd\"", of(0.8), title="Odd <script>alert(1)</script> & | \"co\"", runs=[RUN | {
                 "command": "eitbench submit --baseline '<b>it' --env x"}]),
             record("greedy_a", of(0.4), board="injection", scores={"spent": 30})]

@@ -1,4 +1,4 @@
-"""Floor 5: run baselines on environments, keep what came out, and report it."""
+"""Floor 6: run methods on environments, keep what came out, and report it."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ def load(folder: Path | str | None = None) -> pd.DataFrame:
     DataFrame
         environment, board, method, version, title, role, privileged, official, outdated, split, seed, status, metric,
         value. Metrics are named and measured as in ``leaderboards/schema.json`` (s, V², bytes). A failed episode has
-        one row, with the metric error and no value. ``outdated`` are records of another version of the code than the
-        board's: not to be mixed with the others.
+        one row, with the metric error and no value. ``outdated`` are records of an earlier version of a method of
+        ours than there is one of: not to be mixed with the others.
 
     Raises
     ------

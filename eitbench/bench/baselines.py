@@ -42,6 +42,11 @@ class Baseline(NamedTuple):
     privileged: bool = False
     """Shown the episode's flow and whole record: Estimator(task, revealed). A mark for the others, not one of them."""
 
+    @property
+    def version(self) -> str:
+        """As `version_of`."""
+        return version_of(self.path, self.sha256)
+
     def suits(self, task: Task) -> bool:
         """Whether it can play a task of its boards; an estimator without a word on that suits all."""
         judge = getattr(self.estimator, "suits", None)
@@ -58,9 +63,22 @@ def own_baselines() -> list[str]:
     return sorted(path.stem for path in baseline_folder().glob("*.py"))
 
 
+def own_names(id: str) -> set[str]:
+    """Under which results of our own methods are kept in an environment: of files, and of its trained agents."""
+    folder = baseline_folder()
+    agents = (folder / "checkpoints" / id.replace("/", "-")).glob("*/seed*/model.zip")
+    return {path.stem for pattern in ("*.py", "injection/*.py") for path in folder.glob(pattern)} | {
+        f"{path.parents[1].name}_{path.parent.name}" for path in agents}
+
+
 def is_ours(name: str) -> bool:
     """Whether a method, by name or by path, is one of ours: it lies in our folder."""
     return not name.endswith((".py", ".zip")) or Path(name).resolve().is_relative_to(baseline_folder().resolve())
+
+
+def version_of(path: Path, sha256: str) -> str:
+    """What a method's records say of its version: v1 of ours, of all others eight digits of their file's sha256."""
+    return "v1" if is_ours(str(path)) else sha256[:8]
 
 
 def find_baseline(name: str) -> Path:

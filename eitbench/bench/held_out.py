@@ -18,13 +18,12 @@ import pandas as pd
 
 from eitbench._files import shipped, write_atomically
 from eitbench.bench.baselines import is_ours
-from eitbench.bench.records import read_records
+from eitbench.bench.records import newest, read_records
 from eitbench.bench.run import Job, run_episode
 from eitbench.bench.sandbox.wall import python_files
 from eitbench.bench.statistics import FEWEST, interquartile_mean, mean_over_environments, stratified_bootstrap
+from eitbench.bench.tracks import FLOORS
 from eitbench.data.seeds import SPLITS
-from eitbench.envs import INJECTION
-from eitbench.report.boards import FLOOR
 from eitbench.report.summary import as_markdown, scores_by_seed, with_interval
 
 PUBLISHED = shipped("leaderboards") / "held_out.json"
@@ -125,8 +124,7 @@ def held_out(record: dict[str, Any], job: Job, salt: bytes, episodes: int, folde
     if min(episodes, len(errors)) < 2 or episodes + len(errors) < FEWEST:
         raise ValueError(f"held-out episodes and those of the record must be {FEWEST} together, and two each, for an "
                          f"interval; got {episodes} and {len(errors)}")
-    board = "injection" if job.environment.id in INJECTION else ""
-    floor, seeds = FLOOR.get(board, "homogeneous"), held_out_seeds(salt, episodes)
+    floor, seeds = FLOORS[job.environment.track], held_out_seeds(salt, episodes)
     own, zero = ([run_episode(each._replace(seed=seed))[0] for seed in seeds]
                  for each in (job, Job(job.environment, floor, 0)))
     pairs = [(a["scores"]["error"], b["scores"]["error"]) for a, b in zip(own, zero, strict=True)
@@ -154,8 +152,8 @@ def held_out(record: dict[str, Any], job: Job, salt: bytes, episodes: int, folde
 
 def _gains(record: dict[str, Any], floor: str, errors: dict[str, float], folder: Path) -> list[float]:
     """Of the record's own episodes, if the floor's record lies in the folder."""
-    for other in read_records(folder):
-        if other["method"] == floor and all(other[key] == record[key] for key in ("environment", "source")):
+    for other in newest(read_records(folder))[0]:
+        if (other["method"], other["environment"], other["split"]) == (floor, record["environment"], record["split"]):
             zero = scores_by_seed(other, "error")
             gains = [1.0 - error / zero[seed] for seed, error in errors.items() if zero.get(seed)]
             return gains if len(gains) > 1 else []

@@ -11,11 +11,18 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
-import gymnasium as gym
 import numpy as np
 
-from eitbench.bench.baselines import baseline_folder, is_privileged, load_module, parameters_of, role_of, title_of
-from eitbench.envs import INJECTION
+from eitbench.bench.baselines import (
+    baseline_folder,
+    is_privileged,
+    load_module,
+    parameters_of,
+    role_of,
+    title_of,
+    version_of,
+)
+from eitbench.bench.tracks import Environment, check_track
 from eitbench.envs.injection import InjectionEnv
 from eitbench.envs.injection_core import Rules
 
@@ -38,6 +45,11 @@ class PolicyFile(NamedTuple):
     """Policy(rules, random), if privileged Policy(rules, random, core), with act(observation) -> action."""
     role: str | None = None
     """One of `ROLES`, as of baselines."""
+
+    @property
+    def version(self) -> str:
+        """As `version_of`."""
+        return version_of(self.path, self.sha256)
 
     def suits(self, rules: Rules) -> bool:
         """Whether it can play in this world; a policy without a word on that plays in all."""
@@ -111,7 +123,7 @@ def play(env_id: str, kwargs: dict[str, Any], policy: str | PolicyFile, seed: in
     Parameters
     ----------
     env_id, kwargs
-        One of `INJECTION`, and arguments for it.
+        An environment that asks for injections, and arguments for it.
     policy : str or PolicyFile
         Name or path, or what was loaded.
     estimator : "full" or "reduced"
@@ -162,12 +174,8 @@ def inject(env: InjectionEnv, loaded: PolicyFile, seed: int) -> Iterator[tuple[i
 @lru_cache(maxsize=4)
 def environment(env_id: str, kwargs: str, estimator: str = "full") -> InjectionEnv:
     """Made once a process, so that its models are shared by all episodes; ``kwargs`` are JSON."""
-    if env_id not in INJECTION:
-        raise ValueError(f"env must be one of {', '.join(INJECTION)}; got {env_id!r}")
-    if estimator not in ("full", "reduced"):
-        raise ValueError(f"estimator must be 'full' or 'reduced', got {estimator!r}")
-    env = gym.make(env_id, disable_env_checker=True, observation="raw", estimator=estimator, **json.loads(kwargs))
-    return cast(InjectionEnv, env.unwrapped)
+    check_track(env_id, "injection")
+    return cast(InjectionEnv, Environment(env_id, kwargs).make(estimator=estimator))
 
 
 def adaptivity_gap(table: pd.DataFrame, open_loop: Sequence[str]) -> tuple[float, float, float]:

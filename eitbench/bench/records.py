@@ -1,8 +1,12 @@
 """Records: what one version of a method did in one environment, as JSON that says how to repeat it.
 
+A record says: this version of a method, in this version of a world (the -vN of its id), on these seeds, scored
+this. Numbers decide; commit, machine and digest of the code stand beside each run and decide nothing.
+
 The format is published in ``leaderboards/schema.json``, and a record is checked against it when it is written and when
 it is read. It carries the sha256 of its own content, so that a number changed by hand is noticed. That guards against
-accidents; whether a self-reported number is true is found out by running the method again.
+accidents; whether a self-reported number is true is found out by running the method again. Records of the format
+before are read as well (`eitbench.bench.schema2`).
 """
 
 from __future__ import annotations
@@ -10,6 +14,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import re
 import warnings
 from collections.abc import Iterable
 from functools import lru_cache
@@ -19,14 +24,17 @@ from typing import Any
 import jsonschema
 
 from eitbench._files import shipped, write_atomically
-from eitbench.bench.baselines import BOARDS as ESTIMATION_BOARDS
+from eitbench.bench import schema2, tracks
 from eitbench.data.seeds import name_seed, parse_seeds
-from eitbench.envs import ENTRY_POINTS
 
-SCHEMA = 2
-BOARDS = (*ESTIMATION_BOARDS, "injection")
-SHARED = ("board", "title", "parameters", "role", "privileged", "method_sha256", "checkpoint_sha256", "source")
+SCHEMA = 3
+BOARDS = tracks.ALL_BOARDS
+SHARED = ("board", "title", "parameters", "role", "privileged", "version", "method_sha256", "checkpoint_sha256")
 """What all episodes of a record have in common, beside environment and method."""
+
+
+OURS = re.compile(r"v([1-9][0-9]*)")
+"""Versions of our own methods; of all others a version is eight digits of their file's sha256."""
 
 
 def write_record(folder: Path, record: dict[str, Any]) -> Path:
@@ -45,7 +53,7 @@ def write_record(folder: Path, record: dict[str, Any]) -> Path:
 
 
 def read_record(path: Path) -> dict[str, Any]:
-    """A record as it was written.
+    """A record as it was written; one of the format before as it would be written today.
 
     Raises
     ------
@@ -57,11 +65,15 @@ def read_record(path: Path) -> dict[str, Any]:
         record = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse)
     except (OSError, ValueError) as error:
         raise ValueError(f"record {path} cannot be read: {error}") from None
+    written, name = record, None
+    if isinstance(record, dict) and record.get("schema") == schema2.NUMBER:
+        content, name = schema2.upgraded(path, record)
+        record = sealed(content)
     _check(path, record)
-    if record["sha256"] != sealed(record)["sha256"]:
+    if written.get("sha256") != sealed(written)["sha256"]:
         raise ValueError(f"record {path} was changed since it was written: its sha256 is no longer that of its content")
-    if path.name != file_name(record):
-        raise ValueError(f"record {path} must have the name {file_name(record)}, as its content asks for")
+    if path.name != (name or file_name(record)):
+        raise ValueError(f"record {path} must have the name {name or file_name(record)}, as its content asks for")
     return record
 
 
@@ -70,10 +82,10 @@ def read_records(folder: Path) -> list[dict[str, Any]]:
 
     Records of an environment that is not registered, or no longer in that version, are left out with a warning.
     """
-    records = []
+    records, known = [], set(tracks.ids())
     for path in sorted(Path(folder).glob("*.json")):
         record = read_record(path)
-        if record["environment"]["id"] in ENTRY_POINTS:
+        if record["environment"]["id"] in known:
             records.append(record)
         else:
             warnings.warn(f"record {path} is left out: there is no environment {record['environment']['id']}",
@@ -91,14 +103,9 @@ def sealed(record: dict[str, Any]) -> dict[str, Any]:
     return content | {"sha256": hashlib.sha256(text.encode()).hexdigest()}
 
 
-def version(record: dict[str, Any]) -> str:
-    """Of the method: the first eight digits of its file's sha256."""
-    return record["method_sha256"][:8]
-
-
 def file_name(record: dict[str, Any]) -> str:
     """``ENV--METHOD--VERSION.json``; records of other seeds than test have their split in it too."""
-    parts = [record["environment"]["name"], record["method"], version(record)]
+    parts = [record["environment"]["name"], record["method"], record["version"]]
     return "--".join([*parts, *([] if record["split"] == "test" else [record["split"]])]) + ".json"
 
 
@@ -112,7 +119,7 @@ def alike(runs: Iterable[dict[str, Any]], *keys: str) -> list[list[dict[str, Any
     groups: dict[str, list[dict[str, Any]]] = {}
     for run in runs:
         machine = {key: value for key, value in run["machine"].items() if key != "matmul_seconds"}
-        what = [machine, *(run[key] for key in ("commit", "dirty", "versions", "blas", *keys))]
+        what = [machine, *(run[key] for key in ("commit", "dirty", "source", "versions", "blas", *keys))]
         groups.setdefault(_json(what), []).append(run)
     return list(groups.values())
 
@@ -125,16 +132,26 @@ def finished(record: dict[str, Any]) -> str:
 def newest(records: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Records that may stand on a board together, and the outdated ones, each in the given order.
 
-    Scores depend on the code of the environments (``source``), so a board is of one code only, each environment for
-    itself: that of the official record that was finished last; where none is official, of the last of all.
+    Among those of one environment, one split and one method of ours only the highest version is current; versions of
+    somebody else's method, whose names do not say which came first, stand side by side.
     """
-    last: dict[str, tuple[bool, str, str]] = {}
+    highest: dict[tuple[str, ...], int] = {}
     for record in records:
-        name = record["environment"]["name"]
-        last[name] = max(last.get(name, (False, "", "")), (record["official"], finished(record), record["source"]))
-    current = [record["source"] == last[record["environment"]["name"]][2] for record in records]
+        key = _lineage(record)
+        highest[key] = max(highest.get(key, 0), version_number(record["version"]) or 0)
+    current = [version_number(record["version"]) in (None, highest[_lineage(record)]) for record in records]
     return ([record for record, is_current in zip(records, current, strict=True) if is_current],
             [record for record, is_current in zip(records, current, strict=True) if not is_current])
+
+
+def version_number(version: str) -> int | None:
+    """3 of ``v3``, a version of a method of ours; None for the digits of somebody else's file."""
+    return int(version[1:]) if OURS.fullmatch(version) else None
+
+
+def _lineage(record: dict[str, Any]) -> tuple[str, ...]:
+    """What the versions of one method have in common."""
+    return record["environment"]["name"], record["method"], record["split"]
 
 
 def _check(path: Path, record: Any) -> None:
@@ -147,9 +164,12 @@ def _check(path: Path, record: Any) -> None:
 
 def _contradictions(record: dict[str, Any]) -> list[str]:
     """What the schema cannot say: fields of a valid record that do not fit each other."""
-    wrong, id = [], record["environment"]["id"].replace("/", "-")
-    if record["environment"]["name"] != id and not record["environment"]["name"].startswith(f"{id}-"):
-        wrong.append(f"$.environment.name: must begin with {id}")
+    wrong, environment = [], record["environment"]
+    name = tracks.named(environment["id"], environment["kwargs"])
+    if environment["name"] != name:
+        wrong.append(f"$.environment.name: must be {name}, as id and kwargs ask for")
+    if record["version"] != record["method_sha256"][:8] and version_number(record["version"]) is None:
+        wrong.append("$.version: must be v1, v2, … of ours, or begin as method_sha256 does")
     if record["seeds"] != [episode["seed"] for episode in record["episodes"]]:
         wrong.append("$.seeds: must be those of the episodes, in their order")
     wrong += [f"$.seeds: {seed!r} names no episode" for seed in record["seeds"] if not _names_an_episode(seed)]

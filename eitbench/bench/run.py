@@ -13,7 +13,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import gymnasium as gym
 import numpy as np
 import scipy
 from threadpoolctl import threadpool_limits
@@ -21,43 +20,20 @@ from tqdm import tqdm
 
 from eitbench import _check
 from eitbench.bench import policies
-from eitbench.bench.baselines import BOARDS, Baseline, load_baseline
+from eitbench.bench.baselines import Baseline, load_baseline
 from eitbench.bench.sandbox import guests
 from eitbench.bench.sandbox.host import GuestError
 from eitbench.bench.sandbox.wall import landlock_version
 from eitbench.bench.score import Played, score
 from eitbench.bench.store import EpisodeStore, machine, provenance, source_digest
+from eitbench.bench.tracks import KINDS, Environment, board_of
 from eitbench.data.bank import fill
 from eitbench.data.episodes import simulate
 from eitbench.data.parallel import in_parallel
 from eitbench.data.seeds import name_seed
-from eitbench.envs import ENTRY_POINTS, INJECTION
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.injection import InjectionEnv
 from eitbench.worlds.task import Estimate, Task
-
-
-class Environment(NamedTuple):
-    """A registered id with keyword arguments: what is made, and what a record names."""
-
-    id: str
-    kwargs: str = "{}"
-    """JSON"""
-
-    @property
-    def name(self) -> str:
-        """Fit for a folder; other arguments, other name."""
-        digest = hashlib.sha256(self.kwargs.encode()).hexdigest()[:8]
-        return self.id.replace("/", "-") + ("" if self.kwargs == "{}" else f"-{digest}")
-
-    def make(self, **extra: Any) -> EstimationEnv:
-        """A fresh environment, without gymnasium's wrappers; ``ValueError`` if there is none of this id."""
-        if self.id not in ENTRY_POINTS:
-            raise ValueError(f"env must be one of {', '.join(ENTRY_POINTS)}; got {self.id!r}")
-        env = gym.make(self.id, disable_env_checker=True, **json.loads(self.kwargs), **extra).unwrapped
-        if not isinstance(env, EstimationEnv):
-            raise ValueError(f"environment {self.id} does not ask for estimates; its class is {type(env).__name__}")
-        return env
 
 
 class Job(NamedTuple):
@@ -73,12 +49,9 @@ class Job(NamedTuple):
     def load(self) -> Baseline | policies.PolicyFile:
         """The method's file."""
         if self.isolated:
-            kind = "policy" if self.environment.id in INJECTION else "estimator"
-            spec = _environment(self.environment).spec
-            assert spec is not None
-            kwargs = spec.kwargs | ({"estimator": "none"} if kind == "policy" else {})        # it needs the rules only
-            return guests.load(kind, self.environment.id, json.dumps(kwargs), self.method)
-        return (policies.load_policy if self.environment.id in INJECTION else load_baseline)(self.method)
+            kwargs = json.dumps(self.environment.rules_only())
+            return guests.load(KINDS[self.environment.track], self.environment.id, kwargs, self.method)
+        return (policies.load_policy if self.environment.track == "injection" else load_baseline)(self.method)
 
     @property
     def isolation(self) -> str:
@@ -87,16 +60,10 @@ class Job(NamedTuple):
 
     def identity(self) -> str:
         """What the outcome depends on; a stored result counts only for the very same."""
-        parts = [*self.environment, self.load().sha256, str(self.seed), source_digest(), np.__version__,
+        method = self.load()
+        parts = [*self.environment, method.sha256, method.version, str(self.seed), source_digest(), np.__version__,
                  scipy.__version__]
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
-
-
-def board_of(env: EstimationEnv | InjectionEnv) -> str:
-    """Which of `BOARDS` an environment belongs to, or ``injection``."""
-    if isinstance(env, InjectionEnv):
-        return "injection"
-    return BOARDS[0] if env.lag == 0 else BOARDS[2] if env.lag == env.scenario.n_steps - 1 else BOARDS[1]
 
 
 def play(env: EstimationEnv, baseline: Baseline, seed: int) -> Iterator[tuple[int, Estimate]]:
@@ -187,11 +154,11 @@ def run_episode(job: Job) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     result: dict[str, Any] = {
         "identity": job.identity(), "seed": name_seed(job.seed), "method": method.name, "title": method.title,
         "parameters": method.parameters, "role": method.role, "privileged": method.privileged,
-        "method_sha256": method.sha256, "checkpoint_sha256": method.sha256 if method.path.suffix == ".zip" else None,
+        "version": method.version, "method_sha256": method.sha256,
+        "checkpoint_sha256": method.sha256 if method.path.suffix == ".zip" else None,
         "board": board_of(env),
-        "environment": {"id": job.environment.id, "name": job.environment.name,
-                         "kwargs": env.spec.kwargs if env.spec else {}},
-        "source": source_digest(), "finished": None, "peak_memory": None,
+        "environment": {"id": job.environment.id, "name": job.environment.name, "kwargs": job.environment.given},
+        "finished": None, "peak_memory": None,
     }
     fields: dict[str, np.ndarray] = {}
     begin = time.perf_counter()
@@ -252,11 +219,11 @@ def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1, backend: 
     for job in todo:
         env = _environment(job.environment)
         if isinstance(env, InjectionEnv):
-            recordings.setdefault(env.scenario, []).append(job.seed)
+            recordings.setdefault(env.world, []).append(job.seed)
         else:
-            truths.setdefault((env.scenario, job.seed), job)
-    for scenario, seeds in recordings.items():
-        fill(scenario, seeds, n_jobs=n_jobs, backend=backend)
+            truths.setdefault((env.world, job.seed), job)
+    for world, seeds in recordings.items():
+        fill(world, seeds, n_jobs=n_jobs, backend=backend)
     run, home = {"command": command, **provenance(), "machine": machine()}, platform.node()
     guests.close()                                  # that of `Job.load`; the workers have their own
     try:
@@ -270,7 +237,7 @@ def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1, backend: 
 
 
 def _simulate_job(job: Job) -> None:
-    simulate(_environment(job.environment).scenario, job.seed, progress=False)
+    simulate(_environment(job.environment).world, job.seed, progress=False)
 
 
 def _run_job(job: Job, store: EpisodeStore, run: dict[str, Any], home: str) -> None:
@@ -283,7 +250,7 @@ def _run_job(job: Job, store: EpisodeStore, run: dict[str, Any], home: str) -> N
 @lru_cache(maxsize=4)
 def _environment(environment: Environment) -> EstimationEnv | InjectionEnv:
     """Made once a process, so that models and what estimators derive from them are shared by its episodes."""
-    if environment.id in INJECTION:
+    if environment.track == "injection":
         kwargs, estimator = _inside(environment)
         return policies.environment(environment.id, json.dumps(kwargs), estimator)
     return environment.make()

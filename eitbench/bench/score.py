@@ -1,4 +1,4 @@
-"""Score one played episode on the truth's mesh (problem.md §4)."""
+"""Score one played episode on the truth's mesh (``docs/methods.md``, 4)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from eitbench import scoring
-from eitbench.data.recordings import score_operators
+from eitbench.data.regions import region_operators
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.estimation import best_homogeneous
 from eitbench.worlds.task import Estimate, Task
@@ -76,7 +76,7 @@ def score(env: EstimationEnv, played: Played) -> dict[str, Any]:
     ``error`` is ẽ_c (5.12); a score that needs a claimed variance or innovation is None without one.
     """
     task, truth = env.task, env.truth()
-    interpolation, mass = score_operators(env.scenario)
+    interpolation, mass = region_operators(env.world)
     scored = slice(task.warm_up, None)
     c = truth[scored]
     mean = (interpolation @ played.means[scored].T).T

@@ -12,7 +12,6 @@ import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,8 +29,6 @@ if TYPE_CHECKING:
 PACKAGES = ("eitbench", "numpy", "scipy", "gymnasium", "scikit-fem", "numba", "stable-baselines3", "sb3-contrib",
             "torch")
 """Whose versions a record names."""
-_VERSION = ("source", "method_sha256")
-"""What results of one record must agree in."""
 _NEEDED = {"identity", "seed", "method", "environment", "finished", "status", "run", *SHARED}
 
 
@@ -74,16 +71,19 @@ class EpisodeStore:
             return dict(stored)
 
     def records(self, also: Iterable[dict[str, Any]] = ()) -> list[dict[str, Any]]:
-        """The episodes, and ``also`` results of others or of such as failed here, gathered into one record per
-        environment, method and split of the seeds; not checked yet."""
-        gathered: dict[tuple[str, str, str], dict[tuple[str, ...], dict[str, Any]]] = {}
-        for result in chain(self.results(), also):
-            key = (json.dumps(result["environment"], sort_keys=True), result["method"], split_of(result["seed"]))
-            episode = (result["seed"], *(result[what] for what in _VERSION))
-            first = gathered.setdefault(key, {}).setdefault(episode, result)
-            if first["status"] != "ok":
-                gathered[key][episode] = result
-        return [_gathered(list(results.values())) for results in gathered.values()]
+        """The episodes, gathered into one record per environment, method and split of the seeds; not checked yet.
+
+        Of what lies here only results of the latest run's code count, so that nothing stale is taken for new.
+        ``also`` are results of records: where they are of the same version of the method, they fill in what is missing
+        here or failed.
+        """
+        own, others = _by_record(self.results()), _by_record(also)
+        records = []
+        for key in dict.fromkeys([*own, *others]):
+            fresh = _of_one_code(own.get(key, []))
+            version = max(fresh or others[key], key=lambda result: result["finished"])["version"]
+            records.append(_gathered([*fresh, *(each for each in others.get(key, []) if each["version"] == version)]))
+        return records
 
     def write_records(self) -> list[dict[str, Any]]:
         """Write the `records` into ``records/`` and return them.
@@ -105,12 +105,32 @@ class EpisodeStore:
         return self.folder / "episodes" / environment.replace("/", "-") / method / name
 
 
+def _by_record(results: Iterable[dict[str, Any]]) -> dict[tuple[str, str, str], list[dict[str, Any]]]:
+    """Results that may stand in one record: of an environment, a method and a split."""
+    groups: dict[tuple[str, str, str], list[dict[str, Any]]] = {}
+    for result in results:
+        key = (result["environment"]["name"], result["method"], split_of(result["seed"]))
+        groups.setdefault(key, []).append(result)
+    return groups
+
+
+def _of_one_code(results: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Those of the library and the method's file that ran last."""
+    codes = [(result["run"]["source"], result["method_sha256"]) for result in results]
+    if not codes:
+        return []
+    latest = max(range(len(results)), key=lambda k: results[k]["finished"])
+    return [result for result, code in zip(results, codes, strict=True) if code == codes[latest]]
+
+
 def _gathered(results: list[dict[str, Any]]) -> dict[str, Any]:
-    """The record of one method's episodes, self-reported. Those of different code never stand in one record: those of
-    the latest run's code do."""
+    """The record of one version's episodes, self-reported; of several results of a seed the first successful one."""
     latest = max(results, key=lambda result: result["finished"])
-    results = sorted((r for r in results if all(r[key] == latest[key] for key in _VERSION)),
-                     key=lambda result: (len(result["seed"]), result["seed"]))                  # 9 before 10
+    chosen: dict[str, dict[str, Any]] = {}
+    for result in results:
+        if chosen.setdefault(result["seed"], result)["status"] != "ok":
+            chosen[result["seed"]] = result
+    results = sorted(chosen.values(), key=lambda result: (len(result["seed"]), result["seed"]))      # 9 before 10
     runs: list[dict[str, Any]] = []
     for result in results:
         if result["run"] not in runs:
@@ -136,10 +156,15 @@ def results_in(folder: Path) -> list[dict[str, Any]]:
 
 
 def successful(jobs: Iterable[Job], results: Iterable[dict[str, Any]]) -> dict[Job, dict[str, Any]]:
-    """The successful results of the jobs that have one: of the same method's name and of the very same identity."""
-    fine = {(result["method"], result["identity"]): result for result in results if result["status"] == "ok"}
-    named = ((job, (job.load().name, job.identity())) for job in jobs)
-    return {job: fine[name] for job, name in named if name in fine}
+    """The successful results of the jobs that have one, the first of each: of the same environment, method, version and
+    seed, whatever code it was that played."""
+    fine: dict[tuple[str, ...], dict[str, Any]] = {}
+    for result in results:
+        if result["status"] == "ok":
+            what = (result["environment"]["name"], result["method"], result["version"], result["seed"])
+            fine.setdefault(what, result)
+    named = ((job, (job.environment.name, job.load().name, job.load().version, name_seed(job.seed))) for job in jobs)
+    return {job: fine[what] for job, what in named if what in fine}
 
 
 def unplayed(jobs: Sequence[Job], results: Iterable[dict[str, Any]]) -> list[Job]:
@@ -163,7 +188,8 @@ def _read_json(path: Path) -> dict[str, Any] | None:
 
 @lru_cache(maxsize=1)
 def source_digest() -> str:
-    """Hash of the code that scores depend on: results of other code are not taken for this one's."""
+    """Hash of the code that scores depend on: stored results of other code are played again, and a record says of each
+    run which it was."""
     rooms = ("numerics/*", "physics/*", "worlds/*", "data/*", "estimation/**/*", "scoring", "envs/*", "rl/networks",
              "rl/agents", "bench/run", "bench/score", "bench/policies")
     return code_digest(package_files(*(f"{room}.py" for room in rooms)))
@@ -178,6 +204,7 @@ def provenance() -> dict[str, Any]:
         "versions": {"python": platform.python_version(), **{name: _version(name) for name in PACKAGES}},
         "blas": f"{blas['name']} {blas['version']}",
         "commit": _git("rev-parse", "HEAD"), "dirty": None if status is None else bool(status),
+        "source": source_digest(),
     }
 
 

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+import glob
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from eitbench.bench import suites
-from eitbench.bench.records import file_name, read_record, split_of, write_record
+from eitbench.bench import suites, tracks
+from eitbench.bench.records import read_record, split_of, write_record
 from eitbench.bench.run import Job, run_jobs
-from eitbench.bench.store import EpisodeStore, provenance, results_of, source_digest, unplayed
+from eitbench.bench.store import EpisodeStore, provenance, results_of, unplayed
 from eitbench.data.seeds import name_seed
-from eitbench.envs import ENTRY_POINTS, INJECTION
 from eitbench.report.summary import seed_ranges
 
 
@@ -41,14 +41,14 @@ def submit(method: str | None, environments: list[str], seeds: list[int] | None,
     Yields
     ------
     path
-        Of a record. All test episodes that the store, or a record there before, holds of this method and this code are
+        Of a record. All test episodes that the store, or a record there before, holds of this version of the method are
         in them, those that failed too.
 
     Raises
     ------
     ValueError
         If a seed is not of the test split, the method does not play one of the environments, an official one is asked
-        for from a checkout with changes, or a record is not valid or would replace one of the same code that says more.
+        for from a checkout with changes, or a record is not valid or would replace one that says more.
     """
     code = provenance()
     if official and (code["commit"] is None or code["dirty"]):
@@ -59,45 +59,43 @@ def submit(method: str | None, environments: list[str], seeds: list[int] | None,
         raise ValueError(f"seeds of a submission must be of the test split, got {', '.join(outside)}")
     if method is not None and not environments:
         raise ValueError("env must name at least one environment to submit for")
-    asked = (_jobs(method, id, policy, seeds, isolate) for id in environments or ENTRY_POINTS)
+    asked = (_jobs(method, id, policy, seeds, isolate) for id in environments or tracks.ids())
     for jobs in asked if method is None else list(asked):          # what does not fit is said before anything is played
         before = list[dict[str, Any]]()
         for job in {(job.environment, job.method): job for job in jobs}.values():
-            path = _path_of(Path(to), job)
-            if (earlier := _earlier(path, source_digest())) is not None:
+            for path, earlier in _earlier(Path(to), job.environment.name, job.load().name, job.load().version):
                 _check_nothing_is_lost(path, earlier, official)
                 before += results_of(earlier) if earlier["official"] == official else []
         run_jobs(unplayed(jobs, before), store, n_jobs=n_jobs, backend=backend, command=command)
         played = {(job.environment.name, job.load().name) for job in jobs}
         made = [record | {"official": official} for record in store.records(also=before)
                 if (record["environment"]["name"], record["method"]) in played and record["split"] == "test"]
-        for record in made:
-            path = Path(to) / file_name(record)
-            if (earlier := _earlier(path, record["source"])) is not None:
+        there = [_earlier(Path(to), record["environment"]["name"], record["method"], record["version"])
+                 for record in made]
+        for record, replaced in zip(made, there, strict=True):
+            for path, earlier in replaced:
                 _check_nothing_is_lost(path, earlier, official, record["seeds"])
-        for record in made:
-            yield write_record(to, record)
+        for record, replaced in zip(made, there, strict=True):
+            written = write_record(to, record)
+            for path, _ in replaced:
+                if path != written:                        # of an older format, under another name
+                    path.unlink()
+            yield written
 
 
 def _jobs(method: str | None, id: str, policy: bool, seeds: list[int] | None, isolate: str) -> list[Job]:
     """What is to be played in one environment."""
     methods = [] if method is None else [method]
-    if id in INJECTION if method is None else policy:
+    if tracks.track_of(id) == "injection" if method is None else policy:
         return suites.policy_jobs([id], methods, seeds, isolate=isolate)
     return suites.jobs("full", [id], methods, seeds, isolate=isolate)
 
 
-def _path_of(to: Path, job: Job) -> Path:
-    """Where the record of a job's method will lie."""
-    method = job.load()
-    return to / file_name({"environment": {"name": job.environment.name}, "method": method.name,
-                           "method_sha256": method.sha256, "split": "test"})
-
-
-def _earlier(path: Path, source: str) -> dict[str, Any] | None:
-    """The record at ``path``, if it is one of the same code; an outdated one is played again."""
-    record = read_record(path) if path.exists() else None
-    return record if record is not None and record["source"] == source else None
+def _earlier(to: Path, environment: str, method: str, version: str) -> list[tuple[Path, dict[str, Any]]]:
+    """Records of test episodes of this version that are there; at most one, unless of several formats."""
+    found = [(path, read_record(path)) for path in sorted(to.glob(f"{environment}--{glob.escape(method)}--*.json"))]
+    return [(path, record) for path, record in found
+            if (record["method"], record["version"], record["split"]) == (method, version, "test")]
 
 
 def _check_nothing_is_lost(path: Path, earlier: dict[str, Any], official: bool, seeds: list[str] | None = None) -> None:

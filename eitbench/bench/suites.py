@@ -4,24 +4,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 from eitbench.bench.baselines import Baseline, find_baseline, is_ours, load_baseline, own_baselines
 from eitbench.bench.policies import environment as injection_environment
 from eitbench.bench.policies import find_policy, load_policy, own_agents, own_policies
-from eitbench.bench.run import Environment, Job, board_of
-from eitbench.data.seeds import parse_seeds
-from eitbench.envs import ESTIMATION, INJECTION
-from eitbench.envs.estimation import EstimationEnv
+from eitbench.bench.run import Job
+from eitbench.bench.tracks import ESTIMATORS, QUICK, Environment, board_of, check_track, default_seeds, ids
 
-QUICK = ("eitbench/Pipe2D-v0", "eitbench/Pipe2DFixedLag-v0", "eitbench/Pipe2DSmoothing-v0")
-"""What the quick suite runs; the full one runs all that ask for estimates."""
-SEEDS = {"quick": "test:0-3", "full": "test:0-9"}
-POLICY_SEEDS = {"eitbench/Pipe2DInjectionFaults-v0": "test:0-49", "eitbench/Pipe2DInjectionBudget-v0": "test:0-49",
-                "eitbench/Pipe2DInjectionFlow-v0": "test:0-29"}
-"""Competitions have many, fewer where the estimator inside takes a minute an episode. Others: test:0-9."""
-FEWER_SEEDS = {"velocity": "test:0-5", "3d": "test:0-5"}
-"""In the full suite, where an episode takes a minute a method and more: with the flow asked for too, and in 3D. With
-fewer than six there would be no intervals and no ranks."""
 # An image at every step: minutes an episode.
 TOO_SLOW_FOR_QUICK = {("filter", "gauss_newton")}
 ISOLATE = ("never", "others", "always")
@@ -41,14 +31,13 @@ def jobs(suite: str, environments: list[str], baselines: list[str], seeds: list[
     for baseline in baselines:
         find_baseline(baseline)
     todo, names = [], dict[str, str]()
-    environments = environments or list(QUICK if suite == "quick" else ESTIMATION)
+    environments = environments or list(QUICK if suite == "quick" else ids("estimation"))
     for name in environments:
+        check_track(name, "estimation")
         environment = Environment(name)
-        env = environment.make()
-        board, slow = board_of(env), _expensive(env)
-        numbers = seeds
-        if numbers is None:
-            numbers = parse_seeds(FEWER_SEEDS[slow] if slow and suite == "full" else SEEDS[suite])
+        env: Any = environment.make()
+        board = board_of(env)
+        numbers = default_seeds(env, name, suite) if seeds is None else seeds
         suited = list[Job]()
         for baseline in baselines or own_baselines():
             skipped = suite == "quick" and not baselines and (board, baseline) in TOO_SLOW_FOR_QUICK
@@ -70,28 +59,29 @@ def jobs(suite: str, environments: list[str], baselines: list[str], seeds: list[
 def policy_jobs(environments: list[str], policies: list[str], seeds: list[int] | None = None,
                 estimator: str = "full", *, isolate: str = "others") -> list[Job]:
     """Every named policy (default: all of ours that suit, trained agents among them) in every named environment, on
-    ``seeds`` (default: those of `POLICY_SEEDS`), with this estimator inside. ``isolate`` is one of `ISOLATE`.
+    ``seeds`` (default: those of the boards), with this estimator inside. ``isolate`` is one of `ISOLATE`.
 
     Raises
     ------
     ValueError
         If an environment does not ask for injections, or a policy does not exist or suit one.
     """
-    if estimator not in ("full", "reduced"):
-        raise ValueError(f"estimator must be 'full' or 'reduced', got {estimator!r}")
+    if estimator not in ESTIMATORS:
+        raise ValueError(f"estimator must be one of {', '.join(ESTIMATORS)}, got {estimator!r}")
     kwargs = "{}" if estimator == "full" else json.dumps({"estimator": estimator})
     for policy in policies:
         find_policy(policy)
     todo, names = [], dict[str, str]()
     for id in environments:
-        environment, rules = Environment(id, kwargs), injection_environment(id, "{}", "reduced").rules
+        check_track(id, "injection")
+        environment, env = Environment(id, kwargs), injection_environment(id, "{}", "reduced")
         for policy in policies or [*own_policies(), *own_agents(id)]:
             job = Job(environment, _absolute(policy), 0, is_isolated(environment, policy, isolate))
             loaded = job.load()
             assert not isinstance(loaded, Baseline)
             names[policy] = loaded.name
-            numbers = parse_seeds(POLICY_SEEDS.get(id, SEEDS["full"])) if seeds is None else seeds
-            if loaded.suits(rules):
+            numbers = default_seeds(env, id) if seeds is None else seeds
+            if loaded.suits(env.rules):
                 todo += [job._replace(seed=seed) for seed in numbers]
             elif policies:
                 raise ValueError(f"policy {loaded.name} does not suit {id}")
@@ -105,7 +95,7 @@ def is_isolated(environment: Environment, method: str, isolate: str) -> bool:
         raise ValueError(f"isolate must be one of {', '.join(ISOLATE)}, got {isolate!r}")
     if isolate != "always" or not is_ours(method):
         return isolate != "never" and not is_ours(method)
-    return not (load_policy if environment.id in INJECTION else load_baseline)(method).privileged
+    return not (load_policy if environment.track == "injection" else load_baseline)(method).privileged
 
 
 def _distinct(names: dict[str, str]) -> None:
@@ -114,11 +104,6 @@ def _distinct(names: dict[str, str]) -> None:
     for file, name in names.items():
         if first.setdefault(name, file) != file:
             raise ValueError(f"{first[name]} and {file} have the same name, under which results are kept; rename one")
-
-
-def _expensive(env: EstimationEnv) -> str | None:
-    """Which of `FEWER_SEEDS` an environment is among."""
-    return "velocity" if env.task.velocity is not None else "3d" if env.task.mesh.dim == 3 else None
 
 
 def _absolute(method: str) -> str:

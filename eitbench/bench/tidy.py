@@ -8,11 +8,11 @@ from pathlib import Path
 import pandas as pd
 
 from eitbench._files import shipped
-from eitbench.bench.records import newest, read_records, version
+from eitbench.bench.records import newest, read_records
 
 COLUMNS = ("environment", "board", "method", "version", "title", "role", "privileged", "official", "outdated", "split",
            "seed", "status", "metric", "value")
-_OF_RECORDS = ("board", "method", "title", "role", "privileged", "official", "split")
+_OF_RECORDS = ("board", "method", "version", "title", "role", "privileged", "official", "split")
 
 
 def tidy(folder: Path | str | None = None) -> pd.DataFrame:
@@ -22,7 +22,7 @@ def tidy(folder: Path | str | None = None) -> pd.DataFrame:
                                (False, True), strict=True):
         for record in group:
             shared = {name: record[name] for name in _OF_RECORDS} | {
-                "environment": record["environment"]["name"], "version": version(record), "outdated": outdated}
+                "environment": record["environment"]["name"], "outdated": outdated}
             for episode in record["episodes"]:
                 finished = episode["status"] == "ok"
                 scores = (episode["scores"] | {"peak_memory": episode["peak_memory"]} if finished

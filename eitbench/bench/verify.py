@@ -11,23 +11,23 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pandas as pd
 
 from eitbench import _check
-from eitbench.bench.baselines import find_baseline, load_baseline, own_baselines
+from eitbench.bench.baselines import find_baseline, is_ours, load_baseline, own_baselines
 from eitbench.bench.policies import find_policy, load_policy, own_agents, own_policies
-from eitbench.bench.records import SHARED
-from eitbench.bench.run import Environment, Job, run_episode
+from eitbench.bench.records import SHARED, version_number
+from eitbench.bench.run import Job, run_episode
 from eitbench.bench.sandbox import guests
-from eitbench.bench.store import source_digest
 from eitbench.bench.suites import is_isolated
-from eitbench.data.episodes import CACHE_VARIABLE
+from eitbench.bench.tracks import Environment, track_of
 from eitbench.data.seeds import parse_seeds
-from eitbench.envs import INJECTION
+from eitbench.data.store import CACHE_VARIABLE
 from eitbench.report.summary import as_markdown
 
+OF_OURS = ("board", "role", "privileged")
+"""What must be as a record says of a method of ours, beside its numbers: its words may be mended."""
 TOLERANCE = 1e-6
 """Relative difference of a score that is none, on one machine; sums are taken in another order on another."""
 UNCERTAIN = ("seconds_per_step",)
@@ -40,28 +40,26 @@ def job_of(record: dict[str, Any], file: str | None = None, isolate: str = "alwa
     Raises
     ------
     ValueError
-        If there is no such method, it or the environment's code is not that of the record, or the record gives the
-        registered environment another name.
+        If there is no such method, or the file of one that is not ours is not that of the record.
     """
-    id = record["environment"]["id"]
-    kwargs = {key: value for key, value in record["environment"]["kwargs"].items()
-              if key != "observation" or id not in INJECTION}                  # what policies see is not a choice
-    environment = Environment(id)
-    if record["environment"]["name"] != environment.name:
-        if kwargs == gym.spec(id).kwargs | ({"estimator": "full"} if id in INJECTION else {}):
-            raise ValueError(f"the record's environment must be named {environment.name}, whose arguments it has, got "
-                             f"{record['environment']['name']}")
-        environment = Environment(id, json.dumps(kwargs))
+    environment = Environment(record["environment"]["id"], json.dumps(record["environment"]["kwargs"]))
     method = _own(record) if file is None else str(Path(file).absolute())
     if method is None:
         raise ValueError(f"{record['method']} is none of ours: its file must be given, as --baseline or --policy")
-    path = (find_policy if id in INJECTION else find_baseline)(method)
-    wrong = [f"{what} is {found}, that of the record {record[field]}" for what, found, field in (
-        (f"the sha256 of {path.name}", hashlib.sha256(path.read_bytes()).hexdigest(), "method_sha256"),
-        ("the digest of the environments' code", source_digest(), "source")) if found != record[field]]
-    if wrong:
-        raise ValueError(f"what the record says cannot be played here: {'; '.join(wrong)}")
+    path = (find_policy if environment.track == "injection" else find_baseline)(method)
+    found = hashlib.sha256(path.read_bytes()).hexdigest()
+    if found != record["method_sha256"] and not is_ours(method):
+        raise ValueError(f"what the record says cannot be played here: the sha256 of {path.name} is {found}, that of "
+                         f"the record {record['method_sha256']}")
     return Job(environment, method, 0, is_isolated(environment, method, isolate))
+
+
+def outdated(record: dict[str, Any], job: Job) -> str:
+    """A sentence if the record is of an older version than the method of ours is now; else nothing."""
+    now, then = version_number(job.load().version), version_number(record["version"])
+    if now is None or then is None or then >= now:
+        return ""
+    return f"the record is of {record['version']}, and {record['method']} is now v{now}: other numbers are no wonder"
 
 
 def verify(record: dict[str, Any], job: Job, *, episodes: int = 3, seed: int = 0,
@@ -83,6 +81,7 @@ def verify(record: dict[str, Any], job: Job, *, episodes: int = 3, seed: int = 0
         Markdown, and a sentence for each thing that is not as the record says.
     """
     _check.integer("episodes", episodes, low=1)
+    stated = OF_OURS if is_ours(job.method) else (*SHARED, "method")
     drawn = np.random.default_rng(seed).permutation(len(record["episodes"]))[:episodes]
     rows, differences = [], list[str]()
     for said in (record["episodes"][i] for i in sorted(drawn)):
@@ -90,9 +89,8 @@ def verify(record: dict[str, Any], job: Job, *, episodes: int = 3, seed: int = 0
         wrong = differences_of(said, again)
         differences += [f"{said['seed']}: {_difference(name, said, again)}"
                         for name, off in wrong.items() if off > tolerance]
-        again["environment"]["name"] = record["environment"]["name"]             # arguments may stand in another order
         differences += [f"{name} is {again[name]!r}, the record says {record[name]!r}"
-                        for name in (*SHARED, "environment", "method") if again[name] != record[name]]
+                        for name in (*stated, "environment") if again[name] != record[name]]
         worst = max(wrong, key=lambda name: wrong[name], default="")
         rows.append({"episode": said["seed"], "greatest difference in": worst if wrong.get(worst) else "none",
                      "relative": f"{wrong.get(worst, 0.0):.1g}", "record's ẽ_c": _value(said, "error"),
@@ -119,7 +117,7 @@ def empty_cache() -> Iterator[None]:
 def _own(record: dict[str, Any]) -> str | None:
     """Ours of the record's name."""
     id, name = record["environment"]["id"], record["method"]
-    if id not in INJECTION:
+    if track_of(id) == "estimation":
         return next((own for own in own_baselines() if load_baseline(own).name == name), None)
     return next((own for own in [*own_policies(), *own_agents(id)] if load_policy(own).name == name), None)
 

@@ -1,5 +1,5 @@
-"""The command line: `eitbench list | run | bank | train | policies | submit | verify | held-out | leaderboard |
-compare | render | reproduce`."""
+"""The command line: `eitbench list | run | bank | train | policies | submit | verify | held-out | migrate |
+leaderboard | compare | render | reproduce`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import typer
 
 from eitbench.cli.options import CORES, Backend, Backends, Isolate, Isolation, Jobs, Out, clear_errors
 from eitbench.cli.studies import thesis
-from eitbench.cli.trust import held_out, verify
+from eitbench.cli.trust import held_out, migrate, verify
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, context_settings={
     "help_option_names": ["-h", "--help"]}, help="""
@@ -54,15 +54,14 @@ def list_() -> None:
     import gymnasium as gym
 
     from eitbench.bench.baselines import load_baseline, own_baselines
-    from eitbench.bench.run import Environment, board_of
-    from eitbench.envs import ESTIMATION, INJECTION
+    from eitbench.bench.tracks import Environment, board_of, ids
     typer.echo("environments")
-    for name in ESTIMATION:
-        env = Environment(name).make()
-        scenario = env.scenario
-        typer.echo(f"  {name:40} {board_of(env):10}  lag {env.lag}, {scenario.n_steps - scenario.warm_up} scored of "
-                   f"{scenario.n_steps} states, {env.action_space.shape[0]} numbers each")  # type: ignore[index]
-    for name in INJECTION:
+    for name in ids("estimation"):
+        env: Any = Environment(name).make()
+        world = env.world
+        typer.echo(f"  {name:40} {board_of(env):10}  lag {env.lag}, {world.n_steps - world.warm_up} scored of "
+                   f"{world.n_steps} states, {env.action_space.shape[0]} numbers each")
+    for name in ids("injection"):
         core = gym.make(name).unwrapped.core  # type: ignore[attr-defined]
         rules = core.rules
         what = f"{len(rules.pairs)} electrode pairs" if rules.limit is None else f"{rules.limit} currents"
@@ -115,23 +114,24 @@ def bank(
     import shutil
 
     from eitbench.data.bank import fill, missing_seeds, recording_bytes
-    from eitbench.data.episodes import folder
     from eitbench.data.seeds import parse_seeds
-    from eitbench.envs import scenario_of
+    from eitbench.data.store import folder
+    from eitbench.worlds.registry import entry
     with clear_errors():
-        numbers, scenario = parse_seeds(seeds), scenario_of(env)
-    place, each = folder(scenario), recording_bytes(scenario)
+        numbers = parse_seeds(seeds)
+        world = entry(env).world
+    place, each = folder(world), recording_bytes(world)
     try:
         place.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise typer.BadParameter(f"recordings cannot be kept in {place}: {error}") from error
-    missing = len(missing_seeds(scenario, numbers))
+    missing = len(missing_seeds(world, numbers))
     typer.echo(f"{len(numbers)} episodes, {len(numbers) * each / 1e6:.0f} MB in {place}; {missing} to simulate")
     free = shutil.disk_usage(place).free
     if missing * each > free:
         raise typer.BadParameter(f"seeds need {missing * each / 1e9:.1f} GB more, and {free / 1e9:.1f} GB are free")
     with clear_errors():
-        made = fill(scenario, numbers, n_jobs=jobs, backend=backend)
+        made = fill(world, numbers, n_jobs=jobs, backend=backend)
     typer.echo(f"{made} simulated, {len(numbers) - made} were there")
 
 
@@ -235,6 +235,7 @@ def submit(
 
 app.command()(verify)
 app.command("held-out")(held_out)
+app.command()(migrate)
 
 
 @app.command()
@@ -299,10 +300,10 @@ def render(
         "results/episode.gif"),
 ) -> None:
     """Draw an episode: truth, estimate, its spread, electrodes and the injected pair."""
-    from eitbench.envs import INJECTION
+    from eitbench.bench.tracks import track_of
     from eitbench.report.animate import animate
     with clear_errors():
-        if env in INJECTION and policy is None:
+        if track_of(env) == "injection" and policy is None:
             raise ValueError(f"policy must be given for {env}, which asks for injections")
         typer.echo(f"wrote {animate(env, policy or baseline, seed, step, out, every=every)}")
 

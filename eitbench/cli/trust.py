@@ -57,6 +57,8 @@ def verify(
         with again.empty_cache():
             claimed = read_record(record)
             job, differences = again.job_of(claimed, baseline or policy, isolate), list[str]()
+            if remark := again.outdated(claimed, job):
+                typer.echo(f"{remark}\n")
             if episodes:
                 table, differences = again.verify(claimed, job, episodes=episodes, seed=seed, tolerance=tolerance)
                 typer.echo(f"episodes drawn with --seed {seed}, isolation {job.isolation}\n\n{table}\n")
@@ -91,6 +93,16 @@ def _verify_all(folder: Path, environments: list[str], out: Path, episodes: int,
                    f"{row['problem'] or row['score'] + ' by ' + format(row['difference'], '.2g')}", err=True)
     if len(wrong):
         raise typer.Exit(1)
+
+
+def migrate(
+    folder: Annotated[Path, typer.Argument(exists=True, file_okay=False, help="Folder of records.")],
+) -> None:
+    """For maintainers: rewrite records of an older format in that of today; no episode, score or run is lost."""
+    from eitbench.bench.migrate import migrate as rewritten
+    with clear_errors():
+        for old, new in rewritten(folder):
+            typer.echo(f"{old.name} -> {new.name}")
 
 
 def held_out(

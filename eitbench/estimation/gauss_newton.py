@@ -78,8 +78,8 @@ class _NormalEquations:
 
     Where P is sparse and A has far fewer rows than columns, x = P₀⁻¹g − W (C + V W)⁻¹ Wᵀg with
     P₀ = P + ρ e eᵀ, V = (A; √ρ eᵀ), C = diag(1, …, 1, −1) and W = P₀⁻¹Vᵀ (Woodbury). The unit
-    vector e is there for penalties of gradients, which leave a constant free. If P leaves more free,
-    P₀ is singular, or a residual stays; then, and for all others, AᵀA + P is factorised whole.
+    vector e is there for penalties of gradients, which leave a constant free. If P leaves more
+    free, P₀ is singular, or a residual stays; then, and for others, AᵀA + P is factorised whole.
     """
 
     def __init__(self, penalty: Any) -> None:
@@ -118,8 +118,8 @@ class _NormalEquations:
     @cached_property
     def _grounded(self) -> SparseLU | None:
         """P₀, held at the first node; None if it is singular."""
-        n = self._penalty.shape[0]
+        held = sp.csr_array(([self._ground], ([0], [0])), shape=self._penalty.shape)
         try:
-            return SparseLU(self._penalty + sp.csr_array(([self._ground], ([0], [0])), shape=(n, n)))
+            return SparseLU(self._penalty + held)
         except RuntimeError:
             return None

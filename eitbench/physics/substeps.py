@@ -10,7 +10,7 @@ from eitbench.numerics.sparse_lu import ByRows, SparseLU
 
 
 class WideSubsteps:
-    """Sub-steps A c⁺ = E c − I c_in + f of the free nodes; the first two: A c⁺ = r M c − I c_in + f/2.
+    """Sub-steps A c⁺ = E c − I c_in + f of free nodes, the first two with r M for E and f/2 for f.
 
     A few columns at a time go through all sub-steps, so that they stay in the processor's cache,
     and a substitution takes all of them at once. Each becomes what it would be alone, to the bit.
@@ -64,7 +64,6 @@ class WideSubsteps:
         """
         from eitbench.numerics.wide_kernels import WIDE, advance_wide
         memory = scratch(sum(self._rows) * WIDE).reshape(-1, WIDE)
-        memory[:] = 0.0                    # a panel that is not full holds nothing left by others
         blocks = np.split(memory, np.cumsum(self._rows)[:-1])
         state, first, slope, _, load, _ = blocks
         flat = [block.reshape(-1) for block in blocks]

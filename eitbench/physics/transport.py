@@ -43,6 +43,8 @@ class EvolutionModel(NamedTuple):
 class Transport(Protocol):
     """How a concentration moves in a time step: `ConvectionDiffusion`, or `eitbench.physics.rest.AtRest`."""
 
+    def __hash__(self) -> int: ...
+
     @property
     def mesh(self) -> Mesh:
         """Where the concentration lives."""

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.colors import to_rgb
@@ -16,10 +15,10 @@ from tqdm import tqdm
 
 from eitbench import _check
 from eitbench.bench.policies import inject
-from eitbench.bench.run import Environment, Job, board_of, play
+from eitbench.bench.run import Job, play
 from eitbench.bench.suites import is_isolated
+from eitbench.bench.tracks import Environment, board_of
 from eitbench.data.seeds import parse_seeds
-from eitbench.envs import INJECTION
 from eitbench.envs.rendering import FIELD_MAP, IDLE, SINK, SOURCE, SPREAD_MAP
 
 MOVING = (".gif", ".webp")
@@ -46,19 +45,16 @@ def animate(environment: str, method: str, seed: str, step: int | None, path: Pa
     played = Environment(environment)
     with threadpool_limits(1):
         loaded: Any = Job(played, method, seeds[0], is_isolated(played, method, isolate)).load()
-        env: Any
+        env: Any = played.make(render_mode="rgb_array")
         states: Iterator[tuple[Any, ...]]
-        if environment in INJECTION:
-            env = gym.make(environment, disable_env_checker=True, observation="raw", estimator="full",
-                                render_mode="rgb_array").unwrapped
+        if played.track == "injection":
             begin, states = env.core.first + 1, inject(env, loaded, seeds[0])
         else:
-            env = played.make(render_mode="rgb_array")
             if board_of(env) not in loaded.boards:
                 raise ValueError(f"baseline {loaded.name} plays {', '.join(loaded.boards)}, but {environment} is a "
                                  f"{board_of(env)} environment")
             begin, states = 1, play(env, loaded, seeds[0])
-        first, last = env.scenario.warm_up + 1, env.scenario.n_steps
+        first, last = env.world.warm_up + 1, env.world.n_steps
         if step is not None:
             first = last = _check.integer("step", step, low=begin, high=last)
         frames = []

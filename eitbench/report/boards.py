@@ -8,10 +8,11 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
-from eitbench.bench.records import file_name, finished, newest, version
+from eitbench.bench.records import file_name, finished, newest
 from eitbench.bench.statistics import interquartile_mean, mean_over_environments, shared_ranks, stratified_bootstrap
+from eitbench.bench.tracks import CLASSES, FLOORS, ids, named, track_of_board
+from eitbench.bench.tracks import class_of as class_of_board
 from eitbench.data.seeds import parse_seeds
-from eitbench.envs import ENTRY_POINTS
 from eitbench.report.summary import (
     COLUMNS,
     EXPLANATIONS,
@@ -25,11 +26,6 @@ from eitbench.report.summary import (
     world,
 )
 
-CLASSES = ("filter", "fixed-lag", "smoothing", "stationary", "injection")
-AT_REST = ("eitbench/StationaryTank2D-v0",)
-"""Environments whose target stands still: a class of their own, since nothing there has to be followed."""
-FLOOR = {"injection": "random_pair"}
-"""Whose episodes are the board's, and from whose error the gain is counted; on other boards `homogeneous`."""
 ALL = "all"
 """Stands for the environment in the rows of an aggregate."""
 OTHERS = tuple(name for name in COLUMNS if name != "error")
@@ -68,7 +64,7 @@ class Entry(NamedTuple):
     @property
     def label(self) -> str:
         """Name and version."""
-        return f"{self.record['method']}@{version(self.record)}"
+        return f"{self.record['method']}@{self.record['version']}"
 
     @property
     def errors(self) -> dict[str, float]:
@@ -94,7 +90,7 @@ def boards(records: list[dict[str, Any]]) -> pd.DataFrame:
         if record["split"] != "test":
             raise ValueError(f"leaderboards are made of test seeds; {file_name(record)} has {record['split']} seeds")
     current, _ = newest(records)
-    registered, products = {id.replace("/", "-") for id in ENTRY_POINTS}, _matrix_products(current)
+    registered, products = {named(id, {}) for id in ids()}, _matrix_products(current)
     rows: list[dict[str, Any]] = []
     for name in CLASSES:
         members = [record for record in current if class_of(record) == name]
@@ -110,7 +106,7 @@ def boards(records: list[dict[str, Any]]) -> pd.DataFrame:
 
 def class_of(record: dict[str, Any]) -> str:
     """Which of `CLASSES` a record belongs to."""
-    return "stationary" if record["environment"]["id"] in AT_REST else record["board"]
+    return class_of_board(record["environment"]["id"], record["board"])
 
 
 def render(records: list[dict[str, Any]], table: pd.DataFrame | None = None) -> dict[str, str]:
@@ -123,7 +119,7 @@ def render(records: list[dict[str, Any]], table: pd.DataFrame | None = None) -> 
 
 def _entries(records: list[dict[str, Any]]) -> list[Entry]:
     """The records of one environment on the board's episodes."""
-    floors = [record for record in records if record["method"] == FLOOR.get(record["board"], "homogeneous")]
+    floors = [record for record in records if record["method"] == FLOORS[track_of_board(record["board"])]]
     floor = max(floors, key=lambda record: (record["official"], finished(record)), default=None)
     seeds = {seed for record in ([floor] if floor else records) for seed in record["seeds"]}
     zero = scores_by_seed(floor, "error") if floor else {}
@@ -185,7 +181,7 @@ def _aggregate(played: dict[str, list[Entry]]) -> list[dict[str, Any]]:
 def _row(entry: Entry, environment: str, rank: int | None) -> dict[str, Any]:
     record = entry.record
     return {"class": class_of(record), "environment": environment, "method": record["method"],
-            "version": version(record), "title": record["title"], "rank": rank, "note": entry.note,
+            "version": record["version"], "title": record["title"], "rank": rank, "note": entry.note,
             "official": record["official"]}
 
 
@@ -233,7 +229,7 @@ def _markdown(table: pd.DataFrame, outdated: list[dict[str, Any]]) -> str:
     if not table.empty:
         parts += ["## What the columns say", "\n".join(f"- **{heading}**: {text}" for heading, text in MORE.items())]
     if outdated:
-        parts += ["## Outdated records", "Made with another version of the environment; to be played again.\n\n"
+        parts += ["## Outdated records", "Made by an earlier version of the method.\n\n"
                   + "\n".join(f"- {file_name(record)}" for record in outdated)]
     return "\n\n".join(parts) + "\n"
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from eitbench.bench.records import newest, read_record, read_records, version
+from eitbench.bench.records import newest, read_record, read_records
 from eitbench.bench.statistics import mean_over_environments, paired_difference, paired_probability_of_improvement
 from eitbench.report.summary import as_markdown, number, scores_by_seed, with_interval
 from eitbench.report.templates import template
@@ -18,7 +18,8 @@ FIELDS = ("environment", "episodes", "a", "b", "difference", "low", "high", "bet
 
 
 def find(name: str, folder: Path) -> list[dict[str, Any]]:
-    """The records that are meant by the path of one, or by METHOD or METHOD@VERSION within a folder.
+    """The records that are meant by the path of one, or by METHOD or METHOD@VERSION within a folder; an outdated one
+    only by its version.
 
     Raises
     ------
@@ -28,9 +29,10 @@ def find(name: str, folder: Path) -> list[dict[str, Any]]:
     if name.endswith(".json"):
         return [read_record(Path(name))]
     method, _, asked = name.partition("@")
-    records = [record for record in newest(read_records(folder))[0]
-               if record["method"] == method and version(record).startswith(asked)]
-    versions = sorted({version(record) for record in records})
+    there = read_records(folder)
+    records = [record for record in (there if asked else newest(there)[0])
+               if record["method"] == method and record["version"].startswith(asked)]
+    versions = sorted({record["version"] for record in records})
     if not records:
         raise ValueError(f"there is no record of {name} in {folder}")
     if len(versions) > 1:
@@ -52,8 +54,7 @@ def compare(a: list[dict[str, Any]], b: list[dict[str, Any]]) -> pd.DataFrame:
     Raises
     ------
     ValueError
-        If there is no environment in which both have finished an episode, or one was played with different versions
-        of the code.
+        If there is no environment in which both have finished an episode.
     """
     pairs: dict[str, tuple[dict[str, float], dict[str, float]]] = {}
     others = {(record["environment"]["name"], record["split"]): record for record in b}
@@ -61,8 +62,6 @@ def compare(a: list[dict[str, Any]], b: list[dict[str, Any]]) -> pd.DataFrame:
         name, split = record["environment"]["name"], record["split"]
         if (other := others.get((name, split))) is None:
             continue
-        if record["source"] != other["source"]:
-            raise ValueError(f"{name} was played with different versions of the environment's code; play it again")
         own, theirs = (scores_by_seed(each, "error") for each in (record, other))
         if shared := own.keys() & theirs.keys():
             label = name if split == "test" else f"{name} ({split} seeds)"
@@ -85,7 +84,7 @@ def names(a: dict[str, Any], b: dict[str, Any]) -> tuple[str, str]:
     """What two records' methods are called, apart from each other: by version if they have the same name."""
     if a["method"] != b["method"]:
         return a["method"], b["method"]
-    return f"{a['method']}@{version(a)}", f"{b['method']}@{version(b)}"
+    return f"{a['method']}@{a['version']}", f"{b['method']}@{b['version']}"
 
 
 def cells(table: pd.DataFrame, a: str, b: str) -> pd.DataFrame:

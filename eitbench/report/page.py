@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 
 from eitbench._files import write_atomically
 from eitbench.bench.records import alike
-from eitbench.bench.run import Environment
 from eitbench.bench.store import EpisodeStore
+from eitbench.bench.tracks import Environment
 from eitbench.data.seeds import parse_seeds
 from eitbench.envs.rendering import FIELD_MAP, colour_range, draw_field
 from eitbench.numerics.mesh import Mesh
@@ -119,7 +119,7 @@ def _snapshots(store: EpisodeStore, records: list[dict[str, Any]]) -> dict[str, 
     except FileNotFoundError:                                      # only the records were kept
         return None
     world = chosen[0]["environment"]
-    env = Environment(world["id"], json.dumps(world["kwargs"])).make()
+    env: Any = Environment(world["id"], json.dumps(world["kwargs"])).make()
     env.reset(seed=parse_seeds(seed)[0])
     task, truth = env.task, env.truth()
     times = task.warm_up + np.linspace(0.12, 0.88, 4) * (task.n_steps - task.warm_up)
@@ -134,9 +134,8 @@ def _snapshots(store: EpisodeStore, records: list[dict[str, Any]]) -> dict[str, 
 
 
 def _is_tank(task: Task) -> bool:
-    """Pipes are long, and something flows through them; tanks are as wide as they are long."""
-    length, width = np.ptp(task.mesh.points, axis=0)[:2]
-    return task.mesh.dim == 2 and bool(length < 2 * width)
+    """Whether pictures of it stand side by side; those of long vessels lie one below the other."""
+    return task.vessel is not None and not task.vessel.is_long
 
 
 def _size(task: Task) -> str:

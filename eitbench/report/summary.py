@@ -12,7 +12,7 @@ import pandas as pd
 from scipy.stats import t as student
 
 from eitbench.bench.records import BOARDS, finished
-from eitbench.envs import ENTRY_POINTS
+from eitbench.bench.tracks import ids
 from eitbench.scoring import skill
 
 COLUMNS = {
@@ -41,8 +41,8 @@ _TEXT = ("environment", "board", "method", "seeds")
 """Columns of words; the others are numbers."""
 _WHERE_ASKED = ("velocity_error", "spent")
 """Scores whose column is there only if anybody has them."""
-_NOT_THE_WORLD = ("lag", "episodes", "render_mode", "observation", "estimator")
-"""Arguments of an environment that its episodes do not depend on, beside those of what is believed."""
+_NOT_THE_WORLD = ("lag", "assume", "gate", "episodes", "render_mode", "observation", "estimator")
+"""Arguments of an environment that its episodes do not depend on."""
 _UNIT = {"seconds_per_step": 1e3, "voltage_discrepancy": 1e6}
 
 
@@ -113,16 +113,14 @@ def summary_row(record: dict[str, Any], records: list[dict[str, Any]]) -> dict[s
 def world(record: dict[str, Any]) -> str:
     """What the lagged siblings of an environment share, whatever is believed of it: ``Pipe2D (scored_steps=3)``."""
     environment = record["environment"]
-    registered = ENTRY_POINTS.get(environment["id"], ("", {}))[1]
     changed = {key: value for key, value in environment["kwargs"].items()
-               if value is not None and value != registered.get(key)
-               and key not in _NOT_THE_WORLD and not key.startswith("assumed_")}
-    changed |= changed.pop("scenario", {})
+               if value is not None and key not in _NOT_THE_WORLD}
+    changed |= changed.pop("world", {})
     return _kind(environment["id"]) + (f" ({_arguments(changed)})" if changed else "")
 
 
 def method(record: dict[str, Any]) -> str:
-    """The method's title, and what it was made to believe: ``Linearised Kalman filter, assumed_flow=real``."""
+    """The method's title, and what it was made to believe: ``Linearised Kalman filter, assume={"flow": "real"}``."""
     return ", ".join([record["title"], *filter(None, [_arguments(_beliefs(record))])])
 
 
@@ -134,7 +132,7 @@ def _kind(environment: str) -> str:
 
 def place_of_world(name: str) -> tuple[int, str]:
     """Where a world stands: as the ids were registered, and after them what is not ours."""
-    kinds = [_kind(environment) for environment in ENTRY_POINTS]
+    kinds = [_kind(environment) for environment in ids()]
     kind = name.split(" (")[0]
     return kinds.index(kind) if kind in kinds else len(kinds), name
 
@@ -142,7 +140,7 @@ def place_of_world(name: str) -> tuple[int, str]:
 def _beliefs(record: dict[str, Any]) -> dict[str, Any]:
     """Arguments that change the task's model and leave the truth as it is."""
     return {key: value for key, value in record["environment"]["kwargs"].items()
-            if (key.startswith("assumed_") and value is not None) or (key, value) == ("estimator", "reduced")}
+            if (key in ("assume", "gate") and value) or (key, value) == ("estimator", "reduced")}
 
 
 def _arguments(arguments: dict[str, Any]) -> str:
@@ -156,8 +154,8 @@ def _skills(record: dict[str, Any], records: list[dict[str, Any]]) -> dict[str, 
     The anchors are those of the world's board with the longest record to look back on.
     """
     def of(baseline: str) -> dict[str, float]:
-        found = [r for r in records if r["method"] == baseline and world(r) == world(record)
-                 and all(r[key] == record[key] for key in ("split", "source"))]
+        found = [r for r in records
+                 if r["method"] == baseline and world(r) == world(record) and r["split"] == record["split"]]
         anchor = max(found, key=lambda r: (BOARDS.index(r["board"]), r["official"], finished(r)), default=None)
         return scores_by_seed(anchor, "error") if anchor else {}
 

@@ -110,6 +110,7 @@ class Cylinders(Target):
     tells how well a small thing conducts [ours]"""
 
     is_carried = False
+    stands_still = True
 
     def __post_init__(self) -> None:
         for name, units in (("background", "mol/m³"), ("metal", ""), ("gap", "m")):

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from eitbench.numerics.mesh import Mesh
     from eitbench.physics.observation import ObservationModel, VoltageNoise
     from eitbench.physics.profiles import VelocityModel
-    from eitbench.physics.transport import EvolutionModel, Transport
+    from eitbench.physics.transport import ConvectionDiffusion, EvolutionModel, Transport
 
 
 class Estimate(NamedTuple):
@@ -83,6 +83,13 @@ class Task:
     def mesh(self) -> Mesh:
         """Where estimates live: the CD mesh."""
         return self.transport.mesh
+
+    def transport_at(self, parameters: np.ndarray) -> ConvectionDiffusion:
+        """The evolution model with the flow's ``parameters`` θ (k,) in m/s; ``ValueError`` where it is not asked for."""
+        from eitbench.physics.transport import ConvectionDiffusion
+        if self.velocity is None or not isinstance(self.transport, ConvectionDiffusion):
+            raise ValueError("the flow has no parameters in this task")
+        return self.transport.with_velocity(self.velocity.field(parameters))
 
     @property
     def evolution(self) -> EvolutionModel:

@@ -155,6 +155,11 @@ class Target(Protocol):
         """Whether the truth is concentration that the fluid carries; else the target has a way of its own."""
         ...
 
+    @property
+    def stands_still(self) -> bool:
+        """Whether nothing has to be followed: such worlds have boards of their own."""
+        return False
+
     def evolve(self, world: World, episodes: Sequence[Randomness], truth: Discretisation,
                tick: Callable[[int], object], last: int) -> Iterator[History]:
         """What moves in each episode up to state ``last``. Its numbers do not depend on the others, to the bit.
@@ -195,7 +200,8 @@ class World:
     name : str
         Under which its episodes are kept.
     vessel, flow, target, instrument, schedule
-        See `Vessel`, `Flow`, `Target`, `Instrument`, `Schedule`.
+        A `Vessel`, `Flow`, `Target`, `Instrument` and `Schedule`. A part may ask more of another than its protocol
+        promises, as slugs ask for an inlet.
     prior : Prior
         What estimators are told to believe.
     region : (float, float) or None
@@ -203,9 +209,9 @@ class World:
     """
 
     name: str
-    vessel: Vessel
-    flow: Flow
-    target: Target
+    vessel: Any
+    flow: Any
+    target: Any
     instrument: Instrument = field(default_factory=Instrument)
     schedule: Schedule = field(default_factory=Schedule)
     prior: Prior = field(default_factory=Prior)

@@ -8,12 +8,12 @@ import pytest
 
 from eitbench.bench.baselines import baseline_folder
 from eitbench.bench.policies import load_policy, own_agents, play
-from eitbench.bench.run import Environment, Job, run_episode
+from eitbench.bench.run import Job, run_episode
 from eitbench.bench.sandbox import guests
-from eitbench.envs import INJECTION
+from eitbench.bench.tracks import Environment, ids
 
 FOLDER = baseline_folder() / "checkpoints"
-AGENTS = [path for env in INJECTION for path in own_agents(env)]
+AGENTS = [path for env in ids("injection") for path in own_agents(env)]
 FIRST = 100_000
 """The first dev episode, with which evaluations begin."""
 

@@ -5,11 +5,13 @@ import json
 import numpy as np
 import pandas as pd
 import pytest
+from short import merged
 
 from eitbench.bench import policies
 from eitbench.bench.policies import adaptivity_gap, load_policy, own_policies, play
-from eitbench.bench.run import Environment, Job, run_jobs
+from eitbench.bench.run import Job, run_jobs
 from eitbench.bench.store import EpisodeStore
+from eitbench.bench.tracks import Environment
 from eitbench.data.seeds import parse_seeds
 from eitbench.envs.injection import InjectionEnv
 from eitbench.envs.injection_core import Rules
@@ -21,11 +23,11 @@ from eitbench.worlds import Pipe2D
 NAME = "eitbench/Pipe2DInjection-v0"
 CURRENTS, FAULTS, BUDGET = (f"eitbench/Pipe2DInjection{kind}-v0" for kind in ("Currents", "Faults", "Budget"))
 FLOW = "eitbench/Pipe2DInjectionFlow-v0"
-SHORT = {"scenario": {"scored_steps": 4, "mean_velocity": 16.0}}
+SHORT = {"world": {"flow": {"mean_velocity": 16.0}, "schedule": {"scored_steps": 4}}}
 """Sixteen electrodes and a short record."""
 KWARGS = {NAME: SHORT, CURRENTS: SHORT, FAULTS: SHORT, BUDGET: SHORT | {"budget": 3},
-          FLOW: {"scenario": SHORT["scenario"] | {"velocity_range": [15.0, 17.0]}},
-          "eitbench/RotatingTankInjection-v0": {"scenario": {"warm_up": 2, "scored_steps": 3}}}
+          FLOW: {"world": merged(SHORT["world"], {"flow": {"velocity_range": [15.0, 17.0]}})},
+          "eitbench/RotatingTankInjection-v0": {"world": {"schedule": {"warm_up": 2, "scored_steps": 3}}}}
 SEED = 5
 
 
@@ -42,7 +44,7 @@ def actions_of(name: str, policy: str, monkeypatch) -> list[np.ndarray]:
     assert len(taken) == env.core.length
     budget = env.rules.budget
     assert played["spent"] <= (len(taken) if budget is None else budget)
-    assert len(played["errors"]) == env.scenario.scored_steps
+    assert len(played["errors"]) == env.world.schedule.scored_steps
     assert played["error"] == pytest.approx(np.mean(played["errors"]))
     assert 0.0 < played["error"] < 1.0 and played["seconds_per_step"] >= 0.0
     return taken
@@ -124,7 +126,7 @@ def test_beforehand_is_the_expected_liquid():
     """A belief without data is linear about the expected level, and at the level both derivatives agree."""
     env = environment(NAME)
     belief = Belief.beforehand(env.rules)
-    assert belief._operator.concentration[0] == pytest.approx(env.scenario.expected_concentration, rel=1e-12)
+    assert belief._operator.concentration[0] == pytest.approx(env.world.expected_concentration, rel=1e-12)
     level = belief._operator.concentration[0]
     assert np.abs(belief.mean / level - 1.0).max() < 0.01
     np.testing.assert_allclose(belief.relinearised(), belief.derivative, rtol=0.1,
@@ -154,7 +156,7 @@ def test_the_action_of_a_pair_injects_it(name):
 def test_an_even_budget_is_spent_exactly(budget):
     """So many injections, or one at each step; between two of them the same number of steps, give or take one."""
     rules = Rules(Pipe2D(scored_steps=180), budget=budget)
-    steps = rules.scenario.n_steps - 16
+    steps = rules.world.n_steps - 16
     when = np.flatnonzero([rules.spaced(np.array([left, 0.0])) for left in range(steps, 0, -1)])
     assert len(when) == min(budget, steps)
     assert len(when) < 2 or np.ptp(np.diff([-1, *when])) <= 1
@@ -186,7 +188,7 @@ def test_scores_are_those_of_the_exact_filter():
     errors = []
     for _ in range(env.core.length):
         env.step(7)
-        assert (env.error is None) == (env.core.t <= env.scenario.warm_up)
+        assert (env.error is None) == (env.core.t <= env.world.warm_up)
         errors += [env.core.errors()[0]] * (env.error is not None)
     assert played["errors"] == errors
 
@@ -303,7 +305,7 @@ def test_wrong_names_are_named(tmp_path):
         load_policy("lucky")
     with pytest.raises(ValueError, match="has the name of one of ours"):
         load_policy(write_policy(tmp_path, name="adjacent"))
-    with pytest.raises(ValueError, match=r"env must be one of .*; got 'eitbench/Pipe2D-v0'"):
+    with pytest.raises(ValueError, match="environment eitbench/Pipe2D-v0 does not ask for injections"):
         play("eitbench/Pipe2D-v0", {}, "adjacent", 1)
     with pytest.raises(ValueError, match="estimator must be 'full' or 'reduced', got 'none'"):
         play(NAME, SHORT, "adjacent", 1, "none")

@@ -7,6 +7,8 @@ import warnings
 import pytest
 from tiny import RUN, episode, record, sha, strict
 
+from eitbench._files import shipped
+from eitbench.bench.migrate import migrate
 from eitbench.bench.records import (
     BOARDS,
     _validator,
@@ -15,10 +17,9 @@ from eitbench.bench.records import (
     read_record,
     read_records,
     sealed,
-    version,
     write_record,
 )
-from eitbench.report.summary import COLUMNS
+from eitbench.bench.tracks import named
 
 MINE = record("mine", [0.1, 0.25, None], parameters={"alpha": 0.1, "order": [1, 2], "β": 1e-22})
 
@@ -51,7 +52,7 @@ def write_unchecked(folder, content, name=None):
 def test_round_trip(tmp_path):
     """What was written is read, to the last bit, from a file named by environment, method and version."""
     path = write_record(tmp_path, MINE)
-    assert path.name == f"eitbench-Pipe2D-v0--mine--{sha('mine1')[:8]}.json" and version(MINE) == sha("mine1")[:8]
+    assert path.name == f"eitbench-Pipe2D-v0--mine--{sha('mine1')[:8]}.json" and MINE["version"] == sha("mine1")[:8]
     assert read_record(path) == MINE == strict(path.read_text(encoding="utf-8"))
     assert read_records(tmp_path) == [MINE]
     before = path.read_bytes()
@@ -66,11 +67,12 @@ def test_no_folder_and_an_empty_one(tmp_path):
 
 
 def test_versions_and_splits_have_files_of_their_own(tmp_path):
-    """Another file of the method, or other seeds, do not replace a record; other code of the environments does."""
-    for each in (MINE, record("mine", [0.1], version="2"), record("mine", {"dev:0": 0.1}),
-                 record("mine", [0.3], source="newer")):
+    """Another version of the method, or other seeds, do not replace a record; another run of the library does."""
+    other_code = RUN | {"source": sha("newer")}
+    for each in (MINE, record("mine", [0.1], version="2"), record("mine", [0.1], version="v1"),
+                 record("mine", {"dev:0": 0.1}), record("mine", [0.3], runs=[other_code])):
         write_record(tmp_path, each)
-    assert len(read_records(tmp_path)) == 3
+    assert len(read_records(tmp_path)) == 4
     assert MINE not in read_records(tmp_path)
 
 
@@ -95,7 +97,13 @@ def test_the_digest_is_what_the_schema_says():
 
 
 @pytest.mark.parametrize(("path", "value", "message"), [
-    ("schema", 1, r"\$\.schema: 2 was expected"),
+    ("schema", 1, r"\$\.schema: 3 was expected"),
+    ("source", sha("code"), "'source' was unexpected"),
+    ("version", "1", r"\$\.version: '1' does not match"),
+    ("version", "v0", r"\$\.version: 'v0' does not match"),
+    ("version", "deadbeef", r"\$\.version: must be v1, v2, … of ours, or begin as method_sha256 does"),
+    ("version", ..., "'version' is a required property"),
+    ("runs.0.source", ..., r"\$\.runs\[0\]: 'source' is a required property"),
     ("title", ..., "'title' is a required property"),
     ("title", "", r"\$\.title: "),
     ("title", "Fine |\n| 1 | Forged |", r"\$\.title: "),
@@ -114,7 +122,9 @@ def test_the_digest_is_what_the_schema_says():
     ("seeds", [], r"\$\.seeds: "),
     ("score", 1, "'score' was unexpected"),
     ("environment.id", "Pipe2D", r"\$\.environment\.id: 'Pipe2D' does not match"),
-    ("environment.name", "eitbench-Pipe3D-v0", r"\$\.environment\.name: must begin with eitbench-Pipe2D-v0"),
+    ("environment.name", "eitbench-Pipe3D-v0", r"\$\.environment\.name: must be eitbench-Pipe2D-v0, as id and"),
+    ("environment.name", "eitbench-Pipe2D-v0-deadbeef", r"\$\.environment\.name: must be eitbench-Pipe2D-v0, as"),
+    ("environment.kwargs", {"lag": 3}, r"\$\.environment\.name: must be eitbench-Pipe2D-v0-\w{8}, as id and"),
     ("environment.kwargs", None, r"\$\.environment\.kwargs: None is not of type 'object'"),
     ("runs.0.commit", ..., r"\$\.runs\[0\]: 'commit' is a required property"),
     ("runs.0.isolation", "jail", r"\$\.runs\[0\]\.isolation: 'jail' is not one of"),
@@ -124,8 +134,9 @@ def test_the_digest_is_what_the_schema_says():
     ("episodes.0.scores.error", -1.0, r"\$\.episodes\[0\]\.scores\.error: -1.0 is less than the minimum"),
     ("episodes.0.scores.error", None, r"\$\.episodes\[0\]\.scores\.error: None is not of type 'number'"),
     ("episodes.0.scores.error", 0.05, r"\$\.episodes\[0\]\.scores\.error: must be the mean of step_errors"),
-    ("episodes.0.scores.coverage_90", 90.0, r"\$\.episodes\[0\]\.scores\.coverage_90: 90.0 is greater than"),
-    ("episodes.0.scores.beauty", 1.0, r"\$\.episodes\[0\]\.scores: .*'beauty' was unexpected"),
+    ("episodes.0.scores.beauty", "much", r"\$\.episodes\[0\]\.scores\.beauty: 'much' is not of type"),
+    ("episodes.0.scores.Beauty", 1.0, r"\$\.episodes\[0\]\.scores: 'Beauty' does not match"),
+    ("episodes.0.scores.seconds_per_step", -1.0, r"\$\.episodes\[0\]\.scores\.seconds_per_step: -1.0 is less"),
     ("episodes.0.scores.seconds_per_step", ..., r"\$\.episodes\[0\]\.scores: 'seconds_per_step' is a required"),
     ("episodes.0.scores", ..., r"\$\.episodes\[0\]: 'scores' is a required property"),
     ("episodes.0.message", "all well", r"\$\.episodes\[0\]\.message: "),
@@ -224,25 +235,127 @@ def test_other_versions_of_an_environment_are_set_aside(tmp_path):
         read_records(tmp_path)
 
 
-def test_boards_are_of_one_code():
-    """The code of the last official record counts, each environment for itself; without one, of the last record."""
-    old, new = record("a", [0.1], finished="2025-01-01"), record("b", [0.1], source="new", finished="2025-01-02")
-    tank = record("a", [0.1], id="eitbench/RotatingTank2D-v0")
-    assert newest([old, tank, new]) == ([tank, new], [old])
-    official = record("a", [0.1], finished="2025-01-01", official=True)
-    assert newest([official, tank, new]) == ([official, tank], [new])
+def test_only_the_highest_version_of_a_method_of_ours_is_current():
+    """Each environment and split for itself, by number and not by letters; the code that played has no say."""
+    v2, v10 = (record("a", [0.1], version=version, finished=when) for version, when in (
+        ("v2", "2025-01-02"), ("v10", "2025-01-01")))
+    tank = record("a", [0.1], id="eitbench/RotatingTank2D-v0", version="v1")
+    dev = record("a", {"dev:0": 0.1}, version="v1")
+    other = record("b", [0.1], version="v1", runs=[RUN | {"source": sha("other")}])
+    assert newest([v2, tank, v10, dev, other]) == ([tank, v10, dev, other], [v2])
     assert newest([]) == ([], [])
+
+
+def test_versions_of_strangers_stand_side_by_side():
+    """Digits of a sha256 do not say which came first."""
+    both = [record("mine", [0.1], version=version, finished=f"2025-01-0{version}") for version in "12"]
+    assert newest(both) == (both, [])
 
 
 # -- the schema -------------------------------------------------------------------------------------------------------
 
 
 def test_the_schema_knows_all_that_there_is():
-    """It is a sound schema itself, and has the boards and scores of the code."""
+    """It is a sound schema itself, and has the boards of the code."""
     schema = _validator().schema
     _validator().check_schema(schema)
     assert schema["$schema"].endswith("2020-12/schema")
     assert tuple(schema["properties"]["board"]["enum"]) == BOARDS
-    assert set(COLUMNS) - {"skill"} == set(schema["$defs"]["scores"]["properties"])
     assert set(schema["required"]) == set(schema["properties"]) == set(MINE)
     assert set(episode("test:0", 0.1)) | {"message", "where"} == set(schema["$defs"]["episode"]["properties"])
+
+
+def test_scores_are_open(tmp_path):
+    """Whoever registers a score may write it: any name of small letters, with a finite number or null."""
+    scores = {"error": 0.1, "seconds_per_step": 0.01, "missed_bubbles_2": -3.5, "nis": None}
+    mine = record("mine", [0.1], scores={name: scores[name] for name in ("missed_bubbles_2", "nis")})
+    assert read_record(write_record(tmp_path, mine))["episodes"][0]["scores"] == scores
+
+
+# -- the format before ------------------------------------------------------------------------------------------------
+
+
+def old(made, source="code", **changes):
+    """A record as it was written in schema 2, with its own seal."""
+    kept = {key: value for key, value in made.items() if key not in ("version", "sha256")}
+    runs = [{key: value for key, value in run.items() if key != "source"} for run in made["runs"]]
+    return sealed(kept | {"schema": 2, "source": sha(source), "runs": runs} | changes)
+
+
+def write_old(folder, content):
+    name = "--".join([content["environment"]["name"], content["method"], content["method_sha256"][:8]])
+    return write_unchecked(folder, content, f"{name}.json")
+
+
+@pytest.mark.parametrize(("method", "official", "version"), [
+    ("kalman_filter", True, "v1"), ("kalman_filter", False, sha("kalman_filter1")[:8]),
+    ("mine", True, sha("mine1")[:8])])
+def test_records_of_the_format_before_are_read(method, official, version, tmp_path):
+    """As they would be written today: the source is each run's, and official ones of ours are of version 1."""
+    runs, episodes = [RUN, RUN | {"commit": "decaf"}], [episode("test:0", 0.1), episode("test:1", None) | {"run": 1}]
+    made = record(method, [0.1, None], official=official, runs=runs, episodes=episodes)
+    path = write_old(tmp_path, old(made))
+    expected = made | {"version": version, "runs": runs}
+    assert read_record(path) == sealed(expected) and read_records(tmp_path) == [sealed(expected)]
+
+
+@pytest.mark.parametrize(("name", "kwargs", "expected"), [
+    ("eitbench-Pipe2DFixedLag-v0", {"lag": 4}, {}),
+    ("eitbench-Pipe2DFixedLag-v0-12345678", {"lag": 4, "assumed_flow": "real"}, {"assumed_flow": "real"}),
+    ("eitbench-Pipe2DFixedLag-v0-12345678", {"lag": 3}, {"lag": 3})])
+def test_arguments_of_the_registration_are_left_out(name, kwargs, expected, tmp_path):
+    """What stays are those that somebody gave, and the name follows from them."""
+    environment = {"id": "eitbench/Pipe2DFixedLag-v0", "name": name, "kwargs": kwargs}
+    path = write_old(tmp_path, old(record("mine", [0.1], board="fixed-lag"), environment=environment))
+    found = read_record(path)["environment"]
+    assert found["kwargs"] == expected and found["name"] == named("eitbench/Pipe2DFixedLag-v0", expected)
+
+
+def test_an_old_seal_and_an_old_name_still_count(tmp_path):
+    """What was changed by hand, renamed or is not whole is refused as it always was."""
+    path = write_old(tmp_path, old(MINE))
+    text = path.read_text(encoding="utf-8")
+    path.write_text(text.replace("0.25", "0.24"), encoding="utf-8")
+    with pytest.raises(ValueError, match="was changed since it was written"):
+        read_record(path)
+    path.write_text(text, encoding="utf-8")
+    renamed = path.rename(tmp_path / "eitbench-Pipe2D-v0--mine--v1.json")
+    with pytest.raises(ValueError, match=f"must have the name eitbench-Pipe2D-v0--mine--{sha('mine1')[:8]}.json"):
+        read_record(renamed)
+    for broken in (old(MINE) | {"runs": "none"}, {"schema": 2}, old(MINE) | {"environment": "Pipe2D"}):
+        with pytest.raises(ValueError, match="is not valid"):
+            read_record(write_unchecked(tmp_path, broken, "it.json"))
+
+
+def test_migrating_keeps_every_number(tmp_path):
+    """Old files are rewritten under their new names; what was new already is left as it is."""
+    made = [record("homogeneous", [0.1, 0.25, None], official=True, scores={"nis": 1.0 / 3.0}), record("mine", [0.1])]
+    before = [write_old(tmp_path, old(each)) for each in made]
+    new = write_record(tmp_path, record("yours", [0.3]))
+    content, read = new.read_bytes(), read_records(tmp_path)
+    moved = list(migrate(tmp_path))
+    assert [path for path, _ in moved] == sorted(before) and new.read_bytes() == content
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "eitbench-Pipe2D-v0--homogeneous--v1.json", before[1].name, new.name}
+    assert sorted(read_records(tmp_path), key=str) == sorted(read, key=str)
+    for each in read_records(tmp_path):
+        (same,) = [other for other in [*made, record("yours", [0.3])] if other["method"] == each["method"]]
+        assert all(each[key] == same[key] for key in ("episodes", "seeds", "runs", "method_sha256"))
+    assert list(migrate(tmp_path)) == []
+
+
+def test_migrating_replaces_nothing_else(tmp_path):
+    """Where the new place is taken by a record that says something else, everything stays as it is."""
+    mine = record("homogeneous", [0.1], official=True)
+    write_old(tmp_path, old(mine))
+    write_record(tmp_path, record("homogeneous", [0.2], official=True, version="v1"))
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    with pytest.raises(ValueError, match=r"must not hold two records of one thing, but .*homogeneous--v1\.json"):
+        list(migrate(tmp_path))
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_the_published_records_are_of_today():
+    """Nobody has to upgrade what the repository holds."""
+    texts = [path.read_text() for path in (shipped("leaderboards") / "results").glob("*.json")]
+    assert len(texts) >= 165 and all(json.loads(text)["schema"] == 3 for text in texts)

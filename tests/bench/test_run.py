@@ -9,13 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
+from short import merged
 from tiny import FILTER, FIXED_LAG, SCENARIO, SMOOTHING, count, counting, write_baseline
 
 from eitbench.bench import run
-from eitbench.bench.run import Environment, Job, board_of, play_and_collect, run_episode, run_jobs
+from eitbench.bench.run import Job, play_and_collect, run_episode, run_jobs
 from eitbench.bench.store import EpisodeStore
-from eitbench.data.episodes import CACHE_VARIABLE, simulate, truth_discretisation
-from eitbench.worlds import Pipe2D
+from eitbench.bench.tracks import Environment, board_of
+from eitbench.data.episodes import simulate, truth_discretisation
+from eitbench.data.store import CACHE_VARIABLE
+from eitbench.worlds.pipe2d import PIPE_2D
 from eitbench.worlds.task import Estimate, Task
 
 
@@ -122,7 +125,7 @@ def test_estimators_see_the_task_and_measurements_only(environment):
 
 
 BIASED = Environment("eitbench/Pipe2DSmoothing-v0",
-                     json.dumps({"scenario": SCENARIO, "assumed_mean_velocity": 30.0}))
+                     json.dumps({"world": SCENARIO, "assume": {"mean_velocity": 30.0}}))
 
 
 @pytest.mark.parametrize("environment", [FILTER, FIXED_LAG, SMOOTHING, BIASED],
@@ -137,8 +140,8 @@ def test_reference_with_the_true_model(environment):
 
 def test_reference_in_a_flow_that_changes():
     """Told the flow of every step it errs less than the filter that is told the first guess, and knows the flow."""
-    scenario = {**SCENARIO, "scored_steps": 12, "velocity_range": [30.0, 60.0]}
-    world = Environment("eitbench/Pipe2DTimeVaryingVelocity-v0", json.dumps({"scenario": scenario}))
+    changes = merged(SCENARIO, {"schedule": {"scored_steps": 12}, "flow": {"velocity_range": [30.0, 60.0]}})
+    world = Environment("eitbench/Pipe2DTimeVaryingVelocity-v0", json.dumps({"world": changes}))
     reference, guessing = (run_episode(Job(world, name, 3))[0]["scores"]
                            for name in ("true_model_smoother", "kalman_filter"))
     assert reference["error"] < 0.9 * guessing["error"]
@@ -204,7 +207,7 @@ def tilted(tmp_path_factory):
         store = EpisodeStore(folder)
         run_jobs([Job(FILTER, path, 4)], store)
         (result,) = store.results()
-        return result, store.fields(result)["mean"].astype(float), simulate(Pipe2D(**SCENARIO), 4)
+        return result, store.fields(result)["mean"].astype(float), simulate(PIPE_2D.changed(SCENARIO), 4)
 
 
 def squared(mesh, values):
@@ -232,18 +235,18 @@ def test_scores_can_be_recomputed_from_what_is_stored(tilted):
     """Relative and contrast error follow from the stored estimates and the simulated truth, by other code."""
     result, means, episode = tilted
     env = FILTER.make()
-    mesh, truth = truth_discretisation(env.scenario).transport.mesh, episode.concentration[1:].astype(float)
+    mesh, truth = truth_discretisation(env.world).transport.mesh, episode.concentration[1:].astype(float)
     error = squared(mesh, interpolated(env.task.mesh, means, mesh.points) - truth)[2:]
     steps = error / squared(mesh, truth)[2:]
     np.testing.assert_allclose(result["step_errors"], steps, rtol=1e-9)
     assert result["scores"]["error"] == pytest.approx(steps.mean(), rel=1e-9)
 
     currents = np.array([env.task.currents[i % 2] for i in range(5)])
-    voltages = np.array([episode.voltages(i + 1, currents[i], env.scenario) for i in range(5)])
+    voltages = np.array([episode.voltages(i + 1, currents[i], env.world) for i in range(5)])
 
     def misfit(level):
         computed = env.task.observation.voltages(np.full(1701, level), currents)
-        return (((voltages - computed) / env.scenario.noise.std(voltages))**2).sum()
+        return (((voltages - computed) / env.world.noise.std(voltages))**2).sum()
 
     homogeneous = minimize_scalar(misfit, bounds=(20.0, 40.0), method="bounded", options={"xatol": 1e-7}).x
     contrast = (error / squared(mesh, truth - homogeneous)[2:]).mean()

@@ -13,10 +13,11 @@ from tiny import FILTER, FIXED_LAG, RUN, SCENARIO, sha, strict, write_baseline
 
 from eitbench._files import PACKAGE
 from eitbench.bench import store as store_module
-from eitbench.bench.run import Environment, Job, run_jobs
+from eitbench.bench.run import Job, run_jobs
 from eitbench.bench.store import EpisodeStore, machine, provenance, results_of, source_digest
-from eitbench.data.episodes import CACHE_VARIABLE
+from eitbench.bench.tracks import Environment
 from eitbench.data.seeds import name_seed
+from eitbench.data.store import CACHE_VARIABLE
 
 ENV, COMMAND = "eitbench/Pipe2D-v0", "eitbench run --seeds train:1-2"
 
@@ -39,9 +40,10 @@ def store(tmp_path):
 def result(seed=1, method="mine", **changes):
     """A result such as `run_episode` makes."""
     return {"identity": "abc", "seed": name_seed(seed), "method": method, "title": "Mine", "parameters": {},
-            "role": None, "privileged": False, "method_sha256": sha("mine"), "checkpoint_sha256": None,
+            "role": None, "privileged": False, "method_sha256": sha("mine"), "version": sha("mine")[:8],
+            "checkpoint_sha256": None,
             "board": "filter", "environment": {"id": ENV, "name": "eitbench-Pipe2D-v0", "kwargs": {}},
-            "source": sha("code"), "finished": "2025-01-01T00:00:00+00:00", "status": "ok", "peak_memory": None,
+            "finished": "2025-01-01T00:00:00+00:00", "status": "ok", "peak_memory": None,
             "scores": {"error": 0.1, "seconds_per_step": 0.01}, "step_errors": [0.1], "seconds": 1.0,
             "run": RUN} | changes
 
@@ -145,13 +147,14 @@ def played(tmp_path_factory):
 def test_record_says_how_to_repeat_it(played):
     """Environment with arguments, baseline with parameters and hash, command, seeds, versions, commit, machine."""
     bad, mine = sorted(played.write_records(), key=lambda record: record["method"])
-    assert mine["environment"]["id"] == ENV and mine["environment"]["kwargs"]["scenario"] == SCENARIO
+    assert mine["environment"]["id"] == ENV and mine["environment"]["kwargs"]["world"] == SCENARIO
     assert (mine["method"], mine["title"], mine["board"]) == ("mine", "Mine", "filter")
     assert mine["parameters"] == {"alpha": 0.5, "order": [1, 2]}
     assert len(mine["method_sha256"]) == 64 and mine["method_sha256"] != bad["method_sha256"]
-    assert mine["source"] == source_digest() and mine["schema"] == store_module.SCHEMA == 2
+    assert mine["schema"] == store_module.SCHEMA == 3 and mine["version"] == mine["method_sha256"][:8]
     assert mine["seeds"] == ["train:1", "train:2"] and mine["split"] == "train"
     (run,) = mine["runs"]
+    assert run["source"] == source_digest()
     assert run["command"] == COMMAND and [episode["run"] for episode in mine["episodes"]] == [0, 0]
     assert run["commit"] == "c0ffee" and run["dirty"] is False
     assert run["versions"]["numpy"] == np.__version__ and run["versions"]["python"] == platform.python_version()
@@ -202,14 +205,21 @@ def test_splits_are_not_mixed(store):
 
 
 @pytest.mark.parametrize("what", ["source", "method_sha256"])
-def test_versions_of_code_are_not_mixed(what, store):
-    """Only episodes of the code that ran last make the record; the older ones join again when they are replayed."""
+def test_stale_results_are_not_mixed_in(what, store):
+    """Only episodes of the code that ran here last make the record; the older ones join again when they are
+    replayed."""
+    def of(code):
+        if what == "source":
+            return {"run": RUN | {"source": sha(code)}}
+        return {"method_sha256": sha(code), "version": sha(code)[:8]}
+
     for seed in (1, 2, 3):
-        put(store, result(seed, **{what: sha("old")}))
-    put(store, result(2, **{what: sha("new")}, finished="2025-01-02T00:00:00+00:00"))
+        put(store, result(seed, **of("old")))
+    put(store, result(2, **of("new"), finished="2025-01-02T00:00:00+00:00"))
     (record,) = store.write_records()
-    assert record[what] == sha("new") and record["seeds"] == ["train:2"]
-    put(store, result(1, **{what: sha("new")}, finished="2025-01-02T00:01:00+00:00"))
+    assert record["seeds"] == ["train:2"]
+    assert (record["runs"][0]["source"] if what == "source" else record["method_sha256"]) == sha("new")
+    put(store, result(1, **of("new"), finished="2025-01-02T00:01:00+00:00"))
     assert [record["seeds"] for record in store.write_records()] == [["train:1", "train:2"]]
 
 
@@ -223,10 +233,10 @@ def test_seeds_are_in_numerical_order(store):
 def test_arguments_of_an_environment_make_other_records(store, tmp_path):
     """The same id with other keyword arguments is another world: neither results nor records overwrite each other."""
     path = write_baseline(tmp_path)
-    wider = Environment(FILTER.id, json.dumps({"scenario": SCENARIO | {"noise_relative": 0.02}}))
+    wider = Environment(FILTER.id, json.dumps({"world": SCENARIO | {"instrument": {"noise_relative": 0.02}}}))
     run_jobs([Job(environment, path, 1) for environment in (FILTER, wider, FIXED_LAG)], store)
     records = store.write_records()
-    noise = [record["environment"]["kwargs"]["scenario"].get("noise_relative") for record in records]
+    noise = [record["environment"]["kwargs"]["world"].get("instrument", {}).get("noise_relative") for record in records]
     assert sorted(noise, key=str) == [0.02, None, None]
     assert len(list((store.folder / "records").iterdir())) == 3
 
@@ -277,14 +287,17 @@ def test_provenance_without_git(monkeypatch):
 
 
 def test_other_results_fill_what_is_missing_or_failed(store):
-    """An episode that was played well here stays; results of other code do not come in with it."""
+    """An episode that was played well here stays; results of another version do not come in with it, those of other
+    code do."""
     failed = {"status": "failed", "message": "broke", "where": "mine.py:1", "scores": None}
     put(store, result(1, seconds=2.0))
     put(store, result(2) | failed)
-    others = [result(1, seconds=9.0), result(2, seconds=3.0), result(3, seconds=4.0),
-              result(4, source=sha("older"), finished="2024-01-01T00:00:00+00:00")]
+    others = [result(1, seconds=9.0), result(2, seconds=3.0),
+              result(3, seconds=4.0, run=RUN | {"source": sha("older")}, finished="2024-01-01T00:00:00+00:00"),
+              result(4, version="v7", finished="2024-01-01T00:00:00+00:00")]
     (record,) = store.records(also=others)
     assert [(row["seed"], row["seconds"]) for row in record["episodes"]] == [
         ("train:1", 2.0), ("train:2", 3.0), ("train:3", 4.0)]
+    assert [record["runs"][row["run"]]["source"] for row in record["episodes"]] == [sha("code")] * 2 + [sha("older")]
     (same,) = EpisodeStore(store.folder / "empty").records(also=results_of(record))
     assert same == record

@@ -1,22 +1,22 @@
 """Submitting: test episodes are played, and their records written, failures and all; `eitbench` does it by command."""
 
+import json
 import re
 
-import gymnasium as gym
 import pytest
-from short import FIELDS
+from short import PIPE, shorten
 from tiny import FILTER, SCENARIO, SMOOTHING, count, counting, write_baseline
 from typer.testing import CliRunner
 
-from eitbench.bench import load, policies, run, suites
+from eitbench.bench import baselines, load, policies, run, suites
 from eitbench.bench import store as store_module
-from eitbench.bench.records import read_record, read_records, write_record
+from eitbench.bench.records import newest, read_record, read_records, sealed, write_record
 from eitbench.bench.store import EpisodeStore, provenance
 from eitbench.bench.submit import submit
 from eitbench.cli import app
 from eitbench.data import bank
-from eitbench.data.episodes import CACHE_VARIABLE
 from eitbench.data.seeds import parse_seeds
+from eitbench.data.store import CACHE_VARIABLE
 
 INJECTION = "eitbench/Pipe2DInjection-v0"
 TEST = parse_seeds("test:0-1")
@@ -28,8 +28,8 @@ def tiny_world(monkeypatch, tmp_path, tmp_path_factory):
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path_factory.getbasetemp() / "episodes"))
     monkeypatch.setattr(store_module, "_git", lambda *words: "c0ffee" if "rev-parse" in words else "")
     for name in (FILTER.id, SMOOTHING.id):
-        monkeypatch.setitem(gym.registry[name].kwargs, "scenario", SCENARIO)
-    monkeypatch.setitem(gym.registry[INJECTION].kwargs, "scenario", FIELDS["Pipe2DInjection"])
+        shorten(monkeypatch, {name: SCENARIO})
+    shorten(monkeypatch, {INJECTION: PIPE})
     monkeypatch.chdir(tmp_path)
     for cached in (run._environment, policies.environment, provenance):
         cached.cache_clear()
@@ -88,7 +88,8 @@ def test_policies_are_submitted_alike(tmp_path):
     (path,) = submit("random_pair", [INJECTION], TEST[:1], EpisodeStore(tmp_path), tmp_path / "to", policy=True)
     record = read_record(path)
     assert (record["board"], record["role"], record["seeds"]) == ("injection", "floor", ["test:0"])
-    assert record["environment"]["kwargs"]["estimator"] == "full" and record["episodes"][0]["scores"]["spent"] > 0
+    assert record["environment"]["kwargs"] == {} and record["version"] == "v1"
+    assert record["episodes"][0]["scores"]["spent"] > 0
 
 
 def test_policies_by_command(tmp_path):
@@ -153,8 +154,9 @@ def test_official_needs_a_clean_commit(tmp_path, monkeypatch):
     assert read_record(path)["official"]
 
 
-def test_what_says_more_is_not_replaced(tmp_path):
-    """By a record that is no longer official, or has fewer episodes; an outdated one is, and any by one with more."""
+def test_what_says_more_is_not_replaced(tmp_path, monkeypatch):
+    """By a record that is no longer official, or has fewer episodes, whatever code played; one of a newer version
+    stands beside it."""
     to = tmp_path / "to"
 
     def submitted(results, seeds, **how):
@@ -170,8 +172,44 @@ def test_what_says_more_is_not_replaced(tmp_path):
     with pytest.raises(ValueError, match=r"to must not hold a record that says more; .* lose its being official$"):
         submitted("c", TEST)
     assert read_records(to) == [first] and not (tmp_path / "c").exists()               # it is said before it is played
-    write_record(to, first | {"source": "0" * 64})
-    assert submitted("b", TEST[:1])["seeds"] == ["test:0"]
+    path = write_record(to, first | {"runs": [run | {"source": "0" * 64} for run in first["runs"]]})
+    with pytest.raises(ValueError, match="would lose its being official"):
+        submitted("b", TEST[:1])
+    with monkeypatch.context() as patch:
+        patch.setattr(baselines, "version_of", lambda path, sha256: "v2")
+        assert submitted("b", TEST[:1])["seeds"] == ["test:0"]
+    assert path.exists() and newest(read_records(to))[0] == [read_record(path.with_name(path.name.replace("v1", "v2")))]
+
+
+def test_a_record_of_other_code_is_extended(tmp_path, monkeypatch):
+    """Its episodes are neither played again nor lost, and each run names its own source."""
+    to = tmp_path / "to"
+    (path,) = submit("homogeneous", [FILTER.id], TEST[:1], EpisodeStore(tmp_path / "a"), to)
+    first = read_record(path)
+    monkeypatch.setattr(store_module, "source_digest", lambda: "0" * 64)
+    provenance.cache_clear()
+    (path,) = submit("homogeneous", [FILTER.id], TEST, EpisodeStore(tmp_path / "b"), to)
+    both = read_record(path)
+    assert both["seeds"] == ["test:0", "test:1"] and both["episodes"][0]["scores"] == first["episodes"][0]["scores"]
+    assert [both["runs"][episode["run"]]["source"] for episode in both["episodes"]] == [
+        first["runs"][0]["source"], "0" * 64]
+    assert [path.name for path in (tmp_path / "b").glob("episodes/*/*/*.json")] == ["test-1.json"]
+
+
+def test_a_record_of_the_format_before_is_extended(tmp_path):
+    """And replaced by one of today, under its new name, once that is written."""
+    (path,) = submit("homogeneous", [FILTER.id], TEST[:1], EpisodeStore(tmp_path / "a"), tmp_path / "to", official=True)
+    first = read_record(path)
+    kept = {key: value for key, value in first.items() if key not in ("version", "sha256")}
+    runs = [{key: value for key, value in run.items() if key != "source"} for run in first["runs"]]
+    before = sealed(kept | {"schema": 2, "source": first["runs"][0]["source"], "runs": runs})
+    path.unlink()
+    older = path.with_name(path.name.replace("v1", first["method_sha256"][:8]))
+    older.write_text(json.dumps(before))
+    assert list(submit("homogeneous", [FILTER.id], TEST, EpisodeStore(tmp_path / "b"), tmp_path / "to",
+                       official=True)) == [path]
+    assert not older.exists() and read_record(path)["episodes"][0] == first["episodes"][0]
+    assert read_record(path)["seeds"] == ["test:0", "test:1"]
 
 
 @pytest.mark.parametrize("official", [False, True])
@@ -195,24 +233,24 @@ def test_a_record_is_extended(official, tmp_path):
 
 def test_an_invalid_record_is_in_nobody_s_way(tmp_path, monkeypatch):
     """What another method claimed, and no schema allows, is left out of the table and the page."""
-    monkeypatch.setattr(run, "score", lambda env, played, score=run.score: _with_negative_nis(score(env, played)))
+    monkeypatch.setattr(run, "score", lambda env, played, score=run.score: _with_negative_time(score(env, played)))
     submitted = ("--env", FILTER.id, "--seeds", "test:0", "-j", "1")
-    with pytest.warns(UserWarning, match=r"left out: .*homogeneous.* is not valid: .*nis"):
+    with pytest.warns(UserWarning, match=r"left out: .*homogeneous.* is not valid: .*seconds_per_step"):
         code, _, complaint = eitbench("run", "--baseline", "homogeneous", *submitted)
     assert code == 2 and "no results in results" in complaint
     code, _, complaint = eitbench("submit", "--baseline", "homogeneous", *submitted)
     assert code == 2 and "is not valid" in complaint and not (tmp_path / "leaderboards").exists()
     monkeypatch.undo()
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(gym.registry[FILTER.id].kwargs, "scenario", SCENARIO)
+    shorten(monkeypatch, {FILTER.id: SCENARIO})
     with pytest.warns(UserWarning, match="left out"):
         assert eitbench("run", "--baseline", "persistence", *submitted)[0] == 0
     assert eitbench("submit", "--baseline", "persistence", *submitted)[0] == 0
 
 
-def _with_negative_nis(scored):
+def _with_negative_time(scored):
     outcome = dict(scored)
-    return outcome | {"scores": outcome["scores"] | {"nis": -1.0}}
+    return outcome | {"scores": outcome["scores"] | {"seconds_per_step": -1.0}}
 
 
 def test_mistyped_records_delete_nothing(tmp_path):

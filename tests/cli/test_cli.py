@@ -4,25 +4,27 @@ import json
 import re
 import runpy
 import sys
+from dataclasses import replace
 from pathlib import Path
 
-import gymnasium as gym
 import pytest
-from short import PLAIN, world
+from short import PLAIN, shorten, world
 from typer.testing import CliRunner
 
-from eitbench.bench import run, store, suites
+from eitbench.bench import run, store, suites, tracks
 from eitbench.bench.baselines import own_baselines
+from eitbench.bench.tracks import ids
 from eitbench.cli import app
-from eitbench.data.episodes import CACHE_VARIABLE
 from eitbench.data.seeds import parse_seeds
-from eitbench.envs import ENTRY_POINTS, ESTIMATION
+from eitbench.data.store import CACHE_VARIABLE
+from eitbench.worlds import entry, registry
 
 ROOT = Path(__file__).parents[2]
 PIPE, INJECTION = "eitbench/Pipe2D-v0", "eitbench/Pipe2DInjection-v0"
-COMMANDS = ("list", "run", "bank", "train", "policies", "submit", "verify", "held-out", "leaderboard", "compare",
-            "render", "reproduce")
-TINY = {"mean_velocity": 45.0, "scored_steps": 3, "electrodes_per_wall": 2, "frame": 2}
+COMMANDS = ("list", "run", "bank", "train", "policies", "submit", "verify", "held-out", "migrate", "leaderboard",
+            "compare", "render", "reproduce")
+TINY = {"flow": {"mean_velocity": 45.0}, "schedule": {"scored_steps": 3, "pattern": {"frame": 2}},
+        "vessel": {"electrodes_per_wall": 2}}
 """A fast fluid flushes the pipe in two steps: an episode of five takes a third of a second."""
 
 MINE = '''"""My method: the expected level everywhere."""
@@ -43,10 +45,9 @@ def tiny_world(monkeypatch, tmp_path, tmp_path_factory):
     """The registered environments play tiny worlds, in an empty folder; git is left alone."""
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path_factory.getbasetemp() / "episodes"))
     monkeypatch.setattr(store, "_git", lambda *words: None)
-    for name in ENTRY_POINTS:
-        for argument, value in ({"scenario": TINY} if name in PLAIN else world(name)).items():
-            monkeypatch.setitem(gym.registry[name].kwargs, argument, value)
-    monkeypatch.setitem(gym.registry["eitbench/Pipe2DFixedLag-v0"].kwargs, "lag", 2)
+    shorten(monkeypatch, {name: TINY if name in PLAIN else world(name)["world"] for name in ids()})
+    lagged = replace(entry("eitbench/Pipe2DFixedLag-v0"), settings={"lag": 2})
+    monkeypatch.setitem(registry._entries, lagged.id, lagged)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.py").write_text(MINE)
     run._environment.cache_clear()
@@ -127,14 +128,14 @@ def test_every_board_by_default(tmp_path):
 def test_suites():
     """full is every environment; quick the plain pipe on fewer seeds, but for the one method that takes minutes."""
     quick, full = (suites.jobs(suite, [], [], [1]) for suite in ("quick", "full"))
-    plain = set(PLAIN) & set(ESTIMATION)
+    plain = set(PLAIN) & set(ids("estimation"))
     assert {job.environment.id for job in quick} == plain and len(plain) == 3
-    assert {job.environment.id for job in full} == set(ESTIMATION)
+    assert {job.environment.id for job in full} == set(ids("estimation"))
     missing = {job for job in full if job.environment.id in plain} - set(quick)
     assert missing == {suites.Job(suites.Environment(PIPE), "gauss_newton", 1)} and set(quick) < set(full)
     assert {job.method for job in full} == set(own_baselines())
-    assert set(parse_seeds(suites.SEEDS["quick"])) < set(parse_seeds(suites.SEEDS["full"]))
-    assert min(parse_seeds(suites.SEEDS["full"])) == 200_000
+    assert set(parse_seeds(tracks.SEEDS["quick"])) < set(parse_seeds(tracks.SEEDS["full"]))
+    assert min(parse_seeds(tracks.SEEDS["full"])) == 200_000
     asked_for = suites.jobs("quick", [PIPE], ["gauss_newton"], [1, 2])
     assert [job.seed for job in asked_for] == [1, 2]
 
@@ -147,7 +148,7 @@ def test_list():
     code, said, _ = eitbench("list")
     assert code == 0
     lines = {line.split()[0]: line for line in said.splitlines()}
-    assert lines.keys() >= {*ENTRY_POINTS, *own_baselines()}
+    assert lines.keys() >= {*ids(), *own_baselines()}
     assert "smoothing" in lines["eitbench/Pipe2DSmoothing-v0"] and "3 scored of 5" in lines[PIPE]
     assert "filter, smoothing" in lines["gauss_newton"] and "Stationary Gauss–Newton" in lines["gauss_newton"]
 

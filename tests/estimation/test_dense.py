@@ -38,7 +38,7 @@ def test_equals_the_textbook(n, noise):
 
 @pytest.mark.parametrize("n", [14, 300, 530], ids=["small", "two panels", "three panels"])
 def test_transition_as_a_callable_equals_the_textbook(n):
-    """F as what it makes of columns: means and covariances to 1e-10, F P Fᵀ symmetric to the bit."""
+    """F as what it makes of columns: means and covariances to 1e-10, F P Fᵀ symmetric."""
     rng = np.random.default_rng(10)
     model = random_model(rng, n)
     _, observations = draw(model, random_design(rng, n, 3), rng)

@@ -27,7 +27,7 @@ def columns(k):
 
 
 def dense_step(c, before, after, source):
-    """The scheme that `ConvectionDiffusion` describes, with full matrices; source (91, k) a second."""
+    """The scheme that `ConvectionDiffusion` describes, with full matrices; source (91, k) per s."""
     M, K = (matrix.toarray() for matrix in _supg_matrices(MESH, FLOW, SETTINGS["diffusivity"]))
     dt = SETTINGS["time_step"] / SETTINGS["substeps"]
     free = np.arange(INLET, N)

@@ -220,14 +220,20 @@ def test_only_test_seeds():
         boards([record("a", {"dev:0": 0.1})])
 
 
-def test_old_code_is_listed_and_not_mixed():
+def test_old_versions_are_listed_and_not_mixed():
     """Neither rank nor gain of the new board know of old records; the Markdown names them."""
-    old = record("a", times(0.1), source="old", finished="2024-01-01")
-    records = [floor(), record("b", times(0.5)), old]
-    assert set(boards(records)["method"]) == {"homogeneous", "b"} and boards(records)["rank"].max() == 1
+    old = record("b", times(0.1), version="v1", finished="2026-01-01")
+    records = [floor(), record("b", times(0.5), version="v2"), old]
+    assert list(boards(records)["version"]) == ["v2", sha("homogeneous1")[:8]] and boards(records)["rank"].max() == 1
     text = render(records)["leaderboard.md"]
-    assert f"- eitbench-Pipe2D-v0--a--{sha('a1')[:8]}.json" in text.split("## Outdated records")[1]
+    assert "- eitbench-Pipe2D-v0--b--v1.json" in text.split("## Outdated records")[1]
     assert "Outdated" not in render(records[:2])["leaderboard.md"]
+
+
+def test_other_code_is_no_other_board():
+    """Who played with another commit, or another text of the library, stands beside the others."""
+    elsewhere = record("b", times(0.5), runs=[RUN | {"commit": "decaf", "source": sha("other")}])
+    assert set(boards([floor(), elsewhere])["method"]) == {"homogeneous", "b"}
 
 
 # -- one story --------------------------------------------------------------------------------------------------------
@@ -238,10 +244,10 @@ def folder(tmp_path):
     """A folder of records on three boards."""
     random = np.random.default_rng(7)
     three = random.uniform(0.1, 0.2, (3, 8)).tolist()
-    for each in (floor(official=True), floor(id=TANK), record("a", three[0], scores={"nis": 1.5}),
-                 record("b", [*three[1][:7], None]), record("a", three[2], id=TANK),
+    for each in (floor(official=True), floor(id=TANK), record("a", three[0], version="v2", scores={"nis": 1.5}),
+                 record("b", [*three[1][:7], None]), record("a", three[2], id=TANK, version="v2"),
                  record("random_pair", FLOOR, board="injection", role="floor", scores={"spent": 3}),
-                 record("a", times(0.1), source="old", finished="2020-01-01", version="0")):
+                 record("a", times(0.1), finished="2020-01-01", version="v1")):
         write_record(tmp_path, each)
     return tmp_path
 
@@ -285,11 +291,10 @@ def test_load_is_tidy(folder):
     assert not frame.duplicated(["environment", "method", "version", "seed", "metric"]).any()
     errors = frame[(frame["metric"] == "error") & (frame["environment"] == "eitbench-Pipe2D-v0")]
     assert errors.groupby(["method", "version"]).size().to_dict() == {
-        (method, sha(method + version)[:8]): 8 for method, version in (("homogeneous", "1"), ("a", "1"), ("b", "1"),
-                                                                       ("a", "0"))}
+        ("homogeneous", sha("homogeneous1")[:8]): 8, ("b", sha("b1")[:8]): 8, ("a", "v1"): 8, ("a", "v2"): 8}
     failed = frame[frame["status"] == "failed"]
     assert list(failed["method"]) == ["b"] and failed["value"].isna().all() and list(failed["seed"]) == ["test:7"]
-    assert set(frame[frame["outdated"]]["version"]) == {sha("a0")[:8]}
+    assert set(frame[frame["outdated"]]["version"]) == {"v1"}
     ours = frame[(frame["method"] == "homogeneous") & (frame["metric"] == "error") & frame["official"]]
     assert list(ours["value"]) == FLOOR and set(ours["role"]) == {"floor"}
     mine = record("isolated", [0.1, None])

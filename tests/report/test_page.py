@@ -8,18 +8,18 @@ from html.parser import HTMLParser
 from types import SimpleNamespace
 from xml.etree import ElementTree
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from PIL import Image
-from short import short
+from short import short, shorten
 from tiny import FILTER, SCENARIO, SMOOTHING, write_baseline
 
 from eitbench.bench import run
 from eitbench.bench import store as store_module
-from eitbench.bench.run import Environment, Job, run_jobs
+from eitbench.bench.run import Job, run_jobs
 from eitbench.bench.store import EpisodeStore
-from eitbench.data.episodes import CACHE_VARIABLE
+from eitbench.bench.tracks import Environment
+from eitbench.data.store import CACHE_VARIABLE
 from eitbench.numerics.round import extrude, uniform_disc
 from eitbench.report import charts, page
 from eitbench.report.summary import EXPLANATIONS, markdown, summary
@@ -84,7 +84,7 @@ def made(tmp_path_factory):
         patch.setenv(CACHE_VARIABLE, str(folder / "cache"))
         patch.setattr(store_module, "_git", lambda *words: None)
         for name in (FILTER.id, SMOOTHING.id):
-            patch.setitem(gym.registry[name].kwargs, "scenario", SCENARIO)
+            shorten(patch, {name: SCENARIO})
         evil = write_baseline(folder, "evil", doc=EVIL + ": bad.", update="return Estimate(self.level + self.calls)")
         failing = write_baseline(folder, "surely_failing", doc="Failing", update="raise RuntimeError('<b>&lt;')")
         store = EpisodeStore(folder)
@@ -185,7 +185,7 @@ def test_a_failure_does_not_take_the_snapshots_of_others(made, monkeypatch):
     """Whoever has estimates is shown, also beside a baseline that failed."""
     folder, records, _ = made
     monkeypatch.setenv(CACHE_VARIABLE, str(folder / "cache"))
-    monkeypatch.setitem(gym.registry[SMOOTHING.id].kwargs, "scenario", SCENARIO)
+    shorten(monkeypatch, {SMOOTHING.id: SCENARIO})
     first = sorted((record for record in records if record["board"] == "smoothing"),
                    key=lambda record: record["method"] != "surely_failing")
     snapshots = page._snapshots(EpisodeStore(folder), first)
@@ -211,8 +211,10 @@ def test_snapshots_are_of_the_world_that_was_played(made, monkeypatch):
 
     monkeypatch.setenv(CACHE_VARIABLE, str(folder / "cache"))
     monkeypatch.setattr(page, "Environment", Watched)
-    page._snapshots(EpisodeStore(folder), [record for record in records if record["board"] == "filter"][:2])
-    assert asked[0].get("scenario") == SCENARIO
+    given = {"kwargs": {"world": SCENARIO}}
+    page._snapshots(EpisodeStore(folder), [record | {"environment": record["environment"] | given}
+                                           for record in records if record["board"] == "filter"][:2])
+    assert asked == [{"world": SCENARIO}]
 
 
 @pytest.mark.parametrize("values", [[0.1], [0.1, 0.1], [0.2, 0.0, 0.3]], ids=["one step", "constant", "a zero"])
@@ -245,6 +247,8 @@ def test_perfect_scores_have_intervals(values):
 def test_other_seeds_do_not_take_the_snapshots_away(made, monkeypatch):
     """A method played on dev seeds beside ours on others, as README suggests: the pictures are still there."""
     folder, records, _ = made
+    for name in (FILTER.id, SMOOTHING.id):
+        monkeyshorten(patch, {name: SCENARIO})
     monkeypatch.setattr(page, "SHOWN", (("homogeneous", "filter"), ("homogeneous", "smoothing")))
     others = [record | {"split": "own", "seeds": ["300001"],
                         "episodes": [episode | {"seed": "300001"} for episode in record["episodes"][:1]]}

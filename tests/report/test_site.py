@@ -19,7 +19,7 @@ from test_page import Page, svgs
 from tiny import RUN, record, several_boards
 
 from eitbench.bench.records import read_records, write_record
-from eitbench.envs import ENTRY_POINTS
+from eitbench.bench.tracks import ids
 from eitbench.report import charts
 from eitbench.report.boards import ALL, boards
 from eitbench.report.site import read_media, render_site, write_site
@@ -132,7 +132,7 @@ def test_numbers_are_those_of_the_boards(pages):
         shown = rows_of(pages["index.html"], f"board-{of_class}-{environment}")
         places = [shown] if environment == ALL else [shown, rows_of(pages[f"environments/{environment}.html"])]
         for rows in places:
-            by_label = {re.search(r"(\S+@\w{8})", cells[1])[1]: cells for cells in rows}
+            by_label = {re.search(r"(\S+@\w+)", cells[1])[1]: cells for cells in rows}
             for _, row in own.iterrows():
                 cells = by_label.pop(f"{row['method'].split()[-1]}@{row['version']}")
                 assert cells[0].split()[0] == ("–" if pd.isna(row["rank"]) else str(row["rank"]))
@@ -153,7 +153,7 @@ def test_who_beats_whom(pages):
     board = table[table["environment"] == "eitbench-Pipe2D-v0"]
     errors = [{e["seed"]: e["scores"]["error"] for e in r["episodes"] if e["status"] == "ok"}
               for name, version in zip(board["method"], board["version"], strict=True) for r in several_boards()
-              if (r["environment"]["name"], r["method"], r["method_sha256"][:8]) == (
+              if (r["environment"]["name"], r["method"], r["version"]) == (
                   "eitbench-Pipe2D-v0", name, version)]
     html = pages["environments/eitbench-Pipe2D-v0.html"].split('class="duels"')[1].split("</table>")[0]
     shown = [re.findall(r"<td.*?>(.*?)</td>", row) for row in html.split("<tbody>")[1].split("</tr>")[:-1]]
@@ -243,7 +243,7 @@ def test_docstrings_are_of_the_version_that_was_played(pages):
 
 def test_every_environment_has_its_docstring():
     """Description first, then tables; headings below the page's."""
-    for id in ENTRY_POINTS:
+    for id in ids():
         first, rest = documentation(id)
         assert len(first) > 100 and "<table>" in rest and "<h3>Reward</h3>" in rest and "<h2>" not in first + rest, id
 
@@ -318,7 +318,7 @@ def test_charts_are_within_their_frame(pages):
             assert all(0 <= x <= width and 0 <= y <= height for x, y in marks), path
             assert chart.get("aria-hidden") or chart.get("aria-label")
     used = {colour for html in pages.values() for colour in re.findall(r"var\((--\w+)\)", html)}
-    assert used <= set(re.findall(r"(--\w+):", (ROOT / "eitbench/leaderboard/style.css").read_text()))
+    assert used <= set(re.findall(r"(--\w+):", (ROOT / "eitbench/report/style.css").read_text()))
 
 
 def test_of_many_curves_a_few_stand_out():

@@ -25,7 +25,6 @@ from eitbench.report.summary import (
 unhurried = settings(deadline=None)                                                     # a busy machine is no failure
 BOARD_IDS = {"filter": "eitbench/Pipe2D-v0", "fixed-lag": "eitbench/Pipe2DFixedLag-v0",
              "smoothing": "eitbench/Pipe2DSmoothing-v0"}
-LAGS = {"filter": {}, "fixed-lag": {"lag": 4}, "smoothing": {"lag": "all"}}
 
 
 def record(baseline, board, errors, *, failed=(), kwargs=None, id=None, **scores):
@@ -37,9 +36,9 @@ def record(baseline, board, errors, *, failed=(), kwargs=None, id=None, **scores
                 "scores": dict.fromkeys(COLUMNS) | {"error": error} | scores}
 
     return {"method": baseline, "title": baseline.replace("_", " "), "board": board, "split": "test",
-            "source": "code", "official": False, "seeds": [f"test:{i}" for i in range(len(errors))],
+            "official": False, "seeds": [f"test:{i}" for i in range(len(errors))],
             "environment": {"id": id or BOARD_IDS[board], "name": f"{board}-v0",
-                            "kwargs": LAGS[board] | (kwargs or {})},
+                            "kwargs": kwargs or {}},
             "episodes": [one(i, error) for i, error in enumerate(errors)]}
 
 
@@ -132,7 +131,7 @@ def test_skill_needs_its_anchors():
     mine = record("mine", "filter", FLOOR)
     for others in ([], ANCHORS[:1], ANCHORS[1:]):
         assert row([*others, mine], "mine", "filter")["skill"] is None
-    elsewhere = record("mine", "filter", FLOOR, kwargs={"scenario": {"scored_steps": 16}})
+    elsewhere = record("mine", "filter", FLOOR, kwargs={"world": {"schedule": {"scored_steps": 16}}})
     assert row([*ANCHORS, elsewhere], "mine", "filter")["skill"] is None
 
 
@@ -162,10 +161,12 @@ def test_anchors_look_back_on_the_longest_record(official):
 
 @pytest.mark.parametrize(("id", "kwargs", "world"), [
     ("eitbench/Pipe2DFixedLag-v0", {"lag": 4}, "Pipe2D"),
-    ("eitbench/Pipe3DSmoothing-v0", {"lag": "all", "scenario": None}, "Pipe3D"),
-    ("eitbench/Pipe2D-v0", {"scenario": {"scored_steps": 3}}, "Pipe2D (scored_steps=3)"),
-    ("eitbench/Pipe2DSmoothing-v0", {"scenario": {"scored_steps": 3, "frame": 2}}, "Pipe2D (frame=2, scored_steps=3)"),
-    ("eitbench/Pipe2DUnknownVelocity-v0", {"flow": "unknown"}, "Pipe2DUnknownVelocity"),
+    ("eitbench/Pipe3DSmoothing-v0", {"lag": "all", "world": None}, "Pipe3D"),
+    ("eitbench/Pipe2D-v0", {"world": {"schedule": {"scored_steps": 3}}},
+     'Pipe2D (schedule={"scored_steps": 3})'),
+    ("eitbench/Pipe2DSmoothing-v0", {"world": {"region": None, "flow": {"diffusivity": 1e-3}}},
+     'Pipe2D (flow={"diffusivity": 0.001}, region=null)'),
+    ("eitbench/Pipe2DUnknownVelocity-v0", {}, "Pipe2DUnknownVelocity"),
     ("eitbench/Pipe2DUnknownVelocity-v0", {"flow": "skewed"}, "Pipe2DUnknownVelocity (flow=skewed)"),
     ("eitbench/Pipe2DBiasedVelocity-v0", {"true_mean_velocity": 4.5, "assumed_profile": "plug", "episodes": 2},
      "Pipe2DBiasedVelocity (true_mean_velocity=4.5)"),
@@ -264,11 +265,9 @@ def test_seeds_are_named_by_their_ranges():
     assert seed_ranges(["dev:10", "dev:9"]) == "dev:9-10" and seed_ranges(["300001"]) == "300001"
 
 
-def test_other_seeds_and_other_code_have_boards_of_their_own():
-    """Dev scores stand under their own heading, and neither they nor old code lend anchors for skill."""
+def test_other_seeds_have_boards_of_their_own():
+    """Dev scores stand under their own heading, and find no anchors for skill in those of other seeds."""
     mine = record("mine", "filter", FLOOR) | {"split": "dev"}
     table = summary([*ANCHORS, mine])
     assert list(table["split"]) == ["test", "test", "dev"] and cells(table)["board"].iloc[-1] == "filter (dev seeds)"
     assert row([*ANCHORS, mine], "mine", "filter")["skill"] is None
-    old = record("mine", "filter", FLOOR) | {"source": "old"}
-    assert row([*ANCHORS, old], "mine", "filter")["skill"] is None

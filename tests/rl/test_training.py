@@ -20,7 +20,7 @@ from eitbench.worlds import Pipe2D
 
 NAME = "eitbench/Pipe2DInjection-v0"
 CURRENTS, BUDGET = "eitbench/Pipe2DInjectionCurrents-v0", "eitbench/Pipe2DInjectionBudget-v0"
-SHORT = {"scenario": {"scored_steps": 4, "mean_velocity": 16.0}}
+SHORT = {"world": {"flow": {"mean_velocity": 16.0}, "schedule": {"scored_steps": 4}}}
 """Four steps of the agent an episode."""
 TINY = Config(total_steps=32, n_envs=2, interval=16, evaluation_episodes=2, episodes=3, hidden=(8,),
               algorithm={"n_steps": 8, "batch_size": 8})

@@ -21,9 +21,10 @@ from eitbench.bench.policies import load_policy
 from eitbench.bench.sandbox import wall, wire
 from eitbench.bench.sandbox.host import Guest, GuestError
 from eitbench.bench.sandbox.wall import landlock_version
-from eitbench.data.episodes import CACHE_VARIABLE, simulate
+from eitbench.data.episodes import simulate
 from eitbench.data.recordings import cycle_voltages, recording
-from eitbench.worlds import Pipe2D
+from eitbench.data.store import CACHE_VARIABLE
+from eitbench.worlds.pipe2d import PIPE_2D
 
 KWARGS = json.loads(FILTER.kwargs)
 walled = pytest.mark.skipif(not landlock_version(), reason="this kernel has no Landlock")
@@ -74,8 +75,8 @@ attempt("the truth in memory", lambda: any(type(o).__name__ == "ndarray" and lis
 @pytest.fixture
 def measured():
     """(T, L) voltages and currents of an episode."""
-    scenario = Pipe2D(**SCENARIO)
-    voltages = cycle_voltages(scenario, recording(scenario, 3))
+    scenario = PIPE_2D.changed(SCENARIO)
+    voltages = cycle_voltages(scenario, 3, recording(scenario, 3))
     return voltages, scenario.currents[np.arange(len(voltages)) % len(scenario.currents)]
 
 
@@ -131,7 +132,7 @@ def test_it_reaches_nothing(tmp_path, monkeypatch):
     """Neither files nor other processes, sockets, a terminal or a truth, nor which files are opened, whose names hold
     seeds; without the wall the same code does."""
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
-    here = {"truth": simulate(Pipe2D(**SCENARIO), 3, progress=False).concentration, "makes the collector look": []}
+    here = {"truth": simulate(PIPE_2D.changed(SCENARIO), 3, progress=False).concentration, "makes the collector look": []}
     (tmp_path / "secret.txt").write_text("the truth")
     with (socket.create_server(("127.0.0.1", 0)) as server, socket.socket(socket.AF_UNIX) as service,
           socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as log, a_terminal()):
@@ -188,7 +189,7 @@ def test_its_children_end_with_it(end, tmp_path):
 
 def test_a_question_that_is_not_read_is_too_late(tmp_path):
     """A guest may answer in advance and read nothing; the pipe is full some time."""
-    ahead = ("from eitbench.bench import wire\n        os.write(4, wire.pack({}))\n"
+    ahead = ("from eitbench.bench.sandbox import wire\n        os.write(4, wire.pack({}))\n"
              "        while True: os.write(4, wire.pack({'estimate': None}))")
     with Guest("estimator", FILTER.id, KWARGS, write_baseline(tmp_path, init=ahead)) as guest:
         guest.begin()

@@ -17,11 +17,12 @@ from tiny import FILTER, FIXED_LAG, SMOOTHING, write_baseline
 
 from eitbench.bench import suites
 from eitbench.bench.policies import own_policies
-from eitbench.bench.run import Environment, Job, run_episode, run_jobs
+from eitbench.bench.run import Job, run_episode, run_jobs
 from eitbench.bench.sandbox import guests, host
 from eitbench.bench.sandbox.wall import landlock_version
 from eitbench.bench.store import EpisodeStore
-from eitbench.data.episodes import CACHE_VARIABLE
+from eitbench.bench.tracks import Environment
+from eitbench.data.store import CACHE_VARIABLE
 
 INJECTION = Environment("eitbench/Pipe2DInjection-v0", json.dumps({"scenario": PIPE, "estimator": "reduced"}))
 WALL = "landlock" if landlock_version() else "process"

@@ -12,9 +12,9 @@ from matplotlib.image import imread
 from PIL import Image
 
 from eitbench.bench.baselines import load_baseline
-from eitbench.bench.suites import POLICY_SEEDS
+from eitbench.bench.tracks import MORE_SEEDS
 from eitbench.cli.studies import NAME, thesis
-from eitbench.data.episodes import CACHE_VARIABLE
+from eitbench.data.store import CACHE_VARIABLE
 from eitbench.data.seeds import name_seed
 from eitbench.envs.pipe2d import Pipe2DEnv
 from eitbench.envs.pipe2d_obstacle import Pipe2DObstacleEnv
@@ -140,7 +140,7 @@ def test_injection_is_drawn(monkeypatch, tmp_path):
     path, remark = FIGURES["injection"](None, 1, tmp_path / "new")
     picture = imread(path)
     assert min(picture.shape[:2]) > 250 and picture[..., :3].std() > 0.05
-    assert list(played.items()) == [((env, "{}"), POLICY_SEEDS.get(env, "test:0-9")) for env in injection.WORLDS]
+    assert list(played.items()) == [((env, "{}"), MORE_SEEDS.get(env, "test:0-9")) for env in injection.WORLDS]
     assert remark.count("| best_pair |") == 6
     with Image.open(tmp_path / "new" / "injection.gif") as moving:
         assert moving.n_frames == 3                               # the first frame of 16, then three steps

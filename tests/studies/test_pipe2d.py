@@ -10,7 +10,8 @@ import pytest
 
 from eitbench import make_task, simulate
 from eitbench.bench.baselines import load_baseline
-from eitbench.bench.run import Environment, Job, run_episode
+from eitbench.bench.run import Job, run_episode
+from eitbench.bench.tracks import Environment
 from eitbench.cli.studies import NAME, thesis
 from eitbench.data.recordings import score_operators
 from eitbench.data.seeds import parse_seeds

@@ -9,7 +9,8 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from eitbench.bench.run import Environment, Job, run_episode
+from eitbench.bench.run import Job, run_episode
+from eitbench.bench.tracks import Environment
 from eitbench.data.seeds import parse_seeds
 from eitbench.scoring import deficit_centre
 from eitbench.worlds.base import Randomness

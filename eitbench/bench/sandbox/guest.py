@@ -13,9 +13,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cloudpickle
 import numpy as np
 
 from eitbench.bench.sandbox import wall, wire
+from eitbench.worlds.registry import take_over
 
 Reply = tuple[dict[str, Any], dict[str, np.ndarray]]
 
@@ -52,7 +54,7 @@ def main() -> None:
             return
         try:
             if words["do"] == "play":
-                answer, about = _player(words)
+                answer, about = _player(words, arrays)
                 say(about)
             else:
                 say(*answer(words, arrays))
@@ -64,9 +66,13 @@ def _nothing(words: dict[str, Any], arrays: dict[str, np.ndarray]) -> Reply:
     raise ValueError("the first message must be 'play'")
 
 
-def _player(words: dict[str, Any]) -> tuple[Callable[..., Reply], dict[str, Any]]:
+def _player(words: dict[str, Any], arrays: dict[str, np.ndarray]) -> tuple[Callable[..., Reply], dict[str, Any]]:
     """What answers from now on, and what the method says of itself."""
     import gymnasium as gym
+
+    import eitbench  # noqa: F401 (registers)
+    if arrays["told"].size:                                            # what the host says may be believed
+        take_over([cloudpickle.loads(arrays["told"].tobytes())])
     env: Any = gym.make(words["id"], disable_env_checker=True, **words["kwargs"]).unwrapped
     about: dict[str, Any]
     loaded: Any

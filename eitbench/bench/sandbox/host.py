@@ -20,19 +20,21 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+import cloudpickle
 import numpy as np
 
 from eitbench._files import PACKAGE
 from eitbench.bench.baselines import is_ours
 from eitbench.bench.sandbox import wire
-from eitbench.data.episodes import cache_folder
+from eitbench.data.store import CACHE_VARIABLE, cache_folder, folder
+from eitbench.worlds.registry import entry, registered_by_hand
 
 MEMORY = 8 << 30
 """bytes of address space that a guest may take"""
 PATIENCE = 600.0
 """s that an answer may take; the first after an episode began may hold all preparations"""
 MODELS = ("outline.npz", "region.npz", "reduced-*.npz", "joint-*.npz")
-"""What the cache holds of a scenario, made without any episode; the files of an episode begin with its seed."""
+"""What the cache holds of a world, made without any episode; the files of an episode begin with its seed."""
 ARITHMETIC = ("OPENBLAS_", "MKL_", "OMP_", "NPY_", "NUMBA_CPU")
 """Variables on which the last bits of numbers depend begin so."""
 
@@ -86,7 +88,7 @@ class Guest:
             if self.closed:
                 _refuse_open_cache(wall["readable"])
             self.about = self._ask({"do": "play", "kind": kind, "id": id, "kwargs": kwargs,
-                                    "name": self._copied(name)})[0]
+                                    "name": self._copied(name)}, {"told": _told(id)})[0]
             """What the method's class says of itself: unchecked words of a stranger."""
         except BaseException:
             self.close()
@@ -146,10 +148,8 @@ class Guest:
 
     def _surroundings(self, id: str, kwargs: dict[str, Any]) -> dict[str, str]:
         """Environment variables; models that are kept in the cache, without a truth, are copied for the guest."""
-        from eitbench.data.episodes import CACHE_VARIABLE, folder
-        from eitbench.envs import scenario_of
         cache, kernels = self._private / "cache", self._private / "kernels"
-        there = folder(scenario_of(id, kwargs))
+        there = folder(entry(id).world.changed(kwargs.get("world")))
         (cache / there.name).mkdir(parents=True)
         for model in (path for pattern in MODELS for path in there.glob(pattern)):
             shutil.copy(model, cache / there.name)
@@ -233,6 +233,26 @@ class Guest:
             with suppress(ProcessLookupError, PermissionError):            # it has ended by itself
                 os.killpg(self._process.pid, signal.SIGKILL)
         return self._process.wait()
+
+
+def _told(id: str) -> np.ndarray:
+    """An entry that a guest does not know by itself, since a script registered it, as bytes; else none.
+
+    What is unpickled there comes from here; nothing of a guest is ever unpickled here.
+    """
+    if id not in [each.id for each in registered_by_hand()]:
+        return np.zeros(0, np.uint8)
+    world = entry(id).world
+    parts = {type(world.vessel), type(world.flow), type(world.target), type(world.schedule.pattern)}
+    modules = [sys.modules[name] for name in {kind.__module__ for kind in parts}
+               if not name.startswith("eitbench.")]
+    for module in modules:                              # a guest has not the script's folder
+        cloudpickle.register_pickle_by_value(module)
+    try:
+        return np.frombuffer(cloudpickle.dumps(entry(id)), np.uint8)
+    finally:
+        for module in modules:
+            cloudpickle.unregister_pickle_by_value(module)
 
 
 def _refuse_open_cache(readable: list[str]) -> None:

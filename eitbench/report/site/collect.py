@@ -7,9 +7,8 @@ from urllib.parse import quote
 
 import pandas as pd
 
-from eitbench.bench.records import newest, version
+from eitbench.bench.records import newest
 from eitbench.data.seeds import name_seed, parse_seeds
-from eitbench.envs import ENTRY_POINTS
 from eitbench.report.boards import ALL, boards
 
 
@@ -95,7 +94,7 @@ class Site(NamedTuple):
 
 def collect(records: list[dict[str, Any]], table: pd.DataFrame) -> Site:
     """Boards of all records, the outdated ones among them, from the table of those that are not."""
-    by_key = {(record["environment"]["name"], record["method"], version(record)): record for record in records}
+    by_key = {(record["environment"]["name"], record["method"], record["version"]): record for record in records}
     found: dict[tuple[str, str], list[Row]] = {}
     for generation, rows in enumerate(_generations(records, table)):
         for cells in rows.astype(object).where(rows.notna(), None).to_dict("records"):
@@ -110,7 +109,7 @@ def collect(records: list[dict[str, Any]], table: pd.DataFrame) -> Site:
     made = [Board(*key, titles[key[1]], rows) for key, rows in found.items()]
     classes = list(dict.fromkeys(board.of_class for board in made))
     made.sort(key=lambda board: (classes.index(board.of_class), not board.is_aggregate))
-    return Site(made, sorted(records, key=lambda r: (r["environment"]["name"], r["method"], version(r))))
+    return Site(made, sorted(records, key=lambda r: (r["environment"]["name"], r["method"], r["version"])))
 
 
 def title_of(record: dict[str, Any]) -> str:
@@ -118,9 +117,7 @@ def title_of(record: dict[str, Any]) -> str:
     environment = record["environment"]
     if environment["name"] == environment["id"].replace("/", "-"):
         return environment["id"].removeprefix("eitbench/")
-    usual = ENTRY_POINTS.get(environment["id"], ("", {}))[1]
-    given = [f"{key}={value}" for key, value in environment["kwargs"].items()
-             if value is not None and value != usual.get(key)]
+    given = [f"{key}={value}" for key, value in environment["kwargs"].items() if value is not None]
     return f"{environment['id'].removeprefix('eitbench/')} ({', '.join(given)})"
 
 
@@ -130,7 +127,7 @@ def method_address(name: str) -> str:
 
 
 def _generations(records: list[dict[str, Any]], table: pd.DataFrame) -> list[pd.DataFrame]:
-    """The table, then one of what is outdated, one of what is older still, and so on: each environment of one code."""
+    """The table, then one of what is outdated, one of what is older still, and so on: each method in one version."""
     tables, left = [table], newest(records)[1]
     while left:
         current, older = newest(left)

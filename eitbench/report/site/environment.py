@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
-import inspect
 import re
 from itertools import combinations
 from typing import Any
@@ -13,8 +11,8 @@ from markdown_it import MarkdownIt
 from markupsafe import Markup
 
 from eitbench._files import shipped
+from eitbench.bench import tracks
 from eitbench.bench.statistics import paired_probability_of_improvement
-from eitbench.envs import ENTRY_POINTS
 from eitbench.report import charts
 from eitbench.report.site.collect import Board, Row, Site
 from eitbench.report.site.tables import explanations, table, three
@@ -40,9 +38,8 @@ def environment_page(site: Site, board: Board, animation: bytes | None) -> str:
 
 def documentation(id: str) -> tuple[Markup, Markup]:
     """What a docstring says first, and all the rest, as HTML."""
-    module, name = ENTRY_POINTS[id][0].split(":")
-    text = inspect.getdoc(getattr(importlib.import_module(module), f"{name}Env")) or ""
-    first, *rest = re.split(r"^(?=## )", re.sub(r"\A\s*## Description\s*", "", text), flags=re.MULTILINE)
+    text = re.sub(r"\A\s*## Description\s*", "", tracks.documentation(id))
+    first, *rest = re.split(r"^(?=## )", text, flags=re.MULTILINE)
     return markdown(first), markdown("".join(rest))
 
 

@@ -13,7 +13,8 @@ import numpy as np
 from markupsafe import Markup
 
 from eitbench._files import shipped
-from eitbench.bench.records import alike, finished, version
+from eitbench.bench.baselines import version_of
+from eitbench.bench.records import alike, finished
 from eitbench.report import charts
 from eitbench.report.boards import HEADINGS
 from eitbench.report.site.collect import Board, Row, Site, title_of
@@ -27,10 +28,10 @@ def method_page(site: Site, name: str) -> str:
     """The HTML of the page of all versions of a method."""
     standings = [(board, row) for board in site.boards for row in board.rows if row.cells["method"] == name]
     records = sorted((record for record in site.records if record["method"] == name), key=finished, reverse=True)
-    versions = list(dict.fromkeys(map(version, records)))
+    versions = list(dict.fromkeys(record["version"] for record in records))
     return template("site/method.html.j2").render(
         root="../", name=name, title=records[0]["title"], standings=_standings(standings),
-        intervals=_intervals(standings), versions=[_version([r for r in records if version(r) == each], site)
+        intervals=_intervals(standings), versions=[_version([r for r in records if r["version"] == each], site)
                                                    for each in versions])
 
 
@@ -63,7 +64,7 @@ def _version(records: list[dict[str, Any]], site: Site) -> dict[str, Any]:
     """What is said of one version: its file as far as it is ours and the same, and its records."""
     record = records[0]
     file = source_file(record)
-    return {"name": version(record), "sha256": record["method_sha256"], "checkpoint": record["checkpoint_sha256"],
+    return {"name": record["version"], "sha256": record["method_sha256"], "checkpoint": record["checkpoint_sha256"],
             "parameters": {key: json.dumps(value, ensure_ascii=False)
                            for key, value in sorted(record["parameters"].items())},
             "file": file, "docstring": docstring(record, file),
@@ -75,7 +76,7 @@ def _record(record: dict[str, Any], site: Site) -> dict[str, Any]:
                       (None, None))                                  # it played none of the board's episodes
     return {"title": title_of(record), "address": board and board.address, "official": record["official"],
             "outdated": row is not None and row.outdated, "runs": _runs(record), "command": command(record),
-            "typed": sorted({run["command"] for run in record["runs"]}), "source": record["source"],
+            "typed": sorted({run["command"] for run in record["runs"]}),
             "episodes": _episodes(record),
             "failures": [episode for episode in record["episodes"] if episode["status"] != "ok"]}
 
@@ -104,7 +105,7 @@ def command(record: dict[str, Any]) -> str:
 
     A file is named as it was when they were played.
     """
-    if record["environment"]["name"] != record["environment"]["id"].replace("/", "-"):
+    if record["environment"]["kwargs"]:
         return ""
     kind = "--policy" if record["board"] == "injection" else "--baseline"
     return shlex.join(["eitbench", "submit", kind, _argument(record), "--env", record["environment"]["id"],
@@ -154,5 +155,6 @@ def docstring(record: dict[str, Any], file: str) -> Markup:
 
 
 def _is_version(path: Path, record: dict[str, Any]) -> bool:
-    """Whether the file is the one that was played."""
-    return hashlib.sha256(path.read_bytes()).hexdigest() == record["method_sha256"]
+    """Whether the file is what was played: of ours the same version, of others the very same."""
+    sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
+    return record["version"] == version_of(path, sha256) or sha256 == record["method_sha256"]

@@ -1,0 +1,58 @@
+"""Records of the format before, schema 2, as they would be written today.
+
+There a record carried one ``source``, a digest of the library's text that decided whether it counted;
+its version was always eight digits of the method's file; and ``kwargs`` held what an environment was
+registered with too.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from eitbench.bench import tracks
+from eitbench.bench.baselines import own_names
+
+NUMBER = 2
+
+
+def upgraded(path: Path, record: dict[str, Any]) -> tuple[dict[str, Any], str]:
+    """A record of schema 2 as one of schema 3, not sealed, and the name its file had to have.
+
+    Raises
+    ------
+    ValueError
+        Naming the file, if something is missing that the new record is made from.
+    """
+    try:
+        return _upgraded(record), _file_name(record)
+    except (AttributeError, KeyError, TypeError) as error:
+        raise ValueError(f"record {path} is not valid as one of schema {NUMBER}: "
+                         f"{type(error).__name__}: {error}") from None
+
+
+def _upgraded(record: dict[str, Any]) -> dict[str, Any]:
+    kept = {key: value for key, value in record.items() if key not in ("source", "sha256")}
+    environment = record["environment"]
+    given = _given(environment)
+    is_ours = record["official"] is True and record["method"] in own_names(environment["id"])
+    return kept | {
+        "schema": 3,
+        "version": "v1" if is_ours else record["method_sha256"][:8],
+        "environment": environment | {"kwargs": given, "name": tracks.named(environment["id"], given)},
+        "runs": [run | {"source": record["source"]} for run in record["runs"]],
+    }
+
+
+def _given(environment: dict[str, Any]) -> dict[str, Any]:
+    """Arguments that differ from what is registered."""
+    if environment["name"] == environment["id"].replace("/", "-"):
+        # The name said that nothing was given, whatever the id was registered with in those days.
+        return {}
+    return tracks.changed(environment["id"], environment["kwargs"])
+
+
+def _file_name(record: dict[str, Any]) -> str:
+    parts = [record["environment"]["name"], record["method"], record["method_sha256"][:8]]
+    split = [] if record["split"] == "test" else [record["split"]]
+    return "--".join([*parts, *split]) + ".json"

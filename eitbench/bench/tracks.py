@@ -1,0 +1,157 @@
+"""What is asked, and where: the registered environments, their track, their boards, and the seeds that are played.
+
+All that the benchmark knows of ids is in this file.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import gymnasium as gym
+
+from eitbench.data.seeds import parse_seeds
+from eitbench.envs.pages import page
+from eitbench.worlds.registry import entries, entry
+
+if TYPE_CHECKING:
+    from eitbench.envs.estimation import EstimationEnv
+    from eitbench.envs.injection import InjectionEnv
+
+TRACKS = ("estimation", "injection")
+"""What may be asked for: an estimate of every state, or the next current."""
+BOARDS = {"estimation": ("filter", "fixed-lag", "smoothing"), "injection": ("injection",)}
+"""Of each track: in estimation, by how late the estimate of a state is asked for."""
+ALL_BOARDS = tuple(board for boards in BOARDS.values() for board in boards)
+CLASSES = ("filter", "fixed-lag", "smoothing", "stationary", "injection")
+"""What is ranked together: the boards, and targets that stand still apart."""
+FLOORS = {"estimation": "homogeneous", "injection": "random_pair"}
+"""Whose episodes are the board's, and from whose error the gain is counted."""
+KINDS = {"estimation": "estimator", "injection": "policy"}
+"""What a method of the track is."""
+ESTIMATORS = ("full", "reduced")
+"""What may stand inside an injection environment: the exact filter, for scores, or that of training."""
+
+QUICK = ("eitbench/Pipe2D-v0", "eitbench/Pipe2DFixedLag-v0", "eitbench/Pipe2DSmoothing-v0")
+"""What the quick suite runs; the full one runs all that ask for estimates."""
+QUICK_SEEDS = "test:0-3"
+
+
+class Environment(NamedTuple):
+    """A registered id with keyword arguments: what is made, and what a record names."""
+
+    id: str
+    kwargs: str = "{}"
+    """JSON"""
+
+    @property
+    def given(self) -> dict[str, Any]:
+        """The arguments that differ from what is registered."""
+        return changed(self.id, json.loads(self.kwargs))
+
+    @property
+    def name(self) -> str:
+        """Fit for a folder; other arguments, other name."""
+        return named(self.id, self.given)
+
+    @property
+    def track(self) -> str:
+        """One of `TRACKS`; ``ValueError`` if there is no such environment."""
+        return track_of(self.id)
+
+    def make(self, **extra: Any) -> EstimationEnv | InjectionEnv:
+        """A fresh environment as it is played, without gymnasium's wrappers.
+
+        Raises
+        ------
+        ValueError
+            If there is none of this id, or its arguments are wrong.
+        """
+        arguments = json.loads(self.kwargs)
+        if self.track == "injection":
+            arguments = {"estimator": "full", "observation": "raw"} | arguments | extra
+            if arguments["estimator"] not in ESTIMATORS:
+                raise ValueError(f"estimator must be one of {', '.join(ESTIMATORS)}, got "
+                                 f"{arguments['estimator']!r}")
+        made: Any = gym.make(self.id, disable_env_checker=True, **(arguments | extra)).unwrapped
+        return made
+
+    def rules_only(self) -> dict[str, Any]:
+        """Arguments that make an environment without an estimator inside, for who needs to know only
+        what is allowed."""
+        without = {"estimator": "none"} if self.track == "injection" else {}
+        return json.loads(self.kwargs) | without
+
+
+def ids(track: str | None = None) -> list[str]:
+    """Registered environments of one track, or of all, as they were registered."""
+    return [id for id, each in entries().items() if track in (None, each.track)]
+
+
+def track_of(id: str) -> str:
+    """One of `TRACKS`; ``ValueError`` if there is no environment of this id."""
+    return entry(id).track
+
+
+def check_track(id: str, track: str) -> None:
+    """``ValueError`` if an environment is of another track, or there is none."""
+    if track_of(id) != track:
+        asked = {"estimation": "estimates", "injection": "injections"}[track]
+        raise ValueError(f"environment {id} does not ask for {asked}; env must be one of "
+                         f"{', '.join(ids(track))}")
+
+
+def registered(id: str) -> dict[str, Any]:
+    """Arguments that an id was registered with; none for one that is not registered."""
+    each = entries().get(id)
+    if each is None:
+        return {}
+    played = {"estimator": "full", "observation": "raw"} if each.track == "injection" else {}
+    return played | dict(each.settings)
+
+
+def changed(id: str, kwargs: dict[str, Any]) -> dict[str, Any]:
+    """The arguments that make another world than the registered one, or other beliefs about it."""
+    usual = {"world": {}} | registered(id)
+    return {key: value for key, value in kwargs.items() if value is not None
+            and (key not in usual or json.dumps(value) != json.dumps(usual[key]))}
+
+
+def named(id: str, given: dict[str, Any]) -> str:
+    """Name of an id with the arguments that differ from what is registered."""
+    text = json.dumps(given, sort_keys=True)
+    digest = hashlib.sha256(text.encode()).hexdigest()[:8]
+    return id.replace("/", "-") + (f"-{digest}" if given else "")
+
+
+def board_of(env: EstimationEnv | InjectionEnv) -> str:
+    """Which of its track's `BOARDS` an environment belongs to."""
+    lag = getattr(env, "lag", None)
+    if lag is None:
+        return "injection"
+    if lag == 0:
+        return "filter"
+    return "smoothing" if lag == env.world.n_steps - 1 else "fixed-lag"
+
+
+def track_of_board(board: str) -> str:
+    """One of `TRACKS`."""
+    return next(track for track, boards in BOARDS.items() if board in boards)
+
+
+def class_of(id: str, board: str) -> str:
+    """Which of `CLASSES` a board of an environment belongs to."""
+    each = entries().get(id)
+    at_rest = each is not None and getattr(each.world.target, "stands_still", False)
+    return "stationary" if at_rest else board
+
+
+def default_seeds(env: EstimationEnv | InjectionEnv, id: str, suite: str = "full") -> list[int]:
+    """Seeds that are played in an environment when nobody says which."""
+    return parse_seeds(QUICK_SEEDS if suite == "quick" else entry(id).seeds)
+
+
+def documentation(id: str) -> str:
+    """Page of an environment, as Markdown."""
+    return page(id)

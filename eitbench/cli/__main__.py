@@ -1,0 +1,5 @@
+"""`python -m eitbench.cli` is the command `eitbench`."""
+
+from eitbench.cli import app
+
+app()
