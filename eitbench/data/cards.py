@@ -1,8 +1,9 @@
-"""World cards: reference numbers of a few episodes of each registered id, committed, by which a change of numbers shows.
+"""World cards: reference numbers of a few episodes of each registered id, committed, by which a
+change of numbers shows.
 
-What must not change silently are numbers, not the text of the code: a card that no longer agrees means that the id needs
-a new version. Numbers are compared relative to the largest of their kind, with a tolerance that other processors, BLAS
-kernels and thread counts pass.
+What must not change silently are numbers, not the text of the code: a card that no longer agrees
+means that the id needs a new version. Numbers are compared relative to the largest of their kind,
+with a tolerance that other processors, BLAS kernels and thread counts pass.
 """
 
 from __future__ import annotations
@@ -29,42 +30,71 @@ CARDS = PACKAGE / "worlds" / "cards"
 SEEDS = ("train:0", "dev:0")
 """The episodes of a card."""
 LAST = 24
-"""Only so many injections are simulated: the first scored ones are among them in every world of ours."""
+"""Only so many injections are simulated: the first scored ones are among them in every world of
+ours."""
 TOLERANCE = 1e-6
 """Relative difference that is none; moments are kept in single precision."""
 
 
 def card(id: str) -> dict[str, Any]:
-    """The numbers of an id, simulated anew: of its model, and of the first injections of two episodes.
+    """The card of a registered id, simulated anew; see `numbers`."""
+    return {"id": id} | numbers(entry(id).world)
+
+
+@lru_cache(maxsize=2)
+def numbers(world: World) -> dict[str, Any]:
+    """What stands on the card of a world: its model, and the first injections of two episodes.
 
     Returns
     -------
     dict
-        JSON-ready: ``model`` (voltages in V that it computes, a step of its transport in mol/m³), and for each of
-        ``episodes`` some entries of 𝓡 in Ω, noise draws, voltages in V, moments b_t, ∫(c − background)², ∫c², the
-        flow's moments, faults, ĉ_bh in mol/m³, and the relative error of that estimate.
+        JSON-ready: ``model`` (voltages in V that it computes, a step of its transport in mol/m³),
+        and for each of ``episodes`` some entries of 𝓡 in Ω, noise draws, voltages in V, moments
+        b_t, ∫(c − background)², ∫c², the flow's moments, faults, ĉ_bh in mol/m³, and the relative
+        error of that estimate.
     """
-    world = entry(id).world
-    return {"id": id, "model": _model_numbers(world.fluid), "episodes": {
+    return {"model": _model_numbers(world.fluid), "episodes": {
         name: _episode_numbers(world, parse_seeds(name)[0], episode)
         for name, episode in zip(SEEDS, _episodes(world.fluid), strict=True)}}
 
 
+def disagreements(id: str) -> list[str]:
+    """A sentence for each number of an id, simulated anew, that is not what its card says; one if
+    the card is missing or damaged."""
+    try:
+        kept = json.loads(path_of(id).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return [f"{id} has no card: {path_of(id)} is missing"]
+    except ValueError as error:                                 # no JSON, no UTF-8
+        return [f"the card of {id} is damaged: {error}"]
+    made = json.loads(text_of(card(id)))
+    return [f"{id}: {sentence}" for sentence in differences(made, kept)]
+
+
 def differences(made: Any, kept: Any, place: str = "") -> list[str]:
-    """A sentence for each number of two cards that differs by more than `TOLERANCE` of the largest of its kind."""
-    if isinstance(kept, dict):
-        if not isinstance(made, dict) or made.keys() != kept.keys():
-            return [f"{place} has other names"]
-        return [line for name in kept for line in differences(made[name], kept[name], f"{place}.{name}".lstrip("."))]
-    if isinstance(kept, str):
+    """A sentence for each number of two cards that differs by more than `TOLERANCE` of the largest
+    of its kind; both as they are read from JSON."""
+    if isinstance(made, dict) and isinstance(kept, dict):
+        if made.keys() != kept.keys():
+            others = ", ".join(sorted(made.keys() ^ kept.keys()))
+            return [f"{place or 'the card'} has other names: {others}"]
+        return [line for name in kept
+                for line in differences(made[name], kept[name], f"{place}.{name}".lstrip("."))]
+    if not (isinstance(made, list) and isinstance(kept, list)):
         return [] if made == kept else [f"{place} is {made!r}, the card says {kept!r}"]
-    new = np.asarray(made, dtype=float)
-    old = np.asarray(kept, dtype=float)
-    if new.shape != old.shape:
-        return [f"{place} has shape {new.shape}, on the card {old.shape}"]
+    if len(made) != len(kept):
+        return [f"{place} are {len(made)} numbers, on the card {len(kept)}"]
+    try:
+        new, old = np.array(made, dtype=float), np.array(kept, dtype=float)
+    except (TypeError, ValueError):
+        return [f"{place} on the card are no numbers"]
     scale = np.abs(old).max(initial=0.0)
-    off = np.abs(new - old).max(initial=0.0)
-    return [f"{place} differs by {off / scale if scale else off:.2g}"] if off > TOLERANCE * scale else []
+    off = np.abs(new - old)
+    if (off <= TOLERANCE * scale).all():                        # false for NaN too
+        return []
+    worst = int(np.nanargmax(off)) if np.isfinite(off).any() else 0
+    return [f"{place} differs by {off[worst] / (scale or 1.0):.2g} of its largest: number {worst} "
+            f"is {new[worst]:.10g}, the card says {old[worst]:.10g}"]
 
 
 def path_of(id: str) -> Path:
@@ -73,7 +103,7 @@ def path_of(id: str) -> Path:
 
 
 def text_of(made: dict[str, Any]) -> str:
-    """The card as it is committed: ten digits, a line for each kind of number."""
+    """The card as it is committed: ten digits, a line for each number."""
     return json.dumps(_rounded(made), indent=1) + "\n"
 
 
@@ -86,9 +116,9 @@ def _rounded(value: Any) -> Any:
 
 
 def _some(values: np.ndarray) -> np.ndarray:
-    """A few entries of (n,), and their sum."""
+    """A few entries of (n,), and the mean of all."""
     n = len(values)
-    return np.append(values[[0, n // 3, n // 2, n - 1]].astype(float), values.sum(dtype=float))
+    return np.append(values[[0, n // 3, n // 2, n - 1]].astype(float), values.mean(dtype=float))
 
 
 @lru_cache(maxsize=2)
@@ -96,22 +126,34 @@ def _model_numbers(world: World) -> dict[str, Any]:
     task = make_task(world)
     level = np.full(task.mesh.n_nodes, world.expected_concentration)
     wave = level * (1.0 + 0.2 * np.sin(np.arange(task.mesh.n_nodes)))
-    moved = task.transport.step(wave, world.expected_concentration, 1.1 * world.expected_concentration)
+    moved = task.transport.step(wave, world.expected_concentration,
+                                1.1 * world.expected_concentration)
     return {"homogeneous": task.observation.voltages(level, world.currents[:1])[0],
             "wave": task.observation.voltages(wave, world.currents[:1])[0], "step": _some(moved)}
 
 
+def _shown(last: int) -> list[int]:
+    """Of so many injections those, counted from 0, whose numbers stand on the card."""
+    return [0, 8, last - 1]
+
+
 @lru_cache(maxsize=2)
 def _episodes(world: World) -> list[Episode]:
-    """The first injections of each episode."""
+    """The first injections of each episode; 𝓡 is not a number where the card has no use for it."""
     truth = truth_discretisation(world)
     streams = [randomness(parse_seeds(name)[0]) for name in SEEDS]
     last = min(LAST, world.n_steps)
+    used = sorted({*range(world.calibration), *_shown(last)})
+    L = world.vessel.n_electrodes
     made = []
-    for history, random in zip(world.evolve(streams, truth, lambda _: None, last), streams, strict=True):
-        noise = random.noise.standard_normal((world.n_steps, world.vessel.n_electrodes))[:last]
-        resistance = truth.observation.transfer_resistance(history.concentration[1:])
-        made.append(Episode(history.concentration.astype(np.float32), resistance, noise, history.velocity))
+    for history, random in zip(world.evolve(streams, truth, lambda _: None, last), streams,
+                               strict=True):
+        noise = random.noise.standard_normal((world.n_steps, L))[:last]
+        states = history.concentration[1:]
+        resistance = np.full((last, L, L), np.nan)
+        resistance[used] = truth.observation.transfer_resistance(states[used])
+        made.append(Episode(history.concentration.astype(np.float32), resistance, noise,
+                            history.velocity))
     return made
 
 
@@ -131,15 +173,17 @@ def _episode_numbers(world: World, seed: int, episode: Episode) -> dict[str, Any
     errors = [float(step_error(score_mass(world), level, moments[k], deviations[k], squares[k]))
               for k in range(world.warm_up, len(entries))]
     faults = faults_of(world, seed)
-    steps = [0, 8, len(entries) - 1]
-    numbers = {
+    steps = _shown(len(entries))
+    shown = {
         "seed": name_seed(seed),
-        "resistance": entries["transfer_resistance"][steps][:, [0, 0, 1, L // 2], [1, L // 2, L - 1, L // 2]],
-        "noise": entries["noise"][steps][:, [0, L - 1]], "voltages": voltages[steps][:, [0, L // 2, L - 1]],
+        "resistance": entries["transfer_resistance"][steps][:, [0, 0, 1, L // 2],
+                                                            [1, L // 2, L - 1, L // 2]],
+        "noise": entries["noise"][steps][:, [0, L - 1]],
+        "voltages": voltages[steps][:, [0, L // 2, L - 1]],
         "moment": np.array([_some(moments[k]) for k in steps]), "deviation": deviations[steps],
         "square": squares[steps], "homogeneous": homogeneous, "floor": float(np.mean(errors)),
         "broken_from": faults.broken_from, "loose": faults.resistance}
     if world.velocity_model is not None:
         flow = entries["velocity_moment"][steps]
-        numbers["velocity"] = np.column_stack([flow, entries["velocity_square"][steps]])
-    return numbers
+        shown["velocity"] = np.column_stack([flow, entries["velocity_square"][steps]])
+    return shown

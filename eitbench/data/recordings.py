@@ -21,6 +21,7 @@ from eitbench._files import write_atomically
 from eitbench.data import store
 from eitbench.data.episodes import Episode, simulate, truth_discretisation
 from eitbench.worlds.streams import randomness
+from eitbench.worlds.task import make_task
 
 if TYPE_CHECKING:
     import scipy.sparse as sp
@@ -129,7 +130,7 @@ def _outline(fluid: World) -> Outline:
         interpolation, mass = score_operators(fluid)
         half = doubled_triangle(interpolation.T @ mass @ interpolation)
         level = np.full(half.shape[0], fluid.expected_concentration)
-        largest = np.abs(fluid.model().observation.voltages(level, fluid.currents)).max()
+        largest = np.abs(make_task(fluid).observation.voltages(level, fluid.currents)).max()
         return {name: getattr(half, name) for name in SPARSE} | {"largest": np.array(largest)}
 
     stored = store.kept(store.folder(fluid) / "outline.npz", (*SPARSE, "largest"), make)

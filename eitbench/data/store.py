@@ -45,8 +45,7 @@ def folder(world: World) -> Path:
 def identity(world: World) -> dict[str, Any]:
     """All that an episode's numbers depend on but the seed: the world's parts, the code that simulates, and the
     libraries beneath it."""
-    files = [file for kind in _kinds(world.fluid) if (file := file_of(kind)) and PACKAGE not in file.parents]
-    return {"world": described(world.fluid), "code": code_digest(package_files(*CODE)), "parts": code_digest(files),
+    return {"world": described(world.fluid), "code": _code(), "parts": _parts(_kinds(world.fluid)),
             **{name: version(name) for name in ("numba", "scikit-fem")},
             "numpy": np.__version__, "scipy": scipy.__version__}
 
@@ -61,12 +60,12 @@ def described(part: Any) -> Any:
 
 
 def load(path: Path, names: Sequence[str], label: str = "") -> dict[str, np.ndarray] | None:
-    """The arrays of these names that were saved at ``path`` under this ``label``; None if they are not there, damaged,
-    or another's."""
+    """The arrays of these names that were saved at ``path`` under this ``label``; None if they are
+    not there, damaged, or another's: of another label, or from a folder of another name."""
     try:
         with np.load(path, allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in names}
-            return arrays if int(stored["checksum"]) == _checksum(arrays, label) else None
+            return arrays if int(stored["checksum"]) == _checksum(path, arrays, label) else None
     except Exception:       # a damaged archive may raise anything: zlib.error, NotImplementedError, RuntimeError, …
         return None
 
@@ -75,7 +74,7 @@ def save(path: Path, arrays: Mapping[str, np.ndarray], label: str = "", *, small
     """Keep arrays at ``path``, ``small``: compressed. ``label`` says whose they are."""
     content = io.BytesIO()
     write = np.savez_compressed if small else np.savez
-    write(content, checksum=_checksum(arrays, label), **arrays)  # type: ignore[arg-type]
+    write(content, checksum=_checksum(path, arrays, label), **arrays)  # type: ignore[arg-type]
     write_atomically(path, content.getvalue())
 
 
@@ -104,14 +103,27 @@ def _digest(world: World) -> str:
     return hashlib.sha256(json.dumps(identity(world), sort_keys=True).encode()).hexdigest()[:16]
 
 
+@lru_cache(maxsize=1)
+def _code() -> str:
+    """Of the code that simulates; read once a process."""
+    return code_digest(package_files(*CODE))
+
+
+def _parts(kinds: Sequence[type]) -> str:
+    """Of the files, beside this package's, in which these classes are written."""
+    files = [file for kind in kinds if kind.__module__ not in ("builtins", "typing")
+             and (file := file_of(kind)) and PACKAGE not in file.parents]
+    return code_digest(dict.fromkeys(files))
+
+
 def _kinds(part: Any) -> list[type]:
-    """The classes of a world's parts, each once."""
+    """The classes of a world's parts, and those they descend from, each once."""
     inner = [kind for each in fields(part) if is_dataclass(value := getattr(part, each.name))
              for kind in _kinds(value)]
-    return list(dict.fromkeys([type(part), *inner]))
+    return list(dict.fromkeys([*type(part).__mro__, *inner]))
 
 
-def _checksum(arrays: Mapping[str, np.ndarray], label: str) -> int:
+def _checksum(path: Path, arrays: Mapping[str, np.ndarray], label: str) -> int:
     """Of the arrays' bytes and of whose they are: a file under another's name is not believed."""
     content = b"".join(np.ascontiguousarray(array).tobytes() for array in arrays.values())
-    return zlib.crc32(content, zlib.crc32(label.encode()))
+    return zlib.crc32(content, zlib.crc32(f"{path.parent.name} {label}".encode()))

@@ -115,9 +115,6 @@ class Cylinders(Target):
     def __post_init__(self) -> None:
         for name, units in (("background", "mol/m³"), ("metal", ""), ("gap", "m")):
             _check.number(name, getattr(self, name), low=0.0, open_low=True, units=units)
-        if self.small_radius[1] > self.large_radius[1]:
-            raise ValueError(f"small_radius must not reach beyond large_radius, got {self.small_radius!r} and "
-                             f"{self.large_radius!r} m")
 
     def check(self, world: World) -> None:
         """``ValueError`` if they do not fit into the vessel."""
@@ -127,6 +124,9 @@ class Cylinders(Target):
             if not 0 < low <= high < 0.3 * tank:
                 raise ValueError(f"target.{name} must be a range 0 < low ≤ high < 0.3·radius in m, got "
                                  f"{getattr(self, name)!r}")
+        if self.small_radius[1] > self.large_radius[1]:
+            raise ValueError("target.small_radius must not reach beyond large_radius, got "
+                             f"{self.small_radius!r} and {self.large_radius!r} m")
         _check.integer("vessel.n_electrodes", world.vessel.n_electrodes, low=8)
         _check.number("target.furthest", self.furthest, low=0.5, high=1.0 - self.large_radius[1] / tank)
         apart = self.large_radius[1] + self.small_radius[1] + self.gap

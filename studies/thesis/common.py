@@ -30,20 +30,22 @@ def estimates_of(env: EstimationEnv, baseline: str, seed: int) -> list[Estimate]
     """What a baseline says of t = 1 … T."""
     steps = play(env, load_baseline(baseline), seed)
     with threadpool_limits(1):
-        return [estimate for _, estimate in tqdm(steps, total=env.task.n_steps, desc=baseline, unit="state",
+        return [estimate for _,
+                estimate in tqdm(steps, total=env.task.n_steps, desc=baseline, unit="state",
                                                  disable=None, leave=False)]
 
 
 def error_of(env: EstimationEnv, estimates: list[Estimate]) -> float:
     """ẽ_c of the episode ``env`` has just played."""
-    interpolation, mass = score_operators(env.scenario)
+    interpolation, mass = score_operators(env.world)
     scored = slice(env.task.warm_up, None)
     means = np.array([estimate.mean for estimate in estimates])
     return scoring.relative_error((interpolation @ means[scored].T).T, env.truth()[scored], mass)
 
 
 def verdict(claim: str, holds: bool) -> str:
-    """A line on what the thesis shows: whether our data show it too is computed, not written down."""
+    """A line on what the thesis shows: whether our data show it too is computed, not written
+    down."""
     return f"{'Agrees' if holds else 'DIFFERS'}: {claim}"
 
 
@@ -79,8 +81,10 @@ def shown_times(env: EstimationEnv, rows: int = 5) -> list[int]:
     return list(range(first, first + 5 * rows, 5))
 
 
-def draw_fields(env: EstimationEnv, axes: np.ndarray, times: list[int], columns: Sequence[list[Estimate]]):
-    """Truth in the first column of ``axes``, estimates beside it, one state a row; returns the mappable."""
+def draw_fields(env: EstimationEnv, axes: np.ndarray, times: list[int],
+                columns: Sequence[list[Estimate]]):
+    """Truth in the first column of ``axes``, estimates beside it, one state a row; returns the
+    mappable."""
     truth, (low, high) = env.truth(), colour_range(env.task)
     for row, t in zip(axes, times, strict=True):
         fields = [(env.truth_mesh(), truth[t - 1])]
@@ -102,17 +106,21 @@ def comparison(path: Path, env: EstimationEnv, columns: dict[str, list[Estimate]
     save(figure, path)
 
 
-def draw_flow(axes: Axes, mesh: Mesh, flow: VelocityField, inside: Callable[[np.ndarray], np.ndarray], top: float):
+def draw_flow(axes: Axes, mesh: Mesh, flow: VelocityField,
+              inside: Callable[[np.ndarray], np.ndarray], top: float):
     """Speed in colours up to ``top`` (m/s) and streamlines over it; returns the mappable, in cm/s.
 
     ``inside`` says of points (k, 2) in m whether a streamline may pass there.
     """
-    mappable = draw_field(axes, mesh, 100 * np.hypot(*flow(mesh.points).T), 0.0, 100 * top, SPREAD_MAP)
+    mappable = draw_field(axes, mesh, 100 * np.hypot(*flow(mesh.points).T), 0.0, 100 * top,
+                          SPREAD_MAP)
     low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
-    x, y = (np.linspace(*ends, round((ends[1] - ends[0]) / 0.0035) + 1) for ends in zip(low, high, strict=True))
+    x, y = (np.linspace(*ends, round((ends[1] - ends[0]) / 0.0035) + 1)
+            for ends in zip(low, high, strict=True))
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     velocity = np.where(inside(points)[:, None], flow(points), np.nan).reshape(len(y), len(x), 2)
-    axes.streamplot(100 * x, 100 * y, velocity[..., 0], velocity[..., 1], color="white", linewidth=0.7, arrowsize=0.8,
+    axes.streamplot(100 * x, 100 * y, velocity[..., 0], velocity[..., 1], color="white",
+                    linewidth=0.7, arrowsize=0.8,
                     density=np.array([0.9, 0.9]) * np.maximum((high - low) / 0.28, 0.7))
     return mappable
 

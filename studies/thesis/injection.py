@@ -18,18 +18,27 @@ from eitbench.bench.store import EpisodeStore, results_in, unplayed
 from eitbench.bench.suites import policy_jobs
 from eitbench.data.seeds import name_seed
 from eitbench.report.animate import animate
-from eitbench.report.policy_table import OPEN_LOOP, errors_by_policy, policy_rows, policy_table, ranking
+from eitbench.report.policy_table import (
+    OPEN_LOOP,
+    errors_by_policy,
+    policy_rows,
+    policy_table,
+    ranking,
+)
 from eitbench.report.summary import mean_and_interval
 
 from .common import ACCENT, INK, TRUE, bare, save
 
-WORLDS = {"eitbench/Pipe2DInjectionFaults-v0": "faulty electrodes", "eitbench/Pipe2DInjectionBudget-v0": "a budget",
-          "eitbench/Pipe2DInjectionFlow-v0": "unknown flow", "eitbench/Pipe2DInjection-v0": "plain pipe (reference)",
+WORLDS = {"eitbench/Pipe2DInjectionFaults-v0": "faulty electrodes",
+          "eitbench/Pipe2DInjectionBudget-v0": "a budget",
+          "eitbench/Pipe2DInjectionFlow-v0": "unknown flow",
+          "eitbench/Pipe2DInjection-v0": "plain pipe (reference)",
           "eitbench/Pipe2DInjectionCurrents-v0": "any currents (reference)",
           "eitbench/RotatingTankInjection-v0": "stirred tank (reference)"}
 KINDS = {INK: "open loop", ACCENT: "looks at the data", TRUE: "* is shown the truth"}
 THIN, THICK = 1.2, 4.0
-LINES = {THIN: "95 % interval", THICK: "95 % interval of the paired difference to the best that ranks"}
+LINES = {THIN: "95 % interval",
+         THICK: "95 % interval of the paired difference to the best that ranks"}
 COMPETITIONS = list(WORLDS)[:3]
 """Where agents have learnt."""
 AT_WORK = ("eitbench/Pipe2DInjectionFaults-v0", "fault_aware")
@@ -37,9 +46,9 @@ AT_WORK = ("eitbench/Pipe2DInjectionFaults-v0", "fault_aware")
 
 
 def injection(seeds: list[int] | None, jobs: int, out: Path) -> tuple[Path, str]:
-    """Scores with the exact filter, of all our policies on these episodes, by default the boards'; what the
-    leaderboards' records hold, of this very code, is not played again. An episode with an unknown flow takes one to
-    two minutes."""
+    """Scores with the exact filter, of all our policies on these episodes, by default the boards';
+    what the leaderboards' records hold, of this very code, is not played again. An episode with an
+    unknown flow takes one to two minutes."""
     store, before = EpisodeStore(out), results_in(shipped("leaderboards") / "results")
     figure = Figure(figsize=(13.5, 13.8), dpi=110, layout="constrained")
     panels, said = figure.subplots(3, 3, height_ratios=(4, 4, 3)), []
@@ -56,8 +65,8 @@ def injection(seeds: list[int] | None, jobs: int, out: Path) -> tuple[Path, str]
         axes.set_title(WORLDS[env], fontsize=11)
     figure.legend(handles=[Line2D([], [], marker="o", linestyle="", color=colour, label=meaning)
                            for colour, meaning in KINDS.items()]
-                  + [Line2D([], [], color=TRUE, linewidth=width, label=meaning) for width, meaning in LINES.items()],
-                  frameon=False, ncols=5, loc="outside upper center")
+                  + [Line2D([], [], color=TRUE, linewidth=width, label=meaning) for width,
+                     meaning in LINES.items()], frameon=False, ncols=5, loc="outside upper center")
     path = out / "injection.png"
     save(figure, path)
     first = policy_jobs([AT_WORK[0]], [AT_WORK[1]], seeds)[0].seed
@@ -66,22 +75,25 @@ def injection(seeds: list[int] | None, jobs: int, out: Path) -> tuple[Path, str]
 
 
 def _scores(axes: Axes, rows: pd.DataFrame, privileged: list[str]) -> None:
-    """A dot for each policy, the best above; thin, the 95 % interval over episodes, which differ in how hard they are;
-    thick, that of the difference to the best one that is not privileged, episode by episode."""
+    """A dot for each policy, the best above; thin, the 95 % interval over episodes, which differ in
+    how hard they are; thick, that of the difference to the best one that is not privileged, episode
+    by episode."""
     errors = errors_by_policy(rows)
     order = ranking(errors)[::-1]
     best = errors[[name for name in order if name not in privileged][-1]]
     axes.axvline(best.mean(), color=TRUE, linewidth=0.6, linestyle=":", zorder=0)
     for place, name in enumerate(order):
         mean = errors[name].mean()
-        colour = TRUE if name in privileged else INK if name in OPEN_LOOP or name == "random_pair" else ACCENT
+        blind = name in OPEN_LOOP or name == "random_pair"
+        colour = TRUE if name in privileged else INK if blind else ACCENT
         axes.plot([mean], [place], "o", color=colour, markersize=5)
         for width, values in ((THIN, errors[name]), (THICK, errors[name] - best)):
             _, half = mean_and_interval(list(values.dropna()))
             if np.isfinite(half):
                 axes.plot([mean - half, mean + half], [place, place], color=colour, linewidth=width,
                           solid_capstyle="butt")
-    axes.set_yticks(range(len(order)), [name.replace("_", " ") + " *" * (name in privileged) for name in order])
+    axes.set_yticks(range(len(order)),
+                    [name.replace("_", " ") + " *" * (name in privileged) for name in order])
     axes.set(xlim=(0, None), xlabel=f"ẽ$_c$, {len(errors)} episode{'s' * (len(errors) > 1)}")
     axes.locator_params(axis="x", nbins=5)
     axes.tick_params(axis="y", length=0)
@@ -90,13 +102,15 @@ def _scores(axes: Axes, rows: pd.DataFrame, privileged: list[str]) -> None:
 
 def _curves(axes: Axes, env: str) -> None:
     """Scores on dev episodes while agents learnt, one line a training seed."""
-    runs = sorted((baseline_folder() / "checkpoints" / env.replace("/", "-")).glob("*/seed*/evaluations.npz"))
+    runs = sorted((baseline_folder() / "checkpoints"
+                   / env.replace("/", "-")).glob("*/seed*/evaluations.npz"))
     colours = dict(zip(sorted({run.parts[-3] for run in runs}), (ACCENT, INK, TRUE), strict=False))
     seen = set()
     for run in runs:
         algo = json.loads((run.parent / "config.json").read_text())["algo"]
         kept = np.load(run)
-        axes.plot(1e-6 * kept["steps"], kept["errors"].mean(axis=1), color=colours[run.parts[-3]], linewidth=1.2,
+        axes.plot(1e-6 * kept["steps"], kept["errors"].mean(axis=1), color=colours[run.parts[-3]],
+                  linewidth=1.2,
                   label=None if algo in seen else f"{algo}, reduced filter, dev episodes")
         seen.add(algo)
     axes.legend(frameon=False, fontsize=8)

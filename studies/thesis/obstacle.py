@@ -1,4 +1,5 @@
-"""The pipe past an obstacle: what a model without the real flow costs; the thesis names it as a next step."""
+"""The pipe past an obstacle: what a model without the real flow costs; the thesis names it as a
+next step."""
 
 from __future__ import annotations
 
@@ -8,16 +9,25 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from eitbench.envs.estimation import EstimationEnv
-from eitbench.envs.pipe2d_obstacle import Pipe2DObstacleEnv
 from eitbench.numerics.fem import mass_matrix
 from eitbench.physics.transport import VelocityField
-from eitbench.worlds import Pipe2DObstacle
+from eitbench.worlds.world import World
 
-from .common import draw_fields, draw_flow, error_of, estimates_of, idle_electrodes, save, shown_times, verdict
+from .common import (
+    draw_fields,
+    draw_flow,
+    error_of,
+    estimates_of,
+    idle_electrodes,
+    save,
+    shown_times,
+    verdict,
+)
 
 
-def _env(assumed_flow: str) -> EstimationEnv:
-    return Pipe2DObstacleEnv(assumed_flow=assumed_flow)
+def _env(flow: str) -> EstimationEnv:
+    """The pipe in which estimators believe in this flow."""
+    return EstimationEnv("eitbench/Pipe2DObstacle-v0", assume={"flow": flow})
 
 
 def obstacle(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
@@ -28,12 +38,10 @@ def obstacle(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
         columns.append(estimates_of(env, "kalman_filter", seeds[0]))
         errors.append(error_of(env, columns[-1]))
     constant = error_of(env, estimates_of(env, "homogeneous", seeds[0]))
-    pipe = env.scenario
-    assert isinstance(pipe, Pipe2DObstacle)
     times = shown_times(env, 4)
     figure = Figure(figsize=(11.4, 7.0), dpi=130, layout="constrained")
     top, bottom = np.asarray(figure.subfigures(2, 1, height_ratios=(1.0, 2.3)))
-    backwards = _draw_flows(top.subplots(1, 2, sharey=True), top, env, pipe)
+    backwards = _draw_flows(top.subplots(1, 2, sharey=True), top, env, env.world)
     axes = bottom.subplots(len(times), 3, sharex=True, sharey=True)
     mappable = draw_fields(env, axes, times, columns)
     titles = ("truth", f"filter with the parabola, ẽ$_c$ = {errors[0]:.4f}",
@@ -45,28 +53,34 @@ def obstacle(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
     path = out / "obstacle.png"
     save(figure, path)
     return path, "\n".join([
-        f"ẽ_c is {errors[0]:.4f} with the parabola, {errors[1]:.4f} with the true flow and {constant:.4f} for the "
+        f"ẽ_c is {errors[0]:.4f} with the parabola, {errors[1]:.4f} with the true flow and "
+        f"{constant:.4f} for the "
         f"homogeneous estimate. The fluid flows back in {100 * backwards:.0f} % of the pipe.",
-        verdict("the simple flow model still gives estimates of use: better than a constant", errors[0] < constant),
+        verdict("the simple flow model still gives estimates of use: better than a constant",
+                errors[0] < constant),
         verdict("the true flow is worth having", errors[1] < errors[0]),
         "By choice: the obstacle, and the eddy viscosity on which the length of its eddy depends."])
 
 
-def _draw_flows(axes: np.ndarray, figure, env: EstimationEnv, pipe: Pipe2DObstacle) -> float:
-    """The real and the assumed flow side by side; returns the part of the pipe's area where the real one turns back."""
-    mesh, real = env.truth_mesh(), pipe.real_flow((96, 24))
+def _draw_flows(axes: np.ndarray, figure, env: EstimationEnv, world: World) -> float:
+    """The real and the assumed flow side by side; returns the part of the pipe's area where the
+    real one turns back."""
+    pipe, mesh = world.vessel, env.truth_mesh()
+    real = world.flow.nominal(world, fine=True)
+    assert real is not None
     velocity = real(mesh.points)
 
     def inside(points: np.ndarray) -> np.ndarray:
         return points[:, 1] > pipe.lower_wall(points[:, 0])
 
     flows: dict[str, VelocityField] = {"true flow (Navier–Stokes)": real,
-                                       "assumed: a parabola at each x": pipe.parabolic_flow}
+                                       "assumed: a parabola at each x": world.flow.believed(world)}
     top = max(float(np.hypot(*flow(mesh.points).T).max()) for flow in flows.values())
     for ax, (title, flow) in zip(axes, flows.items(), strict=True):
         mappable = draw_flow(ax, mesh, flow, inside, top)
         idle_electrodes(ax, env.task)
-        ax.set(xlim=(0, 100 * pipe.length), ylim=(-100 * pipe.half_width, 100 * pipe.half_width), xlabel="x / cm")
+        ax.set(xlim=(0, 100 * pipe.length), ylim=(-100 * pipe.half_width, 100 * pipe.half_width),
+               xlabel="x / cm")
         ax.set_title(title, fontsize=10)
         ax.label_outer()
     figure.colorbar(mappable, ax=axes, label="speed / (cm/s)")

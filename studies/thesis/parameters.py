@@ -1,8 +1,9 @@
-"""How much the parameters of the evolution model matter, around the values of the thesis' Table 5.1."""
+"""How much the parameters of the evolution model matter, around the values of the thesis' Table
+5.1."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
@@ -17,11 +18,10 @@ from tqdm import tqdm
 
 from eitbench.bench.baselines import load_baseline
 from eitbench.envs.estimation import EstimationEnv
-from eitbench.envs.pipe2d import Pipe2DEnv
 from eitbench.envs.rendering import FIELD_MAP
-from eitbench.physics.transport import ConvectionDiffusion
-from eitbench.worlds import Pipe2D
+from eitbench.physics.transport import Transport
 from eitbench.worlds.task import Task
+from eitbench.worlds.world import World
 
 from .common import ACCENT, save, verdict
 
@@ -44,7 +44,7 @@ MAPS = (("inflow_std", "nodal_std"), ("initial_std", "diffusivity"))
 
 
 def _env() -> EstimationEnv:
-    return Pipe2DEnv()
+    return EstimationEnv("eitbench/Pipe2D-v0")
 
 
 def table5_1(seeds: list[int], jobs: int, out: Path) -> tuple[Path, str]:
@@ -60,31 +60,37 @@ def table5_1(seeds: list[int], jobs: int, out: Path) -> tuple[Path, str]:
     save(figure, path)
     table = errors[Factors()]
     best = min(errors, key=lambda factors: errors[factors])
-    alone = {name: np.array([errors[Factors(**{name: factor})] for factor in FACTORS]) for name in LABELS}
+    alone = {name: np.array([errors[Factors(**{name: factor})] for factor in FACTORS])
+             for name in LABELS}
     worst = {name: values.max() / table - 1 for name, values in alone.items()}
     most = max(worst, key=lambda name: worst[name])
     return path, "\n".join([
         f"ẽ_c is {table:.5f} with the table's values, {errors[best]:.5f} at best (" + (", ".join(
-            f"{LABELS[name]} × {factor:g}" for name, factor in best._asdict().items() if factor != 1) or "the same")
-        + f"), so that the table is {100 * (table / errors[best] - 1):.1f} % above the best. Mean of {len(seeds)} "
+            f"{LABELS[name]} × {factor:g}" for name, factor in best._asdict().items()
+            if factor != 1) or "the same")
+        + f"), so that the table is {100 * (table / errors[best] - 1):.1f} % above the best. Mean "
+          f"of {len(seeds)} "
         f"episode{'s' * (len(seeds) > 1)}.",
         "Changed alone, four times less to four times more, ẽ_c rises by at most "
         + ", ".join(f"{100 * worst[name]:.1f} % ({label}, × {FACTORS[alone[name].argmax()]:g})"
                     for name, label in LABELS.items()) + ".",
-        verdict("the table's values are a good choice: within 10 % of the best", table < 1.1 * errors[best]),
-        f"What matters most is the {LABELS[most]}.",
-        "By choice: stds of e and of the initial state are ours, illegible in our copy of the table; the truth's κ "
+        verdict("the table's values are a good choice: within 10 % of the best",
+                table < 1.1 * errors[best]), f"What matters most is the {LABELS[most]}.",
+        "By choice: stds of e and of the initial state are ours, illegible in our copy of the "
+        "table; the truth's κ "
         "stays what it is."])
 
 
 def sweep(seeds: list[int], jobs: int) -> dict[Factors, float]:
     """Mean ẽ_c over the seeds for each cell of the `MAPS`."""
-    cells = list(dict.fromkeys(Factors(**{up: a, across: b}) for up, across in MAPS for a in FACTORS for b in FACTORS))
-    cells.sort(key=lambda cell: cell.diffusivity)                # a process keeps only the last few models
+    cells = list(dict.fromkeys(Factors(**{up: a, across: b}) for up, across in MAPS for a in FACTORS
+                               for b in FACTORS))
+    cells.sort(key=lambda cell: cell.diffusivity)         # a process keeps only the last few models
     with Parallel(n_jobs=jobs, return_as="generator", batch_size=1, pre_dispatch=jobs) as parallel:
         done = parallel(delayed(_error)(cell, seeds) for cell in cells)
-        return dict(zip(cells, tqdm(done, total=len(cells), desc="varying Table 5.1", unit="cell", disable=None),
-                        strict=True))
+        return dict(zip(cells,
+                        tqdm(done, total=len(cells), desc="varying Table 5.1", unit="cell",
+                             disable=None), strict=True))
 
 
 def _error(factors: Factors, seeds: list[int]) -> float:
@@ -97,18 +103,20 @@ def _error(factors: Factors, seeds: list[int]) -> float:
 def _changed(env: EstimationEnv, factors: Factors) -> Task:
     """The environment's task with other parameters of the evolution model."""
     prior = env.task.prior
-    stds = {name: getattr(factors, name) * getattr(prior, name) for name in prior._fields if name in factors._fields}
-    task = replace(env.task, prior=prior._replace(**stds))
+    stds = {name: getattr(factors, name) * value for name, value in asdict(prior).items()
+            if name in factors._fields}
+    task = replace(env.task, prior=replace(prior, **stds))
     if factors.diffusivity == 1:
         return task
-    assert isinstance(env.scenario, Pipe2D)
-    return replace(task, transport=_transport(env.scenario, factors.diffusivity))
+    return replace(task, transport=_transport(env.world, factors.diffusivity))
 
 
 @lru_cache(maxsize=1)
-def _transport(scenario: Pipe2D, factor: float) -> ConvectionDiffusion:
-    """The model's transport with another diffusivity; kept, since filters keep what they derive from it with it."""
-    return replace(scenario, diffusivity=factor * scenario.diffusivity).model().transport
+def _transport(world: World, factor: float) -> Transport:
+    """The model's transport with another diffusivity; kept, since filters keep what they derive
+    from it with it."""
+    return world.changed({"flow": {"diffusivity": factor
+                                   * world.flow.diffusivity}}).model().transport
 
 
 def _played(env: EstimationEnv, task: Task, seed: int) -> float:
@@ -122,17 +130,23 @@ def _played(env: EstimationEnv, task: Task, seed: int) -> float:
     return -float(np.mean(rewards[task.warm_up:]))
 
 
-def _heat_map(ax: Axes, errors: dict[Factors, float], up: str, across: str, scale: tuple[float, float]):
+def _heat_map(ax: Axes, errors: dict[Factors, float], up: str, across: str,
+              scale: tuple[float, float]):
     """ẽ_c in colours and numbers; the table's own cell is framed. Returns the mappable."""
-    values = 1e3 * np.array([[errors[Factors(**{up: a, across: b})] for b in FACTORS] for a in FACTORS])
-    image = ax.imshow(values, origin="lower", cmap=FIELD_MAP, vmin=1e3 * scale[0], vmax=1e3 * scale[1])
+    values = 1e3 * np.array([[errors[Factors(**{up: a, across: b})] for b in FACTORS]
+                             for a in FACTORS])
+    image = ax.imshow(values, origin="lower", cmap=FIELD_MAP, vmin=1e3 * scale[0],
+                      vmax=1e3 * scale[1])
     for (row, column), value in np.ndenumerate(values):
         dark = value < 500 * sum(scale)
-        ax.text(column, row, f"{value:.2f}", ha="center", va="center", fontsize=9, color="white" if dark else "black")
+        ax.text(column, row, f"{value:.2f}", ha="center", va="center", fontsize=9,
+                color="white" if dark else "black")
     middle = FACTORS.index(1.0)
-    ax.add_patch(Rectangle((middle - 0.5, middle - 0.5), 1, 1, fill=False, edgecolor=ACCENT, linewidth=2.5))
+    ax.add_patch(Rectangle((middle - 0.5, middle - 0.5), 1, 1, fill=False, edgecolor=ACCENT,
+                           linewidth=2.5))
     names = [{0.25: "¼", 0.5: "½"}.get(factor, f"{factor:g}") for factor in FACTORS]
-    ax.set(xlabel=f"{LABELS[across]}, parts of the assumed", ylabel=f"{LABELS[up]}, parts of the assumed")
+    ax.set(xlabel=f"{LABELS[across]}, parts of the assumed",
+           ylabel=f"{LABELS[up]}, parts of the assumed")
     ax.set_xticks(range(len(FACTORS)), names)
     ax.set_yticks(range(len(FACTORS)), names)
     ax.set_title("framed: the values of Table 5.1", fontsize=10)

@@ -17,7 +17,6 @@ from eitbench.bench.run import play_and_collect
 from eitbench.bench.score import score
 from eitbench.data.recordings import score_operators
 from eitbench.envs.estimation import EstimationEnv
-from eitbench.envs.pipe2d import Pipe2DEnv
 from eitbench.envs.rendering import SPREAD_MAP, colour_range, draw_field
 
 from .common import (
@@ -38,7 +37,8 @@ VELOCITIES = np.arange(0.0, 9.01, 0.5)
 
 
 def _env(lag: int | str = 0, mean_velocity: float | None = None) -> EstimationEnv:
-    return Pipe2DEnv(lag=lag, assumed_mean_velocity=mean_velocity)
+    assume = {} if mean_velocity is None else {"mean_velocity": mean_velocity}
+    return EstimationEnv("eitbench/Pipe2D-v0", lag=lag, assume=assume)
 
 
 def fig5_4(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
@@ -52,7 +52,8 @@ def fig5_4(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
     return path, "\n".join([
         f"ẽ_c is {by_filter:.4f} for the filter and {by_smoother:.4f} for the smoother.",
         verdict("the smoother is better than the filter", by_smoother < by_filter),
-        "By choice: inflow, electrodes and injections are ours, so no slug stands where the thesis has one."])
+        "By choice: inflow, electrodes and injections are ours, so no slug stands where the thesis "
+        "has one."])
 
 
 def fig5_5(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
@@ -65,7 +66,8 @@ def fig5_5(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
     axes = figure.subplots(1, 2, sharey=True)
     variances = [estimates[t - 1].variance for estimates in (filtered, smoothed)]
     top = float(np.quantile(np.asarray(variances[0]), 0.995))
-    for ax, variance, title in zip(axes, variances, ("Kalman filter", "fixed-interval smoother"), strict=True):
+    for ax, variance, title in zip(axes, variances, ("Kalman filter", "fixed-interval smoother"),
+                                   strict=True):
         mappable = draw_field(ax, env.task.mesh, np.asarray(variance), 0.0, top, SPREAD_MAP)
         idle_electrodes(ax, env.task)
         ax.set(title=f"{title}, {milliseconds(env, t)}", xlabel="x / cm")
@@ -76,10 +78,13 @@ def fig5_5(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
     x, third = env.task.mesh.points[:, 0], np.ptp(env.task.mesh.points[:, 0]) / 3
     along = [by_filter[(x >= k * third) & (x <= (k + 1) * third)].mean() for k in range(3)]
     return path, "\n".join([
-        f"Mean variance {by_filter.mean():.2f} (mol/m³)² for the filter, {by_smoother.mean():.2f} for the smoother.",
-        verdict("the variance is largest at the inlet, where uncertainty enters, and falls along the flow",
+        f"Mean variance {by_filter.mean():.2f} (mol/m³)² for the filter, {by_smoother.mean():.2f} "
+        "for the smoother.",
+        verdict("the variance is largest at the inlet, where uncertainty enters, and falls along "
+                "the flow",
                  bool(along[0] > along[1] > along[2] and x[by_filter.argmax()] < third)),
-        verdict("the smoother's variance is smaller everywhere", bool((by_smoother <= by_filter + 1e-9).all())),
+        verdict("the smoother's variance is smaller everywhere",
+                bool((by_smoother <= by_filter + 1e-9).all())),
         "By choice: the scale depends on our inflow noise and electrodes."])
 
 
@@ -89,7 +94,8 @@ def fig5_6(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
     images = estimates_of(env, "gauss_newton", seeds[0])
     frame, truth = len(env.task.currents), env.truth()
     begins = [frame * k for k in range(1, 5)]
-    figure, axes = pipe_grid(len(begins), 2, ["true average over the frame", "stationary Gauss–Newton"])
+    figure, axes = pipe_grid(len(begins), 2,
+                             ["true average over the frame", "stationary Gauss–Newton"])
     low, high = colour_range(env.task)
     averages = []
     for row, begin in zip(axes, begins, strict=True):
@@ -103,12 +109,14 @@ def fig5_6(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
     figure.colorbar(mappable, ax=axes, label="concentration / (mol/m³)", extend="both", aspect=40)
     path = out / "fig5.6.png"
     save(figure, path)
-    interpolation, mass = score_operators(env.scenario)
+    interpolation, mass = score_operators(env.world)
     of_average = scoring.relative_error(np.array([interpolation @ images[b].mean for b in begins]),
                                         np.array(averages), mass)
-    error, constant = error_of(env, images), error_of(env, estimates_of(env, "homogeneous", seeds[0]))
+    error, constant = error_of(env, images), error_of(env,
+                                                      estimates_of(env, "homogeneous", seeds[0]))
     return path, "\n".join([
-        f"ẽ_c is {error:.4f}, of the homogeneous estimate {constant:.4f}; against the true average of its frame an "
+        f"ẽ_c is {error:.4f}, of the homogeneous estimate {constant:.4f}; against the true average "
+        "of its frame an "
         f"image errs by {of_average:.4f}.",
         verdict("the images are of no use: worse than a constant", error > constant),
         verdict("they are not temporal averages of the target either", of_average > 0.5 * error),
@@ -116,7 +124,8 @@ def fig5_6(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
 
 
 def fig5_7(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
-    """Kalman filter estimates when the model's mean velocity is 200 or 700 cm/s; the truth is 450."""
+    """Kalman filter estimates when the model's mean velocity is 200 or 700 cm/s; the truth is
+    450."""
     columns, errors = {}, []
     for velocity in (2.0, 7.0):
         env = _env(mean_velocity=velocity)
@@ -129,20 +138,25 @@ def fig5_7(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
     comparison(path, env, columns)
     constant = error_of(right, estimates_of(right, "homogeneous", seeds[0]))
     return path, "\n".join([
-        f"ẽ_c is {errors[0]:.4f} with 200 cm/s and {errors[1]:.4f} with 700 cm/s, {error:.4f} with the true 450 cm/s "
+        f"ẽ_c is {errors[0]:.4f} with 200 cm/s and {errors[1]:.4f} with 700 cm/s, {error:.4f} with "
+        "the true 450 cm/s "
         f"and {constant:.4f} for the homogeneous estimate.",
         verdict("a wrong velocity costs accuracy", min(errors) > error),
-        verdict("yet the estimates are still of use: better than a constant", max(errors) < constant)])
+        verdict("yet the estimates are still of use: better than a constant",
+                max(errors) < constant)])
 
 
-def velocity_sweep(seeds: list[int], jobs: int, velocities: np.ndarray = VELOCITIES) -> dict[str, np.ndarray]:
-    """Scores of the Kalman filter by assumed mean velocity: ``error``, ``voltage_discrepancy`` (V²), ``nis``.
+def velocity_sweep(seeds: list[int], jobs: int, velocities: np.ndarray = VELOCITIES) -> dict[str,
+                                                                                             np.ndarray]:
+    """Scores of the Kalman filter by assumed mean velocity: ``error``, ``voltage_discrepancy``
+    (V²), ``nis``.
 
     Arrays of shape (velocities, seeds); ``velocities`` in m/s.
     """
     with Parallel(n_jobs=jobs, return_as="generator", batch_size=1, pre_dispatch=jobs) as parallel:
         done = parallel(delayed(_filter_scores)(velocity, seeds) for velocity in velocities)
-        rows = list(tqdm(done, total=len(velocities), desc="sweeping the velocity", unit="velocity", disable=None))
+        rows = list(tqdm(done, total=len(velocities), desc="sweeping the velocity", unit="velocity",
+                         disable=None))
     return {key: np.array([[scores[key] for scores in row] for row in rows])
             for key in ("error", "voltage_discrepancy", "nis")}
 
@@ -150,14 +164,16 @@ def velocity_sweep(seeds: list[int], jobs: int, velocities: np.ndarray = VELOCIT
 def _filter_scores(velocity: float, seeds: list[int]) -> list[dict[str, float]]:
     env = _env(mean_velocity=float(velocity))
     with threadpool_limits(1):
-        return [score(env, play_and_collect(env, load_baseline("kalman_filter"), seed))["scores"] for seed in seeds]
+        return [score(env, play_and_collect(env, load_baseline("kalman_filter"), seed))["scores"]
+                for seed in seeds]
 
 
 def fig5_8(seeds: list[int], jobs: int, out: Path) -> tuple[Path, str]:
     """Estimation error and voltage discrepancy over the assumed mean velocity."""
     sweep = velocity_sweep(seeds, jobs)
     figure = Figure(figsize=(11.0, 3.6), dpi=130, layout="constrained")
-    panels: list[tuple[str, float, str]] = [("error", 1.0, "ẽ_c"), ("voltage_discrepancy", 1e6, "ẽ_V / mV²"),
+    panels: list[tuple[str, float, str]] = [("error", 1.0, "ẽ_c"),
+                                            ("voltage_discrepancy", 1e6, "ẽ_V / mV²"),
                                             ("nis", 1.0, "NIS/m")]
     best = {}
     for ax, (key, unit, label) in zip(figure.subplots(1, 3), panels, strict=True):
@@ -167,7 +183,8 @@ def fig5_8(seeds: list[int], jobs: int, out: Path) -> tuple[Path, str]:
     path = out / "fig5.8.png"
     save(figure, path)
     return path, "\n".join([
-        f"Minimum at {best['error']:.0f} cm/s for ẽ_c, {best['voltage_discrepancy']:.0f} for ẽ_V, {best['nis']:.0f} "
+        f"Minimum at {best['error']:.0f} cm/s for ẽ_c, {best['voltage_discrepancy']:.0f} for ẽ_V, "
+        f"{best['nis']:.0f} "
         f"for NIS, over {len(seeds)} episodes; the truth is 450.",
         verdict("the error is smallest near the true velocity", 400 <= best["error"] <= 500),
         verdict("the voltages alone tell roughly which velocity is right (500 in the thesis)",

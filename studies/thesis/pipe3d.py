@@ -6,8 +6,8 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
+from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.isosurface import draw_isosurfaces
-from eitbench.envs.pipe3d import Pipe3DEnv
 from eitbench.envs.rendering import colour_range, draw_field
 
 from .common import error_of, estimates_of, idle_electrodes, milliseconds, save, verdict
@@ -15,7 +15,8 @@ from .common import error_of, estimates_of, idle_electrodes, milliseconds, save,
 
 def fig5_10(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
     """Isosurfaces, and slices along the pipe, of the true concentration and of both estimates."""
-    env, smoothing = Pipe3DEnv(), Pipe3DEnv(lag="all")
+    env, smoothing = (EstimationEnv(f"eitbench/{name}-v0")
+                      for name in ("Pipe3D", "Pipe3DSmoothing"))
     filtered = estimates_of(env, "kalman_filter", seeds[0])
     smoothed = estimates_of(smoothing, "fixed_interval_smoother", seeds[0])
     by_filter, by_smoother = error_of(env, filtered), error_of(smoothing, smoothed)
@@ -35,20 +36,24 @@ def fig5_10(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
             idle_electrodes(row[3 + k], env.task)
             row[3 + k].set_ylabel("y / cm" if k == 0 else "")
             row[3 + k].tick_params(labelbottom=number == len(times), labelleft=k == 0)
-        row[0].text(-0.02, 0.5, milliseconds(env, t), transform=row[0].transAxes, ha="right", va="center", fontsize=10)
+        row[0].text(-0.02, 0.5, milliseconds(env, t), transform=row[0].transAxes, ha="right",
+                    va="center", fontsize=10)
     for k, title in enumerate(("truth", "Kalman filter", "smoother")):
         axes[0, k].set_title(title, fontsize=11)
         axes[0, 3 + k].set_title(f"{title}, slice x = 0", fontsize=11)
         axes[-1, 3 + k].set_xlabel("z / cm")
-    figure.suptitle(f"Surfaces of {poor:.0f} (blue) and {rich:.0f} (orange) mol/m³; fluid flows to the right",
+    figure.suptitle(f"Surfaces of {poor:.0f} (blue) and {rich:.0f} (orange) mol/m³; fluid flows to "
+                    "the right",
                     fontsize=11)
     figure.colorbar(mappable, ax=axes, label="concentration / (mol/m³)", extend="both", aspect=40)
     path = out / "fig5.10.png"
     save(figure, path)
     return path, "\n".join([
-        f"ẽ_c is {by_filter:.4f} for the filter, {by_smoother:.4f} for the smoother and {constant:.4f} for the "
+        f"ẽ_c is {by_filter:.4f} for the filter, {by_smoother:.4f} for the smoother and "
+        f"{constant:.4f} for the "
         f"homogeneous estimate, on {env.task.mesh.n_nodes} nodes.",
         verdict("both estimates show the slugs where they are: much better than a constant",
                 by_filter < 0.6 * constant),
         verdict("the smoother is better than the filter", by_smoother < by_filter),
-        "By choice: inflow, electrodes and injections are ours; the thesis' page gives the figure only."])
+        "By choice: inflow, electrodes and injections are ours; the thesis' page gives the "
+        "figure only."])

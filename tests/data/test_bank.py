@@ -1,36 +1,41 @@
-"""The bank: exactly what is missing is made, with the bits of a recording made alone, and nothing done is lost."""
+"""The bank: exactly what is missing is made, with the bits of a recording made alone, and nothing
+done is lost."""
 
 import re
 import shutil
+from dataclasses import replace
 from types import SimpleNamespace
 
-import gymnasium as gym
 import pytest
 from joblib.externals.loky import get_reusable_executor
-from short import PLAIN
+from short import merged
+from tiny_worlds import CHANGES, TINY
 from typer.testing import CliRunner
 
 import eitbench  # noqa: F401 (registers)
 from eitbench.cli import app
 from eitbench.data import bank, recordings
 from eitbench.data.bank import fill, recording_bytes
-from eitbench.data.episodes import CACHE_VARIABLE, folder, simulate, simulate_together
+from eitbench.data.episodes import simulate, simulate_together
 from eitbench.data.recordings import is_recorded, make_recording, recording, recording_path
-from eitbench.worlds import Pipe2D
+from eitbench.data.regions import are_kept, integrals_path
+from eitbench.data.store import CACHE_VARIABLE, folder
+from eitbench.worlds import registry
+from eitbench.worlds.pipe2d import PIPE_2D
+from eitbench.worlds.pipe2d_drifting import PIPE_2D_DRIFTING
 
-FIELDS = {"mean_velocity": 45.0, "scored_steps": 3, "electrodes_per_wall": 2, "frame": 2}
-TINY = Pipe2D(**FIELDS)
-"""A fast fluid flushes the pipe in two steps: an episode of five takes a third of a second."""
 SEEDS = range(10)
 """A full batch of eight and a remainder."""
 
 
 @pytest.fixture(autouse=True)
 def place(tmp_path, monkeypatch):
-    """The environments of the plain pipe play the tiny world; recordings lie in a folder of this test's own."""
+    """The ids of the plain pipe play the tiny world; recordings lie in a folder of this test's
+    own."""
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
-    for name in PLAIN:
-        monkeypatch.setitem(gym.registry[name].kwargs, "scenario", FIELDS)
+    for name, each in registry.entries().items():
+        if each.world == PIPE_2D:
+            monkeypatch.setitem(registry._entries, name, replace(each, world=TINY))
     forget()
     yield folder(TINY)
     forget()
@@ -39,13 +44,14 @@ def place(tmp_path, monkeypatch):
 def forget():
     """What a new process does not know: files found in order, and outlines."""
     recordings._sound.clear()
-    recordings.outline.cache_clear()
+    recordings._outline.cache_clear()
 
 
 @pytest.fixture(scope="module")
 def alone():
     """The bytes of each recording when its episode is simulated by itself."""
-    return {seed: make_recording(TINY, seed, simulate(TINY, seed, cache=False)).tobytes() for seed in SEEDS}
+    return {seed: make_recording(TINY, seed, simulate(TINY, seed, cache=False)).tobytes()
+            for seed in SEEDS}
 
 
 @pytest.fixture
@@ -53,9 +59,9 @@ def asked(monkeypatch):
     """The seeds of each batch that is simulated in this process."""
     batches = []
 
-    def counting(scenario, seeds, *more, **options):
+    def counting(world, seeds, *more, **options):
         batches.append(list(seeds))
-        return simulate_together(scenario, seeds, *more, **options)
+        return simulate_together(world, seeds, *more, **options)
 
     monkeypatch.setattr(bank, "simulate_together", counting)
     return batches
@@ -68,16 +74,18 @@ def names(place):
 
 def stamps(place):
     """Which files they are and when they were written."""
-    return {path.name: (path.stat().st_ino, path.stat().st_mtime_ns) for path in place.glob("*.npy")}
+    return {path.name: (path.stat().st_ino, path.stat().st_mtime_ns)
+            for path in place.glob("*.npy")}
 
 
-# -- fill -------------------------------------------------------------------------------------------------------------
+# -- fill ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("n_jobs", [1, 2])
 def test_recordings_have_the_bits_of_those_made_alone(n_jobs, place, alone, monkeypatch):
-    """Eight at once or spread over processes: each recording is the one of its seed, and no truth lies beside it."""
-    get_reusable_executor().shutdown(wait=True)                     # workers keep the cache folder they began with
+    """Eight at once or spread over processes: each recording is the one of its seed, and no truth
+    lies beside it."""
+    get_reusable_executor().shutdown(wait=True)      # workers keep the cache folder they began with
     assert fill(TINY, SEEDS, n_jobs=n_jobs) == 10
     assert names(place) == sorted(f"{seed}.npy" for seed in SEEDS)
     monkeypatch.setattr(recordings, "simulate", None)               # all are there
@@ -85,7 +93,8 @@ def test_recordings_have_the_bits_of_those_made_alone(n_jobs, place, alone, monk
 
 
 def test_only_what_is_missing_is_made(place, asked, alone):
-    """Seeds asked for twice are made once, those that are there are not touched, and the number is the true one."""
+    """Seeds asked for twice are made once, those that are there are not touched, and the number is
+    the true one."""
     recording(TINY, 2)
     (place / "2.truth.npz").unlink()
     assert fill(TINY, [4, 2, 1, 4]) == 2 and asked == [[4, 1]]
@@ -105,7 +114,8 @@ def test_batches_hold_eight(place, asked):
 
 
 def test_interrupted_fill_keeps_what_is_done_and_goes_on(place, asked, alone, monkeypatch):
-    """Ctrl-C after the third recording: three are there and sound, and the next call makes the other seven."""
+    """Ctrl-C after the third recording: three are there and sound, and the next call makes the
+    other seven."""
     stored = []
 
     def interrupted(path, entries):
@@ -119,7 +129,8 @@ def test_interrupted_fill_keeps_what_is_done_and_goes_on(place, asked, alone, mo
         with pytest.raises(KeyboardInterrupt):
             fill(TINY, SEEDS)
     forget()
-    assert [seed for seed in SEEDS if is_recorded(TINY, seed)] == [0, 1, 2] and len(names(place)) == 3
+    assert [seed for seed in SEEDS if is_recorded(TINY, seed)] == [0, 1, 2]
+    assert len(names(place)) == 3
     before = stamps(place)
     assert fill(TINY, SEEDS) == 7 and asked[1] == [3, 4, 5, 6, 7, 8, 9]
     assert {name: stamp for name, stamp in stamps(place).items() if name in before} == before
@@ -138,15 +149,29 @@ def test_damaged_recording_is_made_again(damage, place, asked, alone):
     path.write_bytes(damage(path.read_bytes()))
     forget()
     assert fill(TINY, [0, 1, 2]) == 1 and asked[1:] == [[1]]
-    assert {seed: recording(TINY, seed).tobytes() for seed in (0, 1, 2)} == {seed: alone[seed] for seed in (0, 1, 2)}
+    assert {seed: recording(TINY, seed).tobytes() for seed in (0, 1, 2)} == {seed: alone[seed]
+                                                                             for seed in (0, 1, 2)}
 
 
 def test_size_is_that_of_the_files(place):
     """What is foretold of a recording is within 1 % of what it takes on disk."""
     fill(TINY, [0])
     assert (place / "0.npy").stat().st_size == pytest.approx(recording_bytes(TINY), rel=0.01)
-    real = recordings.recording_type(Pipe2D(), 1701).itemsize * 98
-    assert recording_bytes(Pipe2D()) == real == pytest.approx(881_000, rel=0.01)
+    real = recordings.recording_type(PIPE_2D, 1701).itemsize * 98
+    assert recording_bytes(PIPE_2D) == real == pytest.approx(881_000, rel=0.01)
+
+
+def test_what_lies_beside_a_recording_counts(place):
+    """Where only a region counts, its integrals are made and kept too, and are missing if they are
+    damaged; the size is foretold with them."""
+    world = PIPE_2D_DRIFTING.changed(merged(CHANGES, {"flow": {"velocity_range": [40.0, 50.0]}}))
+    assert fill(world, [0, 1]) == 2 and fill(world, [0, 1]) == 0
+    files = [recording_path(world, 0), integrals_path(world, 0)]
+    size = sum(path.stat().st_size for path in files)
+    assert recording_bytes(world) == pytest.approx(size, rel=0.02)
+    files[1].write_bytes(files[1].read_bytes()[:-1])
+    assert is_recorded(world, 0) and not are_kept(world, 0)
+    assert fill(world, [0, 1]) == 1 and are_kept(world, 0)
 
 
 @pytest.mark.parametrize("seed", [-1, 1.0, True, "1"])
@@ -167,25 +192,30 @@ def test_workers_write_where_the_parent_looks(monkeypatch, tmp_path):
         assert is_recorded(TINY, 0) and is_recorded(TINY, 1), name
 
 
-# -- the command line -------------------------------------------------------------------------------------------------
+# -- the command line ------------------------------------------------------------------------------
 
 
 def eitbench_bank(*arguments):
-    """What the command does: exit code, standard output, standard error without boxes and line breaks."""
+    """What the command does: exit code, standard output, standard error without boxes and line
+    breaks."""
     done = CliRunner().invoke(app, ["bank", *arguments])
     if done.exception is not None and not isinstance(done.exception, SystemExit):
-        raise done.exception                                           # a user would see a traceback
+        raise done.exception                                          # a user would see a traceback
     return done.exit_code, done.stdout, re.sub(r"[│╭╮╰╯─\s]+", " ", done.stderr)
 
 
 def test_command_fills_and_resumes(place, asked, alone):
     """It says what it made and what was there, and keeps it where environments look."""
     code, said, _ = eitbench_bank("--seeds", "train:0-2", "-j", "1")
-    assert code == 0 and "3 simulated, 0 were there" in said and f"3 episodes, 0 MB in {place}" in said
-    code, said, _ = eitbench_bank("--seeds", "train:0-3", "-j", "1", "--env", "eitbench/Pipe2DSmoothing-v0")
+    assert code == 0
+    assert "3 simulated, 0 were there" in said
+    assert f"3 episodes, 0 MB in {place}" in said
+    code, said, _ = eitbench_bank("--seeds", "train:0-3", "-j", "1", "--env",
+                                  "eitbench/Pipe2DSmoothing-v0")
     assert code == 0 and "1 simulated, 3 were there" in said and asked == [[0, 1, 2], [3]]
     assert names(place) == ["0.npy", "1.npy", "2.npy", "3.npy"]
-    assert {seed: recording(TINY, seed).tobytes() for seed in range(4)} == {seed: alone[seed] for seed in range(4)}
+    assert {seed: recording(TINY, seed).tobytes() for seed in range(4)} == {seed: alone[seed]
+                                                                            for seed in range(4)}
 
 
 def test_command_means_the_seeds_of_the_split(place, asked):
@@ -200,7 +230,9 @@ def test_command_states_the_size_on_disk(place, monkeypatch):
     monkeypatch.setattr(bank, "fill", lambda *_, **__: 0)
     code, said, _ = eitbench_bank("--seeds", "train:0-29999")
     stated = re.search(r"30000 episodes, (\d+) MB", said)
-    assert code == 0 and float(stated[1]) * 1e6 == pytest.approx(30_000 * (place / "0.npy").stat().st_size, rel=0.01)
+    assert code == 0
+    assert float(stated[1]) * 1e6 == pytest.approx(30_000 * (place / "0.npy").stat().st_size,
+                                                   rel=0.01)
 
 
 def test_full_disk_is_refused_before_anything_is_simulated(place, asked, monkeypatch):
@@ -208,11 +240,15 @@ def test_full_disk_is_refused_before_anything_is_simulated(place, asked, monkeyp
     looked = []
 
     def disk(free):
-        monkeypatch.setattr(shutil, "disk_usage", lambda path: looked.append(path) or SimpleNamespace(free=free))
+        monkeypatch.setattr(shutil, "disk_usage", lambda path: looked.append(path)
+                            or SimpleNamespace(free=free))
 
     disk(2 * recording_bytes(TINY) - 1)
     code, said, complaint = eitbench_bank("--seeds", "train:0-1", "-j", "1")
-    assert code == 2 and "seeds need" in complaint and "are free" in complaint and "simulated" not in said
+    assert code == 2
+    assert "seeds need" in complaint
+    assert "are free" in complaint
+    assert "simulated" not in said
     assert asked == [] and names(place) == [] and looked[0] in (place, *place.parents)
     disk(2 * recording_bytes(TINY))
     assert eitbench_bank("--seeds", "train:0-1", "-j", "1")[0] == 0 and asked == [[0, 1]]
@@ -229,7 +265,8 @@ def test_full_disk_is_refused_before_anything_is_simulated(place, asked, monkeyp
     (["-j", "0"], "--jobs"),
 ])
 def test_mistakes_are_explained(arguments, message, place, asked):
-    """Exit code 2 and a sentence that names the argument; no traceback, and nothing is simulated."""
+    """Exit code 2 and a sentence that names the argument; no traceback, and nothing is
+    simulated."""
     code, said, complaint = eitbench_bank(*arguments)
     assert code == 2 and said == "" and message in complaint and "Traceback" not in complaint
     assert asked == [] and (not place.exists() or names(place) == [])

@@ -1,4 +1,5 @@
-"""Recordings: they score as the truth does, they are bit for bit the simulation's, and damage is never believed."""
+"""Recordings: they score as the truth does, they are bit for bit the simulation's, and damage is
+never believed."""
 
 import hashlib
 import os
@@ -10,16 +11,25 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import scipy.sparse as sp
+from tiny_worlds import CHANGES, TINY
 
 import eitbench  # noqa: F401 (registers)
-from eitbench.data import episodes, recordings
-from eitbench.data.episodes import CACHE_VARIABLE, folder, simulate, truth_discretisation
-from eitbench.data.recordings import cycle_voltages, is_recorded, outline, recording, recording_path, step_error
-from eitbench.worlds import Pipe2D
+from eitbench.data import episodes, recordings, store
+from eitbench.data.episodes import simulate, truth_discretisation
+from eitbench.data.recordings import (
+    SPARSE,
+    cycle_voltages,
+    faults_of,
+    is_recorded,
+    outline,
+    recording,
+    recording_path,
+    sparse_of,
+    step_error,
+)
+from eitbench.data.store import CACHE_VARIABLE, folder
+from eitbench.worlds.pipe2d import PIPE_2D
 
-FIELDS = {"mean_velocity": 45.0, "scored_steps": 3, "electrodes_per_wall": 2, "frame": 2}
-TINY = Pipe2D(**FIELDS)
-"""A fast fluid flushes the pipe in two steps: an episode of five takes a third of a second."""
 HEADER = 256
 """Bytes before the first step of a recording of TINY."""
 
@@ -36,7 +46,7 @@ def cache(tmp_path, monkeypatch):
 def forget():
     """What a new process does not know: files found in order, and outlines."""
     recordings._sound.clear()
-    outline.cache_clear()
+    recordings._outline.cache_clear()
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +59,8 @@ def episode():
 def counted(monkeypatch, episode):
     """`simulate` replaced by one that returns seed 7 at once and counts its calls."""
     calls = []
-    monkeypatch.setattr(recordings, "simulate", lambda *arguments: calls.append(arguments) or episode)
+    monkeypatch.setattr(recordings, "simulate", lambda *arguments: calls.append(arguments)
+                        or episode)
     return SimpleNamespace(bits=bits(recordings.make_recording(TINY, 7, episode)), calls=calls)
 
 
@@ -61,7 +72,8 @@ def bits(entries):
 def outline_bits(stage):
     """All that makes two outlines the same."""
     mass = stage.mass
-    return [(array.dtype.str, array.tobytes()) for array in (mass.data, mass.indices, mass.indptr)] + [
+    return [(array.dtype.str, array.tobytes())
+            for array in (mass.data, mass.indices, mass.indptr)] + [
         mass.shape, stage.largest_voltage]
 
 
@@ -72,11 +84,12 @@ def digest(entries, stage):
     return hashlib.sha256(b"".join(part.tobytes() for part in parts)).hexdigest()
 
 
-# -- independent integrals --------------------------------------------------------------------------------------------
+# -- independent integrals -------------------------------------------------------------------------
 
 
 def values_at(points, mesh):
-    """Dense matrix from nodal values on ``mesh`` to values at ``points``: every point is looked for in every cell."""
+    """Dense matrix from nodal values on ``mesh`` to values at ``points``: every point is looked for
+    in every cell."""
     matrix, found = np.zeros((len(points), mesh.n_nodes)), np.zeros(len(points), dtype=bool)
     homogeneous = np.column_stack([points, np.ones(len(points))])
     for cell in mesh.cells:
@@ -89,7 +102,8 @@ def values_at(points, mesh):
 
 
 def integral_of_square(mesh, nodal):
-    """∫f² for nodal values (..., n): the three midpoints of a triangle's edges integrate a quadratic exactly."""
+    """∫f² for nodal values (..., n): the three midpoints of a triangle's edges integrate a
+    quadratic exactly."""
     corner = nodal[..., mesh.cells]
     middles = 0.5 * (corner + np.roll(corner, 1, axis=-1))
     edges = mesh.points[mesh.cells[:, 1:]] - mesh.points[mesh.cells[:, :1]]
@@ -105,7 +119,8 @@ def to_truth():
 
 @pytest.mark.parametrize("kind", ["near the truth", "good", "bad", "constant", "background"])
 def test_score_is_the_integral_over_the_truth(kind, episode, to_truth):
-    """The step error from moments equals ∫(ĉ − c)²/∫c² taken over the truth's own triangles, whatever the estimate.
+    """The step error from moments equals ∫(ĉ − c)²/∫c² taken over the truth's own triangles,
+    whatever the estimate.
 
     To 1e-6 of it, but for 3e-10 that single precision of the moments costs (measured: 6e-11).
     """
@@ -118,20 +133,23 @@ def test_score_is_the_integral_over_the_truth(kind, episode, to_truth):
                 "bad": rng.uniform(-250.0, 250.0, (5, len(nodes))),
                 "constant": np.full((5, len(nodes)), 25.0),
                 "background": np.full((5, len(nodes)), TINY.background)}[kind]
-    exact = integral_of_square(mesh, estimate @ to_truth.T - truth) / integral_of_square(mesh, truth)
+    exact = integral_of_square(mesh, estimate @ to_truth.T - truth) / integral_of_square(mesh,
+                                                                                         truth)
     if kind == "near the truth":
-        assert exact.max() < 1e-4                       # what the coarser mesh cannot hold, and no more
+        assert exact.max() < 1e-4                   # what the coarser mesh cannot hold, and no more
     entries, mass = recording(TINY, 7), outline(TINY).mass
-    scored = step_error(mass, estimate - TINY.background, entries["moment"], entries["deviation"], entries["square"])
+    scored = step_error(mass, estimate - TINY.background, entries["moment"], entries["deviation"],
+                        entries["square"])
     np.testing.assert_allclose(scored, exact, **exactly)
-    for t in range(5):                                  # one step at a time, as the environment asks
-        one = step_error(mass, estimate[t] - TINY.background, *(entries[name][t] for name in (
-            "moment", "deviation", "square")))
+    for t in range(5):                                 # one step at a time, as the environment asks
+        one = step_error(mass, estimate[t] - TINY.background, entries["moment"][t],
+                         entries["deviation"][t], entries["square"][t])
         np.testing.assert_allclose(one, exact[t], **exactly)
 
 
 def test_outline_holds_one_triangle_of_the_mass_on_the_estimators_nodes(to_truth):
-    """xᵀ·mass·x = ∫(Px)² over the truth's triangles for any x, and nothing is stored below the diagonal."""
+    """xᵀ·mass·x = ∫(Px)² over the truth's triangles for any x, and nothing is stored below the
+    diagonal."""
     mass, mesh = outline(TINY).mass, truth_discretisation(TINY).transport.mesh
     assert mass.shape == (1701, 1701) and sp.tril(mass, -1).nnz == 0 and sp.triu(mass, 1).nnz > 1701
     for x in np.random.default_rng(2).normal(size=(5, 1701)):
@@ -141,11 +159,12 @@ def test_outline_holds_one_triangle_of_the_mass_on_the_estimators_nodes(to_truth
 def test_outline_knows_the_largest_voltage():
     """That of the whole injection cycle into liquid of the expected concentration."""
     observation, level = TINY.model().observation, np.full(1701, TINY.expected_concentration)
-    largest = max(np.abs(observation.transfer_resistance(level) @ currents).max() for currents in TINY.currents)
+    largest = max(np.abs(observation.transfer_resistance(level) @ currents).max()
+                  for currents in TINY.currents)
     assert outline(TINY).largest_voltage == pytest.approx(largest, rel=1e-10)
 
 
-# -- the simulation, bit for bit --------------------------------------------------------------------------------------
+# -- the simulation, bit for bit -------------------------------------------------------------------
 
 
 def test_resistances_and_noise_are_those_of_the_episode(episode):
@@ -158,43 +177,68 @@ def test_resistances_and_noise_are_those_of_the_episode(episode):
 
 
 def test_cycle_voltages_are_those_of_the_episode(episode):
-    """Step by step what `Episode.voltages` says of the cycle's currents, which begin anew after each frame."""
-    voltages = cycle_voltages(TINY, recording(TINY, 7))
+    """Step by step what `Episode.voltages` says of the cycle's currents, which begin anew after
+    each frame."""
+    voltages = cycle_voltages(TINY, 7, recording(TINY, 7))
     assert voltages.shape == (5, 4)
     for t, currents in enumerate(TINY.currents[[0, 1, 0, 1, 0]], start=1):
         np.testing.assert_allclose(voltages[t - 1], episode.voltages(t, currents, TINY), rtol=1e-12)
 
 
-def test_stored_truth_fresh_truth_and_other_process_give_the_same_bits(episode, monkeypatch, tmp_path):
-    """A recording does not depend on where its truth came from, nor does an outline; both are kept as computed."""
+def test_cycle_voltages_have_the_faults_of_the_episode():
+    """What is broken reads interference, and a current that would have to pass it does not flow;
+    the recording is the same."""
+    faulty = TINY.changed({"instrument": {"dead": [1, 1], "interference": 50.0}})
+    entries = recording(TINY, 7)
+    assert bits(recording(faulty, 7)) == bits(entries)
+    (broken,) = np.flatnonzero(faults_of(faulty, 7).broken_from == 0)
+    sound, read = (cycle_voltages(world, 7, entries) for world in (TINY, faulty))
+    np.testing.assert_array_equal(read[:, broken], 50.0 * entries["noise"][:, broken])
+    passes = np.array([TINY.currents[t % 2, broken] != 0.0 for t in range(5)])
+    assert passes.any()
+    others = np.delete(np.arange(4), broken)
+    np.testing.assert_array_equal(read[np.ix_(passes, others)], 0.0)
+    np.testing.assert_array_equal(read[np.ix_(~passes, others)], sound[np.ix_(~passes, others)])
+
+
+def test_stored_truth_fresh_truth_and_other_process_give_the_same_bits(episode, monkeypatch,
+                                                                       tmp_path):
+    """A recording does not depend on where its truth came from, nor does an outline; both are kept
+    as computed."""
     fresh, stage = recording(TINY, 7), outline(TINY)
     assert bits(fresh) == bits(recordings.make_recording(TINY, 7, episode))
     before = bits(fresh), outline_bits(stage)
-    monkeypatch.setattr(episodes, "_simulate", None)
+    monkeypatch.setattr(episodes, "simulate_together", None)
     recording_path(TINY, 7).unlink()
     forget()
-    assert (bits(recording(TINY, 7)), outline_bits(outline(TINY))) == before            # from the stored truth
+    # from the stored truth
+    assert (bits(recording(TINY, 7)), outline_bits(outline(TINY))) == before
     monkeypatch.setattr(recordings, "simulate", None)
     monkeypatch.setattr(recordings, "score_operators", None)
     forget()
-    assert (bits(recording(TINY, 7)), outline_bits(outline(TINY))) == before            # from the disk
-    program = (f"import sys; sys.path.insert(0, {os.path.dirname(__file__)!r}); from test_recordings import *\n"
+    assert (bits(recording(TINY, 7)), outline_bits(outline(TINY))) == before         # from the disk
+    here = os.path.dirname(__file__)
+    program = (f"import sys; sys.path[:0] = [{here!r}, {os.path.dirname(here)!r}]\n"
+               "from test_recordings import *\n"
                "print(digest(recording(TINY, 7), outline(TINY)))")
-    for place in (tmp_path / "elsewhere", tmp_path / "cache"):                          # anew, and from our files
-        done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True,
-                              env=os.environ | {CACHE_VARIABLE: str(place)})
+    for place in (tmp_path / "elsewhere", tmp_path / "cache"):            # anew, and from our files
+        done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True,
+                              check=True, env=os.environ | {CACHE_VARIABLE: str(place)})
         assert done.stdout.strip() == digest(fresh, stage)
 
 
 def test_playing_what_is_stored_needs_no_finite_elements(counted):
-    """With recording and outline on disk, making, resetting and stepping an environment builds no mesh."""
+    """With recording and outline on disk, making, resetting and stepping an environment builds no
+    mesh."""
     recording(TINY, 7), outline(TINY)
     program = (f"import sys, gymnasium as gym, numpy as np, eitbench\n"
-               f"env = gym.make('eitbench/Pipe2D-v0', scenario={FIELDS!r})\n"
+               f"env = gym.make('eitbench/Pipe2D-v0', world={CHANGES!r})\n"
                "env.reset(seed=7)\n"
                "rewards = [env.step(np.full(1701, 30.0))[1] for _ in range(5)]\n"
-               "print(rewards[-1] < 0.0, sorted({'skfem', 'numba', 'eitbench.numerics.mesh'} & set(sys.modules)))")
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+               "heavy = {'skfem', 'numba', 'eitbench.numerics.mesh'}\n"
+               "print(rewards[-1] < 0.0, sorted(heavy & set(sys.modules)))")
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True,
+                          check=True)
     assert done.stdout == "True []\n"
 
 
@@ -205,7 +249,7 @@ def test_seed_must_be_a_whole_number(seed):
         recording(TINY, seed)
 
 
-# -- on disk ----------------------------------------------------------------------------------------------------------
+# -- on disk ---------------------------------------------------------------------------------------
 
 
 def test_stored_recording_is_mapped_and_read_only(counted):
@@ -222,10 +266,10 @@ def test_stored_recording_is_mapped_and_read_only(counted):
 
 
 def test_is_recorded_tells_what_is_there(counted):
-    """False before, true after, false for another seed, scenario or a damaged file."""
+    """False before, true after, false for another seed, world or a damaged file."""
     assert not is_recorded(TINY, 7)
     recording(TINY, 7)
-    assert is_recorded(TINY, 7) and not is_recorded(TINY, 8) and not is_recorded(Pipe2D(), 7)
+    assert is_recorded(TINY, 7) and not is_recorded(TINY, 8) and not is_recorded(PIPE_2D, 7)
     forget()
     path = recording_path(TINY, 7)
     path.write_bytes(path.read_bytes()[:-1])
@@ -246,7 +290,8 @@ DAMAGE = [
 
 @pytest.mark.parametrize("damage", DAMAGE)
 def test_damaged_recording_is_rebuilt(damage, counted):
-    """What a full disk or a lost power supply leaves is noticed by the next process and replaced for all later ones."""
+    """What a full disk or a lost power supply leaves is noticed by the next process and replaced
+    for all later ones."""
     recording(TINY, 7)
     path = recording_path(TINY, 7)
     path.write_bytes(damage(path.read_bytes()))
@@ -257,7 +302,8 @@ def test_damaged_recording_is_rebuilt(damage, counted):
 
 
 def test_any_flipped_byte_of_a_step_is_noticed(counted):
-    """Wherever a byte is inverted behind the header, in numbers or checksums, the recording is made again."""
+    """Wherever a byte is inverted behind the header, in numbers or checksums, the recording is made
+    again."""
     recording(TINY, 7)
     path = recording_path(TINY, 7)
     data = path.read_bytes()
@@ -271,7 +317,8 @@ def test_any_flipped_byte_of_a_step_is_noticed(counted):
 
 
 def test_file_changed_under_a_running_process_is_read_again(counted):
-    """A process that knows a file as sound looks again once its size or its time of change is another."""
+    """A process that knows a file as sound looks again once its size or its time of change is
+    another."""
     recording(TINY, 7)
     assert recording(TINY, 7) is not None
     path = recording_path(TINY, 7)
@@ -294,62 +341,57 @@ def test_damaged_outline_is_rebuilt(damage):
     path.write_bytes(damage(path.read_bytes()))
     forget()
     assert outline_bits(outline(TINY)) == good
-    assert outline_bits(recordings.Outline(*as_outline(recordings._load_outline(path)))) == good
-
-
-def test_outline_that_does_not_fit_its_checksum_is_rebuilt():
-    """A whole archive in which one number was changed is noticed."""
-    good = outline_bits(outline(TINY))
-    path = folder(TINY) / "outline.npz"
-    with np.load(path) as stored:
-        content = dict(stored)
-    content["arr_0"][100] *= 1.0 + 1e-12
-    np.savez(path, **content)
-    forget()
-    assert outline_bits(outline(TINY)) == good
+    assert outline_bits(as_outline(store.load(path, OUTLINE))) == good
 
 
 def test_any_flipped_byte_of_an_outline_is_harmless():
-    """Wherever a byte is inverted, the right outline comes back: the file is read as it was meant, or rebuilt."""
+    """Wherever a byte is inverted, the right outline comes back: the file is read as it was meant,
+    or not at all."""
     good = outline_bits(outline(TINY))
     path = folder(TINY) / "outline.npz"
     data = path.read_bytes()
-    rng = np.random.default_rng(3)
-    rebuilt = 0
-    for place in [*range(0, 160, 16), *range(len(data) - 400, len(data), 16), *rng.integers(0, len(data), 20)]:
+    ends = [*range(0, 160, 16), *range(len(data) - 400, len(data), 16)]
+    refused = 0
+    for place in [*ends, *np.random.default_rng(3).integers(0, len(data), 20)]:
         path.write_bytes(data[:place] + bytes([data[place] ^ 0xFF]) + data[place + 1:])
-        stored = recordings._load_outline(path)
-        rebuilt += stored is None
-        assert stored is None or outline_bits(recordings.Outline(*as_outline(stored))) == good, f"byte {place}"
-    assert rebuilt > 20
+        stored = store.load(path, OUTLINE)
+        refused += stored is None
+        assert stored is None or outline_bits(as_outline(stored)) == good, f"byte {place}"
+    assert refused > 20
+
+
+OUTLINE = (*SPARSE, "largest")
+"""What an outline's file holds."""
 
 
 def as_outline(stored):
-    """Mass and largest voltage from the arrays on disk."""
-    data, indices, indptr, largest = stored
-    return sp.csr_array((data, indices, indptr), shape=(len(indptr) - 1,) * 2), float(largest)
+    """The outline that these arrays hold."""
+    return recordings.Outline(sparse_of(stored), float(stored["largest"]))
 
 
 def test_unwritable_cache_warns_and_still_plays(monkeypatch, cache, counted):
-    """Nothing can be kept: each is said in words, and the numbers are those of any other machine."""
+    """Nothing can be kept: each is said in words, and the numbers are those of any other
+    machine."""
     def fail(*_):
         raise OSError("no space left on device")
 
-    for module in (recordings, episodes):
+    for module in (recordings, store):
         monkeypatch.setattr(module, "write_atomically", fail)
-    with pytest.warns(UserWarning, match=f"cannot be kept in .*no space left on device.*{CACHE_VARIABLE}"):
+    said = f"cannot be kept in .*no space left on device.*{CACHE_VARIABLE}"
+    with pytest.warns(UserWarning, match=said):
         stage = outline(TINY)
     for _ in range(2):
         with pytest.warns(UserWarning, match="will be simulated again"):
             entries = recording(TINY, 7)
         assert bits(entries) == counted.bits
     assert not cache.exists() and len(counted.calls) == 2
-    env = gym.make("eitbench/Pipe2D-v0", scenario=FIELDS).unwrapped
+    env = gym.make("eitbench/Pipe2D-v0", world=CHANGES).unwrapped
     with pytest.warns(UserWarning, match="cannot be kept"):
         observation, _ = env.reset(seed=7)
-    np.testing.assert_array_equal(observation["voltages"], cycle_voltages(TINY, entries)[0])
+    np.testing.assert_array_equal(observation["voltages"], cycle_voltages(TINY, 7, entries)[0])
     rewards = [env.step(np.full(1701, TINY.background))[1] for _ in range(5)]
-    np.testing.assert_allclose(rewards[2:], -(entries["deviation"] / entries["square"])[2:], rtol=1e-12)
+    np.testing.assert_allclose(rewards[2:], -(entries["deviation"] / entries["square"])[2:],
+                               rtol=1e-12)
     assert rewards[:2] == [0.0, 0.0] and stage.mass.shape == (1701, 1701)
 
 

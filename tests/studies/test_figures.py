@@ -1,30 +1,30 @@
-"""Every figure, drawn from tiny worlds and made-up estimates: what it draws, and that its words follow from them."""
+"""Every figure, drawn from tiny worlds and made-up estimates: what it draws, and that its words
+follow from them."""
 
 import importlib
 import re
+from dataclasses import replace
 from pathlib import Path
 
-import gymnasium as gym
 import numpy as np
 import pandas as pd
 import pytest
+from choosing import SHORT
 from matplotlib.image import imread
 from PIL import Image
+from short import merged, shorten
+from tiny_worlds import CHANGES
 
 from eitbench.bench.baselines import load_baseline
-from eitbench.bench.tracks import MORE_SEEDS
 from eitbench.cli.studies import NAME, thesis
-from eitbench.data.store import CACHE_VARIABLE
 from eitbench.data.seeds import name_seed
-from eitbench.envs.pipe2d import Pipe2DEnv
-from eitbench.envs.pipe2d_obstacle import Pipe2DObstacleEnv
-from eitbench.envs.pipe2d_velocity import Pipe2DVelocityEnv
-from eitbench.envs.rotating_tank import RotatingTank2DEnv
-from eitbench.envs.stationary_tank import StationaryTank2DEnv
+from eitbench.data.store import CACHE_VARIABLE
+from eitbench.envs.estimation import EstimationEnv
 from eitbench.estimation import FirstFrame, initial_covariance
 from eitbench.physics.rest import AtRest
 from eitbench.report.summary import seed_ranges
-from eitbench.worlds import Pipe2DObstacle
+from eitbench.worlds import entry
+from eitbench.worlds.flows import FlowPastBulge, _past_bulge
 from eitbench.worlds.task import Estimate
 
 FIGURES = thesis().FIGURES
@@ -33,31 +33,40 @@ common, injection, obstacle, parameters, pipe2d, profiles, tanks, velocity = (
     ("common", "injection", "obstacle", "parameters", "pipe2d", "profiles", "tanks", "velocity"))
 error_of, estimates_of = common.error_of, common.estimates_of
 SEED = 100_000
-PIPE = {"mean_velocity": 45.0, "scored_steps": 32, "electrodes_per_wall": 2, "frame": 2}
+PIPE = merged(CHANGES, {"schedule": {"scored_steps": 32}})
 """A fast fluid flushes the pipe in two steps; pictures of the pipe show states up to the 28th."""
-FLOW = PIPE | {"velocity_range": (55.0, 60.0), "velocity_std": 10.0}
-OBSTACLE = PIPE | {"viscosity": 2e-2}
+FLOW = merged(PIPE, {"flow": {"velocity_range": [55.0, 60.0], "velocity_std": 10.0}})
+OBSTACLE = merged(PIPE, {"flow": {"viscosity": 2e-2}})
+KINDS = {"unknown": "Unknown", "time-varying": "TimeVarying", "skewed": "Skewed"}
+
+
+def played_in(name, world, **kwargs):
+    """An environment with a changed world."""
+    return EstimationEnv(f"eitbench/{name}-v0", world=world, **kwargs)
 
 
 def perfect(env, name, seed):
-    """An estimator that knows the truth, where it is one of those that should be good; else it says the same always."""
+    """An estimator that knows the truth, where it is one of those that should be good; else it says
+    the same always."""
     env.reset(seed=seed)
     task = env.task
     if name in ("homogeneous", "gauss_newton"):
         return constant(env, name, seed)
     states = env.truth_mesh().interpolation_to(task.mesh.points) @ env.truth().T
-    if isinstance(task.transport, AtRest):                     # two hills instead of two plains, that have no summit
+    if isinstance(task.transport, AtRest):    # two hills instead of two plains, that have no summit
         smooth = initial_covariance(task.mesh, task.prior)
         states = 30.0 + smooth @ (states - 30.0) / smooth.sum(axis=1, keepdims=True)
     if name in ("kalman_filter", "filter_bank") and task.velocity is not None:
-        states = states + 1.0                                  # what trusts a wrong flow is to be a little worse
+        states = states + 1.0                     # what trusts a wrong flow is to be a little worse
     parameters = variance = None
     if task.velocity is not None:
         root = np.sqrt(task.velocity.weights)[:, None]
-        parameters = np.linalg.lstsq(root * task.velocity.profiles, root * env.true_velocity().T, rcond=None)[0].T
+        parameters = np.linalg.lstsq(root * task.velocity.profiles, root * env.true_velocity().T,
+                                     rcond=None)[0].T
         variance = np.full(task.velocity.size, 0.01)
     return [Estimate(state, np.full(len(state), 2.0 if "filter" in name else 1.0),
-                     velocity=None if parameters is None else parameters[t], velocity_variance=variance)
+                     velocity=None if parameters is None else parameters[t],
+                     velocity_variance=variance)
             for t, state in enumerate(states.T)]
 
 
@@ -72,15 +81,20 @@ def constant(env, name, seed):
 def tiny_worlds(monkeypatch, tmp_path_factory):
     """Each figure's environment, small; episodes are shared by the tests."""
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path_factory.getbasetemp() / "figure-episodes"))
-    monkeypatch.setattr(pipe2d, "_env", lambda lag=0, mean_velocity=None: Pipe2DEnv(lag=lag, scenario=PIPE))
-    monkeypatch.setattr(velocity, "_env", lambda flow: Pipe2DVelocityEnv(flow=flow, scenario=FLOW))
-    monkeypatch.setattr(obstacle, "_env", lambda flow: Pipe2DObstacleEnv(assumed_flow=flow, scenario=OBSTACLE))
-    fine = Pipe2DObstacle.real_flow
-    monkeypatch.setattr(Pipe2DObstacle, "real_flow", lambda pipe, _: fine(pipe, (32, 8)))
-    for name, env in (("_stirred", RotatingTank2DEnv(scenario={"scored_steps": 24})),
-                      ("_at_rest", StationaryTank2DEnv(scenario={"scored_steps": 16}))):
-        monkeypatch.setattr(tanks, name, lambda env=env: (env, env.scenario))
-    monkeypatch.setattr(profiles, "_error", lambda lag, baseline, profile, seeds: np.full(len(seeds), 0.02 if (
+    monkeypatch.setattr(pipe2d, "_env", lambda lag=0, mean_velocity=None: played_in(
+        "Pipe2D", PIPE, lag=lag))
+    monkeypatch.setattr(velocity, "_env", lambda flow: played_in(
+        f"Pipe2D{KINDS[flow]}Velocity", FLOW))
+    monkeypatch.setattr(obstacle, "_env", lambda flow: played_in(
+        "Pipe2DObstacle", OBSTACLE, assume={"flow": flow}))
+    monkeypatch.setattr(FlowPastBulge, "nominal", lambda flow, world, fine: _past_bulge(
+        world.vessel, flow, (32, 8)))
+    for name, id, steps in (("_stirred", "RotatingTank2D", 24),
+                            ("_at_rest", "StationaryTank2D", 16)):
+        env = played_in(id, {"schedule": {"scored_steps": steps}})
+        monkeypatch.setattr(tanks, name, lambda env=env: env)
+    monkeypatch.setattr(profiles, "_error", lambda lag, baseline, profile,
+                        seeds: np.full(len(seeds), 0.02 if (
         baseline == "homogeneous") else 0.004 if profile == "parabolic" else 0.006))
     monkeypatch.setattr(parameters, "_error", lambda factors, _: 0.005 * (
         1.0 + 0.1 * abs(np.log2(factors.inflow_std)) + 0.01 * np.log2(factors.diffusivity)**2))
@@ -96,22 +110,25 @@ def draw(monkeypatch, name, folder, estimator):
     path, remark = FIGURES[name]([SEED], 1, folder / "new")
     picture = imread(path)
     assert path.parent == folder / "new" and path.name == f"{name}.png"
-    assert min(picture.shape[:2]) > 250 and picture[..., :3].std() > 0.05      # neither tiny nor blank
+    assert min(picture.shape[:2]) > 250 and picture[..., :3].std() > 0.05   # neither tiny nor blank
     return remark
 
 
 DRAWN = [name for name in FIGURES if name not in ("fig5.8", "fig5.10", "injection")]
-"""fig5.8 is played in earnest in tests/studies; fig5.10 is in 3D, where even a made-up estimate takes minutes."""
+"""fig5.8 is played in earnest in tests/studies; fig5.10 is in 3D, where even a made-up estimate
+takes minutes."""
 
 
 @pytest.mark.parametrize("name", DRAWN)
 def test_figure_is_drawn(name, monkeypatch, tmp_path):
-    """A picture, and words without a hole; with estimates that are right, all but what is about real methods agrees."""
+    """A picture, and words without a hole; with estimates that are right, all but what is about
+    real methods agrees."""
     remark = draw(monkeypatch, name, tmp_path, perfect)
     assert not re.search(r"\b(nan|inf|None)\b", remark)
     verdicts = [line for line in remark.splitlines() if line.startswith(("Agrees: ", "DIFFERS: "))]
     assert verdicts
-    if name in ("table5.1", "profiles", "fig6.1", "fig6.2", "fig6.4", "fig6.5", "fig6.6", "fig7.2", "fig7.4"):
+    if name in ("table5.1", "profiles", "fig6.1", "fig6.2", "fig6.4", "fig6.5", "fig6.6", "fig7.2",
+                "fig7.4"):
         assert all(line.startswith("Agrees") for line in verdicts), remark
 
 
@@ -122,33 +139,36 @@ def test_words_follow_from_the_data(name, monkeypatch, tmp_path):
 
 
 def test_injection_is_drawn(monkeypatch, tmp_path):
-    """Scores as they were played, told in a table for each world, and an animation with a frame for every step; when
-    not told which episodes, in those of the boards."""
+    """Scores as they were played, told in a table for each world, and an animation with a frame for
+    every step; when not told which episodes, in those of the boards."""
     played = {}
 
     def rows(jobs, results):
         names = list(dict.fromkeys(job.load().name for job in jobs))
-        return pd.DataFrame([{"policy": name, "seed": f"dev:{k}", "error": 0.01 * (1 + place) + 0.001 * k, "spent": 5,
-                              "seconds_per_step": 0.001} for place, name in enumerate(names) for k in range(3)])
+        return pd.DataFrame([{"policy": name, "seed": f"dev:{k}",
+                              "error": 0.01 * (1 + place) + 0.001 * k, "spent": 5,
+                              "seconds_per_step": 0.001} for place, name in enumerate(names)
+                              for k in range(3)])
 
     monkeypatch.setattr(injection, "run_jobs", lambda jobs, *_, **__: played.update({
-        jobs[0].environment: seed_ranges(list(dict.fromkeys(name_seed(job.seed) for job in jobs)))}))
+        jobs[0].environment: seed_ranges(list(dict.fromkeys(name_seed(job.seed)
+                                                            for job in jobs)))}))
     monkeypatch.setattr(injection, "policy_rows", rows)
     monkeypatch.setattr(injection, "results_in", lambda folder: [])
-    short = {"scored_steps": 3, "mean_velocity": 16.0}
-    monkeypatch.setitem(gym.registry[injection.AT_WORK[0]].kwargs, "scenario", short)
+    shorten(monkeypatch, {injection.AT_WORK[0]: merged(SHORT, {"schedule": {"scored_steps": 3}})})
     path, remark = FIGURES["injection"](None, 1, tmp_path / "new")
     picture = imread(path)
     assert min(picture.shape[:2]) > 250 and picture[..., :3].std() > 0.05
-    assert list(played.items()) == [((env, "{}"), MORE_SEEDS.get(env, "test:0-9")) for env in injection.WORLDS]
+    assert list(played.items()) == [((env, "{}"), entry(env).seeds) for env in injection.WORLDS]
     assert remark.count("| best_pair |") == 6
     with Image.open(tmp_path / "new" / "injection.gif") as moving:
-        assert moving.n_frames == 3                               # the first frame of 16, then three steps
+        assert moving.n_frames == 3                        # the first frame of 16, then three steps
 
 
 def test_thesis_figures_show_dev_episodes_when_not_told(monkeypatch, tmp_path):
     """Nothing is drawn from test episodes by chance."""
-    monkeypatch.setattr(pipe2d, "fig5_4", lambda seeds, jobs, out: (out, " ".join(map(name_seed, seeds))))
+    monkeypatch.setattr(pipe2d, "fig5_4", lambda seeds, jobs,
+                        out: (out, " ".join(map(name_seed, seeds))))
     assert FIGURES["fig5.4"](None, 1, tmp_path)[1] == "dev:0 dev:1"
 
 
@@ -157,7 +177,8 @@ def test_names():
     modules = [importlib.import_module(f"{NAME}.{path.stem}")
                for path in Path(pipe2d.__file__).parent.glob("[!_]*.py")]
     for name in FIGURES:
-        assert sum(callable(getattr(module, name.replace(".", "_"), None)) for module in modules) == 1, name
+        assert sum(callable(getattr(module, name.replace(".", "_"), None))
+                   for module in modules) == 1, name
 
 
 def test_one_run_serves_several_figures(monkeypatch, tmp_path):
@@ -173,32 +194,37 @@ def test_one_run_serves_several_figures(monkeypatch, tmp_path):
     assert sorted(played) == ["filter_bank", "joint_extended_kalman_filter", "kalman_filter"]
 
 
-# -- what the figures compute -----------------------------------------------------------------------------------------
+# -- what the figures compute ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("delay", [0, 3, 7])
 def test_lag_is_the_delay(delay):
-    """A sine and the same one some steps later, scaled and shifted: the delay, at a correlation of one."""
+    """A sine and the same one some steps later, scaled and shifted: the delay, at a correlation of
+    one."""
     truth = np.sin(np.arange(80) / 9.0)
     late = 2.0 + 0.5 * np.sin((np.arange(80) - delay) / 9.0)
     assert velocity.lag_of(late, truth) == (delay, pytest.approx(1.0, abs=1e-12))
 
 
 def test_table_names_the_best_cell_and_what_matters(monkeypatch, tmp_path):
-    """By made-up errors: the best is the table itself, the inflow noise matters most, at 20 % for a factor of four."""
+    """By made-up errors: the best is the table itself, the inflow noise matters most, at 20 % for a
+    factor of four."""
     remark = draw(monkeypatch, "table5.1", tmp_path, perfect)
-    assert "0.00500 with the table's values, 0.00500 at best" in remark and "20.0 % (std of the inflow noise" in remark
+    assert "0.00500 with the table's values, 0.00500 at best" in remark
+    assert "20.0 % (std of the inflow noise" in remark
     assert "What matters most is the std of the inflow noise η." in remark
     monkeypatch.setattr(parameters, "_error", lambda factors, _: 0.005 / factors.nodal_std)
     remark = draw(monkeypatch, "table5.1", tmp_path, perfect)
-    assert "std of the nodal noise e × 4" in remark and "DIFFERS: the table's values are a good choice" in remark
+    assert "std of the nodal noise e × 4" in remark
+    assert "DIFFERS: the table's values are a good choice" in remark
 
 
 def test_changed_task_is_the_filters_alone():
-    """Other stds and another κ in the model; the environment's own task stays, and what is played is what is scored."""
-    env = Pipe2DEnv(scenario=PIPE | {"scored_steps": 3})
+    """Other stds and another κ in the model; the environment's own task stays, and what is played
+    is what is scored."""
+    env = played_in("Pipe2D", CHANGES)
     task = parameters._changed(env, parameters.Factors(2.0, 0.5, 4.0, 0.25))
-    assert task.prior == env.task.prior._replace(inflow_std=0.5, nodal_std=0.01, initial_std=1.0)
+    assert task.prior == replace(env.task.prior, inflow_std=0.5, nodal_std=0.01, initial_std=1.0)
     assert task.transport.diffusivity == pytest.approx(0.25 * env.task.transport.diffusivity)
     np.testing.assert_array_equal(task.transport.inlet, env.task.transport.inlet)
     assert env.task.prior.inflow_std == 0.25
@@ -207,10 +233,11 @@ def test_changed_task_is_the_filters_alone():
 
 
 def test_map_estimate_is_the_most_probable():
-    """At rest its objective, misfit and prior, is lower than the linearised filter's, and flat to the tolerance."""
-    env = StationaryTank2DEnv(scenario={"scored_steps": 3})
+    """At rest its objective, misfit and prior, is lower than the linearised filter's, and flat to
+    the tolerance."""
+    env = played_in("StationaryTank2D", {"schedule": {"scored_steps": 3}})
     assert load_baseline("map_estimate").estimator.suits(env.task)
-    assert not load_baseline("map_estimate").estimator.suits(RotatingTank2DEnv().task)
+    assert not load_baseline("map_estimate").estimator.suits(played_in("RotatingTank2D", None).task)
     task, first = env.task, FirstFrame(env.task)
     observation, _ = env.reset(seed=SEED)
     seen = []
@@ -225,7 +252,8 @@ def test_map_estimate_is_the_most_probable():
         misfit = (V - task.observation.voltages(c, I)) / task.noise.std(V)
         return (misfit**2).sum() + (c - first.c_bh) @ precision @ (c - first.c_bh)
 
-    best, linear = (estimates_of(env, name, SEED)[2].mean for name in ("map_estimate", "kalman_filter"))
+    best, linear = (estimates_of(env, name, SEED)[2].mean
+                    for name in ("map_estimate", "kalman_filter"))
     assert objective(best) < objective(linear)
     for direction in (linear - best, first.mean - best):
         assert objective(best + 0.05 * direction) > 0.999 * objective(best)

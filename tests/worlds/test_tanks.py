@@ -1,9 +1,10 @@
-"""The round tanks: a ball on an orbit of a steady flow, cylinders that stand still, and electrodes where they are said.
+"""The round tanks: a ball on an orbit of a steady flow, cylinders that stand still, and electrodes
+where they are said.
 
-Nothing of the truth may come from the estimators' meshes: an estimator would be tested against its own mistakes.
+Nothing of the truth may come from the estimators' meshes: an estimator would be tested against its
+own mistakes.
 """
 
-from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -14,44 +15,55 @@ from scipy.stats import kstest
 from eitbench.data.episodes import simulate, simulate_together, truth_discretisation
 from eitbench.numerics.fem import mass_matrix
 from eitbench.numerics.round import electrode_disc
-from eitbench.worlds import RotatingTank2D, StationaryTank2D
-from eitbench.worlds.base import Randomness
-from eitbench.worlds.tank2d import disc_indicator
+from eitbench.worlds.bodies import disc_indicator
+from eitbench.worlds.flows import _stirred
+from eitbench.worlds.rotating_tank import ROTATING_TANK_2D as ROTATING
+from eitbench.worlds.stationary_tank import STATIONARY_TANK_2D as STATIONARY
+from eitbench.worlds.streams import randomness
 from eitbench.worlds.task import make_task
+from eitbench.worlds.vessels import RoundTank
 
-ROTATING, STATIONARY = RotatingTank2D(), StationaryTank2D()
-SHORT = RotatingTank2D(warm_up=1, scored_steps=3, n_electrodes=8)
+SHORT = ROTATING.changed({"schedule": {"warm_up": 1, "scored_steps": 3},
+                          "vessel": {"n_electrodes": 8}})
 """Four injections of the same flow."""
-each_tank = pytest.mark.parametrize("tank", [SHORT, StationaryTank2D(scored_steps=4)], ids=["rotating", "stationary"])
+STILL = STATIONARY.changed({"schedule": {"scored_steps": 4}})
+each_world = pytest.mark.parametrize("world", [SHORT, STILL], ids=["rotating", "stationary"])
 
 
 def flow_stream(seed):
     """The stream that an episode's flow, or what stands in it, is drawn from."""
-    return Randomness(*map(np.random.default_rng, np.random.SeedSequence(seed).spawn(3))).flow
+    return randomness(seed).flow
+
+
+def stirred(rings):
+    """The stirred tank's flow on a mesh with so many rings."""
+    return _stirred(ROTATING.flow, ROTATING.vessel.radius, rings)
 
 
 @lru_cache(maxsize=8)
-def episode(tank, seed):
+def episode(world, seed):
     """Simulated without a cache on disk."""
-    return simulate(tank, seed, cache=False)
+    return simulate(world, seed, cache=False)
 
 
 @lru_cache(maxsize=4)
-def both(tank):
+def both(world):
     """The discretisations of the truth and of the model."""
-    return truth_discretisation(tank), tank.model()
+    return truth_discretisation(world), world.model()
 
 
-# -- what both have in common -----------------------------------------------------------------------------------------
+# -- what both have in common ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("n_electrodes", "cover"), [(16, 0.5), (7, 0.8), (4, 0.05)])
 def test_electrodes_lie_where_the_spans_say(n_electrodes, cover):
-    """Each has ``cells_at_electrodes`` facets, whose chords end at its edges and are as long as an arc so cut is."""
-    tank = RotatingTank2D(n_electrodes=n_electrodes, electrode_cover=cover)
+    """Each has ``cells_at_electrodes`` facets, whose chords end at its edges and are as long as an
+    arc so cut is."""
+    tank = RoundTank(n_electrodes=n_electrodes, electrode_cover=cover)
     spans, R = tank.electrode_spans, tank.radius
     np.testing.assert_allclose((spans[:, 1] - spans[:, 0]).sum(), 2.0 * np.pi * cover, rtol=1e-12)
-    np.testing.assert_allclose(spans.mean(axis=1), 2.0 * np.pi * np.arange(n_electrodes) / n_electrodes, atol=1e-12)
+    middles = 2.0 * np.pi * np.arange(n_electrodes) / n_electrodes
+    np.testing.assert_allclose(spans.mean(axis=1), middles, atol=1e-12)
     mesh = electrode_disc(R, spans, 6, 12)
     electrodes = tank.electrodes(mesh)
     assert len(electrodes) == n_electrodes
@@ -60,33 +72,37 @@ def test_electrodes_lie_where_the_spans_say(n_electrodes, cover):
         np.testing.assert_allclose(np.hypot(*np.moveaxis(ends, -1, 0)), R, rtol=1e-12)
         middle = 0.5 * (first + last)
         angle = np.mod(np.arctan2(ends[..., 1], ends[..., 0]) - middle + np.pi, 2.0 * np.pi) - np.pi
-        np.testing.assert_allclose([angle.min(), angle.max()], [first - middle, last - middle], atol=1e-9)
+        np.testing.assert_allclose([angle.min(), angle.max()], [first - middle, last - middle],
+                                   atol=1e-9)
         chords = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
         np.testing.assert_allclose(chords, 2.0 * R * np.sin(0.5 * np.ptp(angle, axis=1)), rtol=1e-9)
-        assert np.ptp(angle, axis=1).sum() == pytest.approx(last - first, rel=1e-9)              # no part twice
+        assert np.ptp(angle, axis=1).sum() == pytest.approx(last - first, rel=1e-9)  # no part twice
         assert len(facets) == 6
     assert len(np.unique(np.concatenate(electrodes), axis=0)) == 6 * n_electrodes
 
 
-@each_tank
-def test_truth_is_finer_than_the_model(tank):
-    """Other nodes, and more than three times as many, for the target; more than twice as many for the voltages."""
-    truth, model = both(tank)
+@each_world
+def test_truth_is_finer_than_the_model(world):
+    """Other nodes, and more than three times as many, for the target; more than twice as many for
+    the voltages."""
+    truth, model = both(world)
     assert truth.transport.mesh.n_nodes > 3 * model.transport.mesh.n_nodes
     assert truth.observation.cem.n_unknowns > 2 * model.observation.cem.n_unknowns
-    assert truth.observation.cem.n_electrodes == model.observation.cem.n_electrodes == tank.n_electrodes
+    for side in (truth, model):
+        assert side.observation.cem.n_electrodes == world.vessel.n_electrodes
     level = np.full(truth.transport.mesh.n_nodes, 30.0)
-    fine = truth.observation.voltages(level, tank.currents)
-    coarse = model.observation.voltages(level[:model.transport.mesh.n_nodes], tank.currents)
+    fine = truth.observation.voltages(level, world.currents)
+    coarse = model.observation.voltages(level[:model.transport.mesh.n_nodes], world.currents)
     error = np.abs(fine - coarse).max() / np.abs(fine).max()
-    assert 1e-6 < error < 1e-2                                       # another mesh, the same tank; noise is 1e-2
+    assert 1e-6 < error < 1e-2                          # another mesh, the same tank; noise is 1e-2
 
 
-@each_tank
-def test_seed_decides_the_episode(tank):
-    """Same seed, same bits, alone or beside others; another seed, another target and other noise."""
-    one, other = episode(tank, 7), episode(tank, 8)
-    together = list(simulate_together(tank, [8, 7], progress=False))
+@each_world
+def test_seed_decides_the_episode(world):
+    """Same seed, same bits, alone or beside others; another seed, another target and other
+    noise."""
+    one, other = episode(world, 7), episode(world, 8)
+    together = list(simulate_together(world, [8, 7], progress=False))
     for mine, theirs in ((one, together[1]), (other, together[0])):
         assert [array.tobytes() for array in mine] == [array.tobytes() for array in theirs]
     assert np.abs(one.concentration - other.concentration).max() > 10.0
@@ -95,7 +111,8 @@ def test_seed_decides_the_episode(tank):
 
 
 def test_disc_indicator_holds_the_area_of_the_disc():
-    """∫ indicator = πa², but for the edge's (π²/12)·(edge/2a)² of it, and its rim lies at one half."""
+    """∫ indicator = πa², but for the edge's (π²/12)·(edge/2a)² of it, and its rim lies at one
+    half."""
     truth, _ = both(SHORT)
     mesh, centre, a = truth.transport.mesh, np.array([0.03, -0.05]), 0.03
     area = mass_matrix(mesh).sum(axis=0) @ disc_indicator(mesh.points, centre, a, 0.003)
@@ -105,12 +122,13 @@ def test_disc_indicator_holds_the_area_of_the_disc():
     assert disc_indicator(centre[None], centre, a, 0.003) > 1.0 - 1e-9
 
 
-# -- the stirred tank -------------------------------------------------------------------------------------------------
+# -- the stirred tank ------------------------------------------------------------------------------
 
 
 def test_flow_rests_on_the_wall():
-    """No slip at the nodes of the wall and amid its facets, where the fastest fluid does half a metre a second."""
-    flow = ROTATING.flow(24)
+    """No slip at the nodes of the wall and amid its facets, where the fastest fluid does half a
+    metre a second."""
+    flow = stirred(24)
     ends = flow.mesh.points[flow.mesh.boundary_facets]
     for points in (ends[:, 0], ends.mean(axis=1)):
         np.testing.assert_allclose(flow(points), 0.0, atol=1e-12)
@@ -118,9 +136,11 @@ def test_flow_rests_on_the_wall():
 
 
 def test_flow_has_nearly_no_divergence():
-    """∇·v is below 2 % of the vorticity (r.m.s., by differences), and less than a quarter of that with half the rings.
+    """∇·v is below 2 % of the vorticity (r.m.s., by differences), and less than a quarter of that
+    with half the rings.
 
-    Between the circles of two rings no fluid is lost: the flux through any circle about the middle vanishes.
+    Between the circles of two rings no fluid is lost: the flux through any circle about the middle
+    vanishes.
     """
     points = np.random.default_rng(0).uniform(-0.12, 0.12, (4000, 2))
     points = points[np.hypot(*points.T) < 0.12]
@@ -130,137 +150,153 @@ def test_flow_has_nearly_no_divergence():
         divergence, curl = slope[0][:, 0] + slope[1][:, 1], slope[0][:, 1] - slope[1][:, 0]
         return np.sqrt((divergence**2).mean() / (curl**2).mean())
 
-    fine = rates(ROTATING.flow(24))
-    assert fine < 0.02 and fine < 0.25 * rates(ROTATING.flow(12))
+    fine = rates(stirred(24))
+    assert fine < 0.02 and fine < 0.25 * rates(stirred(12))
     angle = 2.0 * np.pi * np.arange(1000) / 1000
     outwards = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     for radius in (0.03, 0.06, 0.1, 0.13):
-        assert abs((ROTATING.flow(24)(radius * outwards) * outwards).sum(axis=1).mean()) < 1e-3
+        assert abs((stirred(24)(radius * outwards) * outwards).sum(axis=1).mean()) < 1e-3
 
 
 def test_flow_is_not_symmetric():
-    """It goes round counter-clockwise, on every circle at another speed on one side than on the other."""
+    """It goes round counter-clockwise, on every circle at another speed on one side than on the
+    other."""
     angle = 2.0 * np.pi * np.arange(100) / 100
     along = np.stack([-np.sin(angle), np.cos(angle)], axis=1)
     for radius in (0.03, 0.06, 0.1, 0.13):
         points = radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        round_it = (ROTATING.flow(24)(points) * along).sum(axis=1)
+        round_it = (stirred(24)(points) * along).sum(axis=1)
         assert round_it.min() > 0.0 and np.ptp(round_it) > 0.05 * round_it.mean()
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_ball_goes_round_on_an_orbit_of_the_flow(seed):
-    """Its centre moves with the mean velocity over the disc: an integral over 192 points, solved to high accuracy.
+    """Its centre moves with the mean velocity over the disc: an integral over 192 points, solved to
+    high accuracy.
 
     In 2 s, or 1 m, the path may stray from that by 1 mm, a twentieth of the ball's radius.
     """
-    flow, a = ROTATING.flow(24), ROTATING.ball_radius
-    path = ROTATING.ball_path(flow_stream(seed))
+    flow, a = ROTATING.flow.nominal(ROTATING, fine=True), ROTATING.target.radius
+    path = ROTATING.target.path(ROTATING, flow_stream(seed))
     s, weights = np.polynomial.legendre.leggauss(8)
     angle = 2.0 * np.pi * np.arange(24) / 24
     round_it = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     disc = (a * np.sqrt(0.5 * (s + 1.0))[:, None, None] * round_it).reshape(-1, 2)
     weights = np.repeat(0.5 * weights / 24, 24)
     times = ROTATING.time_step * np.arange(ROTATING.n_steps + 1)
-    orbit = solve_ivp(lambda _, centre: weights @ flow(centre + disc), (0.0, times[-1]), path[0], t_eval=times,
-                      rtol=1e-6, atol=1e-8).y.T
+    orbit = solve_ivp(lambda _, centre: weights @ flow(centre + disc), (0.0, times[-1]), path[0],
+                      t_eval=times, rtol=1e-6, atol=1e-8).y.T
     np.testing.assert_allclose(path, orbit, rtol=0.0, atol=1e-3)
     distance = np.hypot(*path.T)
-    assert (distance + a < ROTATING.radius).all()
-    assert np.linalg.norm(np.diff(path, axis=0), axis=1).sum() > 2.0 * np.pi * distance.min()           # once round
+    assert (distance + a < ROTATING.vessel.radius).all()
+    way = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
+    assert way > 2.0 * np.pi * distance.min()           # once round
 
 
 def test_ball_begins_within_its_range():
     """Evenly between the two radii, at any angle: no side of the tank is preferred."""
-    one_step = replace(ROTATING, warm_up=0, scored_steps=1)
-    starts = np.array([one_step.ball_path(flow_stream(seed))[0] for seed in range(100)])
-    part = np.hypot(*starts.T) / ROTATING.radius
-    low, high = ROTATING.start_radius
+    one_step = ROTATING.changed({"schedule": {"warm_up": 0, "scored_steps": 1}})
+    ball = one_step.target
+    starts = np.array([ball.path(one_step, flow_stream(seed))[0] for seed in range(100)])
+    part = np.hypot(*starts.T) / ROTATING.vessel.radius
+    low, high = ball.start_radius
     assert low <= part.min() and part.max() <= high
     assert kstest(part, "uniform", (low, high - low)).pvalue > 1e-3
     assert kstest(np.arctan2(*starts.T), "uniform", (-np.pi, 2.0 * np.pi)).pvalue > 1e-3
 
 
 def test_ball_keeps_its_content_and_lies_on_its_path():
-    """∫(background − c) = πa²·(background − c_ball) to 1 % at every step, and its centroid is the centre, to 0.2 mm."""
-    mesh, concentration = both(SHORT)[0].transport.mesh, episode(SHORT, 7).concentration.astype(float)
+    """∫(background − c) = πa²·(background − c_ball) to 1 % at every step, and its centroid is the
+    centre, to 0.2 mm."""
+    mesh, ball = both(SHORT)[0].transport.mesh, SHORT.target
+    concentration = episode(SHORT, 7).concentration.astype(float)
     weights = np.asarray(mass_matrix(mesh).sum(axis=0)).ravel()
     missing = (SHORT.background - concentration) * weights
-    expected = np.pi * SHORT.ball_radius**2 * (SHORT.background - SHORT.ball_concentration)
+    expected = np.pi * ball.radius**2 * (SHORT.background - ball.concentration)
     np.testing.assert_allclose(missing.sum(axis=1), expected, rtol=0.01)
     centroid = missing @ mesh.points / missing.sum(axis=1)[:, None]
-    path = SHORT.ball_path(flow_stream(7))
+    path = ball.path(SHORT, flow_stream(7))
     np.testing.assert_allclose(centroid, path, atol=2e-4)
     assert np.linalg.norm(path[-1] - path[0]) > 0.01
-    assert concentration.min() >= SHORT.ball_concentration - 1e-4 and concentration.max() <= SHORT.background + 1e-4
+    assert concentration.min() >= ball.concentration - 1e-4
+    assert concentration.max() <= SHORT.background + 1e-4
 
 
 def test_one_pair_injects_throughout():
     """One pattern in the cycle: electrode 0 to the one opposite."""
-    for tank, opposite in ((ROTATING, 8), (SHORT, 4)):
-        (current,) = tank.currents
+    for world, opposite in ((ROTATING, 8), (SHORT, 4)):
+        (current,) = world.currents
         assert np.flatnonzero(current).tolist() == [0, opposite]
-        assert current[0] == tank.current == -current[opposite]
+        assert current[0] == world.instrument.current == -current[opposite]
     task = make_task(SHORT)
     assert task.currents.shape == (1, 8) and task.calibration == 1 and task.warm_up == 1
 
 
 def test_model_of_the_stirred_tank_has_no_ball_and_keeps_what_it_holds():
-    """Concentration is carried and spreads, but neither enters nor leaves; what is even stays even."""
+    """Concentration is carried and spreads, but neither enters nor leaves; what is even stays
+    even."""
     model = both(SHORT)[1]
     mesh = model.transport.mesh
     assert len(model.transport.inlet) == 0
     weights = np.asarray(mass_matrix(mesh).sum(axis=0)).ravel()
-    np.testing.assert_allclose(model.transport.step(np.full(mesh.n_nodes, 30.0), 0.0, 0.0), 30.0, rtol=1e-10)
+    np.testing.assert_allclose(model.transport.step(np.full(mesh.n_nodes, 30.0), 0.0, 0.0), 30.0,
+                               rtol=1e-10)
     blob = c = disc_indicator(mesh.points, np.array([0.05, 0.0]), 0.022, 0.01)
     for _ in range(4):
         c = model.transport.step(c, 0.0, 0.0)
     assert weights @ c == pytest.approx(weights @ blob, rel=0.02)
     centroid = [weights * field @ mesh.points / (weights @ field) for field in (blob, c)]
-    assert centroid[1][1] > centroid[0][1] + 0.01                                              # counter-clockwise
+    assert centroid[1][1] > centroid[0][1] + 0.01                                # counter-clockwise
 
 
-# -- the tank at rest -------------------------------------------------------------------------------------------------
+# -- the tank at rest ------------------------------------------------------------------------------
 
 
 def test_cylinders_stand_inside_apart_and_anywhere():
-    """Radii evenly from their ranges, walls apart by more than ``gap``, centres no further out than ``furthest``."""
-    drawn = [STATIONARY.draw_cylinders(flow_stream(seed)) for seed in range(300)]
+    """Radii evenly from their ranges, walls apart by more than ``gap``, centres no further out than
+    ``furthest``."""
+    cylinders, radius = STATIONARY.target, STATIONARY.vessel.radius
+    drawn = [cylinders.draw(STATIONARY, flow_stream(seed)) for seed in range(300)]
     centres = np.array([[centre for centre, _ in pair] for pair in drawn])
-    radii = np.array([[radius for _, radius in pair] for pair in drawn])
-    for of_kind, (low, high) in zip(radii.T, (STATIONARY.large_radius, STATIONARY.small_radius), strict=True):
+    radii = np.array([[size for _, size in pair] for pair in drawn])
+    ranges = cylinders.large_radius, cylinders.small_radius
+    for of_kind, (low, high) in zip(radii.T, ranges, strict=True):
         assert low <= of_kind.min() and of_kind.max() <= high
         assert kstest(of_kind, "uniform", (low, high - low)).pvalue > 1e-3
     apart = np.linalg.norm(centres[:, 0] - centres[:, 1], axis=1) - radii.sum(axis=1)
-    assert apart.min() > STATIONARY.gap and apart.max() > 2.0 * STATIONARY.gap
+    assert apart.min() > cylinders.gap and apart.max() > 2.0 * cylinders.gap
     distance = np.linalg.norm(centres, axis=2)
-    assert distance.max() <= STATIONARY.furthest * STATIONARY.radius and (distance + radii).max() < STATIONARY.radius
+    assert distance.max() <= cylinders.furthest * radius and (distance + radii).max() < radius
     angle = np.arctan2(centres[:, 0, 1], centres[:, 0, 0])
     assert kstest(angle, "uniform", (-np.pi, 2.0 * np.pi)).pvalue > 1e-3
 
 
 def test_nothing_moves_in_the_tank_at_rest():
-    """The concentration is constant in time, to the bit, and so is the resistance that is measured, but for noise."""
-    still = episode(StationaryTank2D(scored_steps=4), 7)
+    """The concentration is constant in time, to the bit, and so is the resistance that is measured,
+    but for noise."""
+    still = episode(STILL, 7)
     for array in (still.concentration, still.transfer_resistance):
         np.testing.assert_array_equal(array, np.broadcast_to(array[:1], array.shape))
     assert len(np.unique(still.noise)) == still.noise.size
 
 
 def test_cylinders_hold_their_metal():
-    """∫(c − background) = π(a₁² + a₂²)·(metal − 1)·background to 1 %; five-fold inside, the background elsewhere."""
-    tank = StationaryTank2D(scored_steps=4)
-    mesh, c = both(tank)[0].transport.mesh, episode(tank, 7).concentration[0].astype(float)
-    cylinders = tank.draw_cylinders(flow_stream(7))
-    expected = np.pi * sum(radius**2 for _, radius in cylinders) * (tank.metal - 1.0) * tank.background
-    assert mass_matrix(mesh).sum(axis=0) @ (c - tank.background) == pytest.approx(expected, rel=0.01)
-    away = np.min([np.hypot(*(mesh.points - centre).T) - radius for centre, radius in cylinders], axis=0)
-    np.testing.assert_allclose(c[away < -0.006], tank.metal * tank.background, rtol=2e-3)
-    np.testing.assert_allclose(c[away > 0.006], tank.background, rtol=2e-3)
+    """∫(c − background) = π(a₁² + a₂²)·(metal − 1)·background to 1 %; five-fold inside, the
+    background elsewhere."""
+    mesh, c = both(STILL)[0].transport.mesh, episode(STILL, 7).concentration[0].astype(float)
+    cylinders = STILL.target.draw(STILL, flow_stream(7))
+    metal, background = STILL.target.metal, STILL.background
+    expected = np.pi * sum(radius**2 for _, radius in cylinders) * (metal - 1.0) * background
+    assert mass_matrix(mesh).sum(axis=0) @ (c - background) == pytest.approx(expected, rel=0.01)
+    away = np.min([np.hypot(*(mesh.points - centre).T) - radius for centre, radius in cylinders],
+                  axis=0)
+    np.testing.assert_allclose(c[away < -0.006], metal * background, rtol=2e-3)
+    np.testing.assert_allclose(c[away > 0.006], background, rtol=2e-3)
 
 
 def test_frame_of_the_tank_at_rest_measures_sixteen_things():
-    """Sixteen different injections, eight of them straight across, fifteen independent: all there are of zero sum."""
+    """Sixteen different injections, eight of them straight across, fifteen independent: all there
+    are of zero sum."""
     currents = STATIONARY.currents
     assert currents.shape == (16, 16) and len(np.unique(currents, axis=0)) == 16
     np.testing.assert_array_equal(np.sort(currents, axis=1)[:, [0, -1]], [[-0.1, 0.1]] * 16)
@@ -268,7 +304,7 @@ def test_frame_of_the_tank_at_rest_measures_sixteen_things():
     assert np.linalg.matrix_rank(currents) == 15
     np.testing.assert_array_equal(currents[:8], -np.roll(currents[:8], 8, axis=1))
     pairs = {frozenset(np.flatnonzero(row).tolist()) for row in currents}
-    assert len(pairs) == 16                                                       # none is another's reverse
+    assert len(pairs) == 16                                              # none is another's reverse
 
 
 def test_estimate_is_asked_for_from_the_first_injection_on():
@@ -279,44 +315,64 @@ def test_estimate_is_asked_for_from_the_first_injection_on():
     np.testing.assert_array_equal(task.transport.step(c), c)
 
 
-# -- mistakes ---------------------------------------------------------------------------------------------------------
+# -- mistakes --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("kind", "change", "message"), [
-    (RotatingTank2D, {"radius": 0.0}, "radius must be"), (RotatingTank2D, {"n_electrodes": 3}, "n_electrodes must be"),
-    (RotatingTank2D, {"electrode_cover": 1.0}, "electrode_cover"), (RotatingTank2D, {"viscosity": -1.0}, "viscosity"),
-    (RotatingTank2D, {"noise_relative": -0.1}, "noise_relative must"), (RotatingTank2D, {"warm_up": -1}, "warm_up"),
-    (RotatingTank2D, {"start_radius": (0.5, 0.4)}, "start_radius must be"),
-    (RotatingTank2D, {"start_radius": (0.5, 0.9)}, "start_radius must be a range .* keeps the ball inside the tank"),
-    (RotatingTank2D, {"ball_radius": 0.1}, "start_radius must be"), (RotatingTank2D, {"current": "big"}, "current"),
-    (RotatingTank2D, {"stirrer_position": (np.nan, 0.0)}, "stirrer_position must be"),
-    (StationaryTank2D, {"gap": 0.12}, "gap must leave room"), (StationaryTank2D, {"metal": 0.0}, "metal must be"),
-    (StationaryTank2D, {"scored_steps": 0}, "scored_steps"), (StationaryTank2D, {"furthest": 0.8}, "furthest must be"),
-    (StationaryTank2D, {"large_radius": (0.03, 0.02)}, "large_radius must be a range"),
-    (StationaryTank2D, {"small_radius": (0.01, 0.05)}, "small_radius must be a range"),
+@pytest.mark.parametrize(("part", "change", "message"), [
+    ("vessel", {"radius": 0.0}, "radius must be"),
+    ("vessel", {"n_electrodes": 3}, "n_electrodes must be"),
+    ("vessel", {"electrode_cover": 1.0}, "electrode_cover"),
+    ("flow", {"viscosity": -1.0}, "viscosity"),
+    ("instrument", {"noise_relative": -0.1}, "noise_relative must"),
+    ("schedule", {"warm_up": -1}, "warm_up"),
+    ("target", {"start_radius": (0.5, 0.4)}, "start_radius must be"),
+    ("target", {"start_radius": (0.5, 0.9)},
+     "start_radius must be a range .* keeps the ball inside the tank"),
+    ("target", {"radius": 0.1}, "start_radius must be"),
+    ("instrument", {"current": "big"}, "current"),
+    ("flow", {"stirrer_position": (np.nan, 0.0)}, "stirrer_position must be"),
 ])
-def test_wrong_fields_are_named(kind, change, message):
-    """The field, what came, and what was expected."""
-    with pytest.raises(ValueError, match=message):
-        kind(**change)
+def test_wrong_numbers_of_the_stirred_tank_are_named(part, change, message):
+    """The part, the number, what came, and what was expected."""
+    with pytest.raises(ValueError, match=f"^world.*{part}.*{message}"):
+        ROTATING.changed({part: change})
+
+
+@pytest.mark.parametrize(("part", "change", "message"), [
+    ("target", {"gap": 0.12}, "gap must leave room"),
+    ("target", {"metal": 0.0}, "metal must be"),
+    ("schedule", {"scored_steps": 0}, "scored_steps"),
+    ("target", {"furthest": 0.8}, "furthest must be"),
+    ("target", {"large_radius": (0.03, 0.02)}, "large_radius must be a range"),
+    ("target", {"small_radius": (0.01, 0.05)}, "small_radius must be a range"),
+    ("target", {"small_radius": (0.018, 0.035)}, "small_radius must not reach beyond large_radius"),
+    ("target", {"small_radius": 0.02}, r"small_radius must have shape \(2,\)"),
+    ("vessel", {"n_electrodes": 7}, "n_electrodes must be"),
+])
+def test_wrong_numbers_of_the_tank_at_rest_are_named(part, change, message):
+    """The part, the number, what came, and what was expected."""
+    with pytest.raises(ValueError, match=f"^world.*{part}.*{message}"):
+        STATIONARY.changed({part: change})
 
 
 def test_cylinders_never_reach_through_the_wall():
-    """Whatever fields are taken, each cylinder stands inside; also where the second one is not the smaller."""
+    """Whatever numbers are taken, each stands inside; also where the second is not the smaller."""
     try:
-        tank = StationaryTank2D(large_radius=(0.01, 0.01), small_radius=(0.04, 0.04), furthest=0.92)
+        world = STATIONARY.changed({"target": {
+            "large_radius": (0.01, 0.01), "small_radius": (0.04, 0.04), "furthest": 0.92}})
     except ValueError:
         return
     for seed in range(20):
-        for centre, radius in tank.draw_cylinders(flow_stream(seed)):
-            assert np.hypot(*centre) + radius <= tank.radius
+        for centre, radius in world.target.draw(world, flow_stream(seed)):
+            assert np.hypot(*centre) + radius <= world.vessel.radius
 
 
 @pytest.mark.parametrize("n_electrodes", [4, 6, 7, 8, 12, 32])
 def test_every_injection_injects(n_electrodes):
-    """With any number of electrodes that is taken, current enters at one of them and leaves at another."""
+    """With any number of electrodes that is taken, current enters at one and leaves at another."""
     try:
-        tank = StationaryTank2D(n_electrodes=n_electrodes)
+        world = STATIONARY.changed({"vessel": {"n_electrodes": n_electrodes}})
     except ValueError:
         return
-    np.testing.assert_array_equal(np.sort(tank.currents, axis=1)[:, [0, -1]], [[-0.1, 0.1]] * 16)
+    ends = np.sort(world.currents, axis=1)[:, [0, -1]]
+    np.testing.assert_array_equal(ends, [[-0.1, 0.1]] * 16)

@@ -6,15 +6,21 @@ from dataclasses import FrozenInstanceError, replace
 
 import numpy as np
 import pytest
+from short import merged
+from tiny_worlds import CHANGES, TINY
 
-from eitbench.data.episodes import CACHE_VARIABLE, Episode, simulate, truth_discretisation
-from eitbench.envs.pipe2d import Pipe2DEnv
-from eitbench.worlds import Pipe2D
-from eitbench.worlds.base import Discretisation
+import eitbench  # noqa: F401 (registers)
+from eitbench.data.episodes import Episode, simulate, truth_discretisation
+from eitbench.data.store import CACHE_VARIABLE
+from eitbench.envs.estimation import EstimationEnv
+from eitbench.worlds.pipe2d import PIPE_2D
 from eitbench.worlds.task import make_task
+from eitbench.worlds.world import World
 
-FIELDS = {"mean_velocity": 45.0, "scored_steps": 3, "electrodes_per_wall": 2, "frame": 2}
-TINY = Pipe2D(**FIELDS)
+
+def environment(**kwargs):
+    """The tiny world, to be played."""
+    return EstimationEnv("eitbench/Pipe2D-v0", world=CHANGES, **kwargs)
 
 
 @pytest.fixture(autouse=True)
@@ -24,23 +30,26 @@ def cache(tmp_path, monkeypatch):
     return tmp_path / "cache"
 
 
-# -- lag and assumptions ----------------------------------------------------------------------------------------------
+# -- lag and assumptions ---------------------------------------------------------------------------
 
 
-def test_says_what_the_scenario_says():
-    """Times, currents, noise and level are the scenario's; estimates live on the CD mesh of its model."""
+def test_says_what_the_world_says():
+    """Times, currents, noise and level are the world's; estimates live on the CD mesh of its
+    model."""
     task = make_task(TINY)
     assert (task.n_steps, task.warm_up, task.lag, task.expected_concentration) == (5, 2, 0, 25.0)
     np.testing.assert_array_equal(task.currents, TINY.currents)
     assert task.noise == TINY.noise
+    assert task.prior == TINY.prior and task.vessel == TINY.vessel
     # The rough level is no disguised truth: as an estimate it would beat the homogeneous one.
-    assert Pipe2D().expected_concentration != Pipe2D().background
+    assert PIPE_2D.expected_concentration != PIPE_2D.background
     assert task.mesh is task.transport.mesh and task.mesh.n_nodes == 1701
 
 
 @pytest.mark.parametrize(("lag", "steps"), [(0, 0), (2, 2), (np.int64(4), 4), ("all", 4)])
 def test_lag(lag, steps):
-    """A number of steps, or the whole record: then the first state is asked for after the last measurement."""
+    """A number of steps, or the whole record: then the first state is asked for after the last
+    measurement."""
     assert make_task(TINY, lag).lag == steps
 
 
@@ -54,7 +63,7 @@ def test_wrong_lags(lag):
 
 def test_wrong_assumptions():
     """What the model does not take, or cannot believe, is refused by name."""
-    with pytest.raises(TypeError, match="viscosity"):
+    with pytest.raises(ValueError, match="'viscosity'; there are mean_velocity, profile"):
         make_task(TINY, viscosity=1.0)
     with pytest.raises(ValueError, match="mean_velocity"):
         make_task(TINY, mean_velocity=-1.0)
@@ -64,15 +73,17 @@ def test_models_are_shared_and_tasks_frozen():
     """Lags share one model, so that F is computed once; other worlds and beliefs have their own."""
     task = make_task(TINY)
     assert make_task(TINY, "all").transport is task.transport
-    assert make_task(replace(TINY, diffusivity=1e-3)).transport is not task.transport
+    other = PIPE_2D.changed(merged(CHANGES, {"flow": {"diffusivity": 1e-3}}))
+    assert make_task(other).transport is not task.transport
     assert make_task(TINY, mean_velocity=60.0).transport is not task.transport
     with pytest.raises(FrozenInstanceError):
         task.lag = 3
 
 
 def test_assumed_velocity_changes_the_model_not_the_world(cache):
-    """A wrong belief moves the model's fluid elsewhere; the episode and its voltages stay as they were."""
-    right, wrong = (Pipe2DEnv(scenario=FIELDS, assumed_mean_velocity=velocity) for velocity in (None, 60.0))
+    """A wrong belief moves the model's fluid elsewhere; the episode and its voltages stay as they
+    were."""
+    right, wrong = environment(), environment(assume={"mean_velocity": 60.0})
     rng = np.random.default_rng(2)
     c = rng.uniform(20.0, 40.0, 1701)
     moved = [env.task.transport.step(c, 30.0, 30.0) for env in (right, wrong)]
@@ -93,7 +104,7 @@ def played(env, action):
         yield np.concatenate([*seen, [reward]])
 
 
-# -- nothing of the truth ---------------------------------------------------------------------------------------------
+# -- nothing of the truth --------------------------------------------------------------------------
 
 
 def reachable(start):
@@ -115,11 +126,13 @@ def reachable(start):
             waiting += [thing.__self__, thing.__func__]
         elif isinstance(thing, functools.partial):
             waiting += [thing.func, thing.args, thing.keywords]
-        elif isinstance(thing, types.FunctionType):               # its globals lead everywhere, so they say nothing
-            waiting += [cell.cell_contents for cell in thing.__closure__ or ()] + [thing.__defaults__]
+        elif isinstance(thing, types.FunctionType):  # its globals lead everywhere: they say nothing
+            waiting += [cell.cell_contents for cell in thing.__closure__ or ()]
+            waiting.append(thing.__defaults__)
         waiting += [vars(thing)] if hasattr(thing, "__dict__") else []
         slots = [name for kind in type(thing).__mro__ for name in getattr(kind, "__slots__", ())]
-        waiting += [getattr(thing, name) for name in slots if isinstance(name, str) and hasattr(thing, name)]
+        waiting += [getattr(thing, name) for name in slots
+                    if isinstance(name, str) and hasattr(thing, name)]
     return list(found.values())
 
 
@@ -130,20 +143,21 @@ def sizes(discretisation):
             len(observation.cem.mesh.cells), observation.cem.n_unknowns}
 
 
-def traces_of_truth(task, scenario):
-    """What in ``task`` tells of the truth: episodes, scenarios, the fine discretisation, arrays of its size."""
-    truth = truth_discretisation(scenario)
+def traces_of_truth(task, world):
+    """What in ``task`` tells of the truth: episodes, worlds, the fine discretisation, arrays of its
+    size."""
+    truth = truth_discretisation(world)
     its_own = {id(thing) for thing in reachable(truth) if isinstance(thing, np.ndarray)}
     fine = sizes(truth)
     return [thing for thing in reachable(task)
-            if isinstance(thing, (Episode, Pipe2D)) or id(thing) in its_own
+            if isinstance(thing, (Episode, World)) or id(thing) in its_own
             or (isinstance(thing, np.ndarray) and not fine.isdisjoint({*thing.shape, thing.size}))]
 
 
 def test_task_holds_nothing_of_the_truth():
     """Not even while an episode is under way, nor through caches and closures."""
-    assert sizes(truth_discretisation(TINY)).isdisjoint(sizes(Discretisation(*TINY.model())))
-    env = Pipe2DEnv(scenario=FIELDS, lag=1)
+    assert sizes(truth_discretisation(TINY)).isdisjoint(sizes(TINY.model()))
+    env = environment(lag=1)
     for _ in played(env, np.full(1701, 30.0)):
         assert traces_of_truth(env.task, TINY) == []
     assert len([thing for thing in reachable(env.task) if isinstance(thing, np.ndarray)]) > 20
@@ -155,7 +169,7 @@ def test_task_holds_nothing_of_the_truth():
     lambda task, episode: replace(task, currents=[{"kept": (episode.concentration[1:],)}]),
     lambda task, episode: replace(task, noise=functools.partial(max, TINY)),
     lambda task, episode: replace(task, observation=truth_discretisation(TINY).observation),
-], ids=["attribute", "closure", "container", "scenario", "fine model"])
+], ids=["attribute", "closure", "container", "world", "fine model"])
 def test_the_search_finds_what_is_hidden(hide):
     """The search above is worth something: a truth that is put into a task is found."""
     assert traces_of_truth(hide(make_task(TINY), simulate(TINY, 3)), TINY)
@@ -164,4 +178,5 @@ def test_the_search_finds_what_is_hidden(hide):
 def test_wrong_belief_does_not_tell_the_right_one():
     """A task that assumes 60 m/s holds no number 45, nor a flow of that velocity."""
     task = make_task(TINY, mean_velocity=60.0)
-    assert not [thing for thing in reachable(task) if isinstance(thing, (int, float)) and thing == 45.0]
+    assert not [thing for thing in reachable(task)
+                if isinstance(thing, (int, float)) and thing == 45.0]
