@@ -10,10 +10,10 @@ import resource
 import time
 
 import numpy as np
+from eitbench.envs.pipe3d import Pipe3DEnv
 from threadpoolctl import threadpool_limits
 
 from eitbench.data.recordings import cycle_voltages, recording, score_operators
-from eitbench.envs.pipe3d import Pipe3DEnv
 from eitbench.estimation import DenseKalmanFilter, FirstFrame, LinearisedObservations, table_5_1
 from eitbench.scoring import relative_error
 

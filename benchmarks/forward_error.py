@@ -13,6 +13,7 @@ import itertools
 
 import numpy as np
 import scipy.sparse as sp
+from eitbench.worlds.base import Discretisation
 from threadpoolctl import threadpool_limits
 
 from eitbench import simulate
@@ -22,7 +23,6 @@ from eitbench.numerics.mesh import graded_pipe_mesh
 from eitbench.physics.cem import CompleteElectrodeModel
 from eitbench.physics.observation import ObservationModel
 from eitbench.worlds import Pipe2D
-from eitbench.worlds.base import Discretisation
 
 SEEDS, STATES = "train:0-3", range(20, 99, 6)
 

@@ -17,7 +17,7 @@ from eitbench._files import shipped
 from eitbench.bench import statistics
 from eitbench.bench.records import read_records
 from eitbench.bench.statistics import interquartile_mean, mean_over_environments, stratified_bootstrap
-from eitbench.report.summary import scores_by_seed
+from eitbench.bench.text import scores_by_seed
 
 SPREAD = 0.8
 """of the logarithm of a lognormal number"""

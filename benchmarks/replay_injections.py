@@ -17,9 +17,9 @@ from stable_baselines3 import PPO
 from threadpoolctl import threadpool_limits
 
 import eitbench.envs
+from eitbench.bench.text import mean_and_interval
 from eitbench.data.seeds import parse_seeds
 from eitbench.envs.injection import InjectionVectorEnv
-from eitbench.report.summary import mean_and_interval
 
 SHIFTS = (1, 7, 19, 31)
 """Whose injections an episode is given: those of so many episodes before."""

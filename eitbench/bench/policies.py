@@ -7,6 +7,7 @@ import json
 import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
+from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
@@ -28,6 +29,9 @@ from eitbench.envs.injection_core import Rules
 
 if TYPE_CHECKING:
     import pandas as pd
+
+LOADERS = "eitbench.loaders"
+"""Entry points that load a policy from another kind of file: named by its suffix, called with path and content."""
 
 
 class PolicyFile(NamedTuple):
@@ -103,9 +107,9 @@ def load_policy(name: str) -> PolicyFile:
 @lru_cache(maxsize=64)
 def _load(path: Path, source: bytes) -> PolicyFile:
     """The file with this content, executed once a process."""
-    if path.suffix == ".zip":
-        from eitbench.rl.agents import load_agent
-        name, title, agent, parameters = load_agent(path, source)
+    kinds = {f".{point.name}": point for point in entry_points(group=LOADERS)}
+    if path.suffix in kinds:
+        name, title, agent, parameters = kinds[path.suffix].load()(path, source)
         return PolicyFile(name, title, path, hashlib.sha256(source).hexdigest(), False, parameters, agent)
     module = load_module("policy", path, source)
     policy = getattr(module, "Policy", None)
