@@ -20,7 +20,7 @@ from eitbench.envs import ENTRY_POINTS, ESTIMATION
 
 ROOT = Path(__file__).parents[2]
 PIPE, INJECTION = "eitbench/Pipe2D-v0", "eitbench/Pipe2DInjection-v0"
-COMMANDS = ("list", "run", "bank", "train", "policies", "submit", "verify", "held-out", "migrate", "leaderboard",
+COMMANDS = ("list", "run", "bank", "train", "policies", "submit", "verify", "held-out", "migrate", "cards", "leaderboard",
             "compare", "render", "reproduce")
 TINY = {"mean_velocity": 45.0, "scored_steps": 3, "electrodes_per_wall": 2, "frame": 2}
 """A fast fluid flushes the pipe in two steps: an episode of five takes a third of a second."""
