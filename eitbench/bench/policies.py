@@ -137,7 +137,7 @@ def play(env_id: str, kwargs: dict[str, Any], policy: str | PolicyFile, seed: in
     -------
     dict
         error : ẽ_c (5.12), the mean over scored states; errors : of each; spent : the agent's injections;
-        seconds_per_step : of the policy, what it prepares included.
+        seconds_per_step : of the policy, what it prepares included; currents : (steps, L) in A, what it injected.
 
     Raises
     ------
@@ -145,13 +145,13 @@ def play(env_id: str, kwargs: dict[str, Any], policy: str | PolicyFile, seed: in
         If there is no such environment or policy, or the policy does not suit it or acts wrongly.
     """
     env = environment(env_id, json.dumps(kwargs), estimator)
-    spent, seconds, errors = 0, 0.0, list[float]()
+    seconds, errors, currents = 0.0, list[float](), list[np.ndarray]()
     for _, observation, elapsed in inject(env, policy if isinstance(policy, PolicyFile) else load_policy(policy), seed):
         seconds += elapsed
-        spent += bool(observation["currents"].any())
+        currents.append(observation["currents"])
         errors += [] if env.error is None else [env.error]
-    return {"error": float(np.mean(errors)), "errors": errors, "spent": spent,
-            "seconds_per_step": seconds / env.core.length}
+    return {"error": float(np.mean(errors)), "errors": errors, "spent": sum(bool(each.any()) for each in currents),
+            "seconds_per_step": seconds / env.core.length, "currents": np.array(currents)}
 
 
 def inject(env: InjectionEnv, loaded: PolicyFile, seed: int) -> Iterator[tuple[int, dict[str, np.ndarray], float]]:
