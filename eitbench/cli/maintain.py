@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import chain
 from pathlib import Path
 from typing import Annotated
 
@@ -11,24 +12,35 @@ from eitbench.cli.options import clear_errors
 
 
 def cards(
-    method: Annotated[list[str] | None, typer.Argument(help="Of ours. Default: all.")] = None,
+    names: Annotated[list[str] | None, typer.Argument(
+        help="Ids of worlds, or methods, of ours. Default: all.")] = None,
     new_version: Annotated[bool, typer.Option(
-        "--new-version", help="Where numbers have moved, write them as the method's next version.")] = False,
+        "--new-version", help="Write what has moved as the method's next version.")] = False,
 ) -> None:
-    """For maintainers: play the short episode of each card in baselines/cards and say whether its
-    numbers are still the same: exit status 0 if so, 1 if not. Missing cards are written.
+    """For maintainers: simulate the episodes of each world's card (eitbench/worlds/cards), play that
+    of each method's (baselines/cards), and say whether their numbers are still the same: exit
+    status 0 if so, 1 if not. Missing cards are written.
+
+    A world whose numbers have moved is another world: give it the next -vN.
     """
-    from eitbench.bench.cards import update
+    from eitbench.bench import cards as method_cards
+    from eitbench.bench import world_cards
+    from eitbench.bench.tracks import own_ids
+    worlds = [name for name in names or own_ids() if name in own_ids()]
+    methods = [name for name in names or [] if name not in worlds]
     anything_moved = False
     with clear_errors():
-        for name, what, differences in update(method or [], new_version=new_version):
+        compared = chain(
+            world_cards.update(worlds),
+            method_cards.update(methods, new_version=new_version) if methods or not names else ())
+        for name, what, differences in compared:
             anything_moved |= what == "moved"
             typer.echo(f"{name}: {what}")
             for difference in differences:
                 typer.echo(f"  {difference}", err=what == "moved")
     if anything_moved:
-        typer.echo("numbers have moved: find out why, or write a new version with --new-version and "
-                   "play the method's records again", err=True)
+        typer.echo("numbers have moved: find out why; or give the world the next -vN, or write a "
+                   "method's new version with --new-version and play its records again", err=True)
         raise typer.Exit(1)
 
 
