@@ -7,8 +7,10 @@ import importlib.util
 import json
 import re
 import sys
+import warnings
 from collections.abc import Callable
 from functools import lru_cache
+from importlib.metadata import entry_points
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -18,6 +20,8 @@ from eitbench._files import shipped
 if TYPE_CHECKING:
     from eitbench.worlds.task import Task
 
+METHODS = "eitbench.methods"
+"""Entry points of installed packages: a method's name, and its module of that name."""
 BOARDS = ("filter", "fixed-lag", "smoothing")
 ROLES = (None, "floor", "reference")
 """What a method is on a board: ranked, or a mark from which the others are judged."""
@@ -73,7 +77,30 @@ def own_names(id: str) -> set[str]:
 
 def is_ours(name: str) -> bool:
     """Whether a method, by name or by path, is one of ours: it lies in our folder."""
-    return not name.endswith((".py", ".zip")) or Path(name).resolve().is_relative_to(baseline_folder().resolve())
+    if not name.endswith((".py", ".zip")):
+        return name not in installed_methods()
+    return Path(name).resolve().is_relative_to(baseline_folder().resolve())
+
+
+@lru_cache(maxsize=1)
+def installed_methods() -> dict[str, Path]:
+    """Name -> file of each method that an installed package offers (entry points `METHODS`).
+
+    A package that takes a name of ours, or whose file is not to be found, is left out with a warning.
+    """
+    found = {}
+    for point in entry_points(group=METHODS):
+        try:
+            specification = importlib.util.find_spec(point.value)
+        except ImportError:
+            specification = None
+        path = Path(specification.origin) if specification and specification.origin else None
+        if point.name in own_baselines() or path is None or path.stem != point.name:
+            warnings.warn(f"method {point.name} of {point.value} is left out: it must be a module of "
+                          "that name, and none of ours may have it", stacklevel=2)
+        else:
+            found[point.name] = path
+    return found
 
 
 def version_of(path: Path, sha256: str) -> str:
@@ -98,12 +125,19 @@ def card_version(name: str) -> int:
 def find_baseline(name: str) -> Path:
     """The file of one of our baselines by name, or anybody's by its path; ``ValueError`` if there is none, or it has
     the name of another."""
-    path = Path(name) if name.endswith(".py") else baseline_folder() / f"{name}.py"
+    path = file_of(name, baseline_folder())
     if not path.is_file():
-        raise ValueError(f"baseline must be a path to a .py file or one of {', '.join(own_baselines())}; got {name!r}")
+        known = [*own_baselines(), *installed_methods()]
+        raise ValueError(f"baseline must be a path to a .py file or one of {', '.join(known)}; got {name!r}")
     if path.stem in own_baselines() and not path.samefile(baseline_folder() / path.name):
         raise ValueError(f"baseline {path} has the name of one of ours, under which results are kept; rename it")
     return path
+
+
+def file_of(name: str, folder: Path) -> Path:
+    """Where a method lies that is named by path, or of an installed package, or of ours."""
+    return Path(name) if name.endswith((".py", ".zip")) else installed_methods().get(
+        name, folder / f"{name}.py")
 
 
 def load_baseline(name: str) -> Baseline:

@@ -16,6 +16,8 @@ import numpy as np
 
 from eitbench.bench.baselines import (
     baseline_folder,
+    file_of,
+    installed_methods,
     is_privileged,
     load_module,
     parameters_of,
@@ -23,6 +25,7 @@ from eitbench.bench.baselines import (
     title_of,
     version_of,
 )
+from eitbench.bench.scores import Outcome
 from eitbench.bench.tracks import Environment, check_track
 from eitbench.envs.injection import InjectionEnv
 from eitbench.envs.injection_core import Rules
@@ -61,6 +64,14 @@ class PolicyFile(NamedTuple):
         return judge is None or bool(judge(rules))
 
 
+class Injected(NamedTuple):
+    """An episode that a policy has played."""
+
+    outcome: Outcome
+    currents: np.ndarray
+    """(steps, L) A (A/m in 2D) of each of its injections"""
+
+
 def policy_folder() -> Path:
     """Where our own policies lie."""
     return baseline_folder() / "injection"
@@ -82,10 +93,10 @@ def own_agents(env_id: str) -> list[str]:
 
 def find_policy(name: str) -> Path:
     """The file of a policy that `load_policy` loads; ``ValueError`` if there is none, or it has the name of another."""
-    path = Path(name) if name.endswith((".py", ".zip")) else policy_folder() / f"{name}.py"
+    path = file_of(name, policy_folder())
     if not path.is_file():
         raise ValueError("policy must be the path of a .py file or of an agent's model.zip, or one of "
-                         f"{', '.join(own_policies())}; got {name!r}")
+                         f"{', '.join([*own_policies(), *installed_methods()])}; got {name!r}")
     if path.stem in own_policies() and not path.samefile(policy_folder() / path.name):
         raise ValueError(f"policy {path} has the name of one of ours, under which results are kept; rename it")
     return path
@@ -121,7 +132,7 @@ def _load(path: Path, source: bytes) -> PolicyFile:
 
 
 def play(env_id: str, kwargs: dict[str, Any], policy: str | PolicyFile, seed: int,
-         estimator: str = "full") -> dict[str, Any]:
+         estimator: str = "full") -> Injected:
     """Play one episode.
 
     Parameters
@@ -133,25 +144,23 @@ def play(env_id: str, kwargs: dict[str, Any], policy: str | PolicyFile, seed: in
     estimator : "full" or "reduced"
         The exact filter, for scores, or the one of training.
 
-    Returns
-    -------
-    dict
-        error : ẽ_c (5.12), the mean over scored states; errors : of each; spent : the agent's injections;
-        seconds_per_step : of the policy, what it prepares included; currents : (steps, L) in A, what it injected.
-
     Raises
     ------
     ValueError
         If there is no such environment or policy, or the policy does not suit it or acts wrongly.
     """
     env = environment(env_id, json.dumps(kwargs), estimator)
-    seconds, errors, currents = 0.0, list[float](), list[np.ndarray]()
-    for _, observation, elapsed in inject(env, policy if isinstance(policy, PolicyFile) else load_policy(policy), seed):
+    loaded = policy if isinstance(policy, PolicyFile) else load_policy(policy)
+    seconds = 0.0
+    errors = list[float]()
+    currents = list[np.ndarray]()
+    for _, observation, elapsed in inject(env, loaded, seed):
         seconds += elapsed
         currents.append(observation["currents"])
         errors += [] if env.error is None else [env.error]
-    return {"error": float(np.mean(errors)), "errors": errors, "spent": sum(bool(each.any()) for each in currents),
-            "seconds_per_step": seconds / env.core.length, "currents": np.array(currents)}
+    spent = sum(bool(each.any()) for each in currents)
+    outcome = Outcome(env.core.world, seconds / env.core.length, np.array(errors), spent)
+    return Injected(outcome, np.array(currents))
 
 
 def inject(env: InjectionEnv, loaded: PolicyFile, seed: int) -> Iterator[tuple[int, dict[str, np.ndarray], float]]:

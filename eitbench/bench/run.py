@@ -25,6 +25,7 @@ from eitbench.bench.sandbox import guests
 from eitbench.bench.sandbox.host import GuestError
 from eitbench.bench.sandbox.wall import landlock_version
 from eitbench.bench.score import Played, score
+from eitbench.bench.scores import scored
 from eitbench.bench.store import EpisodeStore, machine, provenance, source_digest
 from eitbench.bench.tracks import KINDS, Environment, board_of
 from eitbench.data.bank import fill
@@ -190,8 +191,8 @@ def run_episode(job: Job) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
 def _play_policy(job: Job, policy: policies.PolicyFile) -> dict[str, Any]:
     kwargs, estimator = _inside(job.environment)
     played = policies.play(job.environment.id, kwargs, policy, job.seed, estimator)
-    return {"scores": {name: played[name] for name in ("error", "spent", "seconds_per_step")},
-            "step_errors": played["errors"]}
+    return {"scores": scored("injection", played.outcome),
+            "step_errors": played.outcome.errors.tolist()}
 
 
 def _where(error: BaseException) -> str:

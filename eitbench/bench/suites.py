@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from eitbench.bench.baselines import Baseline, find_baseline, is_ours, load_baseline, own_baselines
+from eitbench.bench.baselines import Baseline, find_baseline, installed_methods, is_ours, load_baseline, own_baselines
 from eitbench.bench.policies import environment as injection_environment
 from eitbench.bench.policies import find_policy, load_policy, own_agents, own_policies
 from eitbench.bench.run import Job
@@ -107,5 +107,6 @@ def _distinct(names: dict[str, str]) -> None:
 
 
 def _absolute(method: str) -> str:
-    """A path that worker processes find too; a name as it is."""
-    return str(Path(method).absolute()) if method.endswith((".py", ".zip")) else method
+    """A path that worker processes find too, of an installed package's as well; a name of ours as it is."""
+    path = installed_methods().get(method, Path(method))
+    return str(path.absolute()) if path.suffix in (".py", ".zip") else method

@@ -9,8 +9,7 @@ import numpy as np
 import pandas as pd
 from scipy.stats import t as student
 
-UNIT = {"seconds_per_step": 1e3, "voltage_discrepancy": 1e6}
-"""Factors of the scores that are said in ms and mV²."""
+from eitbench.bench.scores import scores
 
 
 def mean_and_interval(values: list[float]) -> tuple[float, float]:
@@ -45,9 +44,11 @@ def _places(half: float) -> int | None:
 
 def scores_by_seed(record: dict[str, Any], name: str) -> dict[str, float]:
     """Seed -> score, of the episodes that have it; in the units of the table."""
-    scores = {episode["seed"]: episode["scores"].get(name)              # records of older code have fewer scores
+    values = {episode["seed"]: episode["scores"].get(name)              # records of older code have fewer scores
               for episode in record["episodes"] if episode["status"] == "ok"}
-    return {seed: value * UNIT.get(name, 1.0) for seed, value in scores.items() if value is not None}
+    known = scores()
+    factor = known[name].factor if name in known else 1.0
+    return {seed: value * factor for seed, value in values.items() if value is not None}
 
 
 def seed_ranges(seeds: list[str]) -> str:

@@ -15,11 +15,12 @@ import numpy as np
 import pandas as pd
 
 from eitbench import _check
-from eitbench.bench.baselines import find_baseline, is_ours, load_baseline, own_baselines
+from eitbench.bench.baselines import find_baseline, installed_methods, is_ours, load_baseline, own_baselines
 from eitbench.bench.policies import find_policy, load_policy, own_agents, own_policies
 from eitbench.bench.records import SHARED, version_number
 from eitbench.bench.run import Job, run_episode
 from eitbench.bench.sandbox import guests
+from eitbench.bench.scores import scores
 from eitbench.bench.suites import is_isolated
 from eitbench.bench.text import as_markdown
 from eitbench.bench.tracks import Environment, track_of
@@ -30,8 +31,6 @@ OF_OURS = ("board", "role", "privileged")
 """What must be as a record says of a method of ours, beside its numbers: its words may be mended."""
 TOLERANCE = 1e-6
 """Relative difference of a score that is none, on one machine; sums are taken in another order on another."""
-UNCERTAIN = ("seconds_per_step",)
-"""Scores that do not repeat."""
 
 
 def job_of(record: dict[str, Any], file: str | None = None, isolate: str = "always") -> Job:
@@ -115,21 +114,24 @@ def empty_cache() -> Iterator[None]:
 
 
 def _own(record: dict[str, Any]) -> str | None:
-    """Ours of the record's name."""
+    """Ours of the record's name, or the file of an installed package's."""
     id, name = record["environment"]["id"], record["method"]
+    if name in installed_methods():
+        return str(installed_methods()[name])
     if track_of(id) == "estimation":
         return next((own for own in own_baselines() if load_baseline(own).name == name), None)
     return next((own for own in [*own_policies(), *own_agents(id)] if load_policy(own).name == name), None)
 
 
 def differences_of(said: dict[str, Any], again: dict[str, Any]) -> dict[str, float]:
-    """Score -> relative difference between two results of an episode."""
+    """Score -> relative difference between two results of an episode, of the scores that it had then."""
+    known = scores()
     if said["status"] != again["status"]:
         return {"status": np.inf}
     if said["status"] == "failed":
         return {}
     off = {name: _relative([said["scores"].get(name)], [again["scores"].get(name)])
-           for name in sorted({*said["scores"], *again["scores"]} - {*UNCERTAIN})}
+           for name in sorted(said["scores"]) if name not in known or known[name].repeats}
     return off | {"step_errors": _relative(said["step_errors"], again["step_errors"])}
 
 

@@ -273,6 +273,7 @@ def compare(
     a: Annotated[str, typer.Argument(help="A record's file, or METHOD or METHOD@VERSION among the records.")],
     b: Annotated[str, typer.Argument(help="The same of the other.")],
     records: Annotated[Path, typer.Option(help="Folder of the records.")] = RECORDS,
+    score: Annotated[str, typer.Option(help="By which score.")] = "error",
     html: Annotated[Path | None, typer.Option(help="Write a page too.")] = None,
 ) -> None:
     """Compare two methods seed by seed: differences with intervals, and how often the first is better."""
@@ -280,11 +281,11 @@ def compare(
     from eitbench.report import compare as comparison
     with clear_errors():
         ours, theirs = (comparison.find(name, records) for name in (a, b))
-        table = comparison.compare(ours, theirs)
+        table = comparison.compare(ours, theirs, score)
     names = comparison.names(ours[0], theirs[0])
-    typer.echo(comparison.markdown(table, *names))
+    typer.echo(comparison.markdown(table, *names, score))
     if html is not None:
-        write_atomically(html, comparison.html(table, *names).encode())
+        write_atomically(html, comparison.html(table, *names, score).encode())
         typer.echo(f"\nwrote {html}")
 
 

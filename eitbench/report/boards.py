@@ -14,29 +14,50 @@ from eitbench.bench.text import as_markdown, number, scores_by_seed, seed_ranges
 from eitbench.bench.tracks import CLASSES, FLOORS, ids, named, track_of_board
 from eitbench.bench.tracks import class_of as class_of_board
 from eitbench.data.seeds import parse_seeds
-from eitbench.report.summary import COLUMNS, EXPLANATIONS, place_of_world, summary_row, world
+from eitbench.report.summary import columns, explanations, place_of_world, summary_row, world
 
 ALL = "all"
 """Stands for the environment in the rows of an aggregate."""
-OTHERS = tuple(name for name in COLUMNS if name != "error")
-"""Scores that stand beside ranks, as means over the episodes."""
-FIELDS = ("class", "environment", "method", "version", "title", "rank", "note", "official", "seeds", "error",
-          "error_low", "error_high", "gain", "gain_low", "gain_high", *OTHERS, "matmuls_per_step", "peak_memory")
-NUMBERS = FIELDS[FIELDS.index("error"):]
-HEADINGS = {name: heading for name, heading in COLUMNS.items() if name != "error"} | {
-    "matmuls_per_step": "products/step", "peak_memory": "MB"}
-MORE = {
-    "rank": "one more than the number of methods that are significantly better; shared where none is. Floors, "
-            "references, privileged methods and those that have not finished every episode have none",
-    "by": "who ran it: the maintainers (official), or its author (self-reported)",
-    "ẽ_c": "relative estimation error (5.12), mean over episodes with its 95 % bootstrap interval; lower is better",
-    "gain": "1 − ẽ_c over that of the floor (homogeneous; random_pair) in the same episode: 0 as the floor, 1 perfect. "
-            "Interquartile mean with its 95 % bootstrap interval",
-    **{heading: EXPLANATIONS[heading] for heading in HEADINGS.values() if heading in EXPLANATIONS},
-    "products/step": "time per step in units of a 1000 × 1000 × 1000 matrix product on one thread of that processor, "
-                     "the median of all that were timed on it",
-    "MB": "memory that the method's own process held at most",
+_BEFORE = ("class", "environment", "method", "version", "title", "rank", "note", "official", "seeds")
+_NUMBERS = ("error", "error_low", "error_high", "gain", "gain_low", "gain_high")
+_AFTER = {
+    "matmuls_per_step": (
+        "products/step", "time per step in units of a 1000 × 1000 × 1000 matrix product on one thread "
+        "of that processor, the median of all that were timed on it"),
+    "peak_memory": ("MB", "memory that the method's own process held at most"),
 }
+_FIRST = {
+    "rank": "one more than the number of methods that are significantly better; shared where none is. "
+            "Floors, references, privileged methods and those that have not finished every episode "
+            "have none",
+    "by": "who ran it: the maintainers (official), or its author (self-reported)",
+    "ẽ_c": "relative estimation error (5.12), mean over episodes with its 95 % bootstrap interval; "
+           "lower is better",
+    "gain": "1 − ẽ_c over that of the floor (homogeneous; random_pair) in the same episode: 0 as the "
+            "floor, 1 perfect. Interquartile mean with its 95 % bootstrap interval",
+}
+
+
+def others() -> list[str]:
+    """Scores that stand beside ranks, as means over the episodes."""
+    return [name for name in columns() if name != "error"]
+
+
+def fields() -> list[str]:
+    """Columns of `boards`."""
+    return [*_BEFORE, *_NUMBERS, *others(), *_AFTER]
+
+
+def headings() -> dict[str, str]:
+    """Column -> heading, of all numbers but those with intervals."""
+    shown = {name: heading for name, (heading, _) in columns().items() if name != "error"}
+    return shown | {name: heading for name, (heading, _) in _AFTER.items()}
+
+
+def meanings() -> dict[str, str]:
+    """Heading -> what it says."""
+    after = {heading: text for heading, text in _AFTER.values()}
+    return _FIRST | {heading: text for heading, text in explanations().items() if heading != "ẽ_c"} | after
 
 
 class Entry(NamedTuple):
@@ -63,7 +84,7 @@ class Entry(NamedTuple):
 
 
 def boards(records: list[dict[str, Any]]) -> pd.DataFrame:
-    """All boards in one table of `FIELDS`, a row for each record that is not outdated, best first.
+    """All boards in one table of `fields`, a row for each record that is not outdated, best first.
 
     A board is an environment. Its episodes are those that its floor has played (without one, those that anybody has);
     others are not looked at. After the boards of a class comes its aggregate, with ``environment`` `ALL`, if
@@ -91,7 +112,8 @@ def boards(records: list[dict[str, Any]]) -> pd.DataFrame:
             rows += _board(environment, entries, current, products)
         rows += _aggregate({environment: entries for environment, entries in played.items()
                             if environment in registered and any(entry.gains for entry in entries)})
-    return pd.DataFrame(rows, columns=list(FIELDS)).astype({"rank": "Int64"} | dict.fromkeys(NUMBERS, float))
+    types: dict[str, Any] = dict.fromkeys([*_NUMBERS, *others(), *_AFTER], float)
+    return pd.DataFrame(rows, columns=fields()).astype(types | {"rank": "Int64"})
 
 
 def class_of(record: dict[str, Any]) -> str:
@@ -140,7 +162,7 @@ def _board(environment: str, entries: list[Entry], current: list[dict[str, Any]]
             "seeds": seed_ranges(record["seeds"]),
             **_three("error", {environment: entry.errors}, mean_over_environments),
             **_three("gain", {environment: entry.gains}, interquartile_mean),
-            **{name: None if summarised[name] is None else summarised[name][0] for name in OTHERS},
+            **{name: None if summarised[name] is None else summarised[name][0] for name in others()},
             "matmuls_per_step": _in_products(record, products), "peak_memory": _peak(record)})
     return rows
 
@@ -217,7 +239,7 @@ def _markdown(table: pd.DataFrame, outdated: list[dict[str, Any]]) -> str:
                 f"{environment}, {max(board['seeds'], key=lambda seeds: len(parse_seeds(seeds)))}")
             parts += [f"### {heading}", as_markdown(_cells(board), words=3)]
     if not table.empty:
-        parts += ["## What the columns say", "\n".join(f"- **{heading}**: {text}" for heading, text in MORE.items())]
+        parts += ["## What the columns say", "\n".join(f"- **{heading}**: {text}" for heading, text in meanings().items())]
     if outdated:
         parts += ["## Outdated records", "Made by an earlier version of the method.\n\n"
                   + "\n".join(f"- {file_name(record)}" for record in outdated)]
@@ -233,7 +255,7 @@ def _cells(board: pd.DataFrame) -> pd.DataFrame:
         **{heading: [_interval(*three) for three in board[[name, f"{name}_low", f"{name}_high"]].itertuples(False)]
            for name, heading in (("error", "ẽ_c"), ("gain", "gain"))},
         **{heading: ["–" if pd.isna(value) else number(value) for value in board[name]]
-           for name, heading in HEADINGS.items()}})
+           for name, heading in headings().items()}})
     return text.loc[:, [bool((text[heading] != "–").any()) for heading in text]]
 
 

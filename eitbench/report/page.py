@@ -21,7 +21,7 @@ from eitbench.data.seeds import parse_seeds
 from eitbench.envs.rendering import FIELD_MAP, colour_range, draw_field
 from eitbench.numerics.mesh import Mesh
 from eitbench.report import charts
-from eitbench.report.summary import EXPLANATIONS, board_label, cells, method
+from eitbench.report.summary import board_label, cells, explanations, method
 from eitbench.report.templates import template
 from eitbench.worlds.task import Task
 
@@ -36,7 +36,7 @@ def write_page(store: EpisodeStore, records: list[dict[str, Any]], table: pd.Dat
                 for name, rows in table.groupby("world", sort=False)]
     shown = {heading for section in sections for heading in section["headings"]}
     html = template("page.html.j2").render(
-        sections=sections, explanations={heading: text for heading, text in EXPLANATIONS.items() if heading in shown},
+        sections=sections, explanations={heading: text for heading, text in explanations().items() if heading in shown},
         colour_bar=_colour_bar(), runs=_runs(records),
     )
     path = store.folder / "index.html"

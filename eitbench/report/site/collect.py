@@ -16,7 +16,7 @@ class Row(NamedTuple):
     """A method on a board."""
 
     cells: dict[str, Any]
-    """Of `boards.FIELDS`; None where there is nothing."""
+    """Of `boards.fields`; None where there is nothing."""
     record: dict[str, Any] | None
     """None in an aggregate."""
     outdated: bool

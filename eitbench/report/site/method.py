@@ -17,7 +17,7 @@ from eitbench.bench.baselines import version_of
 from eitbench.bench.records import alike, finished
 from eitbench.bench.text import scores_by_seed, seed_ranges
 from eitbench.report import charts
-from eitbench.report.boards import HEADINGS
+from eitbench.report.boards import headings
 from eitbench.report.site.collect import Board, Row, Site, title_of
 from eitbench.report.site.environment import markdown
 from eitbench.report.site.tables import Cell, Table, interval_cell, scale, three, value_cell
@@ -89,15 +89,16 @@ def _runs(record: dict[str, Any]) -> list[dict[str, Any]]:
 
 def _episodes(record: dict[str, Any]) -> Table:
     """A row for each episode, with the scores that any of them has."""
-    scores = {name: values for name in ("error", *HEADINGS) if (values := scores_by_seed(record, name))}
+    shown = {"error": "ẽ_c"} | headings()
+    scores = {name: values for name in shown if (values := scores_by_seed(record, name))}
     rows = []
     for i, episode in enumerate(record["episodes"]):
         seed = episode["seed"]
         cells = [value_cell(values.get(seed)) for values in scores.values()]
         rows.append(([Cell(seed, float(i)), Cell(episode["status"], episode["status"]), *cells,
                       Cell(episode["finished"][:10], episode["finished"])], ""))
-    headings = ["ẽ_c" if name == "error" else HEADINGS[name] for name in scores]
-    return Table(f"Episodes of {title_of(record)}", ["seed", "status", *headings, "played on"], rows)
+    return Table(f"Episodes of {title_of(record)}",
+                 ["seed", "status", *(shown[name] for name in scores), "played on"], rows)
 
 
 def command(record: dict[str, Any]) -> str:
