@@ -81,9 +81,9 @@ def new_card(name: str, method: str) -> dict[str, Any]:
 def played(card: dict[str, Any], method: str) -> dict[str, Any]:
     """The card with what comes out now.
 
-    ``scores`` are those of the episode that are finite and no times. ``answer`` is, of an estimator,
-    some entries of its last estimate in mol/m³; of a policy, the electrodes that were source and sink
-    in each step, or none.
+    ``scores`` are those of the episode that are finite and no times. ``answer`` is, of an
+    estimator, some entries of its last estimate in mol/m³; of a policy, the electrodes that were
+    source and sink in each step, or none.
 
     Raises
     ------
@@ -115,8 +115,8 @@ def moved(card: dict[str, Any], now: dict[str, Any]) -> list[str]:
 def update(names: list[str], *, new_version: bool = False) -> Iterator[tuple[str, str, list[str]]]:
     """Play the cards of some methods (default: all of ours), and write what is new.
 
-    Where numbers have moved the card stays as it is, unless there is to be a new version: then it is
-    written with the next number.
+    Where numbers have moved the card stays as it is, unless there is to be a new version: then it
+    is written with the next number.
 
     Yields
     ------
@@ -142,7 +142,8 @@ def _updated(name: str, method: str, new_version: bool) -> tuple[str, list[str]]
     if differences and not new_version:
         return "moved", differences
     if card and not differences:
-        # Scores that came after the card was written are added; what is there stays to the last bit.
+        # Scores that came after the card was written are added; what is there stays to the last
+        # bit.
         now = card | {"scores": now["scores"] | card["scores"]}
         what = "same"
     else:

@@ -37,7 +37,8 @@ class Replay(NamedTuple):
 
 
 def official_records(folder: Path, environments: Sequence[str] = ()) -> list[Path]:
-    """Paths of the official records of a folder that are not outdated, of these environments or of all.
+    """Paths of the official records of a folder that are not outdated, of these environments or of
+    all.
 
     Raises
     ------
@@ -55,7 +56,8 @@ def official_records(folder: Path, environments: Sequence[str] = ()) -> list[Pat
 
 
 def replays(records: Sequence[Path], episodes: int, seed: int, folder: Path) -> list[Replay]:
-    """``episodes`` drawn from each record with this ``seed``, environment by environment, cheap ones first.
+    """``episodes`` drawn from each record with this ``seed``, environment by environment, cheap
+    ones first.
 
     Records of the same episodes have the same ones drawn, so that each is simulated once.
     """
@@ -76,21 +78,23 @@ def verify_all(records: Sequence[Path], folder: Path, *, episodes: int = 1, seed
                isolate: str = "others", n_jobs: int = 1, backend: str = "loky") -> pd.DataFrame:
     """Play ``episodes`` of every record again.
 
-    What came out is kept in ``folder`` the moment it is there, with the simulated episodes; the same call with the
-    same code goes on from there.
+    What came out is kept in ``folder`` the moment it is there, with the simulated episodes; the
+    same call with the same code goes on from there.
 
     Returns
     -------
     DataFrame
-        A row for each episode: record, environment, method, episode, score (that with the greatest relative
-        difference), difference, said and again (ẽ_c), problem (a sentence where it could not be played), remark (a
-        sentence where the record is of an older version than the method is now).
+        A row for each episode: record, environment, method, episode, score (that with the greatest
+        relative difference), difference, said and again (ẽ_c), problem (a sentence where it could
+        not be played), remark (a sentence where the record is of an older version than the method
+        is now).
     """
     _check.integer("episodes", episodes, low=1)
     todo = replays(records, episodes, seed, folder)
     left = [(replay, isolate) for replay in todo if _kept(replay) is None]
     before = os.environ.get(CACHE_VARIABLE)
-    os.environ[CACHE_VARIABLE] = str((folder / "cache").absolute())       # nothing that was there before is believed
+    # nothing that was there before is believed
+    os.environ[CACHE_VARIABLE] = str((folder / "cache").absolute())
     try:
         for _ in tqdm(in_parallel(_replay, left, n_jobs, backend), total=len(todo), initial=len(todo) - len(left),
                       desc="playing again", unit="episode", disable=None):
@@ -151,7 +155,8 @@ def differing(rows: pd.DataFrame, tolerance: float = TOLERANCE) -> list[str]:
 
 
 def by_environment(rows: pd.DataFrame, tolerance: float = TOLERANCE) -> str:
-    """Markdown: for each environment how many episodes are as their records say, and the greatest difference."""
+    """Markdown: for each environment how many episodes are as their records say, and the greatest
+    difference."""
     lines = []
     for name, group in rows.groupby("environment", sort=False):
         worst = group.iloc[int(group["difference"].argmax())]

@@ -55,8 +55,10 @@ class Played:
                 if estimate.velocity is not None:
                     velocities[t - 1] = estimate.velocity
             if estimate.innovation is not None and estimate.innovation_covariance is not None:
-                innovations[t + task.lag] = (np.array(estimate.innovation, dtype=float),     # copies, as means are:
-                                             np.array(estimate.innovation_covariance, dtype=float))  # arrays get reused
+                # copies, as means are:
+                innovations[t + task.lag] = (np.array(estimate.innovation, dtype=float),
+                                             # arrays get reused
+                                             np.array(estimate.innovation_covariance, dtype=float))
         voltages, currents = (np.array([m[key] for m in measured[:task.n_steps]]) for key in ("voltages", "currents"))
         claimed = bool(np.isfinite(variances[task.warm_up:]).all())
         return cls(means, variances if claimed else None, voltages, currents, innovations, np.array(seconds),
@@ -73,8 +75,8 @@ class Played:
 
 
 def score(env: EstimationEnv, played: Played) -> dict[str, Any]:
-    """Scores of the episode that ``env`` has just played (`eitbench.bench.scores`), and the error of
-    each scored state, as JSON-ready numbers."""
+    """Scores of the episode that ``env`` has just played (`eitbench.bench.scores`), and the error
+    of each scored state, as JSON-ready numbers."""
     outcome = _outcome(env, played)
     return {"scores": scored("estimation", outcome), "step_errors": outcome.errors.tolist()}
 

@@ -1,5 +1,6 @@
-"""Scores: what each is called, its unit, which way is better, what it needs, and how it follows from
-an episode. A new one is one `Score`, registered; records, tables, CSV, pages and `compare` have it then.
+"""Scores: what each is called, its unit, which way is better, what it needs, and how it follows
+from an episode. A new one is one `Score`, registered; records, tables, CSV, pages and `compare`
+have it then.
 """
 
 from __future__ import annotations

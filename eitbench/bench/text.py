@@ -1,4 +1,5 @@
-"""Numbers, seeds and tables as text, and the scores of a record in the units in which they are said."""
+"""Numbers, seeds and tables as text, and the scores of a record in the units in which they are
+said."""
 
 from __future__ import annotations
 
@@ -13,7 +14,8 @@ from eitbench.bench.scores import scores
 
 
 def mean_and_interval(values: list[float]) -> tuple[float, float]:
-    """Mean, and half the width of its 95 % confidence interval (Student's t); infinite for fewer than two values."""
+    """Mean, and half the width of its 95 % confidence interval (Student's t); infinite for fewer
+    than two values."""
     mean = float(np.mean(values))
     if len(values) < 2:
         return mean, math.inf
@@ -21,19 +23,22 @@ def mean_and_interval(values: list[float]) -> tuple[float, float]:
 
 
 def rounded(mean: float, half: float) -> str:
-    """``0.0053 ± 0.0004``: the interval to one significant digit (two if that is a 1), the mean to the same place."""
+    """``0.0053 ± 0.0004``: the interval to one significant digit (two if that is a 1), the mean to
+    the same place."""
     place = _places(half)
     return f"{mean:.3g}" if place is None else f"{mean:z.{place}f} ± {half:.{place}f}"
 
 
 def with_interval(value: float, low: float, high: float) -> str:
-    """``0.0053 (0.0049 to 0.0058)``, rounded as `rounded` does by half the interval; without one, the value."""
+    """``0.0053 (0.0049 to 0.0058)``, rounded as `rounded` does by half the interval; without one,
+    the value."""
     place = _places(0.5 * (high - low))
     return f"{value:.3g}" if place is None else f"{value:z.{place}f} ({low:z.{place}f} to {high:z.{place}f})"
 
 
 def _places(half: float) -> int | None:
-    """Decimal places that half an interval leaves significant; None if it is none, or below the last place shown."""
+    """Decimal places that half an interval leaves significant; None if it is none, or below the
+    last place shown."""
     if not math.isfinite(half) or half < 5e-6:
         return None
     place = -math.floor(math.log10(half))
@@ -44,7 +49,8 @@ def _places(half: float) -> int | None:
 
 def scores_by_seed(record: dict[str, Any], name: str) -> dict[str, float]:
     """Seed -> score, of the episodes that have it; in the units of the table."""
-    values = {episode["seed"]: episode["scores"].get(name)              # records of older code have fewer scores
+    # records of older code have fewer scores
+    values = {episode["seed"]: episode["scores"].get(name)
               for episode in record["episodes"] if episode["status"] == "ok"}
     known = scores()
     factor = known[name].factor if name in known else 1.0
@@ -71,8 +77,8 @@ def number(value: float) -> str:
 
 
 def as_markdown(text: pd.DataFrame, words: int) -> str:
-    """A table of text as Markdown, also pleasant to read in a terminal; all but the first ``words`` columns hold
-    numbers."""
+    """A table of text as Markdown, also pleasant to read in a terminal; all but the first ``words``
+    columns hold numbers."""
     lines = [[str(cell).replace("|", "\\|") for cell in line]
              for line in [list(text.columns), *text.to_numpy().tolist()]]
     widths = [max(len(str(line[i])) for line in lines) for i in range(len(text.columns))]

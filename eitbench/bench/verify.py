@@ -1,4 +1,5 @@
-"""Whether a record is true: play some of its episodes again, or others that nobody could prepare for, and compare."""
+"""Whether a record is true: play some of its episodes again, or others that nobody could prepare
+for, and compare."""
 
 from __future__ import annotations
 
@@ -30,11 +31,13 @@ from eitbench.data.store import CACHE_VARIABLE
 OF_OURS = ("board", "role", "privileged")
 """What must be as a record says of a method of ours, beside its numbers: its words may be mended."""
 TOLERANCE = 1e-6
-"""Relative difference of a score that is none, on one machine; sums are taken in another order on another."""
+"""Relative difference of a score that is none, on one machine; sums are taken in another order on
+another."""
 
 
 def job_of(record: dict[str, Any], file: str | None = None, isolate: str = "always") -> Job:
-    """What a record says was played, with the method in ``file`` (default: that of ours which has its name).
+    """What a record says was played, with the method in ``file`` (default: that of ours which has
+    its name).
 
     Raises
     ------
@@ -99,7 +102,8 @@ def verify(record: dict[str, Any], job: Job, *, episodes: int = 3, seed: int = 0
 
 @contextmanager
 def empty_cache() -> Iterator[None]:
-    """Within, nothing is taken from the cache folder: episodes and models are made anew, and thrown away."""
+    """Within, nothing is taken from the cache folder: episodes and models are made anew, and thrown
+    away."""
     before = os.environ.get(CACHE_VARIABLE)
     with tempfile.TemporaryDirectory(prefix="eitbench-verify-") as folder:
         os.environ[CACHE_VARIABLE] = folder
@@ -124,7 +128,8 @@ def _own(record: dict[str, Any]) -> str | None:
 
 
 def differences_of(said: dict[str, Any], again: dict[str, Any]) -> dict[str, float]:
-    """Score -> relative difference between two results of an episode, of the scores that it had then."""
+    """Score -> relative difference between two results of an episode, of the scores that it had
+    then."""
     known = scores()
     if said["status"] != again["status"]:
         return {"status": np.inf}
@@ -144,7 +149,8 @@ def _relative(a: list[float | None], b: list[float | None]) -> float:
 
 
 def _difference(name: str, said: dict[str, Any], again: dict[str, Any]) -> str:
-    """What one score is now and was then; of the errors of all steps, the one that has changed most."""
+    """What one score is now and was then; of the errors of all steps, the one that has changed
+    most."""
     if name != "step_errors":
         return f"{name} is {_value(again, name)}, the record says {_value(said, name)}"
     now, then = again[name], said[name]

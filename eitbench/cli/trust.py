@@ -34,8 +34,8 @@ def verify(
     """Play episodes of a record again and say whether it is true: exit status 0 if so, 1 if not.
 
     They are simulated anew, whatever the cache folder holds. Numbers decide: of our own methods it
-    does not matter which text of the library played; the file of somebody else's must be the very one
-    that the record names.
+    does not matter which text of the library played; the file of somebody else's must be the very
+    one that the record names.
 
     With --all, episodes of every official record of a folder, cheap environments first; the same
     command again goes on where it was interrupted.

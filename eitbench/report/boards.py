@@ -1,4 +1,5 @@
-"""Leaderboards from records: ranks and intervals board by board, an aggregate for each class, as CSV and Markdown."""
+"""Leaderboards from records: ranks and intervals board by board, an aggregate for each class, as
+CSV and Markdown."""
 
 from __future__ import annotations
 
@@ -86,11 +87,12 @@ class Entry(NamedTuple):
 def boards(records: list[dict[str, Any]]) -> pd.DataFrame:
     """All boards in one table of `fields`, a row for each record that is not outdated, best first.
 
-    A board is an environment. Its episodes are those that its floor has played (without one, those that anybody has);
-    others are not looked at. After the boards of a class comes its aggregate, with ``environment`` `ALL`, if
-    there are several registered environments with a floor: of methods that have finished every episode of every one of
-    them. Environments with arguments of somebody's own have boards, and no part in it.
-    ``seconds_per_step`` is in ms of the fastest episode, ``voltage_discrepancy`` in mV², ``peak_memory`` in 10⁶ bytes.
+    A board is an environment. Its episodes are those that its floor has played (without one, those
+    that anybody has); others are not looked at. After the boards of a class comes its aggregate,
+    with ``environment`` `ALL`, if there are several registered environments with a floor: of
+    methods that have finished every episode of every one of them. Environments with arguments of
+    somebody's own have boards, and no part in it. ``seconds_per_step`` is in ms of the fastest
+    episode, ``voltage_discrepancy`` in mV², ``peak_memory`` in 10⁶ bytes.
 
     Raises
     ------
@@ -122,8 +124,8 @@ def class_of(record: dict[str, Any]) -> str:
 
 
 def render(records: list[dict[str, Any]], table: pd.DataFrame | None = None) -> dict[str, str]:
-    """The content of ``leaderboard.csv`` and ``leaderboard.md``, by file name, from the records and, if it is made
-    already, their `boards`. The same records give the same text."""
+    """The content of ``leaderboard.csv`` and ``leaderboard.md``, by file name, from the records
+    and, if it is made already, their `boards`. The same records give the same text."""
     table = boards(records) if table is None else table
     return {"leaderboard.csv": table.to_csv(index=False, float_format="%.6g", lineterminator="\n"),
             "leaderboard.md": _markdown(table, newest(records)[1])}
@@ -139,7 +141,7 @@ def _entries(records: list[dict[str, Any]]) -> list[Entry]:
     for whole in records:
         record = whole | {"episodes": [episode for episode in whole["episodes"] if episode["seed"] in seeds],
                           "seeds": [seed for seed in whole["seeds"] if seed in seeds]}
-        if not record["seeds"]:                                        # nothing that the board asks for
+        if not record["seeds"]:  # nothing that the board asks for
             continue
         errors = scores_by_seed(record, "error")
         failed, missing = sum(e["status"] != "ok" for e in whole["episodes"]), len(seeds - set(record["seeds"]))
@@ -173,8 +175,8 @@ def _place(entry: Entry) -> tuple[bool, float, str]:
 
 
 def _aggregate(played: dict[str, list[Entry]]) -> list[dict[str, Any]]:
-    """Rows of the methods that have finished all of several environments, ordered and ranked by the interquartile mean
-    of their gains."""
+    """Rows of the methods that have finished all of several environments, ordered and ranked by the
+    interquartile mean of their gains."""
     if len(played) < 2:
         return []
     found = [{entry.label: entry for entry in entries if entry.complete and entry.gains} for entries in played.values()]
@@ -198,7 +200,8 @@ def _row(entry: Entry, environment: str, rank: int | None) -> dict[str, Any]:
 
 
 def _three(name: str, scores: dict[str, dict[str, float]], statistic: Any) -> dict[str, float | None]:
-    """A statistic of environment -> seed -> score, and the ends of its interval, as far as there are any."""
+    """A statistic of environment -> seed -> score, and the ends of its interval, as far as there
+    are any."""
     if not all(scores.values()):
         return dict.fromkeys((name, f"{name}_low", f"{name}_high"))
     three = stratified_bootstrap({key: list(own.values()) for key, own in scores.items()}, statistic)
@@ -207,7 +210,8 @@ def _three(name: str, scores: dict[str, dict[str, float]], statistic: Any) -> di
 
 
 def _matrix_products(records: list[dict[str, Any]]) -> dict[str, float]:
-    """Processor -> time of a matrix product in s, the median of the runs: a single one depends on what runs beside."""
+    """Processor -> time of a matrix product in s, the median of the runs: a single one depends on
+    what runs beside."""
     timed: dict[str, list[float]] = {}
     for record in records:
         for run in record["runs"]:
@@ -239,7 +243,8 @@ def _markdown(table: pd.DataFrame, outdated: list[dict[str, Any]]) -> str:
                 f"{environment}, {max(board['seeds'], key=lambda seeds: len(parse_seeds(seeds)))}")
             parts += [f"### {heading}", as_markdown(_cells(board), words=3)]
     if not table.empty:
-        parts += ["## What the columns say", "\n".join(f"- **{heading}**: {text}" for heading, text in meanings().items())]
+        said = [f"- **{heading}**: {text}" for heading, text in meanings().items()]
+        parts += ["## What the columns say", "\n".join(said)]
     if outdated:
         parts += ["## Outdated records", "Made by an earlier version of the method.\n\n"
                   + "\n".join(f"- {file_name(record)}" for record in outdated)]

@@ -19,8 +19,8 @@ FIELDS = ("environment", "episodes", "a", "b", "difference", "low", "high", "bet
 
 
 def find(name: str, folder: Path) -> list[dict[str, Any]]:
-    """The records that are meant by the path of one, or by METHOD or METHOD@VERSION within a folder; an outdated one
-    only by its version.
+    """The records that are meant by the path of one, or by METHOD or METHOD@VERSION within a
+    folder; an outdated one only by its version.
 
     Raises
     ------
@@ -50,20 +50,21 @@ def comparable(name: str) -> Score:
 
 
 def compare(a: list[dict[str, Any]], b: list[dict[str, Any]], score: str = "error") -> pd.DataFrame:
-    """A score (default: ẽ_c) of a and b on the episodes that both finished, a row for each environment
-    and, if there are several, one for ``all`` of them together.
+    """A score (default: ẽ_c) of a and b on the episodes that both finished, a row for each
+    environment and, if there are several, one for ``all`` of them together.
 
     Returns
     -------
     DataFrame
-        environment, episodes; a, b: means; difference: of a − b, with the ends of its 95 % interval; better: share of
-        episodes in which a is better (an equal score counts ½), with the ends of its interval. Over all, means
-        of the environments' means.
+        environment, episodes; a, b: means; difference: of a − b, with the ends of its 95 %
+        interval; better: share of episodes in which a is better (an equal score counts ½), with the
+        ends of its interval. Over all, means of the environments' means.
 
     Raises
     ------
     ValueError
-        If there is no such score, or no environment in which both have finished an episode and have it.
+        If there is no such score, or no environment in which both have finished an episode and have
+        it.
     """
     higher = comparable(score).better == "higher"
     pairs: dict[str, tuple[dict[str, float], dict[str, float]]] = {}
@@ -94,14 +95,16 @@ def _row(label: str, pairs: dict[str, tuple[dict[str, float], dict[str, float]]]
 
 
 def names(a: dict[str, Any], b: dict[str, Any]) -> tuple[str, str]:
-    """What two records' methods are called, apart from each other: by version if they have the same name."""
+    """What two records' methods are called, apart from each other: by version if they have the same
+    name."""
     if a["method"] != b["method"]:
         return a["method"], b["method"]
     return f"{a['method']}@{a['version']}", f"{b['method']}@{b['version']}"
 
 
 def cells(table: pd.DataFrame, a: str, b: str, score: str = "error") -> pd.DataFrame:
-    """The comparison as text, with a verdict: who is better where the interval of the difference leaves out zero."""
+    """The comparison as text, with a verdict: who is better where the interval of the difference
+    leaves out zero."""
     asked = comparable(score)
     less, more = (b, a) if asked.better == "higher" else (a, b)
     return pd.DataFrame({

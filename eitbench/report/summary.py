@@ -1,4 +1,5 @@
-"""From records to a table: means over seeds with confidence intervals, world by world and board by board."""
+"""From records to a table: means over seeds with confidence intervals, world by world and board by
+board."""
 
 from __future__ import annotations
 
@@ -29,7 +30,8 @@ _NOT_THE_WORLD = ("lag", "assume", "gate", "episodes", "render_mode", "observati
 
 
 def columns() -> dict[str, tuple[str, str]]:
-    """Name -> heading and explanation of each column of numbers: every registered score, and the skill."""
+    """Name -> heading and explanation of each column of numbers: every registered score, and the
+    skill."""
     each = {name: (score.heading, score.explanation) for name, score in scores().items()}
     return {"error": each.pop("error"), "skill": SKILL} | each
 
@@ -40,7 +42,8 @@ def explanations() -> dict[str, str]:
 
 
 def summary(records: list[dict[str, Any]]) -> pd.DataFrame:
-    """One row a record: world, board, environment, method, episodes, failed, (mean, half interval) of each score."""
+    """One row a record: world, board, environment, method, episodes, failed, (mean, half interval)
+    of each score."""
     table = pd.DataFrame([summary_row(record, records) for record in records])
     order = table["error"].map(lambda cell: math.inf if cell is None else cell[0])
     worlds = sorted(set(table["world"]), key=place_of_world)
@@ -67,7 +70,8 @@ def summary_row(record: dict[str, Any], records: list[dict[str, Any]]) -> dict[s
 
 
 def world(record: dict[str, Any]) -> str:
-    """What the lagged siblings of an environment share, whatever is believed of it: ``Pipe2D (scored_steps=3)``."""
+    """What the lagged siblings of an environment share, whatever is believed of it: ``Pipe2D
+    (scored_steps=3)``."""
     environment = record["environment"]
     changed = {key: value for key, value in environment["kwargs"].items()
                if value is not None and key not in _NOT_THE_WORLD}
@@ -76,7 +80,8 @@ def world(record: dict[str, Any]) -> str:
 
 
 def method(record: dict[str, Any]) -> str:
-    """The method's title, and what it was made to believe: ``Linearised Kalman filter, assume.flow=real``."""
+    """The method's title, and what it was made to believe: ``Linearised Kalman filter,
+    assume.flow=real``."""
     return ", ".join([record["title"], *filter(None, [_arguments(_beliefs(record))])])
 
 
@@ -116,7 +121,8 @@ def _dotted(arguments: dict[str, Any]) -> dict[str, Any]:
 
 
 def _skills(record: dict[str, Any], records: list[dict[str, Any]]) -> dict[str, float]:
-    """(E_bh − E)/(E_bh − E_ref) with the means over the seeds that all three have; one number, or none.
+    """(E_bh − E)/(E_bh − E_ref) with the means over the seeds that all three have; one number, or
+    none.
 
     The anchors are those of the world's board with the longest record to look back on.
     """
@@ -127,7 +133,8 @@ def _skills(record: dict[str, Any], records: list[dict[str, Any]]) -> dict[str, 
         return scores_by_seed(anchor, "error") if anchor else {}
 
     own, floor, reference = scores_by_seed(record, "error"), of("homogeneous"), of("true_model_smoother")
-    shared = sorted(own.keys() & floor.keys() & reference.keys())     # a sum's last digit depends on the order
+    # a sum's last digit depends on the order
+    shared = sorted(own.keys() & floor.keys() & reference.keys())
     if not shared:
         return {}
     e, bh, ref = (float(np.mean([scores[seed] for seed in shared])) for scores in (own, floor, reference))
@@ -135,8 +142,8 @@ def _skills(record: dict[str, Any], records: list[dict[str, Any]]) -> dict[str, 
 
 
 def cells(table: pd.DataFrame) -> pd.DataFrame:
-    """The summary as text, with the columns a reader sees: the environment where there are several worlds, the error
-    of the flow where it was asked for."""
+    """The summary as text, with the columns a reader sees: the environment where there are several
+    worlds, the error of the flow where it was asked for."""
     text = table[["world", "board", "method", "seeds"]].rename(columns={"world": "environment"})
     if table["world"].nunique() < 2:
         text = text.drop(columns="environment")

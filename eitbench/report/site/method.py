@@ -1,4 +1,5 @@
-"""The page of a method: where it stands on every board, what it is, how to play it again, and every episode."""
+"""The page of a method: where it stands on every board, what it is, how to play it again, and every
+episode."""
 
 from __future__ import annotations
 
@@ -73,7 +74,7 @@ def _version(records: list[dict[str, Any]], site: Site) -> dict[str, Any]:
 
 def _record(record: dict[str, Any], site: Site) -> dict[str, Any]:
     board, row = next(((board, row) for board in site.boards for row in board.rows if row.record is record),
-                      (None, None))                                  # it played none of the board's episodes
+                      (None, None))  # it played none of the board's episodes
     return {"title": title_of(record), "address": board and board.address, "official": record["official"],
             "outdated": row is not None and row.outdated, "runs": _runs(record), "command": command(record),
             "typed": sorted({run["command"] for run in record["runs"]}),
@@ -82,7 +83,8 @@ def _record(record: dict[str, Any], site: Site) -> dict[str, Any]:
 
 
 def _runs(record: dict[str, Any]) -> list[dict[str, Any]]:
-    """Runs of one code on one machine as one, with ``products``, the times in ms that its processes took for theirs."""
+    """Runs of one code on one machine as one, with ``products``, the times in ms that its processes
+    took for theirs."""
     return [group[0] | {"products": sorted(1000 * run["machine"]["matmul_seconds"] for run in group)}
             for group in alike(record["runs"])]
 
@@ -102,7 +104,8 @@ def _episodes(record: dict[str, Any]) -> Table:
 
 
 def command(record: dict[str, Any]) -> str:
-    """What plays the record's episodes again; empty if the environment was given arguments, which no command takes.
+    """What plays the record's episodes again; empty if the environment was given arguments, which
+    no command takes.
 
     A file is named as it was when they were played.
     """
@@ -114,9 +117,11 @@ def command(record: dict[str, Any]) -> str:
 
 
 def _argument(record: dict[str, Any]) -> str:
-    """The name of a method, or the path that was typed for it, without the folders of whoever typed it.
+    """The name of a method, or the path that was typed for it, without the folders of whoever typed
+    it.
 
-    An agent's name says nothing of its file: where it is none of ours, the path is left to the reader.
+    An agent's name says nothing of its file: where it is none of ours, the path is left to the
+    reader.
     """
     for run in record["runs"]:
         try:

@@ -16,7 +16,8 @@ from eitbench.report.site.collect import Board, Row, method_address
 COMPACT = ("seconds_per_step", "peak_memory")
 """Beside ranks and intervals in the index; the page of an environment has all columns."""
 WORST_GAIN = -1.0
-"""Where the drawn axis of gains ends: a method twice as bad as the floor; numbers say how much worse it is."""
+"""Where the drawn axis of gains ends: a method twice as bad as the floor; numbers say how much
+worse it is."""
 SCALES = {"error": ("ẽ_c", True), "gain": ("gain", False)}
 """Scores with intervals: heading, and whether the axis is logarithmic."""
 
@@ -40,7 +41,8 @@ class Table(NamedTuple):
 
     @property
     def kinds(self) -> list[str]:
-        """Of each column, for the style sheet: with ``drawn`` intervals, of ``words``, or of numbers."""
+        """Of each column, for the style sheet: with ``drawn`` intervals, of ``words``, or of
+        numbers."""
         columns = [[cells[i] for cells, _ in self.rows] for i in range(len(self.headings))]
         return ["drawn" if any(cell.picture for cell in column)
                 else "words" if any(isinstance(cell.value, str) for cell in column) else "" for column in columns]
