@@ -25,7 +25,8 @@ CURRENTS, FAULTS, BUDGET = (f"eitbench/Pipe2DInjection{kind}-v0" for kind in ("C
 FLOW = "eitbench/Pipe2DInjectionFlow-v0"
 SHORT = {"world": {"flow": {"mean_velocity": 16.0}, "schedule": {"scored_steps": 4}}}
 """Sixteen electrodes and a short record."""
-KWARGS = {NAME: SHORT, CURRENTS: SHORT, FAULTS: SHORT, BUDGET: SHORT | {"budget": 3},
+KWARGS = {NAME: SHORT, CURRENTS: SHORT, FAULTS: SHORT,
+          BUDGET: merged(SHORT, {"world": {"schedule": {"budget": 3}}}),
           FLOW: {"world": merged(SHORT["world"], {"flow": {"velocity_range": [15.0, 17.0]}})},
           "eitbench/RotatingTankInjection-v0": {"world": {"schedule": {"warm_up": 2, "scored_steps": 3}}}}
 SEED = 5
@@ -307,7 +308,7 @@ def test_wrong_names_are_named(tmp_path):
         load_policy(write_policy(tmp_path, name="adjacent"))
     with pytest.raises(ValueError, match="environment eitbench/Pipe2D-v0 does not ask for injections"):
         play("eitbench/Pipe2D-v0", {}, "adjacent", 1)
-    with pytest.raises(ValueError, match="estimator must be 'full' or 'reduced', got 'none'"):
+    with pytest.raises(ValueError, match="estimator must be one of full, reduced, got 'none'"):
         play(NAME, SHORT, "adjacent", 1, "none")
 
 

@@ -206,14 +206,15 @@ def test_numbers_decide_and_not_the_text(tmp_path, monkeypatch):
 def test_the_cache_is_not_believed(mine, tmp_path, monkeypatch):
     """A cache in which test:0 is another, easier episode makes a better score, but no record that holds."""
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
-    scenario, seed = PIPE_2D.changed(SCENARIO), parse_seeds("test:0")[0]
-    honest = simulate(scenario, seed, progress=False)
-    flat = honest._replace(concentration=np.full_like(honest.concentration, scenario.expected_concentration))
-    shutil.rmtree(folder(scenario))
+    world, seed = PIPE_2D.changed(SCENARIO), parse_seeds("test:0")[0]
+    honest = simulate(world, seed, progress=False)
+    level = np.full_like(honest.concentration, world.expected_concentration)
+    flat = honest._replace(concentration=level)
+    shutil.rmtree(folder(world))
     with monkeypatch.context() as patch:
         patch.setattr("eitbench.data.episodes.simulate_together", lambda *_: iter([flat]))
         path = submitted(mine, "--seeds", "test:0")
-    assert list(folder(scenario).glob("*.truth.npz"))
+    assert list(folder(world).glob("*.truth.npz"))
     code, _, complaint = eitbench("verify", path, "--baseline", mine)
     assert code == 1 and "test:0: error is" in complaint
     assert cache_folder() == tmp_path / "cache"

@@ -7,6 +7,7 @@ from zipfile import ZIP_DEFLATED, ZipFile
 import gymnasium as gym
 import numpy as np
 import pytest
+from short import merged
 from threadpoolctl import threadpool_limits
 
 from eitbench.bench.policies import load_policy, play
@@ -16,7 +17,7 @@ from eitbench.rl import training
 from eitbench.rl.agents import _mark, load_agent
 from eitbench.rl.training import Config, read_config, train
 from eitbench.rl.vec_env import InjectionVecEnv
-from eitbench.worlds import Pipe2D
+from eitbench.worlds.pipe2d import PIPE_2D
 
 NAME = "eitbench/Pipe2DInjection-v0"
 CURRENTS, BUDGET = "eitbench/Pipe2DInjectionCurrents-v0", "eitbench/Pipe2DInjectionBudget-v0"
@@ -263,7 +264,7 @@ def test_rewards_may_be_counted_from_others(tmp_path):
 def test_an_agent_plays_as_it_was_evaluated(env, algo, tmp_path):
     """As a policy its errors are those of the last evaluation; a file that was changed is not opened."""
     options = {"learning_starts": 4, "batch_size": 4} if algo == "sac" else {"n_steps": 8, "batch_size": 8}
-    kwargs = SHORT | ({"budget": 2} if env == BUDGET else {})
+    kwargs = merged(SHORT, {"world": {"schedule": {"budget": 2}}}) if env == BUDGET else SHORT
     config = replace(TINY, algorithm=options)
     path = train(env, algo, config, 1, tmp_path, kwargs)
     expected = np.load(tmp_path / "evaluations.npz")["errors"][-1]
@@ -284,7 +285,8 @@ def test_an_agent_plays_as_it_was_evaluated(env, algo, tmp_path):
     assert asked["config"] == json.loads(json.dumps(asdict(config)))
     assert agent.name == f"{algo}_{_mark(asked)}_seed1" and _mark(asked) == _mark(asked | {"seed": 2})
     assert _mark(asked) != _mark(asked | {"kwargs": {}}) and not agent.privileged and agent.parameters["env"] == env
-    assert not agent.suits(Rules(Pipe2D(), limit=None if env == CURRENTS else "L1"))
+    other = {"instrument": {"limit": None if env == CURRENTS else "L1"}}
+    assert not agent.suits(Rules(PIPE_2D.changed(other)))
     content = path.read_bytes()
     path.write_bytes(content + b"x")
     assert load_agent(path, content)[0] == agent.name            # what was checked is what is opened

@@ -75,9 +75,9 @@ attempt("the truth in memory", lambda: any(type(o).__name__ == "ndarray" and lis
 @pytest.fixture
 def measured():
     """(T, L) voltages and currents of an episode."""
-    scenario = PIPE_2D.changed(SCENARIO)
-    voltages = cycle_voltages(scenario, 3, recording(scenario, 3))
-    return voltages, scenario.currents[np.arange(len(voltages)) % len(scenario.currents)]
+    world = PIPE_2D.changed(SCENARIO)
+    voltages = cycle_voltages(world, 3, recording(world, 3))
+    return voltages, world.currents[np.arange(len(voltages)) % len(world.currents)]
 
 
 @pytest.mark.parametrize("name", ["homogeneous", "mine"])

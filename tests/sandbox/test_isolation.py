@@ -24,7 +24,7 @@ from eitbench.bench.store import EpisodeStore
 from eitbench.bench.tracks import Environment
 from eitbench.data.store import CACHE_VARIABLE
 
-INJECTION = Environment("eitbench/Pipe2DInjection-v0", json.dumps({"scenario": PIPE, "estimator": "reduced"}))
+INJECTION = Environment("eitbench/Pipe2DInjection-v0", json.dumps({"world": PIPE, "estimator": "reduced"}))
 WALL = "landlock" if landlock_version() else "process"
 
 POLICY = '''"""Mine: chosen by lot."""
