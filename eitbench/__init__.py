@@ -24,8 +24,6 @@ _LATER = {"Estimate": "worlds.task", "Task": "worlds.task", "make_task": "worlds
           "page": "envs.pages"}
 """Where the public names lie that are loaded on first use."""
 
-register_installed()
-
 
 def __getattr__(name: str) -> Any:
     """Load the public nouns, their makers and the leaderboards on first use."""
@@ -34,3 +32,6 @@ def __getattr__(name: str) -> Any:
     if name == "leaderboard":
         return import_module("eitbench.bench")
     raise AttributeError(f"module 'eitbench' has no attribute {name!r}")
+
+
+register_installed()            # last, so that packages may import the public names from here

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -187,7 +187,11 @@ def asked_for(name: str, changes: dict[str, Any] | None, lag: int | str | None,
     world = registered.world.changed(changes)
     if lag is None:
         lag = registered.settings.get("lag", 0)
-    believed = dict(registered.settings.get("assume", {}) if assumed is None else assumed)
+    if assumed is None:
+        assumed = registered.settings.get("assume", {})
+    if not isinstance(assumed, Mapping):
+        raise ValueError(f"assume must be a dict of what is believed of the flow, got {assumed!r}")
+    believed = dict(assumed)
     world.flow.check_assumed(world, believed)
     return world, lag_steps(world, lag), believed
 

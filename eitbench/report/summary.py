@@ -120,7 +120,7 @@ def world(record: dict[str, Any]) -> str:
 
 
 def method(record: dict[str, Any]) -> str:
-    """The method's title, and what it was made to believe: ``Linearised Kalman filter, assume={"flow": "real"}``."""
+    """The method's title, and what it was made to believe: ``Linearised Kalman filter, assume.flow=real``."""
     return ", ".join([record["title"], *filter(None, [_arguments(_beliefs(record))])])
 
 
@@ -144,8 +144,19 @@ def _beliefs(record: dict[str, Any]) -> dict[str, Any]:
 
 
 def _arguments(arguments: dict[str, Any]) -> str:
+    """``flow.mean_velocity=45.0, region=null``: those of parts by dotted names."""
     return ", ".join(f"{key}={value if isinstance(value, str) else json.dumps(value)}"
-                     for key, value in sorted(arguments.items()))
+                     for key, value in sorted(_dotted(arguments).items()))
+
+
+def _dotted(arguments: dict[str, Any]) -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in arguments.items():
+        if isinstance(value, dict):
+            flat |= {f"{key}.{inner}": each for inner, each in _dotted(value).items()}
+        else:
+            flat[key] = value
+    return flat
 
 
 def _skills(record: dict[str, Any], records: list[dict[str, Any]]) -> dict[str, float]:

@@ -12,6 +12,7 @@ from tiny import FILTER, count, write_baseline
 
 from eitbench.bench.run import Job, run_episode, run_jobs
 from eitbench.bench.store import EpisodeStore
+from eitbench.data import parallel
 from eitbench.data.parallel import BACKENDS, WorkerLost, in_parallel
 from eitbench.data.store import CACHE_VARIABLE
 
@@ -77,7 +78,7 @@ def test_backends_that_cannot_be_had(monkeypatch):
     with pytest.raises(ValueError, match="backend must be one of loky, ray, dask, got 'slurm'"):
         list(in_parallel(print, [(1,)], 1, "slurm"))
     with monkeypatch.context() as patch, pytest.raises(ModuleNotFoundError):
-        patch.setattr(_parallel, "_with_ray", lambda *_: iter(importlib.import_module("ray_is_not_here")))
+        patch.setattr(parallel, "_with_ray", lambda *_: iter(importlib.import_module("ray_is_not_here")))
         list(in_parallel(print, [(1,)], 1, "ray"))
     for backend, package in CLUSTERS.items():
         if not importlib.util.find_spec(package):

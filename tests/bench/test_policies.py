@@ -18,7 +18,7 @@ from eitbench.envs.injection_core import Rules
 from eitbench.estimation.onboard.belief import Belief
 from eitbench.report import policy_table
 from eitbench.report.policy_table import policy_rows
-from eitbench.worlds import Pipe2D
+from eitbench.worlds.pipe2d import PIPE_2D
 
 NAME = "eitbench/Pipe2DInjection-v0"
 CURRENTS, FAULTS, BUDGET = (f"eitbench/Pipe2DInjection{kind}-v0" for kind in ("Currents", "Faults", "Budget"))
@@ -155,7 +155,7 @@ def test_the_action_of_a_pair_injects_it(name):
 @pytest.mark.parametrize("budget", [0, 1, 7, 30, 182, 500])
 def test_an_even_budget_is_spent_exactly(budget):
     """So many injections, or one at each step; between two of them the same number of steps, give or take one."""
-    rules = Rules(Pipe2D(scored_steps=180), budget=budget)
+    rules = Rules(PIPE_2D.changed({"schedule": {"scored_steps": 180, "budget": budget}}))
     steps = rules.world.n_steps - 16
     when = np.flatnonzero([rules.spaced(np.array([left, 0.0])) for left in range(steps, 0, -1)])
     assert len(when) == min(budget, steps)

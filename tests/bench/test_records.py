@@ -301,7 +301,7 @@ def test_records_of_the_format_before_are_read(method, official, version, tmp_pa
 
 @pytest.mark.parametrize(("name", "kwargs", "expected"), [
     ("eitbench-Pipe2DFixedLag-v0", {"lag": 4}, {}),
-    ("eitbench-Pipe2DFixedLag-v0-12345678", {"lag": 4, "assumed_flow": "real"}, {"assumed_flow": "real"}),
+    ("eitbench-Pipe2DFixedLag-v0-12345678", {"lag": 4, "assume": {"flow": "real"}}, {"assume": {"flow": "real"}}),
     ("eitbench-Pipe2DFixedLag-v0-12345678", {"lag": 3}, {"lag": 3})])
 def test_arguments_of_the_registration_are_left_out(name, kwargs, expected, tmp_path):
     """What stays are those that somebody gave, and the name follows from them."""

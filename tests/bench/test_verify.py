@@ -211,7 +211,7 @@ def test_the_cache_is_not_believed(mine, tmp_path, monkeypatch):
     flat = honest._replace(concentration=np.full_like(honest.concentration, scenario.expected_concentration))
     shutil.rmtree(folder(scenario))
     with monkeypatch.context() as patch:
-        patch.setattr("eitbench.data.episodes._simulate", lambda *_: flat)
+        patch.setattr("eitbench.data.episodes.simulate_together", lambda *_: iter([flat]))
         path = submitted(mine, "--seeds", "test:0")
     assert list(folder(scenario).glob("*.truth.npz"))
     code, _, complaint = eitbench("verify", path, "--baseline", mine)

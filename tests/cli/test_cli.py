@@ -134,8 +134,8 @@ def test_suites():
     missing = {job for job in full if job.environment.id in plain} - set(quick)
     assert missing == {suites.Job(suites.Environment(PIPE), "gauss_newton", 1)} and set(quick) < set(full)
     assert {job.method for job in full} == set(own_baselines())
-    assert set(parse_seeds(tracks.SEEDS["quick"])) < set(parse_seeds(tracks.SEEDS["full"]))
-    assert min(parse_seeds(tracks.SEEDS["full"])) == 200_000
+    assert set(parse_seeds(tracks.QUICK_SEEDS)) < set(parse_seeds(entry(PIPE).seeds))
+    assert min(parse_seeds(entry(PIPE).seeds)) == 200_000
     asked_for = suites.jobs("quick", [PIPE], ["gauss_newton"], [1, 2])
     assert [job.seed for job in asked_for] == [1, 2]
 

@@ -1,18 +1,27 @@
 """Choosing injections where the mean velocity drifts and only a region counts."""
 
 import dataclasses
+import importlib.util
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from choosing import FLOW, NAME, make, some_pairs
+from short import WANDERING
 
 import eitbench
-from eitbench.bench.baselines import load_baseline
+from eitbench.data import regions
 from eitbench.data.bank import fill, missing_seeds, recording_bytes
-from eitbench.data.episodes import CACHE_VARIABLE
 from eitbench.data.recordings import cycle_voltages, outline, recording, recording_path
-from eitbench.data.regions import integrals, integrals_path, make_integrals, mass_between, score_mass
+from eitbench.data.regions import (
+    integrals,
+    integrals_path,
+    make_integrals,
+    mass_between,
+    score_mass,
+)
+from eitbench.data.store import CACHE_VARIABLE
 from eitbench.envs.injection_core import scaled
 from eitbench.estimation import LinearisedObservations
 from eitbench.estimation.onboard import joint_operator
@@ -20,8 +29,13 @@ from eitbench.estimation.onboard.belief import Belief
 from eitbench.estimation.onboard.operator import electrode_pairs
 from eitbench.estimation.reduced_joint import JointTables, joint_step
 from eitbench.numerics.fem import mass_matrix
-from eitbench.worlds import Pipe2DDriftingVelocity
+from eitbench.worlds.pipe2d_drifting import PIPE_2D_DRIFTING
 from eitbench.worlds.task import make_task
+
+ROOT = Path(__file__).parents[2]
+BASELINE = ROOT / "baselines" / "joint_extended_kalman_filter.py"
+WALK = 0.1
+"""m/s a time step, of the world and of the estimators' belief."""
 
 
 @pytest.fixture(scope="module")
@@ -31,11 +45,12 @@ def env():
 
 @pytest.fixture(scope="module")
 def shared(env):
-    return joint_operator._shared(env.scenario)
+    return joint_operator._shared(env.world.sound)
 
 
 def integrated(mesh, values: np.ndarray, region: tuple[float, float]) -> float:
-    """∫values² over the region, of a field linear in each cell, by its values at the middles of the sides."""
+    """∫values² over the region, of a field linear in each cell, by its values at the middles of the
+    sides."""
     x = mesh.points[mesh.cells][..., 0]
     inside = (x.min(axis=1) > region[0] - 1e-9) & (x.max(axis=1) < region[1] + 1e-9)
     corner = values[mesh.cells[inside]]
@@ -43,119 +58,145 @@ def integrated(mesh, values: np.ndarray, region: tuple[float, float]) -> float:
     return float((mesh.volumes[inside] * (middles**2).mean(axis=1)).sum())
 
 
-# -- what counts ------------------------------------------------------------------------------------------------------
+# -- what counts ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("estimator", ["reduced", "full"])
 def test_errors_are_those_in_the_region(estimator):
-    """Error and pay of every scored step equal integrals over the truth's cells between the two cross-sections."""
+    """Error and pay of every scored step equal integrals over the truth's cells between the two
+    cross-sections."""
     env = make(estimator, FLOW)
     base = env.unwrapped
     env.reset(seed=3)
-    scenario, operator = base.scenario, base.core._operator
-    truth, mesh = eitbench.simulate(scenario, 3).concentration.astype(float), scenario.truth().transport.mesh
-    onto, paid = base.task.mesh.interpolation_to(mesh.points), 0
-    level = np.full(onto.shape[1], operator.concentration[0])
-    for k, action in enumerate(some_pairs()[:scenario.n_steps - 16]):
-        reward, t = env.step(int(action))[1], 17 + k
-        if t <= scenario.warm_up:
-            assert reward == 0.0 and base.error is None
+    world = base.world
+    truth = eitbench.simulate(world, 3).concentration.astype(float)
+    mesh = world.truth().transport.mesh
+    onto = base.task.mesh.interpolation_to(mesh.points)
+    level = np.full(onto.shape[1], base.core._operator.concentration[0])
+    paid = 0
+    for k, action in enumerate(some_pairs()[:world.n_steps - 16]):
+        reward = env.step(int(action))[1]
+        t = 17 + k
+        if t <= world.warm_up:
+            assert reward == 0.0
+            assert base.error is None
             continue
-        square = integrated(mesh, truth[t], scenario.region)
-        homogeneous, error = (integrated(mesh, onto @ c - truth[t], scenario.region) / square
-                              for c in (level, operator.means()[0]))
+        square = integrated(mesh, truth[t], world.region)
+        estimate = base.core.estimate()[0][0]
+        homogeneous, error = (integrated(mesh, onto @ c - truth[t], world.region) / square
+                              for c in (level, estimate))
         assert base.error == pytest.approx(error, rel=1e-5)
         assert reward == pytest.approx(homogeneous - error, rel=1e-5)
         paid += 1
-    assert paid == scenario.scored_steps
+    assert paid == world.schedule.scored_steps
 
 
 def test_without_a_region_all_counts(env):
-    """Then integrals are the recording's own, to the bit; and over all cells both mass matrices are the same."""
-    whole = dataclasses.replace(env.scenario, region=None)
+    """Then integrals are the recording's own, to the bit; and over all cells both mass matrices are
+    the same."""
+    whole = dataclasses.replace(env.world, region=None)
     entries = recording(whole, 3)
     for name, array in integrals(whole, 3)._asdict().items():
         np.testing.assert_array_equal(array, entries[name])
     assert score_mass(whole) is outline(whole).mass
     mesh = make_task(whole).mesh
-    np.testing.assert_allclose(mass_between(mesh, 0.0, 0.4).toarray(), mass_matrix(mesh).toarray(), atol=1e-18)
-    parts = sum(mass_between(mesh, a, b) for a, b in ((0.0, 0.1), (0.1, 0.28), (0.28, 0.4)))
-    np.testing.assert_allclose(parts.toarray(), mass_matrix(mesh).toarray(), atol=1e-18)
+    expected = mass_matrix(mesh).toarray()
+    everywhere = mass_between(mesh, 0.0, 0.4).toarray()
+    np.testing.assert_allclose(everywhere, expected, atol=1e-18)
+    ends = (0.0, 0.1), (0.1, 0.28), (0.28, 0.4)
+    parts = sum(mass_between(mesh, begin, end) for begin, end in ends)
+    np.testing.assert_allclose(parts.toarray(), expected, atol=1e-18)
 
 
 def test_integrals_are_kept_and_damage_is_noticed(env, monkeypatch, tmp_path):
     """Made once from the truth; a damaged file, or another seed's, is made anew."""
-    from eitbench.data import regions
-    made, scenario = integrals(env.scenario, 3), env.scenario
+    world = env.world
+    made = integrals(world, 3)
     places = {seed: tmp_path / f"{seed}.npz" for seed in (3, 4)}
     monkeypatch.setattr(regions, "integrals_path", lambda _, seed: places[seed])
     asked = []
     monkeypatch.setattr(regions, "make_integrals", lambda *_: asked.append(1) or made)
     for _ in range(2):
-        assert all((a == b).all() for a, b in zip(integrals(scenario, 3), made, strict=True))
-    assert len(asked) == 1 and regions.are_kept(scenario, 3) and not regions.are_kept(scenario, 4)
+        assert all((a == b).all() for a, b in zip(integrals(world, 3), made, strict=True))
+    assert len(asked) == 1
+    assert regions.are_kept(world, 3)
+    assert not regions.are_kept(world, 4)
     data = places[3].read_bytes()
     places[4].write_bytes(data)
-    assert not regions.are_kept(scenario, 4)
+    assert not regions.are_kept(world, 4)
     for damaged in (data[:-9], b"", data[:2000] + bytes([data[2000] ^ 1]) + data[2001:]):
         places[3].write_bytes(damaged)
-        assert all((a == b).all() for a, b in zip(integrals(scenario, 3), made, strict=True))
+        assert all((a == b).all() for a, b in zip(integrals(world, 3), made, strict=True))
     assert len(asked) == 4
 
 
 def test_the_bank_keeps_the_integrals(monkeypatch, tmp_path):
-    """Beside each recording; what is missing of either is made, with the bits that the truth gives."""
+    """Beside each recording; what is missing of either is made, with the bits that the truth
+    gives."""
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
-    scenario = Pipe2DDriftingVelocity(mean_velocity=45.0, velocity_range=(44.5, 45.5), scored_steps=3, frame=2,
-                                      electrodes_per_wall=2)
-    assert fill(scenario, [1, 2]) == 2 and not missing_seeds(scenario, [1, 2])
-    path = integrals_path(scenario, 2)
+    narrow = {"flow": {"velocity_range": [44.5, 45.5]}, "schedule": {"scored_steps": 3}}
+    world = PIPE_2D_DRIFTING.changed(WANDERING).changed(narrow)
+    assert fill(world, [1, 2]) == 2
+    assert not missing_seeds(world, [1, 2])
+    path = integrals_path(world, 2)
     kept = path.read_bytes()
-    assert recording_bytes(scenario) == pytest.approx(recording_path(scenario, 2).stat().st_size + len(kept), rel=0.02)
-    made = make_integrals(scenario, eitbench.simulate(scenario, 2, cache=False))
-    assert all((a == b).all() for a, b in zip(integrals(scenario, 2), made, strict=True))
+    beside = recording_path(world, 2).stat().st_size
+    assert recording_bytes(world) == pytest.approx(beside + len(kept), rel=0.02)
+    made = make_integrals(world, eitbench.simulate(world, 2, cache=False))
+    assert all((a == b).all() for a, b in zip(integrals(world, 2), made, strict=True))
     path.unlink()
-    assert missing_seeds(scenario, [1, 2]) == [2] and fill(scenario, [1, 2]) == 1 and path.read_bytes() == kept
+    assert missing_seeds(world, [1, 2]) == [2]
+    assert fill(world, [1, 2]) == 1
+    assert path.read_bytes() == kept
 
 
 @pytest.mark.parametrize(("change", "message"), [
-    ({"region": [0.3, 0.2]}, "region must be a range"), ({"region": [0.283, 0.4]}, "multiples of 0.01 m"),
-    ({"scenario": {"region": [0.2, 0.4]}}, "region must be given as an argument, not in scenario"),
-    ({"region": [0.3, 0.5]}, "region must be a range"), ({"region": [0.3]}, "region must have shape"),
-    ({"scenario": {"velocity_walk": 0.0}}, "velocity_walk must be"),
-    ({"scenario": {"swing_range": [0.0, 0.2]}}, "swing_range and skewness_range must be"),
+    ({"region": [0.3, 0.2]}, "region must be a range"),
+    ({"region": [0.283, 0.4]}, "multiples of 0.01 m"),
+    ({"region": [0.3, 0.5]}, "region must be a range"),
+    ({"region": [0.3]}, "region must have shape"),
+    ({"flow": {"velocity_walk": 0.0}}, "velocity_walk must be"),
+    ({"flow": {"velocity_range": [5.0, 4.0]}}, "velocity_range must be a range"),
+    ({"flow": {"swing_range": [0.0, 0.2]}}, "world.flow has no 'swing_range'; there are mean_vel"),
 ])
 @pytest.mark.filterwarnings("ignore")
 def test_wrong_arguments_are_named(change, message):
     """A wrong argument is named before anything is computed."""
     with pytest.raises(ValueError, match=message):
-        gym.make(FLOW, **change)
+        gym.make(FLOW, world=change)
 
 
 def test_velocity_is_a_walk_that_turns_back():
-    """Up or down by the same step, within its range, which all of it is reached; other seeds, other walks."""
-    scenario = Pipe2DDriftingVelocity(velocity_range=(4.0, 5.0), scored_steps=400)
+    """Up or down by the same step, within its range, all of which it reaches; other seeds, other
+    walks."""
+    world = PIPE_2D_DRIFTING.changed({"flow": {"velocity_range": [4.0, 5.0]},
+                                      "schedule": {"scored_steps": 400}})
     walks = []
     for seed in range(3):
-        flow = scenario.draw_flow(np.random.default_rng(seed))
-        centre = np.array([flow(t).mean_velocity for t in range(1 - scenario.lead_in, scenario.n_steps + 1)])
-        np.testing.assert_allclose(np.abs(np.diff(centre)), 0.1, rtol=1e-9)
-        assert centre.min() == pytest.approx(4.0) and centre.max() == pytest.approx(5.0)
+        flow = world.flow.draw(world, np.random.default_rng(seed))
+        centre = np.array([flow(t).mean_velocity
+                           for t in range(1 - world.lead_in, world.n_steps + 1)])
+        np.testing.assert_allclose(np.abs(np.diff(centre)), WALK, rtol=1e-9)
+        assert centre.min() == pytest.approx(4.0)
+        assert centre.max() == pytest.approx(5.0)
         walks.append(centre)
-    assert (walks[0] != walks[1]).any() and (walks[1] != walks[2]).any()
+    assert (walks[0] != walks[1]).any()
+    assert (walks[1] != walks[2]).any()
 
 
-# -- the estimators ---------------------------------------------------------------------------------------------------
+# -- the estimators -------------------------------------------------------------------------------
 
 
 def test_tables_hold_between_their_velocities(env, shared):
-    """A(θ), the noise and dA/dθ at a velocity that is not tabulated against F(θ) itself, projected."""
-    task, model, tables = env.task, shared.model, JointTables(shared.model)
+    """A(θ), the noise and dA/dθ at a velocity that is not tabulated against F(θ) itself,
+    projected."""
+    task = env.task
+    model = shared.model
     theta = 0.5 * (model.velocities[6] + model.velocities[7])
     transport = task.transport.with_velocity(task.velocity.field([theta]))
     F, Y = transport.transition()
     weighted = mass_matrix(task.mesh) @ model.basis
-    A, slope, W = (part[0] for part in tables.at(np.array([theta])))
+    A, slope, W = (part[0] for part in JointTables(model).at(np.array([theta])))
     exact = weighted.T @ F @ model.basis
     assert np.linalg.norm(A - exact) < 2e-3 * np.linalg.norm(exact)
     nodal = task.evolution.state_noise_covariance(0.0, task.prior.nodal_std**2)
@@ -163,120 +204,154 @@ def test_tables_hold_between_their_velocities(env, shared):
     assert np.linalg.norm(W - exact) < 2e-3 * np.linalg.norm(exact)
     state = np.zeros(len(slope))
     state[:20] = np.random.default_rng(0).normal(size=20)
-    moved = transport.velocity_derivatives(model.basis @ state, (model.basis @ state)[transport.inlet], 0.0,
+    nodes = model.basis @ state
+    moved = transport.velocity_derivatives(nodes, nodes[transport.inlet], 0.0,
                                            task.velocity.directions)[1][:, 0]
-    assert np.linalg.norm(slope @ state - weighted.T @ moved) < 2e-2 * np.linalg.norm(weighted.T @ moved)
+    exact = weighted.T @ moved
+    assert np.linalg.norm(slope @ state - exact) < 2e-2 * np.linalg.norm(exact)
 
 
 def test_single_precision_is_enough(env, shared):
-    """Over an episode the operator's means differ from those of the same filter in double precision by 1e-4 at most."""
-    env.reset(seed=5)
-    operator, scenario = env.core._operator, env.scenario
+    """Over an episode the operator's means differ from those of the same filter in double precision
+    by 1e-4 at most."""
+    observation, _ = env.reset(seed=5)
+    operator = env.core._operator
+    world = env.world
     r = len(shared.model.initial)
-    mean, covariance = np.zeros((1, r + 1)), np.zeros((1, r + 1, r + 1))
-    mean[0, r], covariance[0, :r, :r], covariance[0, r, r] = 16.0, shared.model.initial, 1.0
-    double = joint_operator.ReducedJointFilter(JointTables(shared.model), mean, covariance, 0.1, (16.0 / 3, 32.0))
-    level, pairs = operator.levels[0], some_pairs()
-    steps = [(voltages, current) for voltages, current in zip(env.core._frames[0], scenario.currents, strict=True)]
-    for t in range(scenario.n_steps):
+    mean = np.zeros((1, r + 1))
+    mean[0, r] = 16.0
+    covariance = np.zeros((1, r + 1, r + 1))
+    covariance[0, :r, :r] = shared.model.initial
+    covariance[0, r, r] = 1.0
+    double = joint_operator.ReducedJointFilter(JointTables(shared.model), mean, covariance, WALK,
+                                               (16.0 / 3, 32.0))
+    level = operator.levels[0]
+    pairs = some_pairs()
+    steps = list(zip(observation["frame"], world.currents, strict=True))
+    for t in range(world.n_steps):
         if t >= 16:
             observation = env.step(int(pairs[t]))[0]
             steps.append((observation["voltages"], observation["currents"]))
         voltages, current = steps[t]
         std = shared.levels.noise_std(current @ level.resistance, 0.0)
         computed, std, matrix = level.observe(current, std)
+        residual = ((voltages - computed) / std)[None]
         double.predict()
-        double.update(matrix[None].astype(float), ((voltages - computed) / std)[None], np.ones((1, 16)))
-    estimate = operator.concentration[0] * (1.0 + double.mean[0, :-1] @ shared.model.basis.T)
-    np.testing.assert_allclose(operator.means()[0], estimate, rtol=1e-4)
-    np.testing.assert_allclose(operator.flow()[0][0, 0], double.mean[0, -1], rtol=1e-4)
-    np.testing.assert_allclose(operator.flow()[1][0, 0], np.sqrt(double.covariance[0, -1, -1]), rtol=1e-3)
+        double.update(matrix[None].astype(float), residual, np.ones((1, 16)))
+    beyond = double.mean[0, :-1] @ shared.model.basis.T
+    estimate = operator.concentration[0] * (1.0 + beyond)
+    np.testing.assert_allclose(env.core.estimate()[0][0], estimate, rtol=1e-4)
+    np.testing.assert_allclose(observation["velocity"][0], double.mean[0, -1], rtol=1e-4)
+    std = np.sqrt(double.covariance[0, -1, -1])
+    np.testing.assert_allclose(observation["velocity_std"][0], std, rtol=1e-3)
 
 
-def test_full_operator_is_the_joint_filter_of_the_baselines(monkeypatch):
-    """On the scenario's own cycle: the same concentration and velocity, if the baseline linearises about the level and
-    has the same bounds."""
+def test_full_operator_is_the_joint_filter_of_the_baselines():
+    """On the world's own cycle: the same concentration and velocity, if the baseline linearises
+    about the level and has the same bounds."""
     env = make("full", FLOW).unwrapped
-    scenario, task, pairs = env.scenario, env.task, electrode_pairs(16).tolist()
+    world = env.world
+    task = env.task
+    pairs = electrode_pairs(16).tolist()
     env.reset(seed=5)
-    operator, baseline = env.core._operator, load_baseline("joint_extended_kalman_filter")
-    module = __import__("sys").modules[baseline.estimator.__module__]
-    monkeypatch.setattr(module, "BOUNDS", joint_operator.BOUNDS)
-    estimator = baseline.estimator(task)
-    estimator.first.c_bh = level = operator.concentration[0]
+    spec = importlib.util.spec_from_file_location("joint", BASELINE)
+    baseline = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(baseline)
+    baseline.BOUNDS = joint_operator.BOUNDS
+    estimator = baseline.Estimator(task)
+    estimator.first.c_bh = level = env.core._operator.concentration[0]
     filter_ = estimator.start(level)
-    linear = LinearisedObservations(task.observation, task.noise, np.full(task.mesh.n_nodes, level))
-    for t, voltages in enumerate(cycle_voltages(scenario, recording(scenario, 5))):
-        current = scenario.currents[t % 16]
+    nodes = np.full(task.mesh.n_nodes, level)
+    linear = LinearisedObservations(task.observation, task.noise, nodes)
+    for t, voltages in enumerate(cycle_voltages(world, 5, recording(world, 5))):
+        current = world.currents[t % 16]
         filter_.predict()
         step = filter_.update(linear(voltages, current))
-        if t >= 16:
-            env.step(pairs.index([int(current.argmax()), int(current.argmin())]))
-            np.testing.assert_allclose(operator.means()[0], step.mean, rtol=1e-7)
-            np.testing.assert_allclose(operator.spreads()[0]**2, step.variance, rtol=1e-5, atol=1e-9)
-            velocity, std = (part[0] for part in operator.flow())
-            np.testing.assert_allclose(velocity, step.parameters, rtol=1e-7)
-            np.testing.assert_allclose(std**2, step.parameter_covariance.diagonal(), rtol=1e-6)
+        if t < 16:
+            continue
+        action = pairs.index([int(current.argmax()), int(current.argmin())])
+        seen = env.step(action)[0]
+        means, spreads = env.core.estimate()
+        np.testing.assert_allclose(means[0], step.mean, rtol=1e-7)
+        np.testing.assert_allclose(spreads[0]**2, step.variance, rtol=1e-5, atol=1e-9)
+        np.testing.assert_allclose(seen["velocity"], step.parameters, rtol=1e-7)
+        variance = step.parameter_covariance.diagonal()
+        np.testing.assert_allclose(seen["velocity_std"]**2, variance, rtol=1e-6)
 
 
 def test_observation_shows_the_velocity(env):
-    """Estimate and spread, last in the scaled observation; without a flow to estimate the layout is the old one."""
+    """Estimate and spread, last in the scaled observation; without a flow to estimate the layout is
+    the plain one."""
     observation, _ = env.reset(seed=3)
     for action in some_pairs()[:3]:
         observation = env.step(int(action))[0]
     (velocity,), (std,) = observation["velocity"], observation["velocity_std"]
     estimated, spread = env.core._operator.flow()
-    assert velocity == estimated[0, 0] > 0.0 and 0.0 < std == spread[0, 0] < 1.0
+    assert velocity == estimated[0, 0] > 0.0
+    assert 0.0 < std == spread[0, 0] < 1.0
     flat = scaled(env.rules, observation)
     np.testing.assert_allclose(flat[-2:], [2.0 * (velocity / 16.0 - 1.0), std], rtol=1e-6)
     plain = make("reduced", NAME, "scaled")
-    assert flat.shape == (plain.observation_space.shape[0] + 2,) and "velocity" not in make("reduced").observation_space
+    assert flat.shape == (plain.observation_space.shape[0] + 2,)
+    assert "velocity" not in make("reduced").observation_space.spaces
 
 
-# -- what a policy may believe ----------------------------------------------------------------------------------------
+# -- what a policy may believe --------------------------------------------------------------------
 
 
 def test_gains_are_of_errors_in_the_region(env):
-    """By how much a pair's measurement lowers the expected error over the region, or over what the fluid brings."""
+    """By how much a pair's measurement lowers the expected error over the region, or over what the
+    fluid brings."""
     belief = Belief(env.rules, env.reset(seed=3)[0])
     for action in some_pairs()[:4]:
         belief.see(env.step(int(action))[0])
-    predicted, weight = belief.predicted(), belief.foresight(3)
+    predicted = belief.predicted()
+    weight = belief.foresight(3)
     for pair in (3, 40, 101):
         after = belief.after(predicted, pair)
         gain = belief.gains(predicted)[0][pair]
-        assert gain == pytest.approx(belief.expected_error(predicted) - belief.expected_error(after), rel=1e-6)
-        total, changes = 0.0, predicted - after
+        lower = belief.expected_error(predicted) - belief.expected_error(after)
+        assert gain == pytest.approx(lower, rel=1e-6)
+        total = 0.0
+        changes = predicted - after
         for k in range(4):
             total += belief.expected_error(changes)
-            changes = belief._step(k + 1)[0] @ changes @ belief._step(k + 1)[0].T
-        assert belief.gains(predicted, weight=weight)[0][pair] == pytest.approx(total, rel=1e-6)
+            transition = belief._step(k + 1)[0]
+            changes = transition @ changes @ transition.T
+        foreseen = belief.gains(predicted, weight=weight)[0][pair]
+        assert foreseen == pytest.approx(total, rel=1e-6)
         assert gain <= total
 
 
 def test_told_the_truth_the_belief_moves_along_it(env, shared):
-    """The true states are those of the recording, projected, and the true velocity; steps are linear about them."""
+    """The true states are those of the recording, projected, and the true velocity; steps are
+    linear about them."""
     belief = Belief(env.rules, env.reset(seed=3)[0])
-    entries = recording(env.scenario, 3)
-    told = belief._operator.truth(entries)
-    truth = eitbench.simulate(env.scenario, 3)
-    middle = truth.velocity.max(axis=1)
-    np.testing.assert_allclose(told[:, -1], middle / np.abs(env.task.velocity.profiles).max(), rtol=1e-9)
-    nodal = belief._operator.concentration[0] * (1.0 + told[10, :-1] @ shared.model.basis.T)
-    sampled = truth.concentration[11][[int(np.linalg.norm(env.scenario.truth().transport.mesh.points - point, axis=1)
-                                           .argmin()) for point in env.task.mesh.points[500:1000:50]]]
-    np.testing.assert_allclose(nodal[500:1000:50], sampled, atol=3.0)
+    operator = belief._operator
+    entries = recording(env.world, 3)
+    told = operator.truth(entries)
+    truth = eitbench.simulate(env.world, 3)
+    middle = truth.velocity.max(axis=1) / np.abs(env.task.velocity.profiles).max()
+    np.testing.assert_allclose(told[:, -1], middle, rtol=1e-9)
+    nodal = operator.concentration[0] * (1.0 + told[10, :-1] @ shared.model.basis.T)
+    points = env.world.truth().transport.mesh.points
+    nearest = [int(np.linalg.norm(points - point, axis=1).argmin())
+               for point in env.task.mesh.points[500:1000:50]]
+    np.testing.assert_allclose(nodal[500:1000:50], truth.concentration[11][nearest], atol=3.0)
     belief.told(entries[15:])
-    transition, noise = joint_step(shared.tables, told[17:18], 0.1**2)
+    transition, noise = joint_step(shared.tables, told[17:18], WALK**2)
     np.testing.assert_allclose(belief._step(2)[0], transition[0], rtol=1e-12)
     np.testing.assert_allclose(belief._step(2)[1], noise[0], rtol=1e-12)
 
 
 def test_foresight_ends_with_the_episode(env):
-    """Whoever is told the truth: after the last injection nothing is left to do harm, before it one step is."""
-    belief, entries = Belief(env.rules, env.reset(seed=3)[0]), recording(env.scenario, 3)
-    belief.told(entries[15:])
+    """Whoever is told the truth: after the last injection nothing is left to do harm, before it one
+    step is."""
+    belief = Belief(env.rules, env.reset(seed=3)[0])
+    belief.told(recording(env.world, 3)[15:])
     last = env.core.length - 1
-    np.testing.assert_array_equal(belief.foresight(4, last), belief.foresight(0, last))
-    np.testing.assert_array_equal(belief.foresight(4, last - 1), belief.foresight(1, last - 1))
-    assert (belief.foresight(1, last - 1) != belief.foresight(0, last - 1)).any()
+    nothing = belief.foresight(0, last)
+    np.testing.assert_array_equal(belief.foresight(4, last), nothing)
+    one = belief.foresight(1, last - 1)
+    np.testing.assert_array_equal(belief.foresight(4, last - 1), one)
+    assert (one != belief.foresight(0, last - 1)).any()

@@ -3,19 +3,23 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from choosing import BUDGET, CURRENTS, FAULTS, make, play, some_pairs
+from choosing import BUDGET, CURRENTS, FAULTS, NAME, make, play, some_pairs
 
 from eitbench.envs.injection_core import Rules
 from eitbench.estimation.onboard.operator import electrode_pairs
-from eitbench.worlds import Pipe2D
+from eitbench.worlds import entry
 from eitbench.worlds.instrument import Faults, Instrument
+from eitbench.worlds.pipe2d import PIPE_2D
 
 
 @pytest.mark.parametrize(("limit", "order"), [("L1", 1), ("L2", 2), ("Linf", np.inf)])
 def test_currents_are_projected(limit, order):
-    """They sum to zero; those within the limit are only centred, those beyond it scaled onto a pair's norm."""
-    rules = Rules(Pipe2D(), limit=limit)
-    free = np.random.default_rng(0).uniform(-1.0, 1.0, (50, 16)) * np.geomspace(0.01, 1.0, 50)[:, None]
+    """They sum to zero; those within the limit are only centred, others scaled onto a pair's
+    norm."""
+    rules = Rules(PIPE_2D.changed({"instrument": {"limit": limit}}))
+    assert rules.limit == limit
+    free = np.random.default_rng(0).uniform(-1.0, 1.0, (50, 16))
+    free *= np.geomspace(0.01, 1.0, 50)[:, None]
     currents = rules.currents(free)
     np.testing.assert_allclose(currents.sum(axis=1), 0.0, atol=1e-15)
     pair = np.linalg.norm(np.array([0.1, -0.1]), order)
@@ -25,12 +29,13 @@ def test_currents_are_projected(limit, order):
     assert 0 < within.sum() < 50
     np.testing.assert_allclose(currents[within], centred[within], rtol=1e-12)
     np.testing.assert_allclose(size[~within], pair, rtol=1e-12)
-    np.testing.assert_allclose(np.cross(currents[~within][:, :3], centred[~within][:, :3]), 0.0, atol=1e-15)
+    across = np.cross(currents[~within][:, :3], centred[~within][:, :3])
+    np.testing.assert_allclose(across, 0.0, atol=1e-15)
 
 
 def test_a_pair_and_its_currents_are_the_same():
-    """The world with currents contains the one with pairs: the same voltages, innovations and estimate."""
-    pair = make("reduced", noise_floor=2e-4)
+    """The world with currents contains the one with pairs: the same voltages and estimate."""
+    pair = make("reduced", longer={"instrument": {"noise_floor": 2e-4}})
     free = make("reduced", CURRENTS)
     for env in (pair, free):
         env.reset(seed=2)
@@ -43,77 +48,168 @@ def test_a_pair_and_its_currents_are_the_same():
 
 
 def test_budget_is_spent_and_then_nothing_flows():
-    """Only injections count; without one, or beyond the budget, nothing is learnt and uncertainty grows."""
-    env = make("reduced", BUDGET, budget=2, longer={"scored_steps": 8})
+    """Only injections count; without one, or beyond the budget, nothing is learnt."""
+    env = make("reduced", BUDGET, longer={"schedule": {"scored_steps": 8, "budget": 2}})
     observation, _ = env.reset(seed=1)
     left = [observation["left"][1]]
     for action in (120, 7, 120, 33, 40, 41):
-        before, (observation, *_) = observation, env.step(action)
+        before = observation
+        observation = env.step(action)[0]
         left.append(observation["left"][1])
         flowed = action != 120 and left[-2] > 0
-        assert observation["currents"].any() == flowed and observation["voltages"].any() == flowed
-        assert observation["innovations"].any() == flowed
+        for key in ("currents", "voltages", "innovations"):
+            assert observation[key].any() == flowed
         if not flowed:
             assert observation["std"].sum() > before["std"].sum()
         masks = env.unwrapped.action_masks()
-        assert masks[120] and (masks[:120] == (left[-1] > 0)).all()
+        assert masks[120]
+        assert (masks[:120] == (left[-1] > 0)).all()
     assert left == [2, 2, 1, 1, 0, 0, 0]
+    assert env.unwrapped.core.spent == [2]
+
+
+@pytest.mark.parametrize("budget", [0, 1, 3, 7])
+@pytest.mark.parametrize("estimator", ["none", "reduced"])
+def test_a_spaced_budget_is_spent_exactly(estimator, budget):
+    """Whether there is a first frame or none: over the agent's own steps, evenly, the last at the
+    end."""
+    env = make(estimator, BUDGET, longer={"schedule": {"scored_steps": 8, "budget": budget}})
+    rules = env.unwrapped.rules
+    assert rules.has_frame == (estimator != "none")
+    observation, _ = env.reset(seed=1)
+    over = False
+    when = []
+    steps = 0
+    while not over:
+        now = rules.spaced(observation["left"])
+        observation, _, over, *_ = env.step(rules.action(7 if now else None))
+        assert observation["currents"].any() == now
+        steps += 1
+        when += [steps] * now
+    assert steps == env.unwrapped.world.n_steps - 16 * rules.has_frame
+    assert len(when) == budget == env.unwrapped.core.spent
+    gaps = np.diff([0, *when])
+    if budget:
+        assert when[-1] == steps
+        assert gaps.max() - gaps.min() <= 1
+
+
+def test_without_a_budget_each_step_injects():
+    """And to inject nothing is no action."""
+    rules = Rules(PIPE_2D)
+    assert all(rules.spaced(np.array([left])) for left in range(96, 0, -1))
+    assert len(rules.table) == 120
+    with pytest.raises(ValueError, match="pair must be a number"):
+        rules.action(None)
+
+
+def test_rules_are_the_worlds():
+    """What was found by search is kept under the world's name, its faults and its budget."""
+    for id, name in ((NAME, "Pipe2D"), (CURRENTS, "Pipe2D"), (FAULTS, "Pipe2D with faults"),
+                     (BUDGET, "Pipe2DIntermittent with a budget")):
+        registered = entry(id)
+        rules = Rules(registered.world)
+        assert rules.name == name
+        assert rules.instrument is registered.world.instrument
+        assert rules.gate == np.inf
+        assert registered.settings.get("gate") == (8.0 if id == FAULTS else None)
+    assert make("none", FAULTS).unwrapped.rules.gate == 8.0
+    assert make("none", FAULTS, gate=3.0).unwrapped.rules.gate == 3.0
+    assert make("none", NAME).unwrapped.rules.gate == np.inf
 
 
 def test_dead_electrodes_read_nothing_and_carry_nothing():
-    """A broken wire reads interference; what would have to pass it does not flow; all else is 𝓡 I."""
+    """A broken wire reads interference; what would have to pass it does not flow; all else is 𝓡
+    I."""
     instrument = Instrument(dead=(3, 3), failing=(2, 2), loose=(2, 2), interference=0.5)
+    noise = instrument.noise
+    assert noise == PIPE_2D.noise
     rng = np.random.default_rng(0)
     faults = instrument.draw(rng, 16, 50)
     broken = faults.broken_from
-    assert (broken == 0).sum() == 3 and ((broken > 0) & (broken <= 50)).sum() == 2
+    assert (broken == 0).sum() == 3
+    assert ((broken > 0) & (broken <= 50)).sum() == 2
     assert (faults.resistance > 0).sum() == 2
     assert not ((faults.resistance > 0) & (broken <= 50)).any()
     root = rng.normal(size=(16, 16))
-    R, noise = root @ root.T, Pipe2D().noise
+    R = root @ root.T
     stacked = Faults(*(part[None] for part in faults))
-    zero, draws = np.zeros((1, 16)), rng.normal(size=(1, 16))
+    zero = np.zeros((1, 16))
+    draws = rng.normal(size=(1, 16))
+
+    def read(t, currents, draws):
+        return instrument.measure(stacked, t, R[None], currents, draws)[0]
+
     sound = np.flatnonzero(broken > 50)
     i, j = sound[:2]
     currents = np.zeros((1, 16))
     currents[0, [i, j]] = 0.1, -0.1
     wanted = R @ currents[0] + faults.resistance * currents[0]
-    read = instrument.measure(stacked, 50, noise, R[None], currents, zero)[0]
-    np.testing.assert_allclose(read[sound], wanted[sound], rtol=1e-14)
-    assert not read[broken <= 50].any()
-    noisy = instrument.measure(stacked, 50, noise, R[None], currents, draws)[0]
+    clean = read(50, currents, zero)
+    np.testing.assert_allclose(clean[sound], wanted[sound], rtol=1e-14)
+    assert not clean[broken <= 50].any()
+    noisy = read(50, currents, draws)
     np.testing.assert_allclose(noisy[broken <= 50], 0.5 * draws[0, broken <= 50])
-    np.testing.assert_allclose((noisy - read)[sound], (noise.std(wanted) * faults.noise_factor * draws[0])[sound])
+    added = noise.std(wanted) * faults.noise_factor * draws[0]
+    np.testing.assert_allclose((noisy - clean)[sound], added[sound])
     late = int(np.flatnonzero((broken > 0) & (broken <= 50))[0])
     currents[0] = 0.0
     currents[0, [i, late]] = 0.1, -0.1
-    assert instrument.measure(stacked, broken[late] - 1, noise, R[None], currents, zero)[0, i] != 0.0
-    assert not instrument.measure(stacked, broken[late], noise, R[None], currents, zero).any()
+    assert read(broken[late] - 1, currents, zero)[i] != 0.0
+    assert not read(broken[late], currents, zero).any()
+
+
+def test_a_floor_adds_to_the_noise():
+    """Independent of what is read, and so in quadrature; where nothing flows it is all there is."""
+    rng = np.random.default_rng(1)
+    instrument = Instrument(noise_floor=2e-3)
+    root = rng.normal(size=(16, 16))
+    R = root @ root.T
+    currents = np.zeros((3, 16))
+    currents[:2, [0, 5]] = 0.1, -0.1
+    draws = rng.normal(size=(3, 16))
+    steps = np.arange(1, 4)
+    none = Faults.none(16)
+    read = instrument.measure(none, steps, np.repeat(R[None], 3, axis=0), currents, draws)
+    clean = currents @ R
+    std = np.hypot(instrument.noise.std(clean), 2e-3)
+    np.testing.assert_allclose(read, clean + std * draws, rtol=1e-12)
+    np.testing.assert_allclose(read[2], 2e-3 * draws[2], rtol=1e-12)
+    np.testing.assert_allclose(instrument.believed_noise.std(clean), std, rtol=1e-12)
 
 
 def test_faults_depend_on_the_seed_alone_and_are_shown_by_doubt():
-    """The same seed has the same faults; electrodes in doubt after a while of injections are those with a fault."""
-    env = make("reduced", FAULTS, dead=[3, 3], failing=[0, 0], loose=[0, 0], longer={"scored_steps": 24})
+    """The same seed has the same faults; electrodes in doubt after a while are those with a
+    fault."""
+    faults = {"dead": [3, 3], "failing": [0, 0], "loose": [0, 0]}
+    longer = {"instrument": faults, "schedule": {"scored_steps": 24}}
+    env = make("reduced", FAULTS, longer=longer)
     base = env.unwrapped
     steps = play(env, 4, some_pairs())
-    broken = np.flatnonzero(base._core._faults.broken_from[0] == 0)
+    broken = np.flatnonzero(base.core.faults.broken_from[0] == 0)
     again = play(env, 4, some_pairs())
-    assert all((a[0]["voltages"] == b[0]["voltages"]).all() for a, b in zip(steps, again, strict=True))
-    assert set(np.flatnonzero(steps[-1][0]["doubt"][0] > 0.5)) <= set(broken)
-    assert len(broken) == 3 and steps[-1][0]["doubt"][0][broken].mean() > 0.3
+    for (one, *_), (other, *_) in zip(steps, again, strict=True):
+        np.testing.assert_array_equal(one["voltages"], other["voltages"])
+    doubt = steps[-1][0]["doubt"][0]
+    assert set(np.flatnonzero(doubt > 0.5)) <= set(broken)
+    assert len(broken) == 3
+    assert doubt[broken].mean() > 0.3
     env.reset(seed=5)
-    assert set(np.flatnonzero(base._core._faults.broken_from[0] == 0)) != set(broken)
+    assert set(np.flatnonzero(base.core.faults.broken_from[0] == 0)) != set(broken)
 
 
 @pytest.mark.parametrize(("name", "change", "message"), [
-    (FAULTS, {"dead": [3, 2]}, "dead must be a range least ≤ most"), (FAULTS, {"failing": [1]}, "failing must be a"),
-    (FAULTS, {"loose": [0, 12]}, "must leave two electrodes sound, got up to 18 of 16"),
-    (FAULTS, {"scenario": {"electrodes_per_wall": 2}}, "must leave two electrodes sound, got up to 8 of 4"),
-    (FAULTS, {"dead": 3}, r"dead must be a range \(least, most\), got 3"),
-    (FAULTS, {"loose": "01"}, r"loose must be a range \(least, most\), got '01'"),
-    (BUDGET, {"budget": -1}, "budget must be"),
+    (FAULTS, {"instrument": {"dead": [3, 2]}}, "dead must be a range least ≤ most"),
+    (FAULTS, {"instrument": {"failing": [1]}}, "failing must be a"),
+    (FAULTS, {"instrument": {"loose": [0, 12]}},
+     "must leave two electrodes sound, got up to 18 of 16"),
+    (FAULTS, {"vessel": {"electrodes_per_wall": 2}},
+     "must leave two electrodes sound, got up to 8 of 4"),
+    (FAULTS, {"instrument": {"dead": 3}}, r"dead must be a range \(least, most\), got 3"),
+    (FAULTS, {"instrument": {"loose": "01"}}, r"loose must be a range \(least, most\), got '01'"),
+    (BUDGET, {"schedule": {"budget": -1}}, "budget must be"),
 ])
 def test_wrong_rules_are_named(name, change, message):
     """Of faults and budgets too."""
     with pytest.raises(ValueError, match=message):
-        gym.make(name, **change)
+        gym.make(name, world=change)

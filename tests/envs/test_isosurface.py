@@ -22,7 +22,8 @@ def test_surface_of_a_linear_function_is_a_plane(direction):
     triangles = isosurface(MESH, values, level)
     np.testing.assert_allclose(triangles @ direction, level, atol=1e-12)
     if direction[2] == 1.0:
-        assert area(triangles) == pytest.approx(0.5 * 48 * np.sin(2 * np.pi / 48), rel=1e-9)       # of the 48-gon
+        polygon = 0.5 * 48 * np.sin(2 * np.pi / 48)
+        assert area(triangles) == pytest.approx(polygon, rel=1e-9)
 
 
 def test_surface_of_a_distance_is_a_sphere():

@@ -8,21 +8,22 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+from estimating import ESTIMATION, PIPE
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
-from short import PIPE as FIELDS
-from short import kind, short
+from short import PIPE as CHANGES
+from short import PLAIN, short
 
-import eitbench  # noqa: F401 (registers)
-from eitbench.data.episodes import CACHE_VARIABLE, simulate
-from eitbench.envs import ESTIMATION, estimation
-from eitbench.worlds import Pipe2D
+from eitbench.data.episodes import simulate
+from eitbench.data.store import CACHE_VARIABLE
+from eitbench.envs import estimation, estimation_vector
+from eitbench.worlds import entry
+from eitbench.worlds.pipe2d import PIPE_2D
 from eitbench.worlds.task import lag_steps
 
-LAGS = [name for name in ESTIMATION if kind(name) == "Pipe2D"]
-"""The plain pipe with its three lags; what does not depend on the scenario is tested on these."""
-PIPE = LAGS[0]
-TINY = Pipe2D(**FIELDS)
+LAGS = [name for name in PLAIN if name in ESTIMATION]
+"""The plain pipe with its three lags; what does not depend on the world is tested on these."""
+TINY = PIPE_2D.changed(CHANGES)
 """Seven measurements, of which five are scored."""
 
 
@@ -35,7 +36,7 @@ def cache(tmp_path_factory):
 
 
 def make(name=PIPE, num_envs=3, mode="vector_entry_point", **kwargs):
-    """The vectorised environment on the id's short scenario, with three training episodes."""
+    """The vectorised environment on the id's short world, with three training episodes."""
     return gym.make_vec(name, num_envs=num_envs, vectorization_mode=mode,
                         **short(name) | {"episodes": 3} | kwargs)
 
@@ -44,15 +45,19 @@ def actions_for(envs, steps, seed=0):
     """Meaningless estimates: near the background, at it, and anywhere in the action space."""
     rng = np.random.default_rng(seed)
     shape = envs.action_space.shape
-    near, anywhere = 30.0 + rng.normal(size=(steps, *shape)), rng.uniform(-250.0, 250.0, (steps, *shape))
-    return np.choose(rng.integers(0, 3, (steps, shape[0], 1)), [near, np.full((steps, *shape), 30.0), anywhere])
+    near = 30.0 + rng.normal(size=(steps, *shape))
+    anywhere = rng.uniform(-250.0, 250.0, (steps, *shape))
+    background = np.full((steps, *shape), 30.0)
+    return np.choose(rng.integers(0, 3, (steps, shape[0], 1)), [near, background, anywhere])
 
 
 def play(envs, actions, **how):
-    """(observation, rewards, terminations, truncations, infos) of a reset and of every step after it."""
+    """(observation, rewards, terminations, truncations, infos) of a reset and of every step after
+    it."""
     observation, info = envs.reset(**how)
     nothing = np.zeros(envs.num_envs)
-    return [(observation, nothing, nothing != 0, nothing != 0, info), *(envs.step(action) for action in actions)]
+    first = observation, nothing, nothing != 0, nothing != 0, info
+    return [first, *(envs.step(action) for action in actions)]
 
 
 def assert_same_array(one, other):
@@ -78,31 +83,40 @@ def assert_same_play(one, other):
 @pytest.mark.parametrize("num_envs", [1, 5])
 @pytest.mark.parametrize("name", ESTIMATION)
 def test_same_as_so_many_scalar_environments(name, num_envs):
-    """Over three whole episodes, of which the last two begin by themselves, it is gymnasium's SyncVectorEnv."""
-    mine, sync = make(name, num_envs), make(name, num_envs, "sync")
-    assert type(mine.unwrapped).__name__ == f"{kind(name)}VectorEnv"
+    """Over three whole episodes, of which two begin by themselves, it is gymnasium's
+    SyncVectorEnv."""
+    mine = make(name, num_envs)
+    sync = make(name, num_envs, "sync")
+    assert isinstance(mine.unwrapped, estimation_vector.EstimationVectorEnv)
     assert mine.single_observation_space == sync.single_observation_space
     assert mine.single_action_space == sync.single_action_space
-    assert mine.observation_space == sync.observation_space and mine.action_space == sync.action_space
-    assert mine.metadata["autoreset_mode"] == sync.metadata["autoreset_mode"] == AutoresetMode.NEXT_STEP
-    scenario = mine.unwrapped.scenario
-    length = scenario.n_steps + lag_steps(scenario, ESTIMATION[name][1].get("lag", 0))
+    assert mine.observation_space == sync.observation_space
+    assert mine.action_space == sync.action_space
+    assert mine.metadata["autoreset_mode"] == AutoresetMode.NEXT_STEP
+    assert sync.metadata["autoreset_mode"] == AutoresetMode.NEXT_STEP
+    world = mine.unwrapped.world
+    length = world.n_steps + lag_steps(world, entry(name).settings.get("lag", 0))
     actions = actions_for(mine, 3 * (length + 1) + 2)
-    ours, theirs = play(mine, actions, seed=1), play(sync, actions, seed=1)
-    assert_same_play(ours, theirs)
+    ours = play(mine, actions, seed=1)
+    assert_same_play(ours, play(sync, actions, seed=1))
     ends = [i for i, step in enumerate(ours) if step[2].all()]
-    assert ends == [length, 2 * length + 1, 3 * length + 2] and sum(step[2].any() for step in ours) == 3
+    assert ends == [length, 2 * length + 1, 3 * length + 2]
+    assert sum(step[2].any() for step in ours) == 3
     scored = [i for i, step in enumerate(ours[:ends[-1] + 1]) if step[1].all()]
-    assert len(scored) == 3 * scenario.scored_steps and max(step[1].max() for step in ours) == 0.0
+    assert len(scored) == 3 * world.schedule.scored_steps
+    assert max(step[1].max() for step in ours) == 0.0
     seen = len({step[0]["voltages"][0, 0] for step in ours})
-    assert num_envs == 1 or seen > scenario.n_steps                                                 # other episodes
+    assert num_envs == 1 or seen > world.n_steps                             # other episodes
 
 
 @pytest.mark.parametrize("name", LAGS)
 def test_later_resets_are_those_of_scalar_environments(name):
-    """Sequences of seeds of any kind, with gaps that are drawn, resets in mid-episode, and resets by no seed."""
-    mine, sync = make(name), make(name, mode="sync")
-    for k, seed in enumerate(([4, 0, 9], None, [None, 7, None], 2, None, (1, 1, None), np.int64(5))):
+    """Sequences of seeds of any kind, with gaps that are drawn, resets in mid-episode or by no
+    seed."""
+    mine = make(name)
+    sync = make(name, mode="sync")
+    seeds = [4, 0, 9], None, [None, 7, None], 2, None, (1, 1, None), np.int64(5)
+    for k, seed in enumerate(seeds):
         actions = actions_for(mine, 2 + 9 * (k % 2), seed=k)
         theirs = int(seed) if isinstance(seed, np.int64) else seed
         assert_same_play(play(mine, actions, seed=seed), play(sync, actions, seed=theirs))
@@ -120,7 +134,7 @@ def test_seed_names_the_episode():
 
 
 def test_without_a_seed_training_episodes_are_drawn():
-    """Never anything but the first ``episodes`` ones, each of them at some time, environments apart from each other."""
+    """Never anything but the first ``episodes``, each of them at some time, environments apart."""
     envs = make(num_envs=4)
     first = [simulate(TINY, number).voltages(1, TINY.currents[0], TINY) for number in range(3)]
     drawn = []
@@ -129,7 +143,7 @@ def test_without_a_seed_training_episodes_are_drawn():
         near = [[np.allclose(row, one, rtol=1e-12) for one in first] for row in voltages]
         assert np.sum(near) == 4
         drawn.append([row.index(True) for row in near])
-    assert {number for row in drawn for number in row} == {0, 1, 2}     # missed by chance once in 10⁸ runs
+    assert {number for row in drawn for number in row} == {0, 1, 2}     # but once in 10⁸ runs
     assert len(set(zip(*drawn, strict=True))) > 1
 
 
@@ -139,13 +153,15 @@ def test_observations_are_fresh_and_within_their_space(name):
     envs = make(name)
     actions = actions_for(envs, 30)
     untouched = play(envs, actions, seed=1)
-    given = [array for step in untouched[1:] for array in (*step[0].values(), *step[1:4], *step[4].values())]
-    given += [*untouched[0][0].values(), *untouched[0][4].values()]
+    given = [*untouched[0][0].values(), *untouched[0][4].values()]
+    for step in untouched[1:]:
+        given += [*step[0].values(), *step[1:4], *step[4].values()]
     assert not any(np.shares_memory(*pair) for pair in combinations(given, 2))
     for step in untouched:
         assert envs.observation_space.contains(step[0])
         for k in range(3):
-            assert envs.single_observation_space.contains({key: array[k] for key, array in step[0].items()})
+            one = {key: array[k] for key, array in step[0].items()}
+            assert envs.single_observation_space.contains(one)
     step = envs.reset(seed=1)
     for action, expected in zip(actions, untouched[1:], strict=True):
         for array in (*step[0].values(), *step[1:-1], *step[-1].values()):
@@ -171,58 +187,70 @@ def test_actions_are_left_alone():
 
 @pytest.mark.parametrize("name", ESTIMATION)
 def test_made_again_from_its_specification(name):
-    """From its own EnvSpec, through JSON, from that of the scalar environment, or pickled: the same play."""
+    """From its own EnvSpec, through JSON, from that of the scalar environment, or pickled."""
     envs = make(name)
     actions = actions_for(envs, 20)
     played = play(envs, actions, seed=1)
     scalar = gym.make(name, **short(name) | {"episodes": 3}).spec
-    copies = [gym.make_vec(envs.spec), gym.make_vec(EnvSpec.from_json(envs.spec.to_json())),
+    through_json = EnvSpec.from_json(envs.spec.to_json())
+    copies = [gym.make_vec(envs.spec), gym.make_vec(through_json),
               gym.make_vec(scalar, num_envs=3), pickle.loads(pickle.dumps(envs))]
     for again in copies:
-        assert type(again.unwrapped) is type(envs.unwrapped) and again.num_envs == 3
+        assert type(again.unwrapped) is type(envs.unwrapped)
+        assert again.num_envs == 3
         assert_same_play(play(again, actions, seed=1), played)
 
 
 def test_pickled_in_mid_episode_goes_on():
-    """A copy made between two steps, and the next episodes that it draws, are those of the original."""
+    """A copy made between two steps, and the episodes that it draws next, are the original's."""
     envs = make()
     actions = actions_for(envs, 24)
     play(envs, actions[:3], seed=3)
     copy = pickle.loads(pickle.dumps(envs))
-    assert_same_play([copy.step(action) for action in actions[3:]], [envs.step(action) for action in actions[3:]])
+    later = [copy.step(action) for action in actions[3:]]
+    assert_same_play(later, [envs.step(action) for action in actions[3:]])
 
 
-# -- mistakes ---------------------------------------------------------------------------------------------------------
+# -- mistakes -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("change", "message"), [
-    ({"num_envs": 0}, "num_envs must be an integer of at least 1, got 0"), ({"num_envs": 2.0}, "num_envs must be"),
-    ({"episodes": 0}, "episodes must be"), ({"lag": 7}, "lag must be an integer of at least 0 and at most 6, got 7"),
-    ({"lag": "some"}, "lag must be 'all' or"), ({"assumed_mean_velocity": -1.0}, "assumed_mean_velocity must be"),
-    ({"assumed_mean_velocity": "fast"}, "assumed_mean_velocity must be a number in m/s, got 'fast'"),
-    ({"scenario": {"colour": 1}}, "scenario has no field 'colour'"), ({"scenario": {"frame": 0}}, "frame must be"),
+    ({"num_envs": 0}, "num_envs must be an integer of at least 1, got 0"),
+    ({"num_envs": 2.0}, "num_envs must be"),
+    ({"episodes": 0}, "episodes must be"),
+    ({"lag": 7}, "lag must be an integer of at least 0 and at most 6, got 7"),
+    ({"lag": "some"}, "lag must be 'all' or"),
+    ({"assume": {"mean_velocity": -1.0}}, "assume.mean_velocity must be"),
+    ({"assume": {"mean_velocity": "fast"}},
+     "assume.mean_velocity must be a number in m/s, got 'fast'"),
+    ({"world": {"colour": 1}}, "world has no 'colour'"),
+    ({"world": {"schedule": {"pattern": {"frame": 0}}}}, "frame must be"),
 ])
 def test_wrong_arguments_are_named(change, message):
-    """What the scalar environment refuses is refused here, and a number of environments that is none."""
+    """What the scalar environment refuses is refused here, and a number of environments that is
+    none."""
     with pytest.raises(ValueError, match=message):
         make(**change)
 
 
 def test_what_estimators_believe_changes_nothing():
-    """A sensible ``assumed_mean_velocity`` is taken, and the play is the same."""
-    one, other = make(), make(assumed_mean_velocity=40.0)
+    """A sensible ``assume`` is taken, and the play is the same."""
+    one = make()
+    other = make(assume={"mean_velocity": 40.0})
     actions = actions_for(one, 7)
     assert_same_play(play(one, actions, seed=1), play(other, actions, seed=1))
 
 
 @pytest.mark.parametrize("seed", [[], [1, 2], [1, 2, 3, 4], np.arange(2)])
 def test_wrong_number_of_seeds_is_named(seed):
-    """One for each environment, or one integer for all; the episode that was being played goes on."""
+    """One for each environment, or one integer for all; the episode that was being played goes
+    on."""
     envs = make()
     actions = actions_for(envs, 3)
     played = play(envs, actions, seed=1)
     envs.reset(seed=1)
-    with pytest.raises(ValueError, match=rf"seed must be an integer or a list of 3, got {len(seed)} entries"):
+    message = rf"seed must be an integer or a list of 3, got {len(seed)} entries"
+    with pytest.raises(ValueError, match=message):
         envs.reset(seed=seed)
     assert_same_play([envs.step(action) for action in actions], played[1:])
 
@@ -255,12 +283,14 @@ LARGE[2, 7] = -250.1
     (np.zeros(1701), r"action must have shape \(3, 1701\), got \(1701,\)"),
     (np.zeros((2, 1701)), r"action must have shape \(3, 1701\), got \(2, 1701\)"),
     (np.zeros((1701, 3)), r"action must have shape \(3, 1701\), got \(1701, 3\)"),
-    (BAD, r"action must be finite in mol/m³, got 1 entries that are not, the first at index \(1, 5\)"),
-    (LARGE, "action must lie within ±250 mol/m³, got 250.1"), (-np.inf * np.ones((3, 1701)), "action must be finite"),
-    ("thirty", "action must be an array of numbers"), (None, "action must have shape"),
+    (BAD, r"action must be finite in mol/m³, got 1 entries that are not, .* index \(1, 5\)"),
+    (LARGE, "action must lie within ±250 mol/m³, got 250.1"),
+    (-np.inf * np.ones((3, 1701)), "action must be finite"),
+    ("thirty", "action must be an array of numbers"),
+    (None, "action must have shape"),
 ])
 def test_wrong_actions_are_named_and_change_nothing(action, message):
-    """Refused with what came and what was expected; the step can then be taken with a better one."""
+    """Refused with what came and what was expected; a better one can then be tried."""
     envs = make()
     actions = actions_for(envs, 7)
     played = play(envs, actions, seed=1)
@@ -277,7 +307,8 @@ def test_wrong_actions_are_named_and_change_nothing(action, message):
 def test_actions_of_any_kind_of_number_count(kind):
     """A network's single precision, lists and any memory layout are the same estimates."""
     envs = make()
-    estimates = np.random.default_rng(5).uniform(20.0, 40.0, (3, 1701)).astype(np.float32).astype(float)
+    drawn = np.random.default_rng(5).uniform(20.0, 40.0, (3, 1701))
+    estimates = drawn.astype(np.float32).astype(float)
     given = {"float32": estimates.astype(np.float32), "list": estimates.tolist(),
              "Fortran": np.asfortranarray(estimates), "read-only": estimates.copy()}[kind]
     if kind == "read-only":
@@ -287,7 +318,8 @@ def test_actions_of_any_kind_of_number_count(kind):
     assert plain[-1][1].all()
 
 
-@pytest.mark.parametrize("seed", [1.5, True, [1.7, 2, 3], [True, False, True], np.array([1.5, 2.0, 3.0]), "ab"])
+@pytest.mark.parametrize("seed", [1.5, True, [1.7, 2, 3], [True, False, True],
+                                  np.array([1.5, 2.0, 3.0]), "ab"])
 def test_seeds_that_would_be_cast_are_refused(seed):
     """As the scalar environment refuses them."""
     with pytest.raises(ValueError, match="seed must be"):
@@ -298,14 +330,17 @@ def test_seeds_that_would_be_cast_are_refused(seed):
 def test_wrong_arguments_are_named_before_anything_is_computed(change, monkeypatch):
     """No mesh is built to find out that lag is wrong."""
     monkeypatch.setattr(estimation, "outline", None)
+    monkeypatch.setattr(estimation_vector, "outline", None)
+    asked = {"num_envs": 2, "world": {"flow": {"mean_velocity": 44.0}}} | change
     with pytest.raises(ValueError, match=f"{next(iter(change))} must be"):
-        gym.make_vec("eitbench/Pipe2D-v0", **{"num_envs": 2, "scenario": {"mean_velocity": 44.0}} | change)
+        gym.make_vec(PIPE, **asked)
 
 
-@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="counts open files where Linux lists them")
+@pytest.mark.skipif(not Path("/proc/self/fd").exists(),
+                    reason="counts open files where Linux lists them")
 def test_environments_keep_no_files_open():
     """There may be more environments than files that a process may open."""
-    envs = gym.make_vec("eitbench/Pipe2D-v0", num_envs=12, scenario=FIELDS)
+    envs = gym.make_vec(PIPE, num_envs=12, world=CHANGES)
     before = len(os.listdir("/proc/self/fd"))
     envs.reset(seed=1)
     assert len(os.listdir("/proc/self/fd")) == before

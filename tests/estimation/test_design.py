@@ -1,5 +1,7 @@
 """What an injection teaches, for all pairs at once, against the textbook's update for each."""
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -10,15 +12,17 @@ from eitbench.estimation import LinearisedObservations, kalman_filter, table_5_1
 from eitbench.estimation.design import independent_rows, pair_gains, pair_tables
 from eitbench.estimation.onboard.operator import electrode_pairs
 from eitbench.numerics.fem import mass_matrix
-from eitbench.physics.flow import PlaneChannelFlow
-from eitbench.worlds import Pipe2D
+from eitbench.numerics.mesh import rectangle_mesh
+from eitbench.worlds.pipe2d import PIPE_2D
+from eitbench.worlds.vessels import PlanePipe
 
 L, N = 5, 9
 PAIRS = electrode_pairs(L)
 
 
 def a_state(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Derivatives of 𝓡 (L, L, n), covariance, weight of the errors, noise variances (pairs, L); all at random."""
+    """Derivatives of 𝓡 (L, L, n), covariance, weight of the errors, noise variances (pairs, L); all
+    at random."""
     rng = np.random.default_rng(seed)
     roots = rng.normal(size=(2, N, N))
     covariance, weight = roots @ roots.swapaxes(1, 2)
@@ -27,8 +31,10 @@ def a_state(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
 
 def gains_of(derivative, covariance, weight, noise_variance):
     rows = derivative.reshape(L * L, N)
-    return pair_gains((rows @ covariance @ rows.T).reshape(L, L, L, L),
-                      (rows @ covariance @ weight @ covariance @ rows.T).reshape(L, L, L, L), PAIRS, noise_variance)
+    plain, weighted = (rows @ middle @ rows.T
+                       for middle in (covariance, covariance @ weight @ covariance))
+    return pair_gains(plain.reshape(L, L, L, L), weighted.reshape(L, L, L, L), PAIRS,
+                      noise_variance)
 
 
 def textbook(matrix: np.ndarray, covariance: np.ndarray, noise_variance: np.ndarray) -> np.ndarray:
@@ -40,7 +46,8 @@ def textbook(matrix: np.ndarray, covariance: np.ndarray, noise_variance: np.ndar
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_gains_are_what_the_update_takes_away(seed):
-    """Of every pair: tr(W P) before less after, and half the logarithm of det P before over after."""
+    """Of every pair: tr(W P) before less after, and half the logarithm of det P before over
+    after."""
     derivative, covariance, weight, noise_variance = a_state(seed)
     traces, bits = gains_of(derivative, covariance, weight, noise_variance)
     for k, (i, j) in enumerate(PAIRS):
@@ -63,7 +70,7 @@ def test_endless_noise_is_no_reading():
         assert bits[k] == pytest.approx(0.5 * ratio, rel=1e-7)
 
 
-# -- tables of a large state ------------------------------------------------------------------------------------------
+# -- tables of a large state ----------------------------------------------------------------------
 
 
 def test_tables_from_independent_rows():
@@ -76,31 +83,47 @@ def test_tables_from_independent_rows():
     tables = pair_tables(independent, covariance @ independent.T, weight)
     for table, middle in zip(tables, (covariance, covariance @ weight @ covariance), strict=True):
         expected = rows @ middle @ rows.T
-        np.testing.assert_allclose(table.reshape(L * L, L * L), expected, rtol=0.0, atol=1e-12 * np.abs(expected).max())
+        np.testing.assert_allclose(table.reshape(L * L, L * L), expected, rtol=0.0,
+                                   atol=1e-12 * np.abs(expected).max())
+
+
+@dataclass(frozen=True)
+class CoarsePipe(PlanePipe):
+    """With 495 nodes."""
+
+    def carrier(self, fine):
+        along = np.linspace(0.0, self.length, 45)
+        across = np.linspace(-self.half_width, self.half_width, 11)
+        return rectangle_mesh(along, across), np.arange(11)
 
 
 def test_all_pairs_of_the_pipe():
-    """A filter in mid-record, 495 nodes, against an update of the full covariance for each of the 120 pairs."""
-    scenario = Pipe2D()
-    transport, observation = scenario._discretise(
-        cells=(44, 10), substeps=8, time_step=scenario.time_step, cells_at_electrodes=5, cells_across=14,
-        velocity=PlaneChannelFlow(scenario.mean_velocity, scenario.half_width))
-    level, evolution = 30.0, transport.evolution_model()
-    start = table_5_1(transport, scenario.prior, level, rank_tolerance=1e-6)
+    """A filter in mid-record, 495 nodes, against an update of the full covariance for each of the
+    120 pairs."""
+    world = replace(PIPE_2D, vessel=CoarsePipe())
+    transport, observation = world.model()
+    level = 30.0
+    evolution = transport.evolution_model()
+    assert len(evolution.F) == 495
+    start = table_5_1(transport, world.prior, level, rank_tolerance=1e-6)
     noise = evolution.state_noise_covariance((level / 4)**2, (level / 50)**2)
-    model = LinearGaussian(evolution.F, start.forcing, noise, start.mean, (level / 4)**2 * np.eye(len(start.mean)))
-    linearised = LinearisedObservations(observation, scenario.noise, start.mean)
-    record = [linearised(np.zeros(16), currents) for currents in scenario.currents]
+    initial = (level / 4)**2 * np.eye(len(start.mean))
+    model = LinearGaussian(evolution.F, start.forcing, noise, start.mean, initial)
+    linearised = LinearisedObservations(observation, world.noise, start.mean)
+    record = [linearised(np.zeros(16), currents) for currents in world.currents]
     covariance = dense_filter(model, record)[-1][0].covariance
     kalman_filter(start, record[:-1])
     start.predict()
 
     resistance, table = observation.resistance_derivatives(start.mean)
-    derivative, weight, pairs = np.moveaxis(table, 0, 2), mass_matrix(transport.mesh), electrode_pairs(16)
-    noise_variance = scenario.noise.std(resistance[pairs[:, 0]] - resistance[pairs[:, 1]])**2
+    derivative = np.moveaxis(table, 0, 2)
+    weight = mass_matrix(transport.mesh)
+    pairs = electrode_pairs(16)
+    noise_variance = world.noise.std(resistance[pairs[:, 0]] - resistance[pairs[:, 1]])**2
     rows = independent_rows(derivative)
     cross = start.apply_covariance(rows.T)
-    np.testing.assert_array_equal(cross, start.apply_covariance(rows.T, start.covariance.limit @ rows.T))
+    limit = start.covariance.limit @ rows.T
+    np.testing.assert_array_equal(cross, start.apply_covariance(rows.T, limit))
     traces, bits = pair_gains(*pair_tables(rows, cross, weight), pairs, noise_variance)
     before = np.linalg.slogdet(covariance)[1]
     for k, (i, j) in enumerate(pairs):

@@ -1,4 +1,5 @@
-"""The smoothness prior against its continuum, and the tank at rest: the Kalman filter is a linearised MAP estimate."""
+"""The smoothness prior against its continuum, and the tank at rest: the Kalman filter is a
+linearised MAP estimate."""
 
 from functools import lru_cache
 from types import SimpleNamespace
@@ -8,12 +9,17 @@ import pytest
 from scipy.linalg import cho_factor, cho_solve, eigvalsh
 from scipy.special import kv
 
-from eitbench.estimation import LinearisedObservations, gauss_newton, smoothness_covariance, starting_filter
+from eitbench.estimation import (
+    LinearisedObservations,
+    gauss_newton,
+    smoothness_covariance,
+    starting_filter,
+)
 from eitbench.numerics.fem import mass_matrix, stiffness_matrix
 from eitbench.numerics.mesh import rectangle_mesh
 from eitbench.numerics.round import uniform_disc
-from eitbench.worlds import StationaryTank2D
-from eitbench.worlds.tank2d import disc_indicator
+from eitbench.worlds.bodies import disc_indicator
+from eitbench.worlds.stationary_tank import STATIONARY_TANK_2D
 from eitbench.worlds.task import make_task
 
 LENGTH, STD = 0.1, 2.0
@@ -24,8 +30,8 @@ def square():
     """A unit square of 1,681 nodes, a tenth of which is one correlation length: mesh, M and Γ."""
     mesh = rectangle_mesh(np.linspace(0.0, 1.0, 41), np.linspace(0.0, 1.0, 41))
     mass = mass_matrix(mesh)
-    return SimpleNamespace(mesh=mesh, mass=mass,
-                           covariance=smoothness_covariance(mass, stiffness_matrix(mesh), LENGTH, STD))
+    covariance = smoothness_covariance(mass, stiffness_matrix(mesh), LENGTH, STD)
+    return SimpleNamespace(mesh=mesh, mass=mass, covariance=covariance)
 
 
 def node_at(mesh, x, y):
@@ -33,7 +39,7 @@ def node_at(mesh, x, y):
     return int(np.hypot(*(mesh.points - np.array([x, y])).T).argmin())
 
 
-# -- the prior --------------------------------------------------------------------------------------------------------
+# -- the prior ------------------------------------------------------------------------------------
 
 
 def test_covariance_is_symmetric_and_positive_definite(square):
@@ -51,19 +57,23 @@ def test_mean_variance_is_that_asked_for(std):
     covariance = smoothness_covariance(mass, stiffness_matrix(mesh), 0.03, std)
     weights = np.asarray(mass.sum(axis=0)).ravel()
     assert weights @ covariance.diagonal() / weights.sum() == pytest.approx(std**2, rel=1e-12)
-    assert np.ptp(covariance.diagonal()) > 0.5 * std**2                        # near the wall values are less bound
+    # near the wall values are less bound
+    assert np.ptp(covariance.diagonal()) > 0.5 * std**2
 
 
 def test_correlation_is_that_of_a_matern_field(square):
-    """r·K₁(r) with r = d/ℓ, in the middle of a mesh fine and large against ℓ: 0.60 at ℓ, 0.12 at 3ℓ."""
+    """r·K₁(r) with r = d/ℓ, in the middle of a mesh fine and large against ℓ: 0.60 at ℓ, 0.12 at
+    3ℓ."""
     mesh, covariance = square.mesh, square.covariance
     middle = node_at(mesh, 0.5, 0.5)
     r = np.hypot(*(mesh.points - mesh.points[middle]).T) / LENGTH
     near = (r > 0.0) & (r < 3.2)
     correlation = covariance[middle] / np.sqrt(covariance[middle, middle] * covariance.diagonal())
-    np.testing.assert_allclose(correlation[near], (r * kv(1, np.maximum(r, 1e-9)))[near], atol=0.012)
+    matern = r * kv(1, np.maximum(r, 1e-9))
+    np.testing.assert_allclose(correlation[near], matern[near], atol=0.012)
     for distance, expected in ((1, 0.60), (3, 0.12)):
-        assert correlation[node_at(mesh, 0.5 + distance * LENGTH, 0.5)] == pytest.approx(expected, abs=0.01)
+        there = correlation[node_at(mesh, 0.5 + distance * LENGTH, 0.5)]
+        assert there == pytest.approx(expected, abs=0.01)
 
 
 def test_walls_mirror_the_field(square):
@@ -75,17 +85,21 @@ def test_walls_mirror_the_field(square):
 
 
 def test_longer_is_smoother():
-    """∫|∇x|² of a draw is tr(KΓ) on average; where ℓ is threefold it is less than a quarter (ninth, but for a log)."""
+    """∫|∇x|² of a draw is tr(KΓ) on average; where ℓ is threefold it is less than a quarter (ninth,
+    but for a log)."""
     mesh = uniform_disc(0.14, 16)
-    mass, stiffness = mass_matrix(mesh), stiffness_matrix(mesh)
-    rough, smooth = (np.sum(stiffness.toarray() * smoothness_covariance(mass, stiffness, length, 1.0))
-                     for length in (0.02, 0.06))
+    mass = mass_matrix(mesh)
+    stiffness = stiffness_matrix(mesh)
+    rough, smooth = (
+        np.sum(stiffness.toarray() * smoothness_covariance(mass, stiffness, length, 1.0))
+        for length in (0.02, 0.06))
     assert rough > 4.0 * smooth > 0.0
 
 
 @pytest.mark.parametrize(("length", "std", "message"), [
     (0.0, 1.0, "length must be"), (-0.1, 1.0, "length must be"), (np.nan, 1.0, "length must be"),
-    ("far", 1.0, "length must be a number in m"), (0.1, 0.0, "std must be"), (0.1, -1.0, "std must be"),
+    ("far", 1.0, "length must be a number in m"), (0.1, 0.0, "std must be"),
+    (0.1, -1.0, "std must be"),
 ])
 def test_errors_name_the_argument(length, std, message):
     """Neither a length nor a standard deviation may be zero or below."""
@@ -94,18 +108,19 @@ def test_errors_name_the_argument(length, std, message):
         smoothness_covariance(mass_matrix(mesh), stiffness_matrix(mesh), length, std)
 
 
-# -- the tank at rest -------------------------------------------------------------------------------------------------
+# -- the tank at rest -----------------------------------------------------------------------------
 
 
 C_BH = 32.0
-"""mol/m³, as if it were the best homogeneous estimate: where the observations are linearised, and the prior's mean."""
+"""mol/m³, as if it were the best homogeneous estimate: where the observations are linearised, and
+the prior's mean."""
 
 
 @lru_cache(maxsize=1)
 def frame():
-    """The tank's task, and one frame of its voltages, as the model itself computes them for a disc, with noise."""
-    scenario = StationaryTank2D()
-    task = make_task(scenario)
+    """The tank's task, and one frame of its voltages, as the model itself computes them for a disc,
+    with noise."""
+    task = make_task(STATIONARY_TANK_2D)
     rng = np.random.default_rng(4)
     target = 30.0 * (1.0 + disc_indicator(task.mesh.points, np.array([0.05, 0.02]), 0.03, 0.01))
     clean = task.observation.voltages(target, task.currents)
@@ -127,7 +142,8 @@ def filtered(order):
 def prior():
     """Γ of the task by itself, from its mesh and its numbers."""
     task, _ = frame()
-    return smoothness_covariance(mass_matrix(task.mesh), stiffness_matrix(task.mesh), task.prior.initial_length,
+    return smoothness_covariance(mass_matrix(task.mesh), stiffness_matrix(task.mesh),
+                                 task.prior.initial_length,
                                  C_BH * task.prior.initial_std)
 
 
@@ -144,9 +160,11 @@ def assert_close(one, other, tolerance):
 
 
 def test_filter_of_a_frame_is_the_linearised_map_estimate():
-    """Mean and covariance after 16 injections: min ‖L_v(V − R(c*) − J(c − c*))‖² + (c − c₀)ᵀ Γ⁻¹ (c − c₀), to 1e-8.
+    """Mean and covariance after 16 injections: min ‖L_v(V − R(c*) − J(c − c*))‖² + (c − c₀)ᵀ Γ⁻¹ (c
+    − c₀), to 1e-8.
 
-    c₀ = c* = ĉ_bh; solved by the normal equations, whose matrix is the inverse of the estimate's covariance.
+    c₀ = c* = ĉ_bh; solved by the normal equations, whose matrix is the inverse of the estimate's
+    covariance.
     """
     computed, jacobian, std = linear_model()
     n = jacobian.shape[-1]
@@ -156,11 +174,14 @@ def test_filter_of_a_frame_is_the_linearised_map_estimate():
     mean, covariance = filtered(range(16))
     assert_close(mean - C_BH, cho_solve(information, weighted.T @ residual), 1e-8)
     assert_close(covariance, cho_solve(information, np.eye(n)), 1e-8)
-    assert np.ptp(mean) > 10.0 and covariance.trace() < 0.7 * prior().trace()          # it has learnt something
+    # it has learnt something
+    assert np.ptp(mean) > 10.0
+    assert covariance.trace() < 0.7 * prior().trace()
 
 
 def test_filter_of_a_frame_is_one_step_of_gauss_newton():
-    """`gauss_newton` with Γ⁻¹ for a penalty, asked for the deviation from ĉ_bh of the linearised tank."""
+    """`gauss_newton` with Γ⁻¹ for a penalty, asked for the deviation from ĉ_bh of the linearised
+    tank."""
     task, voltages = frame()
     computed, jacobian, std = linear_model()
     linear = SimpleNamespace(voltages=lambda x, currents: computed + jacobian @ x,
@@ -172,7 +193,8 @@ def test_filter_of_a_frame_is_one_step_of_gauss_newton():
 
 
 def test_order_of_the_injections_does_not_matter():
-    """Where nothing moves, what a frame has taught does not depend on what was measured first; half a frame is less."""
+    """Where nothing moves, what a frame has taught does not depend on what was measured first; half
+    a frame is less."""
     mean, covariance = filtered(range(16))
     for order in (range(15, -1, -1), np.random.default_rng(5).permutation(16)):
         other, spread = filtered(order)
@@ -182,7 +204,8 @@ def test_order_of_the_injections_does_not_matter():
 
 
 def test_nothing_moves_between_measurements():
-    """F = I without noise: predictions, however many, leave mean and covariance as they are, to the bit."""
+    """F = I without noise: predictions, however many, leave mean and covariance as they are, to the
+    bit."""
     task, _ = frame()
     filter_ = starting_filter(task.transport, task.prior, C_BH)
     np.testing.assert_array_equal(filter_.mean, C_BH)
@@ -192,3 +215,17 @@ def test_nothing_moves_between_measurements():
         filter_.predict()
     np.testing.assert_array_equal(filter_.mean, C_BH)
     np.testing.assert_array_equal(filter_.covariance, before)
+
+
+def test_evolution_is_the_identity():
+    """F = I with an H like any other task's, and no inlet: nodal noise adds up as it is."""
+    task, _ = frame()
+    n = task.mesh.n_nodes
+    F, Y, H = task.evolution
+    np.testing.assert_array_equal(F, np.eye(n))
+    np.testing.assert_array_equal(H, np.eye(n))
+    assert Y.shape == (n, 0)
+    c = np.random.default_rng(0).normal(30.0, 5.0, n)
+    np.testing.assert_array_equal(task.transport.step(c), F @ c)
+    covariance = task.evolution.state_noise_covariance(2.0, 0.3)
+    np.testing.assert_allclose(covariance, 0.3 * np.eye(n), rtol=1e-14)

@@ -24,7 +24,7 @@ from shapes import (
 
 from eitbench.numerics.mesh import Mesh, graded_pipe_mesh
 from eitbench.physics.cem import CompleteElectrodeModel
-from eitbench.worlds import Pipe2D
+from eitbench.worlds.pipe2d import PIPE_2D
 
 # -- a small problem in each dimension, with nothing symmetric about it -----------------------------------------------
 
@@ -287,16 +287,18 @@ def slugs(points: np.ndarray) -> np.ndarray:
 
 def test_pipe_meshes_are_fine_enough():
     """In units of the noise the P2 mesh error is below 0.25 for estimators and 0.05 for the truth; P1 is useless."""
-    pipe = Pipe2D()
+    pipe = PIPE_2D.vessel
+    currents = PIPE_2D.currents
     mesh = graded_pipe_mesh(pipe.length, pipe.half_width, pipe.electrode_spans, 24, 44)
     fine = CompleteElectrodeModel(mesh, pipe.electrodes(mesh), pipe.contact_impedance)
     assert fine.n_unknowns > 60_000
-    exact = fine.voltages(slugs(mesh.points), pipe.currents)
-    model, truth = pipe.model().observation.cem, pipe.truth().observation.cem
+    exact = fine.voltages(slugs(mesh.points), currents)
+    model = pipe.electrode_model(fine=False)
+    truth = pipe.electrode_model(fine=True)
     first_order = CompleteElectrodeModel(model.mesh, model.electrodes, model.contact_impedance, order=1)
     rms, worst = {}, {}
     for name, cem in (("model", model), ("truth", truth), ("P1", first_order)):
-        error = (cem.voltages(slugs(cem.mesh.points), pipe.currents) - exact) / pipe.noise.std(exact)
+        error = (cem.voltages(slugs(cem.mesh.points), currents) - exact) / PIPE_2D.noise.std(exact)
         rms[name], worst[name] = np.sqrt(np.mean(error**2)), np.abs(error).max()
     assert rms["model"] < 0.25 and rms["truth"] < 0.05, (rms, worst)
     assert worst["model"] < 1.0 and worst["truth"] < 0.25, (rms, worst)

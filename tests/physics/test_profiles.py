@@ -1,4 +1,5 @@
-"""Profiles across a plane channel: of the mean they are asked for, and a family that adds up as it says."""
+"""Profiles across a plane channel: of the mean they are asked for, and a family that adds up as it
+says."""
 
 import math
 
@@ -7,7 +8,7 @@ import pytest
 
 from eitbench.physics.flow import PlaneChannelFlow
 from eitbench.physics.profiles import SkewedChannelFlow, VelocityModel, parabola
-from eitbench.worlds import Pipe2DSkewedVelocity
+from eitbench.worlds.pipe2d_skewed import PIPE_2D_SKEWED
 
 R = 0.05
 MODEL = VelocityModel(R, ((1.5, 0.0, -1.5), (0.0, 2.0), (0.5, 0.25, 0.0, -0.75)), (4.0, 0.0, 1.0), (1.0, 2.0, 3.0),
@@ -25,7 +26,7 @@ def skewed_mean(k):
     return 2.0 * (k * math.cosh(k) - math.sinh(k)) / k**3
 
 
-# -- the skewed flow --------------------------------------------------------------------------------------------------
+# -- the skewed flow ------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("k", [-5.0, -0.6, 0.0, 0.3, 1.0, 2.5, 5.0])
@@ -38,7 +39,8 @@ def test_mean_over_a_section_is_the_mean_velocity(k):
 
 @pytest.mark.parametrize("k", [-1.0, 0.8, 5.0])
 def test_profile_is_the_formula(k):
-    """v = v̄ (1 − η²)·exp(kη) over its mean in closed form: at rest on the walls, fastest at η = (√(1 + k²) − 1)/k."""
+    """v = v̄ (1 − η²)·exp(kη) over its mean in closed form: at rest on the walls, fastest at η =
+    (√(1 + k²) − 1)/k."""
     eta = np.linspace(-1.0, 1.0, 2001)
     profile = SkewedChannelFlow(2.0, R, k).profile(R * eta)
     np.testing.assert_allclose(profile, 2.0 * (1.0 - eta**2) * np.exp(k * eta) / skewed_mean(k), rtol=1e-12)
@@ -78,7 +80,7 @@ def test_integer_points_are_taken_as_numbers():
     np.testing.assert_allclose(parabola(2.0, 1.0, 1.0, 0.0).field([1.0])(np.array([[0, 1]])), [[1.125, 0.0]])
 
 
-# -- the family that is estimated -------------------------------------------------------------------------------------
+# -- the family that is estimated -----------------------------------------------------------------
 
 
 def test_quadrature_is_exact():
@@ -90,7 +92,8 @@ def test_quadrature_is_exact():
 
 
 def test_profiles_are_those_of_the_directions():
-    """φ_k at `points` is the axial velocity of the k-th basis field there; here written out by hand."""
+    """φ_k at `points` is the axial velocity of the k-th basis field there; here written out by
+    hand."""
     eta = MODEL.points / R
     by_hand = np.stack([1.5 - 1.5 * eta**2, 2.0 * eta, 0.5 + 0.25 * eta - 0.75 * eta**3], axis=1)
     np.testing.assert_allclose(MODEL.profiles, by_hand, rtol=1e-12, atol=1e-15)
@@ -116,14 +119,16 @@ def test_parabola_is_the_plane_channel_flow_of_its_mean():
 
 @pytest.mark.parametrize("k", [-1.0, -0.6, 0.6, 0.8, 1.0])
 def test_basis_of_the_skewed_pipe_holds_its_truth_well_but_not_exactly(k):
-    """The best combination of the three profiles errs by 0.2 to 2 % of the flow; by the parabola alone by 15 to 50 %.
+    """The best combination of the three profiles errs by 0.2 to 2 % of the flow; by the parabola
+    alone by 15 to 50 %.
 
-    No inverse crime, and yet the model is good enough to be worth estimating; of the mean velocity it tells within 1 %.
+    No inverse crime, and yet the model is good enough to be worth estimating; of the mean velocity
+    it tells within 1 %.
     """
-    scenario = Pipe2DSkewedVelocity()
-    assert scenario.skewness_range[0] <= abs(k) <= scenario.skewness_range[1]
-    model = scenario.velocity_model
-    true = SkewedChannelFlow(4.5, scenario.half_width, k).profile(model.points)
+    low, high = PIPE_2D_SKEWED.flow.skewness_range
+    assert low <= abs(k) <= high
+    model = PIPE_2D_SKEWED.velocity_model
+    true = SkewedChannelFlow(4.5, PIPE_2D_SKEWED.vessel.half_width, k).profile(model.points)
     root = np.sqrt(model.weights)
 
     def misfit(profiles):
@@ -137,14 +142,15 @@ def test_basis_of_the_skewed_pipe_holds_its_truth_well_but_not_exactly(k):
 
 
 def test_skewed_basis_rests_on_the_walls_and_only_the_first_carries_fluid():
-    """φ_k(±1) = 0; the mean of the parabola is 1, that of the others 0, so that θ_1 is the mean velocity."""
-    model = Pipe2DSkewedVelocity().velocity_model
+    """φ_k(±1) = 0; the mean of the parabola is 1, that of the others 0, so that θ_1 is the mean
+    velocity."""
+    model = PIPE_2D_SKEWED.velocity_model
     for direction in model.directions:
         np.testing.assert_allclose(direction(np.array([[0.1, -R], [0.2, R]])), 0.0, atol=1e-14)
     np.testing.assert_allclose(model.weights @ model.profiles / (2.0 * R), [1.0, 0.0, 0.0], atol=1e-14)
 
 
-# -- mistakes ---------------------------------------------------------------------------------------------------------
+# -- mistakes -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("arguments", "name"), [

@@ -10,7 +10,7 @@ from eitbench.numerics.fem import mass_matrix
 from eitbench.numerics.mesh import Mesh, rectangle_mesh
 from eitbench.physics.flow import PlaneChannelFlow
 from eitbench.physics.transport import ConvectionDiffusion, _supg_matrices, inlet_nodes
-from eitbench.worlds.pipe2d import Pipe2D
+from eitbench.worlds.pipe2d import PIPE_2D
 
 # -- helpers ----------------------------------------------------------------------------------------------------------
 
@@ -315,7 +315,7 @@ def test_pipe_forgets_at_the_measured_rate():
 
     F is so far from normal that rounding moves its eigenvalues in the second digit: F gives 0.717, Fᵀ 0.705.
     """
-    F = Pipe2D().model().transport.evolution_model().F
+    F = PIPE_2D.model().transport.evolution_model().F
     assert np.abs(np.linalg.eigvals(F)).max() == pytest.approx(0.72, abs=0.03)
 
 

@@ -23,6 +23,7 @@ from eitbench.data.store import CACHE_VARIABLE
 from eitbench.numerics.round import extrude, uniform_disc
 from eitbench.report import charts, page
 from eitbench.report.summary import EXPLANATIONS, markdown, summary
+from eitbench.worlds.pipe3d import PIPE_3D
 
 EVIL = "Evil <script>alert('x')</script> & \\\"co\\\""
 """A title as it stands in a docstring; the page must show it and not run it."""
@@ -248,7 +249,7 @@ def test_other_seeds_do_not_take_the_snapshots_away(made, monkeypatch):
     """A method played on dev seeds beside ours on others, as README suggests: the pictures are still there."""
     folder, records, _ = made
     for name in (FILTER.id, SMOOTHING.id):
-        monkeyshorten(patch, {name: SCENARIO})
+        shorten(monkeypatch, {name: SCENARIO})
     monkeypatch.setattr(page, "SHOWN", (("homogeneous", "filter"), ("homogeneous", "smoothing")))
     others = [record | {"split": "own", "seeds": ["300001"],
                         "episodes": [episode | {"seed": "300001"} for episode in record["episodes"][:1]]}
@@ -303,7 +304,7 @@ def test_one_world_needs_no_sections(made):
 def test_a_round_pipe_is_cut_along_its_axis():
     """In 3D the picture is as long as the pipe and as high as it is wide, and shows what changes along it."""
     mesh = extrude(uniform_disc(0.05, 4), np.linspace(0.0, 0.4, 5))
-    task = SimpleNamespace(mesh=mesh, expected_concentration=1.0)
+    task = SimpleNamespace(mesh=mesh, expected_concentration=1.0, vessel=PIPE_3D.vessel)
     assert page._size(task) == "40 cm long, 10 cm across, cut along the axis; flow from left to right"
     content = page._picture(task, mesh, 0.6 + 3.0 * mesh.points[:, 2]).split(",")[1]
     picture = np.asarray(Image.open(io.BytesIO(base64.b64decode(content))).convert("RGB")).astype(int)

@@ -211,9 +211,9 @@ def test_the_command_names_the_file_that_was_typed():
         return command(record(method, [0.1], runs=[RUN | {"command": typed}], **changes))
 
     name = "eitbench-Pipe2D-v0-12345678"
-    changed = {"environment": {"id": "eitbench/Pipe2D-v0", "name": name, "kwargs": {"assumed_mean_velocity": 4.0}}}
+    changed = {"environment": {"id": "eitbench/Pipe2D-v0", "name": name, "kwargs": {"assume": {"mean_velocity": 4.0}}}}
     assert of("mine", "eitbench run", **changed) == ""
-    assert "assumed_mean_velocity=4.0" in rendered([record("a", [0.1], **changed)])["methods/a.html"].decode()
+    assert "mean_velocity" in rendered([record("a", [0.1], **changed)])["methods/a.html"].decode()
     assert "--baseline sub/mine.py " in of("mine", "eitbench submit --baseline sub/mine.py --env x")
     assert "--baseline mine.py " in of("mine", "eitbench submit --baseline=/home/me/mine.py")
     assert "--baseline mine " in of("mine", "eitbench 'unfinished")

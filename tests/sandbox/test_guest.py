@@ -132,7 +132,8 @@ def test_it_reaches_nothing(tmp_path, monkeypatch):
     """Neither files nor other processes, sockets, a terminal or a truth, nor which files are opened, whose names hold
     seeds; without the wall the same code does."""
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
-    here = {"truth": simulate(PIPE_2D.changed(SCENARIO), 3, progress=False).concentration, "makes the collector look": []}
+    truth = simulate(PIPE_2D.changed(SCENARIO), 3, progress=False).concentration
+    here = {"truth": truth, "makes the collector look": []}
     (tmp_path / "secret.txt").write_text("the truth")
     with (socket.create_server(("127.0.0.1", 0)) as server, socket.socket(socket.AF_UNIX) as service,
           socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as log, a_terminal()):

@@ -1,0 +1,57 @@
+"""What the leaderboard makes of an estimated flow, against what the environment pays for it."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from estimating import PIPE, SKEWED, VELOCITY, make
+
+from eitbench import Estimate
+from eitbench.bench.run import play_and_collect
+from eitbench.bench.score import score
+
+
+@pytest.mark.parametrize("name", VELOCITY)
+@pytest.mark.parametrize("said", [None, 40.0])
+def test_leaderboard_scores_what_is_rewarded(name, said, monkeypatch):
+    """ẽ_c + ẽ_v of the leaderboard is minus the mean reward of what it plays.
+
+    Who says nothing of the flow is taken to say what is believed of it at first.
+    """
+    base = make(name).unwrapped
+    task = base.task
+    step = base.step
+    played = []
+    velocity = None if said is None else np.append(said, np.zeros(task.velocity.size - 1))
+    level = np.full(task.mesh.n_nodes, 31.0)
+    estimator = SimpleNamespace(update=lambda *_: Estimate(level, velocity=velocity))
+
+    def watched(action):
+        played.append((action, step(action)))
+        return played[-1][1]
+
+    monkeypatch.setattr(base, "step", watched)
+    baseline = SimpleNamespace(estimator=lambda _: estimator, privileged=False)
+    scores = score(base, play_and_collect(base, baseline, 1))["scores"]
+    rewards = np.array([reward for _, (_, reward, *_) in played])[task.warm_up:]
+    total = scores["error"] + scores["velocity_error"]
+    assert total == pytest.approx(-rewards.mean(), abs=1e-7)
+    assert scores["velocity_error"] > 1e-3
+    expected = task.velocity.nominal if said is None else velocity
+    for action, _ in played:
+        np.testing.assert_array_equal(action[task.mesh.n_nodes:], expected)
+
+
+@pytest.mark.parametrize(("id", "message"), [
+    (PIPE, "Estimate.velocity must be None where the flow is not asked"),
+    (SKEWED, r"Estimate.velocity must have shape \(3,\)"),
+])
+def test_flow_is_refused_where_it_is_not_asked_for(id, message):
+    """A velocity in the plain pipe is a mistake, and so is one with too few numbers where it is
+    asked for."""
+    base = make(id).unwrapped
+    said = Estimate(np.full(base.task.mesh.n_nodes, 31.0), velocity=np.array([4.5]))
+    estimator = SimpleNamespace(update=lambda *_: said)
+    baseline = SimpleNamespace(estimator=lambda _: estimator, privileged=False)
+    with pytest.raises(ValueError, match=message):
+        play_and_collect(base, baseline, 1)

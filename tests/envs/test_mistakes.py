@@ -1,0 +1,91 @@
+"""Wrong arguments and estimates of estimation environments are named."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from estimating import BIASED, PIPE, UNKNOWN, make
+
+OBSTACLE, SOLID = "eitbench/Pipe2DObstacle-v0", "eitbench/Pipe3D-v0"
+STIRRED, STILL = "eitbench/RotatingTank2D-v0", "eitbench/StationaryTank2D-v0"
+
+
+@pytest.mark.parametrize(("id", "change", "message"), [
+    (PIPE, {"lag": -1}, "lag must be an integer"),
+    (PIPE, {"lag": 1.5}, "lag must be"),
+    (PIPE, {"lag": "some"}, "lag must be 'all'"),
+    (PIPE, {"lag": 98}, "lag must be"),
+    (PIPE, {"render_mode": "tv"}, "render_mode must be"),
+    (PIPE, {"episodes": 0}, "episodes must"),
+    (PIPE, {"world": [1.0]}, r"world must be a dict of parts and their numbers, got \[1.0\]"),
+    (PIPE, {"world": {"colour": 1}}, "world has no 'colour'; there are vessel, flow, target, inst"),
+    (PIPE, {"world": {"flow": {"speed": 1.0}}},
+     "world.flow has no 'speed'; there are mean_velocity, diffusivity"),
+    (PIPE, {"world": {"schedule": {"pattern": {"turn": 1}}}},
+     "world.schedule.pattern has no 'turn'; there are frame"),
+    (PIPE, {"world": {"flow": 4.5}}, "world.flow must be a dict of its numbers, got 4.5"),
+    (PIPE, {"world": {"name": "Mine"}}, "world must not change its name"),
+    (PIPE, {"world": {"flow": {"diffusivity": 0.0}}}, "world.flow: diffusivity must be"),
+    (PIPE, {"world": {"vessel": {"electrode_cover": 2.0}}}, "world.vessel: electrode_cover must"),
+    (PIPE, {"world": {"target": {"arrivals": {"interval": -1.0}}}},
+     "world.target.arrivals: interval must be a finite number"),
+    (PIPE, {"world": {"target": {"strength": [0.4, 0.2]}}}, "strength must be a range"),
+    (PIPE, {"world": {"region": [0.2]}}, "region must have shape"),
+    (PIPE, {"assume": {"mean_velocity": -1.0}}, "assume.mean_velocity must be a finite number"),
+    (PIPE, {"assume": {"flow": "real"}},
+     "assume has no 'flow'; there are mean_velocity, profile"),
+    (PIPE, {"assume": 4.5}, "assume must be a dict of what is believed of the flow, got 4.5"),
+    (SOLID, {"assume": {"profile": "plug"}}, "assume has no 'profile'; there are mean_velocity"),
+    (STIRRED, {"assume": {"flow": "real"}}, "this world has nothing to assume"),
+    (OBSTACLE, {"assume": {"flow": "guessed"}}, "assume.flow must be one of parabolic, real"),
+    (BIASED, {"world": {"flow": {"velocity_range": [0.0, 0.0]}}}, "velocity_range must be a range"),
+    (BIASED, {"assume": {"mean_velocity": "fast"}}, "assume.mean_velocity must be a number in m/s"),
+    (BIASED, {"assume": {"profile": "square"}}, "assume.profile must be one of parabolic"),
+    (UNKNOWN, {"world": {"flow": {"profiles": "four"}}},
+     "profiles must be None, 'mean' or 'three'"),
+    (UNKNOWN, {"world": {"flow": {"velocity_range": [5.0, 4.0]}}},
+     "velocity_range must be a range"),
+    (OBSTACLE, {"world": {"vessel": {"bulge": {"height": 0.06}}}}, "bulge.height must be"),
+    (STIRRED, {"world": {"schedule": {"warm_up": -1}}}, "warm_up must be"),
+    (STIRRED, {"world": {"region": [0.1, 0.2]}}, "region must be None in a RoundTank"),
+    (STILL, {"world": {"target": {"gap": 1.0}}}, "target.gap must leave room"),
+])
+def test_wrong_arguments_are_named(id, change, message):
+    """A wrong argument is named before anything is computed."""
+    with pytest.raises(ValueError, match=message):
+        gym.make(id, **change)
+
+
+def bad(n: int, place: int, value: float) -> np.ndarray:
+    """(n,) thirties but for one."""
+    action = np.full(n, 30.0)
+    action[place] = value
+    return action
+
+
+@pytest.mark.parametrize(("id", "action", "message"), [
+    (PIPE, np.zeros(5), r"action must have shape \(1701,\), got \(5,\)"),
+    (PIPE, np.full(1701, np.nan), "action must be finite"),
+    (PIPE, np.full(1701, 1e4), "action must lie within ±250 mol/m³"),
+    (PIPE, "thirty", "action must be an array"),
+    (UNKNOWN, np.full(1701, 30.0), r"action must have shape \(1702,\), got \(1701,\)"),
+    (UNKNOWN, bad(1702, -1, np.nan), r"action must be finite.* the first at index \(1701,\)"),
+    (UNKNOWN, bad(1702, -1, 451.0), "action must lie within ±450 m/s, got 451"),
+    (UNKNOWN, bad(1702, 7, -251.0), "action must lie within ±250 mol/m³, got 251"),
+    (STILL, np.full(1701, 30.0), r"action must have shape \(1261,\), got \(1701,\)"),
+])
+def test_wrong_actions_are_named(id, action, message):
+    """An estimate that is none is refused with what came and what was expected."""
+    env = make(id).unwrapped
+    env.reset(seed=1)
+    with pytest.raises(ValueError, match=message):
+        env.step(action)
+
+
+@pytest.mark.parametrize("ask", ["truth", "true_velocity", "reveal"])
+def test_there_is_nothing_to_show_before_a_reset(ask):
+    """Nor is there a step to take."""
+    env = make(PIPE).unwrapped
+    with pytest.raises(gym.error.ResetNeeded, match=rf"call reset\(\) before {ask}\(\)"):
+        getattr(env, ask)()
+    with pytest.raises(gym.error.ResetNeeded, match=r"call reset\(\) before step\(\)"):
+        env.step(np.full(1701, 30.0))

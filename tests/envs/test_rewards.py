@@ -1,0 +1,131 @@
+"""What estimates are paid, against integrals on the truth's mesh."""
+
+import numpy as np
+import pytest
+from estimating import ESTIMATION, VELOCITY, best_velocity, make
+
+from eitbench import scoring
+from eitbench.data.recordings import score_operators
+from eitbench.worlds import entry
+
+PARAMETERS = {"Pipe2DUnknownVelocity": 1, "Pipe2DTimeVaryingVelocity": 1, "Pipe2DSkewedVelocity": 3}
+"""Of the flow, by the name of the world."""
+each_velocity = pytest.mark.parametrize("name", VELOCITY)
+
+
+@pytest.fixture(scope="module", params=ESTIMATION)
+def name(request):
+    """Every id; all tests of one id run in a row, while its meshes are kept."""
+    return request.param
+
+
+def test_action_is_one_number_a_node_and_one_a_parameter_of_the_flow(name):
+    """(n + k,), symmetric about zero: ten times the expected concentration, and ten times the
+    velocity."""
+    env = make(name)
+    task = env.unwrapped.task
+    n = task.mesh.n_nodes
+    k = PARAMETERS.get(entry(name).world.name, 0)
+    velocity = env.unwrapped.world.velocity_model
+    assert k == (0 if velocity is None else velocity.size)
+    assert task.velocity == velocity
+    assert env.unwrapped.n_nodes == n
+    assert env.action_space.shape == (n + k,)
+    expected = np.append(np.full(n, 10.0 * task.expected_concentration), np.full(k, 10.0 * 45.0))
+    np.testing.assert_array_equal(env.action_space.high, expected)
+    np.testing.assert_array_equal(env.action_space.low, -expected)
+
+
+def test_every_velocity_has_its_parameters():
+    """The table above is of all worlds in which the flow is asked for."""
+    assert {entry(id).world.name for id in VELOCITY} == set(PARAMETERS)
+
+
+def test_reward_is_minus_the_relative_error_of_the_state_asked_for(name):
+    """At step i the state i − lag is scored, if it lies past the warm-up; the true state at the
+    nodes earns about 0.
+
+    What it earns is what the coarser mesh cannot hold, computed here on the truth's mesh; half as
+    much again errs by a quarter. The flow that fits best is given with it, where one is asked for.
+    """
+    env = make(name)
+    base = env.unwrapped
+    env.reset(seed=1)
+    truth = base.truth()
+    task = base.task
+    to_truth, mass = score_operators(base.world)
+    to_model = base.truth_mesh().interpolation_to(task.mesh.points)
+    flow = best_velocity(base)
+    scored = 0
+    for i in range(1, task.n_steps + task.lag + 1):
+        t = i - task.lag
+        guess = to_model @ truth[t - 1] if t >= 1 else np.zeros(task.mesh.n_nodes)
+        estimate = 1.5 * guess if i % 2 else guess
+        reward = env.step(np.append(estimate, flow[max(t, 1) - 1]))[1]
+        if t <= task.warm_up:
+            assert reward == 0.0
+            continue
+        scored += 1
+        (error,) = scoring.step_errors((to_truth @ estimate)[None], truth[t - 1:t], mass)
+        assert reward == pytest.approx(-error, abs=1e-7 if flow.shape[1] < 3 else 2e-4)
+        if i % 2:
+            assert reward == pytest.approx(-0.25, abs=0.02)
+        else:
+            assert -0.01 < reward < 0.0
+    assert scored == task.n_steps - task.warm_up == base.world.schedule.scored_steps
+
+
+@each_velocity
+def test_reward_has_a_second_term_for_the_flow(name):
+    """−∫(v̂ − v)²/∫v² is added: nothing for the best fit, −1 for none and for twice the flow, else
+    as by quadrature.
+
+    ∫v̂ v is that of the recorded profile; the concentration is the same throughout, so that
+    differences are the flow's.
+    """
+    base = make(name).unwrapped
+    base.reset(seed=1)
+    task = base.task
+    true = base.true_velocity()
+    flow = best_velocity(base)
+    model = task.velocity
+    level = np.full(task.mesh.n_nodes, 30.0)
+    believed = np.array(model.nominal) + 5.0
+    guesses = {"best": lambda t: flow[t - 1], "none": lambda t: 0.0 * flow[t - 1],
+               "twice": lambda t: 2.0 * flow[t - 1], "believed": lambda t: believed}
+    earned = {}
+    for label, guess in guesses.items():
+        base.reset(seed=1)
+        earned[label] = np.array([base.step(np.append(level, guess(t)))[1]
+                                  for t in range(1, task.n_steps + 1)])
+    scored = slice(task.warm_up, None)
+    to_truth, mass = score_operators(base.world)
+    concentration = np.array([scoring.step_errors((to_truth @ level)[None], c[None], mass)[0]
+                              for c in base.truth()])
+    terms = {label: -(rewards + concentration)[scored] for label, rewards in earned.items()}
+    squared = (true**2 @ model.weights)[scored]
+    np.testing.assert_allclose(terms["none"], 1.0, atol=1e-7)
+    # no combination of three profiles is the skewed truth
+    limit = 2e-4 if model.size > 1 else 1e-7
+    assert (terms["best"] < limit).all()
+    assert (terms["best"] > -1e-7).all()
+    np.testing.assert_allclose(terms["twice"], 1.0, atol=limit + 1e-7)
+    missed = ((true - model.profiles @ believed)**2 @ model.weights)[scored]
+    np.testing.assert_allclose(terms["believed"], missed / squared, atol=1e-7)
+    assert np.ptp([term.mean() for term in terms.values()]) > 0.9
+    for rewards in earned.values():
+        np.testing.assert_array_equal(rewards[:task.warm_up], 0.0)
+
+
+def test_what_is_revealed_is_the_episode(name):
+    """References are shown the whole record, which is what an agent sees step by step, and the flow
+    that there was."""
+    base = make(name).unwrapped
+    seen = [base.reset(seed=1)[0]]
+    revealed = base.reveal()
+    level = np.zeros(base.action_space.shape)
+    seen += [base.step(level)[0] for _ in range(base.world.n_steps - 1)]
+    np.testing.assert_array_equal(revealed.voltages, [each["voltages"] for each in seen])
+    np.testing.assert_array_equal(revealed.currents, [each["currents"] for each in seen])
+    np.testing.assert_array_equal(revealed.velocity, base.true_velocity())
+    assert revealed.transport(1).mesh.n_nodes == base.n_nodes
