@@ -22,7 +22,7 @@ from eitbench.bench.statistics import (
     mean_over_environments,
     stratified_bootstrap,
 )
-from eitbench.report.summary import scores_by_seed
+from eitbench.bench.text import scores_by_seed
 
 SPREAD = 0.8
 """of the logarithm of a lognormal number"""

@@ -14,10 +14,10 @@ from tqdm import tqdm
 from eitbench._files import shipped
 from eitbench.bench.records import read_records
 from eitbench.bench.run import Job, run_episode
+from eitbench.bench.text import mean_and_interval, rounded, scores_by_seed, seed_ranges
 from eitbench.bench.tracks import Environment
 from eitbench.bench.verify import job_of
 from eitbench.data.seeds import parse_seeds
-from eitbench.report.summary import mean_and_interval, rounded, scores_by_seed, seed_ranges
 
 PLAYED = {"Pipe2DInjection": ("best_pair", "random_pair"),
           "Pipe2DInjectionFaults": ("fault_aware", "ppo_seed0", "schedule"),

@@ -17,9 +17,9 @@ import numpy as np
 from stable_baselines3 import PPO
 from threadpoolctl import threadpool_limits
 
+from eitbench.bench.text import mean_and_interval
 from eitbench.data.seeds import parse_seeds
 from eitbench.envs.injection import InjectionVectorEnv
-from eitbench.report.summary import mean_and_interval
 from eitbench.worlds import entries
 
 SHIFTS = (1, 7, 19, 31)

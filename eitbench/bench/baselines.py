@@ -77,8 +77,22 @@ def is_ours(name: str) -> bool:
 
 
 def version_of(path: Path, sha256: str) -> str:
-    """What a method's records say of its version: v1 of ours, of all others eight digits of their file's sha256."""
-    return "v1" if is_ours(str(path)) else sha256[:8]
+    """What a method's records say of its version: of ours that of its card, v1 where there is none; of all others eight
+    digits of their file's sha256."""
+    return f"v{card_version(card_name(path))}" if is_ours(str(path)) else sha256[:8]
+
+
+def card_name(path: Path) -> str:
+    """Of the card of one of our methods: that of its file; agents of one environment and algorithm share one."""
+    folders = path.resolve().parents
+    return path.stem if path.suffix == ".py" else f"{folders[2].name}--{folders[1].name}"
+
+
+@lru_cache(maxsize=256)
+def card_version(name: str) -> int:
+    """The number of the version that a card describes; 1 where there is no card."""
+    path = baseline_folder() / "cards" / f"{name}.json"
+    return int(json.loads(path.read_text(encoding="utf-8"))["version"]) if path.is_file() else 1
 
 
 def find_baseline(name: str) -> Path:

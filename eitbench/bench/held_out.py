@@ -22,9 +22,9 @@ from eitbench.bench.records import newest, read_records
 from eitbench.bench.run import Job, run_episode
 from eitbench.bench.sandbox.wall import python_files
 from eitbench.bench.statistics import FEWEST, interquartile_mean, mean_over_environments, stratified_bootstrap
+from eitbench.bench.text import as_markdown, scores_by_seed, with_interval
 from eitbench.bench.tracks import FLOORS
 from eitbench.data.seeds import SPLITS
-from eitbench.report.summary import as_markdown, scores_by_seed, with_interval
 
 PUBLISHED = shipped("leaderboards") / "held_out.json"
 """Where the hash of the salt is."""

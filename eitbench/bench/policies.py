@@ -7,6 +7,7 @@ import json
 import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
+from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
@@ -28,6 +29,9 @@ from eitbench.envs.injection_core import Rules
 
 if TYPE_CHECKING:
     import pandas as pd
+
+LOADERS = "eitbench.loaders"
+"""Entry points that load a policy from another kind of file: named by its suffix, called with path and content."""
 
 
 class PolicyFile(NamedTuple):
@@ -103,9 +107,9 @@ def load_policy(name: str) -> PolicyFile:
 @lru_cache(maxsize=64)
 def _load(path: Path, source: bytes) -> PolicyFile:
     """The file with this content, executed once a process."""
-    if path.suffix == ".zip":
-        from eitbench.rl.agents import load_agent
-        name, title, agent, parameters = load_agent(path, source)
+    kinds = {f".{point.name}": point for point in entry_points(group=LOADERS)}
+    if path.suffix in kinds:
+        name, title, agent, parameters = kinds[path.suffix].load()(path, source)
         return PolicyFile(name, title, path, hashlib.sha256(source).hexdigest(), False, parameters, agent)
     module = load_module("policy", path, source)
     policy = getattr(module, "Policy", None)
@@ -133,7 +137,7 @@ def play(env_id: str, kwargs: dict[str, Any], policy: str | PolicyFile, seed: in
     -------
     dict
         error : ẽ_c (5.12), the mean over scored states; errors : of each; spent : the agent's injections;
-        seconds_per_step : of the policy, what it prepares included.
+        seconds_per_step : of the policy, what it prepares included; currents : (steps, L) in A, what it injected.
 
     Raises
     ------
@@ -141,13 +145,13 @@ def play(env_id: str, kwargs: dict[str, Any], policy: str | PolicyFile, seed: in
         If there is no such environment or policy, or the policy does not suit it or acts wrongly.
     """
     env = environment(env_id, json.dumps(kwargs), estimator)
-    spent, seconds, errors = 0, 0.0, list[float]()
+    seconds, errors, currents = 0.0, list[float](), list[np.ndarray]()
     for _, observation, elapsed in inject(env, policy if isinstance(policy, PolicyFile) else load_policy(policy), seed):
         seconds += elapsed
-        spent += bool(observation["currents"].any())
+        currents.append(observation["currents"])
         errors += [] if env.error is None else [env.error]
-    return {"error": float(np.mean(errors)), "errors": errors, "spent": spent,
-            "seconds_per_step": seconds / env.core.length}
+    return {"error": float(np.mean(errors)), "errors": errors, "spent": sum(bool(each.any()) for each in currents),
+            "seconds_per_step": seconds / env.core.length, "currents": np.array(currents)}
 
 
 def inject(env: InjectionEnv, loaded: PolicyFile, seed: int) -> Iterator[tuple[int, dict[str, np.ndarray], float]]:

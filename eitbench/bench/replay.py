@@ -19,11 +19,11 @@ from eitbench._files import write_atomically
 from eitbench.bench.records import read_record
 from eitbench.bench.run import run_episode
 from eitbench.bench.store import source_digest
+from eitbench.bench.text import as_markdown
 from eitbench.bench.verify import TOLERANCE, differences_of, job_of
 from eitbench.data.parallel import in_parallel
 from eitbench.data.seeds import parse_seeds
 from eitbench.data.store import CACHE_VARIABLE
-from eitbench.report.summary import as_markdown
 
 
 class Replay(NamedTuple):

@@ -11,8 +11,8 @@ from eitbench.bench import suites, tracks
 from eitbench.bench.records import read_record, split_of, write_record
 from eitbench.bench.run import Job, run_jobs
 from eitbench.bench.store import EpisodeStore, provenance, results_of, unplayed
+from eitbench.bench.text import seed_ranges
 from eitbench.data.seeds import name_seed
-from eitbench.report.summary import seed_ranges
 
 
 def submit(method: str | None, environments: list[str], seeds: list[int] | None, store: EpisodeStore, to: Path, *,

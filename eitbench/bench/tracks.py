@@ -37,6 +37,28 @@ QUICK = ("eitbench/Pipe2D-v0", "eitbench/Pipe2DFixedLag-v0", "eitbench/Pipe2DSmo
 """What the quick suite runs; the full one runs all that ask for estimates."""
 QUICK_SEEDS = "test:0-3"
 
+_FAST = {"flow": {"mean_velocity": 45.0},
+         "schedule": {"scored_steps": 5, "pattern": {"frame": 2}},
+         "vessel": {"electrodes_per_wall": 2}}
+_CHOICE = {"flow": {"mean_velocity": 16.0}, "schedule": {"scored_steps": 4}}
+SHORT: dict[str, dict[str, Any]] = {
+    "eitbench/Pipe2D-v0": {"world": _FAST},
+    "eitbench/Pipe2DFixedLag-v0": {"world": _FAST, "lag": 2},
+    "eitbench/Pipe2DSmoothing-v0": {"world": _FAST},
+    "eitbench/StationaryTank2D-v0": {"world": {
+        "vessel": {"n_electrodes": 8}, "schedule": {"scored_steps": 5}}},
+    "eitbench/Pipe2DUnknownVelocity-v0": {"world": _FAST | {
+        "flow": {"mean_velocity": 45.0, "velocity_range": [40.0, 50.0]}}},
+    "eitbench/Pipe2DInjection-v0": {"world": _CHOICE},
+    "eitbench/Pipe2DInjectionCurrents-v0": {"world": _CHOICE},
+    "eitbench/Pipe2DInjectionFaults-v0": {"world": _CHOICE},
+    "eitbench/Pipe2DInjectionBudget-v0": {"world": _CHOICE, "estimator": "reduced"},
+    "eitbench/Pipe2DInjectionFlow-v0": {"world": _CHOICE | {
+        "flow": {"mean_velocity": 16.0, "velocity_range": [15.0, 17.0]}}, "estimator": "reduced"},
+}
+"""Arguments with which an episode takes a moment, since a fast fluid flushes the pipe in a few steps. A
+method's card is of the first of these environments that it plays."""
+
 
 class Environment(NamedTuple):
     """A registered id with keyword arguments: what is made, and what a record names."""
@@ -87,6 +109,11 @@ class Environment(NamedTuple):
 def ids(track: str | None = None) -> list[str]:
     """Registered environments of one track, or of all, as they were registered."""
     return [id for id, each in entries().items() if track in (None, each.track)]
+
+
+def own_ids() -> list[str]:
+    """Those of ours."""
+    return [id for id in ids() if id.startswith("eitbench/")]
 
 
 def track_of(id: str) -> str:

@@ -21,10 +21,10 @@ from eitbench.bench.records import SHARED, version_number
 from eitbench.bench.run import Job, run_episode
 from eitbench.bench.sandbox import guests
 from eitbench.bench.suites import is_isolated
+from eitbench.bench.text import as_markdown
 from eitbench.bench.tracks import Environment, track_of
 from eitbench.data.seeds import parse_seeds
 from eitbench.data.store import CACHE_VARIABLE
-from eitbench.report.summary import as_markdown
 
 OF_OURS = ("board", "role", "privileged")
 """What must be as a record says of a method of ours, beside its numbers: its words may be mended."""

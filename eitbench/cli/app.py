@@ -1,4 +1,4 @@
-"""The command line: `eitbench list | run | bank | train | policies | submit | verify | held-out | migrate |
+"""The command line: `eitbench list | run | bank | train | policies | submit | verify | held-out | migrate | cards |
 leaderboard | compare | render | reproduce`."""
 
 from __future__ import annotations
@@ -12,9 +12,10 @@ from typing import Annotated, Any
 
 import typer
 
+from eitbench.cli.maintain import cards, held_out, migrate
 from eitbench.cli.options import CORES, Backend, Backends, Isolate, Isolation, Jobs, Out, clear_errors
 from eitbench.cli.studies import thesis
-from eitbench.cli.trust import held_out, migrate, verify
+from eitbench.cli.trust import verify
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, context_settings={
     "help_option_names": ["-h", "--help"]}, help="""
@@ -236,6 +237,7 @@ def submit(
 app.command()(verify)
 app.command("held-out")(held_out)
 app.command()(migrate)
+app.command()(cards)
 
 
 @app.command()

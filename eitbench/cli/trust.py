@@ -93,23 +93,3 @@ def _verify_all(folder: Path, environments: list[str], out: Path, episodes: int,
                    f"{row['problem'] or row['score'] + ' by ' + format(row['difference'], '.2g')}", err=True)
     if len(wrong):
         raise typer.Exit(1)
-
-
-def migrate(
-    folder: Annotated[Path, typer.Argument(exists=True, file_okay=False, help="Folder of records.")],
-) -> None:
-    """For maintainers: rewrite records of an older format in that of today; no episode, score or run is lost."""
-    from eitbench.bench.migrate import migrate as rewritten
-    with clear_errors():
-        for old, new in rewritten(folder):
-            typer.echo(f"{old.name} -> {new.name}")
-
-
-def held_out(
-    new: Annotated[Path, typer.Option(help="Where to write a new salt; keep it secret, and keep it.")],
-) -> None:
-    """For maintainers: draw the salt of held-out episodes, and publish its hash in leaderboards/held_out.json, once."""
-    from eitbench.bench import held_out as beyond
-    with clear_errors():
-        digest = beyond.publish_new_salt(new)
-    typer.echo(f"wrote {new}, sha256 {digest}, and {beyond.PUBLISHED}")

@@ -15,8 +15,9 @@ from tqdm import tqdm
 from eitbench import _check
 from eitbench.data import store
 from eitbench.worlds.instrument import Faults
+from eitbench.worlds.parts import Discretisation
 from eitbench.worlds.streams import randomness
-from eitbench.worlds.world import Discretisation, World
+from eitbench.worlds.world import World
 
 
 class Episode(NamedTuple):

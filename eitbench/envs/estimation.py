@@ -14,10 +14,11 @@ from gymnasium.utils import EzPickle
 from eitbench import _check
 from eitbench.data.recordings import cycle_voltages, outline, recording, step_error, velocity_error
 from eitbench.data.regions import integrals, score_mass
+from eitbench.worlds.parts import Discretisation
 from eitbench.worlds.registry import entry
 from eitbench.worlds.streams import randomness
 from eitbench.worlds.task import Task, lag_steps, make_task
-from eitbench.worlds.world import Discretisation, World
+from eitbench.worlds.world import World
 
 if TYPE_CHECKING:
     from eitbench.data.episodes import Episode

@@ -10,21 +10,11 @@ import pandas as pd
 
 from eitbench.bench.records import file_name, finished, newest
 from eitbench.bench.statistics import interquartile_mean, mean_over_environments, shared_ranks, stratified_bootstrap
+from eitbench.bench.text import as_markdown, number, scores_by_seed, seed_ranges, with_interval
 from eitbench.bench.tracks import CLASSES, FLOORS, ids, named, track_of_board
 from eitbench.bench.tracks import class_of as class_of_board
 from eitbench.data.seeds import parse_seeds
-from eitbench.report.summary import (
-    COLUMNS,
-    EXPLANATIONS,
-    as_markdown,
-    number,
-    place_of_world,
-    scores_by_seed,
-    seed_ranges,
-    summary_row,
-    with_interval,
-    world,
-)
+from eitbench.report.summary import COLUMNS, EXPLANATIONS, place_of_world, summary_row, world
 
 ALL = "all"
 """Stands for the environment in the rows of an aggregate."""

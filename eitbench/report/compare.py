@@ -11,7 +11,7 @@ import pandas as pd
 
 from eitbench.bench.records import newest, read_record, read_records
 from eitbench.bench.statistics import mean_over_environments, paired_difference, paired_probability_of_improvement
-from eitbench.report.summary import as_markdown, number, scores_by_seed, with_interval
+from eitbench.bench.text import as_markdown, number, scores_by_seed, with_interval
 from eitbench.report.templates import template
 
 FIELDS = ("environment", "episodes", "a", "b", "difference", "low", "high", "better", "better_low", "better_high")

@@ -10,7 +10,7 @@ import pandas as pd
 from eitbench.bench.policies import adaptivity_gap
 from eitbench.bench.run import Job
 from eitbench.bench.store import successful
-from eitbench.report.summary import mean_and_interval, rounded
+from eitbench.bench.text import mean_and_interval, rounded
 
 OPEN_LOOP = ("adjacent", "opposite", "transverse", "best_pair", "best_cycle", "best_currents", "schedule")
 """Our policies that inject the same whatever is measured."""

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.stats import t as student
 
 from eitbench.bench.records import BOARDS, finished
+from eitbench.bench.text import as_markdown, mean_and_interval, number, rounded, scores_by_seed, seed_ranges
 from eitbench.bench.tracks import ids
 from eitbench.scoring import skill
 
@@ -43,44 +43,6 @@ _WHERE_ASKED = ("velocity_error", "spent")
 """Scores whose column is there only if anybody has them."""
 _NOT_THE_WORLD = ("lag", "assume", "gate", "episodes", "render_mode", "observation", "estimator")
 """Arguments of an environment that its episodes do not depend on."""
-_UNIT = {"seconds_per_step": 1e3, "voltage_discrepancy": 1e6}
-
-
-def mean_and_interval(values: list[float]) -> tuple[float, float]:
-    """Mean, and half the width of its 95 % confidence interval (Student's t); infinite for fewer than two values."""
-    mean = float(np.mean(values))
-    if len(values) < 2:
-        return mean, math.inf
-    return mean, float(student.ppf(0.975, len(values) - 1) * np.std(values, ddof=1) / math.sqrt(len(values)))
-
-
-def rounded(mean: float, half: float) -> str:
-    """``0.0053 ± 0.0004``: the interval to one significant digit (two if that is a 1), the mean to the same place."""
-    place = _places(half)
-    return f"{mean:.3g}" if place is None else f"{mean:z.{place}f} ± {half:.{place}f}"
-
-
-def with_interval(value: float, low: float, high: float) -> str:
-    """``0.0053 (0.0049 to 0.0058)``, rounded as `rounded` does by half the interval; without one, the value."""
-    place = _places(0.5 * (high - low))
-    return f"{value:.3g}" if place is None else f"{value:z.{place}f} ({low:z.{place}f} to {high:z.{place}f})"
-
-
-def _places(half: float) -> int | None:
-    """Decimal places that half an interval leaves significant; None if it is none, or below the last place shown."""
-    if not math.isfinite(half) or half < 5e-6:
-        return None
-    place = -math.floor(math.log10(half))
-    if round(half * 10**place) == 1:
-        place += 1
-    return min(max(place, 0), 5)
-
-
-def scores_by_seed(record: dict[str, Any], name: str) -> dict[str, float]:
-    """Seed -> score, of the episodes that have it; in the units of the table."""
-    scores = {episode["seed"]: episode["scores"].get(name)              # records of older code have fewer scores
-              for episode in record["episodes"] if episode["status"] == "ok"}
-    return {seed: value * _UNIT.get(name, 1.0) for seed, value in scores.items() if value is not None}
 
 
 def summary(records: list[dict[str, Any]]) -> pd.DataFrame:
@@ -198,29 +160,10 @@ def board_label(row: Any) -> str:
     return row["board"] if row["split"] == "test" else f"{row['board']} ({row['split']} seeds)"
 
 
-def seed_ranges(seeds: list[str]) -> str:
-    """``test:0-3,7`` for test:0, test:1, test:2, test:3 and test:7."""
-    split = seeds[0].rpartition(":")[0]
-    numbers = sorted(int(seed.rpartition(":")[2]) for seed in seeds)
-    ranges: list[list[int]] = []
-    for number in numbers:
-        if ranges and number == ranges[-1][1] + 1:
-            ranges[-1][1] = number
-        else:
-            ranges.append([number, number])
-    text = ",".join(f"{a}" if a == b else f"{a}-{b}" for a, b in ranges)
-    return f"{split}:{text}" if split else text
-
-
 def _cell(name: str, value: tuple[float, float] | None) -> str:
     if value is None:
         return "–"
     return rounded(*value) if name in ("error", "contrast_error") else number(value[0])
-
-
-def number(value: float) -> str:
-    """Two digits below 1, three above, and all that stand before the point."""
-    return f"{value:.2g}" if abs(value) < 1 else f"{value:.3g}" if abs(value) < 999.5 else f"{value:.0f}"
 
 
 def markdown(table: pd.DataFrame) -> str:
@@ -228,19 +171,3 @@ def markdown(table: pd.DataFrame) -> str:
     text = cells(table)
     return as_markdown(text, sum(heading in _TEXT for heading in text.columns))
 
-
-def as_markdown(text: pd.DataFrame, words: int) -> str:
-    """A table of text as Markdown, also pleasant to read in a terminal; all but the first ``words`` columns hold
-    numbers."""
-    lines = [[str(cell).replace("|", "\\|") for cell in line]
-             for line in [list(text.columns), *text.to_numpy().tolist()]]
-    widths = [max(len(str(line[i])) for line in lines) for i in range(len(text.columns))]
-
-    def row(line: list[str]) -> str:
-        padded = [str(cell).ljust(width) if i < words else str(cell).rjust(width)
-                  for i, (cell, width) in enumerate(zip(line, widths, strict=True))]
-        return f"| {' | '.join(padded)} |"
-
-    rule = "|" + "|".join("-" * (width + 2) if i < words else "-" * (width + 1) + ":"
-                          for i, width in enumerate(widths)) + "|"
-    return "\n".join([row(lines[0]), rule, *map(row, lines[1:])])

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from eitbench import _check
-from eitbench.worlds.world import Discretisation, History, Target, World
+from eitbench.worlds.parts import Discretisation, History, Target
+from eitbench.worlds.world import World
 
 if TYPE_CHECKING:
     from eitbench.worlds.streams import Randomness

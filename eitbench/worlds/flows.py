@@ -13,8 +13,9 @@ import numpy as np
 from eitbench import _check
 from eitbench.physics.flow import PlaneChannelFlow, PlugFlow, PowerLawFlow
 from eitbench.physics.profiles import SkewedChannelFlow, VelocityModel, parabola
+from eitbench.worlds.parts import Discretisation, Flow, refuse_assumptions
 from eitbench.worlds.vessels import Bulge, PlanePipe
-from eitbench.worlds.world import Discretisation, Flow, World, refuse_assumptions
+from eitbench.worlds.world import World
 
 if TYPE_CHECKING:
     from eitbench.physics.navier_stokes import SteadyFlow

@@ -2,10 +2,11 @@
 
 from eitbench.worlds.bodies import Ball
 from eitbench.worlds.flows import StirredFlow
+from eitbench.worlds.parts import Prior
 from eitbench.worlds.registry import register
 from eitbench.worlds.schedule import OnePair, Schedule
 from eitbench.worlds.vessels import RoundTank
-from eitbench.worlds.world import Prior, World
+from eitbench.worlds.world import World
 
 ROTATING_TANK_2D = World(
     "RotatingTank2D", RoundTank(), StirredFlow(), Ball(),

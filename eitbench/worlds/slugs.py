@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from eitbench import _check
-from eitbench.worlds.world import Discretisation, History, Target, World
+from eitbench.worlds.parts import Discretisation, History, Target
+from eitbench.worlds.world import World
 
 if TYPE_CHECKING:
     from eitbench.physics.transport import Transport

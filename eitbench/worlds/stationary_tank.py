@@ -2,10 +2,11 @@
 
 from eitbench.worlds.bodies import Cylinders
 from eitbench.worlds.flows import NoFlow
+from eitbench.worlds.parts import Prior
 from eitbench.worlds.registry import register
 from eitbench.worlds.schedule import AroundTheTank, Schedule
 from eitbench.worlds.vessels import RoundTank
-from eitbench.worlds.world import Prior, World
+from eitbench.worlds.world import World
 
 STATIONARY_TANK_2D = World(
     "StationaryTank2D", RoundTank(), NoFlow(), Cylinders(),

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from eitbench import _check
-from eitbench.worlds.world import Discretisation, Prior, Vessel, World
+from eitbench.worlds.parts import Discretisation, Prior, Vessel
+from eitbench.worlds.world import World
 
 if TYPE_CHECKING:
     from eitbench.numerics.mesh import Mesh

@@ -16,6 +16,7 @@ from eitbench.bench.baselines import baseline_folder
 from eitbench.bench.run import run_jobs
 from eitbench.bench.store import EpisodeStore, results_in, unplayed
 from eitbench.bench.suites import policy_jobs
+from eitbench.bench.text import mean_and_interval
 from eitbench.data.seeds import name_seed
 from eitbench.report.animate import animate
 from eitbench.report.policy_table import (
@@ -25,7 +26,6 @@ from eitbench.report.policy_table import (
     policy_table,
     ranking,
 )
-from eitbench.report.summary import mean_and_interval
 
 from .common import ACCENT, INK, TRUE, bare, save
 

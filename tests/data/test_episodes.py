@@ -16,8 +16,8 @@ from tiny_worlds import CHANGES, TINY
 from eitbench.data import episodes, store
 from eitbench.data.episodes import Episode, simulate, truth_discretisation
 from eitbench.data.store import CACHE_VARIABLE
+from eitbench.worlds.parts import Discretisation
 from eitbench.worlds.pipe2d import PIPE_2D
-from eitbench.worlds.world import Discretisation
 
 
 @pytest.fixture(autouse=True)

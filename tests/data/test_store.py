@@ -19,7 +19,7 @@ from eitbench.data import store
 from eitbench.data.store import CACHE_VARIABLE, cache_folder, folder, kept, load, save
 from eitbench.worlds.flows import LaminarFlow
 from eitbench.worlds.instrument import Instrument
-from eitbench.worlds.world import Prior
+from eitbench.worlds.parts import Prior
 
 NAMES = ("small", "large", "empty")
 RNG = np.random.default_rng(3)

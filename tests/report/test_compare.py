@@ -10,8 +10,8 @@ from tiny import record, sha
 
 from eitbench.bench.records import write_record
 from eitbench.bench.statistics import paired_difference, paired_probability_of_improvement
+from eitbench.bench.text import scores_by_seed
 from eitbench.report.compare import cells, compare, find, html, markdown, names
-from eitbench.report.summary import scores_by_seed
 
 TANK = "eitbench/RotatingTank2D-v0"
 PIPE_NAME, TANK_NAME = "eitbench-Pipe2D-v0", "eitbench-RotatingTank2D-v0"

@@ -19,6 +19,7 @@ from test_page import Page, svgs
 from tiny import RUN, record, several_boards
 
 from eitbench.bench.records import read_records, write_record
+from eitbench.bench.text import number, with_interval
 from eitbench.bench.tracks import ids
 from eitbench.report import charts
 from eitbench.report.boards import ALL, boards
@@ -26,7 +27,6 @@ from eitbench.report.site import read_media, render_site, write_site
 from eitbench.report.site.collect import Row, collect
 from eitbench.report.site.environment import _told, documentation, learning_curves, markdown
 from eitbench.report.site.method import command
-from eitbench.report.summary import number, with_interval
 
 ROOT = Path(__file__).parents[2]
 BUDGET = "eitbench-Pipe2DInjectionBudget-v0"

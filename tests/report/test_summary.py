@@ -9,18 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from eitbench.report.summary import (
-    COLUMNS,
-    EXPLANATIONS,
-    cells,
-    markdown,
-    mean_and_interval,
-    number,
-    rounded,
-    scores_by_seed,
-    seed_ranges,
-    summary,
-)
+from eitbench.bench.text import mean_and_interval, number, rounded, scores_by_seed, seed_ranges
+from eitbench.report.summary import COLUMNS, EXPLANATIONS, cells, markdown, summary
 
 unhurried = settings(deadline=None)                                                     # a busy machine is no failure
 BOARD_IDS = {"filter": "eitbench/Pipe2D-v0", "fixed-lag": "eitbench/Pipe2DFixedLag-v0",

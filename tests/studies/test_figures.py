@@ -16,13 +16,13 @@ from short import merged, shorten
 from tiny_worlds import CHANGES
 
 from eitbench.bench.baselines import load_baseline
+from eitbench.bench.text import seed_ranges
 from eitbench.cli.studies import NAME, thesis
 from eitbench.data.seeds import name_seed
 from eitbench.data.store import CACHE_VARIABLE
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.estimation import FirstFrame, initial_covariance
 from eitbench.physics.rest import AtRest
-from eitbench.report.summary import seed_ranges
 from eitbench.worlds import entry
 from eitbench.worlds.flows import FlowPastBulge, _past_bulge
 from eitbench.worlds.task import Estimate

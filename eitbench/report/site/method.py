@@ -15,12 +15,12 @@ from markupsafe import Markup
 from eitbench._files import shipped
 from eitbench.bench.baselines import version_of
 from eitbench.bench.records import alike, finished
+from eitbench.bench.text import scores_by_seed, seed_ranges
 from eitbench.report import charts
 from eitbench.report.boards import HEADINGS
 from eitbench.report.site.collect import Board, Row, Site, title_of
 from eitbench.report.site.environment import markdown
 from eitbench.report.site.tables import Cell, Table, interval_cell, scale, three, value_cell
-from eitbench.report.summary import scores_by_seed, seed_ranges
 from eitbench.report.templates import template
 
 

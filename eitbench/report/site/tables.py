@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 
 from markupsafe import Markup
 
+from eitbench.bench.text import number, with_interval
 from eitbench.report import charts
 from eitbench.report.boards import HEADINGS, MORE
 from eitbench.report.site.collect import Board, Row, method_address
-from eitbench.report.summary import number, with_interval
 
 COMPACT = ("seconds_per_step", "peak_memory")
 """Beside ranks and intervals in the index; the page of an environment has all columns."""

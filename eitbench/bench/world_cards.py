@@ -9,13 +9,14 @@ with a tolerance that other processors, BLAS kernels and thread counts pass.
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable, Iterator
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from eitbench._files import PACKAGE
+from eitbench._files import PACKAGE, write_atomically
 from eitbench.data.episodes import Episode, truth_discretisation
 from eitbench.data.recordings import cycle_voltages, faults_of, make_recording, step_error
 from eitbench.data.regions import make_integrals, score_mass
@@ -95,6 +96,24 @@ def differences(made: Any, kept: Any, place: str = "") -> list[str]:
     worst = int(np.nanargmax(off)) if np.isfinite(off).any() else 0
     return [f"{place} differs by {off[worst] / (scale or 1.0):.2g} of its largest: number {worst} "
             f"is {new[worst]:.10g}, the card says {old[worst]:.10g}"]
+
+
+def update(ids: Iterable[str]) -> Iterator[tuple[str, str, list[str]]]:
+    """Compare the cards of these ids, and write those that are missing; one whose numbers have
+    moved stays as it is.
+
+    Yields
+    ------
+    id, what, differences
+        ``what`` is ``new``, ``same`` or ``moved``.
+    """
+    for id in ids:
+        if not path_of(id).is_file():
+            write_atomically(path_of(id), text_of(card(id)).encode())
+            yield id, "new", []
+            continue
+        moved = disagreements(id)
+        yield id, "moved" if moved else "same", moved
 
 
 def path_of(id: str) -> Path:

@@ -10,8 +10,8 @@ import json
 
 import pytest
 
-from eitbench.data import cards
-from eitbench.data.cards import (
+from eitbench.bench import world_cards as cards
+from eitbench.bench.world_cards import (
     CARDS,
     TOLERANCE,
     card,

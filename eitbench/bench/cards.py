@@ -1,0 +1,206 @@
+"""Cards of our methods: what each scores in one short episode, as small committed files.
+
+A card says which version of a method its numbers are of. When code moves them the method is another
+one: it gets a new version, and its records are played again.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from eitbench._files import write_atomically
+from eitbench.bench import policies, tracks
+from eitbench.bench.baselines import (
+    baseline_folder,
+    card_name,
+    card_version,
+    load_baseline,
+    own_baselines,
+)
+from eitbench.bench.policies import load_policy, own_agents, own_policies
+from eitbench.bench.run import Job, run_episode
+from eitbench.data.seeds import parse_seeds
+
+SEED = "dev:0"
+ENTRIES = 5
+"""How many nodes of the last estimate a card holds."""
+DOUBLE = 1e-6
+SINGLE = 1e-4
+"""Relative differences that are none: other processors and BLAS kernels take sums in another order;
+the reduced filter computes in single precision."""
+CLOCKED = ("seconds_per_step",)
+"""Scores that never repeat."""
+
+
+def card_folder() -> Path:
+    """Where the cards lie."""
+    return baseline_folder() / "cards"
+
+
+def card_path(name: str) -> Path:
+    """Of a card, by its name."""
+    return card_folder() / f"{name}.json"
+
+
+def official_methods() -> dict[str, str]:
+    """Name of a card -> the method it is of: name, or path of the first agent of a kind."""
+    agents = {card_name(Path(path)): path
+              for id in tracks.ids("injection") for path in reversed(own_agents(id))}
+    return {name: name for name in [*own_baselines(), *own_policies()]} | agents
+
+
+def read_card(name: str) -> dict[str, Any] | None:
+    """A card as it is kept; None if there is none."""
+    if not card_path(name).is_file():
+        return None
+    card: dict[str, Any] = json.loads(card_path(name).read_text(encoding="utf-8"))
+    return card
+
+
+def new_card(name: str, method: str) -> dict[str, Any]:
+    """What the first card of a method says, before it is played: the episode.
+
+    Raises
+    ------
+    ValueError
+        If the method plays none of the environments in `tracks.SHORT`.
+    """
+    for id, kwargs in tracks.SHORT.items():
+        if _plays(method, id, kwargs):
+            tolerance = SINGLE if kwargs.get("estimator") == "reduced" else DOUBLE
+            return {"method": name, "version": 1, "environment": id, "kwargs": kwargs, "seed": SEED,
+                    "tolerance": tolerance}
+    raise ValueError(f"method {name} plays none of the short worlds {', '.join(tracks.SHORT)}")
+
+
+def played(card: dict[str, Any], method: str) -> dict[str, Any]:
+    """The card with what comes out now.
+
+    ``scores`` are those of the episode that are finite and no times. ``answer`` is, of an estimator,
+    some entries of its last estimate in mol/m³; of a policy, the electrodes that were source and sink
+    in each step, or none.
+
+    Raises
+    ------
+    ValueError
+        If the episode fails.
+    """
+    environment = tracks.Environment(card["environment"], json.dumps(card["kwargs"]))
+    (seed,) = parse_seeds(card["seed"])
+    if environment.track == "injection":
+        scores, answer = _choices(environment, method, seed)
+    else:
+        scores, answer = _estimates(environment, method, seed)
+    kept = {score: value for score, value in scores.items()
+            if value is not None and math.isfinite(value) and score not in CLOCKED}
+    return card | {"scores": kept, "answer": answer}
+
+
+def moved(card: dict[str, Any], now: dict[str, Any]) -> list[str]:
+    """A sentence for each number of a card that is another one now; new scores are no difference."""
+    tolerance = card["tolerance"]
+    said = []
+    for score, then in card["scores"].items():
+        value = now["scores"].get(score)
+        if value is None or not math.isclose(value, then, rel_tol=tolerance, abs_tol=1e-300):
+            said.append(f"{score} is {value}, the card says {then}")
+    if not _same(card["answer"], now["answer"], tolerance):
+        said.append(f"answer is {now['answer']}, the card says {card['answer']}")
+    return said
+
+
+def update(names: list[str], *, new_version: bool = False) -> Iterator[tuple[str, str, list[str]]]:
+    """Play the cards of some methods (default: all of ours), and write what is new.
+
+    Where numbers have moved the card stays as it is, unless there is to be a new version: then it is
+    written with the next number.
+
+    Yields
+    ------
+    name, what, differences
+        ``what`` is ``new``, ``same``, ``moved``, or the new version.
+
+    Raises
+    ------
+    ValueError
+        If a name is none of ours.
+    """
+    methods = official_methods()
+    if unknown := [name for name in names if name not in methods]:
+        raise ValueError(f"method must be one of {', '.join(methods)}; got {', '.join(unknown)}")
+    for name in names or methods:
+        yield (name, *_updated(name, methods[name], new_version))
+
+
+def _updated(name: str, method: str, new_version: bool) -> tuple[str, list[str]]:
+    card = read_card(name)
+    now = played(card or new_card(name, method), method)
+    differences = moved(card, now) if card else []
+    if differences and not new_version:
+        return "moved", differences
+    if card and not differences:
+        # Scores that came after the card was written are added; what is there stays to the last bit.
+        now = card | {"scores": now["scores"] | card["scores"]}
+        what = "same"
+    else:
+        now["version"] = card["version"] + 1 if card else 1
+        what = f"v{now['version']}" if card else "new"
+    if now != card:
+        write_atomically(card_path(name), _text(now).encode())
+        card_version.cache_clear()
+    return what, differences
+
+
+def _plays(method: str, id: str, kwargs: dict[str, Any]) -> bool:
+    environment = tracks.Environment(id, json.dumps(kwargs))
+    if method.endswith(".zip"):
+        return Path(method).parents[2].name == id.replace("/", "-")
+    if environment.track == "injection":
+        if method not in own_policies():
+            return False
+        return load_policy(method).suits(policies.environment(id, environment.kwargs, "reduced").rules)
+    if method not in own_baselines():
+        return False
+    env: Any = environment.make()
+    baseline = load_baseline(method)
+    return tracks.board_of(env) in baseline.boards and baseline.suits(env.task)
+
+
+def _text(card: dict[str, Any]) -> str:
+    """JSON with a line for each field and score, so that changes can be read line by line."""
+    scores = ",\n".join(f"  {json.dumps(score)}: {value!r}" for score, value in sorted(card["scores"].items()))
+    lines = [f" {json.dumps(key)}: {json.dumps(value)}" for key, value in card.items() if key != "scores"]
+    return "{\n" + ",\n".join([*lines, f' "scores": {{\n{scores}\n }}']) + "\n}\n"
+
+
+def _estimates(environment: tracks.Environment, method: str,
+               seed: int) -> tuple[dict[str, Any], list[float]]:
+    result, fields = run_episode(Job(environment, method, seed))
+    if result["status"] != "ok":
+        raise ValueError(f"{method} fails in {environment.id}: {result['message']}")
+    last = fields["mean"][-1]
+    nodes = np.linspace(0, last.size - 1, ENTRIES + 2).astype(int)[1:-1]
+    return result["scores"], [float(last[node]) for node in nodes]
+
+
+def _choices(environment: tracks.Environment, method: str,
+             seed: int) -> tuple[dict[str, Any], list[list[int]]]:
+    arguments = json.loads(environment.kwargs)
+    estimator = arguments.pop("estimator", "full")
+    result = policies.play(environment.id, arguments, method, seed, estimator)
+    pairs = [[int(step.argmax()), int(step.argmin())] if step.any() else []
+             for step in result["currents"]]
+    return {score: result[score] for score in ("error", "spent")}, pairs
+
+
+def _same(then: list[Any], now: list[Any], tolerance: float) -> bool:
+    """Numbers up to the tolerance, choices exactly."""
+    if len(then) != len(now) or any(isinstance(each, list) for each in then):
+        return then == now
+    return bool(np.allclose(now, then, rtol=tolerance, atol=0.0))

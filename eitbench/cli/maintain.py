@@ -1,0 +1,64 @@
+"""The commands `cards`, `migrate` and `held-out`, for maintainers."""
+
+from __future__ import annotations
+
+from itertools import chain
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from eitbench.cli.options import clear_errors
+
+
+def cards(
+    names: Annotated[list[str] | None, typer.Argument(
+        help="Ids of worlds, or methods, of ours. Default: all.")] = None,
+    new_version: Annotated[bool, typer.Option(
+        "--new-version", help="Write what has moved as the method's next version.")] = False,
+) -> None:
+    """For maintainers: simulate the episodes of each world's card (eitbench/worlds/cards), play that
+    of each method's (baselines/cards), and say whether their numbers are still the same: exit
+    status 0 if so, 1 if not. Missing cards are written.
+
+    A world whose numbers have moved is another world: give it the next -vN.
+    """
+    from eitbench.bench import cards as method_cards
+    from eitbench.bench import world_cards
+    from eitbench.bench.tracks import own_ids
+    worlds = [name for name in names or own_ids() if name in own_ids()]
+    methods = [name for name in names or [] if name not in worlds]
+    anything_moved = False
+    with clear_errors():
+        compared = chain(
+            world_cards.update(worlds),
+            method_cards.update(methods, new_version=new_version) if methods or not names else ())
+        for name, what, differences in compared:
+            anything_moved |= what == "moved"
+            typer.echo(f"{name}: {what}")
+            for difference in differences:
+                typer.echo(f"  {difference}", err=what == "moved")
+    if anything_moved:
+        typer.echo("numbers have moved: find out why; or give the world the next -vN, or write a "
+                   "method's new version with --new-version and play its records again", err=True)
+        raise typer.Exit(1)
+
+
+def migrate(
+    folder: Annotated[Path, typer.Argument(exists=True, file_okay=False, help="Folder of records.")],
+) -> None:
+    """For maintainers: rewrite records of an older format in that of today; no episode, score or run is lost."""
+    from eitbench.bench.migrate import migrate as rewritten
+    with clear_errors():
+        for old, new in rewritten(folder):
+            typer.echo(f"{old.name} -> {new.name}")
+
+
+def held_out(
+    new: Annotated[Path, typer.Option(help="Where to write a new salt; keep it secret, and keep it.")],
+) -> None:
+    """For maintainers: draw the salt of held-out episodes, and publish its hash in leaderboards/held_out.json, once."""
+    from eitbench.bench import held_out as beyond
+    with clear_errors():
+        digest = beyond.publish_new_salt(new)
+    typer.echo(f"wrote {new}, sha256 {digest}, and {beyond.PUBLISHED}")
