@@ -256,7 +256,8 @@ def against_dynamax(settled: Settled) -> Iterator[Row]:
             means[name] = result
         agree(settled, np.asarray(means["filter"].filtered_means) * units + level,
               np.asarray(means["smoother"].smoothed_means) * units + level)
-        note = f" (compiling both, {compiling:.1f} s, is not counted; at most {busy:.1f} cores were busy)"
+        note = (f" (compiling both, {compiling:.1f} s, is not counted; at most {busy:.1f} cores "
+                "were busy)")
     yield from against_peer(settled, theirs, f"{peer('dynamax')}, {peer('jax')}", "lgssm_filter",
                             "lgssm_smoother", note)
 
@@ -309,8 +310,9 @@ def memory(cells: tuple[int, int], *, measured: bool) -> Row:
     reference: float | None = stored
     words = "RTS with stored Γ_{t|t} and Γ_{t|t−1}: 2·T·n²·8 bytes, computed"
     if measured:
-        reference, words = None, f"{peer('filterpy')} rts_smoother, measured; two covariances a step alone: " \
-                                 f"{quantity(stored, 'B')}"
+        reference = None
+        words = (f"{peer('filterpy')} rts_smoother, measured; two covariances a step alone: "
+                 f"{quantity(stored, 'B')}")
         with suppress(ImportError):
             reference = in_fresh_process(smoothing_memory, cells, "filterpy")
     return Row("filtering", f"peak memory of smoothing {RECORD} steps, n = {n}", words, ours,

@@ -72,7 +72,8 @@ def factor_flops(cem: CompleteElectrodeModel) -> float:
 
 def narrow(cem: CompleteElectrodeModel) -> str:
     """Why a sparse factor stays far below dgemm."""
-    return f"flops, in supernodes of {np.diff(cem._system._symbolic[0])[:-1].mean():.1f} columns on average"
+    columns = np.diff(cem._system._symbolic[0])[:-1].mean()
+    return f"flops, in supernodes of {columns:.1f} columns on average"
 
 
 def against_solvers(cem: CompleteElectrodeModel, sigma: np.ndarray, K: sp.csc_matrix, *,
@@ -214,7 +215,8 @@ def against_pyeit(cells: tuple[int, int] = (10, 26)) -> Iterator[Row]:
         pass
     seconds = compare(works)
     flops, _ = table_flops(cem)
-    differs = "point electrodes where ours are complete, a conductivity for each cell where ours is for each node"
+    differs = ("point electrodes where ours are complete, a conductivity for each cell where ours "
+               "is for each node")
     where = f"order 1, {mesh.n_nodes:,} nodes, {len(mesh.cells):,} cells"
     yield Row("forward", f"voltages of 16 injections, {where}",
               f"{peer('pyeit')} solve_eit on the same mesh: {differs}; factorises for each "
