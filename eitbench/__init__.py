@@ -1,7 +1,7 @@
 """eitbench: process tomography as Gymnasium environments, with honest baselines and scores.
 
-Importing it registers the environments ``eitbench/…-v0`` and those of installed packages; nothing heavy is
-loaded before something is used.
+Importing it registers the environments ``eitbench/…-v0`` and those of installed packages; nothing
+heavy is loaded before something is used.
 """
 
 from importlib import import_module

@@ -10,7 +10,8 @@ import numpy as np
 
 def number(name: str, value: object, *, low: float = -math.inf, high: float = math.inf, open_low: bool = False,
            units: str = "") -> float:
-    """``value`` as a finite float within [low, high] (``open_low``: within (low, high]); else a ``ValueError``."""
+    """``value`` as a finite float within [low, high] (``open_low``: within (low, high]); else a
+    ``ValueError``."""
     try:
         if isinstance(value, (str, bool)):
             raise TypeError
@@ -25,7 +26,8 @@ def number(name: str, value: object, *, low: float = -math.inf, high: float = ma
 
 def integer(name: str, value: object, *, low: int, high: int | None = None) -> int:
     """``value`` as an int within [low, high]; else a ``ValueError``."""
-    if isinstance(value, np.ndarray) and value.ndim == 0:       # as stable-baselines3 gives a single action
+    # as stable-baselines3 gives a single action
+    if isinstance(value, np.ndarray) and value.ndim == 0:
         value = value.item()
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < low or (
             high is not None and value > high):
@@ -36,7 +38,8 @@ def integer(name: str, value: object, *, low: int, high: int | None = None) -> i
 
 def array(name: str, value: object, shape: Iterable[int | None], *, units: str = "",
           positive: bool = False) -> np.ndarray:
-    """``value`` as a finite float64 array whose trailing axes match ``shape`` (``None``: any length).
+    """``value`` as a finite float64 array whose trailing axes match ``shape`` (``None``: any
+    length).
 
     A leading ``-1`` in ``shape`` stands for any number of batch axes.
     """

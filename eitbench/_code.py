@@ -12,8 +12,8 @@ from eitbench._files import PACKAGE
 
 
 def code_digest(files: Iterable[Path]) -> str:
-    """SHA-256 of these files, in this order, but for the docstrings of Python's: words may be mended without anything
-    being computed anew."""
+    """SHA-256 of these files, in this order, but for the docstrings of Python's: words may be
+    mended without anything being computed anew."""
     return hashlib.sha256(b"".join(map(_without_docstrings, files))).hexdigest()
 
 

@@ -10,7 +10,8 @@ from pathlib import Path
 def write_atomically(path: Path, data: bytes) -> None:
     """Put ``data`` into ``path`` so that nobody ever sees half of it; parent folders are made."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}")  # unlike mkstemp: as the umask allows
+    # unlike mkstemp: as the umask allows
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
     try:
         temporary.write_bytes(data)
         os.replace(temporary, path)

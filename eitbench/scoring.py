@@ -1,4 +1,5 @@
-"""Scores: arrays in, numbers out (``docs/methods.md``, 4). Lower is better unless said; `E` is the relative error (5.12)."""
+"""Scores: arrays in, numbers out (``docs/methods.md``, 4). Lower is better unless said; `E` is the
+relative error (5.12)."""
 
 from __future__ import annotations
 
@@ -30,7 +31,8 @@ def step_errors(estimate: np.ndarray, truth: np.ndarray, mass: Any, reference: f
 
 
 def relative_error(estimate: np.ndarray, truth: np.ndarray, mass: Any, reference: float = 0.0) -> float:
-    """ẽ_c = (1/T) Σ_t ∫(ĉ_t − c_t)² / ∫c_t² (thesis 5.12: squared, no root); arguments as in `step_errors`."""
+    """ẽ_c = (1/T) Σ_t ∫(ĉ_t − c_t)² / ∫c_t² (thesis 5.12: squared, no root); arguments as in
+    `step_errors`."""
     return float(step_errors(estimate, truth, mass, reference).mean())
 
 
@@ -41,15 +43,18 @@ def voltage_discrepancy(measured: np.ndarray, computed: np.ndarray) -> float:
 
 
 def normalised_innovations(innovation: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """NIS/m at each t: νᵀS⁻¹ν/m for innovations (T, m) and covariances (T, m, m); averages 1 in a consistent filter."""
+    """NIS/m at each t: νᵀS⁻¹ν/m for innovations (T, m) and covariances (T, m, m); averages 1 in a
+    consistent filter."""
     whitened = np.linalg.solve(covariance, innovation[..., None])[..., 0]
     return np.einsum("tm,tm->t", innovation, whitened) / innovation.shape[1]
 
 
 def crps(mean: np.ndarray, std: np.ndarray, truth: np.ndarray, weights: np.ndarray) -> float:
-    """Continuous ranked probability score of Gaussian marginals, averaged over time and, with ``weights`` (n,), space.
+    """Continuous ranked probability score of Gaussian marginals, averaged over time and, with
+    ``weights`` (n,), space.
 
-    In the unit of the truth. (T, n) arrays; a zero ``std`` gives the absolute error (Gneiting & Raftery 2007).
+    In the unit of the truth. (T, n) arrays; a zero ``std`` gives the absolute error (Gneiting &
+    Raftery 2007).
     """
     mean, truth = _pair(mean, truth)
     error = np.abs(truth - mean)
@@ -61,26 +66,30 @@ def crps(mean: np.ndarray, std: np.ndarray, truth: np.ndarray, weights: np.ndarr
 
 
 def coverage(mean: np.ndarray, std: np.ndarray, truth: np.ndarray, weights: np.ndarray, level: float) -> float:
-    """Part of space and time where the truth lies in the central ``level`` interval of the Gaussian marginal."""
+    """Part of space and time where the truth lies in the central ``level`` interval of the Gaussian
+    marginal."""
     mean, truth = _pair(mean, truth)
     return float(np.average((np.abs(truth - mean) <= ndtri(0.5 + level / 2) * std).mean(axis=0),
                             weights=weights))
 
 
 def spread_ratio(mean: np.ndarray, std: np.ndarray, truth: np.ndarray, weights: np.ndarray) -> float:
-    """Mean variance over mean squared error; 1 when the claimed uncertainty is honest, above when too modest."""
+    """Mean variance over mean squared error; 1 when the claimed uncertainty is honest, above when
+    too modest."""
     mean, truth = _pair(mean, truth)
     claimed = np.average((std**2).mean(axis=0), weights=weights)
     return float(claimed / np.average(((mean - truth)**2).mean(axis=0), weights=weights))
 
 
 def skill(error: float, homogeneous: float, reference: float) -> float:
-    """(E_bh − E)/(E_bh − E_ref): 0 for the homogeneous estimate, 1 for the reference; higher is better."""
+    """(E_bh − E)/(E_bh − E_ref): 0 for the homogeneous estimate, 1 for the reference; higher is
+    better."""
     return (homogeneous - error) / (homogeneous - reference)
 
 
 def deficit_centre(values: np.ndarray, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Where a field lies lowest: (d,) centroid in m of the deficit median − value, where above half its maximum.
+    """Where a field lies lowest: (d,) centroid in m of the deficit median − value, where above half
+    its maximum.
 
     Parameters
     ----------
@@ -92,7 +101,7 @@ def deficit_centre(values: np.ndarray, points: np.ndarray, weights: np.ndarray) 
     """
     deficit = np.median(values) - values
     counted = weights * np.where(deficit > 0.5 * deficit.max(), deficit, 0.0)
-    if not counted.any():                                     # the same everywhere: no place is lower than another
+    if not counted.any():  # the same everywhere: no place is lower than another
         counted = weights
     centre: np.ndarray = counted @ points / counted.sum()
     return centre

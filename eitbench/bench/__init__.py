@@ -20,10 +20,11 @@ def load(folder: Path | str | None = None) -> pd.DataFrame:
     Returns
     -------
     DataFrame
-        environment, board, method, version, title, role, privileged, official, outdated, split, seed, status, metric,
-        value. Metrics are named and measured as in ``leaderboards/schema.json`` (s, V², bytes). A failed episode has
-        one row, with the metric error and no value. ``outdated`` are records of an earlier version of a method of
-        ours than there is one of: not to be mixed with the others.
+        environment, board, method, version, title, role, privileged, official, outdated, split,
+        seed, status, metric, value. Metrics are named and measured as in
+        ``leaderboards/schema.json`` (s, V², bytes). A failed episode has one row, with the metric
+        error and no value. ``outdated`` are records of an earlier version of a method of ours than
+        there is one of: not to be mixed with the others.
 
     Raises
     ------

@@ -7,8 +7,10 @@ import importlib.util
 import json
 import re
 import sys
+import warnings
 from collections.abc import Callable
 from functools import lru_cache
+from importlib.metadata import entry_points
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -18,6 +20,8 @@ from eitbench._files import shipped
 if TYPE_CHECKING:
     from eitbench.worlds.task import Task
 
+METHODS = "eitbench.methods"
+"""Entry points of installed packages: a method's name, and its module of that name."""
 BOARDS = ("filter", "fixed-lag", "smoothing")
 ROLES = (None, "floor", "reference")
 """What a method is on a board: ranked, or a mark from which the others are judged."""
@@ -40,7 +44,8 @@ class Baseline(NamedTuple):
     role: str | None = None
     """One of `ROLES`."""
     privileged: bool = False
-    """Shown the episode's flow and whole record: Estimator(task, revealed). A mark for the others, not one of them."""
+    """Shown the episode's flow and whole record: Estimator(task, revealed). A mark for the others,
+    not one of them."""
 
     @property
     def version(self) -> str:
@@ -64,7 +69,8 @@ def own_baselines() -> list[str]:
 
 
 def own_names(id: str) -> set[str]:
-    """Under which results of our own methods are kept in an environment: of files, and of its trained agents."""
+    """Under which results of our own methods are kept in an environment: of files, and of its
+    trained agents."""
     folder = baseline_folder()
     agents = (folder / "checkpoints" / id.replace("/", "-")).glob("*/seed*/model.zip")
     return {path.stem for pattern in ("*.py", "injection/*.py") for path in folder.glob(pattern)} | {
@@ -73,17 +79,42 @@ def own_names(id: str) -> set[str]:
 
 def is_ours(name: str) -> bool:
     """Whether a method, by name or by path, is one of ours: it lies in our folder."""
-    return not name.endswith((".py", ".zip")) or Path(name).resolve().is_relative_to(baseline_folder().resolve())
+    if not name.endswith((".py", ".zip")):
+        return name not in installed_methods()
+    return Path(name).resolve().is_relative_to(baseline_folder().resolve())
+
+
+@lru_cache(maxsize=1)
+def installed_methods() -> dict[str, Path]:
+    """Name -> file of each method that an installed package offers (entry points `METHODS`).
+
+    A package that takes a name of ours, or whose file is not to be found, is left out with a
+    warning.
+    """
+    found = {}
+    for point in entry_points(group=METHODS):
+        try:
+            specification = importlib.util.find_spec(point.value)
+        except ImportError:
+            specification = None
+        path = Path(specification.origin) if specification and specification.origin else None
+        if point.name in own_baselines() or path is None or path.stem != point.name:
+            warnings.warn(f"method {point.name} of {point.value} is left out: it must be a module of "
+                          "that name, and none of ours may have it", stacklevel=2)
+        else:
+            found[point.name] = path
+    return found
 
 
 def version_of(path: Path, sha256: str) -> str:
-    """What a method's records say of its version: of ours that of its card, v1 where there is none; of all others eight
-    digits of their file's sha256."""
+    """What a method's records say of its version: of ours that of its card, v1 where there is none;
+    of all others eight digits of their file's sha256."""
     return f"v{card_version(card_name(path))}" if is_ours(str(path)) else sha256[:8]
 
 
 def card_name(path: Path) -> str:
-    """Of the card of one of our methods: that of its file; agents of one environment and algorithm share one."""
+    """Of the card of one of our methods: that of its file; agents of one environment and algorithm
+    share one."""
     folders = path.resolve().parents
     return path.stem if path.suffix == ".py" else f"{folders[2].name}--{folders[1].name}"
 
@@ -96,14 +127,21 @@ def card_version(name: str) -> int:
 
 
 def find_baseline(name: str) -> Path:
-    """The file of one of our baselines by name, or anybody's by its path; ``ValueError`` if there is none, or it has
-    the name of another."""
-    path = Path(name) if name.endswith(".py") else baseline_folder() / f"{name}.py"
+    """The file of one of our baselines by name, or anybody's by its path; ``ValueError`` if there
+    is none, or it has the name of another."""
+    path = file_of(name, baseline_folder())
     if not path.is_file():
-        raise ValueError(f"baseline must be a path to a .py file or one of {', '.join(own_baselines())}; got {name!r}")
+        known = [*own_baselines(), *installed_methods()]
+        raise ValueError(f"baseline must be a path to a .py file or one of {', '.join(known)}; got {name!r}")
     if path.stem in own_baselines() and not path.samefile(baseline_folder() / path.name):
         raise ValueError(f"baseline {path} has the name of one of ours, under which results are kept; rename it")
     return path
+
+
+def file_of(name: str, folder: Path) -> Path:
+    """Where a method lies that is named by path, or of an installed package, or of ours."""
+    return Path(name) if name.endswith((".py", ".zip")) else installed_methods().get(
+        name, folder / f"{name}.py")
 
 
 def load_baseline(name: str) -> Baseline:
@@ -135,21 +173,23 @@ def _load(path: Path, source: bytes) -> Baseline:
 
 
 def load_module(kind: str, path: Path, source: bytes) -> ModuleType:
-    """The module that a file's content makes; ``ValueError``, naming ``kind`` and path, if it cannot be executed."""
+    """The module that a file's content makes; ``ValueError``, naming ``kind`` and path, if it
+    cannot be executed."""
     specification = importlib.util.spec_from_file_location(f"eitbench_{kind}_{path.stem}", path)
     assert specification is not None
     module = importlib.util.module_from_spec(specification)
-    sys.modules[specification.name] = module                       # dataclasses look their module up
+    sys.modules[specification.name] = module  # dataclasses look their module up
     try:
-        exec(compile(source, path, "exec"), module.__dict__)  # a cached .pyc may lag behind an edit by a second
+        # a cached .pyc may lag behind an edit by a second
+        exec(compile(source, path, "exec"), module.__dict__)
     except Exception as error:
         raise ValueError(f"{kind} {path} cannot be loaded: {type(error).__name__}: {error}") from error
     return module
 
 
 def title_of(module: ModuleType, path: Path) -> str:
-    """First line of the docstring, up to a colon, bracket or full stop, 120 letters at most; without one, the file's
-    name."""
+    """First line of the docstring, up to a colon, bracket or full stop, 120 letters at most;
+    without one, the file's name."""
     line = f"{(module.__doc__ or '').strip()}\n".splitlines()[0]
     return re.split(r"[:(.]", line)[0].strip()[:120] or path.stem
 
@@ -164,7 +204,8 @@ def parameters_of(who: str, method: type[Any]) -> dict[str, Any]:
 
 
 def is_privileged(who: str, method: type[Any]) -> bool:
-    """The class attribute ``privileged``; ``ValueError``, naming ``who``, if it is neither True nor False."""
+    """The class attribute ``privileged``; ``ValueError``, naming ``who``, if it is neither True nor
+    False."""
     privileged = getattr(method, "privileged", False)
     if not isinstance(privileged, bool):
         raise ValueError(f"{who}.privileged must be True or False, got {privileged!r}")

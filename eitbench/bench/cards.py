@@ -25,6 +25,7 @@ from eitbench.bench.baselines import (
 )
 from eitbench.bench.policies import load_policy, own_agents, own_policies
 from eitbench.bench.run import Job, run_episode
+from eitbench.bench.scores import scored, scores
 from eitbench.data.seeds import parse_seeds
 
 SEED = "dev:0"
@@ -34,8 +35,6 @@ DOUBLE = 1e-6
 SINGLE = 1e-4
 """Relative differences that are none: other processors and BLAS kernels take sums in another order;
 the reduced filter computes in single precision."""
-CLOCKED = ("seconds_per_step",)
-"""Scores that never repeat."""
 
 
 def card_folder() -> Path:
@@ -82,9 +81,9 @@ def new_card(name: str, method: str) -> dict[str, Any]:
 def played(card: dict[str, Any], method: str) -> dict[str, Any]:
     """The card with what comes out now.
 
-    ``scores`` are those of the episode that are finite and no times. ``answer`` is, of an estimator,
-    some entries of its last estimate in mol/m³; of a policy, the electrodes that were source and sink
-    in each step, or none.
+    ``scores`` are those of the episode that are finite and no times. ``answer`` is, of an
+    estimator, some entries of its last estimate in mol/m³; of a policy, the electrodes that were
+    source and sink in each step, or none.
 
     Raises
     ------
@@ -93,12 +92,10 @@ def played(card: dict[str, Any], method: str) -> dict[str, Any]:
     """
     environment = tracks.Environment(card["environment"], json.dumps(card["kwargs"]))
     (seed,) = parse_seeds(card["seed"])
-    if environment.track == "injection":
-        scores, answer = _choices(environment, method, seed)
-    else:
-        scores, answer = _estimates(environment, method, seed)
-    kept = {score: value for score, value in scores.items()
-            if value is not None and math.isfinite(value) and score not in CLOCKED}
+    answers = _choices if environment.track == "injection" else _estimates
+    numbers, answer = answers(environment, method, seed)
+    kept = {score: value for score, value in numbers.items()
+            if value is not None and math.isfinite(value) and scores()[score].repeats}
     return card | {"scores": kept, "answer": answer}
 
 
@@ -118,8 +115,8 @@ def moved(card: dict[str, Any], now: dict[str, Any]) -> list[str]:
 def update(names: list[str], *, new_version: bool = False) -> Iterator[tuple[str, str, list[str]]]:
     """Play the cards of some methods (default: all of ours), and write what is new.
 
-    Where numbers have moved the card stays as it is, unless there is to be a new version: then it is
-    written with the next number.
+    Where numbers have moved the card stays as it is, unless there is to be a new version: then it
+    is written with the next number.
 
     Yields
     ------
@@ -145,7 +142,8 @@ def _updated(name: str, method: str, new_version: bool) -> tuple[str, list[str]]
     if differences and not new_version:
         return "moved", differences
     if card and not differences:
-        # Scores that came after the card was written are added; what is there stays to the last bit.
+        # Scores that came after the card was written are added; what is there stays to the last
+        # bit.
         now = card | {"scores": now["scores"] | card["scores"]}
         what = "same"
     else:
@@ -180,7 +178,7 @@ def _text(card: dict[str, Any]) -> str:
 
 
 def _estimates(environment: tracks.Environment, method: str,
-               seed: int) -> tuple[dict[str, Any], list[float]]:
+               seed: int) -> tuple[dict[str, Any], list[Any]]:
     result, fields = run_episode(Job(environment, method, seed))
     if result["status"] != "ok":
         raise ValueError(f"{method} fails in {environment.id}: {result['message']}")
@@ -190,13 +188,13 @@ def _estimates(environment: tracks.Environment, method: str,
 
 
 def _choices(environment: tracks.Environment, method: str,
-             seed: int) -> tuple[dict[str, Any], list[list[int]]]:
+             seed: int) -> tuple[dict[str, Any], list[Any]]:
     arguments = json.loads(environment.kwargs)
     estimator = arguments.pop("estimator", "full")
-    result = policies.play(environment.id, arguments, method, seed, estimator)
+    played = policies.play(environment.id, arguments, method, seed, estimator)
     pairs = [[int(step.argmax()), int(step.argmin())] if step.any() else []
-             for step in result["currents"]]
-    return {score: result[score] for score in ("error", "spent")}, pairs
+             for step in played.currents]
+    return scored("injection", played.outcome), pairs
 
 
 def _same(then: list[Any], now: list[Any], tolerance: float) -> bool:

@@ -1,7 +1,8 @@
-"""Episodes that nobody could prepare for: their seeds follow from a salt that only the maintainers know.
+"""Episodes that nobody could prepare for: their seeds follow from a salt that only the maintainers
+know.
 
-Held-out episode k = 0, 1, … has the seed SHA-256(salt ‖ k) mod 2⁶³, k as eight bytes, the first the highest. The
-salt's own SHA-256 is published, so that it cannot be chosen after a method was seen.
+Held-out episode k = 0, 1, … has the seed SHA-256(salt ‖ k) mod 2⁶³, k as eight bytes, the first the
+highest. The salt's own SHA-256 is published, so that it cannot be chosen after a method was seen.
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ LENGTH = 32
 
 
 def new_salt(path: Path) -> str:
-    """Write a new salt, for its owner's eyes only, and return its hash; ``ValueError`` if there is a file already."""
+    """Write a new salt, for its owner's eyes only, and return its hash; ``ValueError`` if there is
+    a file already."""
     salt = secrets.token_bytes(LENGTH)
     try:
         file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
@@ -58,8 +60,8 @@ def publish_new_salt(path: Path) -> str:
 
 
 def read_salt(path: Path) -> bytes:
-    """The salt in a file; ``ValueError`` if there is none, others may read it, guests even, or another's hash is
-    published."""
+    """The salt in a file; ``ValueError`` if there is none, others may read it, guests even, or
+    another's hash is published."""
     if any(path.resolve().is_relative_to(place.resolve()) for place in python_files()):
         raise ValueError(f"salt {path} lies among Python's files, which guests may read; move it elsewhere")
     try:
@@ -92,9 +94,11 @@ def held_out_seeds(salt: bytes, count: int) -> list[int]:
 
 
 def held_out(record: dict[str, Any], job: Job, salt: bytes, episodes: int, folder: Path) -> tuple[str, list[str]]:
-    """Whether what a record gains over the board's floor, its method gains in held-out episodes too.
+    """Whether what a record gains over the board's floor, its method gains in held-out episodes
+    too.
 
-    The interquartile mean gains of both are compared; where the floor's record is not there, the mean errors.
+    The interquartile mean gains of both are compared; where the floor's record is not there, the
+    mean errors.
 
     Parameters
     ----------
@@ -115,7 +119,8 @@ def held_out(record: dict[str, Any], job: Job, salt: bytes, episodes: int, folde
     Raises
     ------
     ValueError
-        If the episodes are too few for an interval, or the method is a stranger's and could reach their seeds.
+        If the episodes are too few for an interval, or the method is a stranger's and could reach
+        their seeds.
     """
     if not is_ours(job.method) and job.isolation != "landlock":
         raise ValueError(f"{job.method} is not ours and can play held-out episodes behind a wall only, "

@@ -18,8 +18,8 @@ def migrate(folder: Path) -> Iterator[tuple[Path, Path]]:
     Raises
     ------
     ValueError
-        As `records.read_record`, or if the place of a new record is taken by one that says something
-        else; then nothing is changed.
+        As `records.read_record`, or if the place of a new record is taken by one that says
+        something else; then nothing is changed.
     """
     todo = [(path, read_record(path)) for path in sorted(Path(folder).glob("*.json")) if _is_old(path)]
     for _, record in todo:

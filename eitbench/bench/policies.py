@@ -16,6 +16,8 @@ import numpy as np
 
 from eitbench.bench.baselines import (
     baseline_folder,
+    file_of,
+    installed_methods,
     is_privileged,
     load_module,
     parameters_of,
@@ -23,6 +25,7 @@ from eitbench.bench.baselines import (
     title_of,
     version_of,
 )
+from eitbench.bench.scores import Outcome
 from eitbench.bench.tracks import Environment, check_track
 from eitbench.envs.injection import InjectionEnv
 from eitbench.envs.injection_core import Rules
@@ -31,7 +34,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 LOADERS = "eitbench.loaders"
-"""Entry points that load a policy from another kind of file: named by its suffix, called with path and content."""
+"""Entry points that load a policy from another kind of file: named by its suffix, called with path
+and content."""
 
 
 class PolicyFile(NamedTuple):
@@ -46,7 +50,8 @@ class PolicyFile(NamedTuple):
     privileged: bool    # shown the truth: a bound for the others, not one of them
     parameters: dict[str, Any]
     policy: Callable[..., Any]
-    """Policy(rules, random), if privileged Policy(rules, random, core), with act(observation) -> action."""
+    """Policy(rules, random), if privileged Policy(rules, random, core), with act(observation) ->
+    action."""
     role: str | None = None
     """One of `ROLES`, as of baselines."""
 
@@ -61,6 +66,14 @@ class PolicyFile(NamedTuple):
         return judge is None or bool(judge(rules))
 
 
+class Injected(NamedTuple):
+    """An episode that a policy has played."""
+
+    outcome: Outcome
+    currents: np.ndarray
+    """(steps, L) A (A/m in 2D) of each of its injections"""
+
+
 def policy_folder() -> Path:
     """Where our own policies lie."""
     return baseline_folder() / "injection"
@@ -72,8 +85,8 @@ def own_policies() -> list[str]:
 
 
 def own_agents(env_id: str) -> list[str]:
-    """Paths of our own trained agents for an environment: ``baselines/checkpoints/ENV/ALGO/seedK/model.zip``; none
-    without the extra ``rl``."""
+    """Paths of our own trained agents for an environment:
+    ``baselines/checkpoints/ENV/ALGO/seedK/model.zip``; none without the extra ``rl``."""
     if not find_spec("stable_baselines3"):
         return []
     folder = baseline_folder() / "checkpoints" / env_id.replace("/", "-")
@@ -81,24 +94,26 @@ def own_agents(env_id: str) -> list[str]:
 
 
 def find_policy(name: str) -> Path:
-    """The file of a policy that `load_policy` loads; ``ValueError`` if there is none, or it has the name of another."""
-    path = Path(name) if name.endswith((".py", ".zip")) else policy_folder() / f"{name}.py"
+    """The file of a policy that `load_policy` loads; ``ValueError`` if there is none, or it has the
+    name of another."""
+    path = file_of(name, policy_folder())
     if not path.is_file():
         raise ValueError("policy must be the path of a .py file or of an agent's model.zip, or one of "
-                         f"{', '.join(own_policies())}; got {name!r}")
+                         f"{', '.join([*own_policies(), *installed_methods()])}; got {name!r}")
     if path.stem in own_policies() and not path.samefile(policy_folder() / path.name):
         raise ValueError(f"policy {path} has the name of one of ours, under which results are kept; rename it")
     return path
 
 
 def load_policy(name: str) -> PolicyFile:
-    """Load one of our policies by name, anybody's by the path of its file, or a trained agent by that of its model.zip.
+    """Load one of our policies by name, anybody's by the path of its file, or a trained agent by
+    that of its model.zip.
 
     Raises
     ------
     ValueError
-        If there is no such policy, its file has no class `Policy` with an `act` method, or an agent's file is not the
-        one that was left by training.
+        If there is no such policy, its file has no class `Policy` with an `act` method, or an
+        agent's file is not the one that was left by training.
     """
     path = find_policy(name)
     return _load(path, path.read_bytes())
@@ -121,7 +136,7 @@ def _load(path: Path, source: bytes) -> PolicyFile:
 
 
 def play(env_id: str, kwargs: dict[str, Any], policy: str | PolicyFile, seed: int,
-         estimator: str = "full") -> dict[str, Any]:
+         estimator: str = "full") -> Injected:
     """Play one episode.
 
     Parameters
@@ -133,34 +148,33 @@ def play(env_id: str, kwargs: dict[str, Any], policy: str | PolicyFile, seed: in
     estimator : "full" or "reduced"
         The exact filter, for scores, or the one of training.
 
-    Returns
-    -------
-    dict
-        error : ẽ_c (5.12), the mean over scored states; errors : of each; spent : the agent's injections;
-        seconds_per_step : of the policy, what it prepares included; currents : (steps, L) in A, what it injected.
-
     Raises
     ------
     ValueError
         If there is no such environment or policy, or the policy does not suit it or acts wrongly.
     """
     env = environment(env_id, json.dumps(kwargs), estimator)
-    seconds, errors, currents = 0.0, list[float](), list[np.ndarray]()
-    for _, observation, elapsed in inject(env, policy if isinstance(policy, PolicyFile) else load_policy(policy), seed):
+    loaded = policy if isinstance(policy, PolicyFile) else load_policy(policy)
+    seconds = 0.0
+    errors = list[float]()
+    currents = list[np.ndarray]()
+    for _, observation, elapsed in inject(env, loaded, seed):
         seconds += elapsed
         currents.append(observation["currents"])
         errors += [] if env.error is None else [env.error]
-    return {"error": float(np.mean(errors)), "errors": errors, "spent": sum(bool(each.any()) for each in currents),
-            "seconds_per_step": seconds / env.core.length, "currents": np.array(currents)}
+    spent = sum(bool(each.any()) for each in currents)
+    outcome = Outcome(env.core.world, seconds / env.core.length, np.array(errors), spent)
+    return Injected(outcome, np.array(currents))
 
 
 def inject(env: InjectionEnv, loaded: PolicyFile, seed: int) -> Iterator[tuple[int, dict[str, np.ndarray], float]]:
-    """(t of the state now seen, observation, seconds the policy took) after each of its injections in one episode, the
-    first with what it took to prepare; errors as `play`."""
+    """(t of the state now seen, observation, seconds the policy took) after each of its injections
+    in one episode, the first with what it took to prepare; errors as `play`."""
     if not loaded.suits(env.rules):
         raise ValueError(f"policy {loaded.name} does not suit {env.spec.id if env.spec else env}")
     observation, done, t = env.reset(seed=seed)[0], False, env.core.first
-    # The fifth of an episode's streams; three made the recording, the fourth its faults. A generator knows what it was
+    # The fifth of an episode's streams; three made the recording, the fourth its faults. A
+    # generator knows what it was
     # seeded with, so the policy's is seeded with a number that says nothing of the episode.
     stream = np.random.default_rng(np.random.SeedSequence(seed).spawn(5)[4])
     random = np.random.default_rng(int(stream.integers(2**63)))
@@ -183,13 +197,14 @@ def environment(env_id: str, kwargs: str, estimator: str = "full") -> InjectionE
 
 
 def adaptivity_gap(table: pd.DataFrame, open_loop: Sequence[str]) -> tuple[float, float, float]:
-    """(best open-loop − clairvoyant) / (random − clairvoyant), mean errors each, with its 95 % bootstrap interval.
+    """(best open-loop − clairvoyant) / (random − clairvoyant), mean errors each, with its 95 %
+    bootstrap interval.
 
     Parameters
     ----------
     table : DataFrame
-        Columns policy, seed and error, with the policies clairvoyant, random_pair and ``open_loop``, all on the same
-        episodes.
+        Columns policy, seed and error, with the policies clairvoyant, random_pair and
+        ``open_loop``, all on the same episodes.
     open_loop : sequence of str
         Names; the one of them with the least mean error counts.
 

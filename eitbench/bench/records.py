@@ -1,12 +1,14 @@
 """Records: what one version of a method did in one environment, as JSON that says how to repeat it.
 
-A record says: this version of a method, in this version of a world (the -vN of its id), on these seeds, scored
-this. Numbers decide; commit, machine and digest of the code stand beside each run and decide nothing.
+A record says: this version of a method, in this version of a world (the -vN of its id), on these
+seeds, scored this. Numbers decide; commit, machine and digest of the code stand beside each run and
+decide nothing.
 
-The format is published in ``leaderboards/schema.json``, and a record is checked against it when it is written and when
-it is read. It carries the sha256 of its own content, so that a number changed by hand is noticed. That guards against
-accidents; whether a self-reported number is true is found out by running the method again. Records of the format
-before are read as well (`eitbench.bench.schema2`).
+The format is published in ``leaderboards/schema.json``, and a record is checked against it when it
+is written and when it is read. It carries the sha256 of its own content, so that a number changed
+by hand is noticed. That guards against accidents; whether a self-reported number is true is found
+out by running the method again. Records of the format before are read as well
+(`eitbench.bench.schema2`).
 """
 
 from __future__ import annotations
@@ -38,7 +40,8 @@ OURS = re.compile(r"v([1-9][0-9]*)")
 
 
 def write_record(folder: Path, record: dict[str, Any]) -> Path:
-    """Write a record into ``folder``, whole or not at all, and return its path; what had its name is replaced.
+    """Write a record into ``folder``, whole or not at all, and return its path; what had its name
+    is replaced.
 
     Raises
     ------
@@ -58,8 +61,8 @@ def read_record(path: Path) -> dict[str, Any]:
     Raises
     ------
     ValueError
-        Naming the file and the fields, if it cannot be read, is not what the schema asks for, was changed since it was
-        written, or has another name than its content asks for.
+        Naming the file and the fields, if it cannot be read, is not what the schema asks for, was
+        changed since it was written, or has another name than its content asks for.
     """
     try:
         record = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse)
@@ -78,9 +81,11 @@ def read_record(path: Path) -> dict[str, Any]:
 
 
 def read_records(folder: Path) -> list[dict[str, Any]]:
-    """All records of a folder, by file name; none if there is no such folder. Errors as `read_record`.
+    """All records of a folder, by file name; none if there is no such folder. Errors as
+    `read_record`.
 
-    Records of an environment that is not registered, or no longer in that version, are left out with a warning.
+    Records of an environment that is not registered, or no longer in that version, are left out
+    with a warning.
     """
     records, known = [], set(tracks.ids())
     for path in sorted(Path(folder).glob("*.json")):
@@ -97,7 +102,7 @@ def sealed(record: dict[str, Any]) -> dict[str, Any]:
     """The record with the ``sha256`` of its content: canonical JSON of all other fields."""
     try:
         content = json.loads(_json({key: value for key, value in record.items() if key != "sha256"}))
-    except (TypeError, ValueError) as error:                              # NaN, or something that is no JSON at all
+    except (TypeError, ValueError) as error:  # NaN, or something that is no JSON at all
         raise ValueError(f"record cannot be written as JSON: {error}") from None
     text = _json(content, separators=(",", ":"))
     return content | {"sha256": hashlib.sha256(text.encode()).hexdigest()}
@@ -115,7 +120,8 @@ def split_of(seed: str) -> str:
 
 
 def alike(runs: Iterable[dict[str, Any]], *keys: str) -> list[list[dict[str, Any]]]:
-    """Runs grouped by code, machine and these ``keys``; the processes of a machine time its matrix product each."""
+    """Runs grouped by code, machine and these ``keys``; the processes of a machine time its matrix
+    product each."""
     groups: dict[str, list[dict[str, Any]]] = {}
     for run in runs:
         machine = {key: value for key, value in run["machine"].items() if key != "matmul_seconds"}
@@ -132,8 +138,9 @@ def finished(record: dict[str, Any]) -> str:
 def newest(records: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Records that may stand on a board together, and the outdated ones, each in the given order.
 
-    Among those of one environment, one split and one method of ours only the highest version is current; versions of
-    somebody else's method, whose names do not say which came first, stand side by side.
+    Among those of one environment, one split and one method of ours only the highest version is
+    current; versions of somebody else's method, whose names do not say which came first, stand side
+    by side.
     """
     highest: dict[tuple[str, ...], int] = {}
     for record in records:
@@ -155,7 +162,8 @@ def _lineage(record: dict[str, Any]) -> tuple[str, ...]:
 
 
 def _check(path: Path, record: Any) -> None:
-    """``ValueError`` naming file and fields if a record is not as the schema says, or contradicts itself."""
+    """``ValueError`` naming file and fields if a record is not as the schema says, or contradicts
+    itself."""
     wrong = [f"{error.json_path}: {_shortened(error.message)}" for error in sorted(
         _validator().iter_errors(record), key=lambda error: error.json_path)] or _contradictions(record)
     if wrong:
@@ -208,7 +216,8 @@ def _named_by_content(record: dict[str, Any]) -> str:
 
 
 def _text(record: dict[str, Any]) -> str:
-    """JSON with sorted keys, a line for each field, episode and run, so that changes can be read line by line."""
+    """JSON with sorted keys, a line for each field, episode and run, so that changes can be read
+    line by line."""
     lines = []
     for key, value in sorted(record.items()):
         if key in ("episodes", "runs"):

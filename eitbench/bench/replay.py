@@ -16,11 +16,11 @@ from tqdm import tqdm
 
 from eitbench import _check
 from eitbench._files import write_atomically
-from eitbench.bench.records import read_record
+from eitbench.bench.records import newest, read_record
 from eitbench.bench.run import run_episode
 from eitbench.bench.store import source_digest
 from eitbench.bench.text import as_markdown
-from eitbench.bench.verify import TOLERANCE, differences_of, job_of
+from eitbench.bench.verify import TOLERANCE, differences_of, job_of, outdated
 from eitbench.data.parallel import in_parallel
 from eitbench.data.seeds import parse_seeds
 from eitbench.data.store import CACHE_VARIABLE
@@ -36,8 +36,28 @@ class Replay(NamedTuple):
     """Where what came out is kept."""
 
 
+def official_records(folder: Path, environments: Sequence[str] = ()) -> list[Path]:
+    """Paths of the official records of a folder that are not outdated, of these environments or of
+    all.
+
+    Raises
+    ------
+    ValueError
+        If there are none, or one of all records is not valid.
+    """
+    read = {path: read_record(path) for path in sorted(folder.glob("*.json"))}
+    current = newest(list(read.values()))[0]
+    chosen = [path for path, record in read.items() if record["official"] and record in current
+              and (not environments or record["environment"]["id"] in environments)]
+    if not chosen:
+        raise ValueError(f"records must be a folder with official records, got {folder}"
+                         + (f", which has none of {', '.join(environments)}" if environments else ""))
+    return chosen
+
+
 def replays(records: Sequence[Path], episodes: int, seed: int, folder: Path) -> list[Replay]:
-    """``episodes`` drawn from each record with this ``seed``, environment by environment, cheap ones first.
+    """``episodes`` drawn from each record with this ``seed``, environment by environment, cheap
+    ones first.
 
     Records of the same episodes have the same ones drawn, so that each is simulated once.
     """
@@ -58,20 +78,23 @@ def verify_all(records: Sequence[Path], folder: Path, *, episodes: int = 1, seed
                isolate: str = "others", n_jobs: int = 1, backend: str = "loky") -> pd.DataFrame:
     """Play ``episodes`` of every record again.
 
-    What came out is kept in ``folder`` the moment it is there, with the simulated episodes; the same call with the
-    same code goes on from there.
+    What came out is kept in ``folder`` the moment it is there, with the simulated episodes; the
+    same call with the same code goes on from there.
 
     Returns
     -------
     DataFrame
-        A row for each episode: record, environment, method, episode, score (that with the greatest relative
-        difference), difference, said and again (ẽ_c), problem (a sentence where it could not be played).
+        A row for each episode: record, environment, method, episode, score (that with the greatest
+        relative difference), difference, said and again (ẽ_c), problem (a sentence where it could
+        not be played), remark (a sentence where the record is of an older version than the method
+        is now).
     """
     _check.integer("episodes", episodes, low=1)
     todo = replays(records, episodes, seed, folder)
     left = [(replay, isolate) for replay in todo if _kept(replay) is None]
     before = os.environ.get(CACHE_VARIABLE)
-    os.environ[CACHE_VARIABLE] = str((folder / "cache").absolute())       # nothing that was there before is believed
+    # nothing that was there before is believed
+    os.environ[CACHE_VARIABLE] = str((folder / "cache").absolute())
     try:
         for _ in tqdm(in_parallel(_replay, left, n_jobs, backend), total=len(todo), initial=len(todo) - len(left),
                       desc="playing again", unit="episode", disable=None):
@@ -90,12 +113,13 @@ def _replay(replay: Replay, isolate: str) -> None:
     outcome: dict[str, Any] = {
         "identity": _identity(replay), "record": replay.record.name, "environment": record["environment"]["id"],
         "method": record["method"], "episode": said["seed"], "score": "", "difference": 0.0,
-        "said": said.get("scores", {}).get("error"), "again": None, "problem": ""}
+        "said": said.get("scores", {}).get("error"), "again": None, "problem": "", "remark": ""}
     try:
         job = job_of(record, None, isolate)._replace(seed=parse_seeds(said["seed"])[0])
     except ValueError as error:
         outcome["problem"] = str(error)
     else:
+        outcome["remark"] = outdated(record, job)
         again = json.loads(json.dumps(run_episode(job)[0]))
         off = differences_of(said, again)
         outcome["score"] = max(off, key=lambda name: off[name], default="")
@@ -119,8 +143,20 @@ def _identity(replay: Replay) -> str:
     return f"{zlib.crc32(content.encode() + source_digest().encode()):08x}"
 
 
+def differing(rows: pd.DataFrame, tolerance: float = TOLERANCE) -> list[str]:
+    """A sentence for each episode that is not as its record says, or could not be played."""
+    wrong = rows[(rows["difference"] > tolerance) | (rows["problem"] != "")]
+    said = []
+    for _, row in wrong.iterrows():
+        what = row["problem"] or f"{row['score']} by {row['difference']:.2g}"
+        remark = f" ({row['remark']})" if row["remark"] else ""
+        said.append(f"{row['record']}, {row['episode']}: {what}{remark}")
+    return said
+
+
 def by_environment(rows: pd.DataFrame, tolerance: float = TOLERANCE) -> str:
-    """Markdown: for each environment how many episodes are as their records say, and the greatest difference."""
+    """Markdown: for each environment how many episodes are as their records say, and the greatest
+    difference."""
     lines = []
     for name, group in rows.groupby("environment", sort=False):
         worst = group.iloc[int(group["difference"].argmax())]

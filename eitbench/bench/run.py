@@ -1,4 +1,5 @@
-"""Run baselines and policies on environments over seeds; each episode's result is stored the moment it is done."""
+"""Run baselines and policies on environments over seeds; each episode's result is stored the moment
+it is done."""
 
 from __future__ import annotations
 
@@ -25,6 +26,7 @@ from eitbench.bench.sandbox import guests
 from eitbench.bench.sandbox.host import GuestError
 from eitbench.bench.sandbox.wall import landlock_version
 from eitbench.bench.score import Played, score
+from eitbench.bench.scores import scored
 from eitbench.bench.store import EpisodeStore, machine, provenance, source_digest
 from eitbench.bench.tracks import KINDS, Environment, board_of
 from eitbench.data.bank import fill
@@ -55,7 +57,8 @@ class Job(NamedTuple):
 
     @property
     def isolation(self) -> str:
-        """What keeps the method from what it should not see: ``none``, a ``process``, or ``landlock`` around it."""
+        """What keeps the method from what it should not see: ``none``, a ``process``, or
+        ``landlock`` around it."""
         return "none" if not self.isolated else "landlock" if landlock_version() else "process"
 
     def identity(self) -> str:
@@ -67,8 +70,8 @@ class Job(NamedTuple):
 
 
 def play(env: EstimationEnv, baseline: Baseline, seed: int) -> Iterator[tuple[int, Estimate]]:
-    """Play one episode and yield (t, estimate of the state t ≥ 1). The estimator sees the task and the measurements;
-    rewards and the environment itself stay here."""
+    """Play one episode and yield (t, estimate of the state t ≥ 1). The estimator sees the task and
+    the measurements; rewards and the environment itself stay here."""
     for t, estimate, _, _ in _play(env, baseline, seed):
         if estimate is not None and t >= 1:
             yield t, estimate
@@ -107,7 +110,8 @@ def _play(env: EstimationEnv, baseline: Baseline, seed: int,
 
 
 def _action(task: Task, estimate: Estimate | None, silence: np.ndarray) -> np.ndarray:
-    """What the environment is told; the flow believed at first where an estimator says nothing of it."""
+    """What the environment is told; the flow believed at first where an estimator says nothing of
+    it."""
     mean = silence if estimate is None else estimate.mean
     if task.velocity is None:
         return mean
@@ -131,7 +135,8 @@ def _check_estimate(estimate: Estimate, task: Task) -> None:
     if covariance is not None:
         _check.array("Estimate.innovation_covariance", covariance, (n_electrodes, n_electrodes), units="V²")
         spectrum = np.linalg.eigvalsh(0.5 * np.asarray(covariance, float) + 0.5 * np.asarray(covariance, float).T)
-        if spectrum[0] <= n_electrodes * np.finfo(float).eps * spectrum[-1]:       # νᵀS⁻¹ν could be less than none
+        # νᵀS⁻¹ν could be less than none
+        if spectrum[0] <= n_electrodes * np.finfo(float).eps * spectrum[-1]:
             raise ValueError("Estimate.innovation_covariance must be positive definite, got eigenvalues "
                              f"from {spectrum[0]:g} to {spectrum[-1]:g} V²")
     if variance is None:
@@ -146,9 +151,11 @@ def run_episode(job: Job) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     Returns
     -------
     result : dict
-        JSON-ready: status "ok" with scores and the error of every scored step, or "failed" with a message.
+        JSON-ready: status "ok" with scores and the error of every scored step, or "failed" with a
+        message.
     fields : dict of arrays
-        The estimates' means and standard deviations (float32); empty for policies and after a failure.
+        The estimates' means and standard deviations (float32); empty for policies and after a
+        failure.
     """
     method, env = job.load(), _environment(job.environment)
     result: dict[str, Any] = {
@@ -175,7 +182,8 @@ def run_episode(job: Job) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         result |= {"status": "ok", **outcome}
     except GuestError as error:
         result |= {"status": "failed", "message": str(error), "where": error.where}
-    except (Exception, SystemExit) as error:        # whatever a method does wrong is its result, not our crash
+    # whatever a method does wrong is its result, not our crash
+    except (Exception, SystemExit) as error:
         result |= {"status": "failed", "message": f"{type(error).__name__}: {error}",
                    "where": _where(error)}
     if result["status"] == "failed":
@@ -190,8 +198,8 @@ def run_episode(job: Job) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
 def _play_policy(job: Job, policy: policies.PolicyFile) -> dict[str, Any]:
     kwargs, estimator = _inside(job.environment)
     played = policies.play(job.environment.id, kwargs, policy, job.seed, estimator)
-    return {"scores": {name: played[name] for name in ("error", "spent", "seconds_per_step")},
-            "step_errors": played["errors"]}
+    return {"scores": scored("injection", played.outcome),
+            "step_errors": played.outcome.errors.tolist()}
 
 
 def _where(error: BaseException) -> str:
@@ -202,11 +210,13 @@ def _where(error: BaseException) -> str:
 
 def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1, backend: str = "loky",
              command: str = "") -> None:
-    """Run all jobs that ``store`` does not hold yet, in ``n_jobs`` processes with one BLAS thread each.
+    """Run all jobs that ``store`` does not hold yet, in ``n_jobs`` processes with one BLAS thread
+    each.
 
-    Each process stores an episode the moment it is done. ``backend`` is one of `eitbench.data.parallel.BACKENDS`, of which
-    those of a cluster need the folders of ``store`` and cache on all its machines; ``command`` is what the results will
-    name as the command that made them. Errors as `eitbench.data.parallel.in_parallel`.
+    Each process stores an episode the moment it is done. ``backend`` is one of
+    `eitbench.data.parallel.BACKENDS`, of which those of a cluster need the folders of ``store`` and
+    cache on all its machines; ``command`` is what the results will name as the command that made
+    them. Errors as `eitbench.data.parallel.in_parallel`.
     """
     todo = [job for job in jobs
             if not store.holds(job.environment.name, job.load().name, job.seed, job.identity())]
@@ -214,7 +224,7 @@ def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1, backend: 
         tqdm.write(f"{len(jobs) - len(todo)} of {len(jobs)} episodes are already there")
     if not todo:
         return
-    truths: dict[Any, Job] = {}                     # each once, before several methods want it at once
+    truths: dict[Any, Job] = {}  # each once, before several methods want it at once
     recordings: dict[Any, list[int]] = {}
     for job in todo:
         env = _environment(job.environment)
@@ -242,14 +252,16 @@ def _simulate_job(job: Job) -> None:
 
 def _run_job(job: Job, store: EpisodeStore, run: dict[str, Any], home: str) -> None:
     result, fields = run_episode(job)
-    elsewhere = {} if platform.node() == home else {"machine": machine()}         # whose times these are, not who asked
+    # whose times these are, not who asked
+    elsewhere = {} if platform.node() == home else {"machine": machine()}
     store.put(job.environment.name, result["method"], job.seed,
               result | {"run": run | elsewhere | {"isolation": job.isolation}}, fields)
 
 
 @lru_cache(maxsize=4)
 def _environment(environment: Environment) -> EstimationEnv | InjectionEnv:
-    """Made once a process, so that models and what estimators derive from them are shared by its episodes."""
+    """Made once a process, so that models and what estimators derive from them are shared by its
+    episodes."""
     if environment.track == "injection":
         kwargs, estimator = _inside(environment)
         return policies.environment(environment.id, json.dumps(kwargs), estimator)
@@ -257,6 +269,7 @@ def _environment(environment: Environment) -> EstimationEnv | InjectionEnv:
 
 
 def _inside(environment: Environment) -> tuple[dict[str, Any], str]:
-    """Arguments of an environment that asks for injections, and the estimator inside: the exact one for scores."""
+    """Arguments of an environment that asks for injections, and the estimator inside: the exact one
+    for scores."""
     kwargs = json.loads(environment.kwargs)
     return {key: value for key, value in kwargs.items() if key != "estimator"}, kwargs.get("estimator", "full")

@@ -1,8 +1,8 @@
 """Records of the format before, schema 2, as they would be written today.
 
-There a record carried one ``source``, a digest of the library's text that decided whether it counted;
-its version was always eight digits of the method's file; and ``kwargs`` held what an environment was
-registered with too.
+There a record carried one ``source``, a digest of the library's text that decided whether it
+counted; its version was always eight digits of the method's file; and ``kwargs`` held what an
+environment was registered with too.
 """
 
 from __future__ import annotations

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 
 from eitbench import scoring
+from eitbench.bench.scores import Claims, Outcome, scored
+from eitbench.data.episodes import truth_discretisation
 from eitbench.data.regions import region_operators
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.estimation import best_homogeneous
@@ -53,8 +55,10 @@ class Played:
                 if estimate.velocity is not None:
                     velocities[t - 1] = estimate.velocity
             if estimate.innovation is not None and estimate.innovation_covariance is not None:
-                innovations[t + task.lag] = (np.array(estimate.innovation, dtype=float),     # copies, as means are:
-                                             np.array(estimate.innovation_covariance, dtype=float))  # arrays get reused
+                # copies, as means are:
+                innovations[t + task.lag] = (np.array(estimate.innovation, dtype=float),
+                                             # arrays get reused
+                                             np.array(estimate.innovation_covariance, dtype=float))
         voltages, currents = (np.array([m[key] for m in measured[:task.n_steps]]) for key in ("voltages", "currents"))
         claimed = bool(np.isfinite(variances[task.warm_up:]).all())
         return cls(means, variances if claimed else None, voltages, currents, innovations, np.array(seconds),
@@ -71,41 +75,39 @@ class Played:
 
 
 def score(env: EstimationEnv, played: Played) -> dict[str, Any]:
-    """Scores of the episode that ``env`` has just played, as JSON-ready numbers.
+    """Scores of the episode that ``env`` has just played (`eitbench.bench.scores`), and the error
+    of each scored state, as JSON-ready numbers."""
+    outcome = _outcome(env, played)
+    return {"scores": scored("estimation", outcome), "step_errors": outcome.errors.tolist()}
 
-    ``error`` is ẽ_c (5.12); a score that needs a claimed variance or innovation is None without one.
-    """
-    task, truth = env.task, env.truth()
+
+def _outcome(env: EstimationEnv, played: Played) -> Outcome:
+    """What can be scored of it, on the truth's mesh."""
+    task = env.task
     interpolation, mass = region_operators(env.world)
-    scored = slice(task.warm_up, None)
-    c = truth[scored]
-    mean = (interpolation @ played.means[scored].T).T
-    c_bh = best_homogeneous(task.observation, task.noise, task.mesh.n_nodes, played.voltages, played.currents,
-                            task.expected_concentration)
-    computed = np.array([task.observation.voltages(estimate, current[None])[0]
-                         for estimate, current in zip(played.means[scored], played.currents[scored], strict=True)])
-    errors = scoring.step_errors(mean, c, mass)
-    scores: dict[str, Any] = {
-        "error": float(errors.mean()),
-        "contrast_error": scoring.relative_error(mean, c, mass, reference=c_bh),
-        "voltage_discrepancy": scoring.voltage_discrepancy(played.voltages[scored], computed),
-        "velocity_error": None, "nis": None, "crps": None, "coverage_50": None, "coverage_90": None,
-        "spread_ratio": None,
-        "seconds_per_step": float(played.seconds.sum() / task.n_steps),
-    }
-    if task.velocity is not None:
-        true = env.true_velocity()[scored]
-        estimated = played.velocities[scored] @ task.velocity.profiles.T
-        scores["velocity_error"] = scoring.relative_error(estimated, true, np.diag(task.velocity.weights))
-    known = [played.innovations[i] for i in range(task.warm_up + 1, task.n_steps + 1) if i in played.innovations]
-    if known:
-        nu, S = (np.array(part) for part in zip(*known, strict=True))
-        scores["nis"] = float(scoring.normalised_innovations(nu, S).mean())
+    states = slice(task.warm_up, None)
+    truth = env.truth()[states]
+    mean = (interpolation @ played.means[states].T).T
+    homogeneous = best_homogeneous(task.observation, task.noise, task.mesh.n_nodes, played.voltages,
+                                   played.currents, task.expected_concentration)
+    computed = np.array([
+        task.observation.voltages(estimate, current[None])[0]
+        for estimate, current in zip(played.means[states], played.currents[states], strict=True)])
+    claims = None
     if played.variances is not None:
-        std = (interpolation @ np.sqrt(played.variances[scored]).T).T
-        weights = np.asarray(mass.sum(axis=0)).ravel()
-        scores["crps"] = scoring.crps(mean, std, c, weights)
-        for level in (50, 90):
-            scores[f"coverage_{level}"] = scoring.coverage(mean, std, c, weights, level / 100)
-        scores["spread_ratio"] = scoring.spread_ratio(mean, std, c, weights)
-    return {"scores": scores, "step_errors": errors.tolist()}
+        std = (interpolation @ np.sqrt(played.variances[states]).T).T
+        claims = Claims(mean, std, truth, np.asarray(mass.sum(axis=0)).ravel())
+    velocity = None
+    if task.velocity is not None:
+        velocity = (played.velocities[states] @ task.velocity.profiles.T,
+                    env.true_velocity()[states], task.velocity.weights)
+    known = [played.innovations[i] for i in range(task.warm_up + 1, task.n_steps + 1)
+             if i in played.innovations]
+    innovations = [np.array(part) for part in zip(*known, strict=True)]
+    return Outcome(
+        env.world, float(played.seconds.sum() / task.n_steps),
+        scoring.step_errors(mean, truth, mass), mean=mean, truth=truth, mass=mass,
+        points=truth_discretisation(env.world).transport.mesh.points, homogeneous=homogeneous,
+        measured=played.voltages[states], computed=computed,
+        innovations=(innovations[0], innovations[1]) if known else None, claims=claims,
+        velocity=velocity)

@@ -1,13 +1,16 @@
-"""Statistics of a board: interquartile mean, bootstrap intervals, comparisons seed by seed, shared ranks.
+"""Statistics of a board: interquartile mean, bootstrap intervals, comparisons seed by seed, shared
+ranks.
 
-Methods play the same episodes, named by their seeds, in several environments. An environment is a stratum: episodes are
-resampled within it, the environments stay as they are. Intervals are percentile bootstrap intervals of 95 % (Efron &
-Tibshirani, *An introduction to the bootstrap*, 1993, ch. 13), stratified as in Agarwal et al., "Deep reinforcement
-learning at the edge of the statistical precipice" (NeurIPS 2021) and its library rliable, but expanded, since with few
-episodes the plain ones are too narrow: cut off where Student's t would (Hesterberg, "What teachers should know about
-the bootstrap", The American Statistician 69, 2015, section 5.3). Each stratum is sorted before it is resampled, and
-``seed`` fixes the random stream: the same scores give the same interval in any process, however they are listed.
-`docs/statistics.md` says what the numbers mean, and how they compare with rliable's.
+Methods play the same episodes, named by their seeds, in several environments. An environment is a
+stratum: episodes are resampled within it, the environments stay as they are. Intervals are
+percentile bootstrap intervals of 95 % (Efron & Tibshirani, *An introduction to the bootstrap*,
+1993, ch. 13), stratified as in Agarwal et al., "Deep reinforcement learning at the edge of the
+statistical precipice" (NeurIPS 2021) and its library rliable, but expanded, since with few episodes
+the plain ones are too narrow: cut off where Student's t would (Hesterberg, "What teachers should
+know about the bootstrap", The American Statistician 69, 2015, section 5.3). Each stratum is sorted
+before it is resampled, and ``seed`` fixes the random stream: the same scores give the same interval
+in any process, however they are listed. `docs/statistics.md` says what the numbers mean, and how
+they compare with rliable's.
 """
 
 from __future__ import annotations
@@ -25,24 +28,28 @@ from scipy.stats import t as student
 Scores = Mapping[str, Mapping[str, float]]
 """Environment -> seed -> score: of one method, for comparisons seed by seed."""
 Statistic = Callable[..., Any]
-"""Takes one array (..., n_e) for each stratum and gives an array (...); n_e episodes, the axes before it are draws."""
+"""Takes one array (..., n_e) for each stratum and gives an array (...); n_e episodes, the axes
+before it are draws."""
 DRAWS = 10_000
 FEWEST = 6
-"""With fewer episodes altogether no interval is claimed: where all n differences have one sign each resample has it,
-and zero lies outside; for two equal methods that happens with probability 2^(1 − n), above 5 % for n < 6."""
+"""With fewer episodes altogether no interval is claimed: where all n differences have one sign each
+resample has it, and zero lies outside; for two equal methods that happens with probability 2^(1 −
+n), above 5 % for n < 6."""
 
 
 def interquartile_mean(*scores: ArrayLike) -> Any:
     """Mean of the middle half of all scores pooled: the 25 % trimmed mean (Agarwal et al. 2021).
 
-    Of N scores the ⌊N/4⌋ lowest and the ⌊N/4⌋ highest are left out whole. Where 4 does not divide N a little more than
-    half therefore stays, with equal weights: all for N ≤ 3, 3 of 5, 4 of 6, 5 of 7, 4 of 8.
+    Of N scores the ⌊N/4⌋ lowest and the ⌊N/4⌋ highest are left out whole. Where 4 does not divide N
+    a little more than half therefore stays, with equal weights: all for N ≤ 3, 3 of 5, 4 of 6, 5 of
+    7, 4 of 8.
 
     Parameters
     ----------
     *scores : (..., n_e) each
-        One array an environment, or a single one. Pooled along the last axis, so that an environment weighs as much as
-        it has episodes; all must be on one scale. A matrix (runs, tasks) of rliable is ``*matrix.T``.
+        One array an environment, or a single one. Pooled along the last axis, so that an
+        environment weighs as much as it has episodes; all must be on one scale. A matrix (runs,
+        tasks) of rliable is ``*matrix.T``.
 
     Returns
     -------
@@ -51,12 +58,14 @@ def interquartile_mean(*scores: ArrayLike) -> Any:
     strata = [np.asarray(stratum, dtype=float) for stratum in scores]
     if not (total := sum(stratum.shape[-1] for stratum in strata)):
         raise ValueError("scores must hold at least one score")
-    # scipy.stats.trim_mean(…, 0.25), but faster for many draws, and the same to the last bit in whatever order
+    # scipy.stats.trim_mean(…, 0.25), but faster for many draws, and the same to the last bit in
+    # whatever order
     return np.sort(np.concatenate(strata, axis=-1), axis=-1)[..., total // 4:total - total // 4].mean(axis=-1)
 
 
 def mean_over_environments(*scores: ArrayLike) -> Any:
-    """Mean of the environments' means, (...) of one array (..., n_e) each: all weigh the same, however long."""
+    """Mean of the environments' means, (...) of one array (..., n_e) each: all weigh the same,
+    however long."""
     if not scores or not all(np.shape(stratum)[-1] for stratum in scores):
         raise ValueError("scores must hold at least one score of each environment")
     return np.mean([np.mean(np.asarray(stratum, dtype=float), axis=-1) for stratum in scores], axis=0)
@@ -64,23 +73,25 @@ def mean_over_environments(*scores: ArrayLike) -> Any:
 
 def stratified_bootstrap(scores_by_stratum: Mapping[str, ArrayLike], statistic: Statistic, *, draws: int = DRAWS,
                          seed: int = 0) -> tuple[float, float, float]:
-    """A statistic with its 95 % percentile bootstrap interval, episodes resampled within each environment.
+    """A statistic with its 95 % percentile bootstrap interval, episodes resampled within each
+    environment.
 
     Parameters
     ----------
     scores_by_stratum : environment -> (n_e,)
         The numbers of episodes may differ.
     statistic : callable
-        Called with one array for each environment, in the order of their names: (n_e,) for the value, and once for all
-        draws with (draws, n_e). It must not depend on the order of episodes; as `interquartile_mean` and
-        `mean_over_environments`.
+        Called with one array for each environment, in the order of their names: (n_e,) for the
+        value, and once for all draws with (draws, n_e). It must not depend on the order of
+        episodes; as `interquartile_mean` and `mean_over_environments`.
     draws, seed : int
         Number of resamples, and what fixes their random stream.
 
     Returns
     -------
     value, low, high
-        With fewer than `FEWEST` episodes altogether, or fewer than two in an environment, low and high are infinite.
+        With fewer than `FEWEST` episodes altogether, or fewer than two in an environment, low and
+        high are infinite.
     """
     strata = _strata("scores_by_stratum", scores_by_stratum)
     low, high = _interval(strata, statistic, draws, seed) if _enough(strata) else (-math.inf, math.inf)
@@ -89,11 +100,13 @@ def stratified_bootstrap(scores_by_stratum: Mapping[str, ArrayLike], statistic: 
 
 def paired_difference(a: Scores, b: Scores, *, statistic: Statistic = mean_over_environments, draws: int = DRAWS,
                       seed: int = 0) -> tuple[float, float, float]:
-    """A statistic of a less that of b, on the episodes that both have, with its 95 % interval; below zero a is lower.
+    """A statistic of a less that of b, on the episodes that both have, with its 95 % interval;
+    below zero a is lower.
 
-    What makes an episode hard for both cancels, so far smaller differences are seen than by comparing two intervals.
-    Pairs are resampled within each environment, so that both have the same episodes in every resample. By default it is
-    the mean difference, of several environments the mean of their means.
+    What makes an episode hard for both cancels, so far smaller differences are seen than by
+    comparing two intervals. Pairs are resampled within each environment, so that both have the same
+    episodes in every resample. By default it is the mean difference, of several environments the
+    mean of their means.
 
     Parameters
     ----------
@@ -122,10 +135,11 @@ def paired_difference(a: Scores, b: Scores, *, statistic: Statistic = mean_over_
 
 def paired_probability_of_improvement(a: Scores, b: Scores, *, higher_is_better: bool = False, draws: int = DRAWS,
                                       seed: int = 0) -> tuple[float, float, float]:
-    """Share of the shared episodes in which a is better than b, with its 95 % interval; an equal score counts ½.
+    """Share of the shared episodes in which a is better than b, with its 95 % interval; an equal
+    score counts ½.
 
-    The mean over environments of each one's share. Arguments, pairing and errors as in `paired_difference`; where there
-    is no interval, 0 and 1 are its ends.
+    The mean over environments of each one's share. Arguments, pairing and errors as in
+    `paired_difference`; where there is no interval, 0 and 1 are its ends.
     """
     wins = {environment: _wins(pair[0], pair[1], higher_is_better) for environment, pair in _pairs(a, b).items()}
     value, low, high = stratified_bootstrap(wins, mean_over_environments, draws=draws, seed=seed)
@@ -135,26 +149,31 @@ def paired_probability_of_improvement(a: Scores, b: Scores, *, higher_is_better:
 def probability_of_improvement(a: Mapping[str, ArrayLike], b: Mapping[str, ArrayLike], *,
                                higher_is_better: bool = False, draws: int = DRAWS,
                                seed: int = 0) -> tuple[float, float, float]:
-    """P(a better than b), whatever the seeds, with its 95 % interval: the Mann–Whitney statistic as in rliable.
+    """P(a better than b), whatever the seeds, with its 95 % interval: the Mann–Whitney statistic as
+    in rliable.
 
-    In each environment the share of all n_a·n_b combinations of an episode of a with one of b in which a is better, an
-    equal score counting ½; then the mean over environments. For the interval both are resampled independently of each
-    other. Meant for runs that have nothing in common, as trainings from different random seeds; of methods that played
-    the same episodes `paired_probability_of_improvement` makes more.
+    In each environment the share of all n_a·n_b combinations of an episode of a with one of b in
+    which a is better, an equal score counting ½; then the mean over environments. For the interval
+    both are resampled independently of each other. Meant for runs that have nothing in common, as
+    trainings from different random seeds; of methods that played the same episodes
+    `paired_probability_of_improvement` makes more.
 
     Parameters
     ----------
     a, b : environment -> (n_e,)
         In the same environments; the numbers of episodes may differ.
     draws, seed
-        As in `stratified_bootstrap`; so are the three numbers returned, but 0 and 1 stand for infinity.
+        As in `stratified_bootstrap`; so are the three numbers returned, but 0 and 1 stand for
+        infinity.
     """
     _same_environments(a, b)
     ours, theirs = _strata("a", a), _strata("b", b)
-    wins = [_wins(x[:, None], y, higher_is_better) for x, y in zip(ours, theirs, strict=True)]       # (n_a, n_b)
+    # (n_a, n_b)
+    wins = [_wins(x[:, None], y, higher_is_better) for x, y in zip(ours, theirs, strict=True)]
 
     def probability(*positions: np.ndarray) -> Any:
-        # A resample is how often each episode is in it, which makes of all its combinations one matrix product.
+        # A resample is how often each episode is in it, which makes of all its combinations one
+        # matrix product.
         shares = [((_counts(i) @ won) * _counts(j)).sum(axis=-1) / won.size
                   for i, j, won in zip(positions[:len(wins)], positions[len(wins):], wins, strict=True)]
         return np.mean(shares, axis=0)
@@ -170,21 +189,23 @@ def shared_ranks(scores: Mapping[str, Scores], unranked: Collection[str] = (), *
                  seed: int = 0) -> dict[str, int | None]:
     """Rank of each method: 1 + the number of ranked methods that are significantly better than it.
 
-    Better is one whose `paired_difference` has its whole interval on the better side of zero. Rank 1 thus means that
-    nobody was shown to be better, rank 3 that two were, and they can be named. A method too uncertain to be told from
-    others costs them no rank.
+    Better is one whose `paired_difference` has its whole interval on the better side of zero. Rank
+    1 thus means that nobody was shown to be better, rank 3 that two were, and they can be named. A
+    method too uncertain to be told from others costs them no rank.
 
-    "Cannot be told apart" is not transitive: a and b may be so, and b and c, and still a is better than c. No ranking
-    then gives one rank to exactly those that cannot be told apart; this one gives a and b rank 1 and c rank 2. Nor need
-    ranks rise along the statistic: a method of scattered scores may stand below one of rank 2 and have rank 1. Each
-    comparison is at 95 %, without correction for their number.
+    "Cannot be told apart" is not transitive: a and b may be so, and b and c, and still a is better
+    than c. No ranking then gives one rank to exactly those that cannot be told apart; this one
+    gives a and b rank 1 and c rank 2. Nor need ranks rise along the statistic: a method of
+    scattered scores may stand below one of rank 2 and have rank 1. Each comparison is at 95 %,
+    without correction for their number.
 
     Parameters
     ----------
     scores : method -> environment -> seed -> score
         In the same environments for all.
     unranked : collection of str
-        Methods outside the competition, such as privileged ones and floors: they have no rank and count for nobody's.
+        Methods outside the competition, such as privileged ones and floors: they have no rank and
+        count for nobody's.
     statistic : callable
         Whose differences decide, and whose value orders the methods; as in `stratified_bootstrap`.
     draws, seed
@@ -192,7 +213,8 @@ def shared_ranks(scores: Mapping[str, Scores], unranked: Collection[str] = (), *
 
     Returns
     -------
-    method -> rank, or None if unranked; in the order of the statistic of all own episodes, best first.
+    method -> rank, or None if unranked; in the order of the statistic of all own episodes, best
+    first.
     """
     for method in scores:
         _same_environments(next(iter(scores.values())), scores[method])
@@ -200,24 +222,26 @@ def shared_ranks(scores: Mapping[str, Scores], unranked: Collection[str] = (), *
     values = {method: sign * statistic(*_strata("scores", {name: list(episodes.values())
                                                            for name, episodes in own.items()}))
               for method, own in scores.items()}
-    order = sorted(scores, key=lambda method: (values[method], method))       # equal values: not as they happen to come
+    # equal values: not as they happen to come
+    order = sorted(scores, key=lambda method: (values[method], method))
     ranks = {method: 1 for method in order if method not in unranked}
     for first, second in combinations(ranks, 2):
         _, low, high = paired_difference(scores[first], scores[second], statistic=statistic, draws=draws, seed=seed)
         low, high = sorted((sign * low, sign * high))
         ranks[second] += high < 0
-        ranks[first] += low > 0                      # happens where each has episodes that the other has not
+        ranks[first] += low > 0  # happens where each has episodes that the other has not
     return {method: ranks.get(method) for method in order}
 
 
 def _interval(strata: Sequence[np.ndarray], statistic: Statistic, draws: int, seed: int) -> tuple[float, float]:
-    """The points of a statistic, over resamples of each stratum (n_e,), beyond which `tail` percent lie."""
+    """The points of a statistic, over resamples of each stratum (n_e,), beyond which `tail` percent
+    lie."""
     if draws < 1:
         raise ValueError(f"draws must be at least 1, got {draws}")
     random = np.random.default_rng(seed)
     values = np.asarray(statistic(*(stratum[random.integers(len(stratum), size=(draws, len(stratum)))]
                                     for stratum in strata)))
-    if values.shape != (draws,):                        # np.mean, say, would make one number of all draws
+    if values.shape != (draws,):  # np.mean, say, would make one number of all draws
         raise ValueError(f"statistic must reduce the last axis only: expected shape {(draws,)}, got {values.shape}")
     cut = tail([len(stratum) for stratum in strata])
     low, high = np.percentile(values, [cut, 100.0 - cut])
@@ -225,10 +249,12 @@ def _interval(strata: Sequence[np.ndarray], statistic: Statistic, draws: int, se
 
 
 def tail(sizes: Sequence[int]) -> float:
-    """Percent of the resamples to leave out at each end for an interval of 95 %, with so many episodes in each stratum.
+    """Percent of the resamples to leave out at each end for an interval of 95 %, with so many
+    episodes in each stratum.
 
-    2.5 in the limit. The spread of resamples is that of the n numbers divided by n, not by the n − E degrees of freedom
-    that E strata leave, and a normal quantile is less than Student's; this makes up for both.
+    2.5 in the limit. The spread of resamples is that of the n numbers divided by n, not by the n −
+    E degrees of freedom that E strata leave, and a normal quantile is less than Student's; this
+    makes up for both.
     """
     n, freedom = sum(sizes), sum(sizes) - len(sizes)
     return float(100.0 * norm.cdf(-student.ppf(0.975, freedom) * math.sqrt(n / freedom)))
@@ -264,7 +290,8 @@ def _pairs(a: Scores, b: Scores) -> dict[str, np.ndarray]:
 
 
 def _sorted(pair: np.ndarray) -> np.ndarray:
-    """(2, n_e) by the difference and then by the first, so that no interval depends on how episodes are listed."""
+    """(2, n_e) by the difference and then by the first, so that no interval depends on how episodes
+    are listed."""
     return pair[:, np.lexsort((pair[0], pair[0] - pair[1]))]
 
 

@@ -33,9 +33,11 @@ _NEEDED = {"identity", "seed", "method", "environment", "finished", "status", "r
 
 
 class EpisodeStore:
-    """The folder of a run: ``episodes/ENV/METHOD/SEED.json`` with its estimates in ``SEED.npz`` beside it.
+    """The folder of a run: ``episodes/ENV/METHOD/SEED.json`` with its estimates in ``SEED.npz``
+    beside it.
 
-    Every file is written whole or not at all, so runs may share a folder and may be interrupted anywhere.
+    Every file is written whole or not at all, so runs may share a folder and may be interrupted
+    anywhere.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -71,11 +73,12 @@ class EpisodeStore:
             return dict(stored)
 
     def records(self, also: Iterable[dict[str, Any]] = ()) -> list[dict[str, Any]]:
-        """The episodes, gathered into one record per environment, method and split of the seeds; not checked yet.
+        """The episodes, gathered into one record per environment, method and split of the seeds;
+        not checked yet.
 
-        Of what lies here only results of the latest run's code count, so that nothing stale is taken for new.
-        ``also`` are results of records: where they are of the same version of the method, they fill in what is missing
-        here or failed.
+        Of what lies here only results of the latest run's code count, so that nothing stale is
+        taken for new. ``also`` are results of records: where they are of the same version of the
+        method, they fill in what is missing here or failed.
         """
         own, others = _by_record(self.results()), _by_record(also)
         records = []
@@ -88,7 +91,8 @@ class EpisodeStore:
     def write_records(self) -> list[dict[str, Any]]:
         """Write the `records` into ``records/`` and return them.
 
-        One that is not valid is left out with a warning: what a method claimed there is no obstacle for the others.
+        One that is not valid is left out with a warning: what a method claimed there is no obstacle
+        for the others.
         """
         written = []
         for record in self.records():
@@ -124,13 +128,15 @@ def _of_one_code(results: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _gathered(results: list[dict[str, Any]]) -> dict[str, Any]:
-    """The record of one version's episodes, self-reported; of several results of a seed the first successful one."""
+    """The record of one version's episodes, self-reported; of several results of a seed the first
+    successful one."""
     latest = max(results, key=lambda result: result["finished"])
     chosen: dict[str, dict[str, Any]] = {}
     for result in results:
         if chosen.setdefault(result["seed"], result)["status"] != "ok":
             chosen[result["seed"]] = result
-    results = sorted(chosen.values(), key=lambda result: (len(result["seed"]), result["seed"]))      # 9 before 10
+    # 9 before 10
+    results = sorted(chosen.values(), key=lambda result: (len(result["seed"]), result["seed"]))
     runs: list[dict[str, Any]] = []
     for result in results:
         if result["run"] not in runs:
@@ -151,13 +157,14 @@ def results_of(record: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def results_in(folder: Path) -> list[dict[str, Any]]:
-    """The results that were gathered into the records of a folder. Errors as `records.read_records`."""
+    """The results that were gathered into the records of a folder. Errors as
+    `records.read_records`."""
     return [result for record in read_records(folder) for result in results_of(record)]
 
 
 def successful(jobs: Iterable[Job], results: Iterable[dict[str, Any]]) -> dict[Job, dict[str, Any]]:
-    """The successful results of the jobs that have one, the first of each: of the same environment, method, version and
-    seed, whatever code it was that played."""
+    """The successful results of the jobs that have one, the first of each: of the same environment,
+    method, version and seed, whatever code it was that played."""
     fine: dict[tuple[str, ...], dict[str, Any]] = {}
     for result in results:
         if result["status"] == "ok":
@@ -188,8 +195,8 @@ def _read_json(path: Path) -> dict[str, Any] | None:
 
 @lru_cache(maxsize=1)
 def source_digest() -> str:
-    """Hash of the code that scores depend on: stored results of other code are played again, and a record says of each
-    run which it was."""
+    """Hash of the code that scores depend on: stored results of other code are played again, and a
+    record says of each run which it was."""
     rooms = ("numerics/*", "physics/*", "worlds/*", "data/*", "estimation/**/*", "scoring", "envs/*", "rl/networks",
              "rl/agents", "bench/run", "bench/score", "bench/policies")
     return code_digest(package_files(*(f"{room}.py" for room in rooms)))
@@ -198,7 +205,8 @@ def source_digest() -> str:
 @lru_cache(maxsize=1)
 def provenance() -> dict[str, Any]:
     """Versions and commit of the code that this process runs."""
-    status = _git("--no-optional-locks", "status", "--porcelain", "--", ".", ":!leaderboards")   # results, not code
+    # results, not code
+    status = _git("--no-optional-locks", "status", "--porcelain", "--", ".", ":!leaderboards")
     blas = np.show_config(mode="dicts")["Build Dependencies"]["blas"]  # type: ignore[index,call-overload]
     return {
         "versions": {"python": platform.python_version(), **{name: _version(name) for name in PACKAGES}},
@@ -217,7 +225,8 @@ def machine() -> dict[str, Any]:
 
 @lru_cache(maxsize=1)
 def matmul_seconds() -> float:
-    """Time of a 1000 × 1000 × 1000 matrix product in double precision on one thread here, in s: the median of three.
+    """Time of a 1000 × 1000 × 1000 matrix product in double precision on one thread here, in s: the
+    median of three.
 
     In units of it, times of different machines can be compared.
     """
@@ -240,7 +249,7 @@ def _version(package: str) -> str | None:
 
 def _git(*arguments: str) -> str | None:
     checkout = PACKAGE.parent
-    if not (checkout / ".git").exists():                 # installed: a repository around it is somebody else's
+    if not (checkout / ".git").exists():  # installed: a repository around it is somebody else's
         return None
     try:
         done = subprocess.run(["git", *arguments], cwd=checkout, capture_output=True, text=True,

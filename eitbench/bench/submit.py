@@ -1,4 +1,5 @@
-"""Play the test episodes with one method, or all of ours, and put what came out among the leaderboards' records."""
+"""Play the test episodes with one method, or all of ours, and put what came out among the
+leaderboards' records."""
 
 from __future__ import annotations
 
@@ -18,17 +19,19 @@ from eitbench.data.seeds import name_seed
 def submit(method: str | None, environments: list[str], seeds: list[int] | None, store: EpisodeStore, to: Path, *,
            policy: bool = False, official: bool = False, isolate: str = "others", n_jobs: int = 1,
            backend: str = "loky", command: str = "") -> Iterator[Path]:
-    """Play what neither ``store`` nor a record holds yet, and write one record for each environment into the folder
-    ``to``.
+    """Play what neither ``store`` nor a record holds yet, and write one record for each environment
+    into the folder ``to``.
 
-    Environment after environment, so that what was done when the run is interrupted has its records.
+    Environment after environment, so that what was done when the run is interrupted has its
+    records.
 
     Parameters
     ----------
     method : str or None
         Name or path of a baseline, or of a ``policy``. None: all of ours.
     environments : list of str
-        With a method at least one, and all of them must be such that it plays them; without, by default all.
+        With a method at least one, and all of them must be such that it plays them; without, by
+        default all.
     seeds : list of int
         Of the test split; default: those of the full suite.
     official : bool
@@ -41,14 +44,15 @@ def submit(method: str | None, environments: list[str], seeds: list[int] | None,
     Yields
     ------
     path
-        Of a record. All test episodes that the store, or a record there before, holds of this version of the method are
-        in them, those that failed too.
+        Of a record. All test episodes that the store, or a record there before, holds of this
+        version of the method are in them, those that failed too.
 
     Raises
     ------
     ValueError
-        If a seed is not of the test split, the method does not play one of the environments, an official one is asked
-        for from a checkout with changes, or a record is not valid or would replace one that says more.
+        If a seed is not of the test split, the method does not play one of the environments, an
+        official one is asked for from a checkout with changes, or a record is not valid or would
+        replace one that says more.
     """
     code = provenance()
     if official and (code["commit"] is None or code["dirty"]):
@@ -60,7 +64,8 @@ def submit(method: str | None, environments: list[str], seeds: list[int] | None,
     if method is not None and not environments:
         raise ValueError("env must name at least one environment to submit for")
     asked = (_jobs(method, id, policy, seeds, isolate) for id in environments or tracks.ids())
-    for jobs in asked if method is None else list(asked):          # what does not fit is said before anything is played
+    # what does not fit is said before anything is played
+    for jobs in asked if method is None else list(asked):
         before = list[dict[str, Any]]()
         for job in {(job.environment, job.method): job for job in jobs}.values():
             for path, earlier in _earlier(Path(to), job.environment.name, job.load().name, job.load().version):
@@ -92,15 +97,16 @@ def _jobs(method: str | None, id: str, policy: bool, seeds: list[int] | None, is
 
 
 def _earlier(to: Path, environment: str, method: str, version: str) -> list[tuple[Path, dict[str, Any]]]:
-    """Records of test episodes of this version that are there; at most one, unless of several formats."""
+    """Records of test episodes of this version that are there; at most one, unless of several
+    formats."""
     found = [(path, read_record(path)) for path in sorted(to.glob(f"{environment}--{glob.escape(method)}--*.json"))]
     return [(path, record) for path, record in found
             if (record["method"], record["version"], record["split"]) == (method, version, "test")]
 
 
 def _check_nothing_is_lost(path: Path, earlier: dict[str, Any], official: bool, seeds: list[str] | None = None) -> None:
-    """``ValueError`` if the record at ``path`` would lose what makes it worth more; before anything is played, without
-    ``seeds``, as far as is known then."""
+    """``ValueError`` if the record at ``path`` would lose what makes it worth more; before anything
+    is played, without ``seeds``, as far as is known then."""
     missing = [] if seeds is None else [seed for seed in earlier["seeds"] if seed not in seeds]
     lost = [*["its being official"] * (earlier["official"] and not official),
             *([f"its episodes {seed_ranges(missing)}"] if missing else [])]

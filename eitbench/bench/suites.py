@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from eitbench.bench.baselines import Baseline, find_baseline, is_ours, load_baseline, own_baselines
+from eitbench.bench.baselines import Baseline, find_baseline, installed_methods, is_ours, load_baseline, own_baselines
 from eitbench.bench.policies import environment as injection_environment
 from eitbench.bench.policies import find_policy, load_policy, own_agents, own_policies
 from eitbench.bench.run import Job
@@ -20,8 +20,9 @@ ISOLATE = ("never", "others", "always")
 
 def jobs(suite: str, environments: list[str], baselines: list[str], seeds: list[int] | None = None, *,
          isolate: str = "others") -> list[Job]:
-    """Every named baseline (default: all of ours) on every named environment (default: the suite's), on ``seeds``
-    (default: the suite's), ordered by environment, method and seed. ``isolate`` is one of `ISOLATE`.
+    """Every named baseline (default: all of ours) on every named environment (default: the
+    suite's), on ``seeds`` (default: the suite's), ordered by environment, method and seed.
+    ``isolate`` is one of `ISOLATE`.
 
     Raises
     ------
@@ -47,7 +48,8 @@ def jobs(suite: str, environments: list[str], baselines: list[str], seeds: list[
             names[baseline] = loaded.name
             if board in loaded.boards and not skipped and loaded.suits(env.task):
                 suited.append(job)
-        # Environment by environment, since models are kept for a few only, and a guest for one method.
+        # Environment by environment, since models are kept for a few only, and a guest for one
+        # method.
         todo += [job._replace(seed=seed) for job in suited for seed in numbers]
     _distinct(names)
     if not todo:
@@ -58,8 +60,9 @@ def jobs(suite: str, environments: list[str], baselines: list[str], seeds: list[
 
 def policy_jobs(environments: list[str], policies: list[str], seeds: list[int] | None = None,
                 estimator: str = "full", *, isolate: str = "others") -> list[Job]:
-    """Every named policy (default: all of ours that suit, trained agents among them) in every named environment, on
-    ``seeds`` (default: those of the boards), with this estimator inside. ``isolate`` is one of `ISOLATE`.
+    """Every named policy (default: all of ours that suit, trained agents among them) in every named
+    environment, on ``seeds`` (default: those of the boards), with this estimator inside.
+    ``isolate`` is one of `ISOLATE`.
 
     Raises
     ------
@@ -90,7 +93,8 @@ def policy_jobs(environments: list[str], policies: list[str], seeds: list[int] |
 
 
 def is_isolated(environment: Environment, method: str, isolate: str) -> bool:
-    """Whether a method plays in a process of its own; those of ours that are shown the truth never do."""
+    """Whether a method plays in a process of its own; those of ours that are shown the truth never
+    do."""
     if isolate not in ISOLATE:
         raise ValueError(f"isolate must be one of {', '.join(ISOLATE)}, got {isolate!r}")
     if isolate != "always" or not is_ours(method):
@@ -99,7 +103,8 @@ def is_isolated(environment: Environment, method: str, isolate: str) -> bool:
 
 
 def _distinct(names: dict[str, str]) -> None:
-    """``ValueError`` if two of the methods, by the name of their file, would be kept under one name."""
+    """``ValueError`` if two of the methods, by the name of their file, would be kept under one
+    name."""
     first: dict[str, str] = {}
     for file, name in names.items():
         if first.setdefault(name, file) != file:
@@ -107,5 +112,7 @@ def _distinct(names: dict[str, str]) -> None:
 
 
 def _absolute(method: str) -> str:
-    """A path that worker processes find too; a name as it is."""
-    return str(Path(method).absolute()) if method.endswith((".py", ".zip")) else method
+    """A path that worker processes find too, of an installed package's as well; a name of ours as
+    it is."""
+    path = installed_methods().get(method, Path(method))
+    return str(path.absolute()) if path.suffix in (".py", ".zip") else method

@@ -1,4 +1,5 @@
-"""Numbers, seeds and tables as text, and the scores of a record in the units in which they are said."""
+"""Numbers, seeds and tables as text, and the scores of a record in the units in which they are
+said."""
 
 from __future__ import annotations
 
@@ -9,12 +10,12 @@ import numpy as np
 import pandas as pd
 from scipy.stats import t as student
 
-UNIT = {"seconds_per_step": 1e3, "voltage_discrepancy": 1e6}
-"""Factors of the scores that are said in ms and mV²."""
+from eitbench.bench.scores import scores
 
 
 def mean_and_interval(values: list[float]) -> tuple[float, float]:
-    """Mean, and half the width of its 95 % confidence interval (Student's t); infinite for fewer than two values."""
+    """Mean, and half the width of its 95 % confidence interval (Student's t); infinite for fewer
+    than two values."""
     mean = float(np.mean(values))
     if len(values) < 2:
         return mean, math.inf
@@ -22,19 +23,22 @@ def mean_and_interval(values: list[float]) -> tuple[float, float]:
 
 
 def rounded(mean: float, half: float) -> str:
-    """``0.0053 ± 0.0004``: the interval to one significant digit (two if that is a 1), the mean to the same place."""
+    """``0.0053 ± 0.0004``: the interval to one significant digit (two if that is a 1), the mean to
+    the same place."""
     place = _places(half)
     return f"{mean:.3g}" if place is None else f"{mean:z.{place}f} ± {half:.{place}f}"
 
 
 def with_interval(value: float, low: float, high: float) -> str:
-    """``0.0053 (0.0049 to 0.0058)``, rounded as `rounded` does by half the interval; without one, the value."""
+    """``0.0053 (0.0049 to 0.0058)``, rounded as `rounded` does by half the interval; without one,
+    the value."""
     place = _places(0.5 * (high - low))
     return f"{value:.3g}" if place is None else f"{value:z.{place}f} ({low:z.{place}f} to {high:z.{place}f})"
 
 
 def _places(half: float) -> int | None:
-    """Decimal places that half an interval leaves significant; None if it is none, or below the last place shown."""
+    """Decimal places that half an interval leaves significant; None if it is none, or below the
+    last place shown."""
     if not math.isfinite(half) or half < 5e-6:
         return None
     place = -math.floor(math.log10(half))
@@ -45,9 +49,12 @@ def _places(half: float) -> int | None:
 
 def scores_by_seed(record: dict[str, Any], name: str) -> dict[str, float]:
     """Seed -> score, of the episodes that have it; in the units of the table."""
-    scores = {episode["seed"]: episode["scores"].get(name)              # records of older code have fewer scores
+    # records of older code have fewer scores
+    values = {episode["seed"]: episode["scores"].get(name)
               for episode in record["episodes"] if episode["status"] == "ok"}
-    return {seed: value * UNIT.get(name, 1.0) for seed, value in scores.items() if value is not None}
+    known = scores()
+    factor = known[name].factor if name in known else 1.0
+    return {seed: value * factor for seed, value in values.items() if value is not None}
 
 
 def seed_ranges(seeds: list[str]) -> str:
@@ -70,8 +77,8 @@ def number(value: float) -> str:
 
 
 def as_markdown(text: pd.DataFrame, words: int) -> str:
-    """A table of text as Markdown, also pleasant to read in a terminal; all but the first ``words`` columns hold
-    numbers."""
+    """A table of text as Markdown, also pleasant to read in a terminal; all but the first ``words``
+    columns hold numbers."""
     lines = [[str(cell).replace("|", "\\|") for cell in line]
              for line in [list(text.columns), *text.to_numpy().tolist()]]
     widths = [max(len(str(line[i])) for line in lines) for i in range(len(text.columns))]

@@ -1,4 +1,5 @@
-"""What is asked, and where: the registered environments, their track, their boards, and the seeds that are played.
+"""What is asked, and where: the registered environments, their track, their boards, and the seeds
+that are played.
 
 All that the benchmark knows of ids is in this file.
 """
@@ -31,7 +32,8 @@ FLOORS = {"estimation": "homogeneous", "injection": "random_pair"}
 KINDS = {"estimation": "estimator", "injection": "policy"}
 """What a method of the track is."""
 ESTIMATORS = ("full", "reduced")
-"""What may stand inside an injection environment: the exact filter, for scores, or that of training."""
+"""What may stand inside an injection environment: the exact filter, for scores, or that of
+training."""
 
 QUICK = ("eitbench/Pipe2D-v0", "eitbench/Pipe2DFixedLag-v0", "eitbench/Pipe2DSmoothing-v0")
 """What the quick suite runs; the full one runs all that ask for estimates."""
@@ -56,8 +58,8 @@ SHORT: dict[str, dict[str, Any]] = {
     "eitbench/Pipe2DInjectionFlow-v0": {"world": _CHOICE | {
         "flow": {"mean_velocity": 16.0, "velocity_range": [15.0, 17.0]}}, "estimator": "reduced"},
 }
-"""Arguments with which an episode takes a moment, since a fast fluid flushes the pipe in a few steps. A
-method's card is of the first of these environments that it plays."""
+"""Arguments with which an episode takes a moment, since a fast fluid flushes the pipe in a few
+steps. A method's card is of the first of these environments that it plays."""
 
 
 class Environment(NamedTuple):
@@ -100,8 +102,8 @@ class Environment(NamedTuple):
         return made
 
     def rules_only(self) -> dict[str, Any]:
-        """Arguments that make an environment without an estimator inside, for who needs to know only
-        what is allowed."""
+        """Arguments that make an environment without an estimator inside, for who needs to know
+        only what is allowed."""
         without = {"estimator": "none"} if self.track == "injection" else {}
         return json.loads(self.kwargs) | without
 

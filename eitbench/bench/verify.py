@@ -1,4 +1,5 @@
-"""Whether a record is true: play some of its episodes again, or others that nobody could prepare for, and compare."""
+"""Whether a record is true: play some of its episodes again, or others that nobody could prepare
+for, and compare."""
 
 from __future__ import annotations
 
@@ -15,11 +16,12 @@ import numpy as np
 import pandas as pd
 
 from eitbench import _check
-from eitbench.bench.baselines import find_baseline, is_ours, load_baseline, own_baselines
+from eitbench.bench.baselines import find_baseline, installed_methods, is_ours, load_baseline, own_baselines
 from eitbench.bench.policies import find_policy, load_policy, own_agents, own_policies
 from eitbench.bench.records import SHARED, version_number
 from eitbench.bench.run import Job, run_episode
 from eitbench.bench.sandbox import guests
+from eitbench.bench.scores import scores
 from eitbench.bench.suites import is_isolated
 from eitbench.bench.text import as_markdown
 from eitbench.bench.tracks import Environment, track_of
@@ -29,13 +31,13 @@ from eitbench.data.store import CACHE_VARIABLE
 OF_OURS = ("board", "role", "privileged")
 """What must be as a record says of a method of ours, beside its numbers: its words may be mended."""
 TOLERANCE = 1e-6
-"""Relative difference of a score that is none, on one machine; sums are taken in another order on another."""
-UNCERTAIN = ("seconds_per_step",)
-"""Scores that do not repeat."""
+"""Relative difference of a score that is none, on one machine; sums are taken in another order on
+another."""
 
 
 def job_of(record: dict[str, Any], file: str | None = None, isolate: str = "always") -> Job:
-    """What a record says was played, with the method in ``file`` (default: that of ours which has its name).
+    """What a record says was played, with the method in ``file`` (default: that of ours which has
+    its name).
 
     Raises
     ------
@@ -100,7 +102,8 @@ def verify(record: dict[str, Any], job: Job, *, episodes: int = 3, seed: int = 0
 
 @contextmanager
 def empty_cache() -> Iterator[None]:
-    """Within, nothing is taken from the cache folder: episodes and models are made anew, and thrown away."""
+    """Within, nothing is taken from the cache folder: episodes and models are made anew, and thrown
+    away."""
     before = os.environ.get(CACHE_VARIABLE)
     with tempfile.TemporaryDirectory(prefix="eitbench-verify-") as folder:
         os.environ[CACHE_VARIABLE] = folder
@@ -115,21 +118,25 @@ def empty_cache() -> Iterator[None]:
 
 
 def _own(record: dict[str, Any]) -> str | None:
-    """Ours of the record's name."""
+    """Ours of the record's name, or the file of an installed package's."""
     id, name = record["environment"]["id"], record["method"]
+    if name in installed_methods():
+        return str(installed_methods()[name])
     if track_of(id) == "estimation":
         return next((own for own in own_baselines() if load_baseline(own).name == name), None)
     return next((own for own in [*own_policies(), *own_agents(id)] if load_policy(own).name == name), None)
 
 
 def differences_of(said: dict[str, Any], again: dict[str, Any]) -> dict[str, float]:
-    """Score -> relative difference between two results of an episode."""
+    """Score -> relative difference between two results of an episode, of the scores that it had
+    then."""
+    known = scores()
     if said["status"] != again["status"]:
         return {"status": np.inf}
     if said["status"] == "failed":
         return {}
     off = {name: _relative([said["scores"].get(name)], [again["scores"].get(name)])
-           for name in sorted({*said["scores"], *again["scores"]} - {*UNCERTAIN})}
+           for name in sorted(said["scores"]) if name not in known or known[name].repeats}
     return off | {"step_errors": _relative(said["step_errors"], again["step_errors"])}
 
 
@@ -142,7 +149,8 @@ def _relative(a: list[float | None], b: list[float | None]) -> float:
 
 
 def _difference(name: str, said: dict[str, Any], again: dict[str, Any]) -> str:
-    """What one score is now and was then; of the errors of all steps, the one that has changed most."""
+    """What one score is now and was then; of the errors of all steps, the one that has changed
+    most."""
     if name != "step_errors":
         return f"{name} is {_value(again, name)}, the record says {_value(said, name)}"
     now, then = again[name], said[name]

@@ -1,5 +1,5 @@
-"""The command line: `eitbench list | run | bank | train | policies | submit | verify | held-out | migrate | cards |
-leaderboard | compare | render | reproduce`."""
+"""The command line: `eitbench list | run | bank | train | policies | submit | verify | held-out |
+migrate | cards | leaderboard | compare | render | reproduce`."""
 
 from __future__ import annotations
 
@@ -89,7 +89,8 @@ def run(
 ) -> None:
     """Run baselines on environments, print the table and write the page.
 
-    Each episode is stored the moment it is done; the same command again resumes where it was interrupted.
+    Each episode is stored the moment it is done; the same command again resumes where it was
+    interrupted.
     """
     from eitbench.bench import suites
     from eitbench.bench.run import run_jobs
@@ -149,8 +150,8 @@ def train(
 ) -> None:
     """Train an agent to choose injections.
 
-    The same command again goes on from the last checkpoint. The folder receives model.zip, config.json, monitor.csv,
-    evaluations.npz (scores on dev episodes) and logs for TensorBoard.
+    The same command again goes on from the last checkpoint. The folder receives model.zip,
+    config.json, monitor.csv, evaluations.npz (scores on dev episodes) and logs for TensorBoard.
     """
     from dataclasses import replace
     with clear_errors():
@@ -216,7 +217,8 @@ def submit(
     out: Out = Path("results"),
     to: Annotated[Path, typer.Option(help="Folder of the records.")] = RECORDS,
 ) -> None:
-    """Play the test episodes with one baseline or policy, or all of ours, and write records for the leaderboards.
+    """Play the test episodes with one baseline or policy, or all of ours, and write records for the
+    leaderboards.
 
     Episodes are stored in OUT the moment they are done; the same command again resumes.
     """
@@ -273,18 +275,20 @@ def compare(
     a: Annotated[str, typer.Argument(help="A record's file, or METHOD or METHOD@VERSION among the records.")],
     b: Annotated[str, typer.Argument(help="The same of the other.")],
     records: Annotated[Path, typer.Option(help="Folder of the records.")] = RECORDS,
+    score: Annotated[str, typer.Option(help="By which score.")] = "error",
     html: Annotated[Path | None, typer.Option(help="Write a page too.")] = None,
 ) -> None:
-    """Compare two methods seed by seed: differences with intervals, and how often the first is better."""
+    """Compare two methods seed by seed: differences with intervals, and how often the first is
+    better."""
     from eitbench._files import write_atomically
     from eitbench.report import compare as comparison
     with clear_errors():
         ours, theirs = (comparison.find(name, records) for name in (a, b))
-        table = comparison.compare(ours, theirs)
+        table = comparison.compare(ours, theirs, score)
     names = comparison.names(ours[0], theirs[0])
-    typer.echo(comparison.markdown(table, *names))
+    typer.echo(comparison.markdown(table, *names, score))
     if html is not None:
-        write_atomically(html, comparison.html(table, *names).encode())
+        write_atomically(html, comparison.html(table, *names, score).encode())
         typer.echo(f"\nwrote {html}")
 
 

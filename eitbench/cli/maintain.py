@@ -17,8 +17,8 @@ def cards(
     new_version: Annotated[bool, typer.Option(
         "--new-version", help="Write what has moved as the method's next version.")] = False,
 ) -> None:
-    """For maintainers: simulate the episodes of each world's card (eitbench/worlds/cards), play that
-    of each method's (baselines/cards), and say whether their numbers are still the same: exit
+    """For maintainers: simulate the episodes of each world's card (eitbench/worlds/cards), play
+    that of each method's (baselines/cards), and say whether their numbers are still the same: exit
     status 0 if so, 1 if not. Missing cards are written.
 
     A world whose numbers have moved is another world: give it the next -vN.
@@ -47,7 +47,8 @@ def cards(
 def migrate(
     folder: Annotated[Path, typer.Argument(exists=True, file_okay=False, help="Folder of records.")],
 ) -> None:
-    """For maintainers: rewrite records of an older format in that of today; no episode, score or run is lost."""
+    """For maintainers: rewrite records of an older format in that of today; no episode, score or
+    run is lost."""
     from eitbench.bench.migrate import migrate as rewritten
     with clear_errors():
         for old, new in rewritten(folder):
@@ -57,7 +58,8 @@ def migrate(
 def held_out(
     new: Annotated[Path, typer.Option(help="Where to write a new salt; keep it secret, and keep it.")],
 ) -> None:
-    """For maintainers: draw the salt of held-out episodes, and publish its hash in leaderboards/held_out.json, once."""
+    """For maintainers: draw the salt of held-out episodes, and publish its hash in
+    leaderboards/held_out.json, once."""
     from eitbench.bench import held_out as beyond
     with clear_errors():
         digest = beyond.publish_new_salt(new)

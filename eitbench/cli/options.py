@@ -45,8 +45,8 @@ RL = ("torch", "stable_baselines3", "sb3_contrib", "yaml")
 
 
 class clear_errors:
-    """Turn a ValueError about an argument, the loss of a process, or the want of an extra into a message instead of a
-    traceback."""
+    """Turn a ValueError about an argument, the loss of a process, or the want of an extra into a
+    message instead of a traceback."""
 
     def __enter__(self) -> None:
         pass

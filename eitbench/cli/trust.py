@@ -33,7 +33,12 @@ def verify(
 ) -> None:
     """Play episodes of a record again and say whether it is true: exit status 0 if so, 1 if not.
 
-    They are simulated anew, whatever the cache folder holds.
+    They are simulated anew, whatever the cache folder holds. Numbers decide: of our own methods it
+    does not matter which text of the library played; the file of somebody else's must be the very
+    one that the record names.
+
+    With --all, episodes of every official record of a folder, cheap environments first; the same
+    command again goes on where it was interrupted.
     """
     if every:
         return _verify_all(records, env or [], out, episodes, seed or 0, tolerance, isolate, jobs, backend)
@@ -77,19 +82,13 @@ def verify(
 
 def _verify_all(folder: Path, environments: list[str], out: Path, episodes: int, seed: int, tolerance: float,
                 isolate: str, jobs: int, backend: str) -> None:
-    from eitbench.bench.records import read_record
-    from eitbench.bench.replay import by_environment, verify_all
+    from eitbench.bench.replay import by_environment, differing, official_records, verify_all
     with clear_errors():
-        read = {path: read_record(path) for path in sorted(folder.glob("*.json"))}
-        chosen = [path for path, record in read.items()
-                  if record["official"] and (not environments or record["environment"]["id"] in environments)]
-        if not chosen:
-            raise ValueError(f"records must be a folder with official records, got {folder}")
+        chosen = official_records(folder, environments)
         rows = verify_all(chosen, out, episodes=episodes, seed=seed, isolate=isolate, n_jobs=jobs, backend=backend)
     typer.echo(by_environment(rows, tolerance))
-    wrong = rows[(rows["difference"] > tolerance) | (rows["problem"] != "")]
-    for _, row in wrong.iterrows():
-        typer.echo(f"differs: {row['record']}, {row['episode']}: "
-                   f"{row['problem'] or row['score'] + ' by ' + format(row['difference'], '.2g')}", err=True)
-    if len(wrong):
+    wrong = differing(rows, tolerance)
+    for sentence in wrong:
+        typer.echo(f"differs: {sentence}", err=True)
+    if wrong:
         raise typer.Exit(1)

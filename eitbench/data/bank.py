@@ -29,24 +29,27 @@ TOGETHER = 8
 
 
 def recording_bytes(world: World) -> int:
-    """Size of one recording on disk, with what lies beside it, but for headers of a few hundred bytes."""
+    """Size of one recording on disk, with what lies beside it, but for headers of a few hundred
+    bytes."""
     n = outline(world).mass.shape[0]
-    beside = 0 if world.region is None else 4 * n + 16                                # see `Integrals`
+    beside = 0 if world.region is None else 4 * n + 16  # see `Integrals`
     return world.n_steps * (recording_type(world, n).itemsize + beside)
 
 
 def fill(world: World, seeds: Sequence[int], *, n_jobs: int = 1, backend: str = "loky") -> int:
     """Make the recordings that are missing, in ``n_jobs`` processes, and return their number.
 
-    ``backend`` is one of `eitbench.data.parallel.BACKENDS`, of which those of a cluster need the cache folder on all
-    machines.
+    ``backend`` is one of `eitbench.data.parallel.BACKENDS`, of which those of a cluster need the
+    cache folder on all machines.
 
-    Each is stored as soon as it is done; after an interruption the same call goes on where it was. Only what an
-    environment needs is kept: the truth, five times as large, is simulated anew should anybody ask for it.
+    Each is stored as soon as it is done; after an interruption the same call goes on where it was.
+    Only what an environment needs is kept: the truth, five times as large, is simulated anew should
+    anybody ask for it.
     """
     n_jobs, missing = _check.integer("n_jobs", n_jobs, low=1), missing_seeds(world, seeds)
     together = max(1, min(TOGETHER, -(-len(missing) // n_jobs)))
-    # The folder is found out here: a worker may live in another environment than its parent does by now.
+    # The folder is found out here: a worker may live in another environment than its parent does by
+    # now.
     groups = [(world, group, [(recording_path(world, seed), integrals_path(world, seed)) for seed in group])
               for group in (missing[k:k + together] for k in range(0, len(missing), together))]
     with tqdm(total=len(missing), desc="recording", unit="episode", disable=None) as bar:

@@ -1,6 +1,7 @@
 """`simulate(world, seed) -> Episode`: the truth, computed once and kept in a cache on disk.
 
-Currents do not move the fluid, so an episode's whole measurement content is one transfer-resistance matrix a step.
+Currents do not move the fluid, so an episode's whole measurement content is one transfer-resistance
+matrix a step.
 """
 
 from __future__ import annotations
@@ -33,8 +34,8 @@ class Episode(NamedTuple):
     """(T, p) m/s at `VelocityModel.points`, t = 1 … T; p = 0 where nobody is asked for the flow."""
 
     def voltages(self, step: int, currents: np.ndarray, world: World) -> np.ndarray:
-        """Noisy voltages (L,) in V of a sound instrument when ``currents`` (L,) in A (A/m in 2D) are injected at step
-        1 … T."""
+        """Noisy voltages (L,) in V of a sound instrument when ``currents`` (L,) in A (A/m in 2D)
+        are injected at step 1 … T."""
         k = slice(step - 1, step)
         return world.instrument.measure(Faults.none(len(currents)), step, self.transfer_resistance[k], currents[None],
                                         self.noise[k])[0]
@@ -49,8 +50,9 @@ def simulate(world: World, seed: int, *, cache: bool = True, progress: bool = Tr
     seed : int
         ≥ 0; see `eitbench.data.seeds` for the public ranges.
     cache : bool
-        Read from and write to the cache folder ($EITBENCH_CACHE, by default in the user's cache folder). A file that
-        is damaged or of another seed is replaced; files of other versions stay beside it.
+        Read from and write to the cache folder ($EITBENCH_CACHE, by default in the user's cache
+        folder). A file that is damaged or of another seed is replaced; files of other versions stay
+        beside it.
     progress : bool
         Show a progress bar, on a terminal only.
     """
@@ -78,8 +80,8 @@ def truth_discretisation(world: World) -> Discretisation:
 def simulate_together(world: World, seeds: Sequence[int], progress: bool = True) -> Iterator[Episode]:
     """The episodes of several seeds, bit for bit as `simulate` gives them and without the cache.
 
-    Eight concentrations in one flow are carried on together in the time of two, and eight conductivities are solved
-    for at once.
+    Eight concentrations in one flow are carried on together in the time of two, and eight
+    conductivities are solved for at once.
     """
     truth = truth_discretisation(world)
     label = f"simulating {world.name}, seed {', '.join(map(str, seeds))}"

@@ -1,4 +1,5 @@
-"""Work spread over processes, each with one BLAS thread: more of them only get into each other's way."""
+"""Work spread over processes, each with one BLAS thread: more of them only get into each other's
+way."""
 
 from __future__ import annotations
 
@@ -24,8 +25,9 @@ def in_parallel(function: Callable[..., Result], arguments: Sequence[tuple], n_j
                 backend: str = "loky") -> Iterator[Result]:
     """Results of ``function(*each)``, as they come.
 
-    ``ray`` and ``dask`` give the work to the cluster that $RAY_ADDRESS or $DASK_SCHEDULER_ADDRESS names, and without
-    one to ``n_jobs`` processes here. When one of their processes is killed another takes up its work.
+    ``ray`` and ``dask`` give the work to the cluster that $RAY_ADDRESS or $DASK_SCHEDULER_ADDRESS
+    names, and without one to ``n_jobs`` processes here. When one of their processes is killed
+    another takes up its work.
 
     Raises
     ------
@@ -69,7 +71,8 @@ def _with_dask(function: Callable[..., Result], arguments: Sequence[tuple], n_jo
 
 
 def _with_ray(function: Callable[..., Result], arguments: Sequence[tuple], n_jobs: int) -> Iterator[Result]:
-    """Without joblib: its backend for ray gives all results at the end, and none if a process was killed."""
+    """Without joblib: its backend for ray gives all results at the end, and none if a process was
+    killed."""
     import ray
     here = {} if "RAY_ADDRESS" in os.environ else {"num_cpus": n_jobs, "include_dashboard": False}
     if ours := not ray.is_initialized():

@@ -1,7 +1,8 @@
 """Recordings: what an environment plays and scores an episode from, without any mesh of the truth.
 
-The score (5.12) needs of the truth only two integrals a step and one vector on the estimator's nodes. With P the
-interpolation to the truth's nodes, M its mass matrix, and everything counted from the world's background,
+The score (5.12) needs of the truth only two integrals a step and one vector on the estimator's
+nodes. With P the interpolation to the truth's nodes, M its mass matrix, and everything counted from
+the world's background,
     ∫(ĉ − c)² = ĉᵀ M̃ ĉ − 2 ĉᵀ b_t + d_t,      M̃ = Pᵀ M P,   b_t = Pᵀ M c_t,   d_t = c_tᵀ M c_t.
 """
 
@@ -38,7 +39,8 @@ class Outline(NamedTuple):
     """What all episodes of a world have in common, as far as playing and scoring need it."""
 
     mass: sp.csr_array
-    """(n, n) upper triangle of M̃ in m² (m³ in 3D), entries beside the diagonal doubled: ĉᵀ·mass·ĉ = ĉᵀ M̃ ĉ."""
+    """(n, n) upper triangle of M̃ in m² (m³ in 3D), entries beside the diagonal doubled: ĉᵀ·mass·ĉ
+    = ĉᵀ M̃ ĉ."""
     largest_voltage: float
     """V, of the cycle's injections into liquid of the expected concentration."""
 
@@ -50,14 +52,11 @@ def recording(world: World, seed: int) -> np.ndarray:
     -------
     (T,) structured array, read-only and memory-mapped, one entry for each t = 1 … T:
 
-    ``transfer_resistance``  (L, L) 𝓡 in Ω (Ω·m in 2D)
-    ``noise``                (L,) standard normal draws
-    ``moment``               (n,) float32, b_t: scores are exact to 2e-10
-    ``deviation``            ∫(c_t − background)²
-    ``square``               ∫c_t²
-    ``velocity_moment``      (k,) ∫φ_k v_t across the pipe; this and the next only where the flow is asked for too
-    ``velocity_square``      ∫v_t²
-    ``checksum``             of all these bytes
+    ``transfer_resistance``  (L, L) 𝓡 in Ω (Ω·m in 2D) ``noise``                (L,) standard normal
+    draws ``moment``               (n,) float32, b_t: scores are exact to 2e-10 ``deviation``
+    ∫(c_t − background)² ``square``               ∫c_t² ``velocity_moment``      (k,) ∫φ_k v_t
+    across the pipe; this and the next only where the flow is asked for too ``velocity_square``
+    ∫v_t² ``checksum``             of all these bytes
     """
     seed = _check.integer("seed", seed, low=0)
     path = recording_path(world, seed)
@@ -178,15 +177,18 @@ def cycle_voltages(world: World, seed: int, entries: np.ndarray) -> np.ndarray:
 
 def step_error(mass: sp.csr_array, estimate: np.ndarray, moment: np.ndarray, deviation: np.ndarray | float,
                square: np.ndarray | float) -> np.ndarray:
-    """∫(ĉ_t − c_t)² / ∫c_t² for ``estimate`` (..., n) less the background, with the entries of recordings."""
-    # Contiguous: else the order of the sums, and so the last bit, would depend on how many estimates there are.
+    """∫(ĉ_t − c_t)² / ∫c_t² for ``estimate`` (..., n) less the background, with the entries of
+    recordings."""
+    # Contiguous: else the order of the sums, and so the last bit, would depend on how many
+    # estimates there are.
     quadratic = np.einsum("...n,...n->...", estimate, np.ascontiguousarray((mass @ estimate.T).T))
     return (quadratic - 2.0 * np.einsum("...n,...n->...", estimate, moment) + deviation) / square
 
 
 def velocity_error(velocity: VelocityModel, parameters: np.ndarray, moment: np.ndarray, square: np.ndarray | float,
                    ) -> np.ndarray:
-    """∫(v̂_t − v_t)² / ∫v_t² across the pipe for ``parameters`` (..., k) in m/s, with the entries of recordings."""
+    """∫(v̂_t − v_t)² / ∫v_t² across the pipe for ``parameters`` (..., k) in m/s, with the entries
+    of recordings."""
     gram = velocity.profiles.T @ (velocity.weights[:, None] * velocity.profiles)
     quadratic = np.einsum("...k,kl,...l->...", parameters, gram, parameters)
     return (quadratic - 2.0 * np.einsum("...k,...k->...", parameters, moment) + square) / square
@@ -214,7 +216,8 @@ def _load(world: World, seed: int) -> np.ndarray | None:
 
 @lru_cache(maxsize=16)
 def _layout(fluid: World) -> tuple[np.dtype, bytes, int]:
-    """Of a recording's file: the type of a step, what numpy writes before the first, and their number."""
+    """Of a recording's file: the type of a step, what numpy writes before the first, and their
+    number."""
     kind = recording_type(fluid, outline(fluid).mass.shape[0])
     content = io.BytesIO()
     np.save(content, np.zeros(fluid.n_steps, kind))

@@ -1,8 +1,9 @@
-"""Scores of a part of the vessel: what recordings hold of the whole, restricted to a world's region of interest.
+"""Scores of a part of the vessel: what recordings hold of the whole, restricted to a world's region
+of interest.
 
-A world with a ``region`` counts errors between two cross-sections only. The integrals of `eitbench.data.recordings` are
-then taken over the cells of the truth's mesh that lie between them, and kept in a file beside the recording. Without a
-region they are the recording's own.
+A world with a ``region`` counts errors between two cross-sections only. The integrals of
+`eitbench.data.recordings` are then taken over the cells of the truth's mesh that lie between them,
+and kept in a file beside the recording. Without a region they are the recording's own.
 """
 
 from __future__ import annotations
@@ -36,7 +37,8 @@ class Integrals(NamedTuple):
 
 
 def integrals(world: World, seed: int) -> Integrals:
-    """What the episode of this seed is scored by, from the cache if it is there; else it is simulated."""
+    """What the episode of this seed is scored by, from the cache if it is there; else it is
+    simulated."""
     if world.region is None:
         entries = recording(world, seed)
         return Integrals(entries["moment"], entries["deviation"], entries["square"])
@@ -73,7 +75,8 @@ def store_integrals(path: Path, seed: int, made: Integrals) -> None:
 
 
 def score_mass(world: World) -> sp.csr_array:
-    """(n, n) M̃ of what counts, its upper triangle with the entries beside the diagonal doubled, as `Outline.mass`."""
+    """(n, n) M̃ of what counts, its upper triangle with the entries beside the diagonal doubled, as
+    `Outline.mass`."""
     return outline(world).mass if world.region is None else _region_mass(world.fluid)
 
 
@@ -88,7 +91,8 @@ def _region_mass(fluid: World) -> sp.csr_array:
 
 
 def region_operators(world: World) -> tuple[sp.csr_array, sp.csr_array]:
-    """(interpolation from the model's CD mesh to the truth's, the truth's mass matrix over the region)."""
+    """(interpolation from the model's CD mesh to the truth's, the truth's mass matrix over the
+    region)."""
     interpolation, mass = score_operators(world)
     return interpolation, mass if world.region is None else _mass_of_region(world.fluid)
 
@@ -100,7 +104,8 @@ def _mass_of_region(fluid: World) -> sp.csr_array:
 
 
 def mass_between(mesh: Mesh, begin: float, end: float) -> sp.csr_array:
-    """(n, n) P1 mass matrix ∫φᵢφⱼ in m² (m³ in 3D) over the cells whose centroids lie in begin < x < end (m)."""
+    """(n, n) P1 mass matrix ∫φᵢφⱼ in m² (m³ in 3D) over the cells whose centroids lie in begin < x
+    < end (m)."""
     import scipy.sparse as sp
     middle = mesh.points[mesh.cells][:, :, 0].mean(axis=1)
     inside = (begin < middle) & (middle < end)

@@ -1,4 +1,5 @@
-"""Public episode seeds in disjoint ranges: learn on ``train``, choose on ``dev``, report on ``test``."""
+"""Public episode seeds in disjoint ranges: learn on ``train``, choose on ``dev``, report on
+``test``."""
 
 from __future__ import annotations
 

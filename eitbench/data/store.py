@@ -1,4 +1,5 @@
-"""The cache folder: arrays kept under a name, whole or not at all, and believed only if their checksum is right."""
+"""The cache folder: arrays kept under a name, whole or not at all, and believed only if their
+checksum is right."""
 
 from __future__ import annotations
 
@@ -28,7 +29,8 @@ CODE = ("numerics/*.py", "physics/*.py", "worlds/*.py", "data/*.py")
 
 
 def cache_folder() -> Path:
-    """Where episodes are kept: $EITBENCH_CACHE, else $XDG_CACHE_HOME/eitbench, else ~/.cache/eitbench."""
+    """Where episodes are kept: $EITBENCH_CACHE, else $XDG_CACHE_HOME/eitbench, else
+    ~/.cache/eitbench."""
     if os.environ.get(CACHE_VARIABLE):
         return Path(os.environ[CACHE_VARIABLE])
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "eitbench"
@@ -43,8 +45,8 @@ def folder(world: World) -> Path:
 
 
 def identity(world: World) -> dict[str, Any]:
-    """All that an episode's numbers depend on but the seed: the world's parts, the code that simulates, and the
-    libraries beneath it."""
+    """All that an episode's numbers depend on but the seed: the world's parts, the code that
+    simulates, and the libraries beneath it."""
     return {"world": described(world.fluid), "code": _code(), "parts": _parts(_kinds(world.fluid)),
             **{name: version(name) for name in ("numba", "scikit-fem")},
             "numpy": np.__version__, "scipy": scipy.__version__}
@@ -66,7 +68,8 @@ def load(path: Path, names: Sequence[str], label: str = "") -> dict[str, np.ndar
         with np.load(path, allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in names}
             return arrays if int(stored["checksum"]) == _checksum(path, arrays, label) else None
-    except Exception:       # a damaged archive may raise anything: zlib.error, NotImplementedError, RuntimeError, …
+    # a damaged archive may raise anything: zlib.error, NotImplementedError, RuntimeError, …
+    except Exception:
         return None
 
 

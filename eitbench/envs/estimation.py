@@ -36,7 +36,8 @@ class Revealed(NamedTuple):
     currents: np.ndarray
     """(T, L) A (A/m in 2D)"""
     transport: Callable[[int], Transport]
-    """t = 1 … T -> the model, on the task's mesh, with the flow that there really is from t − 1 to t"""
+    """t = 1 … T -> the model, on the task's mesh, with the flow that there really is from t − 1 to
+    t"""
     velocity: np.ndarray
     """(T, p) axial velocity in m/s at `VelocityModel.points`; p = 0 where the flow is not asked for"""
 
@@ -44,19 +45,21 @@ class Revealed(NamedTuple):
 class EstimationEnv(gym.Env[Observation, np.ndarray], EzPickle):
     """One episode of a world, seen through its voltages; the action is the estimate.
 
-    At step i = 1, 2, … the agent has seen the measurements up to min(i, T) and says what it thinks of the state
-    t = i − lag. Steps with t < 1 ask for nothing (the action is ignored); after the T-th measurement voltages and
-    currents are zero until every state has been asked for. The reward is −∫(ĉ_t − c_t)² / ∫c_t² for scored states,
-    zero otherwise, so that minus its mean over the scored states is ẽ_c (thesis 5.12). Where the flow is asked for too
-    (`Task.velocity`), its k parameters follow the nodal estimate in the action, and −∫(v̂_t − v_t)² / ∫v_t² across the
-    pipe is added to the reward.
+    At step i = 1, 2, … the agent has seen the measurements up to min(i, T) and says what it thinks
+    of the state t = i − lag. Steps with t < 1 ask for nothing (the action is ignored); after the
+    T-th measurement voltages and currents are zero until every state has been asked for. The reward
+    is −∫(ĉ_t − c_t)² / ∫c_t² for scored states, zero otherwise, so that minus its mean over the
+    scored states is ẽ_c (thesis 5.12). Where the flow is asked for too (`Task.velocity`), its k
+    parameters follow the nodal estimate in the action, and −∫(v̂_t − v_t)² / ∫v_t² across the pipe
+    is added to the reward.
 
     Parameters
     ----------
     name : str
         A registered id; `eitbench.worlds.register`.
     world : dict, optional
-        Numbers of the world's parts to change, as in ``{"instrument": {"noise_relative": 0.02}}``; see `World.changed`.
+        Numbers of the world's parts to change, as in ``{"instrument": {"noise_relative": 0.02}}``;
+        see `World.changed`.
     lag : int or "all", optional
         See `Task`; default: that of the id.
     assume : dict, optional
@@ -89,12 +92,14 @@ class EstimationEnv(gym.Env[Observation, np.ndarray], EzPickle):
 
     @cached_property
     def task(self) -> Task:
-        """What the agent may know; its models are built on first use, since playing needs none of them."""
+        """What the agent may know; its models are built on first use, since playing needs none of
+        them."""
         return make_task(self.world, self.lag, **self._assumed)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None,
               ) -> tuple[Observation, dict[str, Any]]:
-        """Begin the episode with this seed (see `eitbench.data.seeds`), or without one a random training episode."""
+        """Begin the episode with this seed (see `eitbench.data.seeds`), or without one a random
+        training episode."""
         super().reset(seed=seed)
         self._seed = int(self.np_random.integers(self.episodes)) if seed is None else seed
         self._entries = recording(self.world, self._seed)
@@ -107,7 +112,8 @@ class EstimationEnv(gym.Env[Observation, np.ndarray], EzPickle):
         return self._observe(), {"step": 1}
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Take the estimate (n,) in mol/m³ of the state asked for, and the flow's (k,) in m/s where it is asked for.
+        """Take the estimate (n,) in mol/m³ of the state asked for, and the flow's (k,) in m/s where
+        it is asked for.
 
         ``ValueError`` if it is not in the action space.
         """
@@ -133,7 +139,8 @@ class EstimationEnv(gym.Env[Observation, np.ndarray], EzPickle):
         return self._observe(), reward, self._step > last_step, False, {"step": self._step}
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
-        """(height, width, 3) uint8: truth, the last estimate, its spread, the electrodes and the active pair."""
+        """(height, width, 3) uint8: truth, the last estimate, its spread, the electrodes and the
+        active pair."""
         if self.render_mode is None:
             gym.logger.warn("render() needs gym.make(..., render_mode='rgb_array')")
             return None
@@ -146,11 +153,13 @@ class EstimationEnv(gym.Env[Observation, np.ndarray], EzPickle):
                           t * self.world.time_step)
 
     def truth(self) -> np.ndarray:
-        """(T, n_truth) concentration in mol/m³ of this episode, t = 1 … T; for scoring, never for agents."""
+        """(T, n_truth) concentration in mol/m³ of this episode, t = 1 … T; for scoring, never for
+        agents."""
         return self._episode("truth").concentration[1:].astype(float)
 
     def true_velocity(self) -> np.ndarray:
-        """(T, p) axial velocity in m/s at `VelocityModel.points` of this episode; for scoring, never for agents."""
+        """(T, p) axial velocity in m/s at `VelocityModel.points` of this episode; for scoring,
+        never for agents."""
         return self._episode("true_velocity").velocity
 
     def reveal(self) -> Revealed:
@@ -182,8 +191,8 @@ class EstimationEnv(gym.Env[Observation, np.ndarray], EzPickle):
 
 def asked_for(name: str, changes: dict[str, Any] | None, lag: int | str | None,
               assumed: dict[str, Any] | None) -> tuple[World, int, dict[str, Any]]:
-    """The world, the lag, and what models believe, of an id and the arguments given for it; ``ValueError`` if one of
-    them is not allowed."""
+    """The world, the lag, and what models believe, of an id and the arguments given for it;
+    ``ValueError`` if one of them is not allowed."""
     registered = entry(name)
     world = registered.world.changed(changes)
     if lag is None:
@@ -219,7 +228,8 @@ def cycle_currents(world: World, lag: int) -> np.ndarray:
 
 
 def checked_actions(actions: np.ndarray, space: spaces.Box, n_nodes: int) -> np.ndarray:
-    """``actions`` as float64, finite and in ``space``; else a ``ValueError`` that says what is wrong with them.
+    """``actions`` as float64, finite and in ``space``; else a ``ValueError`` that says what is
+    wrong with them.
 
     The first ``n_nodes`` numbers are concentrations, the others velocities.
     """

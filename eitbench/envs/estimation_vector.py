@@ -22,7 +22,8 @@ TOGETHER = 16
 
 
 class EstimationVectorEnv(LockstepVectorEnv):
-    """`EstimationEnv`, many times; parameters as there and in `LockstepVectorEnv`. Rewards agree to rounding."""
+    """`EstimationEnv`, many times; parameters as there and in `LockstepVectorEnv`. Rewards agree to
+    rounding."""
 
     def __init__(self, name: str, *, num_envs: int = 1, world: dict[str, Any] | None = None,
                  lag: int | str | None = None, assume: dict[str, Any] | None = None, episodes: int = 1000) -> None:
@@ -39,7 +40,8 @@ class EstimationVectorEnv(LockstepVectorEnv):
         self._deviations, self._squares = np.empty((2, world.n_steps, self.num_envs))
         self._moments: list[np.ndarray] = []
         self._flows: list[tuple[np.ndarray, np.ndarray]] = []
-        for k, seed in enumerate(seeds):     # all is copied: a mapped file is open, and there may be more than may be
+        # all is copied: a mapped file is open, and there may be more than may be
+        for k, seed in enumerate(seeds):
             entries = recording(world, seed)
             self._voltages[:world.n_steps, k] = cycle_voltages(world, seed, entries)
             moments, self._deviations[:, k], self._squares[:, k] = integrals(world, seed)

@@ -26,25 +26,28 @@ OBSERVATIONS = ("scaled", "raw")
 class InjectionEnv(gym.Env[Any, Any], EzPickle):
     """One episode in which the agent chooses every injection.
 
-    The reward is, for scored states, by how much the estimate's relative error ∫(ĉ_t − c_t)² / ∫c_t² lies below that of
-    ĉ_bh; its sum over an episode is greatest where ẽ_c (thesis 5.12), the mean of these errors, is least.
+    The reward is, for scored states, by how much the estimate's relative error ∫(ĉ_t − c_t)² /
+    ∫c_t² lies below that of ĉ_bh; its sum over an episode is greatest where ẽ_c (thesis 5.12), the
+    mean of these errors, is least.
 
     Parameters
     ----------
     name : str
         A registered id; `eitbench.worlds.register`.
     world : dict, optional
-        Numbers of the world's parts to change, as in ``{"schedule": {"budget": 20}}``; see `World.changed`.
+        Numbers of the world's parts to change, as in ``{"schedule": {"budget": 20}}``; see
+        `World.changed`.
     estimator : "reduced", "full" or "none"
-        "reduced": a Kalman filter of reduced order, for training. "full": the exact one, for scores. The first frame
-        is measured with the world's own cycle, from which ĉ_bh and the filter's parameters follow; the agent takes
-        over after it. "none": the agent chooses all injections, sees noisy voltages, and is paid nothing: for
-        estimators and rewards of one's own.
+        "reduced": a Kalman filter of reduced order, for training. "full": the exact one, for
+        scores. The first frame is measured with the world's own cycle, from which ĉ_bh and the
+        filter's parameters follow; the agent takes over after it. "none": the agent chooses all
+        injections, sees noisy voltages, and is paid nothing: for estimators and rewards of one's
+        own.
     observation : "scaled" or "raw"
         One array with entries of about −1 to 1 (`scaled`), or a dict in SI units.
     gate : float, optional
-        The filter leaves out readings further from its prediction than so many standard deviations; default: as the id
-        says, or none.
+        The filter leaves out readings further from its prediction than so many standard deviations;
+        default: as the id says, or none.
     episodes : int
         How many training episodes an unseeded ``reset`` draws from.
     render_mode : "rgb_array" or None
@@ -74,7 +77,8 @@ class InjectionEnv(gym.Env[Any, Any], EzPickle):
         return make_task(self.world)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Begin the episode with this seed (see `eitbench.data.seeds`), or without one a random training episode."""
+        """Begin the episode with this seed (see `eitbench.data.seeds`), or without one a random
+        training episode."""
         super().reset(seed=seed)
         self._seed = int(self.np_random.integers(self.episodes)) if seed is None else seed
         self._core.begin([self._seed])
@@ -94,7 +98,8 @@ class InjectionEnv(gym.Env[Any, Any], EzPickle):
         return self._observe(), reward, self._step > self._core.length, False, {"step": self._step}
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
-        """(height, width, 3) uint8 picture of truth, estimate, spread and the last injection; None without a mode."""
+        """(height, width, 3) uint8 picture of truth, estimate, spread and the last injection; None
+        without a mode."""
         if self.render_mode is None:
             gym.logger.warn("render() needs gym.make(..., render_mode='rgb_array')")
             return None
@@ -108,7 +113,8 @@ class InjectionEnv(gym.Env[Any, Any], EzPickle):
                           self._core.last_currents[0], t * self.world.time_step, self.world.region)
 
     def action_masks(self) -> np.ndarray:
-        """(actions,) which numbered actions do something: with the budget spent only the last, no injection."""
+        """(actions,) which numbered actions do something: with the budget spent only the last, no
+        injection."""
         return self._core.action_masks()[0]
 
     @property
@@ -118,7 +124,8 @@ class InjectionEnv(gym.Env[Any, Any], EzPickle):
 
     @property
     def error(self) -> float | None:
-        """Relative error (5.12) of the present estimate; None if this state is not scored, or nothing estimates."""
+        """Relative error (5.12) of the present estimate; None if this state is not scored, or
+        nothing estimates."""
         error = float(self._core.errors()[0])
         return None if np.isnan(error) else error
 
@@ -128,7 +135,8 @@ class InjectionEnv(gym.Env[Any, Any], EzPickle):
 
 
 def asked_for(name: str, changes: dict[str, Any] | None, gate: float | None, estimator: str) -> Rules:
-    """The rules of an id and the arguments given for it; ``ValueError`` if one of them is not allowed."""
+    """The rules of an id and the arguments given for it; ``ValueError`` if one of them is not
+    allowed."""
     registered = entry(name)
     if gate is None:
         gate = registered.settings.get("gate", np.inf)
@@ -157,7 +165,8 @@ class InjectionVectorEnv(LockstepVectorEnv):
     Parameters
     ----------
     threads : int
-        How many cores the estimators may use; give BLAS one thread then. The numbers do not depend on it.
+        How many cores the estimators may use; give BLAS one thread then. The numbers do not depend
+        on it.
     """
 
     def __init__(self, name: str, *, num_envs: int = 1, world: dict[str, Any] | None = None,
@@ -191,8 +200,8 @@ class InjectionVectorEnv(LockstepVectorEnv):
         return np.concatenate([core.action_masks() for core in self._cores])
 
     def errors(self) -> np.ndarray:
-        """(num_envs,) relative errors (5.12) of the present estimates, not a number where the state is not scored; for
-        scoring, never for agents."""
+        """(num_envs,) relative errors (5.12) of the present estimates, not a number where the state
+        is not scored; for scoring, never for agents."""
         return np.concatenate([core.errors() for core in self._cores])
 
     def _begin(self, seeds: list[int]) -> None:

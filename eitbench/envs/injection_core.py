@@ -38,12 +38,13 @@ class Rules:
     Parameters
     ----------
     world : World
-        Its instrument's ``limit`` says whether an action is the number of an electrode pair (None), or L currents in
-        parts of the instrument's, of which the mean is taken away, and which are scaled down to the norm of a pair if
-        they exceed it. Its schedule's ``budget`` says how many injections the agent may make in an episode, where it
-        may also inject nothing.
+        Its instrument's ``limit`` says whether an action is the number of an electrode pair (None),
+        or L currents in parts of the instrument's, of which the mean is taken away, and which are
+        scaled down to the norm of a pair if they exceed it. Its schedule's ``budget`` says how many
+        injections the agent may make in an episode, where it may also inject nothing.
     gate : float
-        The estimator leaves out readings further from the prediction than this many standard deviations.
+        The estimator leaves out readings further from the prediction than this many standard
+        deviations.
     has_frame : bool
         Whether the first frame is measured before the agent's first injection.
     """
@@ -82,7 +83,8 @@ class Rules:
 
     @property
     def table(self) -> np.ndarray:
-        """(actions, L) currents of each numbered action; the last is no current, where there is a budget."""
+        """(actions, L) currents of each numbered action; the last is no current, where there is a
+        budget."""
         pairs = pair_currents(self.world)
         return pairs if self.budget is None else np.concatenate([pairs, np.zeros((1, pairs.shape[1]))])
 
@@ -94,13 +96,15 @@ class Rules:
 
     @property
     def name(self) -> str:
-        """What was found by search is kept under: the world's name, and whether there are faults or a budget."""
+        """What was found by search is kept under: the world's name, and whether there are faults or
+        a budget."""
         faults = " with faults" * (self.instrument.most > 0)
         budget = " with a budget" * (self.budget is not None)
         return self.world.name + faults + budget
 
     def action(self, pair: int | None) -> Any:
-        """The action that injects the pair of this number, or nothing (None, which needs a budget or currents)."""
+        """The action that injects the pair of this number, or nothing (None, which needs a budget
+        or currents)."""
         if self.limit is not None:
             currents = np.zeros(self.world.currents.shape[1], dtype=np.float32)
             if pair is not None:
@@ -111,7 +115,8 @@ class Rules:
         return len(self.pairs) if pair is None else int(pair)
 
     def spaced(self, left: np.ndarray) -> bool:
-        """Whether a budget that is spread evenly is spent at this step; ``left`` as observed. Always without a budget.
+        """Whether a budget that is spread evenly is spent at this step; ``left`` as observed.
+        Always without a budget.
 
         The first injection comes at the end of its interval.
         """
@@ -142,11 +147,12 @@ def operator_type(world: World, estimator: str) -> type[Operator] | None:
 
 
 def scaled(rules: Rules, observation: Observation) -> np.ndarray:
-    """An observation as one array (..., d), float32, each entry about between −1 and 1 and never beyond ±5.
+    """An observation as one array (..., d), float32, each entry about between −1 and 1 and never
+    beyond ±5.
 
-    In this order: voltages, recent currents, innovations, mean and std on the grid, doubt, what is left, and where the
-    flow is estimated its velocity and that one's std; all as in the raw observation but for the scale, the first frame
-    left out.
+    In this order: voltages, recent currents, innovations, mean and std on the grid, doubt, what is
+    left, and where the flow is estimated its velocity and that one's std; all as in the raw
+    observation but for the scale, the first frame left out.
     """
     world, level = rules.world, rules.world.expected_concentration
     left = np.array([world.n_steps, rules.budget or 1][:observation["left"].shape[-1]])
@@ -162,7 +168,8 @@ def scaled(rules: Rules, observation: Observation) -> np.ndarray:
 
 
 class InjectionCore:
-    """B episodes: actions in, noisy voltages out, and by how much the estimator's error lies below the homogeneous one.
+    """B episodes: actions in, noisy voltages out, and by how much the estimator's error lies below
+    the homogeneous one.
 
     Parameters
     ----------
@@ -183,7 +190,8 @@ class InjectionCore:
         """What one environment shows, in SI units."""
         world, rules = self.world, self.rules
         L, level = world.currents.shape[1], world.expected_concentration
-        largest, current = 1e3 * outline(world).largest_voltage, 1.5 * rules.amplitude      # "L2" goes up to √2
+        # "L2" goes up to √2
+        largest, current = 1e3 * outline(world).largest_voltage, 1.5 * rules.amplitude
         shown: dict[str, spaces.Space] = {"voltages": spaces.Box(-largest, largest, (L,), np.float64),
                                           "currents": spaces.Box(-current, current, (L,), np.float64)}
         if self._operator_type:
@@ -213,7 +221,8 @@ class InjectionCore:
         self._voltages, self._currents = np.zeros((2, B, L))
         self._recent = np.zeros((B, RECENT, L))
         moments, faults = [], []
-        for k, seed in enumerate(seeds):     # all is copied: a mapped file is open, and there may be more than may be
+        # all is copied: a mapped file is open, and there may be more than may be
+        for k, seed in enumerate(seeds):
             entries = recording(world, seed)
             self._resistance[:, k], self._draws[:, k] = entries["transfer_resistance"], entries["noise"]
             moment, self._deviations[k], self._squares[k] = integrals(world, seed)
@@ -262,15 +271,16 @@ class InjectionCore:
         return np.asarray(rewards)
 
     def errors(self) -> np.ndarray:
-        """(B,) relative errors (5.12) of the present estimates, not a number where the state is not scored, or nothing
-        estimates."""
+        """(B,) relative errors (5.12) of the present estimates, not a number where the state is not
+        scored, or nothing estimates."""
         if self._t <= self.world.warm_up or not self._operator_type:
             return np.full(len(self._spent), np.nan)
         k = self._t - 1
         return self._operator.errors(self._moments[:, k], self._deviations[:, k], self._squares[:, k])
 
     def estimate(self) -> tuple[np.ndarray, np.ndarray]:
-        """Present means and standard deviations (B, n) in mol/m³; without an estimator the expected level and zero."""
+        """Present means and standard deviations (B, n) in mol/m³; without an estimator the expected
+        level and zero."""
         if not self._operator_type:
             n, level = outline(self.world).mass.shape[0], self.world.expected_concentration
             return np.full((len(self._spent), n), level), np.zeros((len(self._spent), n))
@@ -297,7 +307,8 @@ class InjectionCore:
         return self._currents
 
     def action_masks(self) -> np.ndarray:
-        """(B, actions) which numbered actions do something: with the budget spent only the last, no injection."""
+        """(B, actions) which numbered actions do something: with the budget spent only the last, no
+        injection."""
         if self._table is None:
             raise ValueError("action_masks is for environments whose actions are numbers; here they are currents")
         masks = np.ones((len(self._spent), len(self._table)), dtype=bool)
@@ -306,7 +317,8 @@ class InjectionCore:
         return masks
 
     def observe(self) -> Observation:
-        """The last measurement and, if there is an estimator, what an operator makes of it; arrays (B, …)."""
+        """The last measurement and, if there is an estimator, what an operator makes of it; arrays
+        (B, …)."""
         shown = {"voltages": self._voltages.copy(), "currents": self._currents.copy()}
         if self._operator_type:
             shown |= {"recent": self._recent.copy(), "frame": self._frames.copy()} | self._console.shown()

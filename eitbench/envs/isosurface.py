@@ -16,13 +16,15 @@ _EYE = np.linalg.qr(np.array([[0.30, 0.0, 1.0], [0.22, 1.0, 0.0], [0.9, -0.3, -0
 
 
 def isosurface(mesh: Mesh, values: np.ndarray, level: float) -> np.ndarray:
-    """(k, 3, 3) corners in m of the triangles on which the linear interpolant of nodal ``values`` is ``level``.
+    """(k, 3, 3) corners in m of the triangles on which the linear interpolant of nodal ``values``
+    is ``level``.
 
-    A tetrahedron with one corner on either side of the level is cut in a triangle, one with two in a quadrilateral,
-    given as two triangles.
+    A tetrahedron with one corner on either side of the level is cut in a triangle, one with two in
+    a quadrilateral, given as two triangles.
     """
     above = values > level
-    order = np.argsort(~above[mesh.cells], axis=1, kind="stable")               # corners above the level come first
+    # corners above the level come first
+    order = np.argsort(~above[mesh.cells], axis=1, kind="stable")
     cells = np.take_along_axis(mesh.cells, order, axis=1)
     count = above[mesh.cells].sum(axis=1)
 
@@ -40,7 +42,8 @@ def isosurface(mesh: Mesh, values: np.ndarray, level: float) -> np.ndarray:
 
 
 def draw_isosurfaces(axes: Axes, mesh: Mesh, values: np.ndarray, poor: float, rich: float) -> None:
-    """Surfaces where the concentration is ``poor`` (blue) and ``rich`` (orange), mol/m³, in the outline of the pipe."""
+    """Surfaces where the concentration is ``poor`` (blue) and ``rich`` (orange), mol/m³, in the
+    outline of the pipe."""
     surfaces = [isosurface(mesh, values, level) for level in (poor, rich)]
     _draw(axes, np.concatenate(surfaces), np.repeat([POOR, RICH], list(map(len, surfaces))), 0.5)
     _outline(axes, mesh)

@@ -17,8 +17,9 @@ from eitbench.envs.estimation import Observation
 class LockstepVectorEnv(gym.vector.VectorEnv[Observation, np.ndarray, np.ndarray]):
     """Environments whose episodes all have the same length, so that they begin and end together.
 
-    Observations equal those of ``SyncVectorEnv`` over the scalar environment, bit for bit: ``reset(seed=s)`` plays
-    episode s + k in environment k, and the step after an episode's end begins the next one (``NEXT_STEP``).
+    Observations equal those of ``SyncVectorEnv`` over the scalar environment, bit for bit:
+    ``reset(seed=s)`` plays episode s + k in environment k, and the step after an episode's end
+    begins the next one (``NEXT_STEP``).
 
     Parameters
     ----------
@@ -43,7 +44,8 @@ class LockstepVectorEnv(gym.vector.VectorEnv[Observation, np.ndarray, np.ndarray
 
     def reset(self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None,
               ) -> tuple[Observation, dict[str, Any]]:
-        """Begin episodes seed, seed + 1, …, or those of a list; without a seed random training episodes."""
+        """Begin episodes seed, seed + 1, …, or those of a list; without a seed random training
+        episodes."""
         if options and "reset_mask" in options:
             raise ValueError("options must not hold 'reset_mask': all environments begin and end together")
         chosen = []
@@ -67,7 +69,8 @@ class LockstepVectorEnv(gym.vector.VectorEnv[Observation, np.ndarray, np.ndarray
         return [None if one is None else _check.integer("seed", one, low=0) for one in seed]
 
     def step(self, actions: np.ndarray) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """One step of every environment; after an episode's end the actions are ignored and the next one begins."""
+        """One step of every environment; after an episode's end the actions are ignored and the
+        next one begins."""
         if self._step == 0:
             raise gym.error.ResetNeeded("call reset() before step()")
         nothing = np.zeros(self.num_envs, dtype=bool)

@@ -1,4 +1,5 @@
-"""The page of an environment: what the world says of itself, and the sizes of what its objects really are."""
+"""The page of an environment: what the world says of itself, and the sizes of what its objects
+really are."""
 
 from __future__ import annotations
 
@@ -50,7 +51,8 @@ INJECTION_ARGUMENTS = """
 
 
 def page(id: str) -> str:
-    """Markdown: what a registered environment asks for, shows, pays, and takes; ``ValueError`` if there is none."""
+    """Markdown: what a registered environment asks for, shows, pays, and takes; ``ValueError`` if
+    there is none."""
     registered = entry(id)
     env: Any = gym.make(id, disable_env_checker=True).unwrapped
     parts = _estimation(env) if registered.track == "estimation" else _injection(env)

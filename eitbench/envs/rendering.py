@@ -26,7 +26,8 @@ def colour_range(task: Task) -> tuple[float, float]:
 
 
 def draw_field(axes: Axes, mesh: Mesh, values: np.ndarray, low: float, high: float, colours: str = FIELD_MAP):
-    """Nodal ``values`` as smooth colours with equal aspect, axes in cm; returns the mappable for a colour bar.
+    """Nodal ``values`` as smooth colours with equal aspect, axes in cm; returns the mappable for a
+    colour bar.
 
     In 3D the slice x = 0 is drawn, z to the right.
     """
@@ -49,7 +50,8 @@ def _slice(mesh: Mesh) -> tuple[Mesh, sp.csr_array]:
 
 
 def draw_electrodes(axes: Axes, task: Task, currents: np.ndarray, width: float = 5.0) -> None:
-    """Electrodes as bars on the wall: the source red, the sink blue, the others grey; in 3D those at the slice."""
+    """Electrodes as bars on the wall: the source red, the sink blue, the others grey; in 3D those
+    at the slice."""
     cem = task.observation.cem
     for facets, current in zip(cem.electrodes, currents, strict=True):
         colour = IDLE if current == 0 else SOURCE if current > 0 else SINK
@@ -65,7 +67,8 @@ def draw_electrodes(axes: Axes, task: Task, currents: np.ndarray, width: float =
 
 def draw_frame(task: Task, truth_mesh: Mesh, truth: np.ndarray, estimate: np.ndarray, spread: np.ndarray | None,
                currents: np.ndarray, time: float, region: tuple[float, float] | None = None) -> np.ndarray:
-    """(height, width, 3) uint8 picture: truth and estimate in one colour scale, the estimate's spread, electrodes.
+    """(height, width, 3) uint8 picture: truth and estimate in one colour scale, the estimate's
+    spread, electrodes.
 
     Pipes lie one below the other, in 3D with isosurfaces beside them; tanks stand side by side.
 
@@ -128,7 +131,8 @@ def draw_frame(task: Task, truth_mesh: Mesh, truth: np.ndarray, estimate: np.nda
 
 def draw_solids(figure: Figure, grid: GridSpec, task: Task, fields: list[tuple[Mesh, np.ndarray]],
                 levels: tuple[float, float], currents: np.ndarray) -> None:
-    """Isosurfaces of truth and estimate in the second column of ``grid``, and below them the injecting electrodes."""
+    """Isosurfaces of truth and estimate in the second column of ``grid``, and below them the
+    injecting electrodes."""
     from eitbench.envs.isosurface import draw_electrodes_in_space, draw_isosurfaces
     for row, (mesh, values) in enumerate(fields):
         axes = figure.add_subplot(grid[row, 1])

@@ -1,4 +1,5 @@
-"""The covariance without data, Π⁺ = F Π Fᵀ + Γ_w: what remains uncertain when nothing is ever measured."""
+"""The covariance without data, Π⁺ = F Π Fᵀ + Γ_w: what remains uncertain when nothing is ever
+measured."""
 
 from __future__ import annotations
 
@@ -6,11 +7,12 @@ import numpy as np
 
 
 class FreeCovariance:
-    """Π_t for t = 0, 1, …, from which measurements then subtract: P = Π − Z Zᵀ (``docs/methods.md``, 5).
+    """Π_t for t = 0, 1, …, from which measurements then subtract: P = Π − Z Zᵀ
+    (``docs/methods.md``, 5).
 
-    Π_t depends on no data, so it is computed once and shared by all episodes. It is kept as Π_t = Π_∞ + U D Uᵀ with
-    D = diag(±1): what is left of the initial covariance, U ← F U, loses rank quickly because the flow carries it away
-    and diffusion smooths it.
+    Π_t depends on no data, so it is computed once and shared by all episodes. It is kept as Π_t =
+    Π_∞ + U D Uᵀ with D = diag(±1): what is left of the initial covariance, U ← F U, loses rank
+    quickly because the flow carries it away and diffusion smooths it.
 
     Parameters
     ----------
@@ -37,7 +39,7 @@ class FreeCovariance:
         self.limit = _stationary(transition, noise)
         self._threshold = tolerance * np.abs(self.limit).max()
         nothing = np.zeros((len(noise), 0)), np.zeros(0)
-        self._transients = [nothing if initial is None else                               # (U, D) at t = 0, 1, …
+        self._transients = [nothing if initial is None else  # (U, D) at t = 0, 1, …
                             _signed_factor(initial - self.limit, self._threshold)]
 
     def scaled(self, factor: float) -> FreeCovariance:
@@ -49,7 +51,8 @@ class FreeCovariance:
     def apply(self, t: int, X: np.ndarray, limit_times_X: np.ndarray | None = None) -> np.ndarray:
         """Π_t X for X (n, k).
 
-        Most of the work is ``limit @ X``, the same at all times: who asks for one X often may compute it once.
+        Most of the work is ``limit @ X``, the same at all times: who asks for one X often may
+        compute it once.
         """
         U, signs = self._transient(t)
         if limit_times_X is None:

@@ -1,4 +1,5 @@
-"""Kalman filtering with the n×n covariance kept as it is: for transitions that change with time, and for F = I."""
+"""Kalman filtering with the n×n covariance kept as it is: for transitions that change with time,
+and for F = I."""
 
 from __future__ import annotations
 
@@ -36,14 +37,16 @@ class Filtered(NamedTuple):
 
 
 class DenseKalmanFilter:
-    """The Kalman filter of c⁺ = F c + s + w with any F at each step, in about 3n³ operations a prediction.
+    """The Kalman filter of c⁺ = F c + s + w with any F at each step, in about 3n³ operations a
+    prediction.
 
     Where F X costs far less than a product of full matrices, such as solves with a sparse matrix,
     F is better given as a callable: a prediction then costs F X twice, for n columns.
 
-    `KalmanFilter` is far cheaper, but wants a constant F and a covariance with a limit. Where F = I (a target at rest,
-    a closed vessel) a prediction costs next to nothing here; an update costs O(n² m) in any case. The covariance stays
-    symmetric to the bit and its diagonal is kept from falling below zero.
+    `KalmanFilter` is far cheaper, but wants a constant F and a covariance with a limit. Where F = I
+    (a target at rest, a closed vessel) a prediction costs next to nothing here; an update costs
+    O(n² m) in any case. The covariance stays symmetric to the bit and its diagonal is kept from
+    falling below zero.
 
     Parameters
     ----------
@@ -85,7 +88,8 @@ class DenseKalmanFilter:
         noise : (n, n), optional
             Γ_w, symmetric; by default 0.
         mean : (n,), optional
-            The predicted mean in place of F c + s, for a transition that is the derivative of something nonlinear.
+            The predicted mean in place of F c + s, for a transition that is the derivative of
+            something nonlinear.
         """
         if mean is not None and forcing is not None:
             raise ValueError("forcing must not be given beside mean, which is what the state becomes")
@@ -119,7 +123,8 @@ class DenseKalmanFilter:
         gained = solve_triangular(factor[0], cross.T, lower=True).T                      # Γ Hᵀ L⁻ᵀ
         self.covariance -= np.matmul(gained, gained.T, out=self._work)
         diagonal = np.einsum("ii->i", self.covariance)                                   # a view
-        np.maximum(diagonal, 0.0, out=diagonal)                   # precise measurements leave rounding of either sign
+        # precise measurements leave rounding of either sign
+        np.maximum(diagonal, 0.0, out=diagonal)
         return Filtered(self.mean, diagonal.copy(), innovation, S)
 
     def variances(self) -> np.ndarray:
@@ -138,12 +143,14 @@ class DenseKalmanFilter:
         return transition @ self.mean
 
     def _transform(self, F: np.ndarray) -> None:
-        """P ← F P Fᵀ by triangles: with P = L + Lᵀ and B = F L it is B Fᵀ + F Bᵀ, of which one half is computed."""
+        """P ← F P Fᵀ by triangles: with P = L + Lᵀ and B = F L it is B Fᵀ + F Bᵀ, of which one half
+        is computed."""
         P, B = self.covariance, self._work
         diagonal = np.einsum("ii->i", P)
         diagonal *= 0.5
         np.copyto(B, F)
-        # BLAS thinks in columns and sees each array transposed: Lᵀ Fᵀ, from the lower triangle of Pᵀ.
+        # BLAS thinks in columns and sees each array transposed: Lᵀ Fᵀ, from the lower triangle of
+        # Pᵀ.
         blas.dtrmm(1.0, P.T, B.T, lower=1, trans_a=1, overwrite_b=1)
         blas.dsyr2k(1.0, np.asfortranarray(F.T), B.T, beta=0.0, c=P.T, trans=1, lower=1, overwrite_c=1)
         _mirror(P)

@@ -1,7 +1,8 @@
-"""Which injection teaches most: criteria of optimal design for a Gaussian state, over all electrode pairs at once.
+"""Which injection teaches most: criteria of optimal design for a Gaussian state, over all electrode
+pairs at once.
 
-The voltages are bilinear in the pair that drives and the electrode that is read, so one table of products of the
-covariance serves every pair (``docs/methods.md``, 8).
+The voltages are bilinear in the pair that drives and the electrode that is read, so one table of
+products of the covariance serves every pair (``docs/methods.md``, 8).
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ def pair_gains(covariance_of: np.ndarray, weighted: np.ndarray, pairs: np.ndarra
                ) -> tuple[np.ndarray, np.ndarray]:
     """What each pair would teach if it were injected now.
 
-    With D the derivatives of the voltages under a current into one electrode, (L, L, n) for n states, read as L² rows:
+    With D the derivatives of the voltages under a current into one electrode, (L, L, n) for n
+    states, read as L² rows:
 
     Parameters
     ----------
@@ -30,12 +32,14 @@ def pair_gains(covariance_of: np.ndarray, weighted: np.ndarray, pairs: np.ndarra
     pairs : (p, 2)
         Where the current enters and leaves.
     noise_variance : (p, L)
-        Of the voltages of each pair, per current squared; infinite for readings that will not be believed.
+        Of the voltages of each pair, per current squared; infinite for readings that will not be
+        believed.
 
     Returns
     -------
     (p,), (p,)
-        By how much tr(W P) falls (A-optimality), and ½ ln of the ratio in which det P falls (D-optimality).
+        By how much tr(W P) falls (A-optimality), and ½ ln of the ratio in which det P falls
+        (D-optimality).
     """
     i, j = pairs.T
     L = covariance_of.shape[0]
@@ -54,7 +58,8 @@ def pair_gains(covariance_of: np.ndarray, weighted: np.ndarray, pairs: np.ndarra
 
 
 def independent_rows(derivative: np.ndarray) -> np.ndarray:
-    """(L(L−1)/2, n) of the derivatives (L, L, n) of 𝓡; as 𝓡 is symmetric and 𝓡1 = 0, they determine the others."""
+    """(L(L−1)/2, n) of the derivatives (L, L, n) of 𝓡; as 𝓡 is symmetric and 𝓡1 = 0, they determine
+    the others."""
     return np.asarray(derivative[np.triu_indices(len(derivative), 1)])
 
 

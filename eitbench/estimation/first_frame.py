@@ -13,7 +13,8 @@ if TYPE_CHECKING:
 
 
 class FirstFrame:
-    """Collects the measurements of the first frame; after it an estimator knows ĉ_bh and starts from t = 0.
+    """Collects the measurements of the first frame; after it an estimator knows ĉ_bh and starts
+    from t = 0.
 
     The frame lies within the warm-up, so that no scored estimate waits for it.
     """

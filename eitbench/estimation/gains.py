@@ -1,6 +1,8 @@
-"""Gains computed once: with fixed injections a linear filter's covariances do not depend on what is measured.
+"""Gains computed once: with fixed injections a linear filter's covariances do not depend on what is
+measured.
 
-What is left for an episode is a handful of matrix–vector products a step, in the filter and in the smoother.
+What is left for an episode is a handful of matrix–vector products a step, in the filter and in the
+smoother.
 """
 
 from __future__ import annotations
@@ -16,7 +18,8 @@ from eitbench.estimation.kalman import KalmanFilter, Observation
 
 @dataclass(frozen=True)
 class GainSequence:
-    """What the Kalman filter of c⁺ = F c + s + w does at t = 1 … T, whatever is measured; made by `gain_sequence`.
+    """What the Kalman filter of c⁺ = F c + s + w does at t = 1 … T, whatever is measured; made by
+    `gain_sequence`.
 
     Parameters
     ----------
@@ -64,8 +67,9 @@ class GainSequence:
     def smoothed(self, mean: np.ndarray, forcing: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Means c_{t|T} (T, n); arguments as in `filtered`.
 
-        The adjoint λ_t = Hᵀ S⁻¹ ν + (I − K H)ᵀ Fᵀ λ_{t+1} runs back over the innovations, and the smoothed state
-        follows forwards from c_{0|T} = c_{0|0} + Γ_{0|0} Fᵀ λ_1 as c_t = F c_{t−1} + s + Γ_w λ_t (``docs/methods.md``, 6).
+        The adjoint λ_t = Hᵀ S⁻¹ ν + (I − K H)ᵀ Fᵀ λ_{t+1} runs back over the innovations, and the
+        smoothed state follows forwards from c_{0|T} = c_{0|0} + Γ_{0|0} Fᵀ λ_1 as c_t = F c_{t−1} +
+        s + Γ_w λ_t (``docs/methods.md``, 6).
         """
         _, innovations = self.filtered(mean, forcing, values)
         weighted = np.linalg.solve(self.innovation_covariances, innovations[..., None])[..., 0]
@@ -77,12 +81,13 @@ class GainSequence:
         state, smoothed = mean + self.covariance.apply(0, later[:, None])[:, 0], adjoints
         for t, adjoint in enumerate(adjoints):
             state = self.transition @ state + forcing + self.covariance.apply_noise(adjoint)
-            smoothed[t] = state                                      # takes the place of the adjoint just used
+            smoothed[t] = state  # takes the place of the adjoint just used
         return smoothed
 
 
 def gain_sequence(start: KalmanFilter, observations: Sequence[Observation]) -> GainSequence:
-    """Run a filter that stands at t = 0 over a record once, whatever was measured: only H_t and the noise count."""
+    """Run a filter that stands at t = 0 over a record once, whatever was measured: only H_t and the
+    noise count."""
     n_steps, (m, n) = len(observations), observations[0].matrix.shape
     gains, S, variances = np.empty((n_steps, n, m)), np.empty((n_steps, m, m)), np.empty((n_steps, n))
     for t, observation in enumerate(observations):

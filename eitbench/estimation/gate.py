@@ -10,9 +10,11 @@ from eitbench.estimation.kalman import Expected, Observation
 
 
 def believable(innovation: np.ndarray, variance: np.ndarray, gate: float) -> np.ndarray:
-    """Which readings a filter should take in: those within ``gate`` predicted standard deviations of the prediction.
+    """Which readings a filter should take in: those within ``gate`` predicted standard deviations
+    of the prediction.
 
-    Where more than a third of an injection's readings lie beyond, the injection itself has failed, and none counts.
+    Where more than a third of an injection's readings lie beyond, the injection itself has failed,
+    and none counts.
 
     Parameters
     ----------
@@ -37,8 +39,8 @@ class _Filter(Protocol):
 
 
 def gated_update(filter_: _Filter, observation: Observation, gate: float) -> tuple[np.ndarray, np.ndarray]:
-    """Take in what is `believable` of a measurement; returns its innovations in predicted standard deviations (m,) and
-    which readings were taken in (m,)."""
+    """Take in what is `believable` of a measurement; returns its innovations in predicted standard
+    deviations (m,) and which readings were taken in (m,)."""
     cross, innovation, S = filter_.expect(observation)
     kept = believable(innovation, S.diagonal(), gate)
     filter_.take_in(observation.matrix[kept], cross[:, kept], innovation[kept], S[np.ix_(kept, kept)])

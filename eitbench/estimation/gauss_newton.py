@@ -38,7 +38,8 @@ def gauss_newton(model: _ObservationModel, voltages: np.ndarray, currents: np.nd
 
     Returns
     -------
-    (n,) concentration in mol/m³; the best found so far if ``max_iterations`` run out or no step lowers the objective.
+    (n,) concentration in mol/m³; the best found so far if ``max_iterations`` run out or no step
+    lowers the objective.
     """
     normal = _NormalEquations(penalty)
     weight = (1.0 / noise_std).ravel()

@@ -17,7 +17,8 @@ class _Noise(Protocol):
 
 def best_homogeneous(model: _ObservationModel, noise: _Noise, n: int, voltages: np.ndarray, currents: np.ndarray,
                      start: float, *, tolerance: float = 1e-8, max_iterations: int = 30) -> float:
-    """ĉ_bh = argmin_c Σ ((V − R(c·1))/std)², by Gauss–Newton in ln c, which keeps it positive (``docs/methods.md``, 3).
+    """ĉ_bh = argmin_c Σ ((V − R(c·1))/std)², by Gauss–Newton in ln c, which keeps it positive
+    (``docs/methods.md``, 3).
 
     Parameters
     ----------

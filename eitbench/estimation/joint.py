@@ -42,20 +42,24 @@ class JointStep(NamedTuple):
 
 
 class JointFilter:
-    """The extended Kalman filter of c⁺ = F(θ) c + Y(θ) c_in + w, θ⁺ = θ + ω: velocity v = Σ θ_k v_k, θ unknown.
+    """The extended Kalman filter of c⁺ = F(θ) c + Y(θ) c_in + w, θ⁺ = θ + ω: velocity v = Σ θ_k
+    v_k, θ unknown.
 
-    Each step is linearised at the present estimate: the covariance of (c, θ) moves with [[F, ∂c⁺/∂θ], [0, I]], where F,
-    Y and the derivative are those of the discrete step at θ̂. The noise is Γ_w = Y(θ̂) Γ_η Y(θ̂)ᵀ + H Γ_e Hᵀ, of which
-    only the nodal part H Γ_e Hᵀ is frozen at the nominal velocity: H would cost as much as F, and the part is small.
+    Each step is linearised at the present estimate: the covariance of (c, θ) moves with [[F,
+    ∂c⁺/∂θ], [0, I]], where F, Y and the derivative are those of the discrete step at θ̂. The noise
+    is Γ_w = Y(θ̂) Γ_η Y(θ̂)ᵀ + H Γ_e Hᵀ, of which only the nodal part H Γ_e Hᵀ is frozen at the
+    nominal velocity: H would cost as much as F, and the part is small.
 
-    The velocity stays physical: after each measurement it must have the sign that it had at the start, and a size
-    within ``bounds``, at all points of ``profiles``. Where it does not, θ is moved back along the line towards its
-    start θ_0, just as far as needed; concentration and covariance stay what they are.
+    The velocity stays physical: after each measurement it must have the sign that it had at the
+    start, and a size within ``bounds``, at all points of ``profiles``. Where it does not, θ is
+    moved back along the line towards its start θ_0, just as far as needed; concentration and
+    covariance stay what they are.
 
     Parameters
     ----------
     transport_at : callable
-        θ (k,) -> the transport model with that velocity, such as a `ConvectionDiffusion`; all with the same inlet.
+        θ (k,) -> the transport model with that velocity, such as a `ConvectionDiffusion`; all with
+        the same inlet.
     directions : k callables
         v_k, each points (p, d) in m -> velocity (p, d) in m/s for θ_k = 1.
     mean, covariance : (n,), (n, n)
@@ -63,16 +67,18 @@ class JointFilter:
     parameters, parameter_covariance : (k,), (k, k)
         Of θ at t = 0, in m/s and its square if the v_k have no unit.
     walk_std : (k,)
-        Standard deviations of ω, the steps of the random walk; zero for a velocity that is constant.
+        Standard deviations of ω, the steps of the random walk; zero for a velocity that is
+        constant.
     inflow, inflow_std : float
         c_in and the standard deviation of η in mol/m³; ĉ_bh and ĉ_bh/4 in the thesis.
     nodal_noise : (n, n)
         H Γ_e Hᵀ at the nominal velocity, (mol/m³)².
     profiles : (p, k)
-        Axial velocity of each v_k at p points across the flow, not on the walls; that of θ_0 must be positive.
+        Axial velocity of each v_k at p points across the flow, not on the walls; that of θ_0 must
+        be positive.
     bounds : (float, float)
-        Least and largest axial velocity at each point in parts of what θ_0 gives there, so that points close to a wall
-        bind no more than others; 0 < least < 1 < largest.
+        Least and largest axial velocity at each point in parts of what θ_0 gives there, so that
+        points close to a wall bind no more than others; 0 < least < 1 < largest.
 
     Raises
     ------
@@ -142,18 +148,20 @@ class JointFilter:
         self._filter.predict(carried, noise=self._noise, mean=np.concatenate([after, theta]))
 
     def update(self, observation: Observation) -> JointStep:
-        """Take in one measurement of the present concentration, linearised at `concentration` (see `linearised`)."""
+        """Take in one measurement of the present concentration, linearised at `concentration` (see
+        `linearised`)."""
         return self.take_in(observation.matrix, *self.expect(observation))
 
     def expect(self, observation: Observation) -> Expected:
-        """How a measurement of the present concentration compares with what is known before it; the rows of the cross
-        covariance are (c, θ)."""
+        """How a measurement of the present concentration compares with what is known before it; the
+        rows of the cross covariance are (c, θ)."""
         return self._filter.expect(observation._replace(matrix=self._blind(observation.matrix)))
 
     def take_in(self, H: np.ndarray, cross: np.ndarray, innovation: np.ndarray, S: np.ndarray) -> JointStep:
-        """Take in readings of the present concentration, with matrix (m, n) and what `expect` says of them."""
+        """Take in readings of the present concentration, with matrix (m, n) and what `expect` says
+        of them."""
         n, step = self._n, self._filter.take_in(self._blind(H), cross, innovation, S)
-        step.mean[n:] = self._physical(step.mean[n:])                                    # the filter's own array
+        step.mean[n:] = self._physical(step.mean[n:])  # the filter's own array
         return JointStep(step.mean[:n].copy(), step.variance[:n], step.mean[n:].copy(), self.covariance[n:, n:].copy(),
                          step.innovation, step.innovation_covariance)
 
@@ -162,8 +170,9 @@ class JointFilter:
         return np.hstack([matrix, np.zeros((len(matrix), len(self._start)))])
 
     def _physical(self, parameters: np.ndarray) -> np.ndarray:
-        """``parameters``, or the point nearest to them on the line towards θ_0 that keeps to the bounds."""
-        change = self._profiles @ (parameters - self._start)                             # in parts of the start
+        """``parameters``, or the point nearest to them on the line towards θ_0 that keeps to the
+        bounds."""
+        change = self._profiles @ (parameters - self._start)  # in parts of the start
         room = np.where(change < 0, *self._bounds) - 1.0
         beyond = np.abs(change) > np.abs(room)
         if not beyond.any():

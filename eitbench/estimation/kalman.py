@@ -1,4 +1,5 @@
-"""Kalman filtering of a large state seen through few measurements, exactly: P = Π − Z Zᵀ (``docs/methods.md``, 5)."""
+"""Kalman filtering of a large state seen through few measurements, exactly: P = Π − Z Zᵀ
+(``docs/methods.md``, 5)."""
 
 from __future__ import annotations
 
@@ -58,8 +59,9 @@ class FilterStep(NamedTuple):
 class KalmanFilter:
     """The Kalman filter of c⁺ = F c + s + w for small m and large n, without n×n products.
 
-    The covariance is Π_t − Z Zᵀ: Π_t, the covariance without data, is known beforehand; Z gains m columns at every
-    measurement, moves with F, and is compressed to its numerical rank, which stays far below n.
+    The covariance is Π_t − Z Zᵀ: Π_t, the covariance without data, is known beforehand; Z gains m
+    columns at every measurement, moves with F, and is compressed to its numerical rank, which stays
+    far below n.
 
     Parameters
     ----------
@@ -72,7 +74,8 @@ class KalmanFilter:
     covariance : FreeCovariance
         Π_t; Π_0 = Γ_{0|0}.
     rank_tolerance : float
-        Directions of Z shorter than this part of its longest are dropped; the covariance loses the square of it.
+        Directions of Z shorter than this part of its longest are dropped; the covariance loses the
+        square of it.
     """
 
     def __init__(self, transition: np.ndarray, forcing: np.ndarray, mean: np.ndarray, covariance: FreeCovariance, *,
@@ -98,7 +101,8 @@ class KalmanFilter:
         return self.covariance.apply(0, X)
 
     def apply_covariance(self, X: np.ndarray, limit_times_X: np.ndarray | None = None) -> np.ndarray:
-        """Γ X for X (n, k), Γ the covariance of the present state; arguments as in `FreeCovariance.apply`."""
+        """Γ X for X (n, k), Γ the covariance of the present state; arguments as in
+        `FreeCovariance.apply`."""
         return self.covariance.apply(self.time, X, limit_times_X) - self.known @ (self.known.T @ X)
 
     def update(self, observation: Observation) -> FilterStep:
@@ -129,7 +133,8 @@ class KalmanFilter:
 
 
 def expected(observation: Observation, mean: np.ndarray, cross: np.ndarray) -> Expected:
-    """`Expected` for a state with this mean (n,), whose covariance with what is seen is ``cross`` (n, m)."""
+    """`Expected` for a state with this mean (n,), whose covariance with what is seen is ``cross``
+    (n, m)."""
     S = observation.matrix @ cross
     return Expected(cross, observation.value - observation.matrix @ mean,
                     0.5 * (S + S.T) + np.diag(observation.noise_variance))
@@ -153,7 +158,7 @@ def kalman_filter(start: KalmanFilter, observations: Iterable[Observation]) -> l
     return steps
 
 
-# -- nonlinear observations -------------------------------------------------------------------------------------------
+# -- nonlinear observations ------------------------------------------------------------------------
 
 
 class _ObservationModel(Protocol):
@@ -166,7 +171,8 @@ class _Noise(Protocol):
 
 def linearised(model: _ObservationModel, noise: _Noise, point: np.ndarray, voltages: np.ndarray,
                currents: np.ndarray) -> Observation:
-    """V_t − R_t(c*) + J_t c* = J_t c + v (thesis 5.2), linearised at ``point`` (n,) for one injection (L,).
+    """V_t − R_t(c*) + J_t c* = J_t c + v (thesis 5.2), linearised at ``point`` (n,) for one
+    injection (L,).
 
     The noise is that of the voltages computed at the point.
     """

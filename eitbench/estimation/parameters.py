@@ -1,4 +1,5 @@
-"""Parameters of the stochastic evolution model, all in terms of the best homogeneous estimate (thesis Table 5.1)."""
+"""Parameters of the stochastic evolution model, all in terms of the best homogeneous estimate
+(thesis Table 5.1)."""
 
 from __future__ import annotations
 
@@ -23,8 +24,8 @@ def starting_filter(transport: Transport, prior: Prior, c_bh: float,
                     ) -> KalmanFilter | ClosedVesselFilter:
     """A Kalman filter for the target's motion at t = 0, with the parameters of Table 5.1.
 
-    Where the fluid flows through the vessel it is `table_5_1`'s. Where nothing flows in, the covariance without data
-    has no limit, and the filter keeps its covariance as a full matrix.
+    Where the fluid flows through the vessel it is `table_5_1`'s. Where nothing flows in, the
+    covariance without data has no limit, and the filter keeps its covariance as a full matrix.
 
     Parameters
     ----------
@@ -47,16 +48,18 @@ def starting_filter(transport: Transport, prior: Prior, c_bh: float,
 
 
 RANK_TOLERANCE = 1e-4
-"""See `KalmanFilter`: the estimates are those of the exact filter to 1e-7 of their standard deviation, in a quarter of
-the time where n = 3,003 (``docs/pipe3d.md``)."""
+"""See `KalmanFilter`: the estimates are those of the exact filter to 1e-7 of their standard
+deviation, in a quarter of the time where n = 3,003 (``docs/pipe3d.md``)."""
 
 
 def table_5_1(transport: Transport, prior: Prior, c_bh: float, *,
               rank_tolerance: float = RANK_TOLERANCE) -> KalmanFilter:
-    """The Kalman filter of c⁺ = F c + Y c_in + w, where the fluid flows through; arguments as in `starting_filter`.
+    """The Kalman filter of c⁺ = F c + Y c_in + w, where the fluid flows through; arguments as in
+    `starting_filter`.
 
-    Inflow and initial state have mean ĉ_bh; Γ_η and Γ_e are diagonal, Γ_{0|0} is diagonal or smooth. As all of them
-    scale with ĉ_bh², the covariance without data is computed once for a transport model and serves every episode.
+    Inflow and initial state have mean ĉ_bh; Γ_η and Γ_e are diagonal, Γ_{0|0} is diagonal or
+    smooth. As all of them scale with ĉ_bh², the covariance without data is computed once for a
+    transport model and serves every episode.
     """
     F, Y, _ = transport.evolution_model()
     mean = np.full(len(F), c_bh)
@@ -65,7 +68,8 @@ def table_5_1(transport: Transport, prior: Prior, c_bh: float, *,
 
 
 class ClosedVesselFilter(DenseKalmanFilter):
-    """The Kalman filter of c⁺ = F c + w in a vessel that nothing enters; without F and Γ_w it all stands still."""
+    """The Kalman filter of c⁺ = F c + w in a vessel that nothing enters; without F and Γ_w it all
+    stands still."""
 
     def __init__(self, mean: np.ndarray, covariance: np.ndarray, transition: np.ndarray | None,
                  noise: np.ndarray | None) -> None:

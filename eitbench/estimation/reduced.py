@@ -1,8 +1,9 @@
 """A Kalman filter in few coordinates, for very many records at once.
 
-The filter's mean moves away from the prior mean only within the span of Z (P = Π − Z Zᵀ). The directions that carry
-most of Z Zᵀ, as measured by the mass matrix, are therefore the best coordinates for its estimates; Galerkin's
-projection onto them gives a model of the same form with about a hundred states.
+The filter's mean moves away from the prior mean only within the span of Z (P = Π − Z Zᵀ). The
+directions that carry most of Z Zᵀ, as measured by the mass matrix, are therefore the best
+coordinates for its estimates; Galerkin's projection onto them gives a model of the same form with
+about a hundred states.
 """
 
 from __future__ import annotations
@@ -60,8 +61,10 @@ def reduced_model(start: KalmanFilter | ClosedVesselFilter, mass: np.ndarray, ob
 
 
 def learnt_of(start: KalmanFilter | ClosedVesselFilter, observations: Iterable[Observation], skip: int) -> np.ndarray:
-    """(n, n) by how much measurements reduce the covariance, summed over a record but for its first ``skip`` steps."""
-    blind = copy.deepcopy(start) if isinstance(start, ClosedVesselFilter) else None           # never sees a measurement
+    """(n, n) by how much measurements reduce the covariance, summed over a record but for its first
+    ``skip`` steps."""
+    # never sees a measurement
+    blind = copy.deepcopy(start) if isinstance(start, ClosedVesselFilter) else None
     learnt = np.zeros((len(start.mean), len(start.mean)))
     for t, observation in enumerate(observations):
         start.predict()
@@ -74,7 +77,8 @@ def learnt_of(start: KalmanFilter | ClosedVesselFilter, observations: Iterable[O
 
 
 def main_directions(learnt: np.ndarray, mass: np.ndarray, rank: int) -> np.ndarray:
-    """(n, r) the directions that carry most of ``learnt`` (n, n), as measured by the mass matrix M: Φᵀ M Φ = I."""
+    """(n, r) the directions that carry most of ``learnt`` (n, n), as measured by the mass matrix M:
+    Φᵀ M Φ = I."""
     root, n = np.linalg.cholesky(mass), len(mass)
     _, vectors = scipy.linalg.eigh(root.T @ learnt @ root, subset_by_index=[n - rank, n - 1])
     basis: np.ndarray = scipy.linalg.solve_triangular(root.T, vectors[:, ::-1], lower=False)
@@ -124,8 +128,9 @@ class ReducedFilter:
                gate: float = math.inf) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Take in residual = matrix·a + v: (B, m, r), (B, m), (B, m).
 
-        Readings are left out that `believable` does not believe with this ``gate``. Returns innovations (B, m), their
-        predicted variances (B, m) and which were taken in (B, m), all of them before any was left out.
+        Readings are left out that `believable` does not believe with this ``gate``. Returns
+        innovations (B, m), their predicted variances (B, m) and which were taken in (B, m), all of
+        them before any was left out.
         """
         P, transposed, m = self.covariance, np.swapaxes(matrix, -1, -2), matrix.shape[1]
         cross = matrix @ P                                                                  # H P
@@ -133,7 +138,7 @@ class ReducedFilter:
         S[:, np.arange(m), np.arange(m)] += noise_variance
         innovation, variance = residual - (matrix @ self.mean[..., None])[..., 0], S.diagonal(axis1=1, axis2=2).copy()
         kept, taken = believable(innovation, variance, gate), innovation
-        if not kept.all():                                  # a reading left out is one without a word on the state
+        if not kept.all():  # a reading left out is one without a word on the state
             cross, taken = cross * kept[..., None], innovation * kept
             S *= kept[:, :, None] & kept[:, None, :]
             S[:, np.arange(m), np.arange(m)] += ~kept

@@ -1,4 +1,5 @@
-"""Smoothing without inverses of n×n matrices and without storing any (Bryson & Frazier 1963; ``docs/methods.md``, 6)."""
+"""Smoothing without inverses of n×n matrices and without storing any (Bryson & Frazier 1963;
+``docs/methods.md``, 6)."""
 
 from __future__ import annotations
 
@@ -27,7 +28,8 @@ def fixed_interval_smoother(start: KalmanFilter, observations: Iterable[Observat
 
 
 def smoothed_state(filter_: KalmanFilter, steps: Sequence[FilterStep]) -> Smoothed:
-    """The state of the first of consecutive ``steps`` of ``filter_`` given the measurements of all of them.
+    """The state of the first of consecutive ``steps`` of ``filter_`` given the measurements of all
+    of them.
 
     With the last k + 1 steps this is the fixed-lag smoother c_{t−k|t}.
     """
@@ -53,11 +55,12 @@ class _Moving(Protocol):
 
 
 def smoothed_means(start: _Moving, observations: Iterable[Observation]) -> np.ndarray:
-    """Means c_{t|T} (T, n) of a filter that stands at t = 0, whose motion may change from step to step.
+    """Means c_{t|T} (T, n) of a filter that stands at t = 0, whose motion may change from step to
+    step.
 
-    The adjoint λ_t = Hᵀ S⁻¹ ν + (I − K H)ᵀ Fᵀ_{t+1} λ_{t+1} runs back over the innovations, and the smoothed state
-    follows forwards from c_{0|T} = c_{0|0} + Γ_{0|0} F₁ᵀ λ_1 as c_t = F_t c_{t−1} + s_t + Γ_w λ_t (``docs/methods.md``, 6):
-    without variances, and without a covariance being kept.
+    The adjoint λ_t = Hᵀ S⁻¹ ν + (I − K H)ᵀ Fᵀ_{t+1} λ_{t+1} runs back over the innovations, and the
+    smoothed state follows forwards from c_{0|T} = c_{0|0} + Γ_{0|0} F₁ᵀ λ_1 as c_t = F_t c_{t−1} +
+    s_t + Γ_w λ_t (``docs/methods.md``, 6): without variances, and without a covariance being kept.
     """
     mean, steps = start.mean, []
     for observation in observations:
@@ -68,7 +71,7 @@ def smoothed_means(start: _Moving, observations: Iterable[Observation]) -> np.nd
     smoothed, later = np.empty((len(steps), len(mean))), np.zeros_like(mean)
     for t in range(len(steps) - 1, -1, -1):
         H, (cross, innovation, S), F, *_ = steps[t]
-        smoothed[t] = later + H.T @ np.linalg.solve(S, innovation - cross.T @ later)               # λ_t
+        smoothed[t] = later + H.T @ np.linalg.solve(S, innovation - cross.T @ later)  # λ_t
         later = F.T @ smoothed[t]
     state = mean + start.apply_initial(later[:, None])[:, 0]
     for t, (*_, F, forcing, apply_noise) in enumerate(steps):
@@ -88,7 +91,8 @@ def _backwards(filter_: KalmanFilter, steps: Sequence[FilterStep]) -> Iterator[t
         factor = cho_factor(step.innovation_covariance, lower=True)
         if step is not steps[-1]:
             later = filter_.transition.T @ later
-            later -= step.matrix.T @ cho_solve(factor, step.cross_covariance.T @ later)   # (I − K H)ᵀ
+            # (I − K H)ᵀ
+            later -= step.matrix.T @ cho_solve(factor, step.cross_covariance.T @ later)
         adjoint = later[:, 0] + step.matrix.T @ cho_solve(factor, step.innovation)
         information = solve_triangular(factor[0], step.matrix, lower=True).T
         information = compressed(np.hstack([later[:, 1:], information]), filter_.rank_tolerance)

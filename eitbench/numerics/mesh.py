@@ -1,4 +1,5 @@
-"""Simplex meshes from plain arrays: nodes, cells, boundary facets, and linear interpolation between meshes."""
+"""Simplex meshes from plain arrays: nodes, cells, boundary facets, and linear interpolation between
+meshes."""
 
 from __future__ import annotations
 
@@ -29,8 +30,8 @@ class Mesh:
     Raises
     ------
     ValueError
-        If shapes are wrong, a coordinate is not finite, a node number is out of range, a node belongs to no cell,
-        or a cell has no volume.
+        If shapes are wrong, a coordinate is not finite, a node number is out of range, a node
+        belongs to no cell, or a cell has no volume.
     """
 
     points: np.ndarray
@@ -52,7 +53,7 @@ class Mesh:
         if unused.size:
             raise ValueError(f"points must all belong to a cell; {unused.size} do not, the first is node {unused[0]}")
         for name, value in (("points", points.copy()), ("cells", cells)):
-            value.setflags(write=False)                   # meshes are shared, and much is derived from them
+            value.setflags(write=False)  # meshes are shared, and much is derived from them
             object.__setattr__(self, name, value)
         size = np.ptp(points, axis=0).max()
         flat = np.flatnonzero(self.volumes <= 1e-14 * size**d)
@@ -78,7 +79,8 @@ class Mesh:
 
     @cached_property
     def boundary_facets(self) -> np.ndarray:
-        """(n_facets, d) node numbers, sorted within each row, of the facets that belong to one cell only."""
+        """(n_facets, d) node numbers, sorted within each row, of the facets that belong to one cell
+        only."""
         return self._boundary[0]
 
     @cached_property
@@ -90,7 +92,8 @@ class Mesh:
         return facets[count == 1], first[count == 1] % len(self.cells)
 
     def facets_where(self, predicate: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-        """The boundary facets all of whose nodes satisfy ``predicate(points (k, d)) -> bool (k,)``; (n_facets, d)."""
+        """The boundary facets all of whose nodes satisfy ``predicate(points (k, d)) -> bool (k,)``;
+        (n_facets, d)."""
         inside = np.asarray(predicate(self.points), dtype=bool)
         return self.boundary_facets[inside[self.boundary_facets].all(axis=1)]
 
@@ -117,18 +120,20 @@ class Mesh:
         Parameters
         ----------
         points : (k, d) float
-            In m. A point outside the mesh (by rounding, or because a curved wall is a polygon here) is moved to the
-            nearest point of the boundary (in 3D, where that is on an edge of a facet, to one nearly as near).
+            In m. A point outside the mesh (by rounding, or because a curved wall is a polygon here)
+            is moved to the nearest point of the boundary (in 3D, where that is on an edge of a
+            facet, to one nearly as near).
         candidates : int
-            How many cells, nearest by centroid, are searched first; points found in none are searched in all cells
-            whose centroid is near enough.
+            How many cells, nearest by centroid, are searched first; points found in none are
+            searched in all cells whose centroid is near enough.
 
         Returns
         -------
         cells : (k,) int
             Cell numbers; for a point outside, the cell that the nearest boundary facet belongs to.
         barycentric : (k, d + 1) float
-            Weights of the cell's nodes, in the order of ``cells``: not negative, with rows that sum to one.
+            Weights of the cell's nodes, in the order of ``cells``: not negative, with rows that sum
+            to one.
 
         Raises
         ------
@@ -146,7 +151,8 @@ class Mesh:
                 if cells:
                     best[i:i + 1], weights[i:i + 1] = self._best_cell(points[i:i + 1], np.array([cells]))
         for i in np.flatnonzero(weights.min(axis=1) < -1e-9):
-            # The cell with the least negative coordinate may be a large one far inside: take the nearest wall instead.
+            # The cell with the least negative coordinate may be a large one far inside: take the
+            # nearest wall instead.
             best[i], weights[i] = self._nearest_wall(points[i])
         weights = np.clip(weights, 0.0, None)
         weights /= weights.sum(axis=1, keepdims=True)
@@ -158,7 +164,8 @@ class Mesh:
         Parameters
         ----------
         points : (k, d) float
-            Where to interpolate, in m. A point outside the mesh takes the value at the nearest point of the boundary.
+            Where to interpolate, in m. A point outside the mesh takes the value at the nearest
+            point of the boundary.
         candidates : int
             See `locate`.
 
@@ -173,7 +180,8 @@ class Mesh:
         return matrix
 
     def _nearest_wall(self, point: np.ndarray) -> tuple[int, np.ndarray]:
-        """The cell of the boundary facet nearest to ``point``, and the barycentric coordinates of its projection."""
+        """The cell of the boundary facet nearest to ``point``, and the barycentric coordinates of
+        its projection."""
         tree, reach = self._wall_tree
         distance = np.sqrt(((self.points[np.unique(self.boundary_facets)] - point)**2).sum(axis=1).min())
         near = tree.query_ball_point(point, (1.0 + 1e-9) * (distance + reach), return_sorted=True)
@@ -189,8 +197,9 @@ class Mesh:
         return int(cells[nearest]), same_node @ weights[nearest]
 
     def _best_cell(self, points: np.ndarray, candidates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Among each point's candidate cells the one that contains it best, with its barycentric coordinates."""
-        corner = self.points[self.cells[candidates]]                                   # (k, c, d+1, d)
+        """Among each point's candidate cells the one that contains it best, with its barycentric
+        coordinates."""
+        corner = self.points[self.cells[candidates]]  # (k, c, d+1, d)
         edges = np.swapaxes(corner[:, :, 1:] - corner[:, :, :1], 2, 3)
         local = np.linalg.solve(edges, (points[:, None] - corner[:, :, 0])[..., None])[..., 0]
         barycentric = np.concatenate([1.0 - local.sum(axis=2, keepdims=True), local], axis=2)
@@ -202,8 +211,9 @@ class Mesh:
 def rectangle_mesh(x: Sequence[float] | np.ndarray, y: Sequence[float] | np.ndarray) -> Mesh:
     """Structured triangles on the tensor grid of increasing coordinates ``x`` and ``y`` (m).
 
-    Nodes are numbered by cross-section (all ``y`` of the first ``x``, then of the second, ...), so that matrices on
-    this mesh are banded with half-bandwidth ``len(y) + 1``. Diagonals alternate, which keeps the mesh symmetric.
+    Nodes are numbered by cross-section (all ``y`` of the first ``x``, then of the second, ...), so
+    that matrices on this mesh are banded with half-bandwidth ``len(y) + 1``. Diagonals alternate,
+    which keeps the mesh symmetric.
     """
     x = _check.array("x", x, (None,), units="m")
     y = _check.array("y", y, (None,), units="m")
@@ -222,7 +232,8 @@ def rectangle_mesh(x: Sequence[float] | np.ndarray, y: Sequence[float] | np.ndar
 
 
 def graded(start: float, stop: float, cells: int, grading: float, ends: str = "both") -> np.ndarray:
-    """``cells + 1`` coordinates from ``start`` to ``stop`` that crowd towards ``ends`` ("start", "stop" or "both").
+    """``cells + 1`` coordinates from ``start`` to ``stop`` that crowd towards ``ends`` ("start",
+    "stop" or "both").
 
     ``grading`` is the exponent of the clustering, ≥ 1; 1 is uniform.
     """
@@ -242,7 +253,8 @@ def graded(start: float, stop: float, cells: int, grading: float, ends: str = "b
 
 def graded_pipe_mesh(length: float, half_width: float, electrode_spans: np.ndarray, cells_along: int,
                      cells_across: int, grading: tuple[float, float] = (2.5, 1.75)) -> Mesh:
-    """EIT mesh of the pipe [0, length] × [-half_width, half_width], refined at the electrode edges and the walls.
+    """EIT mesh of the pipe [0, length] × [-half_width, half_width], refined at the electrode edges
+    and the walls.
 
     Parameters
     ----------
@@ -251,12 +263,14 @@ def graded_pipe_mesh(length: float, half_width: float, electrode_spans: np.ndarr
     electrode_spans : (n, 2) float
         Start and end (m) of each electrode along the wall, increasing and disjoint.
     cells_along : int
-        Cells on each electrode and in each gap between two; half as many before the first and after the last.
+        Cells on each electrode and in each gap between two; half as many before the first and after
+        the last.
     cells_across : int
         Cells from wall to wall.
     grading : (float, float)
-        Exponents of the clustering towards the electrode edges and towards the walls, see `graded`; the default had
-        the smallest voltage error for random slugs of those tried at equal numbers of unknowns.
+        Exponents of the clustering towards the electrode edges and towards the walls, see `graded`;
+        the default had the smallest voltage error for random slugs of those tried at equal numbers
+        of unknowns.
     """
     along, across = grading
     edges = _check.array("electrode_spans", electrode_spans, (None, 2), units="m").ravel()

@@ -1,7 +1,8 @@
 """Meshes of round cross-sections, and prisms on any cross-section cut into tetrahedra.
 
-In the plane a section lies in (x, y). In space it still does, and the axis of the pipe, along which the fluid flows, is
-the third coordinate z; the plane channel of `eitbench.numerics.mesh` has its flow along x.
+In the plane a section lies in (x, y). In space it still does, and the axis of the pipe, along which
+the fluid flows, is the third coordinate z; the plane channel of `eitbench.numerics.mesh` has its
+flow along x.
 """
 
 from __future__ import annotations
@@ -20,8 +21,9 @@ TURN = 2.0 * np.pi
 def disc_mesh(radii: Sequence[float] | np.ndarray, angles: Sequence[np.ndarray]) -> Mesh:
     """Triangles of a disc, with nodes at its centre and on rings that need not hold equally many.
 
-    Between two rings every edge of either is joined to that node of the other whose share of the turn, from the middle
-    of the edge before it to the middle of the edge behind it, holds the middle of this edge.
+    Between two rings every edge of either is joined to that node of the other whose share of the
+    turn, from the middle of the edge before it to the middle of the edge behind it, holds the
+    middle of this edge.
 
     Parameters
     ----------
@@ -38,7 +40,8 @@ def disc_mesh(radii: Sequence[float] | np.ndarray, angles: Sequence[np.ndarray])
     Raises
     ------
     ValueError
-        Naming the argument, if a shape or an order is wrong, or if the rings are so unlike that triangles overlap.
+        Naming the argument, if a shape or an order is wrong, or if the rings are so unlike that
+        triangles overlap.
     """
     radii = _check.array("radii", radii, (None,), units="m", positive=True)
     if len(radii) == 0 or (np.diff(radii) <= 0).any():
@@ -58,7 +61,8 @@ def disc_mesh(radii: Sequence[float] | np.ndarray, angles: Sequence[np.ndarray])
     cells += [_between(inner, outer, first[k], first[k + 1])
               for k, (inner, outer) in enumerate(itertools.pairwise(rings))]
     triangles = np.concatenate(cells)
-    # All run counter-clockwise, so that their areas add up to the polygon's, unless some lie on top of others.
+    # All run counter-clockwise, so that their areas add up to the polygon's, unless some lie on top
+    # of others.
     a, b, c = np.moveaxis(points[triangles], 1, 0)
     area = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
     if area.min() <= 0:
@@ -68,10 +72,12 @@ def disc_mesh(radii: Sequence[float] | np.ndarray, angles: Sequence[np.ndarray])
 
 
 def _between(inner: np.ndarray, outer: np.ndarray, first_inner: int, first_outer: int) -> np.ndarray:
-    """Triangles (n_inner + n_outer, 3), counter-clockwise, between two rings of these angles and first nodes."""
+    """Triangles (n_inner + n_outer, 3), counter-clockwise, between two rings of these angles and
+    first nodes."""
     i, j = np.arange(len(inner)), np.arange(len(outer))
     middle_i, middle_j = (np.mod(0.5 * (ring + np.append(ring[1:], ring[0] + TURN)), TURN) for ring in (inner, outer))
-    # Edges of both rings in one order around the turn; where two middles coincide the inner edge comes first.
+    # Edges of both rings in one order around the turn; where two middles coincide the inner edge
+    # comes first.
     on_outer, on_inner = _node_at(middle_j, middle_i, "left"), _node_at(middle_i, middle_j, "right")
     inwards = np.stack([first_inner + i, first_outer + on_outer, first_inner + (i + 1) % len(i)], axis=1)
     outwards = np.stack([first_outer + j, first_outer + (j + 1) % len(j), first_inner + on_inner], axis=1)
@@ -79,14 +85,16 @@ def _between(inner: np.ndarray, outer: np.ndarray, first_inner: int, first_outer
 
 
 def _node_at(middles: np.ndarray, angle: np.ndarray, side: str) -> np.ndarray:
-    """The node that follows the last edge whose middle lies before ``angle`` ("left"), or there at the latest."""
+    """The node that follows the last edge whose middle lies before ``angle`` ("left"), or there at
+    the latest."""
     order = np.argsort(middles)
     before = order[np.searchsorted(middles[order], angle, side) - 1]                   # type: ignore[call-overload]
     return (before + 1) % len(middles)
 
 
 def uniform_disc(radius: float, rings: int) -> Mesh:
-    """A disc of ``radius`` (m) in triangles of about one size: 6k nodes on ring k, 1 + 3·rings·(rings + 1) in all."""
+    """A disc of ``radius`` (m) in triangles of about one size: 6k nodes on ring k, 1 +
+    3·rings·(rings + 1) in all."""
     _check.number("radius", radius, low=0.0, open_low=True, units="m")
     _check.integer("rings", rings, low=1)
     counts = 6 * np.arange(1, rings + 1)
@@ -97,7 +105,8 @@ def electrode_disc(radius: float, spans: np.ndarray, cells_at_electrodes: int, r
                    grading: tuple[float, float] = (2.0, 1.5)) -> Mesh:
     """EIT mesh of a disc, refined at the electrode edges and the wall.
 
-    Inwards the rings hold ever fewer nodes, about as far apart as the rings are, and stand ever more evenly.
+    Inwards the rings hold ever fewer nodes, about as far apart as the rings are, and stand ever
+    more evenly.
 
     Parameters
     ----------
@@ -110,15 +119,16 @@ def electrode_disc(radius: float, spans: np.ndarray, cells_at_electrodes: int, r
     rings : int
         Cells from the centre to the wall.
     grading : (float, float)
-        Exponents of the clustering towards the electrode edges and towards the wall, see `graded`; with 16 electrodes
-        the default is within a few per cent of the smallest voltage error at equal numbers of unknowns. Angles stay
-        above 15° where the wall's cells are about as long as the rings next to them are wide.
+        Exponents of the clustering towards the electrode edges and towards the wall, see `graded`;
+        with 16 electrodes the default is within a few per cent of the smallest voltage error at
+        equal numbers of unknowns. Angles stay above 15° where the wall's cells are about as long as
+        the rings next to them are wide.
 
     Raises
     ------
     ValueError
-        Naming the argument, if it is out of range, of the wrong shape, or if electrodes touch or overlap; also if the
-        wall has cells so long that they cut through the rings next to it.
+        Naming the argument, if it is out of range, of the wrong shape, or if electrodes touch or
+        overlap; also if the wall has cells so long that they cut through the rings next to it.
     """
     _check.number("radius", radius, low=0.0, open_low=True, units="m")
     _check.integer("cells_at_electrodes", cells_at_electrodes, low=1)
@@ -141,12 +151,14 @@ def electrode_disc(radius: float, spans: np.ndarray, cells_at_electrodes: int, r
 
 
 def extrude(section: Mesh, z: Sequence[float] | np.ndarray) -> Mesh:
-    """Tetrahedra of the body that has this section in (x, y) at all coordinates ``z`` (m, increasing).
+    """Tetrahedra of the body that has this section in (x, y) at all coordinates ``z`` (m,
+    increasing).
 
-    Nodes are numbered by cross-section: all of the first ``z`` as in the section, then of the second, and so on. Every
-    triangle and two neighbouring ``z`` bound a prism of three tetrahedra. On a prism's side the diagonal leads up from
-    the lower node number to the higher one, so that neighbours agree about it; in every other layer it leads down,
-    which makes the mesh its own mirror image in z.
+    Nodes are numbered by cross-section: all of the first ``z`` as in the section, then of the
+    second, and so on. Every triangle and two neighbouring ``z`` bound a prism of three tetrahedra.
+    On a prism's side the diagonal leads up from the lower node number to the higher one, so that
+    neighbours agree about it; in every other layer it leads down, which makes the mesh its own
+    mirror image in z.
 
     Raises
     ------
@@ -162,7 +174,8 @@ def extrude(section: Mesh, z: Sequence[float] | np.ndarray) -> Mesh:
     points = np.concatenate([np.tile(section.points, (len(z), 1)), np.repeat(z, n)[:, None]], axis=1)
     a, b, c = np.sort(section.cells, axis=1).T
     layer = np.arange(len(z) - 1)[:, None]
-    start, stop = n * (layer + layer % 2), n * (layer + 1 - layer % 2)                # the end where diagonals begin
+    # the end where diagonals begin
+    start, stop = n * (layer + layer % 2), n * (layer + 1 - layer % 2)
     cells = [np.stack(np.broadcast_arrays(*corners), axis=-1).reshape(-1, 4) for corners in (
         (start + a, start + b, start + c, stop + c), (start + a, start + b, stop + b, stop + c),
         (start + a, stop + a, stop + b, stop + c))]
@@ -172,7 +185,8 @@ def extrude(section: Mesh, z: Sequence[float] | np.ndarray) -> Mesh:
 def round_pipe_mesh(length: float, radius: float, spans_around: np.ndarray, spans_along: np.ndarray,
                     cells_at_electrodes: tuple[int, int], rings: int,
                     grading: tuple[float, float, float] = (2.0, 1.5, 2.0)) -> Mesh:
-    """EIT mesh of the round pipe 0 ≤ z ≤ length with electrodes at all pairs of spans around and along it.
+    """EIT mesh of the round pipe 0 ≤ z ≤ length with electrodes at all pairs of spans around and
+    along it.
 
     Parameters
     ----------
@@ -183,8 +197,8 @@ def round_pipe_mesh(length: float, radius: float, spans_around: np.ndarray, span
     spans_along : (m, 2) float
         Start and end (m) of each ring of electrodes, increasing and disjoint.
     cells_at_electrodes : (int, int)
-        Cells on each electrode and in each gap between two, around and along the pipe; half as many before the first
-        ring and after the last.
+        Cells on each electrode and in each gap between two, around and along the pipe; half as many
+        before the first ring and after the last.
     rings : int
         Cells from the axis to the wall.
     grading : (float, float, float)
@@ -193,7 +207,8 @@ def round_pipe_mesh(length: float, radius: float, spans_around: np.ndarray, span
     Raises
     ------
     ValueError
-        Naming the argument, if it is out of range, of the wrong shape, or if electrodes touch or overlap.
+        Naming the argument, if it is out of range, of the wrong shape, or if electrodes touch or
+        overlap.
     """
     _check.number("length", length, low=0.0, open_low=True, units="m")
     around, along = cells_at_electrodes

@@ -1,6 +1,7 @@
 """Electrical impedance tomography with the complete electrode model (CEM; thesis ch. 4).
 
-∇·(σ∇u) = 0 in Ω,  u + z_l σ ∂u/∂n = U_l on electrode e_l,  ∫_{e_l} σ ∂u/∂n = I_l,  σ ∂u/∂n = 0 elsewhere,  ΣI = ΣU = 0.
+∇·(σ∇u) = 0 in Ω,  u + z_l σ ∂u/∂n = U_l on electrode e_l,  ∫_{e_l} σ ∂u/∂n = I_l,  σ ∂u/∂n = 0
+elsewhere,  ΣI = ΣU = 0.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ from eitbench.physics.sensitivity import Sensitivity
 class CompleteElectrodeModel:
     """Electrode voltages, and their derivatives, for a nodal conductivity.
 
-    Voltages are linear in the currents, so for one conductivity everything is in one symmetric L×L matrix,
-    U = 𝓡 I with 𝓡1 = 0: one sparse factorisation serves every injection.
+    Voltages are linear in the currents, so for one conductivity everything is in one symmetric L×L
+    matrix, U = 𝓡 I with 𝓡1 = 0: one sparse factorisation serves every injection.
 
     Parameters
     ----------
@@ -35,14 +36,14 @@ class CompleteElectrodeModel:
     contact_impedance : float or (L,)
         z_l in Ω·m², > 0.
     order : int
-        1 or 2: polynomial order of the potential. First order is wrong by several noise standard deviations on meshes
-        of a few thousand unknowns.
+        1 or 2: polynomial order of the potential. First order is wrong by several noise standard
+        deviations on meshes of a few thousand unknowns.
 
     Raises
     ------
     ValueError
-        If the mesh falls apart, there are fewer than two electrodes, a facet is not on the boundary, two electrodes
-        share a facet, or a contact impedance is not positive.
+        If the mesh falls apart, there are fewer than two electrodes, a facet is not on the
+        boundary, two electrodes share a facet, or a contact impedance is not positive.
     """
 
     def __init__(self, mesh: Mesh, electrodes: Sequence[np.ndarray],
@@ -58,7 +59,8 @@ class CompleteElectrodeModel:
 
         basis = skfem.Basis(to_skfem(mesh), element(mesh.dim, order), intorder=2 * order - 1)
         contact, rows, columns, derivatives = self._contact_terms(basis), *_conduction(basis)
-        # The last electrode is grounded: without its row and column the system is symmetric positive definite.
+        # The last electrode is grounded: without its row and column the system is symmetric
+        # positive definite.
         pattern = sp.coo_array((np.ones(len(rows)), (rows, columns)), shape=contact.shape).tocsc()
         system = Condensation((pattern + abs(contact))[:-1, :-1].tocsc(), n_electrodes - 1,
                               places=basis.doflocs.T if mesh.dim == 3 else None)
@@ -73,7 +75,7 @@ class CompleteElectrodeModel:
         self._centre = (np.eye(n_electrodes) - 1.0 / n_electrodes)[:, :-1]
         self._sensitivity = Sensitivity(basis)
 
-    # -- public ---------------------------------------------------------------------------------------------------
+    # -- public ------------------------------------------------------------------------------------
 
     def transfer_resistance(self, conductivity: np.ndarray) -> np.ndarray:
         """𝓡 with U = 𝓡 I for every injection.
@@ -85,7 +87,8 @@ class CompleteElectrodeModel:
 
         Returns
         -------
-        (..., L, L) array in Ω (Ω·m in 2D, where currents are per metre of depth); symmetric, rows sum to zero.
+        (..., L, L) array in Ω (Ω·m in 2D, where currents are per metre of depth); symmetric, rows
+        sum to zero.
         """
         sigma = self._checked_conductivity(conductivity, batched=True)
         if sigma.ndim == 1:
@@ -98,7 +101,8 @@ class CompleteElectrodeModel:
         return result.reshape(*sigma.shape[:-1], self.n_electrodes, self.n_electrodes)
 
     def voltages(self, conductivity: np.ndarray, currents: np.ndarray) -> np.ndarray:
-        """Electrode potentials (K, L) in V for currents (K, L) in A (A/m in 2D) that sum to zero; rows sum to zero."""
+        """Electrode potentials (K, L) in V for currents (K, L) in A (A/m in 2D) that sum to zero;
+        rows sum to zero."""
         currents = self._checked_currents(currents)
         return currents @ self.transfer_resistance(self._checked_conductivity(conductivity))
 
@@ -115,10 +119,11 @@ class CompleteElectrodeModel:
         return currents @ resistance, (currents @ by_node).reshape(*currents.shape, -1)
 
     def transfer_resistance_derivatives(self, conductivity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """𝓡 and its derivatives by the nodal conductivity, from one factorisation; they serve every injection.
+        """𝓡 and its derivatives by the nodal conductivity, from one factorisation; they serve every
+        injection.
 
-        The field of any injection is a combination of the L fields w_m of unit currents, taken out evenly at all
-        electrodes, so that ∂𝓡_ml/∂σ_j = −∫ φ_j ∇w_m·∇w_l.
+        The field of any injection is a combination of the L fields w_m of unit currents, taken out
+        evenly at all electrodes, so that ∂𝓡_ml/∂σ_j = −∫ φ_j ∇w_m·∇w_l.
 
         Parameters
         ----------
@@ -134,7 +139,7 @@ class CompleteElectrodeModel:
         fields, grounded = np.split(columns, [-self._system.n_ports])
         return self._centred(grounded), self._sensitivity(fields @ self._centre.T)
 
-    # -- the linear system ------------------------------------------------------------------------------------------
+    # -- the linear system -------------------------------------------------------------------------
 
     def _contact_terms(self, basis: skfem.CellBasis) -> sp.csr_array:
         """Σ_l (1/z_l)∫_{e_l}(u − U_l)(φ − Φ_l) on all N + L unknowns."""
@@ -159,7 +164,7 @@ class CompleteElectrodeModel:
         resistance = self._centre @ grounded @ self._centre.T
         return 0.5 * (resistance + np.swapaxes(resistance, -1, -2))
 
-    # -- checks -----------------------------------------------------------------------------------------------------
+    # -- checks ------------------------------------------------------------------------------------
 
     def _checked_conductivity(self, conductivity: np.ndarray, batched: bool = False) -> np.ndarray:
         shape = (-1, self.mesh.n_nodes) if batched else (self.mesh.n_nodes,)
@@ -192,7 +197,8 @@ def _conduction_form(s, u, v, _w):
 
 
 def _conduction(basis: skfem.CellBasis) -> tuple[np.ndarray, np.ndarray, sp.csr_array]:
-    """∫σ∇u·∇φ as local entries: their rows, columns, and their derivatives (entries, n_nodes) by nodal σ."""
+    """∫σ∇u·∇φ as local entries: their rows, columns, and their derivatives (entries, n_nodes) by
+    nodal σ."""
     sigma = basis.with_element(element(basis.mesh.dim(), 1))
     tensor = _conduction_form.coo_data(sigma, basis, basis)
     i, j, k = (np.asarray(index, dtype=np.int64) for index in tensor.indices)

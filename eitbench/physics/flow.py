@@ -1,4 +1,5 @@
-"""Velocity fields: any callable ``points (k, d) in m -> velocity (k, d) in m/s`` without divergence will do."""
+"""Velocity fields: any callable ``points (k, d) in m -> velocity (k, d) in m/s`` without divergence
+will do."""
 
 from __future__ import annotations
 
@@ -11,7 +12,8 @@ from eitbench import _check
 
 @dataclass(frozen=True)
 class PlaneChannelFlow:
-    """Laminar flow between parallel walls y = ±half_width: v(y) = 1.5·v̄·(1 − (y/R)²) along x (thesis 5.1.1).
+    """Laminar flow between parallel walls y = ±half_width: v(y) = 1.5·v̄·(1 − (y/R)²) along x
+    (thesis 5.1.1).
 
     Parameters
     ----------
@@ -38,8 +40,8 @@ class PlaneChannelFlow:
 class PowerLawFlow:
     """Turbulent mean flow between parallel walls: v(y) = (1 + n)·v̄·(1 − |y|/R)ⁿ along x.
 
-    With n = 1/7 this is the power law of Prandtl and von Kármán for moderate Reynolds numbers (Schlichting,
-    *Boundary-Layer Theory*, ch. XX).
+    With n = 1/7 this is the power law of Prandtl and von Kármán for moderate Reynolds numbers
+    (Schlichting, *Boundary-Layer Theory*, ch. XX).
 
     Parameters
     ----------
@@ -70,7 +72,8 @@ class PowerLawFlow:
 
 @dataclass(frozen=True)
 class PlugFlow:
-    """The same velocity everywhere, v̄ along x: the limit of strong mixing, or of a fluid without friction.
+    """The same velocity everywhere, v̄ along x: the limit of strong mixing, or of a fluid without
+    friction.
 
     Parameters
     ----------
@@ -91,7 +94,8 @@ class PlugFlow:
 
 @dataclass(frozen=True)
 class RoundPipeFlow:
-    """Laminar flow in a round pipe, after Hagen and Poiseuille: v(r) = 2·v̄·(1 − (r/R)²) along z, r² = x² + y².
+    """Laminar flow in a round pipe, after Hagen and Poiseuille: v(r) = 2·v̄·(1 − (r/R)²) along z,
+    r² = x² + y².
 
     Parameters
     ----------
@@ -111,5 +115,6 @@ class RoundPipeFlow:
     def __call__(self, points: np.ndarray) -> np.ndarray:
         velocity = np.zeros_like(points, dtype=float)
         squared = (points[:, :2]**2).sum(axis=1) / self.radius**2
-        velocity[:, 2] = 2.0 * self.mean_velocity * np.maximum(1.0 - squared, 0.0)       # by rounding r may exceed R
+        # by rounding r may exceed R
+        velocity[:, 2] = 2.0 * self.mean_velocity * np.maximum(1.0 - squared, 0.0)
         return velocity

@@ -1,4 +1,5 @@
-"""Steady incompressible flow in 2D: v·∇v − ν∆v + ∇p = f, ∇·v = 0, with Taylor–Hood elements (P2 for v, P1 for p)."""
+"""Steady incompressible flow in 2D: v·∇v − ν∆v + ∇p = f, ∇·v = 0, with Taylor–Hood elements (P2 for
+v, P1 for p)."""
 
 from __future__ import annotations
 
@@ -18,21 +19,23 @@ from eitbench.numerics.fem import element, to_skfem
 from eitbench.numerics.mesh import Mesh
 from eitbench.physics.transport import VelocityField
 
-_EDGES = np.array([[0, 1], [1, 2], [2, 0]])               # of a triangle; their middles are its nodes 3, 4 and 5
+_EDGES = np.array([[0, 1], [1, 2], [2, 0]])  # of a triangle; their middles are its nodes 3, 4 and 5
 _NEWTON_STEPS = 15
-_TOLERANCE = 1e-9                                         # of the last step, relative; what is left is about its square
+_TOLERANCE = 1e-9  # of the last step, relative; what is left is about its square
 
 
 @dataclass(frozen=True, eq=False)
 class SteadyFlow:
-    """A velocity field on a mesh: points (k, 2) in m -> velocity (k, 2) in m/s; made by `steady_flow`.
+    """A velocity field on a mesh: points (k, 2) in m -> velocity (k, 2) in m/s; made by
+    `steady_flow`.
 
     Points outside the mesh take the velocity at the nearest point of the boundary.
     """
 
     mesh: Mesh
     cell_velocity: np.ndarray
-    """(n_cells, 6, 2) velocity in m/s at the three nodes of each cell and at the middles of its edges 01, 12 and 20."""
+    """(n_cells, 6, 2) velocity in m/s at the three nodes of each cell and at the middles of its
+    edges 01, 12 and 20."""
     pressure: np.ndarray
     """(n_nodes,) kinematic pressure (pressure over density) in m²/s²."""
 
@@ -44,11 +47,12 @@ class SteadyFlow:
 
 def steady_flow(mesh: Mesh, viscosity: float, walls: Sequence[tuple[np.ndarray, VelocityField]], *,
                 force: VelocityField | None = None) -> SteadyFlow:
-    """A steady flow, by Newton's method from the Stokes flow and, where that fails, by continuation in viscosity.
+    """A steady flow, by Newton's method from the Stokes flow and, where that fails, by continuation
+    in viscosity.
 
-    The error is of third order in the cell size for the velocity and of second for the pressure (L2 norms). Nothing is
-    upwinded: a mesh too coarse for the Reynolds number gives wiggles, or no solution. Where there are several steady
-    flows one of them is found, be it stable or not.
+    The error is of third order in the cell size for the velocity and of second for the pressure (L2
+    norms). Nothing is upwinded: a mesh too coarse for the Reynolds number gives wiggles, or no
+    solution. Where there are several steady flows one of them is found, be it stable or not.
 
     Parameters
     ----------
@@ -57,20 +61,21 @@ def steady_flow(mesh: Mesh, viscosity: float, walls: Sequence[tuple[np.ndarray, 
     viscosity : float
         Kinematic viscosity ν in m²/s, > 0.
     walls : sequence of (facets, velocity)
-        Boundary facets, (k, 2) node numbers as from `Mesh.facets_where`, and the velocity imposed on them: points
-        (k, 2) in m -> velocity (k, 2) in m/s, asked at the ends and the middle of each facet. A node that several
-        entries share takes the value of the last: of a moving lid and walls at rest, or an inlet and walls, the walls
-        should come last. All other boundary facets are outflow, ν∂v/∂n − pn = 0; without any, the pressure has mean
-        zero.
+        Boundary facets, (k, 2) node numbers as from `Mesh.facets_where`, and the velocity imposed
+        on them: points (k, 2) in m -> velocity (k, 2) in m/s, asked at the ends and the middle of
+        each facet. A node that several entries share takes the value of the last: of a moving lid
+        and walls at rest, or an inlet and walls, the walls should come last. All other boundary
+        facets are outflow, ν∂v/∂n − pn = 0; without any, the pressure has mean zero.
     force : callable, optional
         Force per mass, points (k, 2) in m -> acceleration (k, 2) in m/s²; default: none.
 
     Raises
     ------
     ValueError
-        Naming the argument, if the mesh is not 2D, if a value is out of range, of the wrong shape or not finite, if a
-        facet is not on the boundary, or if walls all round let more fluid in than out: by more than 10⁻⁴ of the
-        largest speed times the perimeter. (Less is the error of interpolation, and spread as a uniform divergence.)
+        Naming the argument, if the mesh is not 2D, if a value is out of range, of the wrong shape
+        or not finite, if a facet is not on the boundary, or if walls all round let more fluid in
+        than out: by more than 10⁻⁴ of the largest speed times the perimeter. (Less is the error of
+        interpolation, and spread as a uniform divergence.)
     RuntimeError
         If no steady flow was found.
     """
@@ -85,10 +90,11 @@ def steady_flow(mesh: Mesh, viscosity: float, walls: Sequence[tuple[np.ndarray, 
     return SteadyFlow(mesh, velocity[equations.cell_dofs], pressure)
 
 
-# -- equations --------------------------------------------------------------------------------------------------------
+# -- equations -------------------------------------------------------------------------------------
 
 class _Equations(NamedTuple):
-    """(νL + C(v)) v − Bᵀp = load and −Bv = source, for x = (v₁, v₂, p) with the wall values of v given."""
+    """(νL + C(v)) v − Bᵀp = load and −Bv = source, for x = (v₁, v₂, p) with the wall values of v
+    given."""
 
     basis: skfem.Basis
     """Scalar P2, n unknowns."""
@@ -99,7 +105,8 @@ class _Equations(NamedTuple):
     load: np.ndarray
     """(2n,) ∫φᵢ f."""
     source: np.ndarray
-    """(n_nodes,) zero, but for what walls all round let out by errors of interpolation, spread evenly."""
+    """(n_nodes,) zero, but for what walls all round let out by errors of interpolation, spread
+    evenly."""
     given: np.ndarray
     """(2n + n_nodes,) wall values, zero elsewhere."""
     free: np.ndarray
@@ -107,7 +114,8 @@ class _Equations(NamedTuple):
     weights: np.ndarray
     """(n_nodes,) ∫ψᵢ."""
     closed: bool
-    """Whether all of the boundary is walls; then only the pressure's gradient matters, and one value is given."""
+    """Whether all of the boundary is walls; then only the pressure's gradient matters, and one
+    value is given."""
     cell_dofs: np.ndarray
     """(n_cells, 6) numbers of the scalar unknowns at the nodes and edge middles of each cell."""
 
@@ -149,7 +157,7 @@ def _integral(v, _w):
 
 def _discretise(mesh: Mesh, walls: Sequence[tuple[np.ndarray, VelocityField]],
                 force: VelocityField | None) -> _Equations:
-    basis = skfem.Basis(to_skfem(mesh), element(2, 2), intorder=5)                      # exact for v·∇v
+    basis = skfem.Basis(to_skfem(mesh), element(2, 2), intorder=5)  # exact for v·∇v
     linear = skfem.Basis(basis.mesh, element(2, 1), intorder=5)
     n = basis.N
     value, on_wall, closed = _wall_values(mesh, basis, walls)
@@ -179,7 +187,8 @@ def _discretise(mesh: Mesh, walls: Sequence[tuple[np.ndarray, VelocityField]],
 
 def _wall_values(mesh: Mesh, basis: skfem.Basis, walls: Sequence[tuple[np.ndarray, VelocityField]],
                  ) -> tuple[np.ndarray, np.ndarray, bool]:
-    """Velocity (n, 2) on the walls, the numbers of the unknowns there, and whether the walls are all round."""
+    """Velocity (n, 2) on the walls, the numbers of the unknowns there, and whether the walls are
+    all round."""
     if not len(walls):
         raise ValueError("walls must hold at least one pair of facets and velocity")
     value, on_wall = np.zeros((basis.N, 2)), np.zeros(basis.N, dtype=bool)
@@ -214,7 +223,7 @@ def _sample(name: str, field: VelocityField, points: np.ndarray) -> np.ndarray:
     return _check.array(f"{name}(points)", field(points), points.shape)
 
 
-# -- solution ---------------------------------------------------------------------------------------------------------
+# -- solution --------------------------------------------------------------------------------------
 
 def _continuation(equations: _Equations, viscosity: float) -> np.ndarray:
     """The solution x at this viscosity, if need be by way of higher ones."""
@@ -239,7 +248,8 @@ def _continuation(equations: _Equations, viscosity: float) -> np.ndarray:
 
 
 def _newton(equations: _Equations, viscosity: float, start: np.ndarray | None = None) -> np.ndarray | None:
-    """The solution x that Newton's method finds from ``start``, by default the Stokes flow; none if it diverges."""
+    """The solution x that Newton's method finds from ``start``, by default the Stokes flow; none if
+    it diverges."""
     x = _linear_solution(equations, viscosity, None) if start is None else start
     last = math.inf
     for k in range(_NEWTON_STEPS):
@@ -249,17 +259,19 @@ def _newton(equations: _Equations, viscosity: float, start: np.ndarray | None = 
         if x is not None:
             velocity, pressure = np.split(x, [len(equations.load)])
             step = np.abs(velocity - before[:len(velocity)]).max()
-            # √p is the speed that the pressure could make: where a fluid rests under pressure v is mere rounding.
+            # √p is the speed that the pressure could make: where a fluid rests under pressure v is
+            # mere rounding.
             if step <= _TOLERANCE * max(np.abs(velocity).max(), math.sqrt(np.abs(pressure).max())):
                 return x
-            if k > 1 and step > last:                     # the second step may well be larger than the first
+            if k > 1 and step > last:  # the second step may well be larger than the first
                 return None
             last = step
     return None
 
 
 def _linear_solution(equations: _Equations, viscosity: float, around: np.ndarray | None) -> np.ndarray | None:
-    """x of the equations linearised about ``around``, by default about rest; none if they are singular."""
+    """x of the equations linearised about ``around``, by default about rest; none if they are
+    singular."""
     basis, n, free = equations.basis, equations.basis.N, equations.free
     viscous = viscosity * equations.laplace
     momentum: list[list[sp.csr_array | None]] = [[viscous, None], [None, viscous]]
@@ -279,7 +291,8 @@ def _linear_solution(equations: _Equations, viscosity: float, around: np.ndarray
     x = equations.given.copy()
     right = np.concatenate([load, equations.source]) - matrix @ x
     try:
-        # Diagonal pivots where they are not too small: 10–30 % less fill than with partial pivoting, and as accurate.
+        # Diagonal pivots where they are not too small: 10–30 % less fill than with partial
+        # pivoting, and as accurate.
         x[free] = splu(matrix[free][:, free], diag_pivot_thresh=0.1).solve(right[free])
     except RuntimeError:                                  # exactly singular
         return None

@@ -1,4 +1,5 @@
-"""What EIT sees of a concentration: σ(c), voltages and their derivatives by c, and measurement noise."""
+"""What EIT sees of a concentration: σ(c), voltages and their derivatives by c, and measurement
+noise."""
 
 from __future__ import annotations
 
@@ -47,10 +48,12 @@ class LinearConductivity:
 
 @dataclass(frozen=True)
 class KohlrauschConductivity:
-    """σ = (Λ₀ − K√c) c, Kohlrausch's square-root law of strong electrolytes; rises up to c = (2Λ₀/3K)².
+    """σ = (Λ₀ − K√c) c, Kohlrausch's square-root law of strong electrolytes; rises up to c =
+    (2Λ₀/3K)².
 
-    The defaults are sodium chloride in water at 25 °C by Onsager's limiting law, Λ₀ = 126.45 and K = 89.1 in
-    S·cm²/mol with c in mol/l (Robinson & Stokes, *Electrolyte Solutions*, 1959), in SI units.
+    The defaults are sodium chloride in water at 25 °C by Onsager's limiting law, Λ₀ = 126.45 and K
+    = 89.1 in S·cm²/mol with c in mol/l (Robinson & Stokes, *Electrolyte Solutions*, 1959), in SI
+    units.
 
     Parameters
     ----------
@@ -78,9 +81,11 @@ class KohlrauschConductivity:
 
 @dataclass(frozen=True)
 class VoltageNoise:
-    """Independent Gaussian noise, std² = (relative·reading)² + (of_largest·largest voltage)² + floor² (thesis 5.1.1).
+    """Independent Gaussian noise, std² = (relative·reading)² + (of_largest·largest voltage)² +
+    floor² (thesis 5.1.1).
 
-    The largest voltage is that of the same injection. Without ``floor`` the noise scales with the current.
+    The largest voltage is that of the same injection. Without ``floor`` the noise scales with the
+    current.
 
     Parameters
     ----------
@@ -110,9 +115,9 @@ class VoltageNoise:
 class ObservationModel:
     """Voltages for a nodal concentration on the CD mesh: V = R(c).
 
-    The concentration is interpolated linearly to the EIT mesh, which does not conform, and turned into a conductivity
-    there. A concentration below ``smallest_concentration`` counts as that value with the law's slope there, so that σ
-    stays positive whatever an estimator proposes.
+    The concentration is interpolated linearly to the EIT mesh, which does not conform, and turned
+    into a conductivity there. A concentration below ``smallest_concentration`` counts as that value
+    with the law's slope there, so that σ stays positive whatever an estimator proposes.
 
     Parameters
     ----------
@@ -141,7 +146,8 @@ class ObservationModel:
         return self.cem.voltages(self.conductivity(self._at_eit_nodes(concentration)), currents)
 
     def resistance_derivatives(self, concentration: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """𝓡 (L, L) in Ω (Ω·m in 2D) and its derivatives by the nodal concentration, (n_cd, L, L) per mol/m³.
+        """𝓡 (L, L) in Ω (Ω·m in 2D) and its derivatives by the nodal concentration, (n_cd, L, L)
+        per mol/m³.
 
         They hold `linearise` for every injection: V = 𝓡 I, dV/dc_j = table[j] I.
         """
@@ -152,7 +158,8 @@ class ObservationModel:
         return resistance, by_node.reshape(-1, *resistance.shape)
 
     def linearise(self, concentration: np.ndarray, currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Voltages (K, L) and their derivative by the nodal concentration, (K, L, n_cd) in V·m³/mol (thesis 5.2)."""
+        """Voltages (K, L) and their derivative by the nodal concentration, (K, L, n_cd) in V·m³/mol
+        (thesis 5.2)."""
         c = self._at_eit_nodes(concentration)
         voltages, by_conductivity = self.cem.linearise(self.conductivity(c), currents)
         by_node = (by_conductivity * self.conductivity.derivative(c)).reshape(-1, len(c))

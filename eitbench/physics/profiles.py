@@ -1,4 +1,5 @@
-"""Axial flow in a plane channel by its profile across: one that is drawn, and a family whose members are estimated."""
+"""Axial flow in a plane channel by its profile across: one that is drawn, and a family whose
+members are estimated."""
 
 from __future__ import annotations
 
@@ -10,7 +11,8 @@ import numpy as np
 from eitbench import _check
 
 _ETA, _WEIGHTS = np.polynomial.legendre.leggauss(24)
-"""Gauss–Legendre points and weights on [−1, 1]; integrals of products of profiles are exact to rounding."""
+"""Gauss–Legendre points and weights on [−1, 1]; integrals of products of profiles are exact to
+rounding."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,8 @@ class SkewedChannelFlow:
 
 @dataclass(frozen=True)
 class PolynomialFlow:
-    """Axial flow v = Σ a_j (y/R)ʲ along x between walls y = ±R; ``coefficients`` a_j in m/s, ``half_width`` R in m."""
+    """Axial flow v = Σ a_j (y/R)ʲ along x between walls y = ±R; ``coefficients`` a_j in m/s,
+    ``half_width`` R in m."""
 
     coefficients: tuple[float, ...]
     half_width: float

@@ -39,7 +39,8 @@ class AtRest:
 
     def evolution_model(self) -> EvolutionModel:
         """F = I without any inlet; nodal noise adds up as it is."""
-        from eitbench.physics.transport import EvolutionModel  # finite elements: not needed to play recordings
+        # finite elements: not needed to play recordings
+        from eitbench.physics.transport import EvolutionModel
         identity = np.eye(self.mesh.n_nodes)
         return EvolutionModel(identity, np.zeros((self.mesh.n_nodes, 0)), identity)
 

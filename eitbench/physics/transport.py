@@ -1,4 +1,5 @@
-"""Convection-diffusion (thesis ch. 3): ∂c/∂t = ∇·(κ∇c) − v·∇c, c given on the inlet, ∂c/∂n = 0 elsewhere.
+"""Convection-diffusion (thesis ch. 3): ∂c/∂t = ∇·(κ∇c) − v·∇c, c given on the inlet, ∂c/∂n = 0
+elsewhere.
 
 The discretisation is that of ``docs/methods.md``, 1.
 """
@@ -26,22 +27,26 @@ MANY = 16
 
 
 class EvolutionModel(NamedTuple):
-    """c⁺ = F c + Y c_in⁺ + w, with w = Y η + H e (thesis 5.14–5.16); all matrices act on nodal concentrations."""
+    """c⁺ = F c + Y c_in⁺ + w, with w = Y η + H e (thesis 5.14–5.16); all matrices act on nodal
+    concentrations."""
 
     F: np.ndarray
     """(n, n) state transition over one time step; it carries the inlet's old value along."""
     Y: np.ndarray
     """(n, n_inlet) effect of the new inlet values."""
     H: np.ndarray
-    """(n, n) effect of nodal noise e, the concentration that an unknown source adds over the time step."""
+    """(n, n) effect of nodal noise e, the concentration that an unknown source adds over the time
+    step."""
 
     def state_noise_covariance(self, inflow_variance: float, nodal_variance: float) -> np.ndarray:
-        """Γ_w = Y Γ_η Yᵀ + H Γ_e Hᵀ (thesis 5.16) for Γ_η = inflow_variance·I and Γ_e = nodal_variance·I; (n, n)."""
+        """Γ_w = Y Γ_η Yᵀ + H Γ_e Hᵀ (thesis 5.16) for Γ_η = inflow_variance·I and Γ_e =
+        nodal_variance·I; (n, n)."""
         return inflow_variance * (self.Y @ self.Y.T) + nodal_variance * (self.H @ self.H.T)
 
 
 class Transport(Protocol):
-    """How a concentration moves in a time step: `ConvectionDiffusion`, or `eitbench.physics.rest.AtRest`."""
+    """How a concentration moves in a time step: `ConvectionDiffusion`, or
+    `eitbench.physics.rest.AtRest`."""
 
     def __hash__(self) -> int: ...
 
@@ -76,12 +81,14 @@ class Transport(Protocol):
 class ConvectionDiffusion:
     """One time step of the CD model: P1 elements with SUPG, sub-stepped Crank–Nicolson.
 
-    The SUPG test function φ + τ v·∇φ also weighs the mass matrix, so the scheme is consistent in time. The first
-    sub-step is taken as two backward-Euler halves (Rannacher), which damp node-to-node noise that Crank–Nicolson would
-    keep; they use the same matrix, so a step costs one factorisation for ever and ``substeps + 1`` solves. Within a
-    step the inlet value moves linearly from the old to the new one. Second order in space and in the sub-step; between
-    those, at cell Péclet numbers of about 2–8, the order in space sinks to 1.5, as P1 has no ∇·(κ∇c) to weigh. Because
-    every step starts anew with the two halves, shorter steps at equal ``substeps`` are first order only.
+    The SUPG test function φ + τ v·∇φ also weighs the mass matrix, so the scheme is consistent in
+    time. The first sub-step is taken as two backward-Euler halves (Rannacher), which damp
+    node-to-node noise that Crank–Nicolson would keep; they use the same matrix, so a step costs one
+    factorisation for ever and ``substeps + 1`` solves. Within a step the inlet value moves linearly
+    from the old to the new one. Second order in space and in the sub-step; between those, at cell
+    Péclet numbers of about 2–8, the order in space sinks to 1.5, as P1 has no ∇·(κ∇c) to weigh.
+    Because every step starts anew with the two halves, shorter steps at equal ``substeps`` are
+    first order only.
 
     Parameters
     ----------
@@ -96,7 +103,8 @@ class ConvectionDiffusion:
     substeps : int
         Crank–Nicolson steps per time step, ≥ 1.
     inlet : (n_inlet,) int, optional
-        Nodes where the concentration is given; default: nodes of the boundary facets through which fluid enters.
+        Nodes where the concentration is given; default: nodes of the boundary facets through which
+        fluid enters.
 
     Raises
     ------
@@ -157,13 +165,15 @@ class ConvectionDiffusion:
                              directions: Sequence[VelocityField]) -> tuple[np.ndarray, np.ndarray]:
         """The step and its derivatives by θ when the velocity is v + Σ θ_k v_k, at θ = 0.
 
-        They are those of the discrete step, with the test functions, which depend on the velocity too, the Rannacher
-        start and all sub-steps; the inlet nodes stay what they are. For k directions this costs the step, the assembly
-        of 2k matrices, and one more solve with k right-hand sides a sub-step.
+        They are those of the discrete step, with the test functions, which depend on the velocity
+        too, the Rannacher start and all sub-steps; the inlet nodes stay what they are. For k
+        directions this costs the step, the assembly of 2k matrices, and one more solve with k
+        right-hand sides a sub-step.
 
-        The cell's length along the flow has a kink where the flow passes along the side of a cell; there the
-        derivative is the mean of both one-sided ones. Where v = 0 it is exact along each direction, but the scheme is
-        not linear in the direction there unless all directions are parallel.
+        The cell's length along the flow has a kink where the flow passes along the side of a cell;
+        there the derivative is the mean of both one-sided ones. Where v = 0 it is exact along each
+        direction, but the scheme is not linear in the direction there unless all directions are
+        parallel.
 
         Parameters
         ----------
@@ -176,7 +186,8 @@ class ConvectionDiffusion:
 
         Returns
         -------
-        (n,) the concentration one time step later, and (n, K) its derivatives, in the unit of ``c``.
+        (n,) the concentration one time step later, and (n, K) its derivatives, in the unit of
+        ``c``.
 
         Raises
         ------
@@ -190,13 +201,14 @@ class ConvectionDiffusion:
         after = self._inflow("inflow_after", inflow_after, 1)
         changes = _supg_derivatives(self.mesh, self._velocity, self.diffusivity, directions)
         states = np.hstack([state.copy() for state in self._substeps(c, before, after, self._no_loads())])
-        # A sub-step solves M (c⁺ − c)/Δt + K (c⁺ + c)/2 = 0, backward Euler the same with K c⁺/2; by the product rule
+        # A sub-step solves M (c⁺ − c)/Δt + K (c⁺ + c)/2 = 0, backward Euler the same with K c⁺/2;
+        # by the product rule
         # what M and K change by is a load in the equation for the derivative.
         differences = (states[:, :-1] - states[:, 1:]) * (self.substeps / self.time_step)
         averages = 0.5 * (states[:, 1:] + states[:, :-1])
         averages[:, :2] = 0.5 * states[:, 1:3]
         loads = np.stack([mass[self._free] @ differences - transport[self._free] @ averages
-                          for mass, transport in changes], axis=-1)                        # (n_free, solves, K)
+                          for mass, transport in changes], axis=-1)  # (n_free, solves, K)
         nothing = np.zeros((len(self.inlet), len(directions)))
         *_, derivatives = self._substeps(np.zeros((len(c), len(directions))), nothing, nothing, loads.swapaxes(0, 1))
         return states[:, -1].copy(), derivatives
@@ -206,7 +218,8 @@ class ConvectionDiffusion:
         return self._evolution_model
 
     def transition(self) -> tuple[np.ndarray, np.ndarray]:
-        """F (n, n) and Y (n, n_inlet) of `evolution_model` without H, in half the time; computed once and kept."""
+        """F (n, n) and Y (n, n_inlet) of `evolution_model` without H, in half the time; computed
+        once and kept."""
         return self._transition
 
     @cached_property
@@ -234,7 +247,8 @@ class ConvectionDiffusion:
 
     def _advance(self, c: np.ndarray, before: np.ndarray, after: np.ndarray,
                  source: np.ndarray | None = None) -> np.ndarray:
-        """All sub-steps on (n, batch) columns, perhaps with a nodal source of so much concentration a second."""
+        """All sub-steps on (n, batch) columns, perhaps with a nodal source of so much concentration
+        a second."""
         loads: Iterable[np.ndarray | float] = self._no_loads()
         load = None if source is None else self._mass @ source
         if c.shape[1] >= MANY:
@@ -251,7 +265,8 @@ class ConvectionDiffusion:
                   loads: Iterable[np.ndarray | float]) -> Iterator[np.ndarray]:
         """(n, batch) columns at the beginning and after each solve, always in the same array.
 
-        ``loads`` holds for each of the ``substeps + 1`` solves what is added to the right-hand side of the free nodes.
+        ``loads`` holds for each of the ``substeps + 1`` solves what is added to the right-hand side
+        of the free nodes.
         """
         c = c.copy()
         c[self.inlet] = before
@@ -259,7 +274,8 @@ class ConvectionDiffusion:
         slope = (after - before) / self.substeps
         rate = self.substeps / self.time_step
         for k, load in enumerate(loads):
-            # The first two are backward Euler, each half a sub-step: (2M/Δt + K) c⁺ = (2M/Δt) c + f, divided by two
+            # The first two are backward Euler, each half a sub-step: (2M/Δt + K) c⁺ = (2M/Δt) c +
+            # f, divided by two
             # the Crank–Nicolson matrix again.
             inlet = before + (k or 0.5) * slope
             explicit = rate * (self._mass @ c) if k < 2 else self._explicit @ c
@@ -279,7 +295,8 @@ class ConvectionDiffusion:
 
 
 def inlet_nodes(mesh: Mesh, velocity: VelocityField) -> np.ndarray:
-    """Nodes of the boundary facets through which fluid enters: ∫ v·n < 0 (midpoint rule); (n_inlet,) int."""
+    """Nodes of the boundary facets through which fluid enters: ∫ v·n < 0 (midpoint rule);
+    (n_inlet,) int."""
     basis = skfem.FacetBasis(to_skfem(mesh), element(mesh.dim, 1), intorder=1)
     x = np.asarray(basis.global_coordinates())
     speed = (_velocity_at(velocity, x) * np.asarray(basis.normals)).sum(axis=0).mean(axis=1)
@@ -294,7 +311,7 @@ def _velocity_at(velocity: VelocityField, x: np.ndarray, name: str = "velocity")
     return value.T.reshape(x.shape)
 
 
-# -- SUPG -------------------------------------------------------------------------------------------------------------
+# -- SUPG ------------------------------------------------------------------------------------------
 
 
 @lru_cache(maxsize=8)
@@ -341,9 +358,10 @@ def _supg_derivatives(mesh: Mesh, velocity: VelocityField, diffusivity: float,
     derivatives = []
     for number, direction in enumerate(directions):
         v_k = _velocity_at(direction, x, f"directions[{number}]")
-        test = tau * v_k + (by_velocity * v_k).sum(axis=0) * v                          # what τ v changes by
+        test = tau * v_k + (by_velocity * v_k).sum(axis=0) * v  # what τ v changes by
         along = sum(np.abs((v_k * phi[0].grad).sum(axis=0)) for phi in basis.basis)
-        # In slow flow τ = |v|²/(3κ(Σᵢ|v·∇φᵢ|)²) depends on the direction only: τ v leaves v = 0 as τ(v_k) v_k.
+        # In slow flow τ = |v|²/(3κ(Σᵢ|v·∇φᵢ|)²) depends on the direction only: τ v leaves v = 0 as
+        # τ(v_k) v_k.
         slow = (v_k**2).sum(axis=0) / np.maximum(3 * diffusivity * along**2, 1e-300)
         test = np.where(tau == 0.0, slow * v_k, test)
         derivatives.append((sp.csr_array(mass.assemble(basis, test=test)),
@@ -354,11 +372,12 @@ def _supg_derivatives(mesh: Mesh, velocity: VelocityField, diffusivity: float,
 def _upwinding(basis: skfem.Basis, v: np.ndarray, diffusivity: float) -> tuple[np.ndarray, np.ndarray]:
     """τ (cells, points), and its derivative by the velocity (d, cells, points), zero where τ is.
 
-    τ = h/(2|v|)·(coth Pe − 1/Pe) with Pe = |v|h/(2κ) and h the cell's length along the flow (Brooks & Hughes 1982).
+    τ = h/(2|v|)·(coth Pe − 1/Pe) with Pe = |v|h/(2κ) and h the cell's length along the flow (Brooks
+    & Hughes 1982).
     """
     gradients = [np.asarray(phi[0].grad) for phi in basis.basis]
     streams = [(v * gradient).sum(axis=0) for gradient in gradients]
-    along = sum(np.abs(stream) for stream in streams)                                 # Σᵢ|v·∇φᵢ| = 2|v|/h
+    along = sum(np.abs(stream) for stream in streams)  # Σᵢ|v·∇φᵢ| = 2|v|/h
     some = np.maximum(along, 1e-300)
     peclet = (v**2).sum(axis=0) / np.maximum(along * diffusivity, 1e-300)
     larger = np.maximum(peclet, 1e-3)

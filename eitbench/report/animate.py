@@ -27,13 +27,14 @@ MOVING = (".gif", ".webp")
 
 def animate(environment: str, method: str, seed: str, step: int | None, path: Path, *,
             every: int = 1, isolate: str = "others") -> Path:
-    """Play a baseline, or a policy, on one episode and draw its scored states into ``path``, one in ``every``, or only
-    state ``step``.
+    """Play a baseline, or a policy, on one episode and draw its scored states into ``path``, one in
+    ``every``, or only state ``step``.
 
     Raises
     ------
     ValueError
-        If the method cannot play the environment, or the path's suffix is not .gif or .webp (.png with ``step``).
+        If the method cannot play the environment, or the path's suffix is not .gif or .webp (.png
+        with ``step``).
     """
     suffixes = MOVING if step is None else (".png",)
     if path.suffix not in suffixes:
@@ -69,7 +70,7 @@ def animate(environment: str, method: str, seed: str, step: int | None, path: Pa
         palette = _palette()
         frames = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     elif path.suffix == ".webp":
-        how = {"quality": 30, "method": 6}                   # a fifth of the GIF, and the letters are still sharp
+        how = {"quality": 30, "method": 6}  # a fifth of the GIF, and the letters are still sharp
     if step is None:
         how |= {"save_all": True, "append_images": frames[1:], "loop": 0,
                 "duration": every * 1000 // env.metadata["render_fps"]}
@@ -78,11 +79,12 @@ def animate(environment: str, method: str, seed: str, step: int | None, path: Pa
 
 
 def _palette() -> Image.Image:
-    """The 256 colours of a frame: both colour maps, greys, and the electrodes; one for all frames keeps them steady."""
+    """The 256 colours of a frame: both colour maps, greys, and the electrodes; one for all frames
+    keeps them steady."""
     colours = [colormaps[name](np.linspace(0, 1, n))[:, :3] for name, n in ((FIELD_MAP, 120), (SPREAD_MAP, 100))]
     greys = np.linspace(0, 1, 27)[:, None].repeat(3, axis=1)
     pairs = [to_rgb(colour) for colour in (SOURCE, SINK, IDLE)]
-    halves = [tuple(0.5 + 0.5 * c for c in colour) for colour in pairs]              # at the edges of the bars
+    halves = [tuple(0.5 + 0.5 * c for c in colour) for colour in pairs]  # at the edges of the bars
     table = np.concatenate([*colours, greys, pairs, halves, halves])[:256]
     image = Image.new("P", (1, 1))
     image.putpalette((255 * table).round().astype(np.uint8).tobytes())

@@ -1,4 +1,5 @@
-"""Leaderboards from records: ranks and intervals board by board, an aggregate for each class, as CSV and Markdown."""
+"""Leaderboards from records: ranks and intervals board by board, an aggregate for each class, as
+CSV and Markdown."""
 
 from __future__ import annotations
 
@@ -14,29 +15,50 @@ from eitbench.bench.text import as_markdown, number, scores_by_seed, seed_ranges
 from eitbench.bench.tracks import CLASSES, FLOORS, ids, named, track_of_board
 from eitbench.bench.tracks import class_of as class_of_board
 from eitbench.data.seeds import parse_seeds
-from eitbench.report.summary import COLUMNS, EXPLANATIONS, place_of_world, summary_row, world
+from eitbench.report.summary import columns, explanations, place_of_world, summary_row, world
 
 ALL = "all"
 """Stands for the environment in the rows of an aggregate."""
-OTHERS = tuple(name for name in COLUMNS if name != "error")
-"""Scores that stand beside ranks, as means over the episodes."""
-FIELDS = ("class", "environment", "method", "version", "title", "rank", "note", "official", "seeds", "error",
-          "error_low", "error_high", "gain", "gain_low", "gain_high", *OTHERS, "matmuls_per_step", "peak_memory")
-NUMBERS = FIELDS[FIELDS.index("error"):]
-HEADINGS = {name: heading for name, heading in COLUMNS.items() if name != "error"} | {
-    "matmuls_per_step": "products/step", "peak_memory": "MB"}
-MORE = {
-    "rank": "one more than the number of methods that are significantly better; shared where none is. Floors, "
-            "references, privileged methods and those that have not finished every episode have none",
-    "by": "who ran it: the maintainers (official), or its author (self-reported)",
-    "ẽ_c": "relative estimation error (5.12), mean over episodes with its 95 % bootstrap interval; lower is better",
-    "gain": "1 − ẽ_c over that of the floor (homogeneous; random_pair) in the same episode: 0 as the floor, 1 perfect. "
-            "Interquartile mean with its 95 % bootstrap interval",
-    **{heading: EXPLANATIONS[heading] for heading in HEADINGS.values() if heading in EXPLANATIONS},
-    "products/step": "time per step in units of a 1000 × 1000 × 1000 matrix product on one thread of that processor, "
-                     "the median of all that were timed on it",
-    "MB": "memory that the method's own process held at most",
+_BEFORE = ("class", "environment", "method", "version", "title", "rank", "note", "official", "seeds")
+_NUMBERS = ("error", "error_low", "error_high", "gain", "gain_low", "gain_high")
+_AFTER = {
+    "matmuls_per_step": (
+        "products/step", "time per step in units of a 1000 × 1000 × 1000 matrix product on one thread "
+        "of that processor, the median of all that were timed on it"),
+    "peak_memory": ("MB", "memory that the method's own process held at most"),
 }
+_FIRST = {
+    "rank": "one more than the number of methods that are significantly better; shared where none is. "
+            "Floors, references, privileged methods and those that have not finished every episode "
+            "have none",
+    "by": "who ran it: the maintainers (official), or its author (self-reported)",
+    "ẽ_c": "relative estimation error (5.12), mean over episodes with its 95 % bootstrap interval; "
+           "lower is better",
+    "gain": "1 − ẽ_c over that of the floor (homogeneous; random_pair) in the same episode: 0 as the "
+            "floor, 1 perfect. Interquartile mean with its 95 % bootstrap interval",
+}
+
+
+def others() -> list[str]:
+    """Scores that stand beside ranks, as means over the episodes."""
+    return [name for name in columns() if name != "error"]
+
+
+def fields() -> list[str]:
+    """Columns of `boards`."""
+    return [*_BEFORE, *_NUMBERS, *others(), *_AFTER]
+
+
+def headings() -> dict[str, str]:
+    """Column -> heading, of all numbers but those with intervals."""
+    shown = {name: heading for name, (heading, _) in columns().items() if name != "error"}
+    return shown | {name: heading for name, (heading, _) in _AFTER.items()}
+
+
+def meanings() -> dict[str, str]:
+    """Heading -> what it says."""
+    after = {heading: text for heading, text in _AFTER.values()}
+    return _FIRST | {heading: text for heading, text in explanations().items() if heading != "ẽ_c"} | after
 
 
 class Entry(NamedTuple):
@@ -63,13 +85,14 @@ class Entry(NamedTuple):
 
 
 def boards(records: list[dict[str, Any]]) -> pd.DataFrame:
-    """All boards in one table of `FIELDS`, a row for each record that is not outdated, best first.
+    """All boards in one table of `fields`, a row for each record that is not outdated, best first.
 
-    A board is an environment. Its episodes are those that its floor has played (without one, those that anybody has);
-    others are not looked at. After the boards of a class comes its aggregate, with ``environment`` `ALL`, if
-    there are several registered environments with a floor: of methods that have finished every episode of every one of
-    them. Environments with arguments of somebody's own have boards, and no part in it.
-    ``seconds_per_step`` is in ms of the fastest episode, ``voltage_discrepancy`` in mV², ``peak_memory`` in 10⁶ bytes.
+    A board is an environment. Its episodes are those that its floor has played (without one, those
+    that anybody has); others are not looked at. After the boards of a class comes its aggregate,
+    with ``environment`` `ALL`, if there are several registered environments with a floor: of
+    methods that have finished every episode of every one of them. Environments with arguments of
+    somebody's own have boards, and no part in it. ``seconds_per_step`` is in ms of the fastest
+    episode, ``voltage_discrepancy`` in mV², ``peak_memory`` in 10⁶ bytes.
 
     Raises
     ------
@@ -91,7 +114,8 @@ def boards(records: list[dict[str, Any]]) -> pd.DataFrame:
             rows += _board(environment, entries, current, products)
         rows += _aggregate({environment: entries for environment, entries in played.items()
                             if environment in registered and any(entry.gains for entry in entries)})
-    return pd.DataFrame(rows, columns=list(FIELDS)).astype({"rank": "Int64"} | dict.fromkeys(NUMBERS, float))
+    types: dict[str, Any] = dict.fromkeys([*_NUMBERS, *others(), *_AFTER], float)
+    return pd.DataFrame(rows, columns=fields()).astype(types | {"rank": "Int64"})
 
 
 def class_of(record: dict[str, Any]) -> str:
@@ -100,8 +124,8 @@ def class_of(record: dict[str, Any]) -> str:
 
 
 def render(records: list[dict[str, Any]], table: pd.DataFrame | None = None) -> dict[str, str]:
-    """The content of ``leaderboard.csv`` and ``leaderboard.md``, by file name, from the records and, if it is made
-    already, their `boards`. The same records give the same text."""
+    """The content of ``leaderboard.csv`` and ``leaderboard.md``, by file name, from the records
+    and, if it is made already, their `boards`. The same records give the same text."""
     table = boards(records) if table is None else table
     return {"leaderboard.csv": table.to_csv(index=False, float_format="%.6g", lineterminator="\n"),
             "leaderboard.md": _markdown(table, newest(records)[1])}
@@ -117,7 +141,7 @@ def _entries(records: list[dict[str, Any]]) -> list[Entry]:
     for whole in records:
         record = whole | {"episodes": [episode for episode in whole["episodes"] if episode["seed"] in seeds],
                           "seeds": [seed for seed in whole["seeds"] if seed in seeds]}
-        if not record["seeds"]:                                        # nothing that the board asks for
+        if not record["seeds"]:  # nothing that the board asks for
             continue
         errors = scores_by_seed(record, "error")
         failed, missing = sum(e["status"] != "ok" for e in whole["episodes"]), len(seeds - set(record["seeds"]))
@@ -140,7 +164,7 @@ def _board(environment: str, entries: list[Entry], current: list[dict[str, Any]]
             "seeds": seed_ranges(record["seeds"]),
             **_three("error", {environment: entry.errors}, mean_over_environments),
             **_three("gain", {environment: entry.gains}, interquartile_mean),
-            **{name: None if summarised[name] is None else summarised[name][0] for name in OTHERS},
+            **{name: None if summarised[name] is None else summarised[name][0] for name in others()},
             "matmuls_per_step": _in_products(record, products), "peak_memory": _peak(record)})
     return rows
 
@@ -151,8 +175,8 @@ def _place(entry: Entry) -> tuple[bool, float, str]:
 
 
 def _aggregate(played: dict[str, list[Entry]]) -> list[dict[str, Any]]:
-    """Rows of the methods that have finished all of several environments, ordered and ranked by the interquartile mean
-    of their gains."""
+    """Rows of the methods that have finished all of several environments, ordered and ranked by the
+    interquartile mean of their gains."""
     if len(played) < 2:
         return []
     found = [{entry.label: entry for entry in entries if entry.complete and entry.gains} for entries in played.values()]
@@ -176,7 +200,8 @@ def _row(entry: Entry, environment: str, rank: int | None) -> dict[str, Any]:
 
 
 def _three(name: str, scores: dict[str, dict[str, float]], statistic: Any) -> dict[str, float | None]:
-    """A statistic of environment -> seed -> score, and the ends of its interval, as far as there are any."""
+    """A statistic of environment -> seed -> score, and the ends of its interval, as far as there
+    are any."""
     if not all(scores.values()):
         return dict.fromkeys((name, f"{name}_low", f"{name}_high"))
     three = stratified_bootstrap({key: list(own.values()) for key, own in scores.items()}, statistic)
@@ -185,7 +210,8 @@ def _three(name: str, scores: dict[str, dict[str, float]], statistic: Any) -> di
 
 
 def _matrix_products(records: list[dict[str, Any]]) -> dict[str, float]:
-    """Processor -> time of a matrix product in s, the median of the runs: a single one depends on what runs beside."""
+    """Processor -> time of a matrix product in s, the median of the runs: a single one depends on
+    what runs beside."""
     timed: dict[str, list[float]] = {}
     for record in records:
         for run in record["runs"]:
@@ -217,7 +243,8 @@ def _markdown(table: pd.DataFrame, outdated: list[dict[str, Any]]) -> str:
                 f"{environment}, {max(board['seeds'], key=lambda seeds: len(parse_seeds(seeds)))}")
             parts += [f"### {heading}", as_markdown(_cells(board), words=3)]
     if not table.empty:
-        parts += ["## What the columns say", "\n".join(f"- **{heading}**: {text}" for heading, text in MORE.items())]
+        said = [f"- **{heading}**: {text}" for heading, text in meanings().items()]
+        parts += ["## What the columns say", "\n".join(said)]
     if outdated:
         parts += ["## Outdated records", "Made by an earlier version of the method.\n\n"
                   + "\n".join(f"- {file_name(record)}" for record in outdated)]
@@ -233,7 +260,7 @@ def _cells(board: pd.DataFrame) -> pd.DataFrame:
         **{heading: [_interval(*three) for three in board[[name, f"{name}_low", f"{name}_high"]].itertuples(False)]
            for name, heading in (("error", "ẽ_c"), ("gain", "gain"))},
         **{heading: ["–" if pd.isna(value) else number(value) for value in board[name]]
-           for name, heading in HEADINGS.items()}})
+           for name, heading in headings().items()}})
     return text.loc[:, [bool((text[heading] != "–").any()) for heading in text]]
 
 

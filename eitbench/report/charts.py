@@ -1,4 +1,5 @@
-"""Small charts as inline SVG, coloured by the page's style sheet so that they follow light and dark."""
+"""Small charts as inline SVG, coloured by the page's style sheet so that they follow light and
+dark."""
 
 from __future__ import annotations
 
@@ -63,7 +64,7 @@ class Axis:
 def lines(x: np.ndarray, series: list[Series], x_label: str, y_label: str) -> str:
     """Curves over a linear x axis and a logarithmic y axis; a series may end before ``x`` does."""
     values = np.concatenate([s.values for s in series])
-    floor = values[values > 0].min(initial=1.0) / 1.15            # where a perfect estimate's zero is drawn
+    floor = values[values > 0].min(initial=1.0) / 1.15  # where a perfect estimate's zero is drawn
     last = max([x[-1], x[0] + 1, *(s.at[-1] for s in series if s.at is not None)])
     px = Axis(x[0], last, LEFT, WIDTH - RIGHT, log=False)
     py = Axis(floor, max(values.max(), floor) * 1.15, HEIGHT - BOTTOM, TOP, log=True)
@@ -77,12 +78,13 @@ def lines(x: np.ndarray, series: list[Series], x_label: str, y_label: str) -> st
 
 
 def front(points: list[Point], x_label: str, y_label: str) -> str:
-    """Marks over two logarithmic axes, on which small is good; those that are `optimal` are filled and joined.
+    """Marks over two logarithmic axes, on which small is good; those that are `optimal` are filled
+    and joined.
 
     Names stand beside their marks as far as there is room.
     """
     def span(values: list[float]) -> tuple[float, float]:
-        positive = [value for value in values if value > 0] or [1.0]      # a zero is drawn at the edge
+        positive = [value for value in values if value > 0] or [1.0]  # a zero is drawn at the edge
         return min(positive) / 1.4, max(positive) * 1.4
 
     px = Axis(*span([p.x for p in points]), LEFT, WIDTH - RIGHT, log=True)
@@ -92,10 +94,10 @@ def front(points: list[Point], x_label: str, y_label: str) -> str:
     stairs = " ".join(f"{px(p.x):.1f},{py(p.y):.1f}" for p in best)
     parts.append(f'<polyline class="front" points="{stairs}"/>')
     taken = [(px(p.x) - 6, py(p.y) - 6, px(p.x) + 6, py(p.y) + 6) for p in points]
-    for a, b in pairwise(best):                                          # names keep off the line too
+    for a, b in pairwise(best):  # names keep off the line too
         along = [np.linspace(axis(begin), axis(end), 40) for axis, begin, end in ((px, a.x, b.x), (py, a.y, b.y))]
         taken += [(x - 1, y - 1, x + 1, y + 1) for x, y in zip(*along, strict=True)]
-    for p in [*best, *(p for p in points if p not in best)]:              # the best choose their places first
+    for p in [*best, *(p for p in points if p not in best)]:  # the best choose their places first
         colour = f"var(--c{p.colour % COLOURS})"
         fill = colour if p in best else "var(--card)"
         parts.append(f'<circle style="fill:{fill};stroke:{colour};stroke-width:2" cx="{px(p.x):.1f}" '
@@ -108,7 +110,8 @@ def front(points: list[Point], x_label: str, y_label: str) -> str:
 
 
 def optimal(points: list[Point]) -> list[Point]:
-    """Of those that compete, whom no other beats in one and equals or beats in the other, by x; of equals one."""
+    """Of those that compete, whom no other beats in one and equals or beats in the other, by x; of
+    equals one."""
     best: list[Point] = []
     for p in sorted((p for p in points if p.competes), key=lambda p: (p.x, p.y)):
         if not best or p.y < best[-1].y:
@@ -139,7 +142,8 @@ def intervals(rows: list[Series], x_label: str, *, log: bool = True, mark: float
     known = [value for s in rows for value in s.values if math.isfinite(value)] + ([] if mark is None else [mark])
     if log:
         least = min((float(s.values[0]) for s in rows if s.values[0] > 0), default=1.0)
-        low, high = max(min(known), least / 2) / 1.15, max(*known, least) * 1.15       # what reaches below is cut
+        # what reaches below is cut
+        low, high = max(min(known), least / 2) / 1.15, max(*known, least) * 1.15
     else:
         margin = 0.05 * (max(known) - min(known)) or 1.0
         low, high = min(known) - margin, max(known) + margin
@@ -163,8 +167,8 @@ def intervals(rows: list[Series], x_label: str, *, log: bool = True, mark: float
 
 
 def cell(three: tuple[float, float, float], low: float, high: float, *, log: bool) -> str:
-    """A dot and its interval within a table's cell, on the scale of its column from ``low`` to ``high``; the number
-    beside it says the same, so that it is hidden from those who listen."""
+    """A dot and its interval within a table's cell, on the scale of its column from ``low`` to
+    ``high``; the number beside it says the same, so that it is hidden from those who listen."""
     px = Axis(low, high if high > low else low + 1.0, 4, 76, log=log)
     value, a, b = (min(end if math.isfinite(end) else three[0], px.high) for end in three)
     return (f'<svg class="cell" viewBox="0 0 80 14" aria-hidden="true"><line x1="{px(a):.1f}" x2="{px(b):.1f}" '
@@ -206,7 +210,8 @@ def _shortened(name: str, letters: int) -> str:
 
 def _room(x: float, y: float, width: float, taken: list[tuple[float, float, float, float]]
           ) -> tuple[float, float, str] | None:
-    """Where a name of this width fits beside (x, y) without touching what is ``taken``, to which it is added."""
+    """Where a name of this width fits beside (x, y) without touching what is ``taken``, to which it
+    is added."""
     for left, dy, anchor in ((x + 10, 4, "start"), (x - 10 - width, 4, "end"), (x + 6, -9, "start"),
                              (x + 6, 18, "start"), (x - 6 - width, -9, "end"), (x - 6 - width, 18, "end")):
         box = (left, y + dy - 11, left + width, y + dy + 3)
@@ -218,8 +223,8 @@ def _room(x: float, y: float, width: float, taken: list[tuple[float, float, floa
 
 
 def _log_ticks(low: float, high: float) -> list[float]:
-    """1, 2, 5 times powers of ten within [low, high]; only the powers where they would be many, and those of a linear
-    axis where there would be fewer than two."""
+    """1, 2, 5 times powers of ten within [low, high]; only the powers where they would be many, and
+    those of a linear axis where there would be fewer than two."""
     decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
     ticks = [m * 10.0**e for e in decades for m in (1, 2, 5) if low <= m * 10.0**e <= high]
     if len(ticks) < 2:

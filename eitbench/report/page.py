@@ -21,22 +21,24 @@ from eitbench.data.seeds import parse_seeds
 from eitbench.envs.rendering import FIELD_MAP, colour_range, draw_field
 from eitbench.numerics.mesh import Mesh
 from eitbench.report import charts
-from eitbench.report.summary import EXPLANATIONS, board_label, cells, method
+from eitbench.report.summary import board_label, cells, explanations, method
 from eitbench.report.templates import template
 from eitbench.worlds.task import Task
 
 SHOWN = (("kalman_filter", "filter"), ("joint_extended_kalman_filter", "filter"),
          ("fixed_interval_smoother", "smoothing"), ("gauss_newton", "smoothing"))
-"""Beside the truth, in the snapshots: thesis Figs 5.4 and 5.6, and who estimates the flow too where it is asked for."""
+"""Beside the truth, in the snapshots: thesis Figs 5.4 and 5.6, and who estimates the flow too where
+it is asked for."""
 
 
 def write_page(store: EpisodeStore, records: list[dict[str, Any]], table: pd.DataFrame) -> Path:
-    """Write ``index.html`` into the store's folder and return its path; it needs no other file and no network."""
+    """Write ``index.html`` into the store's folder and return its path; it needs no other file and
+    no network."""
     sections = [_section(store, records, str(name), rows.reset_index(drop=True))
                 for name, rows in table.groupby("world", sort=False)]
     shown = {heading for section in sections for heading in section["headings"]}
     html = template("page.html.j2").render(
-        sections=sections, explanations={heading: text for heading, text in EXPLANATIONS.items() if heading in shown},
+        sections=sections, explanations={heading: text for heading, text in explanations().items() if heading in shown},
         colour_bar=_colour_bar(), runs=_runs(records),
     )
     path = store.folder / "index.html"
@@ -45,7 +47,8 @@ def write_page(store: EpisodeStore, records: list[dict[str, Any]], table: pd.Dat
 
 
 def _section(store: EpisodeStore, records: list[dict[str, Any]], name: str, table: pd.DataFrame) -> dict[str, Any]:
-    """What the page shows of one world; ``table`` has its rows, numbered from 0, which choose the colours."""
+    """What the page shows of one world; ``table`` has its rows, numbered from 0, which choose the
+    colours."""
     text = cells(table)
     ordered = [_record_of(records, row) for _, row in table.iterrows()]
     return {
@@ -101,8 +104,8 @@ def _curves(ordered: list[dict[str, Any]]) -> str:
 def _snapshots(store: EpisodeStore, records: list[dict[str, Any]]) -> dict[str, Any] | None:
     """Truth and estimates of one episode at four times, as PNG data; None if nothing can be shown.
 
-    The records are of one world, which has one mesh and one time step.
-    The episode is of the split that comes first in the table: methods that played other seeds share none with it.
+    The records are of one world, which has one mesh and one time step. The episode is of the split
+    that comes first in the table: methods that played other seeds share none with it.
     """
     records = [record for record in records if any(e["status"] == "ok" for e in record["episodes"])]
     records = [record for record in records if record["split"] == records[0]["split"]]
@@ -150,7 +153,7 @@ def _picture(task: Task, mesh: Mesh, values: np.ndarray) -> str:
     """The field without axes, transparent outside, as a data URI; in 3D the slice along the axis."""
     extent = np.ptp(mesh.points, axis=0)
     length, height = (extent[2], extent[1]) if mesh.dim == 3 else extent
-    width = 2.6 if _is_tank(task) else 4.0                     # inches; the style sheet keeps tanks small too
+    width = 2.6 if _is_tank(task) else 4.0  # inches; the style sheet keeps tanks small too
     figure = Figure(figsize=(width, width * height / length), dpi=90)
     axes = figure.add_axes((0, 0, 1, 1))
     draw_field(axes, mesh, values, *colour_range(task))

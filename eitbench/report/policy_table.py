@@ -17,21 +17,22 @@ OPEN_LOOP = ("adjacent", "opposite", "transverse", "best_pair", "best_cycle", "b
 
 
 def policy_rows(jobs: Sequence[Job], results: Iterable[dict[str, Any]]) -> pd.DataFrame:
-    """One row for each of the jobs that succeeded according to ``results``: policy, seed, error, spent,
-    seconds_per_step."""
+    """One row for each of the jobs that succeeded according to ``results``: policy, seed, error,
+    spent, seconds_per_step."""
     rows = [{"policy": result["method"], "seed": result["seed"], **result["scores"]}
             for result in successful(jobs, results).values()]
     return pd.DataFrame(rows, columns=["policy", "seed", "error", "spent", "seconds_per_step"])
 
 
 def errors_by_policy(rows: pd.DataFrame) -> pd.DataFrame:
-    """ẽ_c with a row an episode and a column a policy; agents that differ in their training's seed are averaged."""
+    """ẽ_c with a row an episode and a column a policy; agents that differ in their training's seed
+    are averaged."""
     return rows.assign(policy=_without_training_seed(rows)).pivot_table(index="seed", columns="policy", values="error")
 
 
 def ranking(errors: pd.DataFrame) -> list[str]:
-    """Columns of `errors_by_policy`, the best first. Who failed in an episode comes after all who did not: a mean over
-    the others, perhaps the easy ones, is no match for theirs."""
+    """Columns of `errors_by_policy`, the best first. Who failed in an episode comes after all who
+    did not: a mean over the others, perhaps the easy ones, is no match for theirs."""
     return sorted(map(str, errors), key=lambda name: (errors[name].isna().any(), errors[name].mean()))
 
 
@@ -40,11 +41,13 @@ def _without_training_seed(rows: pd.DataFrame) -> pd.Series:
 
 
 def policy_table(rows: pd.DataFrame, privileged: Sequence[str]) -> str:
-    """Markdown: policies by their mean ẽ_c, and by how much each is worse than the best that is not privileged, both
-    with 95 % intervals over episodes; below it the adaptivity gap, if the policies for it were played.
+    """Markdown: policies by their mean ẽ_c, and by how much each is worse than the best that is not
+    privileged, both with 95 % intervals over episodes; below it the adaptivity gap, if the policies
+    for it were played.
 
-    Agents that differ in the seed of their training only are one policy: an episode's error is the mean of theirs.
-    Policies that did not finish every episode are below all that did, with the number of those they did.
+    Agents that differ in the seed of their training only are one policy: an episode's error is the
+    mean of theirs. Policies that did not finish every episode are below all that did, with the
+    number of those they did.
     """
     if rows.empty:
         return "no episode was finished"

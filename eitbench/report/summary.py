@@ -1,4 +1,5 @@
-"""From records to a table: means over seeds with confidence intervals, world by world and board by board."""
+"""From records to a table: means over seeds with confidence intervals, world by world and board by
+board."""
 
 from __future__ import annotations
 
@@ -11,42 +12,38 @@ import numpy as np
 import pandas as pd
 
 from eitbench.bench.records import BOARDS, finished
+from eitbench.bench.scores import scores
 from eitbench.bench.text import as_markdown, mean_and_interval, number, rounded, scores_by_seed, seed_ranges
 from eitbench.bench.tracks import ids
 from eitbench.scoring import skill
 
-COLUMNS = {
-    "error": "ẽ_c", "skill": "skill", "contrast_error": "contrast", "nis": "NIS/m", "crps": "CRPS",
-    "velocity_error": "ẽ_v", "coverage_50": "50 %", "coverage_90": "90 %", "spread_ratio": "var/MSE",
-    "voltage_discrepancy": "ẽ_V", "spent": "injections", "seconds_per_step": "ms/step",
-}
-EXPLANATIONS = {
-    "ẽ_c": "relative estimation error (5.12), ± half the 95 % confidence interval over seeds; lower is better",
-    "skill": "0 for the homogeneous estimate, 1 for the fixed-interval smoother that is told the true flow; both with "
-             "the whole record, where the environment has such a board, so that filters may fall below 0",
-    "contrast": "error relative to the deviation from the homogeneous estimate; 1 is no better than that",
-    "NIS/m": "normalised innovation squared; 1 when the filter's own uncertainty fits",
-    "CRPS": "continuous ranked probability score, mol/m³",
-    "ẽ_v": "relative error of the flow, ∫(v̂ − v)²/∫v² across the pipe, where it is asked for too",
-    "50 %": "part of the truth inside the claimed 50 % interval",
-    "90 %": "part of the truth inside the claimed 90 % interval",
-    "var/MSE": "claimed variance over squared error; 1 is honest, more is too modest",
-    "ẽ_V": "voltage discrepancy (5.13), mV²; a diagnostic",
-    "injections": "how many the policy made, where it is asked for them",
-    "ms/step": "time per injection on one core, in the fastest episode: what is done once for a model is left apart",
-}
+SKILL = ("skill", "0 for the homogeneous estimate, 1 for the fixed-interval smoother that is told the "
+         "true flow; both with the whole record, where the environment has such a board, so that "
+         "filters may fall below 0")
+"""Heading and explanation of the one number that follows from several records, not from an episode."""
 SPLITS = ["test", "dev", "train", "own"]
 """In the order in which boards are shown; the reported seeds first."""
 _TEXT = ("environment", "board", "method", "seeds")
 """Columns of words; the others are numbers."""
-_WHERE_ASKED = ("velocity_error", "spent")
-"""Scores whose column is there only if anybody has them."""
 _NOT_THE_WORLD = ("lag", "assume", "gate", "episodes", "render_mode", "observation", "estimator")
 """Arguments of an environment that its episodes do not depend on."""
 
 
+def columns() -> dict[str, tuple[str, str]]:
+    """Name -> heading and explanation of each column of numbers: every registered score, and the
+    skill."""
+    each = {name: (score.heading, score.explanation) for name, score in scores().items()}
+    return {"error": each.pop("error"), "skill": SKILL} | each
+
+
+def explanations() -> dict[str, str]:
+    """Heading -> what it says."""
+    return dict(columns().values())
+
+
 def summary(records: list[dict[str, Any]]) -> pd.DataFrame:
-    """One row a record: world, board, environment, method, episodes, failed, (mean, half interval) of each score."""
+    """One row a record: world, board, environment, method, episodes, failed, (mean, half interval)
+    of each score."""
     table = pd.DataFrame([summary_row(record, records) for record in records])
     order = table["error"].map(lambda cell: math.inf if cell is None else cell[0])
     worlds = sorted(set(table["world"]), key=place_of_world)
@@ -64,7 +61,7 @@ def summary_row(record: dict[str, Any], records: list[dict[str, Any]]) -> dict[s
                            "baseline": record["method"], "method": method(record),
                            "seeds": seed_ranges(record["seeds"]),
                            "episodes": len(status), "failed": sum(s != "ok" for s in status)}
-    for name in COLUMNS:
+    for name in columns():
         values = list((_skills(record, records) if name == "skill" else scores_by_seed(record, name)).values())
         row[name] = mean_and_interval(values) if values else None
         if name == "seconds_per_step" and values:
@@ -73,7 +70,8 @@ def summary_row(record: dict[str, Any], records: list[dict[str, Any]]) -> dict[s
 
 
 def world(record: dict[str, Any]) -> str:
-    """What the lagged siblings of an environment share, whatever is believed of it: ``Pipe2D (scored_steps=3)``."""
+    """What the lagged siblings of an environment share, whatever is believed of it: ``Pipe2D
+    (scored_steps=3)``."""
     environment = record["environment"]
     changed = {key: value for key, value in environment["kwargs"].items()
                if value is not None and key not in _NOT_THE_WORLD}
@@ -82,7 +80,8 @@ def world(record: dict[str, Any]) -> str:
 
 
 def method(record: dict[str, Any]) -> str:
-    """The method's title, and what it was made to believe: ``Linearised Kalman filter, assume.flow=real``."""
+    """The method's title, and what it was made to believe: ``Linearised Kalman filter,
+    assume.flow=real``."""
     return ", ".join([record["title"], *filter(None, [_arguments(_beliefs(record))])])
 
 
@@ -122,7 +121,8 @@ def _dotted(arguments: dict[str, Any]) -> dict[str, Any]:
 
 
 def _skills(record: dict[str, Any], records: list[dict[str, Any]]) -> dict[str, float]:
-    """(E_bh − E)/(E_bh − E_ref) with the means over the seeds that all three have; one number, or none.
+    """(E_bh − E)/(E_bh − E_ref) with the means over the seeds that all three have; one number, or
+    none.
 
     The anchors are those of the world's board with the longest record to look back on.
     """
@@ -133,7 +133,8 @@ def _skills(record: dict[str, Any], records: list[dict[str, Any]]) -> dict[str, 
         return scores_by_seed(anchor, "error") if anchor else {}
 
     own, floor, reference = scores_by_seed(record, "error"), of("homogeneous"), of("true_model_smoother")
-    shared = sorted(own.keys() & floor.keys() & reference.keys())     # a sum's last digit depends on the order
+    # a sum's last digit depends on the order
+    shared = sorted(own.keys() & floor.keys() & reference.keys())
     if not shared:
         return {}
     e, bh, ref = (float(np.mean([scores[seed] for seed in shared])) for scores in (own, floor, reference))
@@ -141,16 +142,17 @@ def _skills(record: dict[str, Any], records: list[dict[str, Any]]) -> dict[str, 
 
 
 def cells(table: pd.DataFrame) -> pd.DataFrame:
-    """The summary as text, with the columns a reader sees: the environment where there are several worlds, the error
-    of the flow where it was asked for."""
+    """The summary as text, with the columns a reader sees: the environment where there are several
+    worlds, the error of the flow where it was asked for."""
     text = table[["world", "board", "method", "seeds"]].rename(columns={"world": "environment"})
     if table["world"].nunique() < 2:
         text = text.drop(columns="environment")
     text["board"] = [board_label(row) for _, row in table.iterrows()]
     text["seeds"] = [f"{seeds}, {failed} failed" if failed else seeds
                      for seeds, failed in zip(table["seeds"], table["failed"], strict=True)]
-    for name, heading in COLUMNS.items():
-        if name not in _WHERE_ASKED or table[name].notna().any():
+    known = scores()
+    for name, (heading, _) in columns().items():
+        if name == "skill" or known[name].everywhere or table[name].notna().any():
             text[heading] = [_cell(name, value) for value in table[name]]
     return text
 

@@ -19,8 +19,8 @@ from eitbench.estimation.onboard.console import Console
 class Agent:
     """A policy that does what a model of stable-baselines3 thinks best; subclasses have the model.
 
-    Whatever filter is inside the environment, the agent is shown the one of reduced order with which it was trained,
-    and so injects the same.
+    Whatever filter is inside the environment, the agent is shown the one of reduced order with
+    which it was trained, and so injects the same.
     """
 
     model: ClassVar[Any]
@@ -28,7 +28,8 @@ class Agent:
 
     @classmethod
     def suits(cls, rules: Rules) -> bool:
-        """Whether the world shows and takes arrays of the shapes that the model was trained on, whatever they mean."""
+        """Whether the world shows and takes arrays of the shapes that the model was trained on,
+        whatever they mean."""
         zeros = {name: np.zeros(space.shape or ()) for name, space in InjectionCore(rules, "reduced").space().items()}
         return bool(cls.model.action_space == rules.action_space
                     and cls.model.observation_space.shape == scaled(rules, zeros).shape)
@@ -58,13 +59,15 @@ class Agent:
 def load_agent(path: Path, content: bytes) -> tuple[str, str, type[Agent], dict[str, Any]]:
     """Name, title, policy and parameters of the model.zip at ``path`` with this ``content``.
 
-    The name is ALGO_seedK for our own agents, and bears a mark of the configuration, ALGO_MARK_seedK, for all others.
-    A model is unpickled, so it is code: the folder must hold its ``sha256``, and a file that differs is not opened.
+    The name is ALGO_seedK for our own agents, and bears a mark of the configuration,
+    ALGO_MARK_seedK, for all others. A model is unpickled, so it is code: the folder must hold its
+    ``sha256``, and a file that differs is not opened.
 
     Raises
     ------
     ValueError
-        If ``config.json`` or ``sha256`` is missing beside it, or the file is not the one that was left there.
+        If ``config.json`` or ``sha256`` is missing beside it, or the file is not the one that was
+        left there.
     """
     try:
         asked = json.loads((path.parent / "config.json").read_text())
@@ -77,7 +80,8 @@ def load_agent(path: Path, content: bytes) -> tuple[str, str, type[Agent], dict[
         raise ValueError(f"policy {path} must have the sha256 that lies beside it, {expected}; it has {found}")
     from eitbench.rl import networks
     from eitbench.rl.training import algorithm_of
-    sys.modules.setdefault("eitbench.pair_policy", networks)       # as older models name their networks' module
+    # as older models name their networks' module
+    sys.modules.setdefault("eitbench.pair_policy", networks)
     algo, seed = asked["algo"], asked["seed"]
     model = algorithm_of(algo).load(io.BytesIO(content), device="cpu")
     policy = type("Policy", (Agent,), {"model": model, "masked": algo.startswith("maskable")})
@@ -92,6 +96,7 @@ def _is_shipped(asked: dict[str, Any], sha256: str) -> bool:
 
 
 def _mark(asked: dict[str, Any]) -> str:
-    """Six digits for what was asked of the training but its seed, so that results of two configurations stay apart."""
+    """Six digits for what was asked of the training but its seed, so that results of two
+    configurations stay apart."""
     words = json.dumps({name: value for name, value in asked.items() if name != "seed"}, sort_keys=True)
     return hashlib.sha256(words.encode()).hexdigest()[:6]

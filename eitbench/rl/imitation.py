@@ -1,7 +1,8 @@
 """Learn from a teacher before reinforcement: DAgger (Ross, Gordon & Bagnell 2011).
 
-Episodes are played by the pupil, the teacher says at every step what it would have done, and the pupil learns that by
-cross-entropy on all that was ever said. The critic learns the returns of the pupil's own episodes.
+Episodes are played by the pupil, the teacher says at every step what it would have done, and the
+pupil learns that by cross-entropy on all that was ever said. The critic learns the returns of the
+pupil's own episodes.
 """
 
 from __future__ import annotations
@@ -30,8 +31,9 @@ def imitate(model: OnPolicyAlgorithm, world: InjectionEnv, options: dict[str, An
     world : InjectionEnv
         With raw observations; its training episodes are played.
     options : dict
-        ``teacher`` (name of one of our policies, or a path), and perhaps ``rounds``, ``episodes`` (a round), ``epochs``
-        (a round), ``batch`` and ``learning_rate``. In the first round the teacher acts, in the others the pupil.
+        ``teacher`` (name of one of our policies, or a path), and perhaps ``rounds``, ``episodes``
+        (a round), ``epochs`` (a round), ``batch`` and ``learning_rate``. In the first round the
+        teacher acts, in the others the pupil.
     reference : (episodes, steps), optional
         Rewards are counted from these, as in training.
     """

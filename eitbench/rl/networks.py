@@ -1,7 +1,8 @@
-"""Networks for choosing electrode pairs: an electrode's worth is shared by all the pairs it belongs to.
+"""Networks for choosing electrode pairs: an electrode's worth is shared by all the pairs it belongs
+to.
 
-A plain network has to learn 120 times that an electrode is dead; here a pair's logit is the sum of what its two
-electrodes are worth as source and as sink, and of a part of its own.
+A plain network has to learn 120 times that an electrode is dead; here a pair's logit is the sum of
+what its two electrodes are worth as source and as sink, and of a part of its own.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ from torch import nn
 
 
 class PairLogits(nn.Module):
-    """Logits of all pairs of L electrodes, and of further actions, from h features; the pairs' own part begins at zero.
+    """Logits of all pairs of L electrodes, and of further actions, from h features; the pairs' own
+    part begins at zero.
 
     Parameters
     ----------

@@ -1,11 +1,14 @@
-"""Train an agent to choose injections with stable-baselines3; interrupted, it goes on from its last checkpoint.
+"""Train an agent to choose injections with stable-baselines3; interrupted, it goes on from its last
+checkpoint.
 
-A configuration is a YAML file such as those in ``baselines/rl/``. A run leaves in its folder: ``config.json`` (what was
-asked for), ``model.zip`` (the agent), ``monitor.csv`` (one row a training episode), ``evaluations.npz`` (scores on dev
-episodes over time), ``sha256`` of the model, and TensorBoard's logs.
+A configuration is a YAML file such as those in ``baselines/rl/``. A run leaves in its folder:
+``config.json`` (what was asked for), ``model.zip`` (the agent), ``monitor.csv`` (one row a training
+episode), ``evaluations.npz`` (scores on dev episodes over time), ``sha256`` of the model, and
+TensorBoard's logs.
 
-A run that goes on draws other episodes and other noise than it did before. A checkpoint holds the networks and the
-optimisers, not what dqn and sac have gathered in their replay buffers: these go on with an empty one.
+A run that goes on draws other episodes and other noise than it did before. A checkpoint holds the
+networks and the optimisers, not what dqn and sac have gathered in their replay buffers: these go on
+with an empty one.
 """
 
 from __future__ import annotations
@@ -55,7 +58,8 @@ class Config:
     """What a configuration file may say."""
 
     total_steps: int
-    """environment steps, all environments together; ppo finishes the rollout in which it reaches them"""
+    """environment steps, all environments together; ppo finishes the rollout in which it reaches
+    them"""
     n_envs: int = 16
     """environments side by side"""
     interval: int = 50_000
@@ -75,7 +79,8 @@ class Config:
     reference: str = ""
     """name or path of a policy from whose rewards in the same episode those of training are counted"""
     imitate: dict[str, Any] = field(default_factory=dict)
-    """what to learn from before reinforcement: ``teacher``, ``episodes``, … (`eitbench.rl.imitation`)"""
+    """what to learn from before reinforcement: ``teacher``, ``episodes``, …
+    (`eitbench.rl.imitation`)"""
 
     def __post_init__(self) -> None:
         for name in ("total_steps", "n_envs", "interval", "evaluation_episodes", "episodes"):
@@ -120,7 +125,8 @@ def read_config(path: str | Path) -> Config:
         raise ValueError(f"config {str(path)!r} must hold what `Config` asks for: {error}") from None
 
 
-@threadpool_limits.wrap(limits=1)              # with more, rounding and so what is learnt depends on how many there are
+# with more, rounding and so what is learnt depends on how many there are
+@threadpool_limits.wrap(limits=1)
 def train(env: str, algo: str, config: Config, seed: int, folder: Path, kwargs: dict[str, Any] | None = None) -> Path:
     """Train an agent; returns the path of its model.
 
@@ -160,7 +166,7 @@ def train(env: str, algo: str, config: Config, seed: int, folder: Path, kwargs: 
     else:
         model = algorithm_of(algo).load(latest, env=learning, device="cpu",
                                         tensorboard_log=str(folder / "tensorboard"))
-        model.set_random_seed(seed + model.num_timesteps)       # loading seeded it as at the beginning
+        model.set_random_seed(seed + model.num_timesteps)  # loading seeded it as at the beginning
     # From here on the folder belongs to this run: all that is cheap to check has been tried.
     write_atomically(folder / "config.json", json.dumps(asked, indent=1).encode())
     if config.reference:
@@ -187,8 +193,8 @@ def train(env: str, algo: str, config: Config, seed: int, folder: Path, kwargs: 
 
 def vector_env(env: str, kwargs: dict[str, Any] | None, config: Config, n_envs: int | None = None,
                ) -> InjectionVectorEnv:
-    """The environments side by side; ``ValueError`` if ``env`` does not ask for injections, or ``kwargs`` hold what
-    training itself decides."""
+    """The environments side by side; ``ValueError`` if ``env`` does not ask for injections, or
+    ``kwargs`` hold what training itself decides."""
     if entry(env).track != "injection":
         asks = [id for id, each in entries().items() if each.track == "injection"]
         raise ValueError(f"env must be one of {', '.join(asks)}; got {env!r}")
@@ -223,8 +229,8 @@ def algorithm_of(name: str) -> Any:
 
 
 def evaluation(env: str, kwargs: dict[str, Any] | None, config: Config) -> Callable[[BaseAlgorithm], np.ndarray]:
-    """A function that gives the ẽ_c of a model's deterministic actions in each of the first dev episodes, with the
-    filter of reduced order."""
+    """A function that gives the ẽ_c of a model's deterministic actions in each of the first dev
+    episodes, with the filter of reduced order."""
     envs = vector_env(env, kwargs, config, config.evaluation_episodes)
     seeds = list(SPLITS["dev"])[:config.evaluation_episodes]
 
@@ -239,7 +245,8 @@ def evaluation(env: str, kwargs: dict[str, Any] | None, config: Config) -> Calla
             observation, _, done, _, _ = envs.step(actions)
             errors.append(envs.errors())
             ended = bool(done.all())
-        # States that are not scored are of no episode; an estimate that is not finite must not pass for one of them.
+        # States that are not scored are of no episode; an estimate that is not finite must not pass
+        # for one of them.
         scored = np.array([row for row in errors if not np.isnan(row).all()])
         return scored.mean(axis=0)
 
@@ -303,14 +310,16 @@ def _compressed(archive: io.BytesIO) -> bytes:
 
 
 def _forget(model: BaseAlgorithm) -> None:
-    """Let go of what the optimisers remember, twice as much as the networks hold: the agent has learnt."""
+    """Let go of what the optimisers remember, twice as much as the networks hold: the agent has
+    learnt."""
     for part in (model.policy, getattr(model.policy, "actor", None), getattr(model.policy, "critic", None)):
         if isinstance(optimiser := getattr(part, "optimizer", None), torch.optim.Optimizer):
             optimiser.state.clear()
 
 
 def _append_evaluation(folder: Path, steps: int, errors: np.ndarray) -> None:
-    """One row more; rows of as many steps or more are of a checkpoint that was never kept, or of this very one."""
+    """One row more; rows of as many steps or more are of a checkpoint that was never kept, or of
+    this very one."""
     path = folder / "evaluations.npz"
     before = dict(np.load(path)) if path.exists() else {"steps": np.zeros(0, int), "errors": np.zeros((0, len(errors)))}
     kept, content = before["steps"] < steps, io.BytesIO()
@@ -319,14 +328,16 @@ def _append_evaluation(folder: Path, steps: int, errors: np.ndarray) -> None:
 
 
 def _forget_beyond(monitor: Path, steps: int) -> None:
-    """Keep the rows up to so many steps: later ones are of a checkpoint that was never kept, and come again."""
+    """Keep the rows up to so many steps: later ones are of a checkpoint that was never kept, and
+    come again."""
     rows = monitor.read_text().splitlines(keepends=True)[1:] if monitor.exists() else []
     kept = [row for row in rows if row.endswith("\n") and int(row.split(",")[0]) <= steps]
     write_atomically(monitor, "".join(["steps,return,length,seconds\n", *kept]).encode())
 
 
 class _Checkpoints(BaseCallback):
-    """Every interval: a checkpoint and an evaluation. Every episode: a row of ``monitor.csv``. A progress bar."""
+    """Every interval: a checkpoint and an evaluation. Every episode: a row of ``monitor.csv``. A
+    progress bar."""
 
     def __init__(self, folder: Path, config: Config, evaluate: Callable[[BaseAlgorithm], np.ndarray]) -> None:
         super().__init__()

@@ -13,16 +13,19 @@ from eitbench.envs.injection import InjectionVectorEnv
 
 
 class InjectionVecEnv(VecEnv):
-    """`InjectionVectorEnv` as a `VecEnv`: when the episodes end, which they do together, the next ones begin at once.
+    """`InjectionVectorEnv` as a `VecEnv`: when the episodes end, which they do together, the next
+    ones begin at once.
 
     Parameters
     ----------
     envs : InjectionVectorEnv
     reward_scale : float
-        Rewards are multiplied by it, which changes no optimum: they are of the order of 0.01 in themselves.
+        Rewards are multiplied by it, which changes no optimum: they are of the order of 0.01 in
+        themselves.
     reference : (episodes, steps), optional
-        What somebody else earned in each training episode: rewards are counted from that. It changes no optimum either,
-        since the agent has no hand in it, and most of what makes one episode harder than another drops out.
+        What somebody else earned in each training episode: rewards are counted from that. It
+        changes no optimum either, since the agent has no hand in it, and most of what makes one
+        episode harder than another drops out.
     """
 
     def __init__(self, envs: InjectionVectorEnv, *, reward_scale: float = 1.0,
@@ -31,7 +34,8 @@ class InjectionVecEnv(VecEnv):
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
 
     def reset(self) -> Any:
-        """Begin training episodes; after ``seed(s)`` they are drawn from a sequence that s determines."""
+        """Begin training episodes; after ``seed(s)`` they are drawn from a sequence that s
+        determines."""
         first = self._seeds[0]
         seeds = None if first is None else np.random.default_rng(first).choice(
             self.envs.episodes, size=self.num_envs, replace=self.num_envs > self.envs.episodes).tolist()

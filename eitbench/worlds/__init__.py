@@ -1,4 +1,5 @@
-"""Floor 2: what is simulated. A world is put together from parts, with the source of every number beside it."""
+"""Floor 2: what is simulated. A world is put together from parts, with the source of every number
+beside it."""
 
 from eitbench.worlds.parts import Discretisation, Flow, History, Prior, Target, Vessel
 from eitbench.worlds.registry import Entry, entries, entry, register

@@ -1,4 +1,5 @@
-"""Bodies in a round tank: a ball that the fluid carries round, and metal cylinders that stand still."""
+"""Bodies in a round tank: a ball that the fluid carries round, and metal cylinders that stand
+still."""
 
 from __future__ import annotations
 
@@ -23,13 +24,14 @@ BALL_POINTS = np.concatenate([np.zeros((1, 2)), np.sqrt(2 / 3) * np.stack(
     [np.cos(np.arange(6) * np.pi / 3), np.sin(np.arange(6) * np.pi / 3)], axis=1)])
 """Where the flow is averaged over a disc of radius one, …"""
 BALL_WEIGHTS = np.array([1 / 4, *[1 / 8] * 6])
-"""… and with which weights: exact for polynomials of the fifth degree (Abramowitz & Stegun 25.4.61)."""
+"""… and with which weights: exact for polynomials of the fifth degree (Abramowitz & Stegun
+25.4.61)."""
 
 
 @dataclass(frozen=True)
 class Ball(Target):
-    """A rigid ball (a disc, in 2D) that hardly conducts; its centre moves with the fluid's mean velocity over its area
-    (thesis 7.1). All numbers are ours."""
+    """A rigid ball (a disc, in 2D) that hardly conducts; its centre moves with the fluid's mean
+    velocity over its area (thesis 7.1). All numbers are ours."""
 
     background: float = 30.0
     """mol/m³, about 0.3 S/m: weak saline"""
@@ -76,7 +78,8 @@ class Ball(Target):
             second = velocity(centre + 0.5 * dt * first)
             third = velocity(centre + 0.5 * dt * second)
             centre = centre + dt / 6.0 * (first + 2.0 * second + 2.0 * third + velocity(centre + dt * third))
-            centre = centre * min(1.0, furthest / max(np.hypot(*centre), 1e-12))          # it cannot enter the wall
+            # it cannot enter the wall
+            centre = centre * min(1.0, furthest / max(np.hypot(*centre), 1e-12))
         return np.array(path)
 
     def evolve(self, world: World, episodes: Sequence[Randomness], truth: Discretisation,
@@ -107,8 +110,8 @@ class Cylinders(Target):
     gap: float = 0.05
     """m at least between the cylinders' walls [ours]"""
     metal: float = 5.0
-    """concentration of the metal in parts of the background: its surface resists, and from five-fold on EIT hardly
-    tells how well a small thing conducts [ours]"""
+    """concentration of the metal in parts of the background: its surface resists, and from
+    five-fold on EIT hardly tells how well a small thing conducts [ours]"""
 
     is_carried = False
     stands_still = True
@@ -131,7 +134,7 @@ class Cylinders(Target):
         _check.integer("vessel.n_electrodes", world.vessel.n_electrodes, low=8)
         _check.number("target.furthest", self.furthest, low=0.5, high=1.0 - self.large_radius[1] / tank)
         apart = self.large_radius[1] + self.small_radius[1] + self.gap
-        if apart > 1.6 * self.furthest * tank:                  # else places would be drawn again and again
+        if apart > 1.6 * self.furthest * tank:  # else places would be drawn again and again
             raise ValueError(f"target.gap must leave room for both cylinders: with it their centres are {apart:g} m "
                              f"apart, of {1.6 * self.furthest * tank:g} m that furthest allows; got {self.gap!r} m")
 

@@ -1,4 +1,5 @@
-"""How the fluid moves: known, drawn for each episode, wandering, past a bulge, stirred, or not at all."""
+"""How the fluid moves: known, drawn for each episode, wandering, past a bulge, stirred, or not at
+all."""
 
 from __future__ import annotations
 
@@ -29,7 +30,8 @@ BELIEVED_PAST_A_BULGE = ("parabolic", "real")
 
 @dataclass(frozen=True)
 class LaminarFlow(Flow):
-    """Laminar flow through a pipe with a known mean velocity; [T]: the thesis' number; [ours]: our choice."""
+    """Laminar flow through a pipe with a known mean velocity; [T]: the thesis' number; [ours]: our
+    choice."""
 
     mean_velocity: float = 4.5
     """v̄ in m/s [T]"""
@@ -66,7 +68,8 @@ class DrawnFlow(Flow):
     diffusivity: float = 5e-4
     """κ in m²/s [ours]"""
     velocity_range: tuple[float, float] = (2.5, 7.0)
-    """m/s; the true mean velocity is drawn evenly from it. The thesis assumes 2 and 7 for a true 4.5 [ours]"""
+    """m/s; the true mean velocity is drawn evenly from it. The thesis assumes 2 and 7 for a true
+    4.5 [ours]"""
     swing_range: tuple[float, float] = (0.0, 0.0)
     """amplitude of the mean velocity's sine in time, in parts of the mean"""
     period_range: tuple[float, float] = (0.4, 0.8)
@@ -74,7 +77,8 @@ class DrawnFlow(Flow):
     skewness_range: tuple[float, float] = (0.0, 0.0)
     """|k|, either sign; 0 is the parabola"""
     profiles: str | None = None
-    """what estimators are asked for: None, the ``mean`` velocity of a parabola, or ``three`` numbers of a profile"""
+    """what estimators are asked for: None, the ``mean`` velocity of a parabola, or ``three``
+    numbers of a profile"""
     velocity_std: float = 1.0
     """m/s, standard deviation of what is believed of it at first [ours]"""
     velocity_walk: float = 0.02
@@ -119,7 +123,8 @@ class DrawnFlow(Flow):
             return None
         if self.profiles == "mean":
             return parabola(half_width, self.mean_velocity, self.velocity_std, self.velocity_walk)
-        # the parabola, a skew cubic, and a quartic that flattens or sharpens the profile without a net flux
+        # the parabola, a skew cubic, and a quartic that flattens or sharpens the profile without a
+        # net flux
         basis = ((1.5, 0.0, -1.5), (0.0, 1.5, 0.0, -1.5), (-1.5, 0.0, 9.0, 0.0, -7.5))
         std = (self.velocity_std, 3.0 * self.velocity_std, self.velocity_std)
         return VelocityModel(half_width, basis, (self.mean_velocity, 0.0, 0.0), std, (self.velocity_walk,) * 3)
@@ -140,10 +145,11 @@ class DrawnFlow(Flow):
 
 @dataclass(frozen=True)
 class WanderingFlow(Flow):
-    """A parabolic flow through a plane pipe whose mean velocity is a random walk; all numbers are ours.
+    """A parabolic flow through a plane pipe whose mean velocity is a random walk; all numbers are
+    ours.
 
-    At every time step it goes up or down by ``velocity_walk``, which is also the walk that estimators are told of; at
-    the ends of ``velocity_range`` it turns back.
+    At every time step it goes up or down by ``velocity_walk``, which is also the walk that
+    estimators are told of; at the ends of ``velocity_range`` it turns back.
     """
 
     mean_velocity: float = 4.5
@@ -179,7 +185,8 @@ class WanderingFlow(Flow):
 
     def draw(self, world: World, random: np.random.Generator) -> Callable[[int], SkewedChannelFlow]:
         low, high = self.velocity_range
-        places = int((high - low) / self.velocity_walk + 1e-9)         # from the lowest velocity to the highest
+        # from the lowest velocity to the highest
+        places = int((high - low) / self.velocity_walk + 1e-9)
         walk = random.integers(2 * places) if places else 0
         signs = random.choice([-1, 1], world.lead_in + world.n_steps)
         steps = walk + np.concatenate([[0], np.cumsum(signs)])[:-1]
@@ -195,10 +202,12 @@ class WanderingFlow(Flow):
 
 @dataclass(frozen=True)
 class FlowPastBulge(Flow):
-    """The steady Navier–Stokes flow through a plane pipe with a bulge: the flow separates behind it.
+    """The steady Navier–Stokes flow through a plane pipe with a bulge: the flow separates behind
+    it.
 
-    Better fluid models are what the thesis names as its next step (5.1.1). Estimators know the walls, but of the flow
-    only that it is parabolic between them at each x, unless they are given the real one. All numbers are ours.
+    Better fluid models are what the thesis names as its next step (5.1.1). Estimators know the
+    walls, but of the flow only that it is parabolic between them at each x, unless they are given
+    the real one. All numbers are ours.
     """
 
     mean_velocity: float = 4.5
@@ -213,7 +222,8 @@ class FlowPastBulge(Flow):
             _check.number(name, getattr(self, name), low=0.0, open_low=True, units=units)
 
     def nominal(self, world: World, fine: bool) -> SteadyFlow:
-        """The real flow, on a mesh with so many cells along and across the pipe; computed once a process."""
+        """The real flow, on a mesh with so many cells along and across the pipe; computed once a
+        process."""
         return _past_bulge(world.vessel, self, (96, 24) if fine else (64, 16))
 
     def check_assumed(self, world: World, assumed: Mapping[str, Any]) -> None:
@@ -240,9 +250,11 @@ class FlowPastBulge(Flow):
 
 @dataclass(frozen=True)
 class StirredFlow(Flow):
-    """A steady Navier–Stokes flow in a round tank, driven by a stirrer off the middle (thesis 7.1); numbers are ours.
+    """A steady Navier–Stokes flow in a round tank, driven by a stirrer off the middle (thesis 7.1);
+    numbers are ours.
 
-    At rest on the wall, driven along the circle that the stirrer sweeps: force·exp(−((d − swept)/width)²/2).
+    At rest on the wall, driven along the circle that the stirrer sweeps: force·exp(−((d −
+    swept)/width)²/2).
     """
 
     viscosity: float = 2e-4
@@ -281,7 +293,8 @@ class NoFlow(Flow):
 
 @dataclass(frozen=True)
 class LocalParabola:
-    """The flow with the stream function 1.5·v̄·R·(η − η³/3), η from −1 at the lower wall to 1 at the upper one.
+    """The flow with the stream function 1.5·v̄·R·(η − η³/3), η from −1 at the lower wall to 1 at
+    the upper one.
 
     At each x a parabola along the pipe, with the fluid following the walls; without divergence.
 
@@ -305,7 +318,7 @@ class LocalParabola:
         slope = -2.0 * (x - self.bulge.position) / self.bulge.width**2 * bulge
         gap = 2.0 * self.half_width - bulge
         part = (y + self.half_width - bulge) / gap
-        by_eta = 1.5 * self.mean_velocity * self.half_width * (1.0 - (2.0 * part - 1.0)**2)          # ∂ψ/∂η
+        by_eta = 1.5 * self.mean_velocity * self.half_width * (1.0 - (2.0 * part - 1.0)**2)  # ∂ψ/∂η
         return np.stack([by_eta * 2.0 / gap, by_eta * 2.0 * slope / gap * (1.0 - part)], axis=1)
 
 
@@ -315,7 +328,8 @@ def steps_through(world: World, velocity: float) -> int:
 
 
 def laminar_assumption(world: World, mean_velocity: float, assumed: Mapping[str, Any]) -> VelocityField:
-    """What a model of a pipe is told to believe of its flow; ``ValueError`` if there is nothing of this name."""
+    """What a model of a pipe is told to believe of its flow; ``ValueError`` if there is nothing of
+    this name."""
     plane = isinstance(world.vessel, PlanePipe)
     refuse_assumptions(assumed, ("mean_velocity", "profile") if plane else ("mean_velocity",))
     mean = assumed.get("mean_velocity")
@@ -338,7 +352,8 @@ def _real_model(world: World) -> Discretisation:
 
 @lru_cache(maxsize=4)
 def _past_bulge(vessel: PlanePipe, flow: FlowPastBulge, cells: tuple[int, int]) -> SteadyFlow:
-    """On a pipe 1.75 times as long, so that the outlet, where the fluid leaves freely, does not shorten the eddy."""
+    """On a pipe 1.75 times as long, so that the outlet, where the fluid leaves freely, does not
+    shorten the eddy."""
     from eitbench.numerics.mesh import rectangle_mesh
     from eitbench.physics.navier_stokes import steady_flow
     along = math.ceil(1.75 * cells[0])

@@ -1,4 +1,5 @@
-"""The instrument between what is asked for and what is read: wires break, contacts come loose, amplifiers are noisy."""
+"""The instrument between what is asked for and what is read: wires break, contacts come loose,
+amplifiers are noisy."""
 
 from __future__ import annotations
 
@@ -33,12 +34,14 @@ class Faults(NamedTuple):
 
 @dataclass(frozen=True)
 class Instrument:
-    """Current sources and voltmeters; by default sound ones. [T]: the thesis' number; all others are ours.
+    """Current sources and voltmeters; by default sound ones. [T]: the thesis' number; all others
+    are ours.
 
-    A broken wire leaves the electrode in place, so the field is that of an electrode without net current: the transfer
-    resistances of the episode stay exact. A current that would have to pass a broken wire does not flow at all, and
-    the electrode's reading is what the open input picks up. A loose contact is a resistance in the wire; it shows only
-    while current flows through it, and it is noisy.
+    A broken wire leaves the electrode in place, so the field is that of an electrode without net
+    current: the transfer resistances of the episode stay exact. A current that would have to pass a
+    broken wire does not flow at all, and the electrode's reading is what the open input picks up. A
+    loose contact is a resistance in the wire; it shows only while current flows through it, and it
+    is noisy.
     """
 
     current: float = 0.1
@@ -50,8 +53,8 @@ class Instrument:
     noise_floor: float = 0.0
     """V; std of an absolute noise beside the relative one"""
     limit: str | None = None
-    """what an agent may ask for. None: pairs of electrodes. "L1", "L2" or "Linf": a current for each electrode, scaled
-    down to this norm of a pair's currents where it exceeds it"""
+    """what an agent may ask for. None: pairs of electrodes. "L1", "L2" or "Linf": a current for
+    each electrode, scaled down to this norm of a pair's currents where it exceeds it"""
     dead: tuple[int, int] = (0, 0)
     """least and most electrodes whose wire is broken from the beginning"""
     failing: tuple[int, int] = (0, 0)
@@ -117,7 +120,8 @@ class Instrument:
 
     def measure(self, faults: Faults, t: np.ndarray | int, transfer_resistance: np.ndarray, currents: np.ndarray,
                 draws: np.ndarray) -> np.ndarray:
-        """Voltages (B, L) in V: 𝓡 I, and noise; of B episodes at step ``t``, or at steps t (B,) of one.
+        """Voltages (B, L) in V: 𝓡 I, and noise; of B episodes at step ``t``, or at steps t (B,) of
+        one.
 
         Parameters
         ----------

@@ -1,4 +1,5 @@
-"""The parts of a world: what a vessel, a flow and a target can be asked, and what is believed beforehand."""
+"""The parts of a world: what a vessel, a flow and a target can be asked, and what is believed
+beforehand."""
 
 from __future__ import annotations
 
@@ -38,7 +39,8 @@ class History(NamedTuple):
 
 
 class Vessel(Protocol):
-    """What holds the liquid, with the electrodes on its wall. A frozen dataclass of plain numbers in SI units."""
+    """What holds the liquid, with the electrodes on its wall. A frozen dataclass of plain numbers
+    in SI units."""
 
     @property
     def contact_impedance(self) -> float:
@@ -66,7 +68,8 @@ class Vessel(Protocol):
         ...
 
     def carrier(self, fine: bool) -> tuple[Mesh, np.ndarray]:
-        """The mesh on which concentration moves, ``fine`` for the truth, and the numbers of its inlet's nodes."""
+        """The mesh on which concentration moves, ``fine`` for the truth, and the numbers of its
+        inlet's nodes."""
         ...
 
     @property
@@ -84,8 +87,8 @@ class Vessel(Protocol):
 
 
 class Flow(Protocol):
-    """How the fluid moves. A frozen dataclass of plain numbers in SI units; what is said here holds where it says
-    nothing else."""
+    """How the fluid moves. A frozen dataclass of plain numbers in SI units; what is said here holds
+    where it says nothing else."""
 
     @property
     def diffusivity(self) -> float:
@@ -93,7 +96,8 @@ class Flow(Protocol):
         ...
 
     def nominal(self, world: World, fine: bool) -> VelocityField | None:
-        """The velocity with which the truth (``fine``) and the estimators' model are built; None: nothing moves."""
+        """The velocity with which the truth (``fine``) and the estimators' model are built; None:
+        nothing moves."""
         ...
 
     def check_assumed(self, world: World, assumed: Mapping[str, Any]) -> None:
@@ -101,7 +105,8 @@ class Flow(Protocol):
         refuse_assumptions(assumed, ())
 
     def believed(self, world: World, **assumed: Any) -> VelocityField | None:
-        """The velocity of the estimators' model; ``assumed`` is what they are told instead, by name."""
+        """The velocity of the estimators' model; ``assumed`` is what they are told instead, by
+        name."""
         self.check_assumed(world, assumed)
         return self.nominal(world, fine=False)
 
@@ -118,7 +123,8 @@ class Flow(Protocol):
         return None
 
     def draw(self, world: World, random: np.random.Generator) -> Callable[[int], SkewedChannelFlow] | None:
-        """t -> the flow from t − 1 to t in one episode; None where that is the nominal one in all of them."""
+        """t -> the flow from t − 1 to t in one episode; None where that is the nominal one in all
+        of them."""
         return None
 
     def true_transport(self, world: World, model: Discretisation, random: np.random.Generator,
@@ -151,7 +157,8 @@ class Target(Protocol):
 
     @property
     def is_carried(self) -> bool:
-        """Whether the truth is concentration that the fluid carries; else the target has a way of its own."""
+        """Whether the truth is concentration that the fluid carries; else the target has a way of
+        its own."""
         ...
 
     @property
@@ -161,7 +168,8 @@ class Target(Protocol):
 
     def evolve(self, world: World, episodes: Sequence[Randomness], truth: Discretisation,
                tick: Callable[[int], object], last: int) -> Iterator[History]:
-        """What moves in each episode up to state ``last``. Its numbers do not depend on the others, to the bit.
+        """What moves in each episode up to state ``last``. Its numbers do not depend on the others,
+        to the bit.
 
         ``tick(k)`` is called when k more steps of one episode are done.
         """
@@ -170,7 +178,8 @@ class Target(Protocol):
 
 @dataclass(frozen=True)
 class Prior:
-    """What is believed before anything is measured; standard deviations in parts of ĉ_bh (thesis Table 5.1)."""
+    """What is believed before anything is measured; standard deviations in parts of ĉ_bh (thesis
+    Table 5.1)."""
 
     expected_concentration: float = 25.0
     """mol/m³; a rough level, deliberately not the background [ours]"""

@@ -9,7 +9,8 @@ from eitbench.worlds.world import World
 PIPE_2D = World("Pipe2D", PlanePipe(), LaminarFlow(), Slugs())
 """A straight plane channel with laminar flow (thesis 5.1.1, Figs 5.1–5.6).
 
-One injection a time step; in the 16 injections of a frame the fluid moves 36 cm on average, almost the whole pipe.
+One injection a time step; in the 16 injections of a frame the fluid moves 36 cm on average, almost
+the whole pipe.
 """
 
 ABOUT = """

@@ -1,4 +1,5 @@
-"""The thesis' 2D pipe in which an agent chooses what to inject: electrode pairs, or a current for each electrode."""
+"""The thesis' 2D pipe in which an agent chooses what to inject: electrode pairs, or a current for
+each electrode."""
 
 from eitbench.worlds.instrument import Instrument
 from eitbench.worlds.pipe2d import PIPE_2D
@@ -7,7 +8,8 @@ from eitbench.worlds.world import World
 
 PIPE_2D_CURRENTS = World("Pipe2D", PIPE_2D.vessel, PIPE_2D.flow, PIPE_2D.target,
                          Instrument(noise_floor=2e-4, limit="Linf"))
-"""A source for each electrode; with the relative noise alone the currents' amplitude would not matter [ours]."""
+"""A source for each electrode; with the relative noise alone the currents' amplitude would not
+matter [ours]."""
 
 ABOUT = """
 The pipe of `eitbench/Pipe2D-v0`; here the agent chooses at every step how the current flows. A Kalman filter inside

@@ -1,4 +1,5 @@
-"""The 2D pipe with a dent in its lower wall: the flow separates behind it, and no parabola describes it."""
+"""The 2D pipe with a dent in its lower wall: the flow separates behind it, and no parabola
+describes it."""
 
 from eitbench.worlds.flows import FlowPastBulge
 from eitbench.worlds.registry import register

@@ -1,4 +1,5 @@
-"""The thesis' 2D pipe with a parabolic flow of unknown mean velocity, to be estimated too (6.2, Figs 6.1, 6.2)."""
+"""The thesis' 2D pipe with a parabolic flow of unknown mean velocity, to be estimated too (6.2,
+Figs 6.1, 6.2)."""
 
 from eitbench.worlds.flows import DrawnFlow
 from eitbench.worlds.registry import register

@@ -1,4 +1,5 @@
-"""The thesis' 3D pipe (5.2, Fig. 5.10): laminar flow in a round pipe, with rings of electrodes on its wall."""
+"""The thesis' 3D pipe (5.2, Fig. 5.10): laminar flow in a round pipe, with rings of electrodes on
+its wall."""
 
 from eitbench.worlds.flows import LaminarFlow
 from eitbench.worlds.registry import register
@@ -9,8 +10,8 @@ from eitbench.worlds.world import World
 
 PIPE_3D = World("Pipe3D", RoundPipe(), LaminarFlow(), Slugs(),
                 schedule=Schedule(scored_steps=48, pattern=RingsInTurn()))
-"""The page at hand shows the figure only: times, velocity and noise are those of the thesis' 2D pipe. Three frames are
-scored [ours]."""
+"""The page at hand shows the figure only: times, velocity and noise are those of the thesis' 2D
+pipe. Three frames are scored [ours]."""
 
 ABOUT = """
 Fluid streams through a round pipe, 40 cm long and 10 cm wide, at 4.5 m/s on average; slugs of higher and lower

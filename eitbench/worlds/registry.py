@@ -1,4 +1,5 @@
-"""The worlds that can be played, by their ids: ours, those of installed packages, and those a script registers."""
+"""The worlds that can be played, by their ids: ours, those of installed packages, and those a
+script registers."""
 
 from __future__ import annotations
 
@@ -63,7 +64,8 @@ def register(world: World, id: str, *, track: str = "estimation", about: str = "
     seeds : str
         The test episodes of its board.
     settings
-        Of the environment: ``lag`` and ``assume`` where estimates are asked for, ``gate`` where injections are.
+        Of the environment: ``lag`` and ``assume`` where estimates are asked for, ``gate`` where
+        injections are.
 
     Raises
     ------
@@ -117,7 +119,8 @@ def take_over(told: list[Entry]) -> None:
 
 
 def register_installed() -> None:
-    """Register our worlds, and those of installed packages; one that fails is left out with a warning."""
+    """Register our worlds, and those of installed packages; one that fails is left out with a
+    warning."""
     import_module("eitbench.worlds.ours")
     for point in entry_points(group=GROUP):
         try:

@@ -14,7 +14,8 @@ if TYPE_CHECKING:
 
 
 class Pattern(Protocol):
-    """The cycle of injections, in parts of the instrument's current. A frozen dataclass of plain numbers."""
+    """The cycle of injections, in parts of the instrument's current. A frozen dataclass of plain
+    numbers."""
 
     def __call__(self, vessel: Any) -> np.ndarray:
         """(K, L), each row summing to zero."""
@@ -25,8 +26,9 @@ class Pattern(Protocol):
 class AcrossAndAslant:
     """Straight across a plane pipe, then aslant, three electrodes further down [ours].
 
-    Successive injections are far apart, so that each part of the pipe is seen anew before the fluid has left it.
-    Electrodes 0 … L/2−1 lie on the lower wall, L/2 … L−1 on the upper one, both along the flow.
+    Successive injections are far apart, so that each part of the pipe is seen anew before the fluid
+    has left it. Electrodes 0 … L/2−1 lie on the lower wall, L/2 … L−1 on the upper one, both along
+    the flow.
     """
 
     frame: int = 16
@@ -50,8 +52,8 @@ class AcrossAndAslant:
 class RingsInTurn:
     """Straight across a ring of a round pipe, then aslant into the next ring down the flow [ours].
 
-    The rings take turns, and the angle moves on by three places each time. Electrode number = ring·(electrodes per
-    ring) + place around.
+    The rings take turns, and the angle moves on by three places each time. Electrode number =
+    ring·(electrodes per ring) + place around.
     """
 
     frame: int = 16
@@ -75,7 +77,8 @@ class RingsInTurn:
 
 @dataclass(frozen=True)
 class OnePair:
-    """The same pair of electrodes all the time: number 0, and the one opposite [T: one pair; ours: which]."""
+    """The same pair of electrodes all the time: number 0, and the one opposite [T: one pair; ours:
+    which]."""
 
     def __call__(self, vessel: RoundTank) -> np.ndarray:
         return _pair(vessel, 0, vessel.n_electrodes // 2)[None]
@@ -83,7 +86,8 @@ class OnePair:
 
 @dataclass(frozen=True)
 class AroundTheTank:
-    """Eight injections straight across a tank, then eight aslant, each far from the one before [ours]."""
+    """Eight injections straight across a tank, then eight aslant, each far from the one before
+    [ours]."""
 
     def __call__(self, vessel: RoundTank) -> np.ndarray:
         half = vessel.n_electrodes // 2
@@ -111,11 +115,13 @@ class Schedule:
     pattern: Pattern = field(default_factory=AcrossAndAslant)
     """the cycle of injections"""
     warm_up: int | None = None
-    """injections not scored; None: the mean flow flushes the vessel once, and there is a whole frame"""
+    """injections not scored; None: the mean flow flushes the vessel once, and there is a whole
+    frame"""
     calibration: int | None = None
     """first injections, from which ĉ_bh is found; None: a whole turn of the pattern"""
     budget: int | None = None
-    """injections that an agent may make, where it may also inject nothing; None: it injects at every step"""
+    """injections that an agent may make, where it may also inject nothing; None: it injects at
+    every step"""
 
     def __post_init__(self) -> None:
         _check.number("time_step", self.time_step, low=0.0, open_low=True, units="s")

@@ -1,4 +1,5 @@
-"""Slugs: liquid of higher or lower concentration that enters at random and is carried through a pipe."""
+"""Slugs: liquid of higher or lower concentration that enters at random and is carried through a
+pipe."""
 
 from __future__ import annotations
 
@@ -21,7 +22,8 @@ if TYPE_CHECKING:
 Inflow = Callable[[np.ndarray, float], np.ndarray]
 """(points (k, d) in m, time in s) -> concentration (k,) in mol/m³"""
 KEPT = 48
-"""Transport models of a fine mesh that are kept: a wandering flow comes back to the same velocities."""
+"""Transport models of a fine mesh that are kept: a wandering flow comes back to the same
+velocities."""
 
 
 class Arrivals(Protocol):
@@ -51,8 +53,8 @@ class OneInEach:
 class NowAndThen:
     """Slugs one at a time, at times nobody foresees; all numbers are ours.
 
-    Between two lies at least ``interval``, and then for every moment the same probability that the next one comes: how
-    long it has been quiet says nothing of what will be.
+    Between two lies at least ``interval``, and then for every moment the same probability that the
+    next one comes: how long it has been quiet says nothing of what will be.
     """
 
     interval: float = 0.10
@@ -75,7 +77,8 @@ class NowAndThen:
 
 @dataclass(frozen=True)
 class Slugs(Target):
-    """Slugs of both signs, Gaussian across the pipe and in time: c_in = background·exp(Σ ±a·g(r)·g(t)) [ours]."""
+    """Slugs of both signs, Gaussian across the pipe and in time: c_in = background·exp(Σ
+    ±a·g(r)·g(t)) [ours]."""
 
     background: float = 30.0
     """mol/m³, about 0.3 S/m: weak saline"""
@@ -109,7 +112,7 @@ class Slugs(Target):
         width = random.uniform(*self.width, n)
 
         def inflow(points: np.ndarray, time: float) -> np.ndarray:
-            distance = world.vessel.across(points)[:, None] - where                        # (k, n, d − 1)
+            distance = world.vessel.across(points)[:, None] - where  # (k, n, d − 1)
             bell = np.exp(-0.5 * ((distance / width[:, None])**2).sum(axis=2))
             strengths = strength * np.exp(-0.5 * ((time - when) / duration)**2)
             return np.asarray(self.background * np.exp(bell @ strengths))
@@ -120,7 +123,7 @@ class Slugs(Target):
                tick: Callable[[int], object], last: int) -> Iterator[History]:
         flows = [world.flow.draw(world, episode.flow) for episode in episodes]
         inflows = [self.draw_inflow(world, episode.inflow) for episode in episodes]
-        if flows[0] is None:                                    # one flow carries all of them together
+        if flows[0] is None:  # one flow carries all of them together
             for concentration in carry(world, lambda t: truth.transport, inflows, tick, last):
                 yield History(concentration, np.empty((last, 0)))
             return
@@ -141,8 +144,9 @@ def carry(world: World, transport_at: Callable[[int], Transport], inflows: Seque
           tick: Callable[[int], object], last: int) -> np.ndarray:
     """Concentrations (B, last + 1, n) in mol/m³ that B inflows make in one flow, t = 0 … last.
 
-    ``transport_at(t)`` moves the fluid from t − 1 to t, perhaps in several steps of its own; its mesh and inlet do
-    not change. The vessel holds the background when the lead-in begins. ``tick`` as in `Target.evolve`.
+    ``transport_at(t)`` moves the fluid from t − 1 to t, perhaps in several steps of its own; its
+    mesh and inlet do not change. The vessel holds the background when the lead-in begins. ``tick``
+    as in `Target.evolve`.
     """
     first = transport_at(1 - world.lead_in)
     inlet = first.mesh.points[first.inlet]

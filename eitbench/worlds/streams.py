@@ -1,4 +1,5 @@
-"""The random streams of an episode: every draw comes from one of these, and its seed says all of them."""
+"""The random streams of an episode: every draw comes from one of these, and its seed says all of
+them."""
 
 from __future__ import annotations
 
@@ -7,8 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 STREAMS = ("inflow", "noise", "flow", "faults", "policy")
-"""In the order in which a seed gives them: what enters, what the voltmeters add, how the fluid moves (or where bodies
-stand), what is broken, and what a policy draws. New ones come last, so that the others stay as they are."""
+"""In the order in which a seed gives them: what enters, what the voltmeters add, how the fluid
+moves (or where bodies stand), what is broken, and what a policy draws. New ones come last, so that
+the others stay as they are."""
 
 
 class Randomness(NamedTuple):

@@ -25,13 +25,15 @@ class Estimate(NamedTuple):
     mean: np.ndarray
     """(n,) concentration at the nodes of `Task.mesh`, mol/m³."""
     variance: np.ndarray | None = None
-    """(n,) its error variance, (mol/m³)²; None: the estimator makes no claim, and calibration is not scored."""
+    """(n,) its error variance, (mol/m³)²; None: the estimator makes no claim, and calibration is
+    not scored."""
     innovation: np.ndarray | None = None
     """(L,) measured minus predicted voltages, V, before this measurement was used; for NIS."""
     innovation_covariance: np.ndarray | None = None
     """(L, L) its covariance, V²."""
     velocity: np.ndarray | None = None
-    """(k,) parameters of the flow in m/s where `Task.velocity` asks for them; None: what is believed at first."""
+    """(k,) parameters of the flow in m/s where `Task.velocity` asks for them; None: what is
+    believed at first."""
     velocity_variance: np.ndarray | None = None
     """(k,) their error variance, m²/s²."""
 
@@ -54,15 +56,19 @@ class Task:
     warm_up : int
         States t ≤ warm_up are not scored.
     lag : int
-        At measurement t the state t − lag is asked for: 0 filters, n_steps − 1 smooths over the whole record.
+        At measurement t the state t − lag is asked for: 0 filters, n_steps − 1 smooths over the
+        whole record.
     expected_concentration : float
         Rough level in mol/m³, where the search for the best homogeneous estimate begins.
     calibration : int
-        First injections, all but always within the warm-up, from which the best homogeneous estimate is found.
+        First injections, all but always within the warm-up, from which the best homogeneous
+        estimate is found.
     prior : Prior
-        What is believed of the target, in parts of the best homogeneous estimate (thesis Table 5.1).
+        What is believed of the target, in parts of the best homogeneous estimate (thesis Table
+        5.1).
     velocity : VelocityModel or None
-        How the flow may be written where it is asked for too; ``transport`` then has the flow believed at first.
+        How the flow may be written where it is asked for too; ``transport`` then has the flow
+        believed at first.
     vessel : Vessel
         Its sizes and electrodes.
     """
@@ -86,7 +92,8 @@ class Task:
         return self.transport.mesh
 
     def transport_at(self, parameters: np.ndarray) -> ConvectionDiffusion:
-        """The evolution model with the flow's ``parameters`` θ (k,) in m/s; ``ValueError`` where it is not asked for."""
+        """The evolution model with the flow's ``parameters`` θ (k,) in m/s; ``ValueError`` where it
+        is not asked for."""
         from eitbench.physics.transport import ConvectionDiffusion
         if self.velocity is None or not isinstance(self.transport, ConvectionDiffusion):
             raise ValueError("the flow has no parameters in this task")
@@ -94,7 +101,8 @@ class Task:
 
     @property
     def evolution(self) -> EvolutionModel:
-        """F, Y, H of the transport; computed on first use and shared by all tasks with the same model."""
+        """F, Y, H of the transport; computed on first use and shared by all tasks with the same
+        model."""
         return self.transport.evolution_model()
 
 
@@ -107,7 +115,8 @@ def make_task(world: World, lag: int | str = 0, **assumed: Any) -> Task:
     lag : int or "all"
         See `Task`; "all" means the whole record.
     assumed
-        What the estimator wrongly believes of the flow, such as ``mean_velocity``; see `World.model`.
+        What the estimator wrongly believes of the flow, such as ``mean_velocity``; see
+        `World.model`.
     """
     steps = lag_steps(world, lag)
     model = _model(world.fluid, tuple(sorted(assumed.items())))

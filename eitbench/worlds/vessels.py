@@ -1,4 +1,5 @@
-"""What holds the liquid: plane and round pipes, and flat round tanks, with the electrodes on their walls."""
+"""What holds the liquid: plane and round pipes, and flat round tanks, with the electrodes on their
+walls."""
 
 from __future__ import annotations
 
@@ -17,7 +18,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Bulge:
-    """A dent of a plane pipe's lower wall, electrodes and all: y = −R + h·exp(−((x − x₀)/w)²). All numbers are ours."""
+    """A dent of a plane pipe's lower wall, electrodes and all: y = −R + h·exp(−((x − x₀)/w)²). All
+    numbers are ours."""
 
     height: float = 0.02
     """h in m: a fifth of the pipe's width"""
@@ -63,7 +65,7 @@ class PlanePipe:
     patches = (12, 3)
     is_long = True
     parts_of_a_step = 2
-    lines = 40                           # parts of its length whose ends are lines of both carriers' meshes
+    lines = 40  # parts of its length whose ends are lines of both carriers' meshes
 
     def __post_init__(self) -> None:
         for name, units in (("length", "m"), ("half_width", "m"), ("contact_impedance", "Ω·m²"),
@@ -87,7 +89,8 @@ class PlanePipe:
         return centres[:, None] + 0.5 * self.electrode_cover * pitch * np.array([-1.0, 1.0])
 
     def electrodes(self, mesh: Mesh) -> list[np.ndarray]:
-        """Boundary facets of each electrode on an EIT mesh of the straight pipe with nodes at the electrodes' edges."""
+        """Boundary facets of each electrode on an EIT mesh of the straight pipe with nodes at the
+        electrodes' edges."""
         tiny = 1e-9 * self.length
         x, y = mesh.points.T
         places = [(wall, *span) for wall in (-self.half_width, self.half_width) for span in self.electrode_spans]
@@ -111,7 +114,8 @@ class PlanePipe:
 
     def carrier(self, fine: bool) -> tuple[Mesh, np.ndarray]:
         """10,251 nodes for the truth, 1,701 for the model."""
-        from eitbench.numerics.mesh import rectangle_mesh  # finite elements: not needed to play recordings
+        # finite elements: not needed to play recordings
+        from eitbench.numerics.mesh import rectangle_mesh
         along, across = (200, 50) if fine else (80, 20)
         mesh = rectangle_mesh(np.linspace(0.0, self.length, along + 1),
                               np.linspace(-self.half_width, self.half_width, across + 1))
@@ -144,7 +148,8 @@ class PlanePipe:
 class RoundPipe:
     """A straight round pipe along z, with rings of electrodes on its wall (thesis 5.2, Fig. 5.10).
 
-    The page at hand shows the figure only: sizes and electrodes are ours. Contact impedance is per area.
+    The page at hand shows the figure only: sizes and electrodes are ours. Contact impedance is per
+    area.
     """
 
     length: float = 0.40
@@ -164,8 +169,8 @@ class RoundPipe:
     molar_conductivity: float = 0.01
     """Λ in S·m²/mol; σ = Λc [ours]"""
     potential_order: int = 2
-    """of the elements for the potential. At equal numbers of unknowns P1 errs three times as much, by more than the
-    noise: ``docs/pipe3d.md``"""
+    """of the elements for the potential. At equal numbers of unknowns P1 errs three times as much,
+    by more than the noise: ``docs/pipe3d.md``"""
 
     patches = (6, 6)
     is_long = True
@@ -200,7 +205,8 @@ class RoundPipe:
         return centres[:, None] + 0.5 * self.electrode_length * np.array([-1.0, 1.0])
 
     def electrodes(self, mesh: Mesh) -> list[np.ndarray]:
-        """Boundary facets of each electrode, ring by ring, on an EIT mesh whose nodes include the electrodes' edges."""
+        """Boundary facets of each electrode, ring by ring, on an EIT mesh whose nodes include the
+        electrodes' edges."""
         z = mesh.points[:, 2]
         tiny = 1e-9 * self.length
         facets = []
@@ -228,7 +234,8 @@ class RoundPipe:
 
     def carrier(self, fine: bool) -> tuple[Mesh, np.ndarray]:
         """13,689 nodes for the truth, 3,003 for the model."""
-        from eitbench.numerics.round import extrude, uniform_disc  # finite elements: not needed to play recordings
+        # finite elements: not needed to play recordings
+        from eitbench.numerics.round import extrude, uniform_disc
         rings, layers = (7, 80) if fine else (5, 32)
         section = uniform_disc(self.radius, rings)
         return extrude(section, np.linspace(0.0, self.length, layers + 1)), np.arange(section.n_nodes)
@@ -274,7 +281,8 @@ class RoundTank:
         return _spans_around(self.n_electrodes, self.electrode_cover)
 
     def electrodes(self, mesh: Mesh) -> list[np.ndarray]:
-        """Boundary facets of each electrode on an EIT mesh whose nodes include the electrodes' edges."""
+        """Boundary facets of each electrode on an EIT mesh whose nodes include the electrodes'
+        edges."""
         return _electrodes_around(mesh, self.radius, self.electrode_spans)
 
     def substeps(self, fine: bool) -> int:

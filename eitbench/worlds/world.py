@@ -23,19 +23,21 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class World:
-    """What is simulated into episodes: parts that can be swapped, each a frozen dataclass of plain numbers.
+    """What is simulated into episodes: parts that can be swapped, each a frozen dataclass of plain
+    numbers.
 
     Parameters
     ----------
     name : str
         Under which its episodes are kept.
     vessel, flow, target, instrument, schedule
-        A `Vessel`, `Flow`, `Target`, `Instrument` and `Schedule`. A part may ask more of another than its protocol
-        promises, as slugs ask for an inlet.
+        A `Vessel`, `Flow`, `Target`, `Instrument` and `Schedule`. A part may ask more of another
+        than its protocol promises, as slugs ask for an inlet.
     prior : Prior
         What estimators are told to believe.
     region : (float, float) or None
-        m along the vessel's first axis; only errors between these cross-sections count. None: the whole vessel.
+        m along the vessel's first axis; only errors between these cross-sections count. None: the
+        whole vessel.
     """
 
     name: str
@@ -87,8 +89,8 @@ class World:
 
     @property
     def warm_up(self) -> int:
-        """Injections that are measured but not scored: by default the mean flow flushes the vessel once, and there is
-        a whole turn of the pattern."""
+        """Injections that are measured but not scored: by default the mean flow flushes the vessel
+        once, and there is a whole turn of the pattern."""
         if self.schedule.warm_up is not None:
             return self.schedule.warm_up
         return max(self.flush_steps, len(self.currents))
@@ -146,15 +148,17 @@ class World:
     def model(self, **assumed: Any) -> Discretisation:
         """The coarser one that estimators are given.
 
-        ``assumed`` is what they wrongly believe of the flow; `Flow.believed` says what there is. ``ValueError`` if it
-        has nothing of this name.
+        ``assumed`` is what they wrongly believe of the flow; `Flow.believed` says what there is.
+        ``ValueError`` if it has nothing of this name.
         """
         return self._discretise(self.flow.believed(self, **assumed), fine=False)
 
     def true_transport(self, model: Discretisation, flow: np.random.Generator) -> Callable[[int], Transport]:
-        """t -> what moves an episode's concentration from t − 1 to t, on the estimators' mesh; for references only.
+        """t -> what moves an episode's concentration from t − 1 to t, on the estimators' mesh; for
+        references only.
 
-        ``model`` is what estimators are given when they are told nothing wrong, ``flow`` the episode's fresh stream.
+        ``model`` is what estimators are given when they are told nothing wrong, ``flow`` the
+        episode's fresh stream.
         """
         return self.flow.true_transport(self, model, flow)
 
@@ -199,7 +203,8 @@ class World:
         Raises
         ------
         ValueError
-            Naming what there is, if a part or a number has another name, or what is allowed, if it is out of range.
+            Naming what there is, if a part or a number has another name, or what is allowed, if it
+            is out of range.
         """
         if changes is None:
             return self
@@ -211,14 +216,16 @@ class World:
 
     @cached_property
     def sound(self) -> World:
-        """What a filter depends on that believes in an instrument without faults and floor: variants share theirs."""
+        """What a filter depends on that believes in an instrument without faults and floor:
+        variants share theirs."""
         instrument = Instrument(current=self.instrument.current, noise_relative=self.instrument.noise_relative,
                                 noise_of_largest=self.instrument.noise_of_largest)
         return replace(self, instrument=instrument, schedule=replace(self.schedule, budget=None))
 
     @cached_property
     def fluid(self) -> World:
-        """What the truth depends on: this world with a sound instrument, so that variants share their episodes."""
+        """What the truth depends on: this world with a sound instrument, so that variants share
+        their episodes."""
         return replace(self, instrument=Instrument(current=self.instrument.current),
                        prior=Prior(self.expected_concentration), schedule=replace(self.schedule, budget=None))
 

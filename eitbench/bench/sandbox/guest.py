@@ -1,7 +1,9 @@
-"""The process in which somebody else's estimator or policy runs; `eitbench.bench.sandbox.host` starts it.
+"""The process in which somebody else's estimator or policy runs; `eitbench.bench.sandbox.host`
+starts it.
 
-It is told the environment's id and arguments, and then, step by step, what was measured. There is no episode, no truth
-and no seed here, and once the wall is up none of the files in which they might be kept can be opened.
+It is told the environment's id and arguments, and then, step by step, what was measured. There is
+no episode, no truth and no seed here, and once the wall is up none of the files in which they might
+be kept can be opened.
 """
 
 from __future__ import annotations
@@ -27,7 +29,7 @@ def main() -> None:
     private, memory = Path(sys.argv[1]), int(sys.argv[2])
     incoming, outgoing = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     silent = os.open(os.devnull, os.O_RDWR)
-    for stream in range(3):                                            # what the guest prints is no answer
+    for stream in range(3):  # what the guest prints is no answer
         os.dup2(silent, stream)
     readable = wall.python_files()
     wall.end_with_parent()
@@ -71,7 +73,7 @@ def _player(words: dict[str, Any], arrays: dict[str, np.ndarray]) -> tuple[Calla
     import gymnasium as gym
 
     import eitbench  # noqa: F401 (registers)
-    if arrays["told"].size:                                            # what the host says may be believed
+    if arrays["told"].size:  # what the host says may be believed
         take_over([cloudpickle.loads(arrays["told"].tobytes())])
     env: Any = gym.make(words["id"], disable_env_checker=True, **words["kwargs"]).unwrapped
     about: dict[str, Any]

@@ -1,6 +1,7 @@
 """Methods whose code runs in a guest, in the form of any other: loading one executes nothing here.
 
-A process has one guest at a time. It plays the episodes of one method in one environment, one after the other.
+A process has one guest at a time. It plays the episodes of one method in one environment, one after
+the other.
 """
 
 from __future__ import annotations
@@ -27,15 +28,17 @@ _present: list[tuple[tuple[str, ...], Guest]] = []
 
 
 def load(kind: str, id: str, kwargs: str, method: str) -> Baseline | PolicyFile:
-    """An "estimator" or a "policy", by name or path, for an environment with these arguments (JSON).
+    """An "estimator" or a "policy", by name or path, for an environment with these arguments
+    (JSON).
 
     Raises
     ------
     ValueError
-        If there is no such file, it cannot be loaded, or it asks for the truth, which a guest has not.
+        If there is no such file, it cannot be loaded, or it asks for the truth, which a guest has
+        not.
     """
     path = (find_baseline if kind == "estimator" else find_policy)(method)
-    if is_ours(method):                                  # what it says of itself need not be asked of a guest
+    if is_ours(method):  # what it says of itself need not be asked of a guest
         return _ours(kind, id, kwargs, method, path)
     return _load(kind, id, kwargs, method, path, hashlib.sha256(path.read_bytes()).hexdigest())
 
@@ -52,7 +55,8 @@ def close() -> None:
 
 
 class _Elsewhere:
-    """Stands for a method's class: to make one is to begin an episode in the guest, which then answers."""
+    """Stands for a method's class: to make one is to begin an episode in the guest, which then
+    answers."""
 
     def __init__(self, enter: Callable[[], Guest], suits: Callable[[Any], bool]) -> None:
         self._enter = enter
@@ -85,7 +89,7 @@ def _load(kind: str, id: str, kwargs: str, method: str, path: Path, sha256: str)
     if about.get("privileged"):
         raise ValueError(f"{path} is privileged: it asks for the truth, which a process of its own has not")
     if path.suffix == ".py":
-        about = about | {"name": path.stem}                             # a guest may call itself anything
+        about = about | {"name": path.stem}  # a guest may call itself anything
     sound = {"name": isinstance(about.get("name"), str) and NAME.fullmatch(about["name"]),
              "title": isinstance(about.get("title"), str) and about["title"],
              "parameters": isinstance(about.get("parameters"), dict), "role": about.get("role") in ROLES,
@@ -95,14 +99,16 @@ def _load(kind: str, id: str, kwargs: str, method: str, path: Path, sha256: str)
     if kind == "policy" and _own_names(id).get(about["name"], sha256) != sha256:
         raise ValueError(f"{path} has the name of one of ours, {about['name']}, under which results are kept")
     name, title, parameters, role = (about[key] for key in ("name", "title", "parameters", "role"))
-    there = _Elsewhere(enter, lambda world: bool(about.get("suits")))                # in the one that its guest knows
+    # in the one that its guest knows
+    there = _Elsewhere(enter, lambda world: bool(about.get("suits")))
     if kind == "estimator":
         return Baseline(name, title, path, sha256, tuple(about["boards"]), parameters, there, role)
     return PolicyFile(name, title, path, sha256, False, parameters, there, role)
 
 
 def _own_names(id: str) -> dict[str, str]:
-    """Under which the results of our own policies and agents are kept, and the sha256 of their files."""
+    """Under which the results of our own policies and agents are kept, and the sha256 of their
+    files."""
     policies = {name: find_policy(name) for name in own_policies()}
     agents = {f"{path.parents[1].name}_{path.parent.name}": path for path in map(Path, own_agents(id))}
     return {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in (policies | agents).items()}

@@ -1,4 +1,5 @@
-"""Run somebody else's estimator or policy in a process of its own: `Guest`. What passes between is measured numbers.
+"""Run somebody else's estimator or policy in a process of its own: `Guest`. What passes between is
+measured numbers.
 
 What this protects against, and what not, is in ``docs/trust.md``.
 """
@@ -34,7 +35,8 @@ MEMORY = 8 << 30
 PATIENCE = 600.0
 """s that an answer may take; the first after an episode began may hold all preparations"""
 MODELS = ("outline.npz", "region.npz", "reduced-*.npz", "joint-*.npz")
-"""What the cache holds of a world, made without any episode; the files of an episode begin with its seed."""
+"""What the cache holds of a world, made without any episode; the files of an episode begin with its
+seed."""
 ARITHMETIC = ("OPENBLAS_", "MKL_", "OMP_", "NPY_", "NUMBA_CPU")
 """Variables on which the last bits of numbers depend begin so."""
 
@@ -54,8 +56,8 @@ class Guest:
     id, kwargs
         The environment, of which it makes its own, without an episode.
     name : str
-        One of ours, or the path of a .py file or an agent's model.zip. A file that is not ours is copied into a folder
-        of the guest's own, which is the only place where it can write.
+        One of ours, or the path of a .py file or an agent's model.zip. A file that is not ours is
+        copied into a folder of the guest's own, which is the only place where it can write.
     memory : int
         bytes
     patience : float
@@ -77,12 +79,13 @@ class Guest:
         self._private = Path(tempfile.mkdtemp(prefix="eitbench-guest-"))
         self._process = subprocess.Popen(
             [sys.executable, "-m", "eitbench.bench.sandbox.guest", str(self._private), str(memory)],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,    # a terminal can be typed into
+            # a terminal can be typed into
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
             start_new_session=True, env=self._surroundings(id, kwargs), cwd=self._private)
         try:
             assert self._process.stdin is not None
             os.set_blocking(self._process.stdin.fileno(), False)
-            wall = self._receive()[0]                                                    # no stranger's word yet
+            wall = self._receive()[0]  # no stranger's word yet
             self.closed = bool(wall["closed"])
             """Whether files are out of its reach."""
             if self.closed:
@@ -95,7 +98,8 @@ class Guest:
             raise
 
     def begin(self, random: int = 0) -> None:
-        """A new episode: another estimator or policy, of the same class; a policy's generator is seeded with this."""
+        """A new episode: another estimator or policy, of the same class; a policy's generator is
+        seeded with this."""
         self._ask({"do": "begin", "random": random})
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Any:
@@ -119,7 +123,8 @@ class Guest:
 
     @property
     def alive(self) -> bool:
-        """Whether it can be asked: not after a crash, nonsense, or an answer that did not come in time."""
+        """Whether it can be asked: not after a crash, nonsense, or an answer that did not come in
+        time."""
         return self._process.poll() is None
 
     @property
@@ -147,7 +152,8 @@ class Guest:
         self.close()
 
     def _surroundings(self, id: str, kwargs: dict[str, Any]) -> dict[str, str]:
-        """Environment variables; models that are kept in the cache, without a truth, are copied for the guest."""
+        """Environment variables; models that are kept in the cache, without a truth, are copied for
+        the guest."""
         cache, kernels = self._private / "cache", self._private / "kernels"
         there = folder(entry(id).world.changed(kwargs.get("world")))
         (cache / there.name).mkdir(parents=True)
@@ -165,7 +171,7 @@ class Guest:
     def _copied(self, name: str) -> str:
         if not name.endswith((".py", ".zip")):
             return name
-        if is_ours(name):                              # a copy would pass for a stranger's that has taken our name
+        if is_ours(name):  # a copy would pass for a stranger's that has taken our name
             return str(Path(name).resolve())
         path, place = Path(name), self._private / "own"
         place.mkdir()
@@ -181,7 +187,7 @@ class Guest:
         try:
             self._send(wire.pack(words, arrays))
             answer = self._receive()
-        except BaseException:                          # whatever it says from now on would answer another question
+        except BaseException:  # whatever it says from now on would answer another question
             self._end()
             raise
         if "error" in answer[0]:
@@ -228,7 +234,7 @@ class Guest:
 
     def _end(self) -> int:
         """Kill it and all processes of its session; its status."""
-        if not self._over:                             # only once: later the number may be another's
+        if not self._over:  # only once: later the number may be another's
             self._over = True
             with suppress(ProcessLookupError, PermissionError):            # it has ended by itself
                 os.killpg(self._process.pid, signal.SIGKILL)
@@ -236,7 +242,8 @@ class Guest:
 
 
 def _told(id: str) -> np.ndarray:
-    """An entry that a guest does not know by itself, since a script registered it, as bytes; else none.
+    """An entry that a guest does not know by itself, since a script registered it, as bytes; else
+    none.
 
     What is unpickled there comes from here; nothing of a guest is ever unpickled here.
     """

@@ -1,8 +1,9 @@
 """Limits that a process puts on itself before it runs somebody else's code, and cannot lift again.
 
-Files: Linux' Landlock (kernel 5.13 and later). Whatever is not named is out of reach, other processes' memory too, and
-TCP where the kernel knows how to refuse it. Linux' seccomp: sockets of all kinds, and what Landlock lets pass, such as
-being told the names of files that others open. Memory: a limit of the address space.
+Files: Linux' Landlock (kernel 5.13 and later). Whatever is not named is out of reach, other
+processes' memory too, and TCP where the kernel knows how to refuse it. Linux' seccomp: sockets of
+all kinds, and what Landlock lets pass, such as being told the names of files that others open.
+Memory: a limit of the address space.
 """
 
 from __future__ import annotations
@@ -28,19 +29,20 @@ _ALL = {1: (1 << 13) - 1, 2: (1 << 14) - 1, 3: (1 << 15) - 1, 5: (1 << 16) - 1}
 _NO_NEW_PRIVILEGES, _END_WITH_PARENT, _FILTER_CALLS = 38, 1, (22, 2)
 _REFUSED_CALLS = {
     "x86_64": (0xC000003E, 302, (
-        41, 53, 425,                                                  # socket, socketpair, io_uring_setup
+        41, 53, 425,  # socket, socketpair, io_uring_setup
         109, 112,                                                     # setpgid, setsid
-        253, 294, 254, 300, 301, 303, 304,                            # inotify, fanotify, files by their handles
+        253, 294, 254, 300, 301, 303, 304,  # inotify, fanotify, files by their handles
         90, 91, 268, 452, 92, 93, 94, 260,                            # chmod and chown
-        132, 235, 261, 280, 188, 189, 190, 463, 197, 198, 199, 466,   # utime and extended attributes
-        101, 310, 311, 298, 321,                                      # ptrace, others' memory, perf events, bpf
-        141, 142, 144, 314, 251, 203)),                               # priorities and processors, of others too
+        132, 235, 261, 280, 188, 189, 190, 463, 197, 198, 199, 466,  # utime and extended attributes
+        101, 310, 311, 298, 321,  # ptrace, others' memory, perf events, bpf
+        141, 142, 144, 314, 251, 203)),  # priorities and processors, of others too
     "aarch64": (0xC00000B7, 261, (
         198, 199, 425, 154, 157, 26, 27, 262, 263, 264, 265, 52, 53, 452, 54, 55, 88, 5, 6, 7, 463, 14, 15, 16, 466,
         117, 270, 271, 241, 280, 140, 118, 119, 274, 30, 122)),
 }
-"""Architecture as the kernel names it, the number of its call prlimit64, which may ask about the process itself, and
-those of the calls that are refused; the second in the order of the first, which has more of its own."""
+"""Architecture as the kernel names it, the number of its call prlimit64, which may ask about the
+process itself, and those of the calls that are refused; the second in the order of the first, which
+has more of its own."""
 _LOAD, _EQUAL, _AT_LEAST, _RETURN = 0x20, 0x15, 0x35, 0x06
 """What a step of a filter of system calls does."""
 _ALLOWED, _REFUSED = 0x7FFF0000, 0x00050000 | errno.EACCES
@@ -82,9 +84,11 @@ def landlock_version() -> int:
 
 
 def close_files(readable: Iterable[Path], writable: Iterable[Path]) -> bool:
-    """From now on this process and its children reach only these files and folders, and what lies beneath them.
+    """From now on this process and its children reach only these files and folders, and what lies
+    beneath them.
 
-    Returns whether that is so; False where the kernel has no Landlock. Raises ``OSError`` if it has and refuses.
+    Returns whether that is so; False where the kernel has no Landlock. Raises ``OSError`` if it has
+    and refuses.
     """
     version = landlock_version()
     if not version:
@@ -109,18 +113,20 @@ def close_files(readable: Iterable[Path], writable: Iterable[Path]) -> bool:
 
 
 def refuse_calls() -> bool:
-    """From now on this process and its children make no socket of any kind, leave neither session nor group, and are
-    not told which files others open; owners, modes, times and attributes of files stay what they are, and so do
-    priorities and limits of other processes.
+    """From now on this process and its children make no socket of any kind, leave neither session
+    nor group, and are not told which files others open; owners, modes, times and attributes of
+    files stay what they are, and so do priorities and limits of other processes.
 
-    Pairs of sockets are refused too, as one of datagrams can be turned to any address. Returns whether that is so;
-    False where the kernel cannot filter system calls or this does not know their numbers.
+    Pairs of sockets are refused too, as one of datagrams can be turned to any address. Returns
+    whether that is so; False where the kernel cannot filter system calls or this does not know
+    their numbers.
     """
     if not sys.platform.startswith("linux") or os.uname().machine not in _REFUSED_CALLS:
         return False
     architecture, limits, calls = _REFUSED_CALLS[os.uname().machine]
     asked = [(_AT_LEAST, _FOREIGN), *((_EQUAL, call) for call in calls)]
-    last = [(_EQUAL, 0, 2, limits), (_LOAD, 0, 0, _ARGUMENT), (_EQUAL, 0, 1, 0),         # limits of process 0: its own
+    # limits of process 0: its own
+    last = [(_EQUAL, 0, 2, limits), (_LOAD, 0, 0, _ARGUMENT), (_EQUAL, 0, 1, 0),
             (_RETURN, 0, 0, _ALLOWED), (_RETURN, 0, 0, _REFUSED)]
     steps = [(_LOAD, 0, 0, _ARCHITECTURE), (_EQUAL, 1, 0, architecture), (_RETURN, 0, 0, _REFUSED),
              (_LOAD, 0, 0, _CALL),
@@ -131,7 +137,8 @@ def refuse_calls() -> bool:
 
 
 def limit_memory(size: int) -> None:
-    """No more than ``size`` bytes of address space, no core dumps; a request beyond raises ``MemoryError``."""
+    """No more than ``size`` bytes of address space, no core dumps; a request beyond raises
+    ``MemoryError``."""
     import resource  # not on Windows
     resource.setrlimit(resource.RLIMIT_AS, (size, size))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
@@ -144,9 +151,11 @@ def end_with_parent() -> None:
 
 
 def python_files() -> list[Path]:
-    """What Python and this package need to read: programs, libraries, this process' own entries and the processor's."""
+    """What Python and this package need to read: programs, libraries, this process' own entries and
+    the processor's."""
     package = PACKAGE
-    checkout = package.parent if (package.parent / "pyproject.toml").exists() else None       # else others lie beside
+    # else others lie beside
+    checkout = package.parent if (package.parent / "pyproject.toml").exists() else None
     places = [sys.prefix, sys.base_prefix, sys.exec_prefix, str(package), str(package.parent / "baselines"), "/usr",
               "/lib", "/lib64", "/bin", *(f"/etc/{name}" for name in _SETTINGS), "/dev/null", "/dev/urandom",
               "/dev/zero", f"/proc/{os.getpid()}", "/proc/cpuinfo", "/proc/meminfo", "/proc/stat",

@@ -1,4 +1,5 @@
-"""Messages between processes that do not trust each other: numbers and words, nothing that could be executed."""
+"""Messages between processes that do not trust each other: numbers and words, nothing that could be
+executed."""
 
 from __future__ import annotations
 
@@ -31,7 +32,7 @@ def unpack(read: Callable[[int], bytes]) -> tuple[dict[str, Any], dict[str, np.n
         raise ValueError(f"a message must have at most {LARGEST} bytes, got {head + body}")
     try:
         words, layout = json.loads(read(head), parse_constant=_refuse)
-        json.dumps(words, ensure_ascii=False).encode()                 # half a character cannot be kept
+        json.dumps(words, ensure_ascii=False).encode()  # half a character cannot be kept
         kinds = [(str(name), np.dtype(kind), tuple(int(n) for n in shape)) for name, kind, shape in layout]
     except (TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"a message must begin with JSON that names its arrays: {error}") from None

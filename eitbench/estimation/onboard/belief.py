@@ -1,4 +1,5 @@
-"""What an injection policy may believe: the filter inside the environment, followed from outside in reduced order."""
+"""What an injection policy may believe: the filter inside the environment, followed from outside in
+reduced order."""
 
 from __future__ import annotations
 
@@ -19,16 +20,19 @@ if TYPE_CHECKING:
 DOUBTFUL = 0.3
 """`Belief.doubt` from which on an electrode is taken for broken."""
 FORGIVEN = 0.8
-"""Part of the doubt after failed injections that is left one step on, if the electrode does not drive."""
+"""Part of the doubt after failed injections that is left one step on, if the electrode does not
+drive."""
 
 
 class Belief:
-    """The covariance of what the environment's filter knows, and what each injection would teach it.
+    """The covariance of what the environment's filter knows, and what each injection would teach
+    it.
 
-    It is made at the first observation of an episode and is shown every later one; all from raw observations. The state
-    is reduced (120 coordinates), in parts of the level, with the mass matrix as the identity: the trace of its
-    covariance is the expected squared error, integrated. Where the flow is estimated too, the mean velocity (m/s) is
-    the state's last entry; s counts all of them.
+    It is made at the first observation of an episode and is shown every later one; all from raw
+    observations. The state is reduced (120 coordinates), in parts of the level, with the mass
+    matrix as the identity: the trace of its covariance is the expected squared error, integrated.
+    Where the flow is estimated too, the mean velocity (m/s) is the state's last entry; s counts all
+    of them.
 
     Parameters
     ----------
@@ -47,17 +51,20 @@ class Belief:
         self._steps: list[tuple[np.ndarray, np.ndarray]] = []
         reading, self._driving = observation["doubt"]
         self.doubt = reading + self._driving
-        """(L,) share of an electrode's recent readings, and of the recent injections it drove, not believed; summed."""
+        """(L,) share of an electrode's recent readings, and of the recent injections it drove, not
+        believed; summed."""
 
     @classmethod
     def beforehand(cls, rules: Rules) -> Belief:
-        """Before any episode: as if a first frame without fault or noise had been measured in the expected liquid."""
+        """Before any episode: as if a first frame without fault or noise had been measured in the
+        expected liquid."""
         frame = rules.world.currents @ levels_of(rules.world).linearised(0).resistance
         return cls(rules, {"frame": frame, "doubt": np.zeros((2, frame.shape[1]))})
 
     @classmethod
     def follow(cls, belief: Belief | None, rules: Rules, observation: Observation) -> Belief:
-        """One more observation: the first of an episode makes a belief, which is then shown the others."""
+        """One more observation: the first of an episode makes a belief, which is then shown the
+        others."""
         if belief is None:
             return cls(rules, observation)
         belief.see(observation)
@@ -66,8 +73,9 @@ class Belief:
     def see(self, observation: Observation) -> None:
         """Take in the outcome of the last injection.
 
-        A failed injection does not say which of its two electrodes is broken. Both are doubted and, if left alone,
-        forgiven: whichever then reads what was predicted is trusted again, and a broken one reads interference.
+        A failed injection does not say which of its two electrodes is broken. Both are doubted and,
+        if left alone, forgiven: whichever then reads what was predicted is trusted again, and a
+        broken one reads interference.
         """
         self._operator.assimilate(observation["voltages"][None], observation["currents"][None])
         self._along, self._steps = None, []
@@ -76,7 +84,8 @@ class Belief:
         self.doubt = reading + self._driving
 
     def told(self, entries: np.ndarray) -> None:
-        """Be shown the truth, by the rest of an episode's recording from the present t on: for bounds only."""
+        """Be shown the truth, by the rest of an episode's recording from the present t on: for
+        bounds only."""
         self._along, self._steps = self._operator.truth(entries), []
 
     @property
@@ -97,8 +106,8 @@ class Belief:
     def predicted(self, covariance: np.ndarray | None = None, ahead: int = 0) -> np.ndarray:
         """(s, s) covariance one step on, before its measurement; from the present one or another.
 
-        ``ahead`` says how many steps from now that other one holds; it matters where the flow is estimated, since what
-        an error of the velocity does depends on what flows.
+        ``ahead`` says how many steps from now that other one holds; it matters where the flow is
+        estimated, since what an error of the velocity does depends on what flows.
         """
         transition, noise = self._step(ahead)
         now = self._operator.covariance[0].astype(float) if covariance is None else covariance
@@ -117,8 +126,9 @@ class Belief:
         return float(covariance.trace() if weight is None else (weight * covariance).sum())
 
     def foresight(self, steps: int, ahead: int = 0) -> np.ndarray:
-        """(s, s) weight of errors at the next measurement (the first after ``ahead`` more steps) by all that they will
-        do: the flow carries them, and the squared errors over what counts are summed over this and so many steps more.
+        """(s, s) weight of errors at the next measurement (the first after ``ahead`` more steps) by
+        all that they will do: the flow carries them, and the squared errors over what counts are
+        summed over this and so many steps more.
         """
         first = self._operator.weight
         weight = total = np.eye(len(self._step(ahead)[0])) if first is None else first
@@ -131,11 +141,12 @@ class Belief:
 
     def gains(self, covariance: np.ndarray, sound: np.ndarray | None = None, derivative: np.ndarray | None = None,
               weight: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """What each pair would teach about a state with this covariance: `pair_gains`, (pairs,) each.
+        """What each pair would teach about a state with this covariance: `pair_gains`, (pairs,)
+        each.
 
-        Of electrodes that are not ``sound`` no reading counts, and pairs with one of them teach nothing. ``derivative``
-        is that about the level, or another, such as `relinearised`. ``weight`` is that of present errors over what
-        counts, or another, such as `foresight`.
+        Of electrodes that are not ``sound`` no reading counts, and pairs with one of them teach
+        nothing. ``derivative`` is that about the level, or another, such as `relinearised`.
+        ``weight`` is that of present errors over what counts, or another, such as `foresight`.
         """
         L = self.rules.pairs.max() + 1
         D = (self.derivative if derivative is None else derivative).reshape(L * L, -1)
@@ -166,9 +177,11 @@ class Belief:
         return covariance - learnt.T @ learnt
 
     def look_ahead(self, depth: int, width: int, sound: np.ndarray | None = None) -> int:
-        """First pair of the plan of ``depth`` injections with the least sum of variances, by beam search.
+        """First pair of the plan of ``depth`` injections with the least sum of variances, by beam
+        search.
 
-        Each of the best ``width`` plans grows by the ``width`` pairs that teach most; only ``sound`` electrodes count.
+        Each of the best ``width`` plans grows by the ``width`` pairs that teach most; only
+        ``sound`` electrodes count.
         """
         beam: list[tuple[float, int | None, np.ndarray | None]] = [(0.0, None, None)]
         for ahead in range(depth):
@@ -194,7 +207,7 @@ class Belief:
     def relinearised(self) -> np.ndarray:
         """(L, L, s) of 𝓡 by the state, about the present estimate; some 10 ms."""
         levels = levels_of(self.rules.world)
-        positive = np.maximum(self.mean, 0.1 * self._operator.concentration[0])     # a conductivity is
+        positive = np.maximum(self.mean, 0.1 * self._operator.concentration[0])  # a conductivity is
         _, table = levels.task.observation.resistance_derivatives(positive)
         return self._with_flow(self._operator.concentration[0] * np.tensordot(table, self._operator.basis, axes=(0, 0)))
 

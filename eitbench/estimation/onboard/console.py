@@ -1,4 +1,5 @@
-"""What an operator sees of the estimator: its innovations, its estimate on a coarse grid, doubts about electrodes."""
+"""What an operator sees of the estimator: its innovations, its estimate on a coarse grid, doubts
+about electrodes."""
 
 from __future__ import annotations
 
@@ -34,7 +35,8 @@ class Console:
     def take_in(self, voltages: np.ndarray, currents: np.ndarray) -> None:
         """One time step on, with voltages (B, L) in V for currents (B, L) in A (A/m in 2D)."""
         self._innovations, believed = self.operator.assimilate(voltages, currents)
-        # Of each electrode: how often lately its own reading was not believed, and the injections that it drove.
+        # Of each electrode: how often lately its own reading was not believed, and the injections
+        # that it drove.
         reading, driving = self._doubt[:, 0], self._doubt[:, 1]
         injected, drives = currents.any(axis=1, keepdims=True), currents != 0.0
         failed = ~believed.any(axis=1, keepdims=True)
@@ -43,7 +45,8 @@ class Console:
         driving += DOUBT * drives * (failed - driving)
 
     def shown(self) -> Observation:
-        """Arrays (B, …): innovations, mean, std, doubt, and where the flow is estimated its velocity and that's std."""
+        """Arrays (B, …): innovations, mean, std, doubt, and where the flow is estimated its
+        velocity and that's std."""
         mean, std = self.operator.grid()
         seen = {"innovations": self._innovations.copy(), "mean": mean, "std": std, "doubt": self._doubt.copy()}
         if (flow := self.operator.flow()) is not None:

@@ -1,8 +1,10 @@
-"""The estimators inside an injection environment where the flow is unknown: concentration and mean velocity together.
+"""The estimators inside an injection environment where the flow is unknown: concentration and mean
+velocity together.
 
-Both are the joint extended Kalman filter of `baselines/joint_extended_kalman_filter.py`, but for two things. Voltages
-are linearised about the level of the first frame, as in the other injection environments, not about each estimate. And
-the velocity is kept within narrower bounds, so that a table of few velocities serves the one of reduced order.
+Both are the joint extended Kalman filter of `baselines/joint_extended_kalman_filter.py`, but for
+two things. Voltages are linearised about the level of the first frame, as in the other injection
+environments, not about each estimate. And the velocity is kept within narrower bounds, so that a
+table of few velocities serves the one of reduced order.
 """
 
 from __future__ import annotations
@@ -34,7 +36,8 @@ LEARNING = (0.6, 1.0, 1.4)
 
 
 class JointFullOperator(FullOperator):
-    """Joint extended Kalman filters with their exact covariance, some 0.15 s a step each: what scored runs use."""
+    """Joint extended Kalman filters with their exact covariance, some 0.15 s a step each: what
+    scored runs use."""
 
     def _start(self, episodes: int) -> list[Any]:
         task = self._shared.task
@@ -153,7 +156,8 @@ def _make_model(world: World) -> JointModel:
     nodal = task.evolution.state_noise_covariance(0.0, prior.nodal_std**2)
 
     def step(part: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """F, Y and Γ_w at a velocity; of the noise the nodal part stays what it is at first, as in `JointFilter`."""
+        """F, Y and Γ_w at a velocity; of the noise the nodal part stays what it is at first, as in
+        `JointFilter`."""
         F, Y = task.transport_at(np.array([part * flow.nominal[0]])).transition()
         return F, Y, prior.inflow_std**2 * (Y @ Y.T) + nodal
 

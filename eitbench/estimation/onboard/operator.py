@@ -1,7 +1,8 @@
-"""What the estimators inside injection environments have in common: levels, linearisation, patches; and the full one.
+"""What the estimators inside injection environments have in common: levels, linearisation, patches;
+and the full one.
 
-`eitbench.estimation.onboard.reduced_operator` holds the one of reduced order, which training runs on, and
-`eitbench.estimation.onboard.joint_operator` those for a flow that is to be estimated too.
+`eitbench.estimation.onboard.reduced_operator` holds the one of reduced order, which training runs
+on, and `eitbench.estimation.onboard.joint_operator` those for a flow that is to be estimated too.
 """
 
 from __future__ import annotations
@@ -28,8 +29,8 @@ LEVEL_STEP = 0.02
 LEVELS = np.arange(-50, 51)
 """Numbers of steps from the expected concentration: from a third of it to three times as much."""
 BROKEN = 30.0
-"""Standard deviations from a homogeneous liquid's voltage beyond which a reading says nothing of the level, where
-the instrument may be faulty."""
+"""Standard deviations from a homogeneous liquid's voltage beyond which a reading says nothing of
+the level, where the instrument may be faulty."""
 
 
 def electrode_pairs(n_electrodes: int) -> np.ndarray:
@@ -47,8 +48,8 @@ def pair_currents(world: World) -> np.ndarray:
 
 
 class Operator(Protocol):
-    """Estimators of B episodes. The parameters are those of Table 5.1, as in the Kalman filter baseline, with the ĉ_bh
-    of the first frame, in which they start from t = 0."""
+    """Estimators of B episodes. The parameters are those of Table 5.1, as in the Kalman filter
+    baseline, with the ĉ_bh of the first frame, in which they start from t = 0."""
 
     concentration: np.ndarray
     """(B,) ĉ_bh in mol/m³"""
@@ -58,8 +59,9 @@ class Operator(Protocol):
         ...
 
     def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """One time step on, with voltages (B, L) in V for currents (B, L), all zero where nothing was injected; returns
-        the innovations in predicted standard deviations and which readings were believed, both (B, L)."""
+        """One time step on, with voltages (B, L) in V for currents (B, L), all zero where nothing
+        was injected; returns the innovations in predicted standard deviations and which readings
+        were believed, both (B, L)."""
         ...
 
     def grid(self) -> tuple[np.ndarray, np.ndarray]:
@@ -67,7 +69,8 @@ class Operator(Protocol):
         ...
 
     def errors(self, moments: np.ndarray, deviations: np.ndarray, squares: np.ndarray) -> np.ndarray:
-        """Relative errors (5.12) of the present means, from what `project` makes of recorded moments (B, …)."""
+        """Relative errors (5.12) of the present means, from what `project` makes of recorded
+        moments (B, …)."""
         ...
 
     def means(self) -> np.ndarray:
@@ -79,12 +82,14 @@ class Operator(Protocol):
         ...
 
     def flow(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """Velocity parameters θ and their standard deviations (B, k) in m/s, None where the flow is taken as known."""
+        """Velocity parameters θ and their standard deviations (B, k) in m/s, None where the flow is
+        taken as known."""
         ...
 
     @staticmethod
     def project(world: World, moment: np.ndarray) -> np.ndarray:
-        """Moments over what counts (T, n), see `eitbench.data.regions.integrals`, as `errors` wants them."""
+        """Moments over what counts (T, n), see `eitbench.data.regions.integrals`, as `errors` wants
+        them."""
         ...
 
 
@@ -99,7 +104,8 @@ class Linearisation(NamedTuple):
     """(L, L, k) of 𝓡 by the state"""
 
     def observe(self, currents: np.ndarray, noise_std: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Computed voltages (L,), their noise (L,) and their derivatives (L, k) in parts of the noise.
+        """Computed voltages (L,), their noise (L,) and their derivatives (L, k) in parts of the
+        noise.
 
         Without a current the reading says nothing.
         """
@@ -122,18 +128,21 @@ class Levels:
         homogeneous = np.repeat(levels[:, None], self.task.mesh.n_nodes, axis=1)
         self._homogeneous = world.currents @ self.task.observation.transfer_resistance(homogeneous)
         self.linearised = lru_cache(maxsize=64)(self._linearised)
-        """number of a level -> (its concentration, 𝓡, derivatives (L, L, n) by the state); the last 64 are kept"""
+        """number of a level -> (its concentration, 𝓡, derivatives (L, L, n) by the state); the last
+        64 are kept"""
 
     def best(self, frame: np.ndarray, broken: float) -> int:
-        """Number of the level that fits the voltages (K, L) best, weighted as in `best_homogeneous`; readings further
-        than ``broken`` standard deviations away count as that far."""
+        """Number of the level that fits the voltages (K, L) best, weighted as in
+        `best_homogeneous`; readings further than ``broken`` standard deviations away count as that
+        far."""
         off = (frame - self._homogeneous) / self.world.noise.std(frame if math.isinf(broken) else self._homogeneous)
         return int(LEVELS[np.argmin(np.minimum(off**2, broken**2).sum(axis=(1, 2)))])
 
     def noise_std(self, computed: np.ndarray, floor: float) -> np.ndarray:
         """What the estimators take for the noise (V) of computed voltages (L,).
 
-        Readings near zero may have next to no noise; what the model leaves out would then count for knowledge.
+        Readings near zero may have next to no noise; what the model leaves out would then count for
+        knowledge.
         """
         return np.hypot(np.maximum(self.world.noise.std(computed), 1e-3 * np.abs(computed).max()), floor)
 
@@ -178,7 +187,8 @@ class FullOperator:
                 continue
             std = self._shared.noise_std(currents[b] @ level.resistance, self._floor)
             computed, std, matrix = level.observe(currents[b], std)
-            value = (voltages[b] - computed) / std + matrix.sum(axis=1)      # the state is 1 where nothing deviates
+            # the state is 1 where nothing deviates
+            value = (voltages[b] - computed) / std + matrix.sum(axis=1)
             innovations[b], kept[b] = gated_update(filter_, Observation(matrix, value, np.ones(len(value))), self._gate)
         return innovations, kept
 
@@ -187,7 +197,8 @@ class FullOperator:
         return self._patch_means(), self.concentration[:, None] * spread
 
     def _patch_means(self) -> np.ndarray:
-        # Episode by episode: the bits of one product of matrices would depend on how many play side by side.
+        # Episode by episode: the bits of one product of matrices would depend on how many play side
+        # by side.
         return (self._patches @ self.means()[..., None])[..., 0]
 
     def errors(self, moments: np.ndarray, deviations: np.ndarray, squares: np.ndarray) -> np.ndarray:
@@ -209,8 +220,8 @@ class FullOperator:
 
 
 def patch_averages(mesh: Mesh, grid: tuple[int, int]) -> np.ndarray:
-    """(patches, n) averages over the boxes of a grid, so many along x and y, x first; a node counts by its share of the
-    mass matrix. ``ValueError`` if there is a box without a node."""
+    """(patches, n) averages over the boxes of a grid, so many along x and y, x first; a node counts
+    by its share of the mass matrix. ``ValueError`` if there is a box without a node."""
     from eitbench.numerics.fem import mass_matrix
     points = mesh.points[:, :2]
     low = points.min(axis=0)

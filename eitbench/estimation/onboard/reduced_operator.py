@@ -1,4 +1,5 @@
-"""The estimator inside an injection environment in reduced order, for many episodes at once: what training runs on."""
+"""The estimator inside an injection environment in reduced order, for many episodes at once: what
+training runs on."""
 
 from __future__ import annotations
 
@@ -28,7 +29,8 @@ Model = TypeVar("Model")
 
 
 class ReducedOperator:
-    """Kalman filters whose injections differ, in single precision, which halves the time; see `Operator`."""
+    """Kalman filters whose injections differ, in single precision, which halves the time; see
+    `Operator`."""
 
     def __init__(self, world: World, frames: np.ndarray, *, gate: float, noise_floor: float) -> None:
         self._shared = shared = self._share(world)
@@ -76,21 +78,23 @@ class ReducedOperator:
         return self._filter.covariance
 
     def steps(self, count: int, along: np.ndarray | None = None) -> list[tuple[np.ndarray, np.ndarray]]:
-        """How the first episode's deviations move in the next ``count`` steps, and their noise, (s, s) each; where that
-        depends on the state itself, about what is predicted or ``along`` (count, s), the states before each step."""
+        """How the first episode's deviations move in the next ``count`` steps, and their noise, (s,
+        s) each; where that depends on the state itself, about what is predicted or ``along``
+        (count, s), the states before each step."""
         model = self._shared.model
         return [(model.transition, model.noise)] * count
 
     @property
     def weight(self) -> np.ndarray | None:
-        """(s, s) W, with which tr(W P) is the expected squared error, integrated over what counts; None: identity."""
+        """(s, s) W, with which tr(W P) is the expected squared error, integrated over what counts;
+        None: identity."""
         return None if self._shared.world.region is None else self._shared.mass[1:, 1:]
 
     def truth(self, entries: np.ndarray) -> np.ndarray:
         """(T, s) what is estimated in the first episode, from its recording: for bounds only."""
         shared, level = self._shared, self.concentration[0]
         mass = outline(shared.world).mass
-        whole = 0.5 * (mass.sum(axis=0) + mass.sum(axis=1))                                 # ∫ of each node's function
+        whole = 0.5 * (mass.sum(axis=0) + mass.sum(axis=1))  # ∫ of each node's function
         beyond = (shared.background - level) * whole + entries["moment"]
         return np.asarray(beyond @ self.basis / level)
 
@@ -162,7 +166,8 @@ def _stored_model(world: World) -> ReducedModel:
 
 
 def stored_model(world: World, name: str, kind: type[Model], make: Callable[[], Model]) -> Model:
-    """A model, a named tuple of arrays, from the cache if one of this name is there; else it is made and kept."""
+    """A model, a named tuple of arrays, from the cache if one of this name is there; else it is
+    made and kept."""
     code = code_digest(package_files("estimation/*.py", "estimation/onboard/*operator.py", "worlds/task.py"))
     whose = hashlib.sha256(f"{code} {store.described(world.sound)}".encode()).hexdigest()
     path = store.folder(world) / f"{name}-{whose[:16]}.npz"

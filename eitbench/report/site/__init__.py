@@ -1,7 +1,8 @@
 """The leaderboards as a static site.
 
-Rendered from the records and from what the repository holds: docstrings of environments and methods, our baselines'
-files and checkpoints. The same records and the same checkout give the same bytes.
+Rendered from the records and from what the repository holds: docstrings of environments and
+methods, our baselines' files and checkpoints. The same records and the same checkout give the same
+bytes.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ HERE = Path(__file__).parent
 ASSETS = {"style.css": ("../style.css", "site.css"), "script.js": ("script.js",)}
 """Files that all pages share, and what they are put together from."""
 MEDIA = "*.webp"
-"""Animations beside the records' folder, in ``media/``: named like an environment, as in eitbench-Pipe2D-v0.webp."""
+"""Animations beside the records' folder, in ``media/``: named like an environment, as in
+eitbench-Pipe2D-v0.webp."""
 
 
 def render_site(records: list[dict[str, Any]], table: pd.DataFrame,

@@ -1,4 +1,5 @@
-"""From the table of the boards to what the pages have in common: boards with their rows, names, and addresses."""
+"""From the table of the boards to what the pages have in common: boards with their rows, names, and
+addresses."""
 
 from __future__ import annotations
 
@@ -16,7 +17,7 @@ class Row(NamedTuple):
     """A method on a board."""
 
     cells: dict[str, Any]
-    """Of `boards.FIELDS`; None where there is nothing."""
+    """Of `boards.fields`; None where there is nothing."""
     record: dict[str, Any] | None
     """None in an aggregate."""
     outdated: bool
@@ -98,7 +99,8 @@ def collect(records: list[dict[str, Any]], table: pd.DataFrame) -> Site:
     found: dict[tuple[str, str], list[Row]] = {}
     for generation, rows in enumerate(_generations(records, table)):
         for cells in rows.astype(object).where(rows.notna(), None).to_dict("records"):
-            if generation and cells["environment"] == ALL:           # what is outdated is not put together any more
+            # what is outdated is not put together any more
+            if generation and cells["environment"] == ALL:
                 continue
             board = found.setdefault((cells["class"], cells["environment"]), [])
             record = by_key.get((cells["environment"], cells["method"], cells["version"]))
@@ -113,7 +115,8 @@ def collect(records: list[dict[str, Any]], table: pd.DataFrame) -> Site:
 
 
 def title_of(record: dict[str, Any]) -> str:
-    """Of its environment: the id without the prefix, and what it was given if its name says that it was."""
+    """Of its environment: the id without the prefix, and what it was given if its name says that it
+    was."""
     environment = record["environment"]
     if environment["name"] == environment["id"].replace("/", "-"):
         return environment["id"].removeprefix("eitbench/")
@@ -127,7 +130,8 @@ def method_address(name: str) -> str:
 
 
 def _generations(records: list[dict[str, Any]], table: pd.DataFrame) -> list[pd.DataFrame]:
-    """The table, then one of what is outdated, one of what is older still, and so on: each method in one version."""
+    """The table, then one of what is outdated, one of what is older still, and so on: each method
+    in one version."""
     tables, left = [table], newest(records)[1]
     while left:
         current, older = newest(left)

@@ -44,7 +44,8 @@ def documentation(id: str) -> tuple[Markup, Markup]:
 
 
 def markdown(text: str) -> Markup:
-    """HTML of a text with tables, whose headings come below those of the page; HTML and links in it are mere text."""
+    """HTML of a text with tables, whose headings come below those of the page; HTML and links in it
+    are mere text."""
     reader = MarkdownIt("commonmark", {"html": False}).enable("table").disable(["link", "image", "autolink"])
     tokens = reader.parse(text)
     for token in tokens:
@@ -94,8 +95,8 @@ def _curves(board: Board) -> dict[str, Any] | None:
 
 
 def _told(rows: list[Row]) -> list[Row]:
-    """Whose curves are drawn strongly: all, or of many two floors or references and the best of each kind of those with
-    a rank; agents that differ by their training's seed are of one kind."""
+    """Whose curves are drawn strongly: all, or of many two floors or references and the best of
+    each kind of those with a rank; agents that differ by their training's seed are of one kind."""
     if len(rows) <= MOST:
         return rows
     kinds: dict[str, Row] = {}
@@ -108,9 +109,11 @@ def _told(rows: list[Row]) -> list[Row]:
 
 
 def _duels(board: Board) -> list[tuple[str, list[dict[str, Any] | None]]]:
-    """Name of each method, and how often it is better than each of them, seed by seed; None against itself.
+    """Name of each method, and how often it is better than each of them, seed by seed; None against
+    itself.
 
-    ``share`` in %, ``low`` and ``high`` the ends of its 95 % interval, and whether it ``tells``: 50 % is outside.
+    ``share`` in %, ``low`` and ``high`` the ends of its 95 % interval, and whether it ``tells``: 50
+    % is outside.
     """
     scores = [(row.cells["title"], {board.environment: {e["seed"]: e["scores"]["error"] for e in row.episodes()}})
               for row in board.current]

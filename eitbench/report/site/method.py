@@ -1,4 +1,5 @@
-"""The page of a method: where it stands on every board, what it is, how to play it again, and every episode."""
+"""The page of a method: where it stands on every board, what it is, how to play it again, and every
+episode."""
 
 from __future__ import annotations
 
@@ -17,7 +18,7 @@ from eitbench.bench.baselines import version_of
 from eitbench.bench.records import alike, finished
 from eitbench.bench.text import scores_by_seed, seed_ranges
 from eitbench.report import charts
-from eitbench.report.boards import HEADINGS
+from eitbench.report.boards import headings
 from eitbench.report.site.collect import Board, Row, Site, title_of
 from eitbench.report.site.environment import markdown
 from eitbench.report.site.tables import Cell, Table, interval_cell, scale, three, value_cell
@@ -73,7 +74,7 @@ def _version(records: list[dict[str, Any]], site: Site) -> dict[str, Any]:
 
 def _record(record: dict[str, Any], site: Site) -> dict[str, Any]:
     board, row = next(((board, row) for board in site.boards for row in board.rows if row.record is record),
-                      (None, None))                                  # it played none of the board's episodes
+                      (None, None))  # it played none of the board's episodes
     return {"title": title_of(record), "address": board and board.address, "official": record["official"],
             "outdated": row is not None and row.outdated, "runs": _runs(record), "command": command(record),
             "typed": sorted({run["command"] for run in record["runs"]}),
@@ -82,26 +83,29 @@ def _record(record: dict[str, Any], site: Site) -> dict[str, Any]:
 
 
 def _runs(record: dict[str, Any]) -> list[dict[str, Any]]:
-    """Runs of one code on one machine as one, with ``products``, the times in ms that its processes took for theirs."""
+    """Runs of one code on one machine as one, with ``products``, the times in ms that its processes
+    took for theirs."""
     return [group[0] | {"products": sorted(1000 * run["machine"]["matmul_seconds"] for run in group)}
             for group in alike(record["runs"])]
 
 
 def _episodes(record: dict[str, Any]) -> Table:
     """A row for each episode, with the scores that any of them has."""
-    scores = {name: values for name in ("error", *HEADINGS) if (values := scores_by_seed(record, name))}
+    shown = {"error": "ẽ_c"} | headings()
+    scores = {name: values for name in shown if (values := scores_by_seed(record, name))}
     rows = []
     for i, episode in enumerate(record["episodes"]):
         seed = episode["seed"]
         cells = [value_cell(values.get(seed)) for values in scores.values()]
         rows.append(([Cell(seed, float(i)), Cell(episode["status"], episode["status"]), *cells,
                       Cell(episode["finished"][:10], episode["finished"])], ""))
-    headings = ["ẽ_c" if name == "error" else HEADINGS[name] for name in scores]
-    return Table(f"Episodes of {title_of(record)}", ["seed", "status", *headings, "played on"], rows)
+    return Table(f"Episodes of {title_of(record)}",
+                 ["seed", "status", *(shown[name] for name in scores), "played on"], rows)
 
 
 def command(record: dict[str, Any]) -> str:
-    """What plays the record's episodes again; empty if the environment was given arguments, which no command takes.
+    """What plays the record's episodes again; empty if the environment was given arguments, which
+    no command takes.
 
     A file is named as it was when they were played.
     """
@@ -113,9 +117,11 @@ def command(record: dict[str, Any]) -> str:
 
 
 def _argument(record: dict[str, Any]) -> str:
-    """The name of a method, or the path that was typed for it, without the folders of whoever typed it.
+    """The name of a method, or the path that was typed for it, without the folders of whoever typed
+    it.
 
-    An agent's name says nothing of its file: where it is none of ours, the path is left to the reader.
+    An agent's name says nothing of its file: where it is none of ours, the path is left to the
+    reader.
     """
     for run in record["runs"]:
         try:

@@ -10,13 +10,14 @@ from markupsafe import Markup
 
 from eitbench.bench.text import number, with_interval
 from eitbench.report import charts
-from eitbench.report.boards import HEADINGS, MORE
+from eitbench.report.boards import headings, meanings
 from eitbench.report.site.collect import Board, Row, method_address
 
 COMPACT = ("seconds_per_step", "peak_memory")
 """Beside ranks and intervals in the index; the page of an environment has all columns."""
 WORST_GAIN = -1.0
-"""Where the drawn axis of gains ends: a method twice as bad as the floor; numbers say how much worse it is."""
+"""Where the drawn axis of gains ends: a method twice as bad as the floor; numbers say how much
+worse it is."""
 SCALES = {"error": ("ẽ_c", True), "gain": ("gain", False)}
 """Scores with intervals: heading, and whether the axis is logarithmic."""
 
@@ -40,7 +41,8 @@ class Table(NamedTuple):
 
     @property
     def kinds(self) -> list[str]:
-        """Of each column, for the style sheet: with ``drawn`` intervals, of ``words``, or of numbers."""
+        """Of each column, for the style sheet: with ``drawn`` intervals, of ``words``, or of
+        numbers."""
         columns = [[cells[i] for cells, _ in self.rows] for i in range(len(self.headings))]
         return ["drawn" if any(cell.picture for cell in column)
                 else "words" if any(isinstance(cell.value, str) for cell in column) else "" for column in columns]
@@ -48,7 +50,7 @@ class Table(NamedTuple):
 
 def table(board: Board, root: str, *, compact: bool) -> Table:
     """A board; ``root`` leads from the page to the site's folder."""
-    scores = [name for name in HEADINGS if not compact or name in COMPACT]
+    scores = [name for name in headings() if not compact or name in COMPACT]
     drawn = {name: scale(board, name) for name in SCALES}
     shared = Counter(row.cells["rank"] for row in board.rows)
     columns: list[tuple[str, list[Cell]]] = [
@@ -57,7 +59,7 @@ def table(board: Board, root: str, *, compact: bool) -> Table:
         *((heading, [interval_cell(row, name, drawn[name]) for row in board.rows])
           for name, (heading, _) in SCALES.items()),
         ("by", [_plain("official" if row.cells["official"] else "self-reported") for row in board.rows]),
-        *((HEADINGS[name], [value_cell(row.cells[name]) for row in board.rows]) for name in scores)]
+        *((headings()[name], [value_cell(row.cells[name]) for row in board.rows]) for name in scores)]
     columns = [(heading, cells) for heading, cells in columns
                if heading == "rank" or any(cell.text != "–" for cell in cells)]
     return Table(board.title, [heading for heading, _ in columns],
@@ -67,7 +69,7 @@ def table(board: Board, root: str, *, compact: bool) -> Table:
 def explanations(tables: list[Table]) -> dict[str, str]:
     """Heading -> what it says, of those that are there."""
     shown = {heading for each in tables for heading in each.headings}
-    return {heading: text for heading, text in MORE.items() if heading in shown}
+    return {heading: text for heading, text in meanings().items() if heading in shown}
 
 
 def scale(board: Board, name: str) -> tuple[float, float]:

@@ -1,0 +1,251 @@
+"""Scores: what each is called, its unit, which way is better, what it needs, and how it follows
+from an episode. A new one is one `Score`, registered; records, tables, CSV, pages and `compare`
+have it then.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib.metadata import entry_points
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from eitbench import _check, scoring
+from eitbench.worlds.world import World
+
+GROUP = "eitbench.scores"
+"""Entry points of installed packages: each names a module that registers scores."""
+TRACKS = ("estimation", "injection")
+BETTER = ("lower", "higher", "nominal", "none")
+"""Which way is better: less, more, nearer to ``nominal``; or it is no matter of good and bad."""
+
+
+class Claims(NamedTuple):
+    """What a method said of its own uncertainty: mean and standard deviation beside the truth."""
+
+    mean: np.ndarray
+    """(S, m) mol/m³"""
+    std: np.ndarray
+    """(S, m) mol/m³"""
+    truth: np.ndarray
+    """(S, m) mol/m³"""
+    weights: np.ndarray
+    """(m,) m² (m³ in 3D) of each node"""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What can be scored of an episode: S scored states at the m nodes of the truth's mesh. What an
+    episode or a track does not have is None."""
+
+    world: World
+    seconds_per_step: float
+    """s, of the method on one core"""
+    errors: np.ndarray
+    """(S,) ẽ_c (5.12) of each state"""
+    spent: int | None = None
+    """injections that a policy made"""
+    mean: np.ndarray | None = None
+    """(S, m) mol/m³"""
+    truth: np.ndarray | None = None
+    """(S, m) mol/m³"""
+    mass: Any = None
+    """(m, m) sparse, m² (m³ in 3D): of what counts"""
+    points: np.ndarray | None = None
+    """(m, d) m"""
+    homogeneous: float | None = None
+    """mol/m³, the one level that fits all measurements best"""
+    measured: np.ndarray | None = None
+    """(S, L) V"""
+    computed: np.ndarray | None = None
+    """(S, L) V that the model computes of the estimates"""
+    innovations: tuple[np.ndarray, np.ndarray] | None = None
+    """(K, L) V and their covariances (K, L, L) V², where claimed"""
+    claims: Claims | None = None
+    """where every scored state has a variance"""
+    velocity: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+    """(S, p) estimated and true m/s, and weights (p,), where the flow is asked for"""
+
+    @property
+    def weights(self) -> np.ndarray:
+        """(m,) area (volume in 3D) that each node stands for."""
+        return np.asarray(self.mass.sum(axis=0)).ravel()
+
+
+@dataclass(frozen=True)
+class Score:
+    """A number that an episode is judged by.
+
+    Parameters
+    ----------
+    name : str
+        As records and CSV have it: lower-case letters, digits, underscores.
+    heading : str
+        Of its column.
+    explanation : str
+        What it says, its unit among it, for readers of a table.
+    of : callable
+        Outcome -> number, or None where it means nothing.
+    better : str
+        One of `BETTER`.
+    nominal : float
+        The best value, where ``better`` is ``nominal``.
+    needs : sequence of str
+        Fields of `Outcome` without which the score is None.
+    tracks : sequence of str
+        Among `TRACKS`.
+    factor : float
+        What it is multiplied by where it is shown: 1e3 for seconds in ms.
+    everywhere : bool
+        Whether tables show its column if nobody has it.
+    repeats : bool
+        Whether the same episode gives the same number: times do not.
+
+    Raises
+    ------
+    ValueError
+        If one of these is not as it must be.
+    """
+
+    name: str
+    heading: str
+    explanation: str
+    of: Callable[[Any], float | None]
+    better: str = "lower"
+    nominal: float = 0.0
+    needs: Sequence[str] = ()
+    tracks: Sequence[str] = ("estimation",)
+    factor: float = 1.0
+    everywhere: bool = False
+    repeats: bool = True
+
+    def __post_init__(self) -> None:
+        if not self.name.isidentifier() or self.name != self.name.lower() or self.name[0] == "_":
+            raise ValueError("name must be of lower-case letters, digits and underscores, got "
+                             f"{self.name!r}")
+        if self.better not in BETTER:
+            raise ValueError(f"better must be one of {', '.join(BETTER)}, got {self.better!r}")
+        for argument, given, known in (("needs", self.needs, Outcome.__dataclass_fields__),
+                                       ("tracks", self.tracks, TRACKS)):
+            if unknown := [each for each in given if each not in known]:
+                raise ValueError(f"{argument} must be among {', '.join(known)}; got "
+                                 f"{', '.join(map(repr, unknown))}")
+        _check.number("factor", self.factor, low=0.0, open_low=True)
+
+    def __call__(self, outcome: Outcome) -> float | None:
+        """The score of an episode, None where it lacks what the score needs, or that means nothing.
+
+        Raises
+        ------
+        ValueError
+            If what comes out is no finite number.
+        """
+        if any(getattr(outcome, need) is None for need in self.needs):
+            return None
+        value = self.of(outcome)
+        if value is None:
+            return None
+        _check.number(f"score {self.name}", float(value))
+        return float(value)
+
+
+_scores: dict[str, Score] = {}
+
+
+def register_score(score: Score) -> Score:
+    """Let a score be among those of every episode that is played from now on.
+
+    Raises
+    ------
+    ValueError
+        If another has its name or heading.
+    """
+    for other in _scores.values():
+        if other.name == score.name or other.heading == score.heading:
+            raise ValueError(f"score {score.name} ({score.heading}) has the name or heading of "
+                             f"another, {other.name} ({other.heading})")
+    _scores[score.name] = score
+    return score
+
+
+def scores(track: str | None = None) -> dict[str, Score]:
+    """All of one track, or of both, by name, in the order of tables: ours, then those of installed
+    packages and those registered by hand."""
+    _load_installed()
+    return {name: each for name, each in _scores.items() if track is None or track in each.tracks}
+
+
+@lru_cache(maxsize=1)
+def _load_installed() -> None:
+    for point in entry_points(group=GROUP):
+        try:
+            point.load()
+        except Exception as error:          # somebody else's package must not break ours
+            warnings.warn(f"scores of {point.value} are left out: {type(error).__name__}: {error}",
+                          stacklevel=2)
+
+
+def scored(track: str, outcome: Outcome) -> dict[str, float | None]:
+    """Name -> what each score of a track says of an episode."""
+    return {name: each(outcome) for name, each in scores(track).items()}
+
+
+def _contrast(outcome: Any) -> float:
+    return scoring.relative_error(outcome.mean, outcome.truth, outcome.mass,
+                                  reference=outcome.homogeneous)
+
+
+def _of_velocity(outcome: Any) -> float:
+    estimated, true, weights = outcome.velocity
+    return scoring.relative_error(estimated, true, np.diag(weights))
+
+
+def _coverage(level: float) -> Callable[[Any], float]:
+    def of(outcome: Any) -> float:
+        mean, std, truth, weights = outcome.claims
+        return scoring.coverage(mean, std, truth, weights, level)
+
+    return of
+
+
+for _score in (
+    Score("error", "ẽ_c",
+          "relative estimation error (5.12), ± half the 95 % confidence interval over seeds; lower "
+          "is better",
+          lambda outcome: outcome.errors.mean(), tracks=TRACKS, everywhere=True),
+    Score("contrast_error", "contrast",
+          "error relative to the deviation from the homogeneous estimate; 1 is no better than that",
+          _contrast, needs=("mean", "truth"), everywhere=True),
+    Score("nis", "NIS/m",
+          "normalised innovation squared; 1 when the filter's own uncertainty fits",
+          lambda outcome: scoring.normalised_innovations(*outcome.innovations).mean(),
+          better="nominal", nominal=1.0, needs=("innovations",), everywhere=True),
+    Score("crps", "CRPS", "continuous ranked probability score, mol/m³",
+          lambda outcome: scoring.crps(*outcome.claims), needs=("claims",), everywhere=True),
+    Score("velocity_error", "ẽ_v",
+          "relative error of the flow, ∫(v̂ − v)²/∫v² across the pipe, where it is asked for too",
+          _of_velocity, needs=("velocity",)),
+    Score("coverage_50", "50 %", "part of the truth inside the claimed 50 % interval",
+          _coverage(0.5), better="nominal", nominal=0.5, needs=("claims",), everywhere=True),
+    Score("coverage_90", "90 %", "part of the truth inside the claimed 90 % interval",
+          _coverage(0.9), better="nominal", nominal=0.9, needs=("claims",), everywhere=True),
+    Score("spread_ratio", "var/MSE",
+          "claimed variance over squared error; 1 is honest, more is too modest",
+          lambda outcome: scoring.spread_ratio(*outcome.claims),
+          better="nominal", nominal=1.0, needs=("claims",), everywhere=True),
+    Score("voltage_discrepancy", "ẽ_V", "voltage discrepancy (5.13), mV²; a diagnostic",
+          lambda outcome: scoring.voltage_discrepancy(outcome.measured, outcome.computed),
+          better="none", needs=("measured", "computed"), factor=1e6, everywhere=True),
+    Score("spent", "injections", "how many the policy made, where it is asked for them",
+          lambda outcome: outcome.spent, better="none", needs=("spent",), tracks=("injection",)),
+    Score("seconds_per_step", "ms/step",
+          "time per injection on one core, in the fastest episode: what is done once for a model is "
+          "left apart",
+          lambda outcome: outcome.seconds_per_step, tracks=TRACKS, factor=1e3, everywhere=True,
+          repeats=False),
+):
+    register_score(_score)
