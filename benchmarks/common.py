@@ -1,6 +1,8 @@
-"""The frame of the speed benchmarks: timing, rows of the tables, and what this machine can do at best.
+"""The frame of the speed benchmarks: timing, rows of the tables, and what this machine can do at
+best.
 
-All times are the fastest of several calls: on a machine that others use too, the minimum is what repeats.
+All times are the fastest of several calls: on a machine that others use too, the minimum is what
+repeats.
 """
 
 from __future__ import annotations
@@ -30,13 +32,14 @@ sys.path.append(str(Path(__file__).parents[1] / "tests"))      # `references` is
 
 Work = Callable[[], object]
 
-ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1",
+ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OMP_NUM_THREADS": "1",
+              "NUMBA_NUM_THREADS": "1",
               "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
               "NPROC": "1", "JAX_PLATFORMS": "cpu"}
 """Environment of every measurement; the libraries read it when they are loaded."""
 
 
-# -- timing -----------------------------------------------------------------------------------------------------------
+# -- timing ----------------------------------------------------------------------------------------
 
 
 def best_of(work: Work, repeats: int = 5) -> float:
@@ -44,12 +47,14 @@ def best_of(work: Work, repeats: int = 5) -> float:
     return compare({"": work}, repeats)[""]
 
 
-def compare(candidates: dict[str, Work], rounds: int = 7, *, warm_up: bool = True, turn: float = 0.02
+def compare(candidates: dict[str, Work], rounds: int = 7, *, warm_up: bool = True,
+            turn: float = 0.02
             ) -> dict[str, float]:
     """Seconds of the fastest call of each candidate.
 
-    They take turns, so that a machine that changes its pace does so for all; a turn is one call, or as many as fit
-    into ``turn`` seconds. ``warm_up=False`` saves the first call, which is not counted, where a call takes very long.
+    They take turns, so that a machine that changes its pace does so for all; a turn is one call, or
+    as many as fit into ``turn`` seconds. ``warm_up=False`` saves the first call, which is not
+    counted, where a call takes very long.
     """
     if warm_up:
         for work in candidates.values():
@@ -76,12 +81,13 @@ def in_fresh_process(function: Callable[..., Any], *arguments: Any) -> Any:
 
 
 def peak_growth(work: Work) -> float:
-    """Bytes by which the resident memory of this process rises at most while ``work`` runs (Linux with glibc).
+    """Bytes by which the resident memory of this process rises at most while ``work`` runs (Linux
+    with glibc).
 
     `resource.getrusage` would count what the process that started this one had in memory.
     """
     gc.collect()
-    ctypes.CDLL(None).malloc_trim(0)                     # what was freed before must not be used unseen
+    ctypes.CDLL(None).malloc_trim(0)                 # what was freed before must not be used unseen
     Path("/proc/self/clear_refs").write_text("5")        # the peak starts anew from here
     before = _status("VmRSS")
     work()
@@ -94,7 +100,7 @@ def _status(name: str) -> float:
     return 1024.0 * int(found[1])
 
 
-# -- rows -------------------------------------------------------------------------------------------------------------
+# -- rows ------------------------------------------------------------------------------------------
 
 
 @dataclass
@@ -111,7 +117,8 @@ class Row:
     reference: float | None
     """None: there is none, or the peer is not installed"""
     target: str = ""
-    """of the ratio, such as "≤ 1.6×", "≤ 1/3" or "≥ 5× faster", or of ours: "≤ 0.5 s", "≥ 60,000/s" """
+    """of the ratio, such as "≤ 1.6×", "≤ 1/3" or "≥ 5× faster", or of ours: "≤ 0.5 s", "≥ 60,000/s"
+    """
     limit: str = ""
     """what limits us: flops, bytes, Python overhead"""
     ceiling: str = ""
@@ -135,12 +142,14 @@ class Row:
 
     @property
     def met(self) -> bool | None:
-        """Whether the target was met; None without one, or without the reference that it speaks of."""
+        """Whether the target was met; None without one, or without the reference that it speaks
+        of."""
         if not self.target:
             return None
         parsed = re.fullmatch(r"([≤≥]) (\d[\d.,]*(?:/\d+)?)(×|× faster| s|/s|)", self.target)
         if parsed is None:
-            raise ValueError("target must read like '≤ 1.6×', '≤ 1/3', '≥ 5× faster', '≤ 0.5 s' or '≥ 60,000/s', "
+            raise ValueError("target must read like '≤ 1.6×', '≤ 1/3', '≥ 5× faster', '≤ 0.5 s' or "
+                             "'≥ 60,000/s', "
                              f"got {self.target!r}")
         sense, number, kind = parsed.groups()
         if kind in (" s", "/s"):
@@ -180,7 +189,7 @@ def peer(package: str) -> str:
         return f"{package} (not installed)"
 
 
-# -- the machine ------------------------------------------------------------------------------------------------------
+# -- the machine -----------------------------------------------------------------------------------
 
 
 class Ceilings(NamedTuple):
@@ -228,8 +237,11 @@ def machine() -> dict[str, str]:
     cpuinfo = Path("/proc/cpuinfo")
     model = re.search(r"model name\s*:\s*(.+)", cpuinfo.read_text()) if cpuinfo.exists() else None
     forced = " as OPENBLAS_CORETYPE says" if os.environ.get("OPENBLAS_CORETYPE") else ""
-    blas = {f"{library['internal_api']} {library['version']}, {library.get('architecture', '?')} kernels{forced}, "
-            f"{library['num_threads']} thread" for library in threadpool_info() if library["user_api"] == "blas"}
-    return {"CPU": model[1] if model else platform.processor() or platform.machine(), "cores": str(os.cpu_count()),
+    blas = {f"{library['internal_api']} {library['version']}, {library.get('architecture', '?')} "
+            f"kernels{forced}, "
+            f"{library['num_threads']} thread" for library in threadpool_info()
+            if library["user_api"] == "blas"}
+    return {"CPU": model[1] if model else platform.processor() or platform.machine(),
+            "cores": str(os.cpu_count()),
             "Python": platform.python_version(), "BLAS": "; ".join(sorted(blas)),
             **{name: peer(name).split(" ", 1)[1] for name in ("numpy", "scipy", "numba")}}

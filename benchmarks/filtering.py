@@ -1,8 +1,9 @@
 """Speed of the Kalman filter and smoother: `python benchmarks/run.py filtering`.
 
-The pipe of `Pipe2D` on three meshes, the injections taking turns. All candidates begin with the same mean and
-covariance after 60 steps, when the rank of what our filter knows has settled, and see the same record. Peers without
-an input term are given deviations from the homogeneous estimate, which the flow leaves as it is.
+The pipe of `Pipe2D` on three meshes, the injections taking turns. All candidates begin with the
+same mean and covariance after 60 steps, when the rank of what our filter knows has settled, and see
+the same record. Peers without an input term are given deviations from the homogeneous estimate,
+which the flow leaves as it is.
 """
 
 from __future__ import annotations
@@ -16,17 +17,24 @@ from dataclasses import dataclass
 import numpy as np
 from common import Row, compare, in_fresh_process, of_flops, peak_growth, peer, quantity
 
-from eitbench.estimation.kalman import KalmanFilter, LinearisedObservations, Observation, kalman_filter
+from eitbench.estimation.kalman import (
+    KalmanFilter,
+    LinearisedObservations,
+    Observation,
+    kalman_filter,
+)
 from eitbench.estimation.parameters import table_5_1
 from eitbench.estimation.smoother import _backwards, fixed_interval_smoother
-from eitbench.physics.flow import PlaneChannelFlow
-from eitbench.worlds import Pipe2D
+from eitbench.numerics.mesh import rectangle_mesh
+from eitbench.physics.observation import ObservationModel
+from eitbench.physics.transport import ConvectionDiffusion
+from eitbench.worlds.pipe2d import PIPE_2D
+from eitbench.worlds.world import Discretisation
 
 CELLS = ((44, 10), (62, 15), (80, 20))
 """along and across the pipe: 495, 1008 and 1701 nodes"""
 WARM_UP, STEPS, RECORD = 60, 8, 98
 """steps before anything is timed; steps timed, half a frame; steps of an episode"""
-SCENARIO = Pipe2D()
 
 
 @dataclass
@@ -73,26 +81,45 @@ def rows() -> Iterator[Row]:
     yield memory(CELLS[-1], measured=False)
 
 
-# -- the problem ------------------------------------------------------------------------------------------------------
+# -- the problem -----------------------------------------------------------------------------------
 
 
 def problem(cells: tuple[int, int], steps: int = WARM_UP + STEPS) -> Problem:
     """The model on a mesh of so many cells; states and measurements are drawn from it."""
-    model = SCENARIO._discretise(cells=cells, substeps=8, time_step=SCENARIO.time_step, cells_at_electrodes=5,
-                                 cells_across=14, velocity=PlaneChannelFlow(SCENARIO.mean_velocity, 0.05))
-    transport, level = model.transport, SCENARIO.expected_concentration
+    transport, seen = pipe_model(cells)
+    level = PIPE_2D.expected_concentration
     evolution = transport.evolution_model()
-    start = table_5_1(transport, SCENARIO.prior, level, rank_tolerance=1e-6)
+    start = table_5_1(transport, PIPE_2D.prior, level, rank_tolerance=1e-6)
     rng = np.random.default_rng(0)
-    inflow, at_inlet = SCENARIO.draw_inflow(rng), transport.mesh.points[transport.inlet]
-    linearised = LinearisedObservations(model.observation, SCENARIO.noise, start.mean)
-    state, observations = np.full(len(start.mean), SCENARIO.background), []
+    inflow = PIPE_2D.target.draw_inflow(PIPE_2D, rng)
+    at_inlet = transport.mesh.points[transport.inlet]
+    linearised = LinearisedObservations(seen, PIPE_2D.noise, start.mean)
+    state, observations = np.full(len(start.mean), PIPE_2D.background), []
+    currents = PIPE_2D.currents
     for t in range(steps):
-        state = evolution.F @ state + evolution.Y @ inflow(at_inlet, t * SCENARIO.time_step)
-        H, _, variance = linearised(np.zeros(16), SCENARIO.currents[t % SCENARIO.frame])
-        observations.append(Observation(H, H @ state + np.sqrt(variance) * rng.standard_normal(len(H)), variance))
-    noise = level**2 * evolution.state_noise_covariance(SCENARIO.prior.inflow_std**2, SCENARIO.prior.nodal_std**2)
+        state = evolution.F @ state + evolution.Y @ inflow(at_inlet, t * PIPE_2D.time_step)
+        H, _, variance = linearised(np.zeros(16), currents[t % len(currents)])
+        observations.append(Observation(H, H @ state + np.sqrt(variance)
+                                        * rng.standard_normal(len(H)), variance))
+    noise = level**2 * evolution.state_noise_covariance(PIPE_2D.prior.inflow_std**2,
+                                                        PIPE_2D.prior.nodal_std**2)
     return Problem(start, noise, observations)
+
+
+def pipe_model(cells: tuple[int, int]) -> Discretisation:
+    """The estimators' model, but with so many cells of concentration along and across the pipe."""
+    told = PIPE_2D.model()
+    pipe, known = PIPE_2D.vessel, told.transport
+    assert isinstance(known, ConvectionDiffusion)
+    mesh = rectangle_mesh(np.linspace(0.0, pipe.length, cells[0] + 1),
+                          np.linspace(-pipe.half_width, pipe.half_width, cells[1] + 1))
+    transport = ConvectionDiffusion(mesh, PIPE_2D.flow.nominal(PIPE_2D, fine=False),
+                                    PIPE_2D.flow.diffusivity, known.time_step,
+                                    substeps=known.substeps, inlet=np.arange(cells[1] + 1))
+    cem = told.observation.cem
+    seen = ObservationModel(cem, mesh.interpolation_to(cem.mesh.points),
+                            told.observation.conductivity, told.observation.smallest_concentration)
+    return Discretisation(transport, seen)
 
 
 def settle(problem: Problem) -> Settled:
@@ -122,11 +149,12 @@ def same(ours: np.ndarray, theirs: np.ndarray, tolerance: float = 1e-10) -> None
     np.testing.assert_allclose(ours, theirs, rtol=0.0, atol=tolerance * np.abs(theirs).max())
 
 
-# -- rows -------------------------------------------------------------------------------------------------------------
+# -- rows ------------------------------------------------------------------------------------------
 
 
 def step_flops(n: int, rank: int, m: int = 16) -> float:
-    """F Z, Π Hᵀ, and the compression of Z: its Gram matrix and the product with the directions kept."""
+    """F Z, Π Hᵀ, and the compression of Z: its Gram matrix and the product with the directions
+    kept."""
     return 2.0 * n**2 * (rank + m) + 4.0 * n * (rank + m)**2
 
 
@@ -150,7 +178,8 @@ def against_textbook(settled: Settled) -> Row:
     return Row("filtering", f"Kalman filter step, n = {n}, m = 16, varying injection, rank {rank}",
                f"numpy {np.__version__}: F P Fᵀ + Q, S, K, P − K (H P)", step, reference,
                "≤ 0.15" if n == 1701 else "", "flops: F Z, and the eigenvectors of ZᵀZ",
-               f"{of_flops(step_flops(n, rank), step)} (the reference {of_flops(4.0 * n**3, reference)})")
+               f"{of_flops(step_flops(n, rank), step)} (the reference "
+               f"{of_flops(4.0 * n**3, reference)})")
 
 
 def against_filterpy(settled: Settled) -> Iterator[Row]:
@@ -160,14 +189,16 @@ def against_filterpy(settled: Settled) -> Iterator[Row]:
         runs = [filterpy(settled.problem, settled.mean, settled.covariance, settled.observations)
                 for _ in range(settled.rounds)]
         agree(settled, *runs[0][:2])
-        theirs = {"filter": min(run[2] for run in runs) / STEPS, "smoother": min(run[3] for run in runs) / STEPS}
+        theirs = {"filter": min(run[2] for run in runs) / STEPS,
+                  "smoother": min(run[3] for run in runs) / STEPS}
     except ImportError:
         pass
     yield from against_peer(settled, theirs, peer("filterpy"), "KalmanFilter predict and update",
                             "the same, and rts_smoother")
 
 
-def filterpy(problem: Problem, mean: np.ndarray, covariance: np.ndarray, observations: list[Observation]
+def filterpy(problem: Problem, mean: np.ndarray, covariance: np.ndarray,
+             observations: list[Observation]
              ) -> tuple[np.ndarray, np.ndarray, float, float]:
     """Filtered and smoothed means; seconds until the former and until the latter."""
     from filterpy.kalman import KalmanFilter as Peer
@@ -201,12 +232,14 @@ def against_dynamax(settled: Settled) -> Iterator[Row]:
     except ImportError:
         pass
     else:
-        # It adds 1e-9 to the diagonal of what it solves with: units in which this is nothing, and white noise.
+        # It adds 1e-9 to the diagonal of what it solves with: units in which this is nothing, and
+        # white noise.
         F, level, units = settled.problem.start.transition, settled.problem.start.mean, 1e-4
         H, values, variances = (np.stack(part) for part in zip(*settled.observations, strict=True))
         std, noise = np.sqrt(variances), settled.problem.noise / units**2
         parameters = make_lgssm_params(
-            F @ (settled.mean - level) / units, F @ settled.covariance @ F.T / units**2 + noise, F, noise,
+            F @ (settled.mean - level) / units, F @ settled.covariance @ F.T / units**2 + noise, F,
+            noise,
             H * units / std[..., None], np.stack([np.eye(H.shape[1])] * STEPS))
         parameters, record = jax.device_put((parameters, (values - H @ level) / std))
         means, busy, compiling = {}, 0.0, 0.0
@@ -223,41 +256,50 @@ def against_dynamax(settled: Settled) -> Iterator[Row]:
             means[name] = result
         agree(settled, np.asarray(means["filter"].filtered_means) * units + level,
               np.asarray(means["smoother"].smoothed_means) * units + level)
-        note = f" (compiling both, {compiling:.1f} s, is not counted; at most {busy:.1f} cores were busy)"
+        note = (f" (compiling both, {compiling:.1f} s, is not counted; at most {busy:.1f} cores "
+                "were busy)")
     yield from against_peer(settled, theirs, f"{peer('dynamax')}, {peer('jax')}", "lgssm_filter",
                             "lgssm_smoother", note)
 
 
 def agree(settled: Settled, filtered: np.ndarray, smoothed: np.ndarray) -> None:
     """Their means and ours; RTS inverts predicted covariances, which costs it digits."""
-    same(np.stack([step.mean for step in kalman_filter(copy.copy(settled.ours), settled.observations)]), filtered)
+    same(np.stack([step.mean
+                   for step in kalman_filter(copy.copy(settled.ours), settled.observations)]),
+                   filtered)
     ours = fixed_interval_smoother(copy.copy(settled.ours), settled.observations)
     same(np.stack([state.mean for state in ours]), smoothed, 1e-8)
 
 
-def against_peer(settled: Settled, theirs: dict[str, float | None], name: str, filtering: str, smoothing: str,
-                 note: str = "") -> Iterator[Row]:
+def against_peer(settled: Settled, theirs: dict[str, float | None], name: str, filtering: str,
+                 smoothing: str, note: str = "") -> Iterator[Row]:
     """Both rows of a peer, each per step of the record."""
     works = {"filter": lambda: kalman_filter(copy.copy(settled.ours), settled.observations),
-             "smoother": lambda: fixed_interval_smoother(copy.copy(settled.ours), settled.observations)}
+             "smoother": lambda: fixed_interval_smoother(copy.copy(settled.ours),
+                                                         settled.observations)}
     seconds = compare(works, 3)
     n, rank = settled.problem.n, settled.ours.known.shape[1]
-    flops = {"filter": step_flops(n, rank), "smoother": step_flops(n, rank) + way_back_flops(settled)}
+    flops = {"filter": step_flops(n, rank), "smoother": step_flops(n, rank)
+             + way_back_flops(settled)}
     for task, words in (("filter", filtering), ("smoother", smoothing)):
         step = seconds[task] / STEPS
-        yield Row("filtering", f"{task}, a step of a record of {STEPS}, n = {n}", f"{name}: {words}{note}", step,
-                  theirs[task], "", "flops: products of n × n by n × rank", of_flops(flops[task], step))
+        yield Row("filtering", f"{task}, a step of a record of {STEPS}, n = {n}",
+                  f"{name}: {words}{note}", step,
+                  theirs[task], "", "flops: products of n × n by n × rank",
+                  of_flops(flops[task], step))
 
 
 def way_back_flops(settled: Settled) -> float:
-    """A step's share of Fᵀ B, of Π B − Z (Zᵀ B), and of the compression of B, whose rank grows on the way."""
+    """A step's share of Fᵀ B, of Π B − Z (Zᵀ B), and of the compression of B, whose rank grows on
+    the way."""
     n, steps = settled.problem.n, kalman_filter(copy.copy(settled.ours), settled.observations)
     ranks = [later.shape[1] for _, later in _backwards(settled.ours, steps)]
     known = settled.ours.known.shape[1]
-    return sum(4.0 * n**2 * rank + 4.0 * n * known * rank + 4.0 * n * (rank + 16)**2 for rank in ranks) / STEPS
+    return sum(4.0 * n**2 * rank + 4.0 * n * known * rank + 4.0 * n * (rank + 16)**2
+               for rank in ranks) / STEPS
 
 
-# -- memory -----------------------------------------------------------------------------------------------------------
+# -- memory ----------------------------------------------------------------------------------------
 
 
 def memory(cells: tuple[int, int], *, measured: bool) -> Row:
@@ -268,12 +310,15 @@ def memory(cells: tuple[int, int], *, measured: bool) -> Row:
     reference: float | None = stored
     words = "RTS with stored Γ_{t|t} and Γ_{t|t−1}: 2·T·n²·8 bytes, computed"
     if measured:
-        reference, words = None, f"{peer('filterpy')} rts_smoother, measured; two covariances a step alone: " \
-                                 f"{quantity(stored, 'B')}"
+        reference = None
+        words = (f"{peer('filterpy')} rts_smoother, measured; two covariances a step alone: "
+                 f"{quantity(stored, 'B')}")
         with suppress(ImportError):
             reference = in_fresh_process(smoothing_memory, cells, "filterpy")
-    return Row("filtering", f"peak memory of smoothing {RECORD} steps, n = {n}", words, ours, reference, "",
-               "bytes: Z of all steps, n × rank each, and what is left of Γ_{0|0} in Π_t", "", unit="B")
+    return Row("filtering", f"peak memory of smoothing {RECORD} steps, n = {n}", words, ours,
+               reference, "",
+               "bytes: Z of all steps, n × rank each, and what is left of Γ_{0|0} in Π_t", "",
+               unit="B")
 
 
 def smoothing_memory(cells: tuple[int, int], whose: str) -> float:
@@ -281,7 +326,8 @@ def smoothing_memory(cells: tuple[int, int], whose: str) -> float:
     record = problem(cells, RECORD)
     start, observations = record.start, record.observations
     covariance = start.covariance.apply(0, np.eye(record.n))
-    fixed_interval_smoother(copy.copy(start), observations[:2])     # loads what is loaded once, at any length
+    # loads what is loaded once, at any length
+    fixed_interval_smoother(copy.copy(start), observations[:2])
     if whose == "ours":
         return peak_growth(lambda: fixed_interval_smoother(copy.copy(start), observations))
     filterpy(record, start.mean, covariance, observations[:2])

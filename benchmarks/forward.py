@@ -1,6 +1,7 @@
 """Speed of the complete electrode model: `python benchmarks/run.py forward`.
 
-Conductivities are random and rough, node by node; the pipe and its sixteen electrodes are those of `Pipe2D`.
+Conductivities are random and rough, node by node; the pipe and its sixteen electrodes are those of
+`Pipe2D`.
 """
 
 from __future__ import annotations
@@ -17,12 +18,12 @@ from solvers import entry_by_entry, pair_by_pair, refactorisations, splu_and_sol
 from eitbench.numerics.fem import element, to_skfem
 from eitbench.numerics.mesh import Mesh, graded_pipe_mesh
 from eitbench.physics.cem import CompleteElectrodeModel
-from eitbench.worlds import Pipe2D
+from eitbench.worlds.pipe2d import PIPE_2D
 
 SIZES = ((5, 13), (7, 20), (11, 32))
 """cells at an electrode and across: 4,300, 9,200 and 23,000 unknowns"""
 BATCH = 64
-SCENARIO = Pipe2D()
+PIPE = PIPE_2D.vessel
 
 
 def rows() -> Iterator[Row]:
@@ -38,12 +39,12 @@ def rows() -> Iterator[Row]:
 
 
 def pipe_mesh(cells_at_electrodes: int, cells_across: int) -> Mesh:
-    return graded_pipe_mesh(SCENARIO.length, SCENARIO.half_width, SCENARIO.electrode_spans, cells_at_electrodes,
+    return graded_pipe_mesh(PIPE.length, PIPE.half_width, PIPE.electrode_spans, cells_at_electrodes,
                             cells_across)
 
 
 def electrode_model(mesh: Mesh, **options) -> CompleteElectrodeModel:
-    return CompleteElectrodeModel(mesh, SCENARIO.electrodes(mesh), SCENARIO.contact_impedance, **options)
+    return CompleteElectrodeModel(mesh, PIPE.electrodes(mesh), PIPE.contact_impedance, **options)
 
 
 def conductivities(mesh: Mesh, count: int = BATCH) -> np.ndarray:
@@ -62,7 +63,8 @@ def system_matrix(cem: CompleteElectrodeModel, sigma: np.ndarray) -> sp.csc_matr
 
 
 def factor_flops(cem: CompleteElectrodeModel) -> float:
-    """Multiplications and additions of the factorisation, down to the electrodes' Schur complement."""
+    """Multiplications and additions of the factorisation, down to the electrodes' Schur
+    complement."""
     start, first_row, *_ = cem._system._symbolic
     width, height = np.diff(start)[:-1], np.diff(first_row)[:-1]
     return float(sum(((h - np.arange(w))**2).sum() for w, h in zip(width, height, strict=True)))
@@ -70,10 +72,12 @@ def factor_flops(cem: CompleteElectrodeModel) -> float:
 
 def narrow(cem: CompleteElectrodeModel) -> str:
     """Why a sparse factor stays far below dgemm."""
-    return f"flops, in supernodes of {np.diff(cem._system._symbolic[0])[:-1].mean():.1f} columns on average"
+    columns = np.diff(cem._system._symbolic[0])[:-1].mean()
+    return f"flops, in supernodes of {columns:.1f} columns on average"
 
 
-def against_solvers(cem: CompleteElectrodeModel, sigma: np.ndarray, K: sp.csc_matrix, *, largest: bool
+def against_solvers(cem: CompleteElectrodeModel, sigma: np.ndarray, K: sp.csc_matrix, *,
+                    largest: bool
                     ) -> Iterator[Row]:
     """All electrodes' voltages against factorisations that have not solved anything yet."""
     everything = splu_and_solves(K, cem.n_electrodes - 1)
@@ -83,32 +87,38 @@ def against_solvers(cem: CompleteElectrodeModel, sigma: np.ndarray, K: sp.csc_ma
     candidates = {"ours": lambda: cem.transfer_resistance(sigma), "all": everything, **bare}
     seconds = compare(candidates, 25)
     fastest = min(bare, key=seconds.__getitem__)
-    listed = [f"{name} {quantity(seconds[name], 's')}" for name in sorted(bare, key=seconds.__getitem__)] + missing
+    listed = [f"{name} {quantity(seconds[name], 's')}"
+              for name in sorted(bare, key=seconds.__getitem__)] + missing
     what = f"𝓡(σ), all injections, {cem.n_unknowns:,} unknowns"
     ceiling = of_flops(factor_flops(cem), seconds["ours"])
     limit = narrow(cem)
-    yield Row("forward", what, f"one bare refactorisation, the fastest of: {', '.join(listed)}", seconds["ours"],
-              seconds[fastest], "≤ 1.6×", limit, ceiling)
-    yield Row("forward", what, f"{peer('scipy')} splu (MMD_AT_PLUS_A, symmetric mode) and 15 solves", seconds["ours"],
-              seconds["all"], "≥ 5× faster" if largest else "", limit, ceiling)
+    yield Row("forward", what, f"one bare refactorisation, the fastest of: {', '.join(listed)}",
+              seconds["ours"], seconds[fastest], "≤ 1.6×", limit, ceiling)
+    yield Row("forward", what,
+              f"{peer('scipy')} splu (MMD_AT_PLUS_A, symmetric mode) and 15 solves",
+              seconds["ours"], seconds["all"], "≥ 5× faster" if largest else "", limit, ceiling)
 
 
 def in_batches(cem: CompleteElectrodeModel, sigma: np.ndarray) -> Row:
     """Of a batch, a state's share."""
-    np.testing.assert_allclose(cem.transfer_resistance(sigma[:9])[8], cem.transfer_resistance(sigma[8]), atol=1e-10)
+    np.testing.assert_allclose(cem.transfer_resistance(sigma[:9])[8],
+                               cem.transfer_resistance(sigma[8]), atol=1e-10)
     seconds = compare({"batch": lambda: cem.transfer_resistance(sigma),
                        "single": lambda: cem.transfer_resistance(sigma[0])}, 25)
     each = seconds["batch"] / len(sigma)
-    return Row("forward", f"𝓡(σ) of one of {len(sigma)} states given at once, {cem.n_unknowns:,} unknowns",
+    return Row("forward",
+               f"𝓡(σ) of one of {len(sigma)} states given at once, {cem.n_unknowns:,} unknowns",
                "𝓡(σ) of one state", each, seconds["single"], "≤ 1/3",
-               "flops, eight matrices side by side in vector registers", of_flops(factor_flops(cem), each))
+               "flops, eight matrices side by side in vector registers",
+               of_flops(factor_flops(cem), each))
 
 
-# -- derivatives ------------------------------------------------------------------------------------------------------
+# -- derivatives -----------------------------------------------------------------------------------
 
 
 def derivatives(cem: CompleteElectrodeModel, sigma: np.ndarray, K: sp.csc_matrix) -> Iterator[Row]:
-    """The table, and from it the Jacobians of all pairs, against a pair of solutions for each of their entries."""
+    """The table, and from it the Jacobians of all pairs, against a pair of solutions for each of
+    their entries."""
     pairs = np.zeros((120, cem.n_electrodes))
     for k, (a, b) in enumerate(itertools.combinations(range(cem.n_electrodes), 2)):
         pairs[k, [a, b]] = 1.0, -1.0
@@ -121,9 +131,12 @@ def derivatives(cem: CompleteElectrodeModel, sigma: np.ndarray, K: sp.csc_matrix
         return pair_by_pair(K, pairs[:, :-1], integrate)
 
     table = cem.transfer_resistance_derivatives(sigma)[1]
-    np.testing.assert_allclose(table, cem._centre @ naive() @ cem._centre.T, atol=1e-8 * np.abs(table).max())
-    seconds = compare({"table": lambda: cem.transfer_resistance_derivatives(sigma), "naive": naive}, 7, warm_up=False)
-    seconds |= compare({"all": lambda: cem.jacobian(sigma, pairs), "pairs": naive_pairs}, 1, warm_up=False)
+    np.testing.assert_allclose(table, cem._centre @ naive() @ cem._centre.T,
+                               atol=1e-8 * np.abs(table).max())
+    seconds = compare({"table": lambda: cem.transfer_resistance_derivatives(sigma), "naive": naive},
+                      7, warm_up=False)
+    seconds |= compare({"all": lambda: cem.jacobian(sigma, pairs), "pairs": naive_pairs}, 1,
+                       warm_up=False)
     seconds |= compare({"all": lambda: cem.jacobian(sigma, pairs)}, 15)
     words = "two solves and ∫φ∇u·∇w by sparse gradient matrices for each of"
     flops, text = table_flops(cem)
@@ -133,20 +146,25 @@ def derivatives(cem: CompleteElectrodeModel, sigma: np.ndarray, K: sp.csc_matrix
     combining = 2.0 * table.size * len(pairs)
     written = 8e-9 * table.size / cem.n_electrodes * len(pairs)
     yield Row("forward", f"Jacobians of all 120 pairs, from the table, {cem.n_unknowns:,} unknowns",
-              f"{peer('scipy')} splu, and {words} their 120 · 15 rows", seconds["all"], seconds["pairs"],
+              f"{peer('scipy')} splu, and {words} their 120 · 15 rows", seconds["all"],
+              seconds["pairs"],
               "≥ 20× faster",
-              f"the table; then {1e-6 * combining:.0f} MFlop to combine it, {1e3 * written:.0f} MB to write",
-              f"{written / (seconds['all'] - seconds['table']):.2g} of {ceilings().copy / 2:.0f} GB/s written, "
+              f"the table; then {1e-6 * combining:.0f} MFlop to combine it, {1e3 * written:.0f} MB "
+              "to write",
+              f"{written / (seconds['all'] - seconds['table']):.2g} of {ceilings().copy / 2:.0f} "
+              "GB/s written, "
               f"{of_flops(flops + combining, seconds['all'])}")
 
 
 def quadrature(mesh: Mesh) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """∫ φ_j ∇u·∇w for all nodes j, exact for potentials of second order; as one writes it with scikit-fem."""
+    """∫ φ_j ∇u·∇w for all nodes j, exact for potentials of second order; as one writes it with
+    scikit-fem."""
     basis = skfem.Basis(to_skfem(mesh), element(2, 2), intorder=3)
     hats = basis.with_element(element(2, 1))
     point = np.arange(basis.dx.size).reshape(basis.dx.shape)
 
-    def at_points(basis_: skfem.CellBasis, value: Callable[[skfem.DiscreteField], np.ndarray]) -> sp.csr_array:
+    def at_points(basis_: skfem.CellBasis,
+                  value: Callable[[skfem.DiscreteField], np.ndarray]) -> sp.csr_array:
         entries = [(np.broadcast_to(value(phi[0]), point.shape).ravel(), point.ravel(),
                     np.repeat(dofs, point.shape[1]))
                    for phi, dofs in zip(basis_.basis, basis_.element_dofs, strict=True)]
@@ -154,7 +172,8 @@ def quadrature(mesh: Mesh) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
         return sp.csr_array((values, (row, column)), shape=(point.size, basis_.N))
 
     by_x, by_y = (at_points(basis, lambda phi, k=k: phi.grad[k]) for k in range(2))
-    tested = sp.csr_array((at_points(hats, lambda phi: np.asarray(phi)) * basis.dx.ravel()[:, None]).T)
+    tested = sp.csr_array((at_points(hats, lambda phi: np.asarray(phi))
+                           * basis.dx.ravel()[:, None]).T)
 
     def integrate(u: np.ndarray, w: np.ndarray) -> np.ndarray:
         u, w = u[:basis.N], w[:basis.N]
@@ -168,39 +187,47 @@ def table_flops(cem: CompleteElectrodeModel) -> tuple[float, str]:
     k, n_cells = cem.n_electrodes, len(cem.mesh.cells)
     substitute = 2.0 * cem._system._symbolic[3][-1] * 16
     gradients = 2.0 * cem._sensitivity._gradient.size * k
-    products = 39.0 * k**2 * n_cells     # 3 vertices: 2·2 for Σ_v G_v G_v, then 1 to add it and 2·2·2 of their own
+    # 3 vertices: 2·2 for Σ_v G_v G_v, then 1 to add it and 2·2·2 of their own
+    products = 39.0 * k**2 * n_cells
     parts = {"factor": factor_flops(cem), "substitution": substitute, "gradients": gradients,
              "their products": products}
-    return sum(parts.values()), ", ".join(f"{name} {1e-6 * flops:.3g}" for name, flops in parts.items()) + " MFlop"
+    return sum(parts.values()), ", ".join(f"{name} {1e-6 * flops:.3g}" for name,
+                                          flops in parts.items()) + " MFlop"
 
 
-# -- pyEIT ------------------------------------------------------------------------------------------------------------
+# -- pyEIT -----------------------------------------------------------------------------------------
 
 
 def against_pyeit(cells: tuple[int, int] = (10, 26)) -> Iterator[Row]:
     """The same mesh, first order for both."""
     mesh = pipe_mesh(*cells)
-    cem, currents = electrode_model(mesh, order=1), SCENARIO.currents
+    cem, currents = electrode_model(mesh, order=1), PIPE_2D.currents
     sigma = conductivities(mesh, 1)[0]
-    works = {"voltages": lambda: cem.voltages(sigma, currents), "jacobian": lambda: cem.jacobian(sigma, currents)}
+    works = {"voltages": lambda: cem.voltages(sigma, currents),
+             "jacobian": lambda: cem.jacobian(sigma, currents)}
     theirs: dict[str, float | None] = dict.fromkeys(works)
     try:
         solver, perm = pyeit_forward(mesh, currents), sigma[mesh.cells].mean(axis=1)
         theirs["voltages"] = compare({"": lambda: solver.solve_eit(perm=perm)}, 3)[""]
-        theirs["jacobian"] = compare({"": lambda: solver.compute_jac(perm=perm)}, 1, warm_up=False)[""]
+        theirs["jacobian"] = compare({"": lambda: solver.compute_jac(perm=perm)}, 1,
+                                     warm_up=False)[""]
     except ImportError:
         pass
     seconds = compare(works)
     flops, _ = table_flops(cem)
-    differs = "point electrodes where ours are complete, a conductivity for each cell where ours is for each node"
+    differs = ("point electrodes where ours are complete, a conductivity for each cell where ours "
+               "is for each node")
     where = f"order 1, {mesh.n_nodes:,} nodes, {len(mesh.cells):,} cells"
     yield Row("forward", f"voltages of 16 injections, {where}",
-              f"{peer('pyeit')} solve_eit on the same mesh: {differs}; factorises for each injection anew",
+              f"{peer('pyeit')} solve_eit on the same mesh: {differs}; factorises for each "
+              "injection anew",
               seconds["voltages"], theirs["voltages"], "", narrow(cem),
               of_flops(factor_flops(cem), seconds["voltages"]))
     yield Row("forward", f"Jacobian of 16 injections, {where}",
-              f"{peer('pyeit')} compute_jac on the same mesh: {differs}; inverts the dense matrix, loops over cells",
-              seconds["jacobian"], theirs["jacobian"], "", "flops: products of gradients, and bytes of the table",
+              f"{peer('pyeit')} compute_jac on the same mesh: {differs}; inverts the dense matrix, "
+              "loops over cells",
+              seconds["jacobian"], theirs["jacobian"], "",
+              "flops: products of gradients, and bytes of the table",
               of_flops(flops, seconds["jacobian"]))
 
 
@@ -209,11 +236,13 @@ def pyeit_forward(mesh: Mesh, currents: np.ndarray):
     from pyeit.eit.fem import EITForward
     from pyeit.eit.protocol import PyEITProtocol
     from pyeit.mesh import PyEITMesh
-    middles = [(x, y) for y in (-SCENARIO.half_width, SCENARIO.half_width) for x in
-               SCENARIO.electrode_spans.mean(axis=1)]
+    middles = [(x, y) for y in (-PIPE.half_width, PIPE.half_width) for x in
+               PIPE.electrode_spans.mean(axis=1)]
     nodes = np.array([((mesh.points - middle)**2).sum(axis=1).argmin() for middle in middles])
     n = len(nodes)
     injections = np.stack([currents.argmax(axis=1), currents.argmin(axis=1)], axis=1)
     readings = np.stack([np.arange(n), (np.arange(n) + 1) % n], axis=1)
-    protocol = PyEITProtocol(injections, np.tile(readings, (len(injections), 1, 1)), np.ones(n * n, dtype=bool))
-    return EITForward(PyEITMesh(mesh.points.copy(), mesh.cells.copy(), perm=1.0, el_pos=nodes), protocol)
+    protocol = PyEITProtocol(injections, np.tile(readings, (len(injections), 1, 1)),
+                             np.ones(n * n, dtype=bool))
+    return EITForward(PyEITMesh(mesh.points.copy(), mesh.cells.copy(), perm=1.0, el_pos=nodes),
+                      protocol)

@@ -21,7 +21,8 @@ def rows() -> Iterator[Row]:
     first = record.observations[:RECORD]
     gains = gain_sequence(copy.copy(start), first)
     smoothed = gains.smoothed(start.mean, start.forcing, values[:RECORD])
-    same(smoothed, np.array([state.mean for state in fixed_interval_smoother(copy.copy(start), first)]))
+    same(smoothed,
+         np.array([state.mean for state in fixed_interval_smoother(copy.copy(start), first)]))
 
     mean, P, steps = start.mean, start.covariance.apply(0, np.eye(n)), 4
     filtered, _ = gains.filtered(start.mean, start.forcing, values[:steps])
@@ -33,10 +34,14 @@ def rows() -> Iterator[Row]:
                        "theirs": lambda: textbook(record, mean, P, first[steps])}, 3)
     ours, bytes_read = seconds["ours"] / RECORD, 8.0 * n * (n + 2 * 16)
     yield Row("filtering", f"Kalman filter step with gains computed beforehand, n = {n}, m = 16",
-              f"numpy {np.__version__}: F P Fᵀ + Q, S, K, P − K (H P)", ours, seconds["theirs"], "≤ 1/200",
-              "bytes: F is read once", f"{1e-9 * bytes_read / ours:.0f} GB/s, of {ceilings().read:.0f} from memory; F "
+              f"numpy {np.__version__}: F P Fᵀ + Q, S, K, P − K (H P)", ours, seconds["theirs"],
+              "≤ 1/200",
+              "bytes: F is read once",
+              f"{1e-9 * bytes_read / ours:.0f} GB/s, of {ceilings().read:.0f} from memory; F "
                                        f"({quantity(8.0 * n * n, 'B')}) may stay in the cache")
     gains = gain_sequence(copy.copy(start), record.observations)
     whole = compare({"": lambda: gains.smoothed(start.mean, start.forcing, values)}, 3)[""]
-    yield Row("filtering", f"smoothed means of {LONG} steps, gains computed beforehand, n = {n}", "–", whole, None,
-              "≤ 1 s", "bytes: F twice, Fᵀ and Γ_w are read once a step", of_flops(8.0 * n * n * LONG, whole))
+    yield Row("filtering", f"smoothed means of {LONG} steps, gains computed beforehand, n = {n}",
+              "–", whole, None,
+              "≤ 1 s", "bytes: F twice, Fᵀ and Γ_w are read once a step",
+              of_flops(8.0 * n * n * LONG, whole))

@@ -15,12 +15,11 @@ from references import reference_flow, reference_model
 from eitbench.physics.cem import CompleteElectrodeModel
 from eitbench.physics.flow import PlaneChannelFlow
 from eitbench.physics.transport import ConvectionDiffusion
-from eitbench.worlds import Pipe2D
+from eitbench.worlds.pipe2d import PIPE_2D
 
-SCENARIO = Pipe2D()
 CELLS = {"the estimators' model": (5, 14), "the truth": (10, 28)}
-FLOWS = {"the estimators' model": (SCENARIO.model, 1), "the truth": (SCENARIO.truth, 8)}
-VELOCITY = PlaneChannelFlow(SCENARIO.mean_velocity, SCENARIO.half_width)
+FLOWS = {"the estimators' model": (PIPE_2D.model, 1), "the truth": (PIPE_2D.truth, 8)}
+VELOCITY = PlaneChannelFlow(PIPE_2D.flow.mean_velocity, PIPE_2D.vessel.half_width)
 
 
 def rows() -> Iterator[Row]:
@@ -28,15 +27,15 @@ def rows() -> Iterator[Row]:
         yield from electrode_models(name, cells)
     for name, (discretise, columns) in FLOWS.items():
         plain = discretise().transport
-        flows = [kind(plain.mesh, VELOCITY, SCENARIO.diffusivity, plain.time_step,
+        flows = [kind(plain.mesh, VELOCITY, PIPE_2D.flow.diffusivity, plain.time_step,
                       substeps=plain.substeps, inlet=plain.inlet)
                  for kind in (ConvectionDiffusion, reference_flow)]
         c = np.random.default_rng(0).uniform(20.0, 40.0, (plain.mesh.n_nodes, columns))
         yield both(f"a step of {columns} flow{'s' * (columns > 1)}, {name}, "
                    f"{plain.mesh.n_nodes:,} nodes", flows, lambda cd, c=c: cd.step(c, 30.0, 31.0))
     identity = np.eye(1701)
-    flows = [kind(SCENARIO.model().transport.mesh, VELOCITY, SCENARIO.diffusivity,
-                  SCENARIO.time_step, inlet=np.arange(21))
+    flows = [kind(PIPE_2D.model().transport.mesh, VELOCITY, PIPE_2D.flow.diffusivity,
+                  PIPE_2D.time_step, inlet=np.arange(21))
              for kind in (ConvectionDiffusion, reference_flow)]
     yield both("F, column by column, 1,701 nodes", flows,
                lambda cd: cd.step(identity, identity[:21], 0.0), rounds=1)
@@ -45,7 +44,7 @@ def rows() -> Iterator[Row]:
 def electrode_models(name: str, cells: tuple[int, int]) -> Iterator[Row]:
     mesh = pipe_mesh(*cells)
     sigma = conductivities(mesh, 16)
-    models = [kind(mesh, SCENARIO.electrodes(mesh), SCENARIO.contact_impedance)
+    models = [kind(mesh, PIPE_2D.vessel.electrodes(mesh), PIPE_2D.vessel.contact_impedance)
               for kind in (CompleteElectrodeModel, reference_model)]
     size = f"{name}, {models[0].n_unknowns:,} unknowns"
     yield both(f"𝓡(σ), {size}", models, lambda cem: cem.transfer_resistance(sigma[0]))

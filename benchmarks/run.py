@@ -1,6 +1,8 @@
-"""Speed against peers: `python benchmarks/run.py [section …]` measures, and writes `results.json` and `README.md`.
+"""Speed against peers: `python benchmarks/run.py [section …]` measures, and writes `results.json`
+and `README.md`.
 
-Each section runs in a process of its own, limited to one thread, and replaces its part of the results.
+Each section runs in a process of its own, limited to one thread, and replaces its part of the
+results.
 """
 
 from __future__ import annotations
@@ -19,7 +21,8 @@ from eitbench._files import write_atomically
 
 HERE = Path(__file__).parent
 SECTIONS = {"forward": "Complete electrode model", "kernels": "What the compiled kernels buy",
-            "filtering": "Kalman filter and smoother", "greedy": "Choosing the injection", "stepping": "Environments",
+            "filtering": "Kalman filter and smoother", "greedy": "Choosing the injection",
+            "stepping": "Environments",
             "simulation": "Simulation of new episodes", "scaling": "Growth with size"}
 """name of a module here, with `rows()` or `curves()` → heading"""
 
@@ -44,8 +47,10 @@ This page is written by that command. A peer that is not installed leaves a dash
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("sections", nargs="*", metavar="section", help=f"of {', '.join(SECTIONS)}; default: all")
-    parser.add_argument("--render-only", action="store_true", help="write README.md anew from results.json")
+    parser.add_argument("sections", nargs="*", metavar="section",
+                        help=f"of {', '.join(SECTIONS)}; default: all")
+    parser.add_argument("--render-only", action="store_true",
+                        help="write README.md anew from results.json")
     arguments = parser.parse_args()
     if unknown := set(arguments.sections) - set(SECTIONS):
         parser.error(f"no section {', '.join(sorted(unknown))}; there are {', '.join(SECTIONS)}")
@@ -53,7 +58,8 @@ def main() -> None:
     record = json.loads(results.read_text()) if results.exists() else {}
     for section in [] if arguments.render_only else arguments.sections or SECTIONS:
         record[section] = in_fresh_process(measure, section)
-        write_atomically(results, (json.dumps(record, indent=1, ensure_ascii=False) + "\n").encode())
+        write_atomically(results,
+                         (json.dumps(record, indent=1, ensure_ascii=False) + "\n").encode())
     write_atomically(HERE / "README.md", page(record).encode())
 
 
@@ -66,14 +72,16 @@ def measure(section: str) -> dict[str, Any]:
         curves = []
         for curve in module.curves():
             curves.append(curve)
-            report(section, begin, f"{curve.column}, {curve.y_label}: exponent {curve.exponent:.2f}")
+            report(section, begin,
+                   f"{curve.column}, {curve.y_label}: exponent {curve.exponent:.2f}")
         module.draw(curves, HERE / "scaling.png")
         record["curves"] = [asdict(curve) | {"exponent": curve.exponent} for curve in curves]
     else:
         record["rows"] = []
         for row in module.rows():
             record["rows"].append(asdict(row))
-            report(section, begin, f"{row.what}: {row.ratio_text} {'' if row.met in (True, None) else '(missed)'}")
+            report(section, begin,
+                   f"{row.what}: {row.ratio_text} {'' if row.met in (True, None) else '(missed)'}")
     return record
 
 
@@ -81,7 +89,7 @@ def report(section: str, begin: float, text: str) -> None:
     print(f"{section} {time.monotonic() - begin:5.0f} s  {text}", flush=True)
 
 
-# -- the page ---------------------------------------------------------------------------------------------------------
+# -- the page --------------------------------------------------------------------------------------
 
 
 def page(record: dict[str, Any]) -> str:
@@ -92,19 +100,24 @@ def page(record: dict[str, Any]) -> str:
             parts.append(f"Not measured yet: `python benchmarks/run.py {section}`.\n")
             continue
         parts.append(conditions(record[section]))
-        parts.append(growth(record[section]) if section == "scaling" else table(record[section]["rows"]))
+        parts.append(growth(record[section])
+                     if section == "scaling" else table(record[section]["rows"]))
     return "\n".join(parts)
 
 
 def conditions(record: dict[str, Any]) -> str:
-    on, best = ", ".join(f"{name}: {value}" for name, value in record["machine"].items()), record["ceilings"]
-    return (f"*{on}. Ceilings: dgemm {best['gflops']:.0f} GFlop/s, reading {best['read']:.0f} GB/s, copying "
+    on, best = ", ".join(f"{name}: {value}" for name,
+                         value in record["machine"].items()), record["ceilings"]
+    return (f"*{on}. Ceilings: dgemm {best['gflops']:.0f} GFlop/s, reading {best['read']:.0f} "
+            "GB/s, copying "
             f"{best['copy']:.0f} GB/s, an empty Python call {quantity(best['call'], 's')}.*\n")
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    lines = [COLUMNS, ["---", "---", "---:", "---:", "---:", "---", "---", "---"], *(Row(**row).cells for row in rows)]
-    return "\n".join(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |" for cells in lines) + "\n"
+    lines = [COLUMNS, ["---", "---", "---:", "---:", "---:", "---", "---", "---"],
+             *(Row(**row).cells for row in rows)]
+    return "\n".join(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
+                     for cells in lines) + "\n"
 
 
 def growth(record: dict[str, Any]) -> str:
@@ -112,7 +125,8 @@ def growth(record: dict[str, Any]) -> str:
     for curve in record["curves"]:
         ends = [f"{f'{y:,.0f}' if y >= 100 else f'{y:.3g}'} at {x:,.0f} {curve['x_label']}"
                 for x, y in list(zip(curve["x"], curve["y"], strict=True))[::len(curve["x"]) - 1]]
-        lines.append(f"| {curve['column']}: {curve['label']} | {curve['y_label']} | {ends[0]} | {ends[1]} | "
+        lines.append(f"| {curve['column']}: {curve['label']} | {curve['y_label']} | {ends[0]} | "
+                     f"{ends[1]} | "
                      f"{curve['exponent']:.2f} |")
     return "![Time and memory against size](scaling.png)\n\n" + "\n".join(lines) + "\n"
 

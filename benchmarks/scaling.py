@@ -1,4 +1,5 @@
-"""How cost grows with size: `python benchmarks/run.py scaling` measures, fits exponents and draws `scaling.png`."""
+"""How cost grows with size: `python benchmarks/run.py scaling` measures, fits exponents and draws
+`scaling.png`."""
 
 from __future__ import annotations
 
@@ -44,12 +45,14 @@ class Curve:
 def curves() -> Iterator[Curve]:
     """Time and memory of the forward model, the filter and the environments."""
     for column, x_label, label, measure, sizes in (
-            ("Complete electrode model", "unknowns", "all injections of a state", forward_model, EIT_CELLS),
-            ("Kalman filter, m = 16", "nodes", "a step", kalman_step, FLOW_CELLS)):
+            ("Complete electrode model", "unknowns", "all injections of a state", forward_model,
+             EIT_CELLS), ("Kalman filter, m = 16", "nodes", "a step", kalman_step, FLOW_CELLS)):
         x, seconds, memory = (list(values) for values in
-                              zip(*(in_fresh_process(measure, cells) for cells in sizes), strict=True))
+                              zip(*(in_fresh_process(measure, cells) for cells in sizes),
+                                  strict=True))
         yield Curve(column, label, x_label, "time in ms", x, [1e3 * value for value in seconds])
-        yield Curve(column, "with the model, peak", x_label, "memory in MB", x, [1e-6 * value for value in memory])
+        yield Curve(column, "with the model, peak", x_label, "memory in MB", x,
+                    [1e-6 * value for value in memory])
     for kind, rates, memory in environments():
         counts = [float(count) for count in COUNTS]
         yield Curve("Environments", kind, "environments", "steps per second", counts, rates)
@@ -58,9 +61,11 @@ def curves() -> Iterator[Curve]:
 
 
 def forward_model(cells: tuple[int, int]) -> tuple[float, float, float]:
-    """Unknowns, seconds of `transfer_resistance`, and peak bytes of setting up the model and solving once."""
+    """Unknowns, seconds of `transfer_resistance`, and peak bytes of setting up the model and
+    solving once."""
     small = pipe_mesh(1, 2)
-    electrode_model(small).transfer_resistance(conductivities(small, 1)[0])     # loads what is loaded once
+    # loads what is loaded once
+    electrode_model(small).transfer_resistance(conductivities(small, 1)[0])
     models = []
 
     def build() -> None:
@@ -74,7 +79,8 @@ def forward_model(cells: tuple[int, int]) -> tuple[float, float, float]:
 
 
 def kalman_step(cells: tuple[int, int]) -> tuple[float, float, float]:
-    """Nodes, seconds of a step once the rank has settled, and bytes of its model F, s, Π and of one step's arrays."""
+    """Nodes, seconds of a step once the rank has settled, and bytes of its model F, s, Π and of one
+    step's arrays."""
     record = problem(cells)
     ours = copy.copy(record.start)
     kalman_filter(ours, record.observations[:WARM_UP])
@@ -83,9 +89,11 @@ def kalman_step(cells: tuple[int, int]) -> tuple[float, float, float]:
         kalman_filter(copy.copy(ours), record.observations[WARM_UP:])
 
     covariance = record.start.covariance
-    held = ours.transition.nbytes + covariance.limit.nbytes + sum(U.nbytes for U, _ in covariance._transients)
+    held = ours.transition.nbytes + covariance.limit.nbytes + sum(U.nbytes for U,
+                                                                  _ in covariance._transients)
     seconds = best_of(steps, 5) / STEPS
-    return record.n, seconds, held + peak_growth(lambda: kalman_filter(copy.copy(ours), record.observations[-1:]))
+    return record.n, seconds, held + peak_growth(lambda: kalman_filter(copy.copy(ours),
+                                                                       record.observations[-1:]))
 
 
 def draw(curves: list[Curve], path: Path) -> None:
@@ -105,7 +113,8 @@ def draw(curves: list[Curve], path: Path) -> None:
                 x, y = np.array(curve.x), np.array(curve.y)
                 level = np.exp(np.log(y).mean() - curve.exponent * np.log(x).mean())
                 ax.loglog(x, level * x**curve.exponent, color=f"C{number}", linewidth=1, alpha=0.5)
-                ax.loglog(x, y, "o", color=f"C{number}", label=f"{curve.label}, exponent {curve.exponent:.2f}")
+                ax.loglog(x, y, "o", color=f"C{number}",
+                          label=f"{curve.label}, exponent {curve.exponent:.2f}")
             if len(drawn) > 1:                                # room for the legend
                 ax.set_ylim(top=4 * max(max(curve.y) for curve in drawn) * len(drawn))
             ax.set_xlabel(drawn[0].x_label)

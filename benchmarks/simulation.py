@@ -18,47 +18,53 @@ from solvers import refactorisations
 from eitbench.data.bank import recording_bytes
 from eitbench.data.episodes import simulate, simulate_together, truth_discretisation
 from eitbench.physics.flow import PlaneChannelFlow
-from eitbench.worlds import Pipe2D
+from eitbench.worlds.pipe2d import PIPE_2D
 
-SCENARIO = Pipe2D()
 BANK = 256
 
 
 def rows() -> Iterator[Row]:
-    transport, observation = truth_discretisation(SCENARIO)
+    transport, observation = truth_discretisation(PIPE_2D)
     cem = observation.cem
     n = transport.mesh.n_nodes
-    n_steps = SCENARIO.n_steps
+    n_steps = PIPE_2D.n_steps
     peers, _ = refactorisations(system_matrix(cem, np.full(cem.mesh.n_nodes, 0.3)))
-    velocity = PlaneChannelFlow(SCENARIO.mean_velocity, SCENARIO.half_width)
-    flow = reference_flow(transport.mesh, velocity, SCENARIO.diffusivity, transport.time_step,
+    velocity = PlaneChannelFlow(PIPE_2D.flow.mean_velocity, PIPE_2D.vessel.half_width)
+    flow = reference_flow(transport.mesh, velocity, PIPE_2D.flow.diffusivity, transport.time_step,
                           substeps=transport.substeps, inlet=transport.inlet)
     right = np.ones(n - len(transport.inlet))
     times = compare({**peers, "solve": lambda: flow._solver.factors.solve(right)}, 5)
     solve = times.pop("solve")
     name = min(times, key=lambda peer: times[peer])
-    n_solves = (n_steps + SCENARIO.lead_in) * round(SCENARIO.time_step / transport.time_step) * (transport.substeps + 1)
+    n_solves = (n_steps + PIPE_2D.lead_in) * round(PIPE_2D.time_step
+                                                   / transport.time_step) * (transport.substeps + 1)
     bare = n_steps * times[name] + n_solves * solve
-    against = (f"{n_steps} bare refactorisations by {name}, {cem.n_unknowns:,} unknowns, {quantity(times[name], 's')} "
-               f"each, and {n_solves:,} bare solves by scipy's splu, {n:,} nodes, {quantity(solve, 's')} each")
-    alone = compare({"": lambda: simulate(SCENARIO, 0, cache=False, progress=False)}, 3)[""]
+    against = (f"{n_steps} bare refactorisations by {name}, {cem.n_unknowns:,} unknowns, "
+               f"{quantity(times[name], 's')} "
+               f"each, and {n_solves:,} bare solves by scipy's splu, {n:,} nodes, "
+               f"{quantity(solve, 's')} each")
+    alone = compare({"": lambda: simulate(PIPE_2D, 0, cache=False, progress=False)}, 3)[""]
     yield Row("simulation", f"a new episode, T = {n_steps}", against, alone, bare, "≤ 1.5×",
               "bytes: the flow's factors are read at every sub-step")
     begin = time.perf_counter()
-    for _ in simulate_together(SCENARIO, range(8), progress=False):
+    for _ in simulate_together(PIPE_2D, range(8), progress=False):
         pass
     yield Row("simulation", "each of eight new episodes simulated together", "one alone",
-              (time.perf_counter() - begin) / 8, alone, "", "flops and bytes; eight flows share what is read")
+              (time.perf_counter() - begin) / 8, alone, "",
+              "flops and bytes; eight flows share what is read")
     one, two = (bank(jobs) for jobs in (1, 2))
-    yield Row("simulation", f"`eitbench bank`, {BANK} episodes, two processes", "one process", two, one,
+    yield Row("simulation", f"`eitbench bank`, {BANK} episodes, two processes", "one process", two,
+              one,
               "≥ 1.8× faster", "both cores; each process imports, and builds the truth's meshes",
-              f"{quantity(two / BANK, 's')} and {recording_bytes(SCENARIO) / 1e6:.2f} MB an episode")
+              f"{quantity(two / BANK, 's')} and {recording_bytes(PIPE_2D) / 1e6:.2f} MB an episode")
 
 
 def bank(jobs: int) -> float:
     """Seconds that the command takes for a bank in an empty cache, its start included."""
     with tempfile.TemporaryDirectory() as empty:
         begin = time.perf_counter()
-        command = [sys.executable, "-m", "eitbench.cli.app", "bank", "--seeds", f"train:0-{BANK - 1}", "-j", str(jobs)]
-        subprocess.run(command, env=os.environ | {"EITBENCH_CACHE": empty}, check=True, capture_output=True)
+        command = [sys.executable, "-m", "eitbench.cli.app", "bank", "--seeds",
+                   f"train:0-{BANK - 1}", "-j", str(jobs)]
+        subprocess.run(command, env=os.environ | {"EITBENCH_CACHE": empty}, check=True,
+                       capture_output=True)
         return time.perf_counter() - begin

@@ -1,6 +1,7 @@
 """Speed of the environments, from recordings that are there: `python benchmarks/run.py stepping`.
 
-Episodes are played from reset to end, so that the resets are counted. Times are for one step of one environment.
+Episodes are played from reset to end, so that the resets are counted. Times are for one step of one
+environment.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from common import Row, ceilings, in_fresh_process, peak_growth
 
 import eitbench  # noqa: F401 (registers)
 from eitbench.data.bank import fill
-from eitbench.worlds import Pipe2D
+from eitbench.worlds.pipe2d import PIPE_2D
 
 ESTIMATION, INJECTION = "eitbench/Pipe2D-v0", "eitbench/Pipe2DInjection-v0"
 EPISODES = 64
@@ -24,7 +25,7 @@ ENVS = 64
 
 
 def rows() -> Iterator[Row]:
-    fill(Pipe2D(), range(EPISODES), n_jobs=1)
+    fill(PIPE_2D, range(EPISODES), n_jobs=1)
     yield from starting()
     yield from estimation()
     yield from injection()
@@ -32,16 +33,17 @@ def rows() -> Iterator[Row]:
 
 def starting() -> Iterator[Row]:
     """Imports, and environments made by a new process."""
-    gym.make(INJECTION).reset(seed=0)                              # everything that is kept on disk is there now
-    code = ("import time; t = time.perf_counter(); import eitbench, gymnasium; i = time.perf_counter(); "
+    gym.make(INJECTION).reset(seed=0)                 # everything that is kept on disk is there now
+    code = ("import time; t = time.perf_counter(); import eitbench, gymnasium; i = "
+            "time.perf_counter(); "
             f"gymnasium.make({ESTIMATION!r}); print(i - t, time.perf_counter() - i)")
     imported, made = np.min([[float(word) for word in subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()]
         for _ in range(5)], axis=0)
     yield Row("stepping", "import eitbench, in a new process", "–", imported, None, "≤ 0.5 s",
               "Python: numpy and gymnasium are imported, torch and finite elements are not")
-    yield Row("stepping", f"gym.make of {ESTIMATION}, recorded, in a new process", "–", made, None, "≤ 0.2 s",
-              "Python: importing scipy.sparse")
+    yield Row("stepping", f"gym.make of {ESTIMATION}, recorded, in a new process", "–", made, None,
+              "≤ 0.2 s", "Python: importing scipy.sparse")
 
 
 def estimation() -> Iterator[Row]:
@@ -49,13 +51,18 @@ def estimation() -> Iterator[Row]:
     estimate = choose()[0]
     alone = scalar_step(gym.make(ESTIMATION), lambda: estimate)
     yield Row("stepping", f"{ESTIMATION}, one", "–", alone, None, "≥ 15,000/s",
-              f"Python overhead, {alone / ceilings().call:.0f} empty calls; reading 19,000 entries of M̃")
-    ours = vector_step(gym.make_vec(ESTIMATION, num_envs=ENVS, vectorization_mode="vector_entry_point"), choose)
+              f"Python overhead, {alone / ceilings().call:.0f} empty calls; reading 19,000 "
+              "entries of M̃")
+    ours = vector_step(gym.make_vec(ESTIMATION, num_envs=ENVS,
+                                    vectorization_mode="vector_entry_point"), choose)
     limit, ceiling = "bytes: estimates are checked, transposed and weighed", (
-        f"{8e-9 * estimate.size / ours:.1f} GB/s of estimates taken in, read at {ceilings().read:.0f}")
+        f"{8e-9 * estimate.size / ours:.1f} GB/s of estimates taken in, read at "
+        f"{ceilings().read:.0f}")
     for mode, reference in (("sync", "SyncVectorEnv"), ("async", "AsyncVectorEnv")):
-        theirs = vector_step(gym.make_vec(ESTIMATION, num_envs=ENVS, vectorization_mode=mode), choose, episodes=1)
-        yield Row("stepping", f"{ESTIMATION}, {ENVS} at once", f"gymnasium's {reference} over ours one by one", ours,
+        theirs = vector_step(gym.make_vec(ESTIMATION, num_envs=ENVS, vectorization_mode=mode),
+                             choose, episodes=1)
+        yield Row("stepping", f"{ESTIMATION}, {ENVS} at once",
+                  f"gymnasium's {reference} over ours one by one", ours,
                   theirs, "≥ 60,000/s", limit, ceiling)
 
 
@@ -66,13 +73,15 @@ def injection() -> Iterator[Row]:
             ("reduced", ("≥ 3,000/s", "≥ 8,000/s"), "flops: A P Aᵀ for 120 states")):
         what = f"{INJECTION}, estimator {estimator!r}"
         alone = scalar_step(gym.make(INJECTION, estimator=estimator), lambda: int(choose()[0]))
-        yield Row("stepping", f"{what}, one", "–", alone, None, targets[0], limit, reached(estimator, alone, 1))
+        yield Row("stepping", f"{what}, one", "–", alone, None, targets[0], limit,
+                  reached(estimator, alone, 1))
         for threads in (1,) if estimator == "none" else (1, 2):
             envs = gym.make_vec(INJECTION, num_envs=ENVS, vectorization_mode="vector_entry_point",
                                 estimator=estimator, threads=threads)
             ours = vector_step(envs, choose)
             yield Row("stepping", f"{what}, {ENVS} at once, {threads} thread{'s' * (threads > 1)}",
-                      "ours one by one", ours, alone, targets[1] if estimator == "none" or threads == 2 else "", limit,
+                      "ours one by one", ours, alone,
+                      targets[1] if estimator == "none" or threads == 2 else "", limit,
                       reached(estimator, ours, threads))
 
 
@@ -80,7 +89,8 @@ def reached(estimator: str, seconds: float, threads: int) -> str:
     if estimator == "none":
         return f"{seconds / ceilings().call:.0f} empty calls"
     r, m = 120, 16
-    flops = 4 * r**3 * 2 / 3 + 2 * (2 * m * r**2) + 2 * m**2 * r      # A is block triangular: a third is saved
+    # A is block triangular: a third is saved
+    flops = 4 * r**3 * 2 / 3 + 2 * (2 * m * r**2) + 2 * m**2 * r
     return f"{1e-9 * flops / seconds:.0f} of {threads} × {ceilings().gflops:.0f} GFlop/s"
 
 
@@ -98,8 +108,10 @@ def scalar_step(env: gym.Env, choose: Callable[[], object], episodes: int = 12) 
     return float(best)
 
 
-def vector_step(envs: gym.vector.VectorEnv, choose: Callable[[], np.ndarray], episodes: int = 5) -> float:
-    """Seconds for one step of one of the environments, of the fastest of several episodes after the first."""
+def vector_step(envs: gym.vector.VectorEnv, choose: Callable[[], np.ndarray],
+                episodes: int = 5) -> float:
+    """Seconds for one step of one of the environments, of the fastest of several episodes after the
+    first."""
     best = np.inf
     for round_ in range(episodes + 1):
         begin, steps, ended = time.perf_counter(), 0, False
@@ -113,14 +125,15 @@ def vector_step(envs: gym.vector.VectorEnv, choose: Callable[[], np.ndarray], ep
     return float(best)
 
 
-KINDS = {"estimation": (ESTIMATION, {}), "injection, no estimator": (INJECTION, {"estimator": "none"}),
+KINDS = {"estimation": (ESTIMATION, {}),
+         "injection, no estimator": (INJECTION, {"estimator": "none"}),
          "injection, reduced filter": (INJECTION, {})}
 COUNTS = (1, 4, 16, 64, 256)
 
 
 def environments() -> Iterator[tuple[str, list[float], list[float]]]:
     """Kind, steps per second and peak bytes for `COUNTS` environments at once, for the figure."""
-    fill(Pipe2D(), range(EPISODES), n_jobs=1)
+    fill(PIPE_2D, range(EPISODES), n_jobs=1)
     for kind in KINDS:
         measured = [in_fresh_process(growth, kind, count) for count in COUNTS]
         yield kind, *(list(values) for values in zip(*measured, strict=True))
@@ -130,11 +143,12 @@ def growth(kind: str, count: int) -> tuple[float, float]:
     """Steps per second, and bytes by which an episode's arrays raise the peak of this process."""
     name, kwargs = KINDS[kind]
     choose = chooser(name, count)
-    gym.make(name, **kwargs).reset(seed=0)                           # what all environments share is there before
+    gym.make(name, **kwargs).reset(seed=0)             # what all environments share is there before
     made = []
 
     def play() -> None:
-        made.append(gym.make_vec(name, num_envs=count, vectorization_mode="vector_entry_point", **kwargs))
+        made.append(gym.make_vec(name, num_envs=count, vectorization_mode="vector_entry_point",
+                                 **kwargs))
         made[0].reset(seed=[k % EPISODES for k in range(count)])
         made[0].step(choose())
 

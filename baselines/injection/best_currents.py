@@ -8,7 +8,7 @@ from eitbench.envs.injection_core import Rules
 
 
 class Policy:
-    # Found by `python benchmarks/search_injections.py eitbench/Pipe2DInjectionCurrents-v0`.
+    # Found by `python studies/search_injections.py eitbench/Pipe2DInjectionCurrents-v0`.
     parameters: dict[str, Any] = {  # noqa: RUF012
         "world": "Pipe2D", "limit": "Linf", "environment_steps": 5_153_536,
         "currents": [1.0, -0.5, -0.5, -0.5, 0.0, -0.5, 0.0, 0.0, -1.0, 0.0, 0.0, 0.5, -0.5, 0.0, -1.0, 0.0]}

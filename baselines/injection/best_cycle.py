@@ -9,7 +9,7 @@ from eitbench.envs.injection_core import Rules
 
 
 class Policy:
-    # Found by `python benchmarks/search_injections.py`; electrodes by world.
+    # Found by `python studies/search_injections.py`; electrodes by world.
     parameters: dict[str, Any] = {  # noqa: RUF012
         "cycle": {"Pipe2D": [[0, 8]], "Pipe2D with faults": [[8, 11], [0, 4], [2, 8], [0, 14]],
                   "Pipe2DIntermittent with a budget": [[0, 10]], "Pipe2DDriftingVelocity": [[7, 8], [1, 7]],

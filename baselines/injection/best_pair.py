@@ -8,7 +8,7 @@ from eitbench.envs.injection_core import Rules
 
 
 class Policy:
-    # Found by `python benchmarks/search_injections.py`; electrodes by world.
+    # Found by `python studies/search_injections.py`; electrodes by world.
     parameters: dict[str, Any] = {  # noqa: RUF012
         "pair": {"Pipe2D": [0, 8], "Pipe2D with faults": [0, 8], "Pipe2DIntermittent with a budget": [0, 10],
                  "Pipe2DDriftingVelocity": [7, 9], "RotatingTank2D": [9, 15]},

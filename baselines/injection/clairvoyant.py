@@ -24,7 +24,7 @@ NOTHING, CURRENTS = -1, -2
 class Policy:
     privileged = True
     role = "reference"
-    # The cycles are for an unknown flow; those of one pair were found by `python benchmarks/search_injections.py`.
+    # The cycles are for an unknown flow; those of one pair were found by `python studies/search_injections.py`.
     parameters: dict[str, Any] = {"fixed_pairs": [[0, 8], [0, 10]], "thresholds": [1e-4, 3e-2, 16],  # noqa: RUF012
                                   "intervals": [1, 2, 3], "horizons": [0, 2, 4, 8, 16], "changes": 10, "cycles": [
         [[7, 9]], [[7, 8]], [[8, 15]], [[9, 15]], [[1, 7]], [[6, 9]], [[1, 6]], [[8, 14]], [[0, 7]], [[7, 8], [1, 7]],

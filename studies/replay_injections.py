@@ -1,8 +1,9 @@
-"""What an agent owes to looking: `python benchmarks/replay_injections.py eitbench/Pipe2DInjectionFlow-v0 MODEL.ZIP`.
+"""What an agent owes to looking: `python studies/replay_injections.py
+eitbench/Pipe2DInjectionFlow-v0 MODEL.ZIP`.
 
-The agent plays 50 dev episodes with the reduced estimator. Then the same injections are made again, each episode's in
-another one: a plan as good as the agent's on average, but made for other data. By how much the error rises is what
-adapting was worth. Printed with its 95 % interval over episodes.
+The agent plays 50 dev episodes with the reduced estimator. Then the same injections are made again,
+each episode's in another one: a plan as good as the agent's on average, but made for other data. By
+how much the error rises is what adapting was worth. Printed with its 95 % interval over episodes.
 """
 
 from __future__ import annotations
@@ -16,10 +17,10 @@ import numpy as np
 from stable_baselines3 import PPO
 from threadpoolctl import threadpool_limits
 
-import eitbench.envs
 from eitbench.bench.text import mean_and_interval
 from eitbench.data.seeds import parse_seeds
 from eitbench.envs.injection import InjectionVectorEnv
+from eitbench.worlds import entries
 
 SHIFTS = (1, 7, 19, 31)
 """Whose injections an episode is given: those of so many episodes before."""
@@ -27,30 +28,34 @@ SHIFTS = (1, 7, 19, 31)
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="What an agent owes to looking.")
-    parser.add_argument("env", choices=eitbench.envs.INJECTION)
+    parser.add_argument("env",
+                        choices=[id for id, each in entries().items() if each.track == "injection"])
     parser.add_argument("model", help="model.zip of a PPO agent")
     arguments = parser.parse_args()
     seeds = parse_seeds("dev:0-49")
-    made: Any = gym.make_vec(arguments.env, num_envs=len(seeds), vectorization_mode="vector_entry_point")
+    made: Any = gym.make_vec(arguments.env, num_envs=len(seeds),
+                             vectorization_mode="vector_entry_point")
     agent = PPO.load(arguments.model, device="cpu")
     earned, actions = play(made, seeds, lambda _, seen: agent.predict(seen, deterministic=True)[0])
-    replayed = [play(made, seeds, lambda k, _, shift=shift: np.roll(actions[k], shift))[0] for shift in SHIFTS]
+    replayed = [play(made, seeds, lambda k, _, shift=shift: np.roll(actions[k], shift))[0]
+                for shift in SHIFTS]
     rise, half = mean_and_interval(list(earned - np.mean(replayed, axis=0)))
     print(f"with the injections of another episode the error rises by {rise:.5f} ± {half:.5f}")
 
 
 def play(env: InjectionVectorEnv, seeds: list[int], act: Callable[[int, np.ndarray], np.ndarray],
          ) -> tuple[np.ndarray, np.ndarray]:
-    """(B,) by how much the error of each episode lies below the homogeneous one, and (steps, B) the actions."""
-    rules = env.rules
-    steps = rules.scenario.n_steps - len(rules.scenario.currents)
+    """(B,) by how much the error of each episode lies below the homogeneous one, and (steps, B) the
+    actions."""
+    world = env.rules.world
+    steps = world.n_steps - len(world.currents)
     seen, _ = env.reset(seed=seeds)
     actions, rewards = [], []
     for k in range(steps):
         actions.append(act(k, seen))  # type: ignore[arg-type]
         seen, reward, *_ = env.step(actions[-1])
         rewards.append(reward)
-    return np.sum(rewards, axis=0) / (rules.scenario.n_steps - rules.scenario.warm_up), np.array(actions)
+    return np.sum(rewards, axis=0) / (world.n_steps - world.warm_up), np.array(actions)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
-"""What an exact covariance costs in 3D, and what is lost by keeping less: `python benchmarks/covariance_rank.py`.
+"""What an exact covariance costs in 3D, and what is lost by keeping less: `python
+studies/covariance_rank.py`.
 
-The Kalman filter of `Pipe3D` on a record of 66 injections of training episode 0, with all tolerances of the rank of
-what it knows, against the same filter with the full n×n covariance.
+The Kalman filter of `Pipe3D` on a record of 66 injections of training episode 0, with all
+tolerances of the rank of what it knows, against the same filter with the full n×n covariance.
 """
 
 from __future__ import annotations
@@ -10,10 +11,10 @@ import resource
 import time
 
 import numpy as np
-from eitbench.envs.pipe3d import Pipe3DEnv
 from threadpoolctl import threadpool_limits
 
 from eitbench.data.recordings import cycle_voltages, recording, score_operators
+from eitbench.envs.estimation import EstimationEnv
 from eitbench.estimation import DenseKalmanFilter, FirstFrame, LinearisedObservations, table_5_1
 from eitbench.scoring import relative_error
 
@@ -21,21 +22,22 @@ TOLERANCES = (1e-6, 1e-4, 1e-3, 1e-2, 1e-1)
 
 
 def main() -> None:
-    env = Pipe3DEnv()
-    task, scenario = env.task, env.scenario
+    env = EstimationEnv("eitbench/Pipe3D-v0")
+    task, world = env.task, env.world
     env.reset(seed=0)
-    voltages = cycle_voltages(scenario, recording(scenario, 0))
+    voltages = cycle_voltages(world, 0, recording(world, 0))
     currents = task.currents[np.arange(task.n_steps) % len(task.currents)]
     first = FirstFrame(task)
     for k in range(first.length):
         first.add(voltages[k], currents[k])
     begin = time.perf_counter()
     start = table_5_1(task.transport, task.prior, first.c_bh)
-    print(f"n = {task.mesh.n_nodes}, {task.currents.shape[1]} readings an injection; evolution model and covariance "
+    print(f"n = {task.mesh.n_nodes}, {task.currents.shape[1]} readings an injection; evolution "
+          "model and covariance "
           f"without data, once a process: {time.perf_counter() - begin:.0f} s")
     linear = LinearisedObservations(task.observation, task.noise, start.mean)
     observations = [linear(*measured) for measured in zip(voltages, currents, strict=True)]
-    interpolation, mass = score_operators(scenario)
+    interpolation, mass = score_operators(world)
     scored = slice(task.warm_up, None)
 
     def row(name: str, steps: list, seconds: float, rank: int) -> None:
@@ -43,7 +45,8 @@ def main() -> None:
         error = relative_error((interpolation @ means[scored].T).T, env.truth()[scored], mass)
         off = np.abs((means - exact[0]) / np.sqrt(exact[1])).max()
         wrong = np.abs(variances / exact[1] - 1.0)[:, inner].max()
-        print(f"| {name} | {rank} | {seconds:.2f} | {error:.6f} | {off:.1e} | {wrong:.1e} |", flush=True)
+        print(f"| {name} | {rank} | {seconds:.2f} | {error:.6f} | {off:.1e} | {wrong:.1e} |",
+              flush=True)
 
     n = task.mesh.n_nodes
     dense = DenseKalmanFilter(start.mean, start.covariance.apply(0, np.eye(n)))
@@ -54,7 +57,8 @@ def main() -> None:
     seconds = (time.perf_counter() - begin) / len(steps)
     exact = np.array([s.mean for s in steps]), np.array([s.variance for s in steps])
     inner = np.setdiff1d(np.arange(n), task.transport.inlet)
-    print("| covariance | rank | s a step | ẽ_c | mean off by, in std | variance off by, relative |")
+    print("| covariance | rank | s a step | ẽ_c | mean off by, in std | variance off by, "
+          "relative |")
     print("|---|---|---|---|---|---|")
     row("full, n × n", steps, seconds, n)
     for tolerance in TOLERANCES:

@@ -1,7 +1,8 @@
-"""What the reduced filter costs: `python benchmarks/reduced_filter.py`, some minutes once the episodes are simulated.
+"""What the reduced filter costs: `python studies/reduced_filter.py`, some minutes once the episodes
+are simulated.
 
-Policies play the episodes of their official records once more, with the reduced filter inside; printed is by how much
-the exact one's error is larger in the same episodes, with its 95 % interval.
+Policies play the episodes of their official records once more, with the reduced filter inside;
+printed is by how much the exact one's error is larger in the same episodes, with its 95 % interval.
 """
 
 from __future__ import annotations
@@ -28,13 +29,16 @@ PLAYED = {"Pipe2DInjection": ("best_pair", "random_pair"),
 def main() -> None:
     records = {(record["environment"]["name"], record["method"]): record
                for record in read_records(shipped("leaderboards") / "results")}
-    print("| environment | episodes | policy | exact | exact less reduced |\n|---|---|---|---:|---:|")
+    print("| environment | episodes | policy | exact | exact less reduced "
+          "|\n|---|---|---|---:|---:|")
     for world, policies in PLAYED.items():
         for policy in policies:
             record = records[f"eitbench-{world}-v0", policy]
             exact, full = scores_by_seed(record, "error"), job_of(record, isolate="never")
             reduced = Environment(full.environment.id, json.dumps({"estimator": "reduced"}))
-            steps = [exact[seed] - run_episode(Job(reduced, full.method, parse_seeds(seed)[0]))[0]["scores"]["error"]
+            steps = [exact[seed]
+                     - run_episode(Job(reduced, full.method,
+                                       parse_seeds(seed)[0]))[0]["scores"]["error"]
                      for seed in tqdm(exact, desc=f"{world}, {policy}", leave=False, disable=None)]
             error, _ = mean_and_interval(list(exact.values()))
             print(f"| {world} | {seed_ranges(list(exact))} | {policy} | {error:.4f} | "

@@ -1,8 +1,8 @@
-"""Discretisation errors in 3D, of voltages and of transport: `python benchmarks/forward_error_3d.py`.
+"""Discretisation errors in 3D, of voltages and of transport: `python studies/forward_error_3d.py`.
 
-As `forward_error.py`, for `Pipe3D`: EIT meshes with potentials of first and second order against one of about 100,000
-unknowns (2 GB, some minutes), and the estimators' whole model. Voltage errors are in noise standard deviations, of all
-16 injections for states of a training episode.
+As `forward_error.py`, for `Pipe3D`: EIT meshes with potentials of first and second order against
+one of about 100,000 unknowns (2 GB, some minutes), and the estimators' whole model. Voltage errors
+are in noise standard deviations, of all 16 injections for states of a training episode.
 """
 
 import time
@@ -15,37 +15,40 @@ from eitbench import simulate
 from eitbench.numerics.round import round_pipe_mesh
 from eitbench.physics.cem import CompleteElectrodeModel
 from eitbench.physics.observation import ObservationModel
-from eitbench.worlds import Pipe3D
+from eitbench.worlds.pipe3d import PIPE_3D
 
 REFERENCE = ((5, 6), 6, (2.5, 1.75, 2.5), 2)
 MESHES = {"P1": ((3, 4), 6, (2.0, 1.5, 2.0), 1), "P1, finer": ((4, 6), 7, (2.0, 1.5, 2.0), 1),
           "P1, finest": ((5, 8), 9, (2.0, 1.5, 2.0), 1), "P2": ((2, 4), 4, (2.0, 1.5, 2.0), 2),
-          "P2, the model's": ((3, 4), 4, (2.5, 1.5, 2.5), 2), "P2, the truth's": ((4, 5), 5, (2.5, 1.75, 2.5), 2)}
+          "P2, the model's": ((3, 4), 4, (2.5, 1.5, 2.5), 2),
+          "P2, the truth's": ((4, 5), 5, (2.5, 1.75, 2.5), 2)}
 STATES = range(20, 66, 15)
 
 
 def main() -> None:
-    scenario = Pipe3D()
-    truth, model = scenario.truth(), scenario.model()
-    concentration = simulate(scenario, 0).concentration.astype(float)
+    world = PIPE_3D
+    pipe = world.vessel
+    truth, model = world.truth(), world.model()
+    concentration = simulate(world, 0).concentration.astype(float)
     states = concentration[list(STATES)]
 
     def observation(cells: tuple[int, int], rings: int, grading: tuple[float, float, float],
                     order: int) -> ObservationModel:
-        mesh = round_pipe_mesh(scenario.length, scenario.radius, scenario.spans_around, scenario.spans_along, cells,
+        mesh = round_pipe_mesh(pipe.length, pipe.radius, pipe.spans_around, pipe.spans_along, cells,
                                rings, grading)
-        cem = CompleteElectrodeModel(mesh, scenario.electrodes(mesh), scenario.contact_impedance, order)
-        return ObservationModel(cem, truth.transport.mesh.interpolation_to(mesh.points), truth.observation.conductivity,
-                                0.01)
+        cem = CompleteElectrodeModel(mesh, pipe.electrodes(mesh), pipe.contact_impedance, order)
+        return ObservationModel(cem, truth.transport.mesh.interpolation_to(mesh.points),
+                                truth.observation.conductivity, 0.01)
 
     def voltages(seen: ObservationModel, fields: np.ndarray) -> np.ndarray:
-        return np.array([seen.voltages(c, scenario.currents) for c in fields])
+        return np.array([seen.voltages(c, world.currents) for c in fields])
 
     reference = observation(*REFERENCE)
     exact = voltages(reference, states)
-    std = scenario.noise.std(exact)
+    std = world.noise.std(exact)
     print(f"reference: {reference.cem.n_unknowns:,} unknowns, {len(states)} states")
-    print("| mesh | EIT unknowns | s a state | error rms | 99 % below | largest |\n|---|---|---|---|---|---|")
+    print("| mesh | EIT unknowns | s a state | error rms | 99 % below | largest "
+          "|\n|---|---|---|---|---|---|")
 
     def row(name: str, seen: ObservationModel, fields: np.ndarray) -> None:
         seen.transfer_resistance(fields[:1])                        # compiled, and memory at hand
@@ -53,14 +56,16 @@ def main() -> None:
         seen.transfer_resistance(fields)
         seconds = (time.perf_counter() - begin) / len(fields)
         e = np.abs((voltages(seen, fields) - exact) / std)
-        print(f"| {name} | {seen.cem.n_unknowns:,} | {seconds:.3f} | {np.sqrt((e**2).mean()):.2f} | "
+        print(f"| {name} | {seen.cem.n_unknowns:,} | {seconds:.3f} | "
+              f"{np.sqrt((e**2).mean()):.2f} | "
               f"{np.quantile(e, 0.99):.2f} | {e.max():.2f} |", flush=True)
 
     for name, specification in MESHES.items():
         row(name, observation(*specification), states)
     to_model = truth.transport.mesh.interpolation_to(model.transport.mesh.points)
     row("the model with its coarser concentration", model.observation, (to_model @ states.T).T)
-    print(f"transport: relative L2 error {_transport_error(scenario, model, to_model, concentration):.3f}")
+    print("transport: relative L2 error "
+          f"{_transport_error(world, model, to_model, concentration):.3f}")
 
 
 if __name__ == "__main__":

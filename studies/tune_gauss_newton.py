@@ -1,7 +1,9 @@
-"""Tune α of the stationary Gauss–Newton on stationary targets: `python benchmarks/tune_gauss_newton.py`.
+"""Tune α of the stationary Gauss–Newton on stationary targets: `python
+studies/tune_gauss_newton.py`.
 
-The rule: one frame of 16 injections for each of a few states of training episodes, the target standing still; of a grid
-with two values an octave take the α with the smallest mean relative error. Dev and test seeds are not touched.
+The rule: one frame of 16 injections for each of a few states of training episodes, the target
+standing still; of a grid with two values an octave take the α with the smallest mean relative
+error. Dev and test seeds are not touched.
 """
 
 import numpy as np
@@ -13,29 +15,32 @@ from eitbench.data.seeds import parse_seeds
 from eitbench.estimation import best_homogeneous, gauss_newton
 from eitbench.numerics.fem import stiffness_matrix
 from eitbench.scoring import relative_error
-from eitbench.worlds import Pipe2D
+from eitbench.worlds.pipe2d import PIPE_2D
 
 SEEDS, STATES = "train:0-3", (30, 60, 90)
 ALPHAS = 2.0 ** np.arange(-5, 2.5, 0.5)
 
 
 def main() -> None:
-    scenario = Pipe2D()
-    task = make_task(scenario)
+    task = make_task(PIPE_2D)
     stiffness = stiffness_matrix(task.mesh)
-    interpolation, mass = score_operators(scenario)
+    interpolation, mass = score_operators(PIPE_2D)
     errors: dict[float, list[float]] = {alpha: [] for alpha in [0.0, *ALPHAS]}
     for seed in parse_seeds(SEEDS):
-        episode = simulate(scenario, seed)
+        episode = simulate(PIPE_2D, seed)
         for state in STATES:
             clean = task.currents @ episode.transfer_resistance[state - 1]
-            draws = np.random.default_rng(np.random.SeedSequence([seed, state])).standard_normal(clean.shape)
-            voltages = clean + scenario.noise.std(clean) * draws
+            draws = np.random.default_rng(np.random.SeedSequence([seed,
+                                                                  state])).standard_normal(clean.shape)
+            voltages = clean + PIPE_2D.noise.std(clean) * draws
             start = np.full(task.mesh.n_nodes, best_homogeneous(
-                task.observation, task.noise, task.mesh.n_nodes, voltages, task.currents, task.expected_concentration))
+                task.observation, task.noise, task.mesh.n_nodes, voltages, task.currents,
+                task.expected_concentration))
             for alpha in errors:
-                image = start if alpha == 0 else gauss_newton(task.observation, voltages, task.currents,
-                                                              task.noise.std(voltages), alpha**2 * stiffness, start)
+                image = start if alpha == 0 else gauss_newton(task.observation, voltages,
+                                                              task.currents,
+                                                              task.noise.std(voltages),
+                                                              alpha**2 * stiffness, start)
                 truth = episode.concentration[state][None].astype(float)
                 errors[alpha].append(relative_error((interpolation @ image)[None], truth, mass))
     for alpha, values in errors.items():
