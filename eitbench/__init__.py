@@ -7,12 +7,13 @@ heavy is loaded before something is used.
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from eitbench.worlds import ours as _ours  # noqa: F401 (registers our ids)
 from eitbench.worlds.registry import register, register_installed
 
 if TYPE_CHECKING:
     from eitbench.data.episodes import Episode, simulate
-    from eitbench.envs.injection_core import Rules
     from eitbench.envs.pages import page
+    from eitbench.estimation.onboard.rules import Rules
     from eitbench.worlds.task import Estimate, Task, make_task
     from eitbench.worlds.world import World
 
@@ -20,7 +21,7 @@ __version__ = "0.1.0"
 __all__ = ["Episode", "Estimate", "Rules", "Task", "World", "make_task", "page", "register", "simulate"]
 
 _LATER = {"Estimate": "worlds.task", "Task": "worlds.task", "make_task": "worlds.task", "World": "worlds.world",
-          "Episode": "data.episodes", "simulate": "data.episodes", "Rules": "envs.injection_core",
+          "Episode": "data.episodes", "simulate": "data.episodes", "Rules": "estimation.onboard.rules",
           "page": "envs.pages"}
 """Where the public names lie that are loaded on first use."""
 

@@ -14,8 +14,9 @@ import numpy as np
 
 from eitbench.bench.policies import load_policy
 from eitbench.data.recordings import recording
-from eitbench.envs.injection_core import InjectionCore, Rules
+from eitbench.envs.injection_core import InjectionCore
 from eitbench.estimation.onboard.belief import Belief
+from eitbench.estimation.onboard.rules import Rules
 
 NOTHING, CURRENTS = -1, -2
 """What plans say, besides the number of a pair, of a step where nothing is injected, or the best fixed currents."""

@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from eitbench.envs.injection_core import Rules
 from eitbench.estimation.onboard.belief import DOUBTFUL, FORGIVEN, Belief
+from eitbench.estimation.onboard.rules import Rules
 
 
 class Policy:

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from eitbench.envs.injection_core import Rules
+from eitbench.estimation.onboard.rules import Rules
 
 
 class Policy:

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from eitbench.envs.injection_core import Rules
 from eitbench.estimation.onboard.belief import Belief
+from eitbench.estimation.onboard.rules import Rules
 
 CANDIDATES, SWEEPS, AFTERWARDS = 6, 2, 16
 """Pairs that are tried at a step, how often all steps are gone through, and steps on which an exchange is judged."""

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from eitbench.envs.injection_core import Rules
+from eitbench.estimation.onboard.rules import Rules
 
 DOWN = 3
 """Electrodes by which the current leaves further down than it enters."""

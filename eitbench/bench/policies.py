@@ -28,7 +28,7 @@ from eitbench.bench.baselines import (
 from eitbench.bench.scores import Outcome
 from eitbench.bench.tracks import Environment, check_track
 from eitbench.envs.injection import InjectionEnv
-from eitbench.envs.injection_core import Rules
+from eitbench.estimation.onboard.rules import Rules
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -8,7 +8,7 @@ import json
 import platform
 import time
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from datetime import UTC, datetime
 from functools import lru_cache
 from pathlib import Path
@@ -244,6 +244,24 @@ def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1, backend: 
                 pass
     finally:
         guests.close()
+
+
+def successful(jobs: Iterable[Job], results: Iterable[dict[str, Any]]) -> dict[Job, dict[str, Any]]:
+    """The successful results of the jobs that have one, the first of each: of the same environment,
+    method, version and seed, whatever code it was that played."""
+    fine: dict[tuple[str, ...], dict[str, Any]] = {}
+    for result in results:
+        if result["status"] == "ok":
+            what = (result["environment"]["name"], result["method"], result["version"], result["seed"])
+            fine.setdefault(what, result)
+    named = ((job, (job.environment.name, job.load().name, job.load().version, name_seed(job.seed))) for job in jobs)
+    return {job: fine[what] for job, what in named if what in fine}
+
+
+def unplayed(jobs: Sequence[Job], results: Iterable[dict[str, Any]]) -> list[Job]:
+    """The jobs of which none of the results is a successful one."""
+    done = successful(jobs, results)
+    return [job for job in jobs if job not in done]
 
 
 def _simulate_job(job: Job) -> None:

@@ -9,11 +9,11 @@ import platform
 import subprocess
 import time
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -22,9 +22,6 @@ from eitbench._code import code_digest, package_files
 from eitbench._files import PACKAGE, write_atomically
 from eitbench.bench.records import SCHEMA, SHARED, read_records, sealed, split_of, write_record
 from eitbench.data.seeds import name_seed
-
-if TYPE_CHECKING:
-    from eitbench.bench.run import Job
 
 PACKAGES = ("eitbench", "numpy", "scipy", "gymnasium", "scikit-fem", "numba", "stable-baselines3", "sb3-contrib",
             "torch")
@@ -160,24 +157,6 @@ def results_in(folder: Path) -> list[dict[str, Any]]:
     """The results that were gathered into the records of a folder. Errors as
     `records.read_records`."""
     return [result for record in read_records(folder) for result in results_of(record)]
-
-
-def successful(jobs: Iterable[Job], results: Iterable[dict[str, Any]]) -> dict[Job, dict[str, Any]]:
-    """The successful results of the jobs that have one, the first of each: of the same environment,
-    method, version and seed, whatever code it was that played."""
-    fine: dict[tuple[str, ...], dict[str, Any]] = {}
-    for result in results:
-        if result["status"] == "ok":
-            what = (result["environment"]["name"], result["method"], result["version"], result["seed"])
-            fine.setdefault(what, result)
-    named = ((job, (job.environment.name, job.load().name, job.load().version, name_seed(job.seed))) for job in jobs)
-    return {job: fine[what] for job, what in named if what in fine}
-
-
-def unplayed(jobs: Sequence[Job], results: Iterable[dict[str, Any]]) -> list[Job]:
-    """The jobs of which none of the results is a successful one."""
-    done = successful(jobs, results)
-    return [job for job in jobs if job not in done]
 
 
 def _read(path: Path) -> dict[str, Any] | None:

@@ -10,8 +10,8 @@ from typing import Any
 
 from eitbench.bench import suites, tracks
 from eitbench.bench.records import read_record, split_of, write_record
-from eitbench.bench.run import Job, run_jobs
-from eitbench.bench.store import EpisodeStore, provenance, results_of, unplayed
+from eitbench.bench.run import Job, run_jobs, unplayed
+from eitbench.bench.store import EpisodeStore, provenance, results_of
 from eitbench.bench.text import seed_ranges
 from eitbench.data.seeds import name_seed
 

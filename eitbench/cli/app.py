@@ -184,8 +184,8 @@ def policies(
 
     Each episode is stored the moment it is done; the same command again resumes.
     """
-    from eitbench.bench.run import run_jobs
-    from eitbench.bench.store import EpisodeStore, results_in, unplayed
+    from eitbench.bench.run import run_jobs, unplayed
+    from eitbench.bench.store import EpisodeStore, results_in
     from eitbench.bench.suites import policy_jobs
     from eitbench.report.policy_table import policy_rows, policy_table
     with clear_errors():

@@ -12,8 +12,9 @@ from gymnasium import spaces
 from gymnasium.utils import EzPickle
 
 from eitbench import _check
-from eitbench.envs.injection_core import FURTHEST, InjectionCore, Rules, scaled
+from eitbench.envs.injection_core import FURTHEST, InjectionCore, scaled
 from eitbench.envs.lockstep import LockstepVectorEnv
+from eitbench.estimation.onboard.rules import Rules
 from eitbench.worlds.registry import entry
 from eitbench.worlds.task import Task, make_task
 

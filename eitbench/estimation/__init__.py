@@ -1,4 +1,4 @@
-"""Floor 3: estimators; matrices in, estimates out."""
+"""Floor 4: estimators; matrices in, estimates out."""
 
 from eitbench.estimation.covariance import FreeCovariance
 from eitbench.estimation.dense import DenseKalmanFilter, Filtered

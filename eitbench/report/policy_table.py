@@ -8,8 +8,7 @@ from typing import Any
 import pandas as pd
 
 from eitbench.bench.policies import adaptivity_gap
-from eitbench.bench.run import Job
-from eitbench.bench.store import successful
+from eitbench.bench.run import Job, successful
 from eitbench.bench.text import mean_and_interval, rounded
 
 OPEN_LOOP = ("adjacent", "opposite", "transverse", "best_pair", "best_cycle", "best_currents", "schedule")

@@ -17,7 +17,8 @@ from tqdm import tqdm
 from eitbench import _check
 from eitbench.bench.policies import PolicyFile, load_policy
 from eitbench.envs.injection import InjectionEnv
-from eitbench.envs.injection_core import Rules, scaled
+from eitbench.envs.injection_core import scaled
+from eitbench.estimation.onboard.rules import Rules
 
 DEFAULTS = {"rounds": 4, "episodes": 50, "epochs": 10, "batch": 256, "learning_rate": 1e-3}
 

@@ -8,7 +8,6 @@ import re
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from importlib import import_module
 from importlib.metadata import entry_points
 from typing import Any
 
@@ -119,9 +118,7 @@ def take_over(told: list[Entry]) -> None:
 
 
 def register_installed() -> None:
-    """Register our worlds, and those of installed packages; one that fails is left out with a
-    warning."""
-    import_module("eitbench.worlds.ours")
+    """Register the worlds of installed packages; one that fails is left out with a warning."""
     for point in entry_points(group=GROUP):
         try:
             point.load()

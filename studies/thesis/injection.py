@@ -13,8 +13,8 @@ from matplotlib.lines import Line2D
 
 from eitbench._files import shipped
 from eitbench.bench.baselines import baseline_folder
-from eitbench.bench.run import run_jobs
-from eitbench.bench.store import EpisodeStore, results_in, unplayed
+from eitbench.bench.run import run_jobs, unplayed
+from eitbench.bench.store import EpisodeStore, results_in
 from eitbench.bench.suites import policy_jobs
 from eitbench.bench.text import mean_and_interval
 from eitbench.data.seeds import name_seed

@@ -14,8 +14,8 @@ from eitbench.bench.store import EpisodeStore
 from eitbench.bench.tracks import Environment
 from eitbench.data.seeds import parse_seeds
 from eitbench.envs.injection import InjectionEnv
-from eitbench.envs.injection_core import Rules
 from eitbench.estimation.onboard.belief import Belief
+from eitbench.estimation.onboard.rules import Rules
 from eitbench.report import policy_table
 from eitbench.report.policy_table import policy_rows
 from eitbench.worlds.pipe2d import PIPE_2D

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from choosing import BUDGET, CURRENTS, FAULTS, NAME, make, play, some_pairs
 
-from eitbench.envs.injection_core import Rules
 from eitbench.estimation.onboard.operator import electrode_pairs
+from eitbench.estimation.onboard.rules import Rules
 from eitbench.worlds import entry
 from eitbench.worlds.instrument import Faults, Instrument
 from eitbench.worlds.pipe2d import PIPE_2D

@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_limits
 
 from eitbench.bench.policies import load_policy, play
 from eitbench.envs.injection import InjectionVectorEnv
-from eitbench.envs.injection_core import Rules
+from eitbench.estimation.onboard.rules import Rules
 from eitbench.rl import training
 from eitbench.rl.agents import _mark, load_agent
 from eitbench.rl.training import Config, read_config, train

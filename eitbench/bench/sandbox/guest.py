@@ -71,8 +71,6 @@ def _nothing(words: dict[str, Any], arrays: dict[str, np.ndarray]) -> Reply:
 def _player(words: dict[str, Any], arrays: dict[str, np.ndarray]) -> tuple[Callable[..., Reply], dict[str, Any]]:
     """What answers from now on, and what the method says of itself."""
     import gymnasium as gym
-
-    import eitbench  # noqa: F401 (registers)
     if arrays["told"].size:  # what the host says may be believed
         take_over([cloudpickle.loads(arrays["told"].tobytes())])
     env: Any = gym.make(words["id"], disable_env_checker=True, **words["kwargs"]).unwrapped

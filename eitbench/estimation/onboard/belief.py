@@ -14,8 +14,7 @@ from eitbench.estimation.onboard.operator import levels_of
 from eitbench.estimation.onboard.reduced_operator import ReducedOperator
 
 if TYPE_CHECKING:
-    from eitbench.envs.estimation import Observation
-    from eitbench.envs.injection_core import Rules
+    from eitbench.estimation.onboard.rules import Rules
 
 DOUBTFUL = 0.3
 """`Belief.doubt` from which on an electrode is taken for broken."""
@@ -42,7 +41,7 @@ class Belief:
         The first one.
     """
 
-    def __init__(self, rules: Rules, observation: Observation) -> None:
+    def __init__(self, rules: Rules, observation: dict[str, np.ndarray]) -> None:
         self.rules = rules
         kind = JointReducedOperator if rules.world.velocity_model is not None else ReducedOperator
         self._operator = kind(rules.world, observation["frame"][None], gate=rules.gate,
@@ -62,7 +61,7 @@ class Belief:
         return cls(rules, {"frame": frame, "doubt": np.zeros((2, frame.shape[1]))})
 
     @classmethod
-    def follow(cls, belief: Belief | None, rules: Rules, observation: Observation) -> Belief:
+    def follow(cls, belief: Belief | None, rules: Rules, observation: dict[str, np.ndarray]) -> Belief:
         """One more observation: the first of an episode makes a belief, which is then shown the
         others."""
         if belief is None:
@@ -70,7 +69,7 @@ class Belief:
         belief.see(observation)
         return belief
 
-    def see(self, observation: Observation) -> None:
+    def see(self, observation: dict[str, np.ndarray]) -> None:
         """Take in the outcome of the last injection.
 
         A failed injection does not say which of its two electrodes is broken. Both are doubted and,

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from eitbench.envs.estimation import Observation
-    from eitbench.envs.injection_core import Rules
     from eitbench.estimation.onboard.operator import Operator
+    from eitbench.estimation.onboard.rules import Rules
 
 DOUBT = 0.2
 """Weight of the last injection in the running share of readings that were not believed."""
@@ -44,7 +43,7 @@ class Console:
         reading += DOUBT * (injected & ~failed) * (~believed - reading)
         driving += DOUBT * drives * (failed - driving)
 
-    def shown(self) -> Observation:
+    def shown(self) -> dict[str, np.ndarray]:
         """Arrays (B, …): innovations, mean, std, doubt, and where the flow is estimated its
         velocity and that's std."""
         mean, std = self.operator.grid()
