@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 from common import Row, ceilings, compare, of_flops, quantity
-from filtering import CELLS, RECORD, problem, same, textbook
+from pipe_record import CELLS, RECORD, problem, same, textbook
 
 from eitbench.estimation import fixed_interval_smoother, gain_sequence
 

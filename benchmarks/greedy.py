@@ -8,7 +8,8 @@ from collections.abc import Iterator
 
 import numpy as np
 from common import Row, compare, of_flops
-from filtering import CELLS, problem, same, settle
+from filtering import settle
+from pipe_record import CELLS, problem, same
 
 from eitbench.estimation.design import independent_rows, pair_gains, pair_tables
 from eitbench.estimation.onboard.operator import electrode_pairs

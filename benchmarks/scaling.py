@@ -12,8 +12,8 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 from common import best_of, in_fresh_process, peak_growth
-from filtering import STEPS, WARM_UP, problem
 from forward import conductivities, electrode_model, pipe_mesh
+from pipe_record import STEPS, WARM_UP, problem
 from stepping import COUNTS, environments
 
 from eitbench._files import write_atomically

@@ -21,8 +21,9 @@ from eitbench.numerics.fem import mass_matrix
 from eitbench.numerics.mesh import graded_pipe_mesh
 from eitbench.physics.cem import CompleteElectrodeModel
 from eitbench.physics.observation import ObservationModel
+from eitbench.worlds.parts import Discretisation
 from eitbench.worlds.pipe2d import PIPE_2D
-from eitbench.worlds.world import Discretisation, World
+from eitbench.worlds.world import World
 
 SEEDS, STATES = "train:0-3", range(20, 99, 6)
 

@@ -1,0 +1,93 @@
+"""The record on which filters and smoothers are timed: the pipe of `Pipe2D`, on a mesh of any
+fineness."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from eitbench.estimation.kalman import (
+    KalmanFilter,
+    LinearisedObservations,
+    Observation,
+)
+from eitbench.estimation.parameters import table_5_1
+from eitbench.numerics.mesh import rectangle_mesh
+from eitbench.physics.observation import ObservationModel
+from eitbench.physics.transport import ConvectionDiffusion
+from eitbench.worlds.parts import Discretisation
+from eitbench.worlds.pipe2d import PIPE_2D
+
+CELLS = ((44, 10), (62, 15), (80, 20))
+"""along and across the pipe: 495, 1008 and 1701 nodes"""
+WARM_UP, STEPS, RECORD = 60, 8, 98
+"""steps before anything is timed; steps timed, half a frame; steps of an episode"""
+
+
+@dataclass
+class Problem:
+    """A linear Gaussian model, and a record of it."""
+
+    start: KalmanFilter
+    """at t = 0"""
+    noise: np.ndarray
+    """(n, n) Γ_w"""
+    observations: list[Observation]
+
+    @property
+    def n(self) -> int:
+        return len(self.start.mean)
+
+
+def problem(cells: tuple[int, int], steps: int = WARM_UP + STEPS) -> Problem:
+    """The model on a mesh of so many cells; states and measurements are drawn from it."""
+    transport, seen = pipe_model(cells)
+    level = PIPE_2D.expected_concentration
+    evolution = transport.evolution_model()
+    start = table_5_1(transport, PIPE_2D.prior, level, rank_tolerance=1e-6)
+    rng = np.random.default_rng(0)
+    inflow = PIPE_2D.target.draw_inflow(PIPE_2D, rng)
+    at_inlet = transport.mesh.points[transport.inlet]
+    linearised = LinearisedObservations(seen, PIPE_2D.noise, start.mean)
+    state, observations = np.full(len(start.mean), PIPE_2D.background), []
+    currents = PIPE_2D.currents
+    for t in range(steps):
+        state = evolution.F @ state + evolution.Y @ inflow(at_inlet, t * PIPE_2D.time_step)
+        H, _, variance = linearised(np.zeros(16), currents[t % len(currents)])
+        observations.append(Observation(H, H @ state + np.sqrt(variance)
+                                        * rng.standard_normal(len(H)), variance))
+    noise = level**2 * evolution.state_noise_covariance(PIPE_2D.prior.inflow_std**2,
+                                                        PIPE_2D.prior.nodal_std**2)
+    return Problem(start, noise, observations)
+
+
+def pipe_model(cells: tuple[int, int]) -> Discretisation:
+    """The estimators' model, but with so many cells of concentration along and across the pipe."""
+    told = PIPE_2D.model()
+    pipe, known = PIPE_2D.vessel, told.transport
+    assert isinstance(known, ConvectionDiffusion)
+    mesh = rectangle_mesh(np.linspace(0.0, pipe.length, cells[0] + 1),
+                          np.linspace(-pipe.half_width, pipe.half_width, cells[1] + 1))
+    transport = ConvectionDiffusion(mesh, PIPE_2D.flow.nominal(PIPE_2D, fine=False),
+                                    PIPE_2D.flow.diffusivity, known.time_step,
+                                    substeps=known.substeps, inlet=np.arange(cells[1] + 1))
+    cem = told.observation.cem
+    seen = ObservationModel(cem, mesh.interpolation_to(cem.mesh.points),
+                            told.observation.conductivity, told.observation.smallest_concentration)
+    return Discretisation(transport, seen)
+
+
+def textbook(problem: Problem, mean: np.ndarray, P: np.ndarray, observation: Observation
+             ) -> tuple[np.ndarray, np.ndarray]:
+    """One step with full matrices; (I − K H) P as P − K (H P), which saves a third of the work."""
+    F, (H, value, variance) = problem.start.transition, observation
+    mean, P = F @ mean + problem.start.forcing, F @ P @ F.T + problem.noise
+    seen = H @ P
+    K = np.linalg.solve(seen @ H.T + np.diag(variance), seen).T
+    return mean + K @ (value - H @ mean), P - K @ seen
+
+
+def same(ours: np.ndarray, theirs: np.ndarray, tolerance: float = 1e-10) -> None:
+    """Means agree relative to the largest entry."""
+    np.testing.assert_allclose(ours, theirs, rtol=0.0, atol=tolerance * np.abs(theirs).max())
