@@ -126,7 +126,9 @@ class InjectionEnv(gym.Env[Any, Any], EzPickle):
     @property
     def error(self) -> float | None:
         """Relative error (5.12) of the present estimate; None if this state is not scored, or
-        nothing estimates."""
+        nothing estimates. ``ResetNeeded`` before the first episode."""
+        if self._step == 0:
+            raise gym.error.ResetNeeded("call reset() before error")
         error = float(self._core.errors()[0])
         return None if np.isnan(error) else error
 

@@ -77,9 +77,13 @@ def register(world: World, id: str, *, track: str = "estimation", about: str = "
         raise ValueError(f"track must be one of {', '.join(CLASSES)}, got {track!r}")
     if unknown := sorted(set(settings) - set(SETTINGS[track])):
         raise ValueError(f"settings of the track {track} are {', '.join(SETTINGS[track])}; got {', '.join(unknown)}")
-    json.dumps(settings)
+    try:
+        json.dumps(settings, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"settings must be fit for JSON: {error}") from None
     entry = Entry(id, world, track, settings, about, seeds)
-    if id in _entries and _entries[id] != entry:
+    taken = _entries[id] != entry if id in _entries else id in gym.registry
+    if taken:
         raise ValueError(f"id {id} belongs to another world already; take another name or version")
     _entries[id] = entry
     _by_hand.add(id)
@@ -111,9 +115,11 @@ def registered_by_hand() -> list[Entry]:
 
 
 def take_over(told: list[Entry]) -> None:
-    """Register what another process has registered by hand."""
+    """Register what another process has registered by hand, in place of what had its id here."""
     for each in told:
+        gym.registry.pop(each.id, None)
         _entries[each.id] = each
+        _by_hand.add(each.id)
         _make_known(each)
 
 

@@ -161,9 +161,20 @@ def test_settings_of_another_track_are_refused(settings, message):
 
 def test_settings_must_travel():
     """As JSON, since records name them."""
-    with pytest.raises(TypeError, match="not JSON"):
+    with pytest.raises(ValueError, match="not JSON"):
         register(QUIET, ID, assume={"mean_velocity": {1.0}})
     assert ID not in entries()
+
+
+def test_an_id_of_somebody_else_is_refused():
+    """What gymnasium knows by it already stays."""
+    with pytest.raises(ValueError, match="id theirs/CartPole-v7 belongs to another world"):
+        gym.register("theirs/CartPole-v7", entry_point="gymnasium.envs.classic_control:CartPoleEnv")
+        try:
+            register(entry("eitbench/Pipe2D-v0").world, "theirs/CartPole-v7")
+        finally:
+            gym.registry.pop("theirs/CartPole-v7")
+
 
 
 def test_an_id_that_nobody_registered_is_named():
