@@ -72,9 +72,11 @@ def _estimation(env: EstimationEnv) -> dict[str, str]:
     first = world.warm_up + 1
     return {
         "Action space": f"`{_short(env.action_space)}`: {asked}. Ignored while nothing is asked for yet.",
-        "Observation space": f"`Dict`, zeros once the record has been played:\n\n{_table(env.observation_space, world)}",
-        "Reward": f"{reward} for the {world.schedule.scored_steps} scored states t = {first} … {world.n_steps}, else 0: "
-                  "minus the mean of the first term over the scored states is ẽ_c (thesis 5.12).",
+        "Observation space": "`Dict`, zeros once the record has been played:\n\n"
+                             + _table(env.observation_space, world),
+        "Reward": f"{reward} for the {world.schedule.scored_steps} scored states "
+                  f"t = {first} … {world.n_steps}, else 0: minus the mean of "
+                  "the first term over the scored states is ẽ_c (thesis 5.12).",
         "Starting state": f"{_flowing(world)}`reset(seed=s)` plays episode s (train, dev and test have ranges of their "
                           "own); without a seed a random one of the first `episodes` training episodes. The first use "
                           "of a seed simulates its truth, which is then kept on disk; `eitbench bank` does so for many "
@@ -104,9 +106,11 @@ def _injection(env: InjectionEnv) -> dict[str, str]:
                   f"∫(ĉ_t − c_t)² dΩ / ∫c_t² dΩ{over}, by how much the error lies below that of the homogeneous "
                   "estimate, which no injection can change. The score is ẽ_c (thesis 5.12), the mean of the second "
                   "term. With `estimator=\"none\"` the reward is always 0.",
-        "Starting state": f"{_flowing(world)}The first {env.core.first} injections are the world's own cycle; the agent "
-                          "takes over after them. With `estimator=\"none\"` it chooses from the first one on.",
-        "Episode end": f"Terminated after {env.core.length} steps ({alone} with `estimator=\"none\"`). Never truncated.",
+        "Starting state": f"{_flowing(world)}The first {env.core.first} injections are the world's own "
+                          "cycle; the agent takes over after them. With `estimator=\"none\"` it "
+                          "chooses from the first one on.",
+        "Episode end": f"Terminated after {env.core.length} steps ({alone} with `estimator=\"none\"`). "
+                       "Never truncated.",
         "Arguments": INJECTION_ARGUMENTS.format(gate=f"{rules.gate:g}" if rules.gate < 1e300 else None)}
 
 

@@ -41,13 +41,12 @@ def actions_of(name: str, policy: str, monkeypatch) -> list[np.ndarray]:
     env, taken, step = environment(name), [], InjectionEnv.step
     with monkeypatch.context() as patch:
         patch.setattr(InjectionEnv, "step", lambda self, action: taken.append(np.array(action)) or step(self, action))
-        played = play(name, KWARGS[name], policy, SEED, "reduced")
+        played = play(name, KWARGS[name], policy, SEED, "reduced").outcome
     assert len(taken) == env.core.length
     budget = env.rules.budget
-    assert played["spent"] <= (len(taken) if budget is None else budget)
-    assert len(played["errors"]) == env.world.schedule.scored_steps
-    assert played["error"] == pytest.approx(np.mean(played["errors"]))
-    assert 0.0 < played["error"] < 1.0 and played["seconds_per_step"] >= 0.0
+    assert played.spent <= (len(taken) if budget is None else budget)
+    assert len(played.errors) == env.world.schedule.scored_steps
+    assert 0.0 < played.errors.mean() < 1.0 and played.seconds_per_step >= 0.0
     return taken
 
 
@@ -183,7 +182,7 @@ def test_policies_play_what_they_suit(policy, name, monkeypatch):
 
 def test_scores_are_those_of_the_exact_filter():
     """The mean error under the full estimator is that of its own estimates, step by step."""
-    played = play(NAME, SHORT, "best_pair", SEED)
+    played = play(NAME, SHORT, "best_pair", SEED).outcome
     env = policies.environment(NAME, json.dumps(SHORT), "full")
     env.reset(seed=SEED)
     errors = []
@@ -191,7 +190,7 @@ def test_scores_are_those_of_the_exact_filter():
         env.step(7)
         assert (env.error is None) == (env.core.t <= env.world.warm_up)
         errors += [env.core.errors()[0]] * (env.error is not None)
-    assert played["errors"] == errors
+    assert played.errors.tolist() == errors
 
 
 def test_only_the_clairvoyant_is_privileged():
@@ -215,13 +214,13 @@ def test_played_episodes_are_kept(tmp_path, monkeypatch):
     rows = policy_rows(todo, store.results())
     assert sorted(zip(rows["policy"], rows["seed"], strict=True)) == [
         (policy, seed) for policy in ("adjacent", "opposite") for seed in ("dev:0", "dev:1")]
-    played = play(NAME, SHORT, "adjacent", parse_seeds("dev:0")[0], "reduced")
-    assert rows.set_index(["policy", "seed"])["error"]["adjacent", "dev:0"] == played["error"]
+    played = play(NAME, SHORT, "adjacent", parse_seeds("dev:0")[0], "reduced").outcome
+    assert rows.set_index(["policy", "seed"])["error"]["adjacent", "dev:0"] == played.errors.mean()
     record, _ = store.write_records()
     assert (record["board"], record["method"], record["seeds"]) == ("injection", "adjacent", ["dev:0", "dev:1"])
     assert record["environment"]["kwargs"]["estimator"] == "reduced"
-    assert record["episodes"][0]["scores"]["spent"] == played["spent"] > 0
-    assert record["episodes"][0]["step_errors"] == played["errors"]
+    assert record["episodes"][0]["scores"]["spent"] == played.spent > 0
+    assert record["episodes"][0]["step_errors"] == played.errors.tolist()
 
     next(store.folder.glob("episodes/*/opposite/dev-1.json")).write_text("{")
     again = []
@@ -316,8 +315,9 @@ def test_anybodys_file_plays(tmp_path):
     """Its title is its docstring's first words; a wrong action is named."""
     loaded = load_policy(path := write_policy(tmp_path))
     assert (loaded.name, loaded.title, loaded.privileged, loaded.parameters) == ("mine", "Mine", False, {})
-    played = play(NAME, SHORT, path, SEED, "reduced")
-    assert played["errors"] == play(NAME, SHORT, "best_pair", SEED, "reduced")["errors"]
+    played = play(NAME, SHORT, path, SEED, "reduced").outcome
+    assert played.errors.tolist() == play(
+        NAME, SHORT, "best_pair", SEED, "reduced").outcome.errors.tolist()
     with pytest.raises(ValueError, match="action must be an integer"):
         play(NAME, SHORT, write_policy(tmp_path, "def act(self, observation): return 0.5", "wrong"), SEED, "reduced")
 

@@ -1,0 +1,135 @@
+"""Scores: their formulas reach an episode, what they need is asked for, and a new one is shown everywhere."""
+
+import csv
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from eitbench.bench import scores
+from eitbench.bench.records import read_records
+from eitbench.bench.scores import Outcome, Score, register_score, scored
+from eitbench.report import boards, compare, summary
+from eitbench.report.site import render_site
+from eitbench.worlds import entry
+
+PUBLISHED = Path(__file__).parents[2] / "leaderboards" / "results"
+WORLD = entry("eitbench/Pipe2D-v0").world
+
+
+@pytest.fixture
+def apart(monkeypatch):
+    """Whatever is registered is forgotten after the test."""
+    monkeypatch.setattr(scores, "_scores", dict(scores.scores()))
+
+
+def outcome(**given):
+    """Two states of two nodes; the estimate is off by (1, 0) and (0, 2), at masses 1 and 3."""
+    truth = np.array([[4.0, 2.0], [4.0, 2.0]])
+    return Outcome(WORLD, 0.5, np.array([0.1, 0.3]), mean=truth + np.diag([1.0, 2.0]), truth=truth,
+                   mass=np.diag([1.0, 3.0]), points=np.zeros((2, 2)), homogeneous=3.0, **given)
+
+
+def test_numbers_by_hand():
+    """ẽ_c is the mean of the steps' errors; the contrast is 1/4 and 12/4 of ∫(c − 3)² = 4."""
+    said = scored("estimation", outcome())
+    assert said["error"] == pytest.approx(0.2) and said["seconds_per_step"] == 0.5
+    assert said["contrast_error"] == pytest.approx(0.5 * (1 / 4 + 12 / 4))
+    assert [said[name] for name in ("nis", "crps", "coverage_50", "velocity_error")] == [None] * 4
+    assert "spent" not in said
+
+
+def test_innovations_and_velocity_where_they_are_claimed():
+    """ν = (2, 0) with S = diag(1, 4) has NIS/m = 2; a velocity 10 % too high everywhere has 0.01."""
+    innovations = np.array([[2.0, 0.0]]), np.diag([1.0, 4.0])[None]
+    velocity = np.full((2, 3), 1.1), np.ones((2, 3)), np.full(3, 0.2)
+    said = scored("estimation", outcome(innovations=innovations, velocity=velocity))
+    assert said["nis"] == pytest.approx(2.0) and said["velocity_error"] == pytest.approx(0.01)
+
+
+def test_policies_have_theirs():
+    """Error, injections, time, and nothing else."""
+    said = scored("injection", Outcome(WORLD, 0.5, np.array([0.1, 0.3]), spent=7))
+    assert said == {"error": pytest.approx(0.2), "spent": 7.0, "seconds_per_step": 0.5}
+
+
+def worst(better="lower"):
+    return Score("worst_step", "worst", "the worst step", lambda outcome: outcome.errors.max(),
+                 better=better, factor=100.0)
+
+
+def test_a_new_score_is_shown_everywhere(apart):
+    """One call, and it is in episodes, summaries, CSV, Markdown, pages and comparisons, in its unit."""
+    register_score(worst())
+    assert scored("estimation", outcome())["worst_step"] == pytest.approx(0.3)
+    records = [record for record in read_records(PUBLISHED)
+               if record["environment"]["name"] == "eitbench-Pipe2D-v0"
+               and record["method"] in ("kalman_filter", "homogeneous")]
+    assert len(records) == 2
+    for record in records:
+        for episode in record["episodes"]:
+            episode["scores"]["worst_step"] = max(episode["step_errors"])
+    expected = {record["method"]: 100.0 * np.mean([max(episode["step_errors"])
+                                                   for episode in record["episodes"]]) for record in records}
+    assert "worst" in summary.cells(summary.summary(records))
+    made = boards.render(records)
+    rows = {row["method"]: row for row in csv.DictReader(io.StringIO(made["leaderboard.csv"]))}
+    for method, value in expected.items():
+        assert float(rows[method]["worst_step"]) == pytest.approx(value, rel=1e-5)
+    assert "| worst |" in made["leaderboard.md"] and "**worst**: the worst step" in made["leaderboard.md"]
+    site = render_site(records, boards.boards(records))
+    assert "the worst step" in site["environments/eitbench-Pipe2D-v0.html"].decode()
+    a, b = ([record for record in records if record["method"] == name]
+            for name in ("kalman_filter", "homogeneous"))
+    table = compare.compare(a, b, "worst_step")
+    assert table["a"][0] == pytest.approx(expected["kalman_filter"]) and table["better"][0] == 1.0
+    assert compare.cells(table, "kalman", "floor", "worst_step")["verdict"][0] == "kalman"
+
+
+def test_where_more_is_better_the_other_wins(apart):
+    """The verdict turns round with the score."""
+    register_score(worst("higher"))
+    records = {record["method"]: record for record in read_records(PUBLISHED)
+               if record["environment"]["name"] == "eitbench-Pipe2D-v0"}
+    for record in records.values():
+        for episode in record["episodes"]:
+            episode["scores"]["worst_step"] = max(episode["step_errors"])
+    table = compare.compare([records["kalman_filter"]], [records["homogeneous"]], "worst_step")
+    assert table["better"][0] == 0.0
+    assert compare.cells(table, "kalman", "floor", "worst_step")["verdict"][0] == "floor"
+
+
+@pytest.mark.parametrize("name", ["nis", "voltage_discrepancy", "beauty"])
+def test_only_scores_that_can_be_better_are_compared(name):
+    """The message names those that can."""
+    record = json.loads((next(PUBLISHED.glob("eitbench-Pipe2D-v0--kalman*"))).read_text())
+    with pytest.raises(ValueError, match=f"score must be one of error, .*got '{name}'"):
+        compare.compare([record], [record], name)
+
+
+@pytest.mark.parametrize(("changes", "message"), [
+    ({"name": "My score"}, "name must be of lower-case"),
+    ({"name": "error"}, "has the name or heading of another, error"),
+    ({"heading": "CRPS"}, "has the name or heading of another, crps"),
+    ({"better": "more"}, "better must be one of lower, higher"),
+    ({"needs": ("luck",)}, "needs must be among world, .*got 'luck'"),
+    ({"tracks": ("sprint",)}, "tracks must be among estimation, injection; got 'sprint'"),
+    ({"factor": 0.0}, "factor must be")])
+def test_bad_scores_are_refused(changes, message, apart):
+    """Before anything is registered."""
+    before = list(scores.scores())
+    given = {"name": "mine", "heading": "mine", "explanation": "", "of": lambda outcome: 0.0} | changes
+    with pytest.raises(ValueError, match=message):
+        register_score(Score(**given))
+    assert list(scores.scores()) == before
+
+
+def test_a_score_that_is_no_number_is_refused(apart):
+    """It is named; None means that there is nothing to be said."""
+    register_score(Score("mine", "mine", "", lambda outcome: np.nan))
+    with pytest.raises(ValueError, match="score mine"):
+        scored("estimation", outcome())
+    register_score(Score("yours", "yours", "", lambda outcome: None))
+    assert scores.scores()["yours"](outcome()) is None
