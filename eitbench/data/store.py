@@ -47,7 +47,7 @@ def folder(world: World) -> Path:
 def identity(world: World) -> dict[str, Any]:
     """All that an episode's numbers depend on but the seed: the world's parts, the code that
     simulates, and the libraries beneath it."""
-    return {"world": described(world.fluid), "code": _code(), "parts": _parts(_kinds(world.fluid)),
+    return {"world": described(world.fluid), "code": _code(), "parts": _parts(kinds(world.fluid)),
             **{name: version(name) for name in ("numba", "scikit-fem")},
             "numpy": np.__version__, "scipy": scipy.__version__}
 
@@ -59,6 +59,13 @@ def described(part: Any) -> Any:
         return {"kind": f"{kind.__module__}.{kind.__qualname__}"} | {
             each.name: described(getattr(part, each.name)) for each in fields(part)}
     return list(part) if isinstance(part, tuple) else part
+
+
+def kinds(part: Any) -> list[type]:
+    """The classes of a world's parts, and those they descend from, each once."""
+    inner = [kind for each in fields(part) if is_dataclass(value := getattr(part, each.name))
+             for kind in kinds(value)]
+    return list(dict.fromkeys([*type(part).__mro__, *inner]))
 
 
 def load(path: Path, names: Sequence[str], label: str = "") -> dict[str, np.ndarray] | None:
@@ -112,18 +119,11 @@ def _code() -> str:
     return code_digest(package_files(*CODE))
 
 
-def _parts(kinds: Sequence[type]) -> str:
+def _parts(classes: Sequence[type]) -> str:
     """Of the files, beside this package's, in which these classes are written."""
-    files = [file for kind in kinds if kind.__module__ not in ("builtins", "typing")
+    files = [file for kind in classes if kind.__module__ not in ("builtins", "typing")
              and (file := file_of(kind)) and PACKAGE not in file.parents]
     return code_digest(dict.fromkeys(files))
-
-
-def _kinds(part: Any) -> list[type]:
-    """The classes of a world's parts, and those they descend from, each once."""
-    inner = [kind for each in fields(part) if is_dataclass(value := getattr(part, each.name))
-             for kind in _kinds(value)]
-    return list(dict.fromkeys([*type(part).__mro__, *inner]))
 
 
 def _checksum(path: Path, arrays: Mapping[str, np.ndarray], label: str) -> int:

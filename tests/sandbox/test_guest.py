@@ -4,8 +4,11 @@ import io
 import json
 import os
 import socket
+import sys
 import time
 from contextlib import contextmanager, suppress
+from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 
 import gymnasium as gym
@@ -24,6 +27,7 @@ from eitbench.bench.sandbox.wall import landlock_version
 from eitbench.data.episodes import simulate
 from eitbench.data.recordings import cycle_voltages, recording
 from eitbench.data.store import CACHE_VARIABLE
+from eitbench.worlds import registry
 from eitbench.worlds.pipe2d import PIPE_2D
 
 KWARGS = json.loads(FILTER.kwargs)
@@ -72,12 +76,16 @@ attempt("the truth in memory", lambda: any(type(o).__name__ == "ndarray" and lis
 '''
 
 
-@pytest.fixture
-def measured():
+def simulated(world):
     """(T, L) voltages and currents of an episode."""
-    world = PIPE_2D.changed(SCENARIO)
     voltages = cycle_voltages(world, 3, recording(world, 3))
     return voltages, world.currents[np.arange(len(voltages)) % len(world.currents)]
+
+
+@pytest.fixture
+def measured():
+    """The same of the tiny pipe."""
+    return simulated(PIPE_2D.changed(SCENARIO))
 
 
 @pytest.mark.parametrize("name", ["homogeneous", "mine"])
@@ -112,6 +120,49 @@ def test_a_policy_plays_as_it_would_here():
         guest.begin(random=12)
         said = [guest.act(observation) for _ in range(4)]
         assert said == [here.act(observation) for _ in range(4)] and {type(action) for action in said} == {int}
+
+
+SCRIPT = {
+    "base_of_mine": """
+from eitbench.worlds.slugs import OneInEach
+
+class Base(OneInEach):
+    pass
+""",
+    "arrivals_of_mine": """
+from dataclasses import dataclass
+from base_of_mine import Base
+
+@dataclass(frozen=True)
+class Mine(Base):
+    interval: float = 0.03
+"""}
+"""The files of a script whose slugs come otherwise."""
+
+
+def test_a_guest_is_told_a_script_s_world(tmp_path, monkeypatch):
+    """Also where only a part of a part is the script's own, and descends from another file's."""
+    id = "mine/Told-v0"
+    for name, text in SCRIPT.items():
+        (tmp_path / f"{name}.py").write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(registry, "_entries", registry.entries())
+    monkeypatch.setattr(registry, "_by_hand", set(registry._by_hand))
+    target = replace(PIPE_2D.target, arrivals=import_module("arrivals_of_mine").Mine())
+    world = replace(PIPE_2D.changed(SCENARIO), name="Told", target=target)
+    try:
+        registry.register(world, id)
+        voltages, currents = simulated(world)
+        here = load_baseline("homogeneous").estimator(gym.make(id).unwrapped.task)
+        with Guest("estimator", id, {}, "homogeneous") as guest:
+            guest.begin()
+            for measured in zip(voltages, currents, strict=True):
+                said, expected = guest.update(*measured), here.update(*measured)
+                np.testing.assert_array_equal(said.mean, expected.mean)
+    finally:
+        gym.registry.pop(id, None)
+        for name in SCRIPT:
+            sys.modules.pop(name, None)
 
 
 @contextmanager

@@ -27,7 +27,7 @@ import numpy as np
 from eitbench._files import PACKAGE
 from eitbench.bench.baselines import is_ours
 from eitbench.bench.sandbox import wire
-from eitbench.data.store import CACHE_VARIABLE, cache_folder, folder
+from eitbench.data.store import CACHE_VARIABLE, cache_folder, folder, kinds
 from eitbench.worlds.registry import entry, registered_by_hand
 
 MEMORY = 8 << 30
@@ -249,11 +249,12 @@ def _told(id: str) -> np.ndarray:
     """
     if id not in [each.id for each in registered_by_hand()]:
         return np.zeros(0, np.uint8)
-    world = entry(id).world
-    parts = {type(world.vessel), type(world.flow), type(world.target), type(world.schedule.pattern)}
-    modules = [sys.modules[name] for name in {kind.__module__ for kind in parts}
-               if not name.startswith("eitbench.")]
-    for module in modules:                              # a guest has not the script's folder
+    # Parts of parts, and the classes that they descend from, may stand in files of their own.
+    names = {kind.__module__ for kind in kinds(entry(id).world)}
+    known = {"eitbench", *sys.stdlib_module_names}
+    modules = [sys.modules[name] for name in sorted(names & set(sys.modules))
+               if name.partition(".")[0] not in known]
+    for module in modules:  # a guest has not the script's folder
         cloudpickle.register_pickle_by_value(module)
     try:
         return np.frombuffer(cloudpickle.dumps(entry(id)), np.uint8)
