@@ -29,6 +29,7 @@ from eitbench.bench.scores import Outcome
 from eitbench.bench.tracks import Environment, check_track
 from eitbench.envs.injection import InjectionEnv
 from eitbench.estimation.onboard.rules import Rules
+from eitbench.worlds.streams import randomness
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -173,11 +174,9 @@ def inject(env: InjectionEnv, loaded: PolicyFile, seed: int) -> Iterator[tuple[i
     if not loaded.suits(env.rules):
         raise ValueError(f"policy {loaded.name} does not suit {env.spec.id if env.spec else env}")
     observation, done, t = env.reset(seed=seed)[0], False, env.core.first
-    # The fifth of an episode's streams; three made the recording, the fourth its faults. A
-    # generator knows what it was
-    # seeded with, so the policy's is seeded with a number that says nothing of the episode.
-    stream = np.random.default_rng(np.random.SeedSequence(seed).spawn(5)[4])
-    random = np.random.default_rng(int(stream.integers(2**63)))
+    # A generator knows what it was seeded with, so the policy's is seeded with a number that says
+    # nothing of the episode.
+    random = np.random.default_rng(int(randomness(seed).policy.integers(2**63)))
     begin = time.perf_counter()
     player = loaded.policy(env.rules, random, *[env.core] * loaded.privileged)
     while not done:

@@ -89,3 +89,5 @@ def test_there_is_nothing_to_show_before_a_reset(ask):
         getattr(env, ask)()
     with pytest.raises(gym.error.ResetNeeded, match=r"call reset\(\) before step\(\)"):
         env.step(np.full(1701, 30.0))
+    with pytest.raises(gym.error.ResetNeeded, match=r"call reset\(\) before error"):
+        make("eitbench/Pipe2DInjection-v0").unwrapped.error  # noqa: B018

@@ -164,7 +164,7 @@ class FullOperator:
     """The Kalman filter of the baselines with its exact covariance: what scored runs use."""
 
     def __init__(self, world: World, frames: np.ndarray, *, gate: float, noise_floor: float) -> None:
-        self._scenario, self._gate, self._floor = world, gate, noise_floor
+        self._world, self._gate, self._floor = world, gate, noise_floor
         self._shared = levels = levels_of(world)
         broken = BROKEN if math.isfinite(gate) else math.inf
         self._levels = [levels.linearised(levels.best(frame, broken)) for frame in frames]
@@ -202,8 +202,8 @@ class FullOperator:
         return (self._patches @ self.means()[..., None])[..., 0]
 
     def errors(self, moments: np.ndarray, deviations: np.ndarray, squares: np.ndarray) -> np.ndarray:
-        estimate = self.means() - self._scenario.background
-        return step_error(score_mass(self._scenario), estimate, moments, deviations, squares)
+        estimate = self.means() - self._world.background
+        return step_error(score_mass(self._world), estimate, moments, deviations, squares)
 
     def means(self) -> np.ndarray:
         return self.concentration[:, None] * np.array([filter_.mean for filter_ in self._filters])
