@@ -29,7 +29,9 @@ from eitbench.bench.scores import Outcome
 from eitbench.bench.tracks import Environment, check_track
 from eitbench.envs.injection import InjectionEnv
 from eitbench.estimation.onboard.rules import Rules
+from eitbench.worlds.registry import entry
 from eitbench.worlds.streams import randomness
+from eitbench.worlds.world import World
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -188,11 +190,16 @@ def inject(env: InjectionEnv, loaded: PolicyFile, seed: int) -> Iterator[tuple[i
         begin = time.perf_counter()
 
 
-@lru_cache(maxsize=4)
 def environment(env_id: str, kwargs: str, estimator: str = "full") -> InjectionEnv:
     """Made once a process, so that its models are shared by all episodes; ``kwargs`` are JSON."""
     check_track(env_id, "injection")
-    return cast(InjectionEnv, Environment(env_id, kwargs).make(estimator=estimator))
+    return _made(Environment(env_id, kwargs), estimator, entry(env_id).world)
+
+
+@lru_cache(maxsize=4)
+def _made(asked: Environment, estimator: str, world: World) -> InjectionEnv:
+    """Whose ``world`` is that of the id: another process may have told this one of another."""
+    return cast(InjectionEnv, asked.make(estimator=estimator))
 
 
 def adaptivity_gap(table: pd.DataFrame, open_loop: Sequence[str]) -> tuple[float, float, float]:

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from datetime import UTC, datetime
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import scipy
@@ -35,7 +35,9 @@ from eitbench.data.parallel import in_parallel
 from eitbench.data.seeds import name_seed
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.injection import InjectionEnv
+from eitbench.worlds.registry import entry
 from eitbench.worlds.task import Estimate, Task
+from eitbench.worlds.world import World
 
 
 class Job(NamedTuple):
@@ -276,14 +278,19 @@ def _run_job(job: Job, store: EpisodeStore, run: dict[str, Any], home: str) -> N
               result | {"run": run | elsewhere | {"isolation": job.isolation}}, fields)
 
 
-@lru_cache(maxsize=4)
 def _environment(environment: Environment) -> EstimationEnv | InjectionEnv:
     """Made once a process, so that models and what estimators derive from them are shared by its
     episodes."""
     if environment.track == "injection":
         kwargs, estimator = _inside(environment)
         return policies.environment(environment.id, json.dumps(kwargs), estimator)
-    return environment.make()
+    return _made(environment, entry(environment.id).world)
+
+
+@lru_cache(maxsize=4)
+def _made(environment: Environment, world: World) -> EstimationEnv:
+    """Whose ``world`` is that of the id: another process may have told this one of another."""
+    return cast(EstimationEnv, environment.make())
 
 
 def _inside(environment: Environment) -> tuple[dict[str, Any], str]:

@@ -10,9 +10,8 @@ from typer.testing import CliRunner
 from eitbench.bench import baselines, cards
 from eitbench.bench.baselines import baseline_folder, load_baseline
 from eitbench.bench.policies import load_policy, own_agents
-from eitbench.bench.run import _environment
 from eitbench.cli import app
-from eitbench.data.episodes import CACHE_VARIABLE
+from eitbench.data.store import CACHE_VARIABLE
 
 SLOW = ("filter_bank", "eitbench-Pipe2DInjectionFlow-v0--ppo")
 """Half a minute and more, whatever the episode."""
@@ -68,7 +67,6 @@ def copies(monkeypatch, tmp_path):
     monkeypatch.setattr(cards, "card_folder", lambda: tmp_path)
     for name, text in originals.items():
         cards.card_path(name).write_text(text)
-    _environment.cache_clear()
     return tmp_path
 
 

@@ -13,7 +13,7 @@ from short import PIPE, merged, shorten
 from tiny import FILTER, SCENARIO, write_baseline
 from typer.testing import CliRunner
 
-from eitbench.bench import baselines, held_out, policies, run
+from eitbench.bench import baselines, held_out, run
 from eitbench.bench import store as store_module
 from eitbench.bench import verify as verification
 from eitbench.bench.records import read_record, write_record
@@ -39,13 +39,10 @@ def tiny_world(monkeypatch, tmp_path, tmp_path_factory):
     shorten(monkeypatch, {FILTER.id: SCENARIO, INJECTION: PIPE})
     monkeypatch.setattr(held_out, "PUBLISHED", tmp_path / "leaderboards" / "held_out.json")
     monkeypatch.chdir(tmp_path)
-    cached = (run._environment, policies.environment, store_module.provenance)
-    for each in cached:
-        each.cache_clear()
+    store_module.provenance.cache_clear()
     yield
     guests.close()
-    for each in cached:
-        each.cache_clear()
+    store_module.provenance.cache_clear()
 
 
 def eitbench(*arguments):

@@ -11,7 +11,7 @@ import pytest
 from short import PLAIN, shorten, world
 from typer.testing import CliRunner
 
-from eitbench.bench import run, store, suites, tracks
+from eitbench.bench import store, suites, tracks
 from eitbench.bench.baselines import own_baselines
 from eitbench.bench.tracks import ids
 from eitbench.cli import app
@@ -50,9 +50,6 @@ def tiny_world(monkeypatch, tmp_path, tmp_path_factory):
     monkeypatch.setitem(registry._entries, lagged.id, lagged)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.py").write_text(MINE)
-    run._environment.cache_clear()
-    yield
-    run._environment.cache_clear()
 
 
 def eitbench(*arguments):

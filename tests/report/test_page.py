@@ -14,7 +14,6 @@ from PIL import Image
 from short import short, shorten
 from tiny import FILTER, SCENARIO, SMOOTHING, write_baseline
 
-from eitbench.bench import run
 from eitbench.bench import store as store_module
 from eitbench.bench.run import Job, run_jobs
 from eitbench.bench.store import EpisodeStore
@@ -95,7 +94,6 @@ def made(tmp_path_factory):
                  command="eitbench run --baseline <script>")
         records = store.write_records()
         path = page.write_page(store, records, summary(records))
-    run._environment.cache_clear()                                     # made with the patched registry
     return folder, records, path.read_text(encoding="utf-8")
 
 

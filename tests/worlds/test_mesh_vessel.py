@@ -59,6 +59,7 @@ def test_electrodes_are_those_of_the_groups(files, vessel):
 def test_a_world_of_it_is_played(vessel, monkeypatch):
     """Registered by a script it plays as any other; no inlet, so that nothing flows in."""
     monkeypatch.setattr(registry, "_entries", dict(registry._entries))
+    monkeypatch.setattr(registry, "_by_hand", set())
     world = World("Meshed", vessel, NoFlow(), Cylinders(), schedule=Schedule(
         time_step=0.02, scored_steps=4, pattern=AroundTheTank(), warm_up=0, calibration=1))
     register(world, "test/Meshed-v0")
