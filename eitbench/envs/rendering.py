@@ -107,7 +107,10 @@ def draw_frame(task: Task, truth_mesh: Mesh, truth: np.ndarray, estimate: np.nda
         label = "std / (mol/m³)"
     if spread is not None or tank:                       # tanks keep their size beside each other
         where = {"location": "bottom", "aspect": 20} if tank else {"aspect": 12}
-        figure.colorbar(draw, ax=panels[2], label=label, extend="max", **where)
+        bar = figure.colorbar(draw, ax=panels[2], label=label, extend="max", **where)
+        if spread is None:                                # its place stays, with nothing to be seen
+            for part in bar.ax.findobj():
+                part.set_alpha(0.0)
     for axes, title in zip(panels, (f"truth, t = {1e3 * time:.0f} ms", "estimate",
                                     "standard deviation of the estimate"), strict=True):
         axes.set_title(title, loc="left", fontsize=10)
