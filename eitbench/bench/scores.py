@@ -150,7 +150,7 @@ class Score:
         if value is None:
             return None
         _check.number(f"score {self.name}", float(value))
-        return float(value)
+        return value if isinstance(value, int) else float(value)
 
 
 _scores: dict[str, Score] = {}

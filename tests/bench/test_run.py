@@ -169,7 +169,7 @@ def test_estimators_cannot_spoil_the_task_for_others(tmp_path):
     try:
         assert scores_of(run_episode(Job(FILTER, good, 1))[0]) == before
     finally:
-        run._environment.cache_clear()                                 # what a vandal broke is no other test's affair
+        run._made.cache_clear()                                 # what a vandal broke is no other test's affair
 
 
 @pytest.mark.parametrize(("environment", "board"), [(FILTER, "filter"), (FIXED_LAG, "fixed-lag"),

@@ -8,7 +8,7 @@ from short import PIPE, shorten
 from tiny import FILTER, SCENARIO, SMOOTHING, count, counting, write_baseline
 from typer.testing import CliRunner
 
-from eitbench.bench import baselines, load, policies, run, suites
+from eitbench.bench import baselines, load, run, suites
 from eitbench.bench import store as store_module
 from eitbench.bench.records import newest, read_record, read_records, sealed, write_record
 from eitbench.bench.store import EpisodeStore, provenance
@@ -31,11 +31,9 @@ def tiny_world(monkeypatch, tmp_path, tmp_path_factory):
         shorten(monkeypatch, {name: SCENARIO})
     shorten(monkeypatch, {INJECTION: PIPE})
     monkeypatch.chdir(tmp_path)
-    for cached in (run._environment, policies.environment, provenance):
-        cached.cache_clear()
+    provenance.cache_clear()
     yield
-    for cached in (run._environment, policies.environment, provenance):
-        cached.cache_clear()
+    provenance.cache_clear()
 
 
 def eitbench(*arguments):
