@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from eitbench import scoring
-from eitbench.bench.scores import Claims, Outcome, scored
+from eitbench.bench.scores import Outcome, scored
 from eitbench.data.episodes import truth_discretisation
 from eitbench.data.regions import region_operators
 from eitbench.envs.estimation import EstimationEnv
@@ -93,10 +93,9 @@ def _outcome(env: EstimationEnv, played: Played) -> Outcome:
     computed = np.array([
         task.observation.voltages(estimate, current[None])[0]
         for estimate, current in zip(played.means[states], played.currents[states], strict=True)])
-    claims = None
+    std = None
     if played.variances is not None:
         std = (interpolation @ np.sqrt(played.variances[states]).T).T
-        claims = Claims(mean, std, truth, np.asarray(mass.sum(axis=0)).ravel())
     velocity = None
     if task.velocity is not None:
         velocity = (played.velocities[states] @ task.velocity.profiles.T,
@@ -109,5 +108,5 @@ def _outcome(env: EstimationEnv, played: Played) -> Outcome:
         scoring.step_errors(mean, truth, mass), mean=mean, truth=truth, mass=mass,
         points=truth_discretisation(env.world).transport.mesh.points, homogeneous=homogeneous,
         measured=played.voltages[states], computed=computed,
-        innovations=(innovations[0], innovations[1]) if known else None, claims=claims,
+        innovations=(innovations[0], innovations[1]) if known else None, std=std,
         velocity=velocity)

@@ -10,31 +10,18 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.metadata import entry_points
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from eitbench import _check, scoring
+from eitbench.bench.tracks import TRACKS
 from eitbench.worlds.world import World
 
 GROUP = "eitbench.scores"
 """Entry points of installed packages: each names a module that registers scores."""
-TRACKS = ("estimation", "injection")
 BETTER = ("lower", "higher", "nominal", "none")
-"""Which way is better: less, more, nearer to ``nominal``; or it is no matter of good and bad."""
-
-
-class Claims(NamedTuple):
-    """What a method said of its own uncertainty: mean and standard deviation beside the truth."""
-
-    mean: np.ndarray
-    """(S, m) mol/m³"""
-    std: np.ndarray
-    """(S, m) mol/m³"""
-    truth: np.ndarray
-    """(S, m) mol/m³"""
-    weights: np.ndarray
-    """(m,) m² (m³ in 3D) of each node"""
+"""Which way is better: less, more, nearer to what the explanation says; or neither."""
 
 
 @dataclass(frozen=True)
@@ -65,8 +52,8 @@ class Outcome:
     """(S, L) V that the model computes of the estimates"""
     innovations: tuple[np.ndarray, np.ndarray] | None = None
     """(K, L) V and their covariances (K, L, L) V², where claimed"""
-    claims: Claims | None = None
-    """where every scored state has a variance"""
+    std: np.ndarray | None = None
+    """(S, m) mol/m³, where every scored state has a variance"""
     velocity: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
     """(S, p) estimated and true m/s, and weights (p,), where the flow is asked for"""
 
@@ -92,8 +79,6 @@ class Score:
         Outcome -> number, or None where it means nothing.
     better : str
         One of `BETTER`.
-    nominal : float
-        The best value, where ``better`` is ``nominal``.
     needs : sequence of str
         Fields of `Outcome` without which the score is None.
     tracks : sequence of str
@@ -116,7 +101,6 @@ class Score:
     explanation: str
     of: Callable[[Any], float | None]
     better: str = "lower"
-    nominal: float = 0.0
     needs: Sequence[str] = ()
     tracks: Sequence[str] = ("estimation",)
     factor: float = 1.0
@@ -204,12 +188,9 @@ def _of_velocity(outcome: Any) -> float:
     return scoring.relative_error(estimated, true, np.diag(weights))
 
 
-def _coverage(level: float) -> Callable[[Any], float]:
-    def of(outcome: Any) -> float:
-        mean, std, truth, weights = outcome.claims
-        return scoring.coverage(mean, std, truth, weights, level)
-
-    return of
+def _claimed(outcome: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """What `scoring` asks for of a claimed uncertainty."""
+    return outcome.mean, outcome.std, outcome.truth, outcome.weights
 
 
 for _score in (
@@ -223,20 +204,20 @@ for _score in (
     Score("nis", "NIS/m",
           "normalised innovation squared; 1 when the filter's own uncertainty fits",
           lambda outcome: scoring.normalised_innovations(*outcome.innovations).mean(),
-          better="nominal", nominal=1.0, needs=("innovations",), everywhere=True),
+          better="nominal", needs=("innovations",), everywhere=True),
     Score("crps", "CRPS", "continuous ranked probability score, mol/m³",
-          lambda outcome: scoring.crps(*outcome.claims), needs=("claims",), everywhere=True),
+          lambda outcome: scoring.crps(*_claimed(outcome)), needs=("std",), everywhere=True),
     Score("velocity_error", "ẽ_v",
           "relative error of the flow, ∫(v̂ − v)²/∫v² across the pipe, where it is asked for too",
           _of_velocity, needs=("velocity",)),
     Score("coverage_50", "50 %", "part of the truth inside the claimed 50 % interval",
-          _coverage(0.5), better="nominal", nominal=0.5, needs=("claims",), everywhere=True),
+          lambda outcome: scoring.coverage(*_claimed(outcome), 0.5), better="nominal", needs=("std",), everywhere=True),
     Score("coverage_90", "90 %", "part of the truth inside the claimed 90 % interval",
-          _coverage(0.9), better="nominal", nominal=0.9, needs=("claims",), everywhere=True),
+          lambda outcome: scoring.coverage(*_claimed(outcome), 0.9), better="nominal", needs=("std",), everywhere=True),
     Score("spread_ratio", "var/MSE",
           "claimed variance over squared error; 1 is honest, more is too modest",
-          lambda outcome: scoring.spread_ratio(*outcome.claims),
-          better="nominal", nominal=1.0, needs=("claims",), everywhere=True),
+          lambda outcome: scoring.spread_ratio(*_claimed(outcome)),
+          better="nominal", needs=("std",), everywhere=True),
     Score("voltage_discrepancy", "ẽ_V", "voltage discrepancy (5.13), mV²; a diagnostic",
           lambda outcome: scoring.voltage_discrepancy(outcome.measured, outcome.computed),
           better="none", needs=("measured", "computed"), factor=1e6, everywhere=True),

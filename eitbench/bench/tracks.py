@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import gymnasium as gym
 
 from eitbench.data.seeds import parse_seeds
-from eitbench.envs.pages import page
 from eitbench.worlds.registry import entries, entry
 
 if TYPE_CHECKING:
@@ -38,29 +37,6 @@ training."""
 QUICK = ("eitbench/Pipe2D-v0", "eitbench/Pipe2DFixedLag-v0", "eitbench/Pipe2DSmoothing-v0")
 """What the quick suite runs; the full one runs all that ask for estimates."""
 QUICK_SEEDS = "test:0-3"
-
-_FAST = {"flow": {"mean_velocity": 45.0},
-         "schedule": {"scored_steps": 5, "pattern": {"frame": 2}},
-         "vessel": {"electrodes_per_wall": 2}}
-_CHOICE = {"flow": {"mean_velocity": 16.0}, "schedule": {"scored_steps": 4}}
-SHORT: dict[str, dict[str, Any]] = {
-    "eitbench/Pipe2D-v0": {"world": _FAST},
-    "eitbench/Pipe2DFixedLag-v0": {"world": _FAST, "lag": 2},
-    "eitbench/Pipe2DSmoothing-v0": {"world": _FAST},
-    "eitbench/StationaryTank2D-v0": {"world": {
-        "vessel": {"n_electrodes": 8}, "schedule": {"scored_steps": 5}}},
-    "eitbench/Pipe2DUnknownVelocity-v0": {"world": _FAST | {
-        "flow": {"mean_velocity": 45.0, "velocity_range": [40.0, 50.0]}}},
-    "eitbench/Pipe2DInjection-v0": {"world": _CHOICE},
-    "eitbench/Pipe2DInjectionCurrents-v0": {"world": _CHOICE},
-    "eitbench/Pipe2DInjectionFaults-v0": {"world": _CHOICE},
-    "eitbench/Pipe2DInjectionBudget-v0": {"world": _CHOICE, "estimator": "reduced"},
-    "eitbench/Pipe2DInjectionFlow-v0": {"world": _CHOICE | {
-        "flow": {"mean_velocity": 16.0, "velocity_range": [15.0, 17.0]}}, "estimator": "reduced"},
-}
-"""Arguments with which an episode takes a moment, since a fast fluid flushes the pipe in a few
-steps. A method's card is of the first of these environments that it plays."""
-
 
 class Environment(NamedTuple):
     """A registered id with keyword arguments: what is made, and what a record names."""
@@ -179,8 +155,3 @@ def class_of(id: str, board: str) -> str:
 def default_seeds(env: EstimationEnv | InjectionEnv, id: str, suite: str = "full") -> list[int]:
     """Seeds that are played in an environment when nobody says which."""
     return parse_seeds(QUICK_SEEDS if suite == "quick" else entry(id).seeds)
-
-
-def documentation(id: str) -> str:
-    """Page of an environment, as Markdown."""
-    return page(id)

@@ -11,8 +11,8 @@ from markdown_it import MarkdownIt
 from markupsafe import Markup
 
 from eitbench._files import shipped
-from eitbench.bench import tracks
 from eitbench.bench.statistics import paired_probability_of_improvement
+from eitbench.envs.pages import page
 from eitbench.report import charts
 from eitbench.report.site.collect import Board, Row, Site
 from eitbench.report.site.tables import explanations, table, three
@@ -38,7 +38,7 @@ def environment_page(site: Site, board: Board, animation: bytes | None) -> str:
 
 def documentation(id: str) -> tuple[Markup, Markup]:
     """What a docstring says first, and all the rest, as HTML."""
-    text = re.sub(r"\A\s*## Description\s*", "", tracks.documentation(id))
+    text = re.sub(r"\A\s*## Description\s*", "", page(id))
     first, *rest = re.split(r"^(?=## )", text, flags=re.MULTILINE)
     return markdown(first), markdown("".join(rest))
 
