@@ -3,7 +3,12 @@ really are."""
 
 from __future__ import annotations
 
+import ast
+import inspect
+import textwrap
 from dataclasses import fields, is_dataclass
+from functools import lru_cache
+from itertools import pairwise
 from typing import Any
 
 import gymnasium as gym
@@ -135,18 +140,37 @@ def _table(space: spaces.Dict, world: World) -> str:
 
 def _numbers(world: World) -> str:
     """Every number of every part, by the names that the argument ``world`` takes."""
-    lines = ["| name | value |", "|---|---|"]
+    lines = ["| name | value | meaning |", "|---|---|---|"]
     for each in fields(world):
         value = getattr(world, each.name)
         if each.name == "name":
             continue
-        lines += _rows(each.name, value)
+        lines += _rows(each.name, value, _meanings(World).get(each.name, ""))
     return "\n".join(lines)
 
 
-def _rows(name: str, value: Any) -> list[str]:
-    if is_dataclass(value):
-        kind = f"| `{name}` | {type(value).__name__} |"
-        return [kind, *(row for each in fields(value) for row in _rows(f"{name}.{each.name}",
-                                                                       getattr(value, each.name)))]
-    return [f"| `{name}` | {list(value) if isinstance(value, tuple) else value} |"]
+def _rows(name: str, value: Any, meaning: str) -> list[str]:
+    if not is_dataclass(value):
+        return [f"| `{name}` | {list(value) if isinstance(value, tuple) else value} | {meaning} |"]
+    kind: type = type(value)
+    first = " ".join((kind.__doc__ or "").partition("\n\n")[0].split())
+    said = _meanings(kind)
+    return [f"| `{name}` | {kind.__name__} | {first} |",
+            *(row for each in fields(value)
+              for row in _rows(f"{name}.{each.name}", getattr(value, each.name), said.get(each.name, "")))]
+
+
+@lru_cache(maxsize=64)
+def _meanings(kind: type) -> dict[str, str]:
+    """Field -> the text below it in the source, with its unit; nothing where there is no source."""
+    found: dict[str, str] = {}
+    for each in reversed(kind.__mro__[:-1]):
+        try:
+            body = ast.parse(textwrap.dedent(inspect.getsource(each))).body[0]
+        except (OSError, TypeError):
+            continue
+        for line, after in pairwise(getattr(body, "body", [])):
+            if (isinstance(line, ast.AnnAssign) and isinstance(line.target, ast.Name)
+                    and isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)):
+                found[line.target.id] = " ".join(str(after.value.value).split()).replace("|", "\\|")
+    return found

@@ -48,6 +48,7 @@ class World:
     schedule: Schedule = field(default_factory=Schedule)
     prior: Prior = field(default_factory=Prior)
     region: tuple[float, float] | None = None
+    """m along the vessel; errors count between these cross-sections only. None: everywhere"""
 
     def __post_init__(self) -> None:
         for part in (self.vessel, self.flow, self.target):

@@ -112,3 +112,25 @@ def test_there_is_no_page_of_what_is_not_registered():
     message = r"env must be one of eitbench/Pipe2D-v0, .*got 'mine/No-v0'"
     with pytest.raises(ValueError, match=message):
         page("mine/No-v0")
+
+
+def meanings(text: str) -> dict[str, str]:
+    """Name -> last cell of each row of the numbers."""
+    rows = re.findall(r"^\| `([^`]+)` \| .*? \| (.*) \|$", section(text, "Numbers of the world"), re.MULTILINE)
+    return dict(rows)
+
+
+def test_no_number_stands_without_a_meaning(told):
+    """Beside each is what its source says of it."""
+    _, text, _ = told
+    said = meanings(text)
+    assert len(said) > 30 and not [name for name, meaning in said.items() if not meaning]
+
+
+def test_numbers_have_their_units():
+    """As their source has them."""
+    said = meanings(page("eitbench/Pipe2D-v0"))
+    assert said["vessel.length"] == "m [T]"
+    assert said["vessel.contact_impedance"] == "z in Ω·m² [ours]"
+    assert said["schedule.time_step"] == "s between two injections [T]"
+    assert said["region"].startswith("m along the vessel")
