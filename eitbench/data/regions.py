@@ -16,7 +16,7 @@ import numpy as np
 
 from eitbench.data import store
 from eitbench.data.episodes import Episode, simulate, truth_discretisation
-from eitbench.data.recordings import SPARSE, doubled_triangle, outline, recording, score_operators, sparse_of
+from eitbench.data.recordings import SPARSE, doubled_triangle, outline, score_operators, sparse_of
 
 if TYPE_CHECKING:
     import scipy.sparse as sp
@@ -36,11 +36,10 @@ class Integrals(NamedTuple):
     """(T,) ∫c_t²"""
 
 
-def integrals(world: World, seed: int) -> Integrals:
-    """What the episode of this seed is scored by, from the cache if it is there; else it is
-    simulated."""
+def integrals(world: World, seed: int, entries: np.ndarray) -> Integrals:
+    """What the episode of this seed, whose recording is ``entries``, is scored by. Over a region it
+    is from the cache if it is there; else it is simulated."""
     if world.region is None:
-        entries = recording(world, seed)
         return Integrals(entries["moment"], entries["deviation"], entries["square"])
 
     def make() -> dict[str, Any]:

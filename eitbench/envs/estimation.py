@@ -103,7 +103,7 @@ class EstimationEnv(gym.Env[Observation, np.ndarray], EzPickle):
         super().reset(seed=seed)
         self._seed = int(self.np_random.integers(self.episodes)) if seed is None else seed
         self._entries = recording(self.world, self._seed)
-        self._integrals = integrals(self.world, self._seed)
+        self._integrals = integrals(self.world, self._seed, self._entries)
         self._voltages = np.zeros_like(self._currents)
         self._voltages[:self.world.n_steps] = cycle_voltages(self.world, self._seed, self._entries)
         self._step = 1

@@ -44,7 +44,7 @@ class EstimationVectorEnv(LockstepVectorEnv):
         for k, seed in enumerate(seeds):
             entries = recording(world, seed)
             self._voltages[:world.n_steps, k] = cycle_voltages(world, seed, entries)
-            moments, self._deviations[:, k], self._squares[:, k] = integrals(world, seed)
+            moments, self._deviations[:, k], self._squares[:, k] = integrals(world, seed, entries)
             self._moments.append(moments[world.warm_up:].copy())
             if world.velocity_model is not None:
                 self._flows.append((entries["velocity_moment"].copy(), entries["velocity_square"].copy()))

@@ -117,7 +117,7 @@ class InjectionCore:
         for k, seed in enumerate(seeds):
             entries = recording(world, seed)
             self._resistance[:, k], self._draws[:, k] = entries["transfer_resistance"], entries["noise"]
-            moment, self._deviations[k], self._squares[k] = integrals(world, seed)
+            moment, self._deviations[k], self._squares[k] = integrals(world, seed, entries)
             totals[k] = moment.sum(axis=1, dtype=float)
             faults.append(faults_of(world, seed))
             if self._operator_type:

@@ -96,7 +96,7 @@ def test_without_a_region_all_counts(env):
     the same."""
     whole = dataclasses.replace(env.world, region=None)
     entries = recording(whole, 3)
-    for name, array in integrals(whole, 3)._asdict().items():
+    for name, array in integrals(whole, 3, entries)._asdict().items():
         np.testing.assert_array_equal(array, entries[name])
     assert score_mass(whole) is outline(whole).mass
     mesh = make_task(whole).mesh
@@ -111,13 +111,13 @@ def test_without_a_region_all_counts(env):
 def test_integrals_are_kept_and_damage_is_noticed(env, monkeypatch, tmp_path):
     """Made once from the truth; a damaged file, or another seed's, is made anew."""
     world = env.world
-    made = integrals(world, 3)
+    made = integrals(world, 3, recording(world, 3))
     places = {seed: tmp_path / f"{seed}.npz" for seed in (3, 4)}
     monkeypatch.setattr(regions, "integrals_path", lambda _, seed: places[seed])
     asked = []
     monkeypatch.setattr(regions, "make_integrals", lambda *_: asked.append(1) or made)
     for _ in range(2):
-        assert all((a == b).all() for a, b in zip(integrals(world, 3), made, strict=True))
+        assert all((a == b).all() for a, b in zip(integrals(world, 3, recording(world, 3)), made, strict=True))
     assert len(asked) == 1
     assert regions.are_kept(world, 3)
     assert not regions.are_kept(world, 4)
@@ -126,7 +126,7 @@ def test_integrals_are_kept_and_damage_is_noticed(env, monkeypatch, tmp_path):
     assert not regions.are_kept(world, 4)
     for damaged in (data[:-9], b"", data[:2000] + bytes([data[2000] ^ 1]) + data[2001:]):
         places[3].write_bytes(damaged)
-        assert all((a == b).all() for a, b in zip(integrals(world, 3), made, strict=True))
+        assert all((a == b).all() for a, b in zip(integrals(world, 3, recording(world, 3)), made, strict=True))
     assert len(asked) == 4
 
 
@@ -143,7 +143,7 @@ def test_the_bank_keeps_the_integrals(monkeypatch, tmp_path):
     beside = recording_path(world, 2).stat().st_size
     assert recording_bytes(world) == pytest.approx(beside + len(kept), rel=0.02)
     made = make_integrals(world, eitbench.simulate(world, 2, cache=False))
-    assert all((a == b).all() for a, b in zip(integrals(world, 2), made, strict=True))
+    assert all((a == b).all() for a, b in zip(integrals(world, 2, recording(world, 2)), made, strict=True))
     path.unlink()
     assert missing_seeds(world, [1, 2]) == [2]
     assert fill(world, [1, 2]) == 1
