@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from eitbench._files import write_atomically
 from eitbench.bench import policies, tracks
@@ -213,7 +214,8 @@ def _choices(environment: tracks.Environment, method: str,
              seed: int) -> tuple[dict[str, Any], list[Any]]:
     arguments = json.loads(environment.kwargs)
     estimator = arguments.pop("estimator", "full")
-    played = policies.play(environment.id, arguments, method, seed, estimator)
+    with threadpool_limits(1):  # as episodes of records are played
+        played = policies.play(environment.id, arguments, method, seed, estimator)
     pairs = [[int(step.argmax()), int(step.argmin())] if step.any() else []
              for step in played.currents]
     return scored("injection", played.outcome), pairs
