@@ -194,9 +194,7 @@ def _claimed(outcome: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarr
 
 
 for _score in (
-    Score("error", "ẽ_c",
-          "relative estimation error (5.12), ± half the 95 % confidence interval over seeds; lower "
-          "is better",
+    Score("error", "ẽ_c", "relative estimation error (5.12)",
           lambda outcome: outcome.errors.mean(), tracks=TRACKS, everywhere=True),
     Score("contrast_error", "contrast",
           "error relative to the deviation from the homogeneous estimate; 1 is no better than that",

@@ -134,5 +134,6 @@ def html(table: pd.DataFrame, a: str, b: str, score: str = "error") -> str:
     bars = [[f"{50.0 + 45.0 * value / widest:.2f}" if math.isfinite(value) else None for value in three]
             for three in table[["low", "difference", "high"]].itertuples(False)]
     return template("compare.html.j2").render(
-        a=a, b=b, headings=list(text.columns), rows=list(zip(text.to_numpy().tolist(), bars, strict=True)))
+        a=a, b=b, score=comparable(score), headings=list(text.columns),
+        rows=list(zip(text.to_numpy().tolist(), bars, strict=True)))
 

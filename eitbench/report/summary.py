@@ -33,7 +33,9 @@ def columns() -> dict[str, tuple[str, str]]:
     """Name -> heading and explanation of each column of numbers: every registered score, and the
     skill."""
     each = {name: (score.heading, score.explanation) for name, score in scores().items()}
-    return {"error": each.pop("error"), "skill": SKILL} | each
+    heading, text = each.pop("error")
+    text += ", ± half the 95 % confidence interval over seeds; lower is better"
+    return {"error": (heading, text), "skill": SKILL} | each
 
 
 def explanations() -> dict[str, str]:
