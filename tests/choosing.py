@@ -1,10 +1,15 @@
 """Injection environments that leave the agent few steps, and what tests do with them."""
 
+import json
+
 import gymnasium as gym
 import numpy as np
 from short import merged
 
-import eitbench  # noqa: F401 (registers)
+from eitbench.bench import playing
+from eitbench.bench.methods import load_method
+from eitbench.bench.scores import Outcome
+from eitbench.bench.tracks import Environment
 
 NAME = "eitbench/Pipe2DInjection-v0"
 CURRENTS, FAULTS, BUDGET = (f"eitbench/Pipe2DInjection{kind}-v0" for kind in ("Currents", "Faults", "Budget"))
@@ -50,3 +55,9 @@ def some_actions(env: gym.Env, steps: int = 120) -> np.ndarray:
 
 def arrays_of(observation) -> list[np.ndarray]:
     return [observation[key] for key in sorted(observation)] if isinstance(observation, dict) else [observation]
+
+
+def injected(name: str, kwargs: dict, policy: str, seed: int, estimator: str = "full") -> Outcome:
+    """What can be scored of an episode that a policy plays, with this filter inside."""
+    asked = Environment(name, json.dumps(kwargs | {"estimator": estimator}))
+    return playing.play(asked, load_method(policy, "injection"), seed).outcome

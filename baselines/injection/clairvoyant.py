@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from eitbench.bench.policies import load_policy
+from eitbench.bench.methods import load_method
 from eitbench.data.recordings import recording
 from eitbench.envs.injection_core import InjectionCore
 from eitbench.estimation.onboard.belief import Belief
@@ -37,10 +37,10 @@ class Policy:
             self.plan = iter(self.changing().tolist())
             return
         pairs, every = rules.pairs.tolist(), np.ones(core.length, dtype=int)
-        best = load_policy("best_pair").parameters["pair"].get(rules.name)
+        best = load_method("best_pair", "injection").parameters["pair"].get(rules.name)
         fixed = sorted({pairs.index(pair) for pair in [*self.parameters["fixed_pairs"], best] if pair in pairs})
         if rules.budget is None:
-            any_currents = load_policy("best_currents")
+            any_currents = load_method("best_currents", "injection")
             self.currents = np.array(any_currents.parameters["currents"], dtype=np.float32)
             currents = [CURRENTS] * any_currents.suits(rules)
             errors, plans = self.ahead(np.array([self.greedy(), *(option * every for option in fixed + currents)]))

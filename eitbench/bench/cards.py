@@ -16,16 +16,17 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from eitbench._files import write_atomically
-from eitbench.bench import policies, tracks
-from eitbench.bench.baselines import (
+from eitbench.bench import tracks
+from eitbench.bench.methods import (
     baseline_folder,
     card_name,
     card_version,
-    load_baseline,
-    own_baselines,
+    is_path,
+    load_method,
+    own_agents,
+    own_methods,
 )
-from eitbench.bench.policies import load_policy, own_agents, own_policies
-from eitbench.bench.run import Job, run_episode
+from eitbench.bench.playing import Episode, environment, play
 from eitbench.bench.scores import scored, scores
 from eitbench.data.seeds import parse_seeds
 
@@ -74,7 +75,7 @@ def official_methods() -> dict[str, str]:
     """Name of a card -> the method it is of: name, or path of the first agent of a kind."""
     agents = {card_name(Path(path)): path
               for id in tracks.ids("injection") for path in reversed(own_agents(id))}
-    return {name: name for name in [*own_baselines(), *own_policies()]} | agents
+    return {name: name for track in tracks.TRACKS for name in own_methods(track)} | agents
 
 
 def read_card(name: str) -> dict[str, Any] | None:
@@ -111,15 +112,16 @@ def played(card: dict[str, Any], method: str) -> dict[str, Any]:
     Raises
     ------
     ValueError
-        If the episode fails.
+        If the method cannot play the episode.
     """
-    environment = tracks.Environment(card["environment"], json.dumps(card["kwargs"]))
+    asked = tracks.Environment(card["environment"], json.dumps(card["kwargs"]))
     (seed,) = parse_seeds(card["seed"])
-    answers = _choices if environment.track == "injection" else _estimates
-    numbers, answer = answers(environment, method, seed)
+    with threadpool_limits(1):  # as episodes of records are played
+        episode = play(asked, load_method(method, asked.track), seed)
+    numbers = scored(asked.track, episode.outcome)
     kept = {score: value for score, value in numbers.items()
             if value is not None and math.isfinite(value) and scores()[score].repeats}
-    return card | {"scores": kept, "answer": answer}
+    return card | {"scores": kept, "answer": _answer(episode)}
 
 
 def moved(card: dict[str, Any], now: dict[str, Any]) -> list[str]:
@@ -179,18 +181,15 @@ def _updated(name: str, method: str, new_version: bool) -> tuple[str, list[str]]
 
 
 def _plays(method: str, id: str, kwargs: dict[str, Any]) -> bool:
-    environment = tracks.Environment(id, json.dumps(kwargs))
-    if method.endswith(".zip"):
+    asked = tracks.Environment(id, json.dumps(kwargs))
+    if is_path(method):
         return Path(method).parents[2].name == id.replace("/", "-")
-    if environment.track == "injection":
-        if method not in own_policies():
-            return False
-        return load_policy(method).suits(policies.environment(id, environment.kwargs, "reduced").rules)
-    if method not in own_baselines():
+    if method not in own_methods(asked.track):
         return False
-    env: Any = environment.make()
-    baseline = load_baseline(method)
-    return tracks.board_of(env) in baseline.boards and baseline.suits(env.task)
+    env: Any = environment(asked)
+    loaded = load_method(method, asked.track)
+    known = env.rules if asked.track == "injection" else env.task
+    return tracks.board_of(env) in loaded.boards and loaded.suits(known)
 
 
 def _text(card: dict[str, Any]) -> str:
@@ -200,25 +199,14 @@ def _text(card: dict[str, Any]) -> str:
     return "{\n" + ",\n".join([*lines, f' "scores": {{\n{scores}\n }}']) + "\n}\n"
 
 
-def _estimates(environment: tracks.Environment, method: str,
-               seed: int) -> tuple[dict[str, Any], list[Any]]:
-    result, fields = run_episode(Job(environment, method, seed))
-    if result["status"] != "ok":
-        raise ValueError(f"{method} fails in {environment.id}: {result['message']}")
-    last = fields["mean"][-1]
+def _answer(episode: Episode) -> list[Any]:
+    """Some entries of the last estimate; of a policy, source and sink of each step."""
+    if not episode.fields:
+        return [[int(step.argmax()), int(step.argmin())] if step.any() else []
+                for step in episode.currents]
+    last = episode.fields["mean"][-1]
     nodes = np.linspace(0, last.size - 1, ENTRIES + 2).astype(int)[1:-1]
-    return result["scores"], [float(last[node]) for node in nodes]
-
-
-def _choices(environment: tracks.Environment, method: str,
-             seed: int) -> tuple[dict[str, Any], list[Any]]:
-    arguments = json.loads(environment.kwargs)
-    estimator = arguments.pop("estimator", "full")
-    with threadpool_limits(1):  # as episodes of records are played
-        played = policies.play(environment.id, arguments, method, seed, estimator)
-    pairs = [[int(step.argmax()), int(step.argmin())] if step.any() else []
-             for step in played.currents]
-    return scored("injection", played.outcome), pairs
+    return [float(last[node]) for node in nodes]
 
 
 def _same(then: list[Any], now: list[Any], tolerance: float) -> bool:

@@ -15,15 +15,14 @@ import secrets
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
-
 from eitbench._files import shipped, write_atomically
-from eitbench.bench.baselines import is_ours
+from eitbench.bench.methods import is_ours
 from eitbench.bench.records import newest, read_records
 from eitbench.bench.run import Job, run_episode
 from eitbench.bench.sandbox.wall import python_files
 from eitbench.bench.statistics import FEWEST, interquartile_mean, mean_over_environments, stratified_bootstrap
-from eitbench.bench.text import as_markdown, scores_by_seed, with_interval
+from eitbench.bench.table import Cell, Table
+from eitbench.bench.text import scores_by_seed, with_interval
 from eitbench.bench.tracks import FLOORS
 from eitbench.data.seeds import SPLITS
 
@@ -142,17 +141,20 @@ def held_out(record: dict[str, Any], job: Job, salt: bytes, episodes: int, folde
     if gains := _gains(record, floor, errors, folder):
         # How hard an episode is cancels in its gain, so that far smaller differences are seen.
         compared[f"gain over {floor}"] = interquartile_mean, gains, [1.0 - error / zero for error, zero in pairs]
-    rows = [{"episodes": "record", "number": str(len(errors))}, {"episodes": "held-out", "number": str(len(pairs))},
-            {"episodes": "difference", "number": ""}]
+    rows: list[dict[str, Cell | str]] = [
+        {"episodes": "record", "number": Cell(str(len(errors)))},
+        {"episodes": "held-out", "number": Cell(str(len(pairs)))},
+        {"episodes": "difference", "number": Cell("")},
+    ]
     for name, (statistic, theirs, new) in compared.items():
         step, low, high = stratified_bootstrap({"a": new, "b": theirs},
                                                lambda a, b, statistic=statistic: statistic(a) - statistic(b))
         said = [_said(stratified_bootstrap({"": each}, statistic)) for each in (theirs, new)]
         for row, text in zip(rows, (*said, with_interval(step, low, high)), strict=True):
-            row[name] = text
+            row[name] = Cell(text)
     if not low <= 0.0 <= high:
         differences.append(f"{name} of held-out episodes differs from the record's by {with_interval(step, low, high)}")
-    return as_markdown(pd.DataFrame(rows), words=1), differences
+    return Table.of(rows).markdown(), differences
 
 
 def _gains(record: dict[str, Any], floor: str, errors: dict[str, float], folder: Path) -> list[float]:

@@ -19,7 +19,7 @@ from eitbench._files import write_atomically
 from eitbench.bench.records import newest, read_record
 from eitbench.bench.run import run_episode
 from eitbench.bench.store import source_digest
-from eitbench.bench.text import as_markdown
+from eitbench.bench.table import Cell, Table
 from eitbench.bench.verify import TOLERANCE, differences_of, job_of, outdated
 from eitbench.data.parallel import in_parallel
 from eitbench.data.seeds import parse_seeds
@@ -157,12 +157,13 @@ def differing(rows: pd.DataFrame, tolerance: float = TOLERANCE) -> list[str]:
 def by_environment(rows: pd.DataFrame, tolerance: float = TOLERANCE) -> str:
     """Markdown: for each environment how many episodes are as their records say, and the greatest
     difference."""
-    lines = []
+    lines: list[dict[str, Cell | str]] = []
     for name, group in rows.groupby("environment", sort=False):
         worst = group.iloc[int(group["difference"].argmax())]
         differs = (group["difference"] > tolerance) | (group["problem"] != "")
         lines.append({"environment": str(name), "greatest difference in": f"{worst['score']} of {worst['method']}"
-                      if worst["difference"] else "none", "episodes": str(len(group)),
-                      "to the bit": str(int((group["difference"] == 0).sum())), "differ": str(int(differs.sum())),
-                      "relative": f"{worst['difference']:.1g}"})
-    return as_markdown(pd.DataFrame(lines), words=2)
+                      if worst["difference"] else "none", "episodes": Cell(str(len(group))),
+                      "to the bit": Cell(str(int((group["difference"] == 0).sum()))),
+                      "differ": Cell(str(int(differs.sum()))),
+                      "relative": Cell(f"{worst['difference']:.1g}")})
+    return Table.of(lines).markdown()

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from eitbench.bench import tracks
-from eitbench.bench.baselines import own_names
+from eitbench.bench.methods import own_files
 
 NUMBER = 2
 
@@ -35,7 +35,7 @@ def _upgraded(record: dict[str, Any]) -> dict[str, Any]:
     kept = {key: value for key, value in record.items() if key not in ("source", "sha256")}
     environment = record["environment"]
     given = _given(environment)
-    is_ours = record["official"] is True and record["method"] in own_names(environment["id"])
+    is_ours = record["official"] is True and record["method"] in own_files(environment["id"])
     return kept | {
         "schema": 3,
         "version": "v1" if is_ours else record["method_sha256"][:8],

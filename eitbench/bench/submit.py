@@ -91,9 +91,9 @@ def submit(method: str | None, environments: list[str], seeds: list[int] | None,
 def _jobs(method: str | None, id: str, policy: bool, seeds: list[int] | None, isolate: str) -> list[Job]:
     """What is to be played in one environment."""
     methods = [] if method is None else [method]
-    if tracks.track_of(id) == "injection" if method is None else policy:
-        return suites.policy_jobs([id], methods, seeds, isolate=isolate)
-    return suites.jobs("full", [id], methods, seeds, isolate=isolate)
+    asked = "injection" if policy else "estimation"
+    track = tracks.track_of(id) if method is None else asked
+    return suites.jobs(track, [id], methods, seeds, isolate=isolate)
 
 
 def _earlier(to: Path, environment: str, method: str, version: str) -> list[tuple[Path, dict[str, Any]]]:

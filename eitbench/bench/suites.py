@@ -1,4 +1,4 @@
-"""What `eitbench run` runs when it is not told."""
+"""What is played when nobody says it in detail."""
 
 from __future__ import annotations
 
@@ -6,89 +6,91 @@ import json
 from pathlib import Path
 from typing import Any
 
-from eitbench.bench.baselines import Baseline, find_baseline, installed_methods, is_ours, load_baseline, own_baselines
-from eitbench.bench.policies import environment as injection_environment
-from eitbench.bench.policies import find_policy, load_policy, own_agents, own_policies
+from eitbench.bench import playing
+from eitbench.bench.methods import (
+    FORMS,
+    Method,
+    find_method,
+    installed_methods,
+    is_ours,
+    is_path,
+    load_method,
+    own_agents,
+    own_methods,
+)
 from eitbench.bench.run import Job
-from eitbench.bench.tracks import ESTIMATORS, QUICK, Environment, board_of, check_track, default_seeds, ids
+from eitbench.bench.tracks import (
+    ESTIMATORS,
+    QUICK,
+    Environment,
+    board_of,
+    check_track,
+    default_seeds,
+    ids,
+)
 
-# An image at every step: minutes an episode.
 TOO_SLOW_FOR_QUICK = {("filter", "gauss_newton")}
+"""An image at every step takes minutes an episode."""
 ISOLATE = ("never", "others", "always")
 """Whose methods run in a process of their own."""
 
 
-def jobs(suite: str, environments: list[str], baselines: list[str], seeds: list[int] | None = None, *,
-         isolate: str = "others") -> list[Job]:
-    """Every named baseline (default: all of ours) on every named environment (default: the
-    suite's), on ``seeds`` (default: the suite's), ordered by environment, method and seed.
-    ``isolate`` is one of `ISOLATE`.
+def jobs(track: str, environments: list[str], methods: list[str], seeds: list[int] | None = None, *,
+         suite: str = "full", estimator: str = "full", isolate: str = "others") -> list[Job]:
+    """Every named method of a track in every named environment that it suits, ordered by
+    environment, method and seed.
+
+    Parameters
+    ----------
+    track : str
+        One of `tracks.TRACKS`.
+    environments, methods : list of str
+        Default: the suite's; all of ours, trained agents among them.
+    seeds : list of int
+        Default: the suite's, those of the boards.
+    suite : "quick" or "full"
+    estimator : str
+        What stands inside environments that ask for injections: one of `tracks.ESTIMATORS`.
+    isolate : str
+        One of `ISOLATE`.
 
     Raises
     ------
     ValueError
-        If an environment is not registered, a baseline does not exist, or no pair of them fits.
-    """
-    for baseline in baselines:
-        find_baseline(baseline)
-    todo, names = [], dict[str, str]()
-    environments = environments or list(QUICK if suite == "quick" else ids("estimation"))
-    for name in environments:
-        check_track(name, "estimation")
-        environment = Environment(name)
-        env: Any = environment.make()
-        board = board_of(env)
-        numbers = default_seeds(env, name, suite) if seeds is None else seeds
-        suited = list[Job]()
-        for baseline in baselines or own_baselines():
-            skipped = suite == "quick" and not baselines and (board, baseline) in TOO_SLOW_FOR_QUICK
-            job = Job(environment, _absolute(baseline), 0, is_isolated(environment, baseline, isolate))
-            loaded = job.load()
-            assert isinstance(loaded, Baseline)
-            names[baseline] = loaded.name
-            if board in loaded.boards and not skipped and loaded.suits(env.task):
-                suited.append(job)
-        # Environment by environment, since models are kept for a few only, and a guest for one
-        # method.
-        todo += [job._replace(seed=seed) for job in suited for seed in numbers]
-    _distinct(names)
-    if not todo:
-        raise ValueError(f"none of the baselines {', '.join(baselines)} plays any of the environments "
-                         f"{', '.join(environments)}; see `eitbench list`")
-    return todo
-
-
-def policy_jobs(environments: list[str], policies: list[str], seeds: list[int] | None = None,
-                estimator: str = "full", *, isolate: str = "others") -> list[Job]:
-    """Every named policy (default: all of ours that suit, trained agents among them) in every named
-    environment, on ``seeds`` (default: those of the boards), with this estimator inside.
-    ``isolate`` is one of `ISOLATE`.
-
-    Raises
-    ------
-    ValueError
-        If an environment does not ask for injections, or a policy does not exist or suit one.
+        If there is no such environment or method, a named method plays none of the environments, or
+        two have one name.
     """
     if estimator not in ESTIMATORS:
         raise ValueError(f"estimator must be one of {', '.join(ESTIMATORS)}, got {estimator!r}")
-    kwargs = "{}" if estimator == "full" else json.dumps({"estimator": estimator})
-    for policy in policies:
-        find_policy(policy)
-    todo, names = [], dict[str, str]()
+    given = {} if estimator == "full" else {"estimator": estimator}
+    for method in methods:
+        find_method(method, track)
+    if not environments:
+        quick = track == "estimation" and suite == "quick"
+        environments = list(QUICK) if quick else ids(track)
+    todo = []
+    names = dict[str, str]()
+    fitting = set[str]()
     for id in environments:
-        check_track(id, "injection")
-        environment, env = Environment(id, kwargs), injection_environment(id, "{}", "reduced")
-        for policy in policies or [*own_policies(), *own_agents(id)]:
-            job = Job(environment, _absolute(policy), 0, is_isolated(environment, policy, isolate))
+        check_track(id, track)
+        asked = Environment(id, json.dumps(given))
+        env = _to_look_at(asked)
+        board = board_of(env)
+        numbers = default_seeds(env, id, suite) if seeds is None else seeds
+        # Environment by environment, since models are kept for a few only, and a guest for one
+        # method.
+        for method in methods or [*own_methods(track), *own_agents(id)]:
+            skipped = suite == "quick" and not methods and (board, method) in TOO_SLOW_FOR_QUICK
+            job = Job(asked, _absolute(method), 0, is_isolated(asked, method, isolate))
             loaded = job.load()
-            assert not isinstance(loaded, Baseline)
-            names[policy] = loaded.name
-            numbers = default_seeds(env, id) if seeds is None else seeds
-            if loaded.suits(env.rules):
+            names[method] = loaded.name
+            if not skipped and _fits(loaded, env):
+                fitting.add(method)
                 todo += [job._replace(seed=seed) for seed in numbers]
-            elif policies:
-                raise ValueError(f"policy {loaded.name} does not suit {id}")
     _distinct(names)
+    if missing := [method for method in methods if method not in fitting]:
+        raise ValueError(f"{FORMS[track].kind} {', '.join(missing)} plays none of the environments "
+                         f"{', '.join(environments)}; see `eitbench list`")
     return todo
 
 
@@ -99,7 +101,19 @@ def is_isolated(environment: Environment, method: str, isolate: str) -> bool:
         raise ValueError(f"isolate must be one of {', '.join(ISOLATE)}, got {isolate!r}")
     if isolate != "always" or not is_ours(method):
         return isolate != "never" and not is_ours(method)
-    return not (load_policy if environment.track == "injection" else load_baseline)(method).privileged
+    return not load_method(method, environment.track).privileged
+
+
+def _to_look_at(asked: Environment) -> Any:
+    """The environment, with whatever filter is made fastest: for what it asks, not to be played."""
+    if asked.track == "injection":
+        asked = asked._replace(kwargs=json.dumps({"estimator": "reduced"}))
+    return playing.environment(asked)
+
+
+def _fits(method: Method, env: Any) -> bool:
+    known = env.rules if method.track == "injection" else env.task
+    return board_of(env) in method.boards and method.suits(known)
 
 
 def _distinct(names: dict[str, str]) -> None:
@@ -108,11 +122,12 @@ def _distinct(names: dict[str, str]) -> None:
     first: dict[str, str] = {}
     for file, name in names.items():
         if first.setdefault(name, file) != file:
-            raise ValueError(f"{first[name]} and {file} have the same name, under which results are kept; rename one")
+            raise ValueError(f"{first[name]} and {file} have the same name, under which results are "
+                             "kept; rename one")
 
 
 def _absolute(method: str) -> str:
     """A path that worker processes find too, of an installed package's as well; a name of ours as
     it is."""
     path = installed_methods().get(method, Path(method))
-    return str(path.absolute()) if path.suffix in (".py", ".zip") else method
+    return str(path.absolute()) if is_path(str(path)) else method

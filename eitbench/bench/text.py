@@ -7,7 +7,6 @@ import math
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from scipy.stats import t as student
 
 from eitbench.bench.scores import scores
@@ -74,20 +73,3 @@ def seed_ranges(seeds: list[str]) -> str:
 def number(value: float) -> str:
     """Two digits below 1, three above, and all that stand before the point."""
     return f"{value:.2g}" if abs(value) < 1 else f"{value:.3g}" if abs(value) < 999.5 else f"{value:.0f}"
-
-
-def as_markdown(text: pd.DataFrame, words: int) -> str:
-    """A table of text as Markdown, also pleasant to read in a terminal; all but the first ``words``
-    columns hold numbers."""
-    lines = [[str(cell).replace("|", "\\|") for cell in line]
-             for line in [list(text.columns), *text.to_numpy().tolist()]]
-    widths = [max(len(str(line[i])) for line in lines) for i in range(len(text.columns))]
-
-    def row(line: list[str]) -> str:
-        padded = [str(cell).ljust(width) if i < words else str(cell).rjust(width)
-                  for i, (cell, width) in enumerate(zip(line, widths, strict=True))]
-        return f"| {' | '.join(padded)} |"
-
-    rule = "|" + "|".join("-" * (width + 2) if i < words else "-" * (width + 1) + ":"
-                          for i, width in enumerate(widths)) + "|"
-    return "\n".join([row(lines[0]), rule, *map(row, lines[1:])])

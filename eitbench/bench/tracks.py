@@ -28,8 +28,6 @@ CLASSES = ("filter", "fixed-lag", "smoothing", "stationary", "injection")
 """What is ranked together: the boards, and targets that stand still apart."""
 FLOORS = {"estimation": "homogeneous", "injection": "random_pair"}
 """Whose episodes are the board's, and from whose error the gain is counted."""
-KINDS = {"estimation": "estimator", "injection": "policy"}
-"""What a method of the track is."""
 ESTIMATORS = ("full", "reduced")
 """What may stand inside an injection environment: the exact filter, for scores, or that of
 training."""

@@ -13,18 +13,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from eitbench import _check
-from eitbench.bench.baselines import find_baseline, installed_methods, is_ours, load_baseline, own_baselines
-from eitbench.bench.policies import find_policy, load_policy, own_agents, own_policies
+from eitbench.bench.methods import find_method, installed_methods, is_ours, own_files
 from eitbench.bench.records import SHARED, version_number
 from eitbench.bench.run import Job, run_episode
 from eitbench.bench.sandbox import guests
 from eitbench.bench.scores import scores
 from eitbench.bench.suites import is_isolated
-from eitbench.bench.text import as_markdown
-from eitbench.bench.tracks import Environment, track_of
+from eitbench.bench.table import Cell, Table
+from eitbench.bench.tracks import Environment
 from eitbench.data.seeds import parse_seeds
 from eitbench.data.store import CACHE_VARIABLE
 
@@ -48,7 +46,7 @@ def job_of(record: dict[str, Any], file: str | None = None, isolate: str = "alwa
     method = _own(record) if file is None else str(Path(file).absolute())
     if method is None:
         raise ValueError(f"{record['method']} is none of ours: its file must be given, as --baseline or --policy")
-    path = (find_policy if environment.track == "injection" else find_baseline)(method)
+    path = find_method(method, environment.track)
     found = hashlib.sha256(path.read_bytes()).hexdigest()
     if found != record["method_sha256"] and not is_ours(method):
         raise ValueError(f"what the record says cannot be played here: the sha256 of {path.name} is {found}, that of "
@@ -95,9 +93,10 @@ def verify(record: dict[str, Any], job: Job, *, episodes: int = 3, seed: int = 0
                         for name in (*stated, "environment") if again[name] != record[name]]
         worst = max(wrong, key=lambda name: wrong[name], default="")
         rows.append({"episode": said["seed"], "greatest difference in": worst if wrong.get(worst) else "none",
-                     "relative": f"{wrong.get(worst, 0.0):.1g}", "record's ẽ_c": _value(said, "error"),
-                     "ẽ_c again": _value(again, "error")})
-    return as_markdown(pd.DataFrame(rows), words=2), list(dict.fromkeys(differences))
+                     "relative": Cell(f"{wrong.get(worst, 0.0):.1g}"),
+                     "record's ẽ_c": Cell(_value(said, "error")),
+                     "ẽ_c again": Cell(_value(again, "error"))})
+    return Table.of(rows, keep=list(rows[0])).markdown(), list(dict.fromkeys(differences))
 
 
 @contextmanager
@@ -119,12 +118,11 @@ def empty_cache() -> Iterator[None]:
 
 def _own(record: dict[str, Any]) -> str | None:
     """Ours of the record's name, or the file of an installed package's."""
-    id, name = record["environment"]["id"], record["method"]
-    if name in installed_methods():
-        return str(installed_methods()[name])
-    if track_of(id) == "estimation":
-        return next((own for own in own_baselines() if load_baseline(own).name == name), None)
-    return next((own for own in [*own_policies(), *own_agents(id)] if load_policy(own).name == name), None)
+    name = record["method"]
+    path = (own_files(record["environment"]["id"]) | installed_methods()).get(name)
+    if path is None:
+        return None
+    return name if path.suffix == ".py" and name not in installed_methods() else str(path)
 
 
 def differences_of(said: dict[str, Any], again: dict[str, Any]) -> dict[str, float]:

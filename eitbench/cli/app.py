@@ -54,7 +54,7 @@ def list_() -> None:
     """Show the environments and the baselines, and which board each plays on."""
     import gymnasium as gym
 
-    from eitbench.bench.baselines import load_baseline, own_baselines
+    from eitbench.bench.methods import load_method, own_methods
     from eitbench.bench.tracks import Environment, board_of, ids
     typer.echo("environments")
     for name in ids("estimation"):
@@ -69,8 +69,8 @@ def list_() -> None:
         allowed = "" if rules.budget is None else f", {rules.budget} of them allowed"
         typer.echo(f"  {name:40} injection   {what}, {core.length} injections{allowed}")
     typer.echo("baselines")
-    for name in own_baselines():
-        baseline = load_baseline(name)
+    for name in own_methods("estimation"):
+        baseline = load_method(name, "estimation")
         typer.echo(f"  {name:40} {', '.join(baseline.boards):30}  {baseline.title}")
 
 
@@ -96,8 +96,8 @@ def run(
     from eitbench.bench.run import run_jobs
     from eitbench.bench.store import EpisodeStore
     with clear_errors():
-        todo = suites.jobs(suite.value, env or [], baseline or [], _numbers(seeds),
-                           isolate=isolate)
+        todo = suites.jobs("estimation", env or [], baseline or [], _numbers(seeds),
+                           suite=suite.value, isolate=isolate)
         run_jobs(todo, EpisodeStore(out), n_jobs=jobs, backend=backend, command=_command())
         _report(out)
 
@@ -186,10 +186,11 @@ def policies(
     """
     from eitbench.bench.run import run_jobs, unplayed
     from eitbench.bench.store import EpisodeStore, results_in
-    from eitbench.bench.suites import policy_jobs
+    from eitbench.bench.suites import jobs as jobs_of
     from eitbench.report.policy_table import policy_rows, policy_table
     with clear_errors():
-        todo = policy_jobs([env], policy or [], _numbers(seeds), estimator, isolate=isolate)
+        todo = jobs_of("injection", [env], policy or [], _numbers(seeds), estimator=estimator,
+                       isolate=isolate)
         before = results_in(records) if records else []
     store = EpisodeStore(out)
     with clear_errors():
@@ -255,8 +256,8 @@ def leaderboard(
             return _report(out)
     from eitbench._files import write_atomically
     from eitbench.bench.records import read_records
-    from eitbench.report.boards import boards, render
-    from eitbench.report.site import read_media, render_site, write_site
+    from eitbench.report.boards import boards
+    from eitbench.report.site import read_media, render, render_site, write_site
     beside = records.parent
     with clear_errors():
         if not records.is_dir():
@@ -286,7 +287,7 @@ def compare(
         ours, theirs = (comparison.find(name, records) for name in (a, b))
         table = comparison.compare(ours, theirs, score)
     names = comparison.names(ours[0], theirs[0])
-    typer.echo(comparison.markdown(table, *names, score))
+    typer.echo(comparison.shown(table, *names, score).markdown())
     if html is not None:
         write_atomically(html, comparison.html(table, *names, score).encode())
         typer.echo(f"\nwrote {html}")
@@ -338,14 +339,15 @@ def _report(out: Path) -> None:
     from eitbench._files import write_atomically
     from eitbench.bench.store import EpisodeStore
     from eitbench.report.page import write_page
-    from eitbench.report.summary import markdown, summary
+    from eitbench.report.summary import shown, summary
     store = EpisodeStore(out)
     records = store.write_records()
     if not records:
         raise typer.BadParameter(f"no results in {out}; make some with `eitbench run`")
     table = summary(records)
-    write_atomically(out / "leaderboard.md", (markdown(table) + "\n").encode())
-    typer.echo(markdown(table))
+    text = shown(table).markdown()
+    write_atomically(out / "leaderboard.md", f"{text}\n".encode())
+    typer.echo(text)
     _say_failures(records)
     write_page(store, records, table)
     typer.echo(f"\nwrote {out / 'index.html'}")

@@ -14,8 +14,8 @@ from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from eitbench import _check
-from eitbench.bench.policies import inject
-from eitbench.bench.run import Job, play
+from eitbench.bench.playing import estimates, injections
+from eitbench.bench.run import Job
 from eitbench.bench.suites import is_isolated
 from eitbench.bench.tracks import Environment, board_of
 from eitbench.data.seeds import parse_seeds
@@ -49,12 +49,14 @@ def animate(environment: str, method: str, seed: str, step: int | None, path: Pa
         env: Any = played.make(render_mode="rgb_array")
         states: Iterator[tuple[Any, ...]]
         if played.track == "injection":
-            begin, states = env.core.first + 1, inject(env, loaded, seeds[0])
+            begin = env.core.first + 1
+            states = injections(env, loaded, seeds[0])
         else:
             if board_of(env) not in loaded.boards:
                 raise ValueError(f"baseline {loaded.name} plays {', '.join(loaded.boards)}, but {environment} is a "
                                  f"{board_of(env)} environment")
-            begin, states = 1, play(env, loaded, seeds[0])
+            begin = 1
+            states = estimates(env, loaded, seeds[0])
         first, last = env.world.warm_up + 1, env.world.n_steps
         if step is not None:
             first = last = _check.integer("step", step, low=begin, high=last)

@@ -1,5 +1,4 @@
-"""Leaderboards from records: ranks and intervals board by board, an aggregate for each class, as
-CSV and Markdown."""
+"""Leaderboards from records: ranks and intervals board by board, and an aggregate for each class."""
 
 from __future__ import annotations
 
@@ -10,16 +9,21 @@ from typing import Any, NamedTuple
 import pandas as pd
 
 from eitbench.bench.records import file_name, finished, newest
-from eitbench.bench.statistics import interquartile_mean, mean_over_environments, shared_ranks, stratified_bootstrap
-from eitbench.bench.text import as_markdown, number, scores_by_seed, seed_ranges, with_interval
+from eitbench.bench.statistics import (
+    interquartile_mean,
+    mean_over_environments,
+    shared_ranks,
+    stratified_bootstrap,
+)
+from eitbench.bench.text import scores_by_seed, seed_ranges
 from eitbench.bench.tracks import CLASSES, FLOORS, ids, named, track_of_board
 from eitbench.bench.tracks import class_of as class_of_board
-from eitbench.data.seeds import parse_seeds
 from eitbench.report.summary import columns, explanations, place_of_world, summary_row, world
 
 ALL = "all"
 """Stands for the environment in the rows of an aggregate."""
-_BEFORE = ("class", "environment", "method", "version", "title", "rank", "note", "official", "seeds")
+_BEFORE = ("class", "environment", "method", "version", "title", "rank", "note", "official",
+           "seeds")
 _NUMBERS = ("error", "error_low", "error_high", "gain", "gain_low", "gain_high")
 _AFTER = {
     "matmuls_per_step": (
@@ -58,7 +62,8 @@ def headings() -> dict[str, str]:
 def meanings() -> dict[str, str]:
     """Heading -> what it says."""
     after = {heading: text for heading, text in _AFTER.values()}
-    return _FIRST | {heading: text for heading, text in explanations().items() if heading != "ẽ_c"} | after
+    scores = {heading: text for heading, text in explanations().items() if heading != "ẽ_c"}
+    return _FIRST | scores | after
 
 
 class Entry(NamedTuple):
@@ -101,14 +106,18 @@ def boards(records: list[dict[str, Any]]) -> pd.DataFrame:
     """
     for record in records:
         if record["split"] != "test":
-            raise ValueError(f"leaderboards are made of test seeds; {file_name(record)} has {record['split']} seeds")
+            raise ValueError(f"leaderboards are made of test seeds; {file_name(record)} has "
+                             f"{record['split']} seeds")
     current, _ = newest(records)
-    registered, products = {named(id, {}) for id in ids()}, _matrix_products(current)
+    registered = {named(id, {}) for id in ids()}
+    products = _matrix_products(current)
     rows: list[dict[str, Any]] = []
     for name in CLASSES:
         members = [record for record in current if class_of(record) == name]
-        environments = sorted({(place_of_world(world(r)), r["environment"]["name"]) for r in members})
-        played = {environment: _entries([r for r in members if r["environment"]["name"] == environment])
+        environments = sorted({(place_of_world(world(record)), record["environment"]["name"])
+                               for record in members})
+        played = {environment: _entries([record for record in members
+                                         if record["environment"]["name"] == environment])
                   for _, environment in environments}
         for environment, entries in played.items():
             rows += _board(environment, entries, current, products)
@@ -123,30 +132,26 @@ def class_of(record: dict[str, Any]) -> str:
     return class_of_board(record["environment"]["id"], record["board"])
 
 
-def render(records: list[dict[str, Any]], table: pd.DataFrame | None = None) -> dict[str, str]:
-    """The content of ``leaderboard.csv`` and ``leaderboard.md``, by file name, from the records
-    and, if it is made already, their `boards`. The same records give the same text."""
-    table = boards(records) if table is None else table
-    return {"leaderboard.csv": table.to_csv(index=False, float_format="%.6g", lineterminator="\n"),
-            "leaderboard.md": _markdown(table, newest(records)[1])}
-
-
 def _entries(records: list[dict[str, Any]]) -> list[Entry]:
     """The records of one environment on the board's episodes."""
-    floors = [record for record in records if record["method"] == FLOORS[track_of_board(record["board"])]]
+    floors = [record for record in records
+              if record["method"] == FLOORS[track_of_board(record["board"])]]
     floor = max(floors, key=lambda record: (record["official"], finished(record)), default=None)
     seeds = {seed for record in ([floor] if floor else records) for seed in record["seeds"]}
     zero = scores_by_seed(floor, "error") if floor else {}
     entries = []
     for whole in records:
-        record = whole | {"episodes": [episode for episode in whole["episodes"] if episode["seed"] in seeds],
-                          "seeds": [seed for seed in whole["seeds"] if seed in seeds]}
+        record = whole | {
+            "episodes": [episode for episode in whole["episodes"] if episode["seed"] in seeds],
+            "seeds": [seed for seed in whole["seeds"] if seed in seeds]}
         if not record["seeds"]:  # nothing that the board asks for
             continue
         errors = scores_by_seed(record, "error")
-        failed, missing = sum(e["status"] != "ok" for e in whole["episodes"]), len(seeds - set(record["seeds"]))
-        shortcomings = [f"{count} {what}" for count, what in ((failed, "failed"), (missing, "missing")) if count]
-        note = ", ".join([*filter(None, [record["role"]]), *["privileged"] * record["privileged"], *shortcomings])
+        counts = {"failed": sum(episode["status"] != "ok" for episode in whole["episodes"]),
+                  "missing": len(seeds - set(record["seeds"]))}
+        shortcomings = [f"{count} {what}" for what, count in counts.items() if count]
+        note = ", ".join([*filter(None, [record["role"]]), *["privileged"] * record["privileged"],
+                          *shortcomings])
         gains = {seed: 1.0 - error / zero[seed] for seed, error in errors.items() if zero.get(seed)}
         entries.append(Entry(record, note, not shortcomings, gains))
     return entries
@@ -154,17 +159,20 @@ def _entries(records: list[dict[str, Any]]) -> list[Entry]:
 
 def _board(environment: str, entries: list[Entry], current: list[dict[str, Any]],
            products: dict[str, float]) -> list[dict[str, Any]]:
-    """Rows of one environment, by their mean error; after them who has not finished every episode."""
+    """Rows of one environment, by their mean error; after them who has not finished every
+    episode."""
     competing = {entry.label: {environment: entry.errors} for entry in entries if not entry.note}
     ranks = shared_ranks(competing) if competing else {}
     rows = []
     for entry in sorted(entries, key=_place):
-        record, summarised = entry.record, summary_row(entry.record, current)
+        record = entry.record
+        summarised = summary_row(record, current)
+        means = {name: summarised[name] and summarised[name][0] for name in others()}
         rows.append(_row(entry, environment, ranks.get(entry.label)) | {
             "seeds": seed_ranges(record["seeds"]),
             **_three("error", {environment: entry.errors}, mean_over_environments),
             **_three("gain", {environment: entry.gains}, interquartile_mean),
-            **{name: None if summarised[name] is None else summarised[name][0] for name in others()},
+            **means,
             "matmuls_per_step": _in_products(record, products), "peak_memory": _peak(record)})
     return rows
 
@@ -179,15 +187,19 @@ def _aggregate(played: dict[str, list[Entry]]) -> list[dict[str, Any]]:
     interquartile mean of their gains."""
     if len(played) < 2:
         return []
-    found = [{entry.label: entry for entry in entries if entry.complete and entry.gains} for entries in played.values()]
+    found = [{entry.label: entry for entry in entries if entry.complete and entry.gains}
+             for entries in played.values()]
     labels = [label for label in found[0] if all(label in entries for entries in found)]
-    gains = {label: {environment: entries[label].gains for environment, entries in zip(played, found, strict=True)}
+    gains = {label: {environment: entries[label].gains
+                     for environment, entries in zip(played, found, strict=True)}
              for label in labels}
     competing = {label: own for label, own in gains.items() if not found[0][label].note}
-    ranks = shared_ranks(competing, statistic=interquartile_mean, higher_is_better=True) if competing else {}
+    ranks = shared_ranks(competing, statistic=interquartile_mean,
+                         higher_is_better=True) if competing else {}
     rows = []
     for label in labels:
-        row = _row(found[0][label], ALL, ranks.get(label)) | _three("gain", gains[label], interquartile_mean)
+        row = _row(found[0][label], ALL, ranks.get(label))
+        row |= _three("gain", gains[label], interquartile_mean)
         rows.append(row | {"official": all(entries[label].record["official"] for entries in found)})
     return sorted(rows, key=lambda row: (-row["gain"], row["method"], row["version"]))
 
@@ -195,16 +207,18 @@ def _aggregate(played: dict[str, list[Entry]]) -> list[dict[str, Any]]:
 def _row(entry: Entry, environment: str, rank: int | None) -> dict[str, Any]:
     record = entry.record
     return {"class": class_of(record), "environment": environment, "method": record["method"],
-            "version": record["version"], "title": record["title"], "rank": rank, "note": entry.note,
-            "official": record["official"]}
+            "version": record["version"], "title": record["title"], "rank": rank,
+            "note": entry.note, "official": record["official"]}
 
 
-def _three(name: str, scores: dict[str, dict[str, float]], statistic: Any) -> dict[str, float | None]:
+def _three(name: str, scores: dict[str, dict[str, float]],
+           statistic: Any) -> dict[str, float | None]:
     """A statistic of environment -> seed -> score, and the ends of its interval, as far as there
     are any."""
     if not all(scores.values()):
         return dict.fromkeys((name, f"{name}_low", f"{name}_high"))
-    three = stratified_bootstrap({key: list(own.values()) for key, own in scores.items()}, statistic)
+    values = {key: list(own.values()) for key, own in scores.items()}
+    three = stratified_bootstrap(values, statistic)
     return dict(zip((name, f"{name}_low", f"{name}_high"),
                     (value if math.isfinite(value) else None for value in three), strict=True))
 
@@ -215,7 +229,8 @@ def _matrix_products(records: list[dict[str, Any]]) -> dict[str, float]:
     timed: dict[str, list[float]] = {}
     for record in records:
         for run in record["runs"]:
-            timed.setdefault(run["machine"]["processor"], []).append(run["machine"]["matmul_seconds"])
+            machine = run["machine"]
+            timed.setdefault(machine["processor"], []).append(machine["matmul_seconds"])
     return {processor: median(seconds) for processor, seconds in timed.items()}
 
 
@@ -227,42 +242,5 @@ def _in_products(record: dict[str, Any], products: dict[str, float]) -> float | 
 
 
 def _peak(record: dict[str, Any]) -> float | None:
-    return max((1e-6 * episode["peak_memory"] for episode in record["episodes"] if episode["peak_memory"]),
-               default=None)
-
-
-def _markdown(table: pd.DataFrame, outdated: list[dict[str, Any]]) -> str:
-    parts = ["# Leaderboards", "*Rendered from the records by `eitbench leaderboard --records leaderboards/results`; "
-             "[README.md](README.md) says how to add one.*"]
-    if table.empty:
-        parts.append("There are no records yet.")
-    for name, rows in table.groupby("class", sort=False):
-        parts.append(f"## {name}")
-        for environment, board in rows.groupby("environment", sort=False):
-            heading = "All environments" if environment == ALL else (
-                f"{environment}, {max(board['seeds'], key=lambda seeds: len(parse_seeds(seeds)))}")
-            parts += [f"### {heading}", as_markdown(_cells(board), words=3)]
-    if not table.empty:
-        said = [f"- **{heading}**: {text}" for heading, text in meanings().items()]
-        parts += ["## What the columns say", "\n".join(said)]
-    if outdated:
-        parts += ["## Outdated records", "Made by an earlier version of the method.\n\n"
-                  + "\n".join(f"- {file_name(record)}" for record in outdated)]
-    return "\n\n".join(parts) + "\n"
-
-
-def _cells(board: pd.DataFrame) -> pd.DataFrame:
-    """A board as text, without columns in which there is nothing."""
-    text = pd.DataFrame({
-        "rank": [note or str(rank) for rank, note in zip(board["rank"], board["note"], strict=True)],
-        "method": [f"{row['title']} ({row['method']} {row['version']})" for _, row in board.iterrows()],
-        "by": ["official" if official else "self-reported" for official in board["official"]],
-        **{heading: [_interval(*three) for three in board[[name, f"{name}_low", f"{name}_high"]].itertuples(False)]
-           for name, heading in (("error", "ẽ_c"), ("gain", "gain"))},
-        **{heading: ["–" if pd.isna(value) else number(value) for value in board[name]]
-           for name, heading in headings().items()}})
-    return text.loc[:, [bool((text[heading] != "–").any()) for heading in text]]
-
-
-def _interval(value: float, low: float, high: float) -> str:
-    return "–" if pd.isna(value) else with_interval(value, low, high)
+    return max((1e-6 * episode["peak_memory"] for episode in record["episodes"]
+                if episode["peak_memory"]), default=None)

@@ -166,13 +166,18 @@ def intervals(rows: list[Series], x_label: str, *, log: bool = True, mark: float
     return "".join(parts)
 
 
-def cell(three: tuple[float, float, float], low: float, high: float, *, log: bool) -> str:
+def cell(three: tuple[float, float, float], low: float, high: float, *, log: bool = False,
+         mark: float | None = None) -> str:
     """A dot and its interval within a table's cell, on the scale of its column from ``low`` to
-    ``high``; the number beside it says the same, so that it is hidden from those who listen."""
+    ``high``, perhaps with a line at a ``mark``; the number beside it says the same, so that it is
+    hidden from those who listen."""
     px = Axis(low, high if high > low else low + 1.0, 4, 76, log=log)
     value, a, b = (min(end if math.isfinite(end) else three[0], px.high) for end in three)
-    return (f'<svg class="cell" viewBox="0 0 80 14" aria-hidden="true"><line x1="{px(a):.1f}" x2="{px(b):.1f}" '
-            f'y1="7" y2="7"/><circle cx="{px(value):.1f}" cy="7" r="3"/></svg>')
+    line = "" if mark is None else (
+        f'<path class="grid" d="M{px(mark):.1f} 0V14"/>')
+    return (f'<svg class="cell" viewBox="0 0 80 14" aria-hidden="true">{line}'
+            f'<line x1="{px(a):.1f}" x2="{px(b):.1f}" y1="7" y2="7"/>'
+            f'<circle cx="{px(value):.1f}" cy="7" r="3"/></svg>')
 
 
 def _frame(px: Axis, py: Axis, x_label: str, y_label: str) -> list[str]:

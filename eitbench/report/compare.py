@@ -8,14 +8,22 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from markupsafe import Markup
 
 from eitbench.bench.records import newest, read_record, read_records
 from eitbench.bench.scores import Score, scores
-from eitbench.bench.statistics import mean_over_environments, paired_difference, paired_probability_of_improvement
-from eitbench.bench.text import as_markdown, number, scores_by_seed, with_interval
+from eitbench.bench.statistics import (
+    mean_over_environments,
+    paired_difference,
+    paired_probability_of_improvement,
+)
+from eitbench.bench.table import NOTHING, Cell, Table, number_cell
+from eitbench.bench.text import scores_by_seed, with_interval
+from eitbench.report import charts
 from eitbench.report.templates import template
 
-FIELDS = ("environment", "episodes", "a", "b", "difference", "low", "high", "better", "better_low", "better_high")
+FIELDS = ("environment", "episodes", "a", "b", "difference", "low", "high",
+          "better", "better_low", "better_high")
 
 
 def find(name: str, folder: Path) -> list[dict[str, Any]]:
@@ -37,7 +45,8 @@ def find(name: str, folder: Path) -> list[dict[str, Any]]:
     if not records:
         raise ValueError(f"there is no record of {name} in {folder}")
     if len(versions) > 1:
-        raise ValueError(f"{name} fits several versions: {', '.join(f'{method}@{each}' for each in versions)}")
+        found = ", ".join(f"{method}@{each}" for each in versions)
+        raise ValueError(f"{name} fits several versions: {found}")
     return records
 
 
@@ -76,22 +85,26 @@ def compare(a: list[dict[str, Any]], b: list[dict[str, Any]], score: str = "erro
         own, theirs = (scores_by_seed(each, score) for each in (record, other))
         if shared := own.keys() & theirs.keys():
             label = name if split == "test" else f"{name} ({split} seeds)"
-            pairs[label] = {seed: own[seed] for seed in shared}, {seed: theirs[seed] for seed in shared}
+            pairs[label] = ({seed: own[seed] for seed in shared},
+                            {seed: theirs[seed] for seed in shared})
     if not pairs:
-        raise ValueError("there is no environment in which both have finished an episode of the same seed"
-                         + (f" and have {score}" if score != "error" else ""))
-    groups = [(name, [name]) for name in sorted(pairs)] + ([("all", sorted(pairs))] if len(pairs) > 1 else [])
-    return pd.DataFrame([_row(label, {name: pairs[name] for name in names}, higher) for label, names in groups],
-                        columns=list(FIELDS))
+        also = f" and have {score}" if score != "error" else ""
+        raise ValueError("there is no environment in which both have finished an episode of the "
+                         f"same seed{also}")
+    rows = [_row(name, {name: pairs[name]}, higher) for name in sorted(pairs)]
+    if len(pairs) > 1:
+        rows.append(_row("all", pairs, higher))
+    return pd.DataFrame(rows, columns=list(FIELDS))
 
 
 def _row(label: str, pairs: dict[str, tuple[dict[str, float], dict[str, float]]],
          higher: bool) -> dict[str, Any]:
     ours, theirs = ({name: pair[i] for name, pair in pairs.items()} for i in (0, 1))
-    means = [float(mean_over_environments(*[list(own.values()) for own in side.values()])) for side in (ours, theirs)]
-    return dict(zip(FIELDS, (label, sum(map(len, ours.values())), *means, *paired_difference(ours, theirs),
-                             *paired_probability_of_improvement(ours, theirs, higher_is_better=higher)),
-                    strict=True))
+    means = [float(mean_over_environments(*[list(own.values()) for own in side.values()]))
+             for side in (ours, theirs)]
+    better = paired_probability_of_improvement(ours, theirs, higher_is_better=higher)
+    values = (label, sum(map(len, ours.values())), *means, *paired_difference(ours, theirs), *better)
+    return dict(zip(FIELDS, values, strict=True))
 
 
 def names(a: dict[str, Any], b: dict[str, Any]) -> tuple[str, str]:
@@ -102,38 +115,35 @@ def names(a: dict[str, Any], b: dict[str, Any]) -> tuple[str, str]:
     return f"{a['method']}@{a['version']}", f"{b['method']}@{b['version']}"
 
 
-def cells(table: pd.DataFrame, a: str, b: str, score: str = "error") -> pd.DataFrame:
-    """The comparison as text, with a verdict: who is better where the interval of the difference
-    leaves out zero."""
+def shown(table: pd.DataFrame, a: str, b: str, score: str = "error") -> Table:
+    """The comparison of methods named ``a`` and ``b`` as a reader sees it, with a verdict: who is
+    better where the interval of the difference leaves out zero."""
     asked = comparable(score)
     less, more = (b, a) if asked.better == "higher" else (a, b)
-    return pd.DataFrame({
-        "environment": table["environment"],
-        "verdict": [less if high < 0 else more if low > 0 else "–" for low, high in zip(table["low"], table["high"],
-                                                                                  strict=True)],
-        "episodes": table["episodes"].astype(str),
-        f"{asked.heading} of {a}": [number(value) for value in table["a"]],
-        f"{asked.heading} of {b}": [number(value) for value in table["b"]],
-        "difference": [with_interval(*three) for three in table[["difference", "low", "high"]].itertuples(False)],
-        f"{a} better": [f"{100 * value:.0f} %" + (f" ({100 * low:.0f} to {100 * high:.0f} %)" if known else "")
-                        for value, low, high, known in zip(table["better"], table["better_low"], table["better_high"],
-                                                           np.isfinite(table["low"]), strict=True)],
-    })
-
-
-def markdown(table: pd.DataFrame, a: str, b: str, score: str = "error") -> str:
-    """The comparison of methods named ``a`` and ``b`` as a Markdown table."""
-    return as_markdown(cells(table, a, b, score), words=2)
+    ends = table[["low", "high", "difference"]].to_numpy(dtype=float)
+    widest = float(np.abs(ends[np.isfinite(ends)]).max(initial=0.0)) or 1.0
+    rows = []
+    for _, row in table.iterrows():
+        three = (row["difference"], row["low"], row["high"])
+        share = f"{100 * row['better']:.0f} %"
+        if math.isfinite(row["low"]):
+            share += f" ({100 * row['better_low']:.0f} to {100 * row['better_high']:.0f} %)"
+        rows.append({
+            "environment": row["environment"],
+            "verdict": less if row["high"] < 0 else more if row["low"] > 0 else NOTHING,
+            "episodes": Cell(str(row["episodes"]), float(row["episodes"])),
+            f"{asked.heading} of {a}": number_cell(row["a"]),
+            f"{asked.heading} of {b}": number_cell(row["b"]),
+            "difference": Cell(with_interval(*three), row["difference"],
+                               picture=Markup(charts.cell(three, -widest, widest, mark=0.0))),
+            f"{a} better": Cell(share, row["better"]),
+        })
+    return Table.of(rows, label="Comparison", keep=list(rows[0]))
 
 
 def html(table: pd.DataFrame, a: str, b: str, score: str = "error") -> str:
     """The comparison as a page that needs no other file."""
-    text = cells(table, a, b, score)
-    widest = max((abs(end) for end in [*table["low"], *table["high"], *table["difference"]] if math.isfinite(end)),
-                 default=0.0) or 1.0
-    bars = [[f"{50.0 + 45.0 * value / widest:.2f}" if math.isfinite(value) else None for value in three]
-            for three in table[["low", "difference", "high"]].itertuples(False)]
+    asked = comparable(score)
+    less, more = (b, a) if asked.better == "higher" else (a, b)
     return template("compare.html.j2").render(
-        a=a, b=b, score=comparable(score), headings=list(text.columns),
-        rows=list(zip(text.to_numpy().tolist(), bars, strict=True)))
-
+        a=a, b=b, score=asked, less=less, more=more, table=shown(table, a, b, score))

@@ -21,7 +21,7 @@ from eitbench.data.seeds import parse_seeds
 from eitbench.envs.rendering import FIELD_MAP, colour_range, draw_field
 from eitbench.numerics.mesh import Mesh
 from eitbench.report import charts
-from eitbench.report.summary import board_label, cells, explanations, method
+from eitbench.report.summary import board_label, explanations, method, shown
 from eitbench.report.templates import template
 from eitbench.worlds.task import Task
 
@@ -36,11 +36,10 @@ def write_page(store: EpisodeStore, records: list[dict[str, Any]], table: pd.Dat
     no network."""
     sections = [_section(store, records, str(name), rows.reset_index(drop=True))
                 for name, rows in table.groupby("world", sort=False)]
-    shown = {heading for section in sections for heading in section["headings"]}
+    headings = {heading for section in sections for heading in section["table"].headings}
+    said = {heading: text for heading, text in explanations().items() if heading in headings}
     html = template("page.html.j2").render(
-        sections=sections, explanations={heading: text for heading, text in explanations().items() if heading in shown},
-        colour_bar=_colour_bar(), runs=_runs(records),
-    )
+        sections=sections, explanations=said, colour_bar=_colour_bar(), runs=_runs(records))
     path = store.folder / "index.html"
     write_atomically(path, html.encode())
     return path
@@ -49,11 +48,9 @@ def write_page(store: EpisodeStore, records: list[dict[str, Any]], table: pd.Dat
 def _section(store: EpisodeStore, records: list[dict[str, Any]], name: str, table: pd.DataFrame) -> dict[str, Any]:
     """What the page shows of one world; ``table`` has its rows, numbered from 0, which choose the
     colours."""
-    text = cells(table)
     ordered = [_record_of(records, row) for _, row in table.iterrows()]
     return {
-        "name": name, "headings": list(text.columns)[1:],
-        "boards": [(board, rows.iloc[:, 1:].to_numpy().tolist()) for board, rows in text.groupby("board", sort=False)],
+        "name": name, "table": shown(table, grouped=True),
         "intervals": _intervals(table), "curves": _curves(ordered), "legend": _legend(ordered),
         "snapshots": _snapshots(store, ordered),
         "failures": [(method(record), episode["seed"], episode["message"]) for record in ordered

@@ -13,18 +13,18 @@ import pandas as pd
 
 from eitbench.bench.records import BOARDS, finished
 from eitbench.bench.scores import scores
-from eitbench.bench.text import as_markdown, mean_and_interval, number, rounded, scores_by_seed, seed_ranges
+from eitbench.bench.table import NOTHING, Cell, Table
+from eitbench.bench.text import mean_and_interval, number, rounded, scores_by_seed, seed_ranges
 from eitbench.bench.tracks import ids
 from eitbench.scoring import skill
 
-SKILL = ("skill", "0 for the homogeneous estimate, 1 for the fixed-interval smoother that is told the "
-         "true flow; both with the whole record, where the environment has such a board, so that "
-         "filters may fall below 0")
-"""Heading and explanation of the one number that follows from several records, not from an episode."""
+SKILL = ("skill", "0 for the homogeneous estimate, 1 for the fixed-interval smoother that is told "
+         "the true flow; both with the whole record, where the environment has such a board, so "
+         "that filters may fall below 0")
+"""Heading and explanation of the one number that follows from several records, not from an
+episode."""
 SPLITS = ["test", "dev", "train", "own"]
 """In the order in which boards are shown; the reported seeds first."""
-_TEXT = ("environment", "board", "method", "seeds")
-"""Columns of words; the others are numbers."""
 _NOT_THE_WORLD = ("lag", "assume", "gate", "episodes", "render_mode", "observation", "estimator")
 """Arguments of an environment that its episodes do not depend on."""
 
@@ -51,20 +51,22 @@ def summary(records: list[dict[str, Any]]) -> pd.DataFrame:
     worlds = sorted(set(table["world"]), key=place_of_world)
     keys = {"_split": table["split"].map(SPLITS.index), "_world": table["world"].map(worlds.index),
             "_board": table["board"].map(BOARDS.index), "_error": order}
-    return table.assign(**keys).sort_values(["_split", "_world", "_board", "environment", "_error"]).drop(
-        columns=list(keys)).reset_index(drop=True)
+    ordered = table.assign(**keys).sort_values(["_split", "_world", "_board", "environment", "_error"])
+    return ordered.drop(columns=list(keys)).reset_index(drop=True)
 
 
 def summary_row(record: dict[str, Any], records: list[dict[str, Any]]) -> dict[str, Any]:
     """The row of one of the ``records``, among which are the anchors of its skill."""
     status = [episode["status"] for episode in record["episodes"]]
-    row: dict[str, Any] = {"world": world(record), "board": record["board"], "split": record["split"],
-                           "environment": record["environment"]["name"],
-                           "baseline": record["method"], "method": method(record),
-                           "seeds": seed_ranges(record["seeds"]),
-                           "episodes": len(status), "failed": sum(s != "ok" for s in status)}
+    row: dict[str, Any] = {
+        "world": world(record), "board": record["board"], "split": record["split"],
+        "environment": record["environment"]["name"],
+        "baseline": record["method"], "method": method(record),
+        "seeds": seed_ranges(record["seeds"]),
+        "episodes": len(status), "failed": sum(s != "ok" for s in status)}
     for name in columns():
-        values = list((_skills(record, records) if name == "skill" else scores_by_seed(record, name)).values())
+        skills = name == "skill"
+        values = list((_skills(record, records) if skills else scores_by_seed(record, name)).values())
         row[name] = mean_and_interval(values) if values else None
         if name == "seconds_per_step" and values:
             row[name] = (min(values), math.inf)
@@ -129,34 +131,42 @@ def _skills(record: dict[str, Any], records: list[dict[str, Any]]) -> dict[str, 
     The anchors are those of the world's board with the longest record to look back on.
     """
     def of(baseline: str) -> dict[str, float]:
-        found = [r for r in records
-                 if r["method"] == baseline and world(r) == world(record) and r["split"] == record["split"]]
-        anchor = max(found, key=lambda r: (BOARDS.index(r["board"]), r["official"], finished(r)), default=None)
+        found = [other for other in records if other["method"] == baseline
+                 and world(other) == world(record) and other["split"] == record["split"]]
+        anchor = max(found, default=None, key=lambda other: (
+            BOARDS.index(other["board"]), other["official"], finished(other)))
         return scores_by_seed(anchor, "error") if anchor else {}
 
-    own, floor, reference = scores_by_seed(record, "error"), of("homogeneous"), of("true_model_smoother")
+    own = scores_by_seed(record, "error")
+    floor = of("homogeneous")
+    reference = of("true_model_smoother")
     # a sum's last digit depends on the order
     shared = sorted(own.keys() & floor.keys() & reference.keys())
     if not shared:
         return {}
-    e, bh, ref = (float(np.mean([scores[seed] for seed in shared])) for scores in (own, floor, reference))
+    e, bh, ref = (float(np.mean([scores[seed] for seed in shared]))
+                  for scores in (own, floor, reference))
     return {"all": skill(e, bh, ref)} if bh != ref else {}
 
 
-def cells(table: pd.DataFrame) -> pd.DataFrame:
-    """The summary as text, with the columns a reader sees: the environment where there are several
-    worlds, the error of the flow where it was asked for."""
-    text = table[["world", "board", "method", "seeds"]].rename(columns={"world": "environment"})
-    if table["world"].nunique() < 2:
-        text = text.drop(columns="environment")
-    text["board"] = [board_label(row) for _, row in table.iterrows()]
-    text["seeds"] = [f"{seeds}, {failed} failed" if failed else seeds
-                     for seeds, failed in zip(table["seeds"], table["failed"], strict=True)]
+def shown(table: pd.DataFrame, *, grouped: bool = False) -> Table:
+    """The summary as a reader sees it: the environment where there are several worlds, scores that
+    are shown everywhere or that anybody has; the board as a column, or ``grouped`` by it."""
     known = scores()
-    for name, (heading, _) in columns().items():
-        if name == "skill" or known[name].everywhere or table[name].notna().any():
-            text[heading] = [_cell(name, value) for value in table[name]]
-    return text
+    several = table["world"].nunique() > 1
+    rows = []
+    for _, row in table.iterrows():
+        cells: dict[str, Cell | str] = {"environment": row["world"]} if several else {}
+        if not grouped:
+            cells["board"] = board_label(row)
+        failed = f", {row['failed']} failed" if row["failed"] else ""
+        cells |= {"method": row["method"], "seeds": row["seeds"] + failed}
+        cells |= {heading: _cell(name, row[name]) for name, (heading, _) in columns().items()}
+        rows.append(cells)
+    keep = [heading for name, (heading, _) in columns().items()
+            if name == "skill" or known[name].everywhere]
+    return Table.of(rows, label="Scores", keep=keep,
+                    groups=[board_label(row) for _, row in table.iterrows()] if grouped else ())
 
 
 def board_label(row: Any) -> str:
@@ -164,14 +174,8 @@ def board_label(row: Any) -> str:
     return row["board"] if row["split"] == "test" else f"{row['board']} ({row['split']} seeds)"
 
 
-def _cell(name: str, value: tuple[float, float] | None) -> str:
+def _cell(name: str, value: tuple[float, float] | None) -> Cell:
     if value is None:
-        return "–"
-    return rounded(*value) if name in ("error", "contrast_error") else number(value[0])
-
-
-def markdown(table: pd.DataFrame) -> str:
-    """The summary as Markdown."""
-    text = cells(table)
-    return as_markdown(text, sum(heading in _TEXT for heading in text.columns))
-
+        return Cell(NOTHING)
+    text = rounded(*value) if name in ("error", "contrast_error") else number(value[0])
+    return Cell(text, value[0])

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from eitbench.bench.baselines import baseline_folder
+from eitbench.bench.methods import baseline_folder
 from eitbench.envs.injection_core import InjectionCore, operator_type, scaled
 from eitbench.estimation.onboard.console import Console
 from eitbench.estimation.onboard.rules import Rules

@@ -15,7 +15,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from tqdm import tqdm
 
 from eitbench import _check
-from eitbench.bench.policies import PolicyFile, load_policy
+from eitbench.bench.methods import Method, load_method
 from eitbench.envs.injection import InjectionEnv
 from eitbench.envs.injection_core import scaled
 from eitbench.estimation.onboard.rules import Rules
@@ -38,7 +38,8 @@ def imitate(model: OnPolicyAlgorithm, world: InjectionEnv, options: dict[str, An
     reference : (episodes, steps), optional
         Rewards are counted from these, as in training.
     """
-    settings, teacher = DEFAULTS | options, load_policy(str(options["teacher"]))
+    settings = DEFAULTS | options
+    teacher = load_method(str(options["teacher"]), "injection")
     random = np.random.default_rng([seed, 1])
     optimiser = torch.optim.Adam(model.policy.parameters(), lr=settings["learning_rate"])
     seen, said, worth = [], [], []
@@ -57,9 +58,9 @@ def imitate(model: OnPolicyAlgorithm, world: InjectionEnv, options: dict[str, An
             _fit(model, optimiser, np.concatenate(seen), np.concatenate(said), np.concatenate(worth), settings, random)
 
 
-def suited(argument: str, name: str, rules: Rules) -> PolicyFile:
+def suited(argument: str, name: str, rules: Rules) -> Method:
     """The policy of this name or path; ``ValueError`` if it cannot play in this world."""
-    loaded = load_policy(name)
+    loaded = load_method(name, "injection")
     if not loaded.suits(rules):
         raise ValueError(f"{argument} must be a policy that suits env, got {name!r}, which does not")
     return loaded
@@ -84,7 +85,7 @@ def _play(model: OnPolicyAlgorithm, world: InjectionEnv, teacher: Any, number: i
     """(T, d) scaled observations of an episode, (T,) what the teacher says to them, (T,) rewards."""
     observation, _ = world.reset(seed=number)
     stream = np.random.default_rng(int(random.integers(2**63)))
-    advisor = teacher.policy(world.rules, stream, *[world.core] * teacher.privileged)
+    advisor = teacher.make(world.rules, stream, *[world.core] * teacher.privileged)
     seen, said, rewards, ended = [], [], [], False
     while not ended:
         action = int(advisor.act(observation))

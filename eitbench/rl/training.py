@@ -40,7 +40,7 @@ from tqdm import tqdm
 
 from eitbench import _check
 from eitbench._files import write_atomically
-from eitbench.bench.policies import load_policy
+from eitbench.bench.methods import load_method
 from eitbench.data.seeds import SPLITS
 from eitbench.envs.injection import InjectionEnv, InjectionVectorEnv
 from eitbench.rl.imitation import check_imitation, imitate, suited
@@ -211,10 +211,12 @@ def rewards_of(policy: str, world: InjectionEnv, path: Path) -> np.ndarray:
     """(episodes, steps) what a policy earns in every training episode; kept at ``path``."""
     if path.exists():
         return np.asarray(np.load(path))
-    rewards, loaded = np.zeros((world.episodes, world.core.length)), load_policy(policy)
+    rewards = np.zeros((world.episodes, world.core.length))
+    loaded = load_method(policy, "injection")
     for episode in tqdm(range(world.episodes), desc=f"playing {policy}", unit="episode", disable=None):
         observation, _ = world.reset(seed=episode)
-        player = loaded.policy(world.rules, np.random.default_rng(episode), *[world.core] * loaded.privileged)
+        random = np.random.default_rng(episode)
+        player = loaded.make(world.rules, random, *[world.core] * loaded.privileged)
         for k in range(world.core.length):
             observation, rewards[episode, k], *_ = world.step(player.act(observation))
     content = io.BytesIO()

@@ -12,10 +12,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from eitbench._files import shipped
-from eitbench.bench.baselines import baseline_folder
+from eitbench.bench.methods import baseline_folder
 from eitbench.bench.run import run_jobs, unplayed
 from eitbench.bench.store import EpisodeStore, results_in
-from eitbench.bench.suites import policy_jobs
+from eitbench.bench.suites import jobs as jobs_of
 from eitbench.bench.text import mean_and_interval
 from eitbench.data.seeds import name_seed
 from eitbench.report.animate import animate
@@ -53,7 +53,7 @@ def injection(seeds: list[int] | None, jobs: int, out: Path) -> tuple[Path, str]
     figure = Figure(figsize=(13.5, 13.8), dpi=110, layout="constrained")
     panels, said = figure.subplots(3, 3, height_ratios=(4, 4, 3)), []
     for (env, title), axes in zip(WORLDS.items(), panels[:2].flat, strict=True):
-        todo = policy_jobs([env], [], seeds)
+        todo = jobs_of("injection", [env], [], seeds)
         run_jobs(unplayed(todo, before), store, n_jobs=jobs, command="eitbench reproduce injection")
         rows = policy_rows(todo, [*before, *store.results()])
         privileged = sorted({job.load().name for job in todo if job.load().privileged})
@@ -69,7 +69,7 @@ def injection(seeds: list[int] | None, jobs: int, out: Path) -> tuple[Path, str]
                      meaning in LINES.items()], frameon=False, ncols=5, loc="outside upper center")
     path = out / "injection.png"
     save(figure, path)
-    first = policy_jobs([AT_WORK[0]], [AT_WORK[1]], seeds)[0].seed
+    first = jobs_of("injection", [AT_WORK[0]], [AT_WORK[1]], seeds)[0].seed
     moving = animate(*AT_WORK, name_seed(first), None, out / "injection.gif")
     return path, "\n".join([*said, f"wrote {moving}: {AT_WORK[1]} in {AT_WORK[0]}"])
 

@@ -16,7 +16,7 @@ from matplotlib.patches import Rectangle
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
-from eitbench.bench.baselines import load_baseline
+from eitbench.bench.methods import load_method
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.rendering import FIELD_MAP
 from eitbench.physics.transport import Transport
@@ -121,7 +121,7 @@ def _transport(world: World, factor: float) -> Transport:
 
 def _played(env: EstimationEnv, task: Task, seed: int) -> float:
     """ẽ_c of a Kalman filter that believes ``task`` in an episode of ``env``."""
-    estimator = load_baseline("kalman_filter").estimator(task)
+    estimator = load_method("kalman_filter", "estimation").make(task)
     observation, _ = env.reset(seed=seed)
     done, rewards = False, []
     while not done:

@@ -12,9 +12,9 @@ from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from eitbench import scoring
-from eitbench.bench.baselines import load_baseline
-from eitbench.bench.run import play_and_collect
-from eitbench.bench.score import score
+from eitbench.bench.methods import load_method
+from eitbench.bench.playing import estimated
+from eitbench.bench.scores import scored
 from eitbench.data.recordings import score_operators
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.rendering import SPREAD_MAP, colour_range, draw_field
@@ -164,7 +164,8 @@ def velocity_sweep(seeds: list[int], jobs: int, velocities: np.ndarray = VELOCIT
 def _filter_scores(velocity: float, seeds: list[int]) -> list[dict[str, float]]:
     env = _env(mean_velocity=float(velocity))
     with threadpool_limits(1):
-        return [score(env, play_and_collect(env, load_baseline("kalman_filter"), seed))["scores"]
+        kalman_filter = load_method("kalman_filter", "estimation")
+        return [scored("estimation", estimated(env, kalman_filter, seed).outcome)
                 for seed in seeds]
 
 

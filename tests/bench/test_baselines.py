@@ -5,19 +5,20 @@ import json
 import pytest
 from tiny import strict
 
-from eitbench.bench.baselines import load_baseline, own_baselines
+from eitbench.bench.methods import load_method, own_methods
 
 
 def test_our_baselines_load():
     """Each of ours has a title, a board, a hash, and parameters that JSON can hold."""
-    assert {"homogeneous", "kalman_filter", "fixed_interval_smoother", "gauss_newton"} <= set(own_baselines())
-    for name in own_baselines():
-        baseline = load_baseline(name)
+    assert {"homogeneous", "kalman_filter", "fixed_interval_smoother", "gauss_newton"} <= set(own_methods("estimation"))
+    for name in own_methods("estimation"):
+        baseline = load_method(name, "estimation")
         assert baseline.name == name and baseline.title and baseline.boards and len(baseline.sha256) == 64
         assert strict(json.dumps(baseline.parameters)) == baseline.parameters
-    roles = {name: load_baseline(name).role for name in own_baselines() if load_baseline(name).role}
+    ours = [load_method(name, "estimation") for name in own_methods("estimation")]
+    roles = {method.name: method.role for method in ours if method.role}
     assert roles == {"homogeneous": "floor", "persistence": "floor", "true_model_smoother": "reference"}
-    assert [name for name in own_baselines() if load_baseline(name).privileged] == ["true_model_smoother"]
+    assert [method.name for method in ours if method.privileged] == ["true_model_smoother"]
 
 
 @pytest.mark.parametrize(("source", "message"), [
@@ -38,7 +39,7 @@ def test_files_that_are_no_baselines(source, message, tmp_path):
     path = tmp_path / "mine.py"
     path.write_text(source)
     with pytest.raises(ValueError, match=message) as caught:
-        load_baseline(str(path))
+        load_method(str(path), "estimation")
     assert str(path) in str(caught.value)
 
 
@@ -46,7 +47,7 @@ def test_unknown_baselines():
     """A name that is none of ours: the message lists ours."""
     for name in ("kalman", "no/such/file.py", ""):
         with pytest.raises(ValueError, match=r"one of .*homogeneous.*got"):
-            load_baseline(name)
+            load_method(name, "estimation")
 
 
 @pytest.mark.parametrize(("docstring", "title"), [
@@ -57,7 +58,7 @@ def test_titles(docstring, title, tmp_path):
     """The docstring's first line up to a colon, bracket or full stop; without one, the file's name."""
     path = tmp_path / "mine.py"
     path.write_text(docstring + "\nclass Estimator:\n    def update(self, V, I): pass\n")
-    assert load_baseline(str(path)).title == title
+    assert load_method(str(path), "estimation").title == title
 
 
 def test_baselines_may_use_dataclasses(tmp_path):
@@ -65,4 +66,4 @@ def test_baselines_may_use_dataclasses(tmp_path):
     path = tmp_path / "mine.py"
     path.write_text("from __future__ import annotations\nfrom dataclasses import dataclass\n@dataclass\n"
                     "class Estimator:\n    task: object\n    def update(self, V, I): pass\n")
-    assert load_baseline(str(path)).estimator(task=3).task == 3
+    assert load_method(str(path), "estimation").make(task=3).task == 3

@@ -7,9 +7,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from eitbench.bench import baselines, cards
-from eitbench.bench.baselines import baseline_folder, load_baseline
-from eitbench.bench.policies import load_policy, own_agents
+from eitbench.bench import cards, methods
+from eitbench.bench.methods import baseline_folder, load_method, own_agents
 from eitbench.cli import app
 from eitbench.data.store import CACHE_VARIABLE
 
@@ -50,13 +49,14 @@ def test_a_method_scores_what_its_card_says(name):
 
 def test_versions_of_ours_are_those_of_their_cards(monkeypatch, tmp_path):
     """Agents of one environment and algorithm share theirs; a stranger's file has eight digits, whatever its name."""
-    monkeypatch.setattr(baselines, "card_version", {"homogeneous": 3, "adjacent": 2}.get)
-    assert (load_baseline("homogeneous").version, load_policy("adjacent").version) == ("v3", "v2")
+    monkeypatch.setattr(methods, "card_version", {"homogeneous": 3, "adjacent": 2}.get)
+    assert load_method("homogeneous", "estimation").version == "v3"
+    assert load_method("adjacent", "injection").version == "v2"
     mine = tmp_path / "mine.py"
     mine.write_text((baseline_folder() / "homogeneous.py").read_text())
-    assert load_baseline(str(mine)).version == load_baseline(str(mine)).sha256[:8]
+    assert load_method(str(mine), "estimation").version == load_method(str(mine), "estimation").sha256[:8]
     agents = own_agents("eitbench/Pipe2DInjectionFlow-v0")
-    names = {baselines.card_name(Path(path)) for path in agents}
+    names = {methods.card_name(Path(path)) for path in agents}
     assert names == ({"eitbench-Pipe2DInjectionFlow-v0--ppo"} if agents else set())
 
 

@@ -5,9 +5,9 @@ import shutil
 
 import numpy as np
 import pytest
+from choosing import injected
 
-from eitbench.bench.baselines import baseline_folder
-from eitbench.bench.policies import load_policy, own_agents, play
+from eitbench.bench.methods import baseline_folder, load_method, own_agents
 from eitbench.bench.run import Job, run_episode
 from eitbench.bench.sandbox import guests
 from eitbench.bench.tracks import Environment, ids
@@ -27,14 +27,14 @@ def test_every_checkpoint_is_an_agent_of_an_environment():
 @pytest.mark.parametrize("path", AGENTS, ids=lambda path: "-".join(path.split("/")[-4:-1]))
 def test_an_agent_plays_as_it_did_when_it_was_kept(path):
     """Its error in the first dev episode is that of its last evaluation; rounding may turn a close choice."""
-    folder, agent = FOLDER.joinpath(*path.split("/")[-4:-1]), load_policy(path)
+    folder, agent = FOLDER.joinpath(*path.split("/")[-4:-1]), load_method(path, "injection")
     asked = json.loads((folder / "config.json").read_text())
     assert agent.name == f"{asked['algo']}_{folder.name}" and folder.parts[-2] == asked["algo"]
     assert folder.parts[-3] == asked["env"].replace("/", "-") and asked["kwargs"] == {}
     kept = np.load(folder / "evaluations.npz")
     assert kept["steps"][0] == 0 and kept["steps"][-1] >= asked["config"]["total_steps"]
     assert len((folder / "monitor.csv").read_text().splitlines()) > 100
-    error = play(asked["env"], {}, path, FIRST, "reduced").outcome.errors.mean()
+    error = injected(asked["env"], {}, path, FIRST, "reduced").errors.mean()
     np.testing.assert_allclose(error, kept["errors"][-1][0], rtol=0.02)
 
 

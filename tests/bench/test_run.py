@@ -12,8 +12,11 @@ from scipy.optimize import minimize_scalar
 from short import merged
 from tiny import FILTER, FIXED_LAG, SCENARIO, SMOOTHING, count, counting, write_baseline
 
-from eitbench.bench import run
-from eitbench.bench.run import Job, play_and_collect, run_episode, run_jobs
+from eitbench.bench import playing, run
+from eitbench.bench.methods import Method
+from eitbench.bench.outcomes import Said
+from eitbench.bench.playing import estimated
+from eitbench.bench.run import Job, run_episode, run_jobs
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.tracks import Environment, board_of
 from eitbench.data.episodes import simulate, truth_discretisation
@@ -39,7 +42,7 @@ def scores_of(result):
 
 
 def baseline_of(update, boards=("filter",)):
-    """A `Baseline` that was never a file; ``update(task, i, voltages, currents)`` says what it thinks."""
+    """An estimator that was never a file; ``update(task, i, voltages, currents)`` says what it thinks."""
     class Estimator:
         def __init__(self, *arguments):
             (self.task,), self.i = arguments, 0
@@ -48,7 +51,7 @@ def baseline_of(update, boards=("filter",)):
             self.i += 1
             return update(self.task, self.i, *arguments)
 
-    return run.Baseline("made_here", "Made here", Path(), "0" * 64, boards, {}, Estimator)
+    return Method("estimation", "made_here", "Made here", Path(), "0" * 64, boards, {}, Estimator)
 
 
 # -- mistakes of baselines --------------------------------------------------------------------------------------------
@@ -113,7 +116,7 @@ def test_estimators_see_the_task_and_measurements_only(environment):
         seen.append(arguments)
         return Estimate(np.full(1701, 30.0))
 
-    play_and_collect(env, baseline_of(update), 3)
+    estimated(env, baseline_of(update), 3)
     assert len(seen) == env.task.n_steps + env.task.lag
     observation, _ = env.reset(seed=3)
     for task, _, *measurement in seen:
@@ -169,7 +172,7 @@ def test_estimators_cannot_spoil_the_task_for_others(tmp_path):
     try:
         assert scores_of(run_episode(Job(FILTER, good, 1))[0]) == before
     finally:
-        run._made.cache_clear()                                 # what a vandal broke is no other test's affair
+        playing._made.cache_clear()                                 # what a vandal broke is no other test's affair
 
 
 @pytest.mark.parametrize(("environment", "board"), [(FILTER, "filter"), (FIXED_LAG, "fixed-lag"),
@@ -182,7 +185,7 @@ def test_estimates_are_taken_for_the_state_that_was_asked_for(environment, board
     def update(task, i, *_):
         return Estimate(np.full(1701, 20.0 + i - task.lag)) if i > task.lag else None
 
-    played = play_and_collect(env, baseline_of(update), 3)
+    played = Said.collect(env.task, playing._estimates(env, baseline_of(update), 3))
     np.testing.assert_array_equal(played.means, np.repeat(20.0 + np.arange(1, 6)[:, None], 1701, axis=1))
     assert played.voltages.shape == played.currents.shape == (5, 4) and len(played.seconds) == 5 + env.task.lag
 

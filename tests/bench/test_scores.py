@@ -7,12 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tables import said
 
 from eitbench.bench import scores
 from eitbench.bench.records import read_records
 from eitbench.bench.scores import Outcome, Score, register_score, scored
 from eitbench.report import boards, compare, summary
-from eitbench.report.site import render_site
+from eitbench.report.site import render, render_site
 from eitbench.worlds import entry
 
 PUBLISHED = Path(__file__).parents[2] / "leaderboards" / "results"
@@ -73,8 +74,8 @@ def test_a_new_score_is_shown_everywhere(apart):
             episode["scores"]["worst_step"] = max(episode["step_errors"])
     expected = {record["method"]: 100.0 * np.mean([max(episode["step_errors"])
                                                    for episode in record["episodes"]]) for record in records}
-    assert "worst" in summary.cells(summary.summary(records))
-    made = boards.render(records)
+    assert "worst" in summary.shown(summary.summary(records)).headings
+    made = render(records)
     rows = {row["method"]: row for row in csv.DictReader(io.StringIO(made["leaderboard.csv"]))}
     for method, value in expected.items():
         assert float(rows[method]["worst_step"]) == pytest.approx(value, rel=1e-5)
@@ -85,7 +86,7 @@ def test_a_new_score_is_shown_everywhere(apart):
             for name in ("kalman_filter", "homogeneous"))
     table = compare.compare(a, b, "worst_step")
     assert table["a"][0] == pytest.approx(expected["kalman_filter"]) and table["better"][0] == 1.0
-    assert compare.cells(table, "kalman", "floor", "worst_step")["verdict"][0] == "kalman"
+    assert said(compare.shown(table, "kalman", "floor", "worst_step"))["verdict"][0] == "kalman"
     assert "worst: the worst step; lower is better" in compare.html(table, "kalman", "floor", "worst_step")
 
 
@@ -99,7 +100,7 @@ def test_where_more_is_better_the_other_wins(apart):
             episode["scores"]["worst_step"] = max(episode["step_errors"])
     table = compare.compare([records["kalman_filter"]], [records["homogeneous"]], "worst_step")
     assert table["better"][0] == 0.0
-    assert compare.cells(table, "kalman", "floor", "worst_step")["verdict"][0] == "floor"
+    assert said(compare.shown(table, "kalman", "floor", "worst_step"))["verdict"][0] == "floor"
 
 
 @pytest.mark.parametrize("name", ["nis", "voltage_discrepancy", "beauty"])

@@ -63,8 +63,9 @@ def test_a_submission_is_a_record_an_environment(tmp_path):
 
 def test_all_of_ours_by_one_command(tmp_path, monkeypatch):
     """Those that play, environment after environment: what is done has its record when a later one is interrupted."""
-    monkeypatch.setattr(suites, "own_baselines", lambda: ["homogeneous", "fixed_interval_smoother"])
-    monkeypatch.setattr(suites, "own_policies", lambda: ["random_pair", "event_triggered"])
+    ours = {"estimation": ["homogeneous", "fixed_interval_smoother"],
+            "injection": ["random_pair", "event_triggered"]}
+    monkeypatch.setattr(suites, "own_methods", ours.get)
     monkeypatch.setattr(suites, "own_agents", lambda id: [])
     made = submit(None, [FILTER.id, INJECTION], TEST[:1], EpisodeStore(tmp_path / "r"), tmp_path / "to")
     assert "--homogeneous--" in next(made).name

@@ -12,7 +12,7 @@ from short import PLAIN, shorten, world
 from typer.testing import CliRunner
 
 from eitbench.bench import store, suites, tracks
-from eitbench.bench.baselines import own_baselines
+from eitbench.bench.methods import own_methods
 from eitbench.bench.tracks import ids
 from eitbench.cli import app
 from eitbench.data.seeds import parse_seeds
@@ -124,16 +124,16 @@ def test_every_board_by_default(tmp_path):
 
 def test_suites():
     """full is every environment; quick the plain pipe on fewer seeds, but for the one method that takes minutes."""
-    quick, full = (suites.jobs(suite, [], [], [1]) for suite in ("quick", "full"))
+    quick, full = (suites.jobs("estimation", [], [], [1], suite=suite) for suite in ("quick", "full"))
     plain = set(PLAIN) & set(ids("estimation"))
     assert {job.environment.id for job in quick} == plain and len(plain) == 3
     assert {job.environment.id for job in full} == set(ids("estimation"))
     missing = {job for job in full if job.environment.id in plain} - set(quick)
     assert missing == {suites.Job(suites.Environment(PIPE), "gauss_newton", 1)} and set(quick) < set(full)
-    assert {job.method for job in full} == set(own_baselines())
+    assert {job.method for job in full} == set(own_methods("estimation"))
     assert set(parse_seeds(tracks.QUICK_SEEDS)) < set(parse_seeds(entry(PIPE).seeds))
     assert min(parse_seeds(entry(PIPE).seeds)) == 200_000
-    asked_for = suites.jobs("quick", [PIPE], ["gauss_newton"], [1, 2])
+    asked_for = suites.jobs("estimation", [PIPE], ["gauss_newton"], [1, 2], suite="quick")
     assert [job.seed for job in asked_for] == [1, 2]
 
 
@@ -145,7 +145,7 @@ def test_list():
     code, said, _ = eitbench("list")
     assert code == 0
     lines = {line.split()[0]: line for line in said.splitlines()}
-    assert lines.keys() >= {*ids(), *own_baselines()}
+    assert lines.keys() >= {*ids(), *own_methods("estimation")}
     assert "smoothing" in lines["eitbench/Pipe2DSmoothing-v0"] and "3 scored of 5" in lines[PIPE]
     assert "filter, smoothing" in lines["gauss_newton"] and "Stationary Gauss–Newton" in lines["gauss_newton"]
 

@@ -7,8 +7,8 @@ import pytest
 from estimating import PIPE, SKEWED, VELOCITY, make
 
 from eitbench import Estimate
-from eitbench.bench.run import play_and_collect
-from eitbench.bench.score import score
+from eitbench.bench.playing import estimated
+from eitbench.bench.scores import scored
 
 
 @pytest.mark.parametrize("name", VELOCITY)
@@ -31,8 +31,8 @@ def test_leaderboard_scores_what_is_rewarded(name, said, monkeypatch):
         return played[-1][1]
 
     monkeypatch.setattr(base, "step", watched)
-    baseline = SimpleNamespace(estimator=lambda _: estimator, privileged=False)
-    scores = score(base, play_and_collect(base, baseline, 1))["scores"]
+    baseline = SimpleNamespace(make=lambda _: estimator, privileged=False)
+    scores = scored("estimation", estimated(base, baseline, 1).outcome)
     rewards = np.array([reward for _, (_, reward, *_) in played])[task.warm_up:]
     total = scores["error"] + scores["velocity_error"]
     assert total == pytest.approx(-rewards.mean(), abs=1e-7)
@@ -52,6 +52,6 @@ def test_flow_is_refused_where_it_is_not_asked_for(id, message):
     base = make(id).unwrapped
     said = Estimate(np.full(base.task.mesh.n_nodes, 31.0), velocity=np.array([4.5]))
     estimator = SimpleNamespace(update=lambda *_: said)
-    baseline = SimpleNamespace(estimator=lambda _: estimator, privileged=False)
+    baseline = SimpleNamespace(make=lambda _: estimator, privileged=False)
     with pytest.raises(ValueError, match=message):
-        play_and_collect(base, baseline, 1)
+        estimated(base, baseline, 1)

@@ -17,7 +17,8 @@ import eitbench
 from eitbench.bench import load
 from eitbench.bench.records import read_records, write_record
 from eitbench.bench.statistics import interquartile_mean, stratified_bootstrap
-from eitbench.report.boards import ALL, boards, class_of, fields, render
+from eitbench.report.boards import ALL, boards, class_of, fields
+from eitbench.report.site import render
 
 ROOT = Path(__file__).parents[2]
 FLOOR = [0.20, 0.24, 0.22, 0.26, 0.18, 0.30, 0.25, 0.21]
@@ -65,7 +66,7 @@ def test_rendering_does_not_depend_on_the_order_or_the_process(tmp_path):
         write_record(tmp_path, each)
     expected = render(read_records(tmp_path))
     assert render(list(reversed(records))) == expected
-    code = ("import json, sys; from pathlib import Path; from eitbench.report.boards import render; "
+    code = ("import json, sys; from pathlib import Path; from eitbench.report.site import render; "
             "from eitbench.bench.records import read_records; "
             "print(json.dumps(render(read_records(Path(sys.argv[1])))))")
     done = subprocess.run([sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True, check=True)
@@ -265,12 +266,17 @@ def test_csv_and_markdown_agree_with_the_episodes(folder):
         assert row["error"] == pytest.approx(means["error"], rel=1e-5)
         if "nis" in means:
             assert row["nis"] == pytest.approx(means["nis"], rel=1e-5)
-        section = texts["leaderboard.md"].split(f"### {row['environment']}")[1].split("###")[0]
-        (line,) = [line for line in section.splitlines() if f"({row['method']} {row['version']})" in line]
-        shown = float(re.search(r"\| +(0\.\d+)", line)[1])
-        assert shown == pytest.approx(row["error"], rel=0.1)
-        assert line.split("|")[1].strip() == (f"{row['rank']:.0f}" if row["rank"] > 0 else row["note"])
-        assert line.split("|")[3].strip() == ("official" if row["official"] else "self-reported")
+        title = row["environment"].removeprefix("eitbench-")
+        section = texts["leaderboard.md"].split(f"### {title}, ")[1].split("###")[0]
+        heading = [cell.strip() for cell in section.splitlines()[2].split("|")]
+        (line,) = [line for line in section.splitlines()
+                   if f" {row['method']}@{row['version']} " in line]
+        cells = dict(zip(heading, (cell.strip() for cell in line.split("|")), strict=True))
+        assert float(cells["ẽ_c"].split()[0]) == pytest.approx(row["error"], rel=0.1)
+        ranked = row["rank"] > 0
+        assert cells["rank"].split()[0] == (f"{row['rank']:.0f}" if ranked else "–")
+        assert ranked or cells["method"].endswith(f"({row['note']})")
+        assert cells["by"] == ("official" if row["official"] else "self-reported")
     assert "All environments" in texts["leaderboard.md"] and (table["environment"] == ALL).sum() == 2
 
 

@@ -122,7 +122,7 @@ def rows_of(html, anchor=""):
 
 def text_of(html):
     """What is read."""
-    return " ".join(" ".join(Page(html.replace("<wbr>", "")).text).split())
+    return " ".join(" ".join(Page(html.replace("<wbr/>", "")).text).split())
 
 
 def test_numbers_are_those_of_the_boards(pages):

@@ -8,10 +8,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
+from tables import said
 
 from eitbench.bench.scores import scores as registered
 from eitbench.bench.text import mean_and_interval, number, rounded, scores_by_seed, seed_ranges
-from eitbench.report.summary import cells, explanations, markdown, summary
+from eitbench.report.summary import explanations, shown, summary
 
 unhurried = settings(deadline=None)                                                     # a busy machine is no failure
 BOARD_IDS = {"filter": "eitbench/Pipe2D-v0", "fixed-lag": "eitbench/Pipe2DFixedLag-v0",
@@ -191,13 +192,13 @@ def test_world_by_world():
 
 def test_the_environment_is_named_where_there_are_several():
     """The first column says which, in words as the next ones; with one world there is no such column."""
-    text = cells(summary(several()))
+    text = said(shown(summary(several())))
     assert list(text.columns)[:4] == ["environment", "board", "method", "seeds"]
     assert list(text["environment"]) == ["Pipe2D", "Pipe2D", "Pipe3D", "theirs/Tank", "Pipe2D"]
-    lines = markdown(summary(several())).splitlines()
+    lines = shown(summary(several())).markdown().splitlines()
     assert lines[2].startswith("| Pipe2D      | filter") and lines[4].startswith("| Pipe3D      | filter")
     assert [cell.endswith(":") for cell in lines[1].strip("|").split("|")][:5] == [False] * 4 + [True]
-    alone = markdown(summary(ANCHORS)).splitlines()
+    alone = shown(summary(ANCHORS)).markdown().splitlines()
     assert re.match(r"\| board +\| method +\| seeds +\| +ẽ_c \|", alone[0])
     assert [cell.endswith(":") for cell in alone[1].strip("|").split("|")][:4] == [False] * 3 + [True]
 
@@ -219,13 +220,13 @@ def test_failures_are_counted_not_averaged():
     records = [record("mine", "filter", [0.1, 0.2, 9.9], failed=(2,)), record("bad", "filter", [1.0], failed=(0,))]
     assert scores_by_seed(records[0], "error") == {"test:0": 0.1, "test:1": 0.2}
     assert row(records, "mine", "filter")["error"][0] == pytest.approx(0.15)
-    text = cells(summary(records))
+    text = said(shown(summary(records)))
     assert list(text["seeds"]) == ["test:0-2, 1 failed", "test:0, 1 failed"] and text["ẽ_c"][1] == "–"
 
 
 def test_units_of_the_table():
     """Time in ms, voltage discrepancy in mV²; what is not claimed is a dash."""
-    text = cells(summary([record("mine", "filter", [0.1], seconds_per_step=0.0025, voltage_discrepancy=4e-6)]))
+    text = said(shown(summary([record("mine", "filter", [0.1], seconds_per_step=0.0025, voltage_discrepancy=4e-6)])))
     assert (text["ms/step"][0], text["ẽ_V"][0], text["CRPS"][0]) == ("2.5", "4", "–")
     always = [name for name in explanations() if name not in ("ẽ_v", "injections")]
     assert list(text.columns) == ["board", "method", "seeds", *always]
@@ -236,14 +237,14 @@ def test_the_error_of_the_flow_stands_where_it_was_asked_for():
     old = record("old", "filter", [0.3])
     del old["episodes"][0]["scores"]["velocity_error"]
     rows = [record("mine", "filter", [0.1], velocity_error=0.02), record("theirs", "filter", [0.2]), old]
-    text = cells(summary(rows))
+    text = said(shown(summary(rows)))
     assert list(text["ẽ_v"]) == ["0.02", "–", "–"]
 
 
 def test_markdown_is_a_table():
     """Every line has the same number of cells and the same width, whatever a title contains."""
     odd = record("mine", "filter", [0.1, 0.2]) | {"title": "mine | yours"}
-    lines = markdown(summary([*ANCHORS, odd])).splitlines()
+    lines = shown(summary([*ANCHORS, odd])).markdown().splitlines()
     assert len(lines) == 5 and re.fullmatch(r"[|:-]+", lines[1])
     assert len({len(line) for line in lines}) == 1
     assert len({len(re.findall(r"(?<!\\)\|", line)) for line in lines}) == 1
@@ -259,5 +260,6 @@ def test_other_seeds_have_boards_of_their_own():
     """Dev scores stand under their own heading, and find no anchors for skill in those of other seeds."""
     mine = record("mine", "filter", FLOOR) | {"split": "dev"}
     table = summary([*ANCHORS, mine])
-    assert list(table["split"]) == ["test", "test", "dev"] and cells(table)["board"].iloc[-1] == "filter (dev seeds)"
+    assert list(table["split"]) == ["test", "test", "dev"]
+    assert said(shown(table))["board"].iloc[-1] == "filter (dev seeds)"
     assert row([*ANCHORS, mine], "mine", "filter")["skill"] is None

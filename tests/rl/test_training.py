@@ -7,10 +7,11 @@ from zipfile import ZIP_DEFLATED, ZipFile
 import gymnasium as gym
 import numpy as np
 import pytest
+from choosing import injected
 from short import merged
 from threadpoolctl import threadpool_limits
 
-from eitbench.bench.policies import load_policy, play
+from eitbench.bench.methods import load_method
 from eitbench.envs.injection import InjectionVectorEnv
 from eitbench.estimation.onboard.rules import Rules
 from eitbench.rl import training
@@ -268,10 +269,10 @@ def test_an_agent_plays_as_it_was_evaluated(env, algo, tmp_path):
     config = replace(TINY, algorithm=options)
     path = train(env, algo, config, 1, tmp_path, kwargs)
     expected = np.load(tmp_path / "evaluations.npz")["errors"][-1]
-    errors = [play(env, kwargs, str(path), seed, "reduced").outcome.errors.mean()
+    errors = [injected(env, kwargs, str(path), seed, "reduced").errors.mean()
               for seed in (100_000, 100_001)]
     np.testing.assert_allclose(errors, expected, rtol=1e-5)
-    agent = load_policy(str(path))
+    agent = load_method(str(path), "injection")
     injected = []
     for estimator in ("reduced", "full"):
         world = gym.make(env, estimator=estimator, observation="raw", **kwargs).unwrapped
@@ -292,7 +293,7 @@ def test_an_agent_plays_as_it_was_evaluated(env, algo, tmp_path):
     path.write_bytes(content + b"x")
     assert load_agent(path, content)[0] == agent.name            # what was checked is what is opened
     with pytest.raises(ValueError, match="must have the sha256 that lies beside it"):
-        load_policy(str(path))
+        load_method(str(path), "injection")
     (tmp_path / "sha256").unlink()
     with pytest.raises(ValueError, match="must lie beside the config"):
-        load_policy(str(path))
+        load_method(str(path), "injection")

@@ -19,8 +19,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from tiny import FILTER, SCENARIO, write_baseline
 
-from eitbench.bench.baselines import load_baseline
-from eitbench.bench.policies import load_policy
+from eitbench.bench.methods import load_method
 from eitbench.bench.sandbox import wall, wire
 from eitbench.bench.sandbox.host import Guest, GuestError
 from eitbench.bench.sandbox.wall import landlock_version
@@ -94,8 +93,8 @@ def test_a_guest_answers_as_it_would_here(name, measured, tmp_path):
     if name == "mine":
         name = write_baseline(tmp_path, update="return None if self.calls < 2 else Estimate(self.level + self.calls, "
                               "self.level**2, voltages, np.outer(voltages, voltages))")
-    here = load_baseline(name)
-    with Guest("estimator", FILTER.id, KWARGS, name) as guest:
+    here = load_method(name, "estimation")
+    with Guest("estimation", FILTER.id, KWARGS, name) as guest:
         for _ in range(2):
             guest.begin()
             estimator = here.estimator(FILTER.make().task)
@@ -115,8 +114,8 @@ def test_a_policy_plays_as_it_would_here():
     name, kwargs = "eitbench/Pipe2DInjection-v0", {"estimator": "none", "observation": "raw"}
     env = gym.make(name, **kwargs).unwrapped
     observation, _ = env.reset(seed=1)
-    here = load_policy("random_pair").policy(env.rules, np.random.default_rng(12))
-    with Guest("policy", name, kwargs, "random_pair") as guest:
+    here = load_method("random_pair", "injection").make(env.rules, np.random.default_rng(12))
+    with Guest("injection", name, kwargs, "random_pair") as guest:
         guest.begin(random=12)
         said = [guest.act(observation) for _ in range(4)]
         assert said == [here.act(observation) for _ in range(4)] and {type(action) for action in said} == {int}
@@ -153,8 +152,8 @@ def test_a_guest_is_told_a_script_s_world(tmp_path, monkeypatch):
     try:
         registry.register(world, id)
         voltages, currents = simulated(world)
-        here = load_baseline("homogeneous").estimator(gym.make(id).unwrapped.task)
-        with Guest("estimator", id, {}, "homogeneous") as guest:
+        here = load_method("homogeneous", "estimation").make(gym.make(id).unwrapped.task)
+        with Guest("estimation", id, {}, "homogeneous") as guest:
             guest.begin()
             for measured in zip(voltages, currents, strict=True):
                 said, expected = guest.update(*measured), here.update(*measured)
@@ -202,7 +201,7 @@ def test_it_reaches_nothing(tmp_path, monkeypatch):
                 "the name of the cache", "the truth in memory"} <= set(within["reached"])
         curious = write_baseline(tmp_path, init=f"exec({source!r}, globals())",
                                  update="raise RuntimeError(f'reached {reached}')")
-        with Guest("estimator", FILTER.id, KWARGS, curious) as guest:
+        with Guest("estimation", FILTER.id, KWARGS, curious) as guest:
             assert guest.closed
             guest.begin()
             with pytest.raises(GuestError, match=r"^RuntimeError: reached \[\]$"):
@@ -227,7 +226,7 @@ CHILD = """child = os.fork()
 @pytest.mark.parametrize("end", ["return Estimate(self.level)", "os._exit(1)"])
 def test_its_children_end_with_it(end, tmp_path):
     """Also one that would leave its session, and when the guest itself has ended before."""
-    with Guest("estimator", FILTER.id, KWARGS, write_baseline(tmp_path, update=CHILD + end)) as guest:
+    with Guest("estimation", FILTER.id, KWARGS, write_baseline(tmp_path, update=CHILD + end)) as guest:
         guest.begin()
         guest._patience = 5.0
         with suppress(GuestError):
@@ -243,7 +242,7 @@ def test_a_question_that_is_not_read_is_too_late(tmp_path):
     """A guest may answer in advance and read nothing; the pipe is full some time."""
     ahead = ("from eitbench.bench.sandbox import wire\n        os.write(4, wire.pack({}))\n"
              "        while True: os.write(4, wire.pack({'estimate': None}))")
-    with Guest("estimator", FILTER.id, KWARGS, write_baseline(tmp_path, init=ahead)) as guest:
+    with Guest("estimation", FILTER.id, KWARGS, write_baseline(tmp_path, init=ahead)) as guest:
         guest.begin()
         guest._patience, began = 2.0, time.monotonic()
         with pytest.raises(GuestError, match="TimeoutError: a question was not read within 2 s"):
@@ -258,7 +257,7 @@ def test_no_guest_where_the_cache_can_be_read(monkeypatch):
     place = Path(np.__file__).parents[1] / "eitbench-test-cache"
     monkeypatch.setenv(CACHE_VARIABLE, str(place))
     with pytest.raises(ValueError, match=r"the cache folder .*eitbench-test-cache lies in .*, which guests may read"):
-        Guest("estimator", FILTER.id, KWARGS, "homogeneous")
+        Guest("estimation", FILTER.id, KWARGS, "homogeneous")
 
 
 def test_what_lies_beside_the_package_is_read_unless_it_is_a_checkout(tmp_path, monkeypatch):
@@ -280,7 +279,7 @@ def test_what_goes_wrong_is_said(statement, message, tmp_path):
     """Limits of memory and time, a crash, an exit, nonsense on the wire; what it prints is no answer."""
     path = write_baseline(tmp_path, update=statement)
     began = time.monotonic()
-    with Guest("estimator", FILTER.id, KWARGS, path, memory=3 << 30, patience=60) as guest:
+    with Guest("estimation", FILTER.id, KWARGS, path, memory=3 << 30, patience=60) as guest:
         guest.begin()
         guest._patience = 3.0
         with pytest.raises(GuestError, match=message):
@@ -293,7 +292,7 @@ def test_a_file_that_cannot_be_loaded_is_named(tmp_path):
     """As the error that it would be here."""
     (tmp_path / "mine.py").write_text("class Estimator: pass")
     with pytest.raises(GuestError, match="must define a class Estimator"):
-        Guest("estimator", FILTER.id, KWARGS, str(tmp_path / "mine.py"))
+        Guest("estimation", FILTER.id, KWARGS, str(tmp_path / "mine.py"))
 
 
 numbers = hnp.arrays(st.sampled_from([np.float64, np.float32, np.int64, np.bool_]),
@@ -331,7 +330,7 @@ def test_the_variables_of_this_process_stay_here():
     """A guest sees none of them but those it needs."""
     os.environ["EITBENCH_TEST_SECRET"] = "salt"
     try:
-        with Guest("estimator", FILTER.id, KWARGS, "homogeneous") as guest:
+        with Guest("estimation", FILTER.id, KWARGS, "homogeneous") as guest:
             seen = Path(f"/proc/{guest._process.pid}/environ").read_text()
     finally:
         del os.environ["EITBENCH_TEST_SECRET"]

@@ -16,7 +16,7 @@ from short import PIPE
 from tiny import FILTER, FIXED_LAG, SMOOTHING, write_baseline
 
 from eitbench.bench import suites
-from eitbench.bench.policies import own_policies
+from eitbench.bench.methods import own_methods
 from eitbench.bench.run import Job, run_episode, run_jobs
 from eitbench.bench.sandbox import guests, host
 from eitbench.bench.sandbox.wall import landlock_version
@@ -166,7 +166,7 @@ def test_a_guest_ends_with_who_started_it(tmp_path):
     """Even if a killed worker leaves it in an endless loop."""
     path = write_baseline(tmp_path, update="while True: pass")
     program = ("import numpy as np; from eitbench.bench.sandbox.host import Guest\n"
-               f"guest = Guest('estimator', {FILTER.id!r}, {json.loads(FILTER.kwargs)!r}, {path!r})\n"
+               f"guest = Guest('estimation', {FILTER.id!r}, {json.loads(FILTER.kwargs)!r}, {path!r})\n"
                "guest.begin(); print(guest._process.pid, flush=True); guest.update(np.zeros(4), np.zeros(4))")
     with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True,
                           env=os.environ | {"TMPDIR": str(tmp_path)}) as host_:
@@ -188,17 +188,18 @@ def test_a_file_that_changes_meanwhile_is_not_played(tmp_path):
     guests.close()
     write_baseline(tmp_path, update="raise RuntimeError('changed')")
     with pytest.raises(host.GuestError, match="was changed while it was being played"):
-        loaded.estimator(None)
+        loaded.make(None)
 
 
 @pytest.mark.parametrize(("said", "message"), [
     ("class Estimator: pass", "mine.py must define a class Estimator with a method update"),
     ("raise SystemExit(3)", "cannot be played: SystemExit: 3"),
     ("import os; os._exit(4)", "ended with status 4"),
-    ("class Estimator:\n    def update(self, v, i): pass\nimport eitbench.bench.baselines as b\n"
+    ("class Estimator:\n    def update(self, v, i): pass\nimport eitbench.bench.methods as b\n"
      "b.title_of = lambda *_: 7", "says nonsense of its title"),
-    ("class Estimator:\n    def update(self, v, i): pass\nimport eitbench.bench.baselines as b\n"
-     "b.BOARDS = [[1]]\nEstimator.boards = b.BOARDS\nb.set = lambda _: type('S', (), {'__le__': lambda *_: True})()",
+    ("class Estimator:\n    def update(self, v, i): pass\nimport eitbench.bench.methods as b\n"
+     "b.BOARDS = {'estimation': [[1]]}\nEstimator.boards = [[1]]\n"
+     "b.set = lambda _: type('S', (), {'__le__': lambda *_: True})()",
      "says nonsense of its boards"),
 ])
 def test_files_that_cannot_be_played(said, message, tmp_path):
@@ -213,16 +214,17 @@ def test_files_that_cannot_be_played(said, message, tmp_path):
 def test_a_guest_does_not_choose_its_name(tmp_path, monkeypatch):
     """Results are kept under it: those of a file that calls itself like ours would take the place of ours."""
     path = Path(write_baseline(tmp_path))
-    path.write_text(path.read_text() + "\nimport eitbench.bench.baselines as b\nmade = b.Baseline\n"
-                    "b.Baseline = lambda name, *rest: made('homogeneous', *rest)\n")
+    path.write_text(path.read_text() + "\nimport eitbench.bench.methods as b\nmade = b.Method\n"
+                    "b.Method = lambda track, name, *rest: made(track, 'homogeneous', *rest)\n")
     assert Job(FILTER, str(path), 1, True).load().name == "mine"
     agent = tmp_path / "model.zip"
     agent.write_bytes(b"")
     ours = tmp_path / "ppo" / "seed3" / "model.zip"
     ours.parent.mkdir(parents=True)
     ours.write_bytes(b"another")
-    monkeypatch.setattr(guests, "own_agents", lambda id: [str(ours)])
-    about = {"title": "Mine", "parameters": {}, "role": None, "suits": True}
+    own = guests.own_files
+    monkeypatch.setattr(guests, "own_files", lambda id: own(id) | {"ppo_seed3": ours})
+    about = {"title": "Mine", "boards": ["injection"], "parameters": {}, "role": None, "suits": True}
     for name, refused in (("ppo_seed3", True), ("random_pair", True), ("ppo_seed4", False)):
         guests._load.cache_clear()
         monkeypatch.setattr(guests, "_enter", lambda *_, name=name: SimpleNamespace(about=about | {"name": name}))
@@ -246,7 +248,8 @@ def test_who_is_isolated(tmp_path):
                              (str(root / ours), (False, False, True)),
                              (str(root / "baselines" / ".." / "tests" / "mine.py"), (False, True, True))):
         assert tuple(suites.is_isolated(FILTER, method, how) for how in suites.ISOLATE) == expected
-    assert [name for name in own_policies() if not suites.is_isolated(INJECTION, name, "always")] == ["clairvoyant"]
+    assert [name for name in own_methods("injection")
+            if not suites.is_isolated(INJECTION, name, "always")] == ["clairvoyant"]
     privileged = write_policy(tmp_path)
     text = Path(privileged).read_text()
     Path(privileged).write_text(text.replace("class Policy:", "class Policy:\n    privileged = True"))
@@ -259,6 +262,6 @@ def test_who_is_isolated(tmp_path):
 def test_jobs_are_ordered_for_guests(tmp_path):
     """All seeds of a method together, environment by environment."""
     paths = [write_baseline(tmp_path, name) for name in ("first", "second")]
-    todo = suites.jobs("quick", [SMOOTHING.id, FILTER.id], paths, [1, 2], isolate="never")
+    todo = suites.jobs("estimation", [SMOOTHING.id, FILTER.id], paths, [1, 2], isolate="never")
     assert [(job.environment.id, job.method, job.seed) for job in todo] == [
         (id, path, seed) for id in (SMOOTHING.id, FILTER.id) for path in paths for seed in (1, 2)]

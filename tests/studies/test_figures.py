@@ -15,7 +15,7 @@ from PIL import Image
 from short import merged, shorten
 from tiny_worlds import CHANGES
 
-from eitbench.bench.baselines import load_baseline
+from eitbench.bench.methods import load_method
 from eitbench.bench.text import seed_ranges
 from eitbench.cli.studies import NAME, thesis
 from eitbench.data.seeds import name_seed
@@ -236,8 +236,8 @@ def test_map_estimate_is_the_most_probable():
     """At rest its objective, misfit and prior, is lower than the linearised filter's, and flat to
     the tolerance."""
     env = played_in("StationaryTank2D", {"schedule": {"scored_steps": 3}})
-    assert load_baseline("map_estimate").estimator.suits(env.task)
-    assert not load_baseline("map_estimate").estimator.suits(played_in("RotatingTank2D", None).task)
+    assert load_method("map_estimate", "estimation").make.suits(env.task)
+    assert not load_method("map_estimate", "estimation").make.suits(played_in("RotatingTank2D", None).task)
     task, first = env.task, FirstFrame(env.task)
     observation, _ = env.reset(seed=SEED)
     seen = []

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from eitbench import make_task, simulate
-from eitbench.bench.baselines import load_baseline
+from eitbench.bench.methods import load_method
 from eitbench.bench.run import Job, run_episode
 from eitbench.bench.tracks import Environment
 from eitbench.cli.studies import NAME, thesis
@@ -63,7 +63,7 @@ def test_stationary_method_works_on_a_stationary_target():
     target stands still."""
     task = make_task(PIPE_2D)
     interpolation, mass = score_operators(PIPE_2D)
-    penalty = load_baseline("gauss_newton").parameters["alpha"]**2 * stiffness_matrix(task.mesh)
+    penalty = load_method("gauss_newton", "estimation").parameters["alpha"]**2 * stiffness_matrix(task.mesh)
     images, constants, truths = [], [], []
     for seed in SEEDS[:3]:
         episode = simulate(PIPE_2D, seed)
@@ -84,7 +84,7 @@ def test_stationary_method_works_on_a_stationary_target():
 
 def test_persistence_uses_the_alpha_of_gauss_newton():
     """One tuned value, in two files."""
-    assert load_baseline("persistence").parameters == load_baseline("gauss_newton").parameters
+    assert load_method("persistence", "estimation").parameters == load_method("gauss_newton", "estimation").parameters
 
 
 @pytest.mark.slow

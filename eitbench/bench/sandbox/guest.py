@@ -71,30 +71,30 @@ def _nothing(words: dict[str, Any], arrays: dict[str, np.ndarray]) -> Reply:
 def _player(words: dict[str, Any], arrays: dict[str, np.ndarray]) -> tuple[Callable[..., Reply], dict[str, Any]]:
     """What answers from now on, and what the method says of itself."""
     import gymnasium as gym
+
+    from eitbench.bench.methods import load_method
     if arrays["told"].size:  # what the host says may be believed
         take_over([cloudpickle.loads(arrays["told"].tobytes())])
     env: Any = gym.make(words["id"], disable_env_checker=True, **words["kwargs"]).unwrapped
-    about: dict[str, Any]
-    loaded: Any
-    if words["kind"] == "estimator":
-        from eitbench.bench.baselines import load_baseline
-        loaded = baseline = load_baseline(words["name"])
-        answer, about = _estimator(env.task, baseline), {"boards": baseline.boards, "suits": baseline.suits(env.task)}
+    loaded = load_method(words["name"], words["track"])
+    if words["track"] == "estimation":
+        known = env.task
+        answer = _estimator(known, loaded)
     else:
-        from eitbench.bench.policies import load_policy
-        loaded = policy = load_policy(words["name"])
-        answer, about = _policy(env.rules, policy), {"suits": policy.suits(env.rules)}
-    return answer, about | {name: getattr(loaded, name)
-                            for name in ("name", "title", "parameters", "role", "privileged")}
+        known = env.rules
+        answer = _policy(known, loaded)
+    about = {name: getattr(loaded, name)
+             for name in ("name", "title", "boards", "parameters", "role", "privileged")}
+    return answer, about | {"suits": loaded.suits(known)}
 
 
-def _estimator(task: Any, baseline: Any) -> Callable[..., Reply]:
+def _estimator(task: Any, method: Any) -> Callable[..., Reply]:
     estimator = None
 
     def answer(words: dict[str, Any], arrays: dict[str, np.ndarray]) -> Reply:
         nonlocal estimator
         if words["do"] == "begin":
-            estimator = baseline.estimator(task)
+            estimator = method.make(task)
             return {}, {}
         assert estimator is not None
         estimate = estimator.update(arrays["voltages"], arrays["currents"])
@@ -108,13 +108,13 @@ def _estimator(task: Any, baseline: Any) -> Callable[..., Reply]:
     return answer
 
 
-def _policy(rules: Any, policy: Any) -> Callable[..., Reply]:
+def _policy(rules: Any, method: Any) -> Callable[..., Reply]:
     player = None
 
     def answer(words: dict[str, Any], arrays: dict[str, np.ndarray]) -> Reply:
         nonlocal player
         if words["do"] == "begin":
-            player = policy.policy(rules, np.random.default_rng(words["random"]))
+            player = method.make(rules, np.random.default_rng(words["random"]))
             return {}, {}
         assert player is not None
         return {}, {"action": np.asarray(player.act(arrays))}

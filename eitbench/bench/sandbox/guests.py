@@ -13,23 +13,23 @@ import re
 from collections.abc import Callable
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
-from eitbench.bench.baselines import BOARDS, ROLES, Baseline, find_baseline, is_ours, load_baseline
-from eitbench.bench.policies import PolicyFile, find_policy, load_policy, own_agents, own_policies
+from eitbench.bench.methods import ROLES, Method, find_method, is_ours, load_method, own_files
 from eitbench.bench.sandbox.host import Guest, GuestError
+from eitbench.bench.tracks import BOARDS
 
 NAME = re.compile(r"[^./\\][^/\\]*")
 """Of a method, as records have it."""
+PRIVILEGED = "{} is privileged: it asks for the truth, which a process of its own has not"
 _present: list[tuple[tuple[str, ...], Guest]] = []
 """The guest of this process, and whom it plays."""
 
 
-def load(kind: str, id: str, kwargs: str, method: str) -> Baseline | PolicyFile:
-    """An "estimator" or a "policy", by name or path, for an environment with these arguments
-    (JSON).
+def load(track: str, id: str, kwargs: str, method: str) -> Method:
+    """A method of a track, by name or path, for an environment with these arguments (JSON).
 
     Raises
     ------
@@ -37,10 +37,10 @@ def load(kind: str, id: str, kwargs: str, method: str) -> Baseline | PolicyFile:
         If there is no such file, it cannot be loaded, or it asks for the truth, which a guest has
         not.
     """
-    path = (find_baseline if kind == "estimator" else find_policy)(method)
+    path = find_method(method, track)
     if is_ours(method):  # what it says of itself need not be asked of a guest
-        return _ours(kind, id, kwargs, method, path)
-    return _load(kind, id, kwargs, method, path, hashlib.sha256(path.read_bytes()).hexdigest())
+        return _ours(track, id, kwargs, method, path)
+    return _load(track, id, kwargs, method, path, hashlib.sha256(path.read_bytes()).hexdigest())
 
 
 def peak_memory() -> int | None:
@@ -69,58 +69,52 @@ class _Elsewhere:
         return guest
 
 
-def _ours(kind: str, id: str, kwargs: str, method: str, path: Path) -> Baseline | PolicyFile:
+def _ours(track: str, id: str, kwargs: str, method: str, path: Path) -> Method:
     """One of ours: loaded here, played in a guest."""
-    loaded = load_baseline(method) if kind == "estimator" else load_policy(method)
+    loaded = load_method(method, track)
     if loaded.privileged:
-        raise ValueError(f"{path} is privileged: it asks for the truth, which a process of its own has not")
-    there = _Elsewhere(partial(_enter, kind, id, kwargs, method, loaded.sha256), loaded.suits)
-    return (loaded._replace(estimator=there) if isinstance(loaded, Baseline)
-            else loaded._replace(policy=cast(Any, there)))
+        raise ValueError(PRIVILEGED.format(path))
+    enter = partial(_enter, track, id, kwargs, method, loaded.sha256)
+    return loaded._replace(make=_Elsewhere(enter, loaded.suits))
 
 
 @lru_cache(maxsize=64)
-def _load(kind: str, id: str, kwargs: str, method: str, path: Path, sha256: str) -> Baseline | PolicyFile:
-    enter = partial(_enter, kind, id, kwargs, method, sha256)
+def _load(track: str, id: str, kwargs: str, method: str, path: Path, sha256: str) -> Method:
+    enter = partial(_enter, track, id, kwargs, method, sha256)
     try:
         about = enter().about
     except GuestError as error:
         raise ValueError(f"{path} cannot be played: {error}") from None
     if about.get("privileged"):
-        raise ValueError(f"{path} is privileged: it asks for the truth, which a process of its own has not")
+        raise ValueError(PRIVILEGED.format(path))
     if path.suffix == ".py":
         about = about | {"name": path.stem}  # a guest may call itself anything
-    sound = {"name": isinstance(about.get("name"), str) and NAME.fullmatch(about["name"]),
-             "title": isinstance(about.get("title"), str) and about["title"],
-             "parameters": isinstance(about.get("parameters"), dict), "role": about.get("role") in ROLES,
-             "boards": kind == "policy" or all(board in BOARDS for board in about.get("boards") or [None])}
+    sound = {
+        "name": isinstance(about.get("name"), str) and NAME.fullmatch(about["name"]),
+        "title": isinstance(about.get("title"), str) and about["title"],
+        "parameters": isinstance(about.get("parameters"), dict),
+        "role": about.get("role") in ROLES,
+        "boards": all(board in BOARDS[track] for board in about.get("boards") or [None]),
+    }
     if wrong := [name for name, is_sound in sound.items() if not is_sound]:
         raise ValueError(f"{path} says nonsense of its {', '.join(wrong)}")
-    if kind == "policy" and _own_names(id).get(about["name"], sha256) != sha256:
-        raise ValueError(f"{path} has the name of one of ours, {about['name']}, under which results are kept")
-    name, title, parameters, role = (about[key] for key in ("name", "title", "parameters", "role"))
+    ours = own_files(id).get(about["name"])
+    if ours is not None and hashlib.sha256(ours.read_bytes()).hexdigest() != sha256:
+        raise ValueError(f"{path} has the name of one of ours, {about['name']}, under which results "
+                         "are kept")
     # in the one that its guest knows
     there = _Elsewhere(enter, lambda world: bool(about.get("suits")))
-    if kind == "estimator":
-        return Baseline(name, title, path, sha256, tuple(about["boards"]), parameters, there, role)
-    return PolicyFile(name, title, path, sha256, False, parameters, there, role)
+    return Method(track, about["name"], about["title"], path, sha256, tuple(about["boards"]),
+                  about["parameters"], there, about["role"])
 
 
-def _own_names(id: str) -> dict[str, str]:
-    """Under which the results of our own policies and agents are kept, and the sha256 of their
-    files."""
-    policies = {name: find_policy(name) for name in own_policies()}
-    agents = {f"{path.parents[1].name}_{path.parent.name}": path for path in map(Path, own_agents(id))}
-    return {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in (policies | agents).items()}
-
-
-def _enter(kind: str, id: str, kwargs: str, method: str, sha256: str) -> Guest:
+def _enter(track: str, id: str, kwargs: str, method: str, sha256: str) -> Guest:
     """The present guest if it plays this and can be asked; else a fresh one takes its place."""
-    key = (kind, id, kwargs, method, sha256)
+    key = (track, id, kwargs, method, sha256)
     if not _present or _present[0][0] != key or not _present[0][1].alive:
         close()
         atexit.register(close)
-        _present.append((key, Guest(kind, id, json.loads(kwargs), method)))
+        _present.append((key, Guest(track, id, json.loads(kwargs), method)))
     guest = _present[0][1]
     if guest.sha256 not in ("", sha256):
         close()

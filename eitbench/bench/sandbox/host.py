@@ -25,7 +25,7 @@ import cloudpickle
 import numpy as np
 
 from eitbench._files import PACKAGE
-from eitbench.bench.baselines import is_ours
+from eitbench.bench.methods import is_ours, is_path
 from eitbench.bench.sandbox import wire
 from eitbench.data.store import CACHE_VARIABLE, cache_folder, folder, kinds
 from eitbench.worlds.registry import entry, registered_by_hand
@@ -52,7 +52,8 @@ class Guest:
 
     Parameters
     ----------
-    kind : "estimator" or "policy"
+    track : "estimation" or "injection"
+        Whether it is an estimator or a policy.
     id, kwargs
         The environment, of which it makes its own, without an episode.
     name : str
@@ -71,9 +72,10 @@ class Guest:
         If the cache folder lies where the guest can read.
     """
 
-    def __init__(self, kind: str, id: str, kwargs: dict[str, Any], name: str, *, memory: int = MEMORY,
-                 patience: float = PATIENCE) -> None:
-        self._patience, self._over = patience, False
+    def __init__(self, track: str, id: str, kwargs: dict[str, Any], name: str, *,
+                 memory: int = MEMORY, patience: float = PATIENCE) -> None:
+        self._patience = patience
+        self._over = False
         self.sha256 = ""
         """Of the file that was copied; empty for one of ours."""
         self._private = Path(tempfile.mkdtemp(prefix="eitbench-guest-"))
@@ -90,7 +92,7 @@ class Guest:
             """Whether files are out of its reach."""
             if self.closed:
                 _refuse_open_cache(wall["readable"])
-            self.about = self._ask({"do": "play", "kind": kind, "id": id, "kwargs": kwargs,
+            self.about = self._ask({"do": "play", "track": track, "id": id, "kwargs": kwargs,
                                     "name": self._copied(name)}, {"told": _told(id)})[0]
             """What the method's class says of itself: unchecked words of a stranger."""
         except BaseException:
@@ -169,7 +171,7 @@ class Guest:
         } | dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
     def _copied(self, name: str) -> str:
-        if not name.endswith((".py", ".zip")):
+        if not is_path(name):
             return name
         if is_ours(name):  # a copy would pass for a stranger's that has taken our name
             return str(Path(name).resolve())

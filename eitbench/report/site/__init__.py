@@ -1,4 +1,4 @@
-"""The leaderboards as a static site.
+"""The leaderboards as a static site, as Markdown, and as CSV.
 
 Rendered from the records and from what the repository holds: docstrings of environments and
 methods, our baselines' files and checkpoints. The same records and the same checkout give the same
@@ -14,10 +14,13 @@ from typing import Any
 import pandas as pd
 
 from eitbench._files import write_atomically
+from eitbench.bench.records import file_name, newest
+from eitbench.report.boards import boards, meanings
 from eitbench.report.site.collect import collect
 from eitbench.report.site.environment import environment_page
 from eitbench.report.site.index import index_page
 from eitbench.report.site.method import method_page
+from eitbench.report.site.tables import table as shown
 
 MARK = b"<strong>eitbench</strong> leaderboards"
 """By which an index.html is known to be ours."""
@@ -52,6 +55,32 @@ def render_site(records: list[dict[str, Any]], table: pd.DataFrame,
     files |= {name: b"".join((HERE / part).read_bytes() for part in parts) for name, parts in ASSETS.items()}
     shown = {board.environment for board in site.boards}
     return files | {f"media/{name}.webp": content for name, content in media.items() if name in shown}
+
+
+def render(records: list[dict[str, Any]], table: pd.DataFrame | None = None) -> dict[str, str]:
+    """The content of ``leaderboard.csv`` and ``leaderboard.md``, by file name, from the records
+    and, if it is made already, their `boards`. The same records give the same text."""
+    found = boards(records) if table is None else table
+    site = collect(records, found)
+    parts = ["# Leaderboards", "*Rendered from the records by `eitbench leaderboard --records "
+             "leaderboards/results`; [README.md](README.md) says how to add one.*"]
+    if not site.boards:
+        parts.append("There are no records yet.")
+    for name in site.classes:
+        parts.append(f"## {name}")
+        for board in site.boards:
+            if board.of_class == name and board.current:
+                seeds = "" if board.is_aggregate else f", {board.seeds}"
+                current = board._replace(rows=board.current)
+                parts += [f"### {board.title}{seeds}", shown(current, "", compact=False).markdown()]
+    if site.boards:
+        said = [f"- **{heading}**: {text}" for heading, text in meanings().items()]
+        parts += ["## What the columns say", "\n".join(said)]
+    if outdated := newest(records)[1]:
+        parts += ["## Outdated records", "Made by an earlier version of the method.\n\n"
+                  + "\n".join(f"- {file_name(record)}" for record in outdated)]
+    return {"leaderboard.csv": found.to_csv(index=False, float_format="%.6g", lineterminator="\n"),
+            "leaderboard.md": "\n\n".join(parts) + "\n"}
 
 
 def read_media(folder: Path) -> dict[str, bytes]:

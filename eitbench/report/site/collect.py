@@ -65,6 +65,12 @@ class Board(NamedTuple):
         return [row for row in self.rows if not row.outdated]
 
     @property
+    def seeds(self) -> str:
+        """Its episodes, as whoever has played most of them has them."""
+        return str(max((row.cells["seeds"] for row in self.rows),
+                       key=lambda seeds: len(parse_seeds(seeds))))
+
+    @property
     def address(self) -> str:
         """Of its page within the site."""
         return f"environments/{quote(self.environment)}.html"

@@ -14,14 +14,15 @@ import numpy as np
 from markupsafe import Markup
 
 from eitbench._files import shipped
-from eitbench.bench.baselines import version_of
+from eitbench.bench.methods import version_of
 from eitbench.bench.records import alike, finished
+from eitbench.bench.table import NOTHING, Cell, Table, number_cell
 from eitbench.bench.text import scores_by_seed, seed_ranges
 from eitbench.report import charts
 from eitbench.report.boards import headings
 from eitbench.report.site.collect import Board, Row, Site, title_of
 from eitbench.report.site.environment import markdown
-from eitbench.report.site.tables import Cell, Table, interval_cell, scale, three, value_cell
+from eitbench.report.site.tables import interval_cell, scale, three
 from eitbench.report.templates import template
 
 
@@ -38,18 +39,25 @@ def method_page(site: Site, name: str) -> str:
 
 def _standings(standings: list[tuple[Board, Row]]) -> Table:
     """A row for each board."""
-    rows, several = [], len({row.cells["version"] for _, row in standings}) > 1
+    several = len({row.cells["version"] for _, row in standings}) > 1
+    rows = []
     for board, row in standings:
         competing = sum(other.competes for other in board.rows)
         rank = row.cells["rank"]
         link = f"../index.html#{board.anchor}" if board.is_aggregate else f"../{board.address}"
         badges = (*filter(None, row.cells["note"].split(", ")), *["outdated"] * row.outdated)
-        rows.append(([Cell(board.title, board.title.casefold(), link=link, small=board.of_class, badges=badges),
-                      *[Cell(row.cells["version"], row.cells["version"])] * several,
-                      Cell("–") if rank is None else Cell(str(rank), float(rank), small=f"of {competing}"),
-                      *(interval_cell(row, score, scale(board, score)) for score in ("error", "gain")),
-                      value_cell(row.cells["seconds_per_step"])], ""))
-    return Table("Boards", ["board", *["version"] * several, "rank", "ẽ_c", "gain", "ms/step"], rows)
+        cells: dict[str, Cell | str] = {
+            "board": Cell(board.title, board.title.casefold(), link=link, small=board.of_class,
+                          badges=badges)}
+        if several:
+            cells["version"] = row.cells["version"]
+        rows.append(cells | {
+            "rank": Cell(NOTHING) if rank is None else Cell(str(rank), float(rank),
+                                                            small=f"of {competing}"),
+            "ẽ_c": interval_cell(row, "error", scale(board, "error")),
+            "gain": interval_cell(row, "gain", scale(board, "gain")),
+            "ms/step": number_cell(row.cells["seconds_per_step"])})
+    return Table.of(rows, label="Boards", keep=list(rows[0]) if rows else ())
 
 
 def _intervals(standings: list[tuple[Board, Row]]) -> Markup:
@@ -93,14 +101,13 @@ def _episodes(record: dict[str, Any]) -> Table:
     """A row for each episode, with the scores that any of them has."""
     shown = {"error": "ẽ_c"} | headings()
     scores = {name: values for name in shown if (values := scores_by_seed(record, name))}
-    rows = []
-    for i, episode in enumerate(record["episodes"]):
-        seed = episode["seed"]
-        cells = [value_cell(values.get(seed)) for values in scores.values()]
-        rows.append(([Cell(seed, float(i)), Cell(episode["status"], episode["status"]), *cells,
-                      Cell(episode["finished"][:10], episode["finished"])], ""))
-    return Table(f"Episodes of {title_of(record)}",
-                 ["seed", "status", *(shown[name] for name in scores), "played on"], rows)
+    rows = [{
+        "seed": Cell(episode["seed"], float(i)),
+        "status": episode["status"],
+        **{shown[name]: number_cell(values.get(episode["seed"])) for name, values in scores.items()},
+        "played on": Cell(episode["finished"][:10], episode["finished"]),
+    } for i, episode in enumerate(record["episodes"])]
+    return Table.of(rows, label=f"Episodes of {title_of(record)}")
 
 
 def command(record: dict[str, Any]) -> str:

@@ -1,15 +1,15 @@
-"""Score one played episode on the truth's mesh (``docs/methods.md``, 4)."""
+"""From what an estimator said of an episode to what can be scored, on the truth's mesh
+(``docs/methods.md``, 4)."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from eitbench import scoring
-from eitbench.bench.scores import Outcome, scored
+from eitbench.bench.scores import Outcome
 from eitbench.data.episodes import truth_discretisation
 from eitbench.data.regions import region_operators
 from eitbench.envs.estimation import EstimationEnv
@@ -18,7 +18,7 @@ from eitbench.worlds.task import Estimate, Task
 
 
 @dataclass
-class Played:
+class Said:
     """What an estimator said in one episode, and what it saw."""
 
     means: np.ndarray
@@ -37,12 +37,17 @@ class Played:
     """(T, k) parameters of the flow in m/s; k = 0 where it is not asked for"""
 
     @classmethod
-    def collect(cls, task: Task, played: Iterable[tuple[int, Estimate | None, dict[str, np.ndarray], float]]) -> Played:
+    def collect(
+        cls, task: Task,
+        played: Iterable[tuple[int, Estimate | None, dict[str, np.ndarray], float]],
+    ) -> Said:
         """Take in (t, estimate, measurement, seconds) step by step."""
         means = np.full((task.n_steps, task.mesh.n_nodes), np.nan)
         variances = means.copy()
         velocities = np.tile(task.velocity.nominal if task.velocity else (), (task.n_steps, 1))
-        measured, innovations, seconds = [], {}, []
+        measured = []
+        innovations = {}
+        seconds = []
         for t, estimate, measurement, elapsed in played:
             measured.append(measurement)
             seconds.append(elapsed)
@@ -55,14 +60,15 @@ class Played:
                 if estimate.velocity is not None:
                     velocities[t - 1] = estimate.velocity
             if estimate.innovation is not None and estimate.innovation_covariance is not None:
-                # copies, as means are:
-                innovations[t + task.lag] = (np.array(estimate.innovation, dtype=float),
-                                             # arrays get reused
-                                             np.array(estimate.innovation_covariance, dtype=float))
-        voltages, currents = (np.array([m[key] for m in measured[:task.n_steps]]) for key in ("voltages", "currents"))
+                # copies, as means are: arrays get reused
+                innovations[t + task.lag] = (
+                    np.array(estimate.innovation, dtype=float),
+                    np.array(estimate.innovation_covariance, dtype=float))
+        voltages, currents = (np.array([m[key] for m in measured[:task.n_steps]])
+                              for key in ("voltages", "currents"))
         claimed = bool(np.isfinite(variances[task.warm_up:]).all())
-        return cls(means, variances if claimed else None, voltages, currents, innovations, np.array(seconds),
-                   velocities)
+        return cls(means, variances if claimed else None, voltages, currents, innovations,
+                   np.array(seconds), velocities)
 
     def fields(self) -> dict[str, np.ndarray]:
         """Means and standard deviations as float32, for pictures."""
@@ -74,39 +80,32 @@ class Played:
         return fields
 
 
-def score(env: EstimationEnv, played: Played) -> dict[str, Any]:
-    """Scores of the episode that ``env`` has just played (`eitbench.bench.scores`), and the error
-    of each scored state, as JSON-ready numbers."""
-    outcome = _outcome(env, played)
-    return {"scores": scored("estimation", outcome), "step_errors": outcome.errors.tolist()}
-
-
-def _outcome(env: EstimationEnv, played: Played) -> Outcome:
-    """What can be scored of it, on the truth's mesh."""
+def outcome_of(env: EstimationEnv, said: Said) -> Outcome:
+    """What can be scored of the episode that ``env`` has just played."""
     task = env.task
     interpolation, mass = region_operators(env.world)
     states = slice(task.warm_up, None)
     truth = env.truth()[states]
-    mean = (interpolation @ played.means[states].T).T
-    homogeneous = best_homogeneous(task.observation, task.noise, task.mesh.n_nodes, played.voltages,
-                                   played.currents, task.expected_concentration)
+    mean = (interpolation @ said.means[states].T).T
+    homogeneous = best_homogeneous(task.observation, task.noise, task.mesh.n_nodes, said.voltages,
+                                   said.currents, task.expected_concentration)
     computed = np.array([
         task.observation.voltages(estimate, current[None])[0]
-        for estimate, current in zip(played.means[states], played.currents[states], strict=True)])
+        for estimate, current in zip(said.means[states], said.currents[states], strict=True)])
     std = None
-    if played.variances is not None:
-        std = (interpolation @ np.sqrt(played.variances[states]).T).T
+    if said.variances is not None:
+        std = (interpolation @ np.sqrt(said.variances[states]).T).T
     velocity = None
     if task.velocity is not None:
-        velocity = (played.velocities[states] @ task.velocity.profiles.T,
+        velocity = (said.velocities[states] @ task.velocity.profiles.T,
                     env.true_velocity()[states], task.velocity.weights)
-    known = [played.innovations[i] for i in range(task.warm_up + 1, task.n_steps + 1)
-             if i in played.innovations]
+    known = [said.innovations[i] for i in range(task.warm_up + 1, task.n_steps + 1)
+             if i in said.innovations]
     innovations = [np.array(part) for part in zip(*known, strict=True)]
     return Outcome(
-        env.world, float(played.seconds.sum() / task.n_steps),
+        env.world, float(said.seconds.sum() / task.n_steps),
         scoring.step_errors(mean, truth, mass), mean=mean, truth=truth, mass=mass,
         points=truth_discretisation(env.world).transport.mesh.points, homogeneous=homogeneous,
-        measured=played.voltages[states], computed=computed,
+        measured=said.voltages[states], computed=computed,
         innovations=(innovations[0], innovations[1]) if known else None, std=std,
         velocity=velocity)

@@ -1,0 +1,184 @@
+"""Play methods on episodes, step by step or whole, and hand over what can be scored."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from eitbench import _check
+from eitbench.bench.methods import Method
+from eitbench.bench.outcomes import Said, outcome_of
+from eitbench.bench.scores import Outcome
+from eitbench.bench.tracks import Environment, check_track
+from eitbench.envs.estimation import EstimationEnv
+from eitbench.envs.injection import InjectionEnv
+from eitbench.worlds.registry import entry
+from eitbench.worlds.streams import randomness
+from eitbench.worlds.task import Estimate, Task
+from eitbench.worlds.world import World
+
+
+class Episode(NamedTuple):
+    """An episode that a method has played."""
+
+    outcome: Outcome
+    currents: np.ndarray
+    """(steps, L) A (A/m in 2D), injected in each step"""
+    fields: dict[str, np.ndarray]
+    """Means and standard deviations of an estimator's estimates as float32, for pictures; of a
+    policy none."""
+
+
+def environment(asked: Environment) -> EstimationEnv | InjectionEnv:
+    """Made once a process, so that its models, and what methods derive from them, are shared by all
+    its episodes; errors as `Environment.make`."""
+    return _made(asked, entry(asked.id).world)
+
+
+@lru_cache(maxsize=4)
+def _made(asked: Environment, world: World) -> EstimationEnv | InjectionEnv:
+    """Whose ``world`` is that of the id: another process may have told this one of another."""
+    return asked.make()
+
+
+def play(asked: Environment, method: Method, seed: int) -> Episode:
+    """Play one whole episode.
+
+    Raises
+    ------
+    ValueError
+        If there is no such environment, it is of another track than the method, or the method does
+        not suit it or answers wrongly.
+    """
+    check_track(asked.id, method.track)
+    env = environment(asked)
+    if isinstance(env, InjectionEnv):
+        return _injected(env, method, seed)
+    return estimated(env, method, seed)
+
+
+def estimated(env: EstimationEnv, estimator: Method, seed: int) -> Episode:
+    """What an estimator makes of one whole episode."""
+    said = Said.collect(env.task, _estimates(env, estimator, seed))
+    return Episode(outcome_of(env, said), said.currents, said.fields())
+
+
+def _injected(env: InjectionEnv, policy: Method, seed: int) -> Episode:
+    seconds = 0.0
+    errors = list[float]()
+    currents = list[np.ndarray]()
+    for _, observation, elapsed in injections(env, policy, seed):
+        seconds += elapsed
+        currents.append(observation["currents"])
+        errors += [] if env.error is None else [env.error]
+    spent = sum(bool(each.any()) for each in currents)
+    outcome = Outcome(env.core.world, seconds / env.core.length, np.array(errors), spent)
+    return Episode(outcome, np.array(currents), {})
+
+
+def injections(env: InjectionEnv, policy: Method, seed: int,
+               ) -> Iterator[tuple[int, dict[str, np.ndarray], float]]:
+    """(t of the state now seen, observation, seconds the policy took) after each of its injections
+    in one episode, the first with what it took to prepare; errors as `play`."""
+    if not policy.suits(env.rules):
+        raise ValueError(f"policy {policy.name} does not suit {env.spec.id if env.spec else env}")
+    observation, _ = env.reset(seed=seed)
+    t = env.core.first
+    # A generator knows what it was seeded with, so the policy's is seeded with a number that says
+    # nothing of the episode.
+    random = np.random.default_rng(int(randomness(seed).policy.integers(2**63)))
+    begin = time.perf_counter()
+    player = policy.make(env.rules, random, *[env.core] * policy.privileged)
+    done = False
+    while not done:
+        action = player.act(observation)
+        seconds = time.perf_counter() - begin
+        observation, _, done, _, _ = env.step(action)
+        t += 1
+        yield t, observation, seconds
+        begin = time.perf_counter()
+
+
+def estimates(env: EstimationEnv, estimator: Method, seed: int) -> Iterator[tuple[int, Estimate]]:
+    """(t, estimate of the state t ≥ 1) in one episode. The estimator sees the task and the
+    measurements; rewards and the environment itself stay here."""
+    for t, estimate, _, _ in _estimates(env, estimator, seed):
+        if estimate is not None and t >= 1:
+            yield t, estimate
+
+
+def _estimates(env: EstimationEnv, estimator: Method, seed: int,
+               ) -> Iterator[tuple[int, Estimate | None, dict[str, np.ndarray], float]]:
+    """(t = i − lag, estimate, measurement i, seconds the estimator took) at each step i."""
+    observation, _ = env.reset(seed=seed)
+    shown = (env.task, env.reveal()) if estimator.privileged else (env.task,)
+    begin = time.perf_counter()
+    player = estimator.make(*shown)
+    setup = time.perf_counter() - begin
+    silence = np.full(env.task.mesh.n_nodes, env.task.expected_concentration)
+    t = -env.task.lag
+    done = False
+    while not done:
+        t += 1
+        seen = {key: value.copy() for key, value in observation.items()}
+        begin = time.perf_counter()
+        estimate = player.update(observation["voltages"], observation["currents"])
+        seconds = time.perf_counter() - begin + setup
+        setup = 0.0
+        if estimate is None and t >= 1:
+            raise ValueError("Estimator.update must return an Estimate once a state is asked for; "
+                             f"at t = {t} it returned None")
+        if estimate is not None:
+            _check_estimate(estimate, env.task)
+            if estimate.variance is not None:
+                env.spread = np.sqrt(estimate.variance)
+        observation, _, done, _, _ = env.step(_action(env.task, estimate, silence))
+        yield t, estimate, seen, seconds
+
+
+def _action(task: Task, estimate: Estimate | None, silence: np.ndarray) -> np.ndarray:
+    """What the environment is told; the flow believed at first where an estimator says nothing of
+    it."""
+    mean = silence if estimate is None else estimate.mean
+    if task.velocity is None:
+        return mean
+    said = None if estimate is None else estimate.velocity
+    return np.concatenate([mean, task.velocity.nominal if said is None else said])
+
+
+def _check_estimate(estimate: Any, task: Task) -> None:
+    n = task.mesh.n_nodes
+    n_electrodes = task.currents.shape[1]
+    if not isinstance(estimate, Estimate):
+        raise ValueError("Estimator.update must return an Estimate or None, got "
+                         f"{type(estimate).__name__}")
+    _check.array("Estimate.mean", estimate.mean, (n,), units="mol/m³")
+    variance, innovation, covariance, velocity, velocity_variance = estimate[1:]
+    for name, value in (("velocity", velocity), ("velocity_variance", velocity_variance)):
+        if value is not None:
+            if task.velocity is None:
+                raise ValueError(f"Estimate.{name} must be None where the flow is not asked for, "
+                                 f"got {value!r}")
+            _check.array(f"Estimate.{name}", value, (task.velocity.size,))
+    if innovation is not None:
+        _check.array("Estimate.innovation", innovation, (n_electrodes,), units="V")
+    if covariance is not None:
+        _check_covariance(covariance, n_electrodes)
+    if variance is not None and not (np.shape(variance) == (n,) and np.isfinite(variance).all()
+                                     and (np.asarray(variance) >= 0).all()):
+        raise ValueError(f"Estimate.variance must be finite, ≥ 0 and of shape ({n},), got shape "
+                         f"{np.shape(variance)}")
+
+
+def _check_covariance(covariance: Any, size: int) -> None:
+    _check.array("Estimate.innovation_covariance", covariance, (size, size), units="V²")
+    given = np.asarray(covariance, float)
+    spectrum = np.linalg.eigvalsh(0.5 * given + 0.5 * given.T)
+    # νᵀS⁻¹ν could be less than none
+    if spectrum[0] <= size * np.finfo(float).eps * spectrum[-1]:
+        raise ValueError("Estimate.innovation_covariance must be positive definite, got "
+                         f"eigenvalues from {spectrum[0]:g} to {spectrum[-1]:g} V²")

@@ -1,0 +1,11 @@
+"""What a table says, for tests that look up its cells."""
+
+import pandas as pd
+
+from eitbench.bench.table import Table
+
+
+def said(table: Table) -> pd.DataFrame:
+    """All cells as plain text, under their headings."""
+    return pd.DataFrame([[cell.plain for cell in row.cells] for row in table.rows],
+                        columns=table.headings)
