@@ -125,6 +125,7 @@ def shown(table: pd.DataFrame, a: str, b: str, score: str = "error") -> Table:
     rows = []
     for _, row in table.iterrows():
         three = (row["difference"], row["low"], row["high"])
+        difference, _, interval = with_interval(*three).partition(" ")
         share = f"{100 * row['better']:.0f} %"
         if math.isfinite(row["low"]):
             share += f" ({100 * row['better_low']:.0f} to {100 * row['better_high']:.0f} %)"
@@ -134,7 +135,7 @@ def shown(table: pd.DataFrame, a: str, b: str, score: str = "error") -> Table:
             "episodes": Cell(str(row["episodes"]), float(row["episodes"])),
             f"{asked.heading} of {a}": number_cell(row["a"]),
             f"{asked.heading} of {b}": number_cell(row["b"]),
-            "difference": Cell(with_interval(*three), row["difference"],
+            "difference": Cell(difference, row["difference"], small=interval,
                                picture=Markup(charts.cell(three, -widest, widest, mark=0.0))),
             f"{a} better": Cell(share, row["better"]),
         })
