@@ -12,20 +12,8 @@ from typing import Annotated, Any
 
 import typer
 
+from eitbench.cli import options
 from eitbench.cli.maintain import cards, held_out, migrate
-from eitbench.cli.options import (
-    CORES,
-    RECORDS,
-    Backend,
-    Backends,
-    Environments,
-    InjectionId,
-    Isolate,
-    Isolation,
-    Jobs,
-    Out,
-    clear_errors,
-)
 from eitbench.cli.studies import thesis
 from eitbench.cli.trust import verify
 
@@ -80,10 +68,10 @@ def run(
              "all of ours.")] = None,
     seeds: Annotated[str | None, typer.Option(
         help="Episodes, as in dev:0-9 or test:3. Default: the suite's.")] = None,
-    isolate: Isolate = Isolation.others,
-    jobs: Jobs = CORES,
-    backend: Backends = Backend.loky,
-    out: Out = Path("results"),
+    isolate: options.Isolate = options.Isolation.others,
+    jobs: options.Jobs = options.CORES,
+    backend: options.Backends = options.Backend.loky,
+    out: options.Out = Path("results"),
 ) -> None:
     """Run baselines on environments, print the table and write the page.
 
@@ -93,7 +81,7 @@ def run(
     from eitbench.bench import suites
     from eitbench.bench.run import run_jobs
     from eitbench.bench.store import EpisodeStore
-    with clear_errors():
+    with options.clear_errors():
         todo = suites.jobs(suite, env or [], baseline or [], _numbers(seeds), isolate=isolate)
         run_jobs(todo, EpisodeStore(out), n_jobs=jobs, backend=backend, command=_command())
         _report(out)
@@ -103,8 +91,8 @@ def run(
 def bank(
     env: Annotated[str, typer.Option(help="Environment id.")] = "eitbench/Pipe2D-v0",
     seeds: Annotated[str, typer.Option(help="Episodes, such as train:0-999.")] = "train:0-99",
-    jobs: Jobs = CORES,
-    backend: Backends = Backend.loky,
+    jobs: options.Jobs = options.CORES,
+    backend: options.Backends = options.Backend.loky,
 ) -> None:
     """Simulate many episodes ahead of training and keep what an environment needs of them.
 
@@ -116,7 +104,7 @@ def bank(
     from eitbench.data.seeds import parse_seeds
     from eitbench.data.store import folder
     from eitbench.worlds.registry import entry
-    with clear_errors():
+    with options.clear_errors():
         numbers = parse_seeds(seeds)
         world = entry(env).world
     place = folder(world)
@@ -132,14 +120,14 @@ def bank(
     if missing * each > free:
         raise typer.BadParameter(f"seeds need {missing * each / 1e9:.1f} GB more, and "
                                  f"{free / 1e9:.1f} GB are free")
-    with clear_errors():
+    with options.clear_errors():
         made = fill(world, numbers, n_jobs=jobs, backend=backend)
     typer.echo(f"{made} simulated, {len(numbers) - made} were there")
 
 
 @app.command()
 def train(
-    env: InjectionId,
+    env: options.InjectionId,
     algo: Annotated[Algorithm, typer.Option(
         help="Algorithm of stable-baselines3 or sb3-contrib.")] = Algorithm.ppo,
     config: Annotated[Path, typer.Option(
@@ -157,7 +145,7 @@ def train(
     config.json, monitor.csv, evaluations.npz (scores on dev episodes) and logs for TensorBoard.
     """
     from dataclasses import replace
-    with clear_errors():
+    with options.clear_errors():
         from eitbench.rl import training
         asked = training.read_config(config)
         if steps is not None:
@@ -169,7 +157,7 @@ def train(
 
 @app.command()
 def policies(
-    env: InjectionId,
+    env: options.InjectionId,
     policy: Annotated[list[str] | None, typer.Option(
         help="Name of one of ours, the path of your own .py file, or of an agent's model.zip; may "
              "be repeated. Default: all of ours.")] = None,
@@ -177,10 +165,10 @@ def policies(
         help="Episodes, such as dev:0-49. Default: those of the boards.")] = None,
     estimator: Annotated[str, typer.Option(
         help="full: the exact filter, for scores; reduced: that of training.")] = "full",
-    isolate: Isolate = Isolation.others,
-    jobs: Jobs = CORES,
-    backend: Backends = Backend.loky,
-    out: Out = Path("results"),
+    isolate: options.Isolate = options.Isolation.others,
+    jobs: options.Jobs = options.CORES,
+    backend: options.Backends = options.Backend.loky,
+    out: options.Out = Path("results"),
     records: Annotated[Path | None, typer.Option(
         exists=True, file_okay=False,
         help="Folder of records, such as leaderboards/results: what they hold of these episodes is "
@@ -194,7 +182,7 @@ def policies(
     from eitbench.bench.store import EpisodeStore, results_in
     from eitbench.bench.suites import policy_jobs
     from eitbench.report.policy_table import policy_rows, policy_table
-    with clear_errors():
+    with options.clear_errors():
         todo = policy_jobs([env], policy or [], _numbers(seeds), estimator, isolate=isolate)
         before = results_in(records) if records else []
         store = EpisodeStore(out)
@@ -208,7 +196,7 @@ def policies(
 
 @app.command()
 def submit(
-    env: Environments = None,
+    env: options.Environments = None,
     baseline: Annotated[str | None, typer.Option(
         help="Name of one of ours, or the path of your own .py file.")] = None,
     policy: Annotated[str | None, typer.Option(
@@ -218,11 +206,11 @@ def submit(
         help="Test episodes, as in test:0-9. Default: those of the boards.")] = None,
     official: Annotated[bool, typer.Option(
         "--official", help="For maintainers: a run of theirs.")] = False,
-    isolate: Isolate = Isolation.others,
-    jobs: Jobs = CORES,
-    backend: Backends = Backend.loky,
-    out: Out = Path("results"),
-    to: Annotated[Path, typer.Option(help="Folder of the records.")] = RECORDS,
+    isolate: options.Isolate = options.Isolation.others,
+    jobs: options.Jobs = options.CORES,
+    backend: options.Backends = options.Backend.loky,
+    out: options.Out = Path("results"),
+    to: Annotated[Path, typer.Option(help="Folder of the records.")] = options.RECORDS,
 ) -> None:
     """Play the test episodes with one baseline or policy, or all of ours, and write records for the
     leaderboards.
@@ -232,7 +220,7 @@ def submit(
     from eitbench.bench.records import read_record
     from eitbench.bench.store import EpisodeStore
     from eitbench.bench.submit import submit
-    with clear_errors():
+    with options.clear_errors():
         if baseline and policy:
             raise ValueError("one of --baseline and --policy may be given, got both")
         for path in submit(baseline or policy, env or [], _numbers(seeds), EpisodeStore(out), to,
@@ -252,21 +240,21 @@ app.command()(cards)
 
 @app.command()
 def leaderboard(
-    out: Out = Path("results"),
+    out: options.Out = Path("results"),
     records: Annotated[Path | None, typer.Option(
         help="Folder of the leaderboards' records, such as leaderboards/results: render "
              "leaderboard.csv, leaderboard.md and the pages site/ beside it instead.")] = None,
 ) -> None:
     """Print the table and write the page again from the results stored in a folder."""
     if records is None:
-        with clear_errors():
+        with options.clear_errors():
             return _report(out)
     from eitbench._files import write_atomically
     from eitbench.bench.records import read_records
     from eitbench.report.boards import boards, render
     from eitbench.report.site import read_media, render_site, write_site
     beside = records.parent
-    with clear_errors():
+    with options.clear_errors():
         if not records.is_dir():
             raise ValueError(f"records must be a folder that exists, got {records}")
         found = read_records(records)
@@ -283,7 +271,7 @@ def compare(
     a: Annotated[str, typer.Argument(
         help="A record's file, or METHOD or METHOD@VERSION among the records.")],
     b: Annotated[str, typer.Argument(help="The same of the other.")],
-    records: Annotated[Path, typer.Option(help="Folder of the records.")] = RECORDS,
+    records: Annotated[Path, typer.Option(help="Folder of the records.")] = options.RECORDS,
     score: Annotated[str, typer.Option(help="By which score.")] = "error",
     html: Annotated[Path | None, typer.Option(help="Write a page too.")] = None,
 ) -> None:
@@ -291,7 +279,7 @@ def compare(
     better."""
     from eitbench._files import write_atomically
     from eitbench.report import compare as comparison
-    with clear_errors():
+    with options.clear_errors():
         ours, theirs = (comparison.find(name, records) for name in (a, b))
         table = comparison.compare(ours, theirs, score)
     names = comparison.names(ours[0], theirs[0])
@@ -319,7 +307,7 @@ def render(
     """Draw an episode: truth, estimate, its spread, electrodes and the injected pair."""
     from eitbench.bench.tracks import track_of
     from eitbench.report.animate import animate
-    with clear_errors():
+    with options.clear_errors():
         if track_of(env) == "injection" and policy is None:
             raise ValueError(f"policy must be given for {env}, which asks for injections")
         typer.echo(f"wrote {animate(env, policy or baseline, seed, step, out, every=every)}")
@@ -332,11 +320,11 @@ def reproduce(
     seeds: Annotated[str | None, typer.Option(
         help="Episodes; pictures show the first, sweeps average over all. Default: dev:0-1; of the "
              "injection those of the boards.")] = None,
-    jobs: Jobs = CORES,
-    out: Out = Path("results/figures"),
+    jobs: options.Jobs = options.CORES,
+    out: options.Out = Path("results/figures"),
 ) -> None:
     """Draw a figure of the thesis from our data, and say what agrees and what differs."""
-    with clear_errors():
+    with options.clear_errors():
         path, remark = thesis().FIGURES[name.value](_numbers(seeds), jobs, out)
     typer.echo(f"wrote {path}\n{remark}")
 

@@ -7,17 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from eitbench.cli.options import (
-    CORES,
-    RECORDS,
-    Backend,
-    Backends,
-    Isolate,
-    Isolation,
-    Jobs,
-    clear_errors,
-    say_differences,
-)
+from eitbench.cli import options
 
 
 def verify(
@@ -30,7 +20,7 @@ def verify(
         min=0, help="By which they are drawn. Default: any.")] = None,
     tolerance: Annotated[float, typer.Option(
         min=0.0, help="Relative difference of scores that is none.")] = 1e-6,
-    isolate: Isolate = Isolation.always,
+    isolate: options.Isolate = options.Isolation.always,
     held_out: Annotated[int, typer.Option(
         "--held-out", min=0, help="For maintainers: play so many held-out episodes too, and "
                                   "compare the gains.")] = 0,
@@ -39,11 +29,11 @@ def verify(
     every: Annotated[bool, typer.Option(
         "--all", help="Every official record of a folder; resumes.")] = False,
     records: Annotated[Path, typer.Option(
-        help="With --all: the folder of the records.")] = RECORDS,
+        help="With --all: the folder of the records.")] = options.RECORDS,
     env: Annotated[list[str] | None, typer.Option(
         help="With --all: only this environment; may be repeated.")] = None,
-    jobs: Jobs = CORES,
-    backend: Backends = Backend.loky,
+    jobs: options.Jobs = options.CORES,
+    backend: options.Backends = options.Backend.loky,
     out: Annotated[Path, typer.Option(
         "--out", "-o", help="With --all: where what came out is kept.")] = Path("results/verify"),
 ) -> None:
@@ -66,7 +56,7 @@ def verify(
     from eitbench.bench import held_out as beyond
     from eitbench.bench import verify as again
     from eitbench.bench.records import read_record
-    with clear_errors():
+    with options.clear_errors():
         if baseline and policy:
             raise ValueError("only one of --baseline and --policy may be given")
         if (held_out > 0) != (salt_file is not None):
@@ -95,14 +85,14 @@ def verify(
                            f"{beyond.hash_of(salt)}\n\n{table}\n")
     except ValueError as error:
         differences = [str(error)]
-    say_differences(differences)
+    options.say_differences(differences)
     typer.echo(f"{record.name}: what was played again is as it says")
 
 
 def _verify_all(folder: Path, environments: list[str], out: Path, tolerance: float,
                 **how: Any) -> None:
     from eitbench.bench.replay import by_environment, differing, official_records, verify_all
-    with clear_errors():
+    with options.clear_errors():
         rows = verify_all(official_records(folder, environments), out, **how)
     typer.echo(by_environment(rows, tolerance))
-    say_differences(differing(rows, tolerance))
+    options.say_differences(differing(rows, tolerance))
