@@ -1,9 +1,15 @@
-"""Linearised Kalman filter (thesis 5.1.2): linear about the first frame's ĉ_bh, parameters of Table 5.1."""
+"""Linearised Kalman filter (thesis 5.1.2, Table 5.1): linear about the first frame's ĉ_bh."""
 
 import numpy as np
 
 from eitbench import Estimate, Task
-from eitbench.estimation import Filtered, FilterStep, FirstFrame, LinearisedObservations, starting_filter
+from eitbench.estimation import (
+    Filtered,
+    FilterStep,
+    FirstFrame,
+    LinearisedObservations,
+    starting_filter,
+)
 
 
 class Estimator:
@@ -18,7 +24,8 @@ class Estimator:
             if not self.first.add(voltages, currents):
                 return Estimate(self.first.mean)
             self.filter = starting_filter(self.task.transport, self.task.prior, self.first.c_bh)
-            self.observations = LinearisedObservations(self.task.observation, self.task.noise, self.filter.mean)
+            self.observations = LinearisedObservations(
+                self.task.observation, self.task.noise, self.filter.mean)
             for earlier in self.first.measurements[:-1]:
                 self.assimilate(*earlier)
         step = self.assimilate(voltages, currents)
