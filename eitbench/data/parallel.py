@@ -26,14 +26,8 @@ def in_parallel(function: Callable[..., Result], arguments: Sequence[tuple], n_j
 
     ``ray`` and ``dask`` give the work to the cluster that $RAY_ADDRESS or $DASK_SCHEDULER_ADDRESS
     names, and without one to ``n_jobs`` processes here. When one of their processes is killed
-    another takes up its work.
-
-    Raises
-    ------
-    ValueError
-        If there is no such backend, or what it needs is not installed.
-    WorkerLost
-        If a process was killed and nobody took up its work.
+    another takes up its work; else it is a `WorkerLost`. ``ValueError`` if there is no such
+    backend, or what it needs is not installed.
     """
     if backend not in BACKENDS:
         raise ValueError(f"backend must be one of {', '.join(BACKENDS)}, got {backend!r}")
