@@ -1,7 +1,5 @@
-"""Extended Kalman filter: the observation is linearised anew about each prediction.
-
-All else is as in the Kalman filter.
-"""
+"""Extended Kalman filter: the observation is linearised anew about each prediction; else as the \
+Kalman filter."""
 
 import numpy as np
 

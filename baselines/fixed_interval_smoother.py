@@ -1,4 +1,5 @@
-"""Fixed-interval Kalman smoother (thesis 5.1.2): the Kalman filter, then back over the record."""
+"""Fixed-interval Kalman smoother (thesis 5.1.2): the Kalman filter, and then back over the whole \
+record."""
 
 import numpy as np
 

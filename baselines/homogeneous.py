@@ -1,7 +1,5 @@
-"""Best homogeneous estimate: one constant, fitted to all complete frames so far.
-
-The floor on every board.
-"""
+"""Best homogeneous estimate: one constant, fitted to all complete frames so far. The floor on \
+every board."""
 
 import numpy as np
 

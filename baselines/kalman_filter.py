@@ -1,4 +1,5 @@
-"""Linearised Kalman filter (thesis 5.1.2, Table 5.1): linear about the first frame's ĉ_bh."""
+"""Linearised Kalman filter (thesis 5.1.2): linear about the first frame's ĉ_bh, parameters of \
+Table 5.1."""
 
 import numpy as np
 

@@ -1,7 +1,8 @@
-"""Maximum a posteriori: nonlinear Gauss–Newton over all injections so far.
+"""Maximum a posteriori: nonlinear Gauss–Newton over all injections so far, with the Kalman \
+filter's own prior.
 
-With the Kalman filter's own prior, for targets that stand still: what the linearised filter
-approximates, and is to be compared with (thesis 7.2).
+For targets that stand still: what the linearised filter approximates, and is to be compared with \
+(thesis 7.2).
 """
 
 import numpy as np

@@ -1,7 +1,5 @@
-"""Best fixed currents: one for each electrode, the same at every step.
-
-The best found on training episodes.
-"""
+"""Best fixed currents: one for each electrode, the same at every step, the best found on training \
+episodes."""
 
 from typing import Any
 

@@ -1,7 +1,5 @@
-"""Best cycle: up to four pairs in turn, the best found on training episodes.
-
-A budget is spread evenly.
-"""
+"""Best cycle: up to four pairs in turn, the best of a search on training episodes; a budget is \
+spread evenly."""
 
 from itertools import cycle
 from typing import Any

@@ -1,7 +1,5 @@
-"""Best fixed pair: the same at every step, the best of all on training episodes.
-
-A budget is spread evenly.
-"""
+"""Best fixed pair: the same one at every step, the best of all on training episodes; a budget is \
+spread evenly."""
 
 from typing import Any
 

@@ -1,4 +1,5 @@
-"""Fault-aware look-ahead: beam search over the next three injections, by electrodes in no doubt."""
+"""Fault-aware look-ahead: beam search over the next three injections, among the electrodes that \
+are not in doubt."""
 
 from typing import Any
 
