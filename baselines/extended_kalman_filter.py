@@ -1,4 +1,5 @@
-"""Extended Kalman filter: the observation is linearised anew about each prediction; else as the Kalman filter."""
+"""Extended Kalman filter: the observation is linearised anew about each prediction; else as the \
+Kalman filter."""
 
 import numpy as np
 
@@ -25,5 +26,6 @@ class Estimator:
 
     def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> FilterStep | Filtered:
         self.filter.predict()
-        observation = linearised(self.task.observation, self.task.noise, self.filter.mean, voltages, currents)
-        return self.filter.update(observation)
+        task = self.task
+        return self.filter.update(
+            linearised(task.observation, task.noise, self.filter.mean, voltages, currents))

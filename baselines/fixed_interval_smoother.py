@@ -1,9 +1,15 @@
-"""Fixed-interval Kalman smoother (thesis 5.1.2): the Kalman filter, and then back over the whole record."""
+"""Fixed-interval Kalman smoother (thesis 5.1.2): the Kalman filter, and then back over the whole \
+record."""
 
 import numpy as np
 
 from eitbench import Estimate, Task
-from eitbench.estimation import FirstFrame, LinearisedObservations, fixed_interval_smoother, table_5_1
+from eitbench.estimation import (
+    FirstFrame,
+    LinearisedObservations,
+    fixed_interval_smoother,
+    table_5_1,
+)
 
 
 class Estimator:
@@ -29,5 +35,6 @@ class Estimator:
         for measurement in self.record[:first.length]:
             first.add(*measurement)
         start = table_5_1(self.task.transport, self.task.prior, first.c_bh)
-        observations = LinearisedObservations(self.task.observation, self.task.noise, start.mean)
-        return fixed_interval_smoother(start, [observations(*measurement) for measurement in self.record])
+        linear = LinearisedObservations(self.task.observation, self.task.noise, start.mean)
+        observations = [linear(*measurement) for measurement in self.record]
+        return fixed_interval_smoother(start, observations)

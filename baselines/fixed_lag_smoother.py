@@ -3,7 +3,13 @@
 import numpy as np
 
 from eitbench import Estimate, Task
-from eitbench.estimation import FilterStep, FirstFrame, LinearisedObservations, smoothed_state, table_5_1
+from eitbench.estimation import (
+    FilterStep,
+    FirstFrame,
+    LinearisedObservations,
+    smoothed_state,
+    table_5_1,
+)
 
 
 class Estimator:
@@ -16,20 +22,25 @@ class Estimator:
         self.asked_for = -task.lag
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
+        task = self.task
         self.asked_for += 1
-        if self.asked_for + self.task.lag <= self.task.n_steps:  # else the record has ended, and the lag shrinks
+        # Else the record has ended, and the lag shrinks.
+        if self.asked_for + task.lag <= task.n_steps:
             if not self.first.complete:
                 if not self.first.add(voltages, currents):
                     return Estimate(self.first.mean)
-                self.filter = table_5_1(self.task.transport, self.task.prior, self.first.c_bh)
-                self.observations = LinearisedObservations(self.task.observation, self.task.noise, self.filter.mean)
+                self.filter = table_5_1(task.transport, task.prior, self.first.c_bh)
+                self.observations = LinearisedObservations(
+                    task.observation, task.noise, self.filter.mean)
                 for earlier in self.first.measurements[:-1]:
                     self.assimilate(*earlier)
             self.assimilate(voltages, currents)
         if self.asked_for < 1:
             return None
-        return Estimate(*smoothed_state(self.filter, [step for step in self.steps if step.time >= self.asked_for]))
+        later = [step for step in self.steps if step.time >= self.asked_for]
+        return Estimate(*smoothed_state(self.filter, later))
 
     def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> None:
         self.filter.predict()
-        self.steps = [*self.steps[-self.task.lag:], self.filter.update(self.observations(voltages, currents))]
+        step = self.filter.update(self.observations(voltages, currents))
+        self.steps = [*self.steps[-self.task.lag:], step]

@@ -1,8 +1,12 @@
-"""Stationary Gauss–Newton (thesis 5.11): each frame of 16 injections is taken for a target that stands still.
+"""Stationary Gauss–Newton (thesis 5.11): each frame of 16 injections is taken for a target that \
+stands still.
 
-When filtering, the frame is the latest 16 injections; when smoothing, it is the thesis' own: each state takes the image
-of the frame that contains it (Fig. 5.6). ALPHA was tuned once, on stationary targets from the training seeds, by
-`studies/tune_gauss_newton.py`, whose rule is the smallest mean error on a grid of two values an octave.
+When filtering, the frame is the latest 16 injections; when smoothing, it is the thesis' own: each \
+state takes the image
+of the frame that contains it (Fig. 5.6). ALPHA was tuned once, on stationary targets from the \
+training seeds, by
+`studies/tune_gauss_newton.py`, whose rule is the smallest mean error on a grid of two values an \
+octave.
 """
 
 import numpy as np
@@ -11,12 +15,13 @@ from eitbench import Estimate, Task
 from eitbench.estimation import best_homogeneous, gauss_newton
 from eitbench.numerics.fem import stiffness_matrix
 
-ALPHA = 0.177  # 1/(mol/m³): weighs the gradient of c/(1 mol/m³) against voltages in noise standard deviations
+ALPHA = 0.177
+"""1/(mol/m³): weighs the gradient of c/(1 mol/m³) against voltages in noise standard deviations"""
 
 
 class Estimator:
     boards = ("filter", "smoothing")
-    parameters = {"alpha": ALPHA}  # noqa: RUF012 (a plain dict is what a record stores)
+    parameters = {"alpha": ALPHA}  # noqa: RUF012 (as a record has it)
 
     def __init__(self, task: Task) -> None:
         self.task = task
@@ -44,9 +49,10 @@ class Estimator:
         """The stationary image of measurements begin + 1 … end."""
         if end not in self.images:
             task = self.task
-            voltages, currents = np.array(self.voltages[begin:end]), np.array(self.currents[begin:end])
-            c_bh = best_homogeneous(task.observation, task.noise, task.mesh.n_nodes, voltages, currents,
+            n = task.mesh.n_nodes
+            V, I = np.array(self.voltages[begin:end]), np.array(self.currents[begin:end])
+            c_bh = best_homogeneous(task.observation, task.noise, n, V, I,
                                     task.expected_concentration)
-            self.images = {end: gauss_newton(task.observation, voltages, currents, task.noise.std(voltages),
-                                             self.penalty, np.full(task.mesh.n_nodes, c_bh))}
+            self.images = {end: gauss_newton(task.observation, V, I, task.noise.std(V),
+                                             self.penalty, np.full(n, c_bh))}
         return self.images[end]

@@ -1,4 +1,5 @@
-"""Best homogeneous estimate: one constant, fitted to all complete frames so far. The floor on every board."""
+"""Best homogeneous estimate: one constant, fitted to all complete frames so far. The floor on \
+every board."""
 
 import numpy as np
 
@@ -16,10 +17,11 @@ class Estimator:
         self.c_bh = task.expected_concentration
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate:
-        task, frame = self.task, len(self.task.currents)
+        task = self.task
+        n = task.mesh.n_nodes
         if len(self.record) < task.n_steps:
             self.record.append((voltages, currents))
-            if len(self.record) % frame == 0 or len(self.record) == task.n_steps:
+            if len(self.record) % len(task.currents) == 0 or len(self.record) == task.n_steps:
                 V, I = (np.array(part) for part in zip(*self.record, strict=True))
-                self.c_bh = best_homogeneous(task.observation, task.noise, task.mesh.n_nodes, V, I, self.c_bh)
-        return Estimate(np.full(task.mesh.n_nodes, self.c_bh))
+                self.c_bh = best_homogeneous(task.observation, task.noise, n, V, I, self.c_bh)
+        return Estimate(np.full(n, self.c_bh))

@@ -1,20 +1,28 @@
 """Joint extended Kalman filter (thesis ch. 6): concentration and velocity parameters in one state.
 
-The flow is updated with every injection from the first frame on. Its axial velocity is kept between 0.05 and 4 times
-the one believed at first, everywhere across the pipe: fluid does not flow back, and an estimate that runs away returns.
+The flow is updated with every injection from the first frame on. Its axial velocity is kept \
+between 0.05 and 4 times
+the one believed at first, everywhere across the pipe: fluid does not flow back, and an estimate \
+that runs away returns.
 """
 
 import numpy as np
 
 from eitbench import Estimate, Task
-from eitbench.estimation import FirstFrame, JointFilter, JointStep, initial_covariance, linearised
+from eitbench.estimation import (
+    FirstFrame,
+    JointFilter,
+    JointStep,
+    initial_covariance,
+    linearised,
+)
 
 BOUNDS = (0.05, 4.0)
 
 
 class Estimator:
     boards = ("filter",)
-    parameters = {"bounds": list(BOUNDS)}  # noqa: RUF012 (a plain dict is what a record stores)
+    parameters = {"bounds": list(BOUNDS)}  # noqa: RUF012 (as a record has it)
 
     def __init__(self, task: Task) -> None:
         self.task = task
@@ -36,17 +44,22 @@ class Estimator:
                         step.parameters, step.parameter_covariance.diagonal())
 
     def start(self, c_bh: float) -> JointFilter:
-        transport, prior, flow = self.task.transport, self.task.prior, self.task.velocity
+        task = self.task
+        prior = task.prior
+        flow = task.velocity
         assert flow is not None
+        evolution = task.transport.evolution_model()
         return JointFilter(
-            self.task.transport_at, flow.directions,
-            mean=self.first.mean, covariance=c_bh**2 * initial_covariance(transport.mesh, prior),
-            parameters=np.array(flow.nominal), parameter_covariance=np.diag(np.square(flow.initial_std)),
+            task.transport_at, flow.directions, mean=self.first.mean,
+            covariance=c_bh**2 * initial_covariance(task.transport.mesh, prior),
+            parameters=np.array(flow.nominal),
+            parameter_covariance=np.diag(np.square(flow.initial_std)),
             walk_std=np.array(flow.walk_std), inflow=c_bh, inflow_std=prior.inflow_std * c_bh,
-            nodal_noise=transport.evolution_model().state_noise_covariance(0.0, (prior.nodal_std * c_bh)**2),
+            nodal_noise=evolution.state_noise_covariance(0.0, (prior.nodal_std * c_bh)**2),
             profiles=flow.profiles, bounds=BOUNDS)
 
     def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> JointStep:
         self.filter.predict()
-        return self.filter.update(linearised(self.task.observation, self.task.noise, self.filter.concentration,
-                                             voltages, currents))
+        task = self.task
+        return self.filter.update(
+            linearised(task.observation, task.noise, self.filter.concentration, voltages, currents))

@@ -1,9 +1,16 @@
-"""Linearised Kalman filter (thesis 5.1.2): linear about the first frame's ĉ_bh, parameters of Table 5.1."""
+"""Linearised Kalman filter (thesis 5.1.2): linear about the first frame's ĉ_bh, parameters of \
+Table 5.1."""
 
 import numpy as np
 
 from eitbench import Estimate, Task
-from eitbench.estimation import Filtered, FilterStep, FirstFrame, LinearisedObservations, starting_filter
+from eitbench.estimation import (
+    Filtered,
+    FilterStep,
+    FirstFrame,
+    LinearisedObservations,
+    starting_filter,
+)
 
 
 class Estimator:
@@ -18,7 +25,8 @@ class Estimator:
             if not self.first.add(voltages, currents):
                 return Estimate(self.first.mean)
             self.filter = starting_filter(self.task.transport, self.task.prior, self.first.c_bh)
-            self.observations = LinearisedObservations(self.task.observation, self.task.noise, self.filter.mean)
+            self.observations = LinearisedObservations(
+                self.task.observation, self.task.noise, self.filter.mean)
             for earlier in self.first.measurements[:-1]:
                 self.assimilate(*earlier)
         step = self.assimilate(voltages, currents)

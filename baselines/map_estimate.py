@@ -1,6 +1,8 @@
-"""Maximum a posteriori: nonlinear Gauss–Newton over all injections so far, with the Kalman filter's own prior.
+"""Maximum a posteriori: nonlinear Gauss–Newton over all injections so far, with the Kalman \
+filter's own prior.
 
-For targets that stand still: what the linearised filter approximates, and is to be compared with (thesis 7.2).
+For targets that stand still: what the linearised filter approximates, and is to be compared with \
+(thesis 7.2).
 """
 
 import numpy as np
@@ -28,7 +30,8 @@ class Estimator:
         if not self.first.complete:
             if not self.first.add(voltages, currents):
                 return Estimate(self.first.mean)
-            self.penalty = np.linalg.inv(self.first.c_bh**2 * initial_covariance(task.mesh, task.prior))
+            covariance = self.first.c_bh**2 * initial_covariance(task.mesh, task.prior)
+            self.penalty = np.linalg.inv(covariance)
             self.deviation = np.zeros(task.mesh.n_nodes)
         V, I = (np.array(part) for part in zip(*self.measurements, strict=True))
         model = Deviations(task.observation, self.first.mean)
@@ -37,10 +40,11 @@ class Estimator:
 
 
 class Deviations:
-    """Voltages by the deviation from the prior's mean, since `gauss_newton` draws its unknown towards zero."""
+    """Voltages by the deviation from the prior's mean: `gauss_newton` draws towards zero."""
 
     def __init__(self, observation, mean: np.ndarray) -> None:
-        self.observation, self.mean = observation, mean
+        self.observation = observation
+        self.mean = mean
 
     def voltages(self, deviation: np.ndarray, currents: np.ndarray) -> np.ndarray:
         return self.observation.voltages(self.mean + deviation, currents)

@@ -1,6 +1,8 @@
-"""Persistence: the stationary image of the last complete frame, held until the next frame is complete.
+"""Persistence: the stationary image of the last complete frame, held until the next frame is \
+complete.
 
-Where estimates are asked for later it says what it would have said at the time: the floor for those who look back.
+Where estimates are asked for later it says what it would have said at the time: the floor for \
+those who look back.
 """
 
 import numpy as np
@@ -15,7 +17,7 @@ ALPHA = 0.177  # that of gauss_newton.py
 class Estimator:
     boards = ("filter", "fixed-lag", "smoothing")
     role = "floor"
-    parameters = {"alpha": ALPHA}  # noqa: RUF012 (a plain dict is what a record stores)
+    parameters = {"alpha": ALPHA}  # noqa: RUF012 (as a record has it)
 
     def __init__(self, task: Task) -> None:
         self.task = task
@@ -28,13 +30,16 @@ class Estimator:
         self.asked_for += 1
         if len(self.held) <= self.task.n_steps:
             self.frame.append((voltages, currents))
-            self.held.append(self.image() if len(self.frame) == len(self.task.currents) else self.held[-1])
+            is_complete = len(self.frame) == len(self.task.currents)
+            self.held.append(self.image() if is_complete else self.held[-1])
         return Estimate(self.held[self.asked_for]) if self.asked_for >= 1 else None
 
     def image(self) -> np.ndarray:
         """Of the frame, which begins anew."""
         V, I = (np.array(part) for part in zip(*self.frame, strict=True))
-        noise, model = self.task.noise, self.task.observation
-        c_bh = best_homogeneous(model, noise, len(self.held[0]), V, I, self.task.expected_concentration)
         self.frame = []
-        return gauss_newton(model, V, I, noise.std(V), self.penalty, np.full(len(self.held[0]), c_bh))
+        task = self.task
+        n = task.mesh.n_nodes
+        c_bh = best_homogeneous(task.observation, task.noise, n, V, I, task.expected_concentration)
+        return gauss_newton(task.observation, V, I, task.noise.std(V), self.penalty,
+                            np.full(n, c_bh))

@@ -1,6 +1,8 @@
-"""Smoother with the true flow: what the linearised fixed-interval smoother reaches that is told how the fluid moves.
+"""Smoother with the true flow: what the linearised fixed-interval smoother reaches that is told \
+how the fluid moves.
 
-It is shown the flow and the whole record of the episode, which is more than anyone on a board is given. It is no bound:
+It is shown the flow and the whole record of the episode, which is more than anyone on a board is \
+given. It is no bound:
 where the linearisation about the first frame costs more than the future teaches, others do better.
 """
 
@@ -26,7 +28,8 @@ class Estimator:
     privileged = True
 
     def __init__(self, task: Task, revealed) -> None:
-        first, record = FirstFrame(task), list(zip(revealed.voltages, revealed.currents, strict=True))
+        first = FirstFrame(task)
+        record = list(zip(revealed.voltages, revealed.currents, strict=True))
         for measurement in record[:first.length]:
             first.add(*measurement)
         flow = revealed.transport(1)
@@ -35,28 +38,35 @@ class Estimator:
                  else ChangingFlow(task, revealed.transport, first.c_bh))
         observations = LinearisedObservations(task.observation, task.noise, first.mean)
         self.means = smoothed_means(start, [observations(*measurement) for measurement in record])
-        self.velocities = [None] * task.n_steps if task.velocity is None else closest(task.velocity, revealed.velocity)
+        self.velocities = ([None] * task.n_steps if task.velocity is None
+                           else closest(task.velocity, revealed.velocity))
         self.t = -task.lag
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
         self.t += 1
-        return None if self.t < 1 else Estimate(self.means[self.t - 1], velocity=self.velocities[self.t - 1])
+        if self.t < 1:
+            return None
+        return Estimate(self.means[self.t - 1], velocity=self.velocities[self.t - 1])
 
 
 class ChangingFlow(DenseKalmanFilter):
-    """The filter of Table 5.1 in a flow that is another one at each step; of its noise the nodal part is that of the
-    flow believed at first, as in `JointFilter`."""
+    """The filter of Table 5.1 in a flow that is another one at each step; of its noise the nodal
+    part is that of the flow believed at first, as in `JointFilter`."""
 
     def __init__(self, task: Task, transport_at, c_bh: float) -> None:
         prior = task.prior
-        super().__init__(np.full(task.mesh.n_nodes, c_bh), c_bh**2 * initial_covariance(task.mesh, prior))
-        self.transports, self.level = map(transport_at, count(1)), c_bh
-        self.initial, self.inflow_std = self.covariance.copy(), c_bh * prior.inflow_std
+        super().__init__(np.full(task.mesh.n_nodes, c_bh),
+                         c_bh**2 * initial_covariance(task.mesh, prior))
+        self.transports = map(transport_at, count(1))
+        self.level = c_bh
+        self.initial = self.covariance.copy()
+        self.inflow_std = c_bh * prior.inflow_std
         self.nodal = task.evolution.state_noise_covariance(0.0, (c_bh * prior.nodal_std)**2)
 
     def predict(self) -> None:  # type: ignore[override]
         self.transition, Y = next(self.transports).transition()
-        self.forcing, Y = self.level * Y.sum(axis=1), self.inflow_std * Y
+        self.forcing = self.level * Y.sum(axis=1)
+        Y = self.inflow_std * Y
         self.apply_noise = partial(self.noise, Y)
         super().predict(self.transition, self.forcing, Y @ Y.T + self.nodal)
 
@@ -69,5 +79,5 @@ class ChangingFlow(DenseKalmanFilter):
 
 def closest(model, velocity: np.ndarray) -> np.ndarray:
     """(T, k) parameters of the flow that come closest to the true profiles (T, p)."""
-    root = np.sqrt(model.weights)
-    return np.linalg.lstsq(root[:, None] * model.profiles, root[:, None] * velocity.T, rcond=None)[0].T
+    root = np.sqrt(model.weights)[:, None]
+    return np.linalg.lstsq(root * model.profiles, root * velocity.T, rcond=None)[0].T

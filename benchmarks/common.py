@@ -149,8 +149,7 @@ class Row:
         parsed = re.fullmatch(r"([≤≥]) (\d[\d.,]*(?:/\d+)?)(×|× faster| s|/s|)", self.target)
         if parsed is None:
             raise ValueError("target must read like '≤ 1.6×', '≤ 1/3', '≥ 5× faster', '≤ 0.5 s' or "
-                             "'≥ 60,000/s', "
-                             f"got {self.target!r}")
+                             f"'≥ 60,000/s', got {self.target!r}")
         sense, number, kind = parsed.groups()
         if kind in (" s", "/s"):
             value = self.ours if kind == " s" else 1 / self.ours
@@ -210,7 +209,8 @@ def ceilings() -> Ceilings:
     """Measured once in each process that asks."""
     rng = np.random.default_rng(0)
     A, B = rng.random((2, 1000, 1000))
-    product, large = np.empty_like(A), rng.random(25_000_000)
+    product = np.empty_like(A)
+    large = rng.random(25_000_000)
     copied = np.empty_like(large)
 
     def calls() -> None:
@@ -238,8 +238,7 @@ def machine() -> dict[str, str]:
     model = re.search(r"model name\s*:\s*(.+)", cpuinfo.read_text()) if cpuinfo.exists() else None
     forced = " as OPENBLAS_CORETYPE says" if os.environ.get("OPENBLAS_CORETYPE") else ""
     blas = {f"{library['internal_api']} {library['version']}, {library.get('architecture', '?')} "
-            f"kernels{forced}, "
-            f"{library['num_threads']} thread" for library in threadpool_info()
+            f"kernels{forced}, {library['num_threads']} thread" for library in threadpool_info()
             if library["user_api"] == "blas"}
     return {"CPU": model[1] if model else platform.processor() or platform.machine(),
             "cores": str(os.cpu_count()),

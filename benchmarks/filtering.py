@@ -81,7 +81,8 @@ def step_flops(n: int, rank: int, m: int = 16) -> float:
 
 def against_textbook(settled: Settled) -> Row:
     """Means are compared once more, then both run over the same steps from the same state."""
-    problem, observations = settled.problem, settled.observations[:4]
+    problem = settled.problem
+    observations = settled.observations[:4]
 
     def theirs() -> np.ndarray:
         mean, P = settled.mean, settled.covariance
@@ -155,15 +156,20 @@ def against_dynamax(settled: Settled) -> Iterator[Row]:
     else:
         # It adds 1e-9 to the diagonal of what it solves with: units in which this is nothing, and
         # white noise.
-        F, level, units = settled.problem.start.transition, settled.problem.start.mean, 1e-4
+        F = settled.problem.start.transition
+        level = settled.problem.start.mean
+        units = 1e-4
         H, values, variances = (np.stack(part) for part in zip(*settled.observations, strict=True))
-        std, noise = np.sqrt(variances), settled.problem.noise / units**2
+        std = np.sqrt(variances)
+        noise = settled.problem.noise / units**2
         parameters = make_lgssm_params(
             F @ (settled.mean - level) / units, F @ settled.covariance @ F.T / units**2 + noise, F,
             noise,
             H * units / std[..., None], np.stack([np.eye(H.shape[1])] * STEPS))
         parameters, record = jax.device_put((parameters, (values - H @ level) / std))
-        means, busy, compiling = {}, 0.0, 0.0
+        means = {}
+        busy = 0.0
+        compiling = 0.0
         for name, function in (("filter", lgssm_filter), ("smoother", lgssm_smoother)):
             begin = time.perf_counter()
             compiled = jax.jit(function).lower(parameters, record).compile()
@@ -213,7 +219,8 @@ def against_peer(settled: Settled, theirs: dict[str, float | None], name: str, f
 def way_back_flops(settled: Settled) -> float:
     """A step's share of Fᵀ B, of Π B − Z (Zᵀ B), and of the compression of B, whose rank grows on
     the way."""
-    n, steps = settled.problem.n, kalman_filter(copy.copy(settled.ours), settled.observations)
+    n = settled.problem.n
+    steps = kalman_filter(copy.copy(settled.ours), settled.observations)
     ranks = [later.shape[1] for _, later in _backwards(settled.ours, steps)]
     known = settled.ours.known.shape[1]
     return sum(4.0 * n**2 * rank + 4.0 * n * known * rank + 4.0 * n * (rank + 16)**2
@@ -245,7 +252,8 @@ def memory(cells: tuple[int, int], *, measured: bool) -> Row:
 def smoothing_memory(cells: tuple[int, int], whose: str) -> float:
     """Bytes by which smoothing raises the peak of this process; the model is there before."""
     record = problem(cells, RECORD)
-    start, observations = record.start, record.observations
+    start = record.start
+    observations = record.observations
     covariance = start.covariance.apply(0, np.eye(record.n))
     # loads what is loaded once, at any length
     fixed_interval_smoother(copy.copy(start), observations[:2])

@@ -29,7 +29,8 @@ PIPE = PIPE_2D.vessel
 def rows() -> Iterator[Row]:
     for n, size in enumerate(SIZES):
         mesh = pipe_mesh(*size)
-        cem, sigma = electrode_model(mesh), conductivities(mesh)
+        cem = electrode_model(mesh)
+        sigma = conductivities(mesh)
         K = system_matrix(cem, sigma[0])
         yield from against_solvers(cem, sigma[0], K, largest=size == SIZES[-1])
         if n < 2:
@@ -152,8 +153,7 @@ def derivatives(cem: CompleteElectrodeModel, sigma: np.ndarray, K: sp.csc_matrix
               f"the table; then {1e-6 * combining:.0f} MFlop to combine it, {1e3 * written:.0f} MB "
               "to write",
               f"{written / (seconds['all'] - seconds['table']):.2g} of {ceilings().copy / 2:.0f} "
-              "GB/s written, "
-              f"{of_flops(flops + combining, seconds['all'])}")
+              f"GB/s written, {of_flops(flops + combining, seconds['all'])}")
 
 
 def quadrature(mesh: Mesh) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
@@ -184,7 +184,8 @@ def quadrature(mesh: Mesh) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
 
 def table_flops(cem: CompleteElectrodeModel) -> tuple[float, str]:
     """Of `transfer_resistance_derivatives`, as its steps are written: in sum, and in words."""
-    k, n_cells = cem.n_electrodes, len(cem.mesh.cells)
+    k = cem.n_electrodes
+    n_cells = len(cem.mesh.cells)
     substitute = 2.0 * cem._system._symbolic[3][-1] * 16
     gradients = 2.0 * cem._sensitivity._gradient.size * k
     # 3 vertices: 2·2 for Σ_v G_v G_v, then 1 to add it and 2·2·2 of their own
@@ -201,13 +202,15 @@ def table_flops(cem: CompleteElectrodeModel) -> tuple[float, str]:
 def against_pyeit(cells: tuple[int, int] = (10, 26)) -> Iterator[Row]:
     """The same mesh, first order for both."""
     mesh = pipe_mesh(*cells)
-    cem, currents = electrode_model(mesh, order=1), PIPE_2D.currents
+    cem = electrode_model(mesh, order=1)
+    currents = PIPE_2D.currents
     sigma = conductivities(mesh, 1)[0]
     works = {"voltages": lambda: cem.voltages(sigma, currents),
              "jacobian": lambda: cem.jacobian(sigma, currents)}
     theirs: dict[str, float | None] = dict.fromkeys(works)
     try:
-        solver, perm = pyeit_forward(mesh, currents), sigma[mesh.cells].mean(axis=1)
+        solver = pyeit_forward(mesh, currents)
+        perm = sigma[mesh.cells].mean(axis=1)
         theirs["voltages"] = compare({"": lambda: solver.solve_eit(perm=perm)}, 3)[""]
         theirs["jacobian"] = compare({"": lambda: solver.compute_jac(perm=perm)}, 1,
                                      warm_up=False)[""]

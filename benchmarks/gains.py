@@ -16,7 +16,8 @@ LONG = 320
 
 def rows() -> Iterator[Row]:
     record = problem(CELLS[-1], LONG)
-    start, n = record.start, record.n
+    start = record.start
+    n = record.n
     values = np.array([observation.value for observation in record.observations])
     first = record.observations[:RECORD]
     gains = gain_sequence(copy.copy(start), first)
@@ -24,7 +25,9 @@ def rows() -> Iterator[Row]:
     same(smoothed,
          np.array([state.mean for state in fixed_interval_smoother(copy.copy(start), first)]))
 
-    mean, P, steps = start.mean, start.covariance.apply(0, np.eye(n)), 4
+    mean = start.mean
+    P = start.covariance.apply(0, np.eye(n))
+    steps = 4
     filtered, _ = gains.filtered(start.mean, start.forcing, values[:steps])
     for t in range(steps):
         mean, P = textbook(record, mean, P, first[t])
@@ -32,7 +35,8 @@ def rows() -> Iterator[Row]:
 
     seconds = compare({"ours": lambda: gains.filtered(start.mean, start.forcing, values[:RECORD]),
                        "theirs": lambda: textbook(record, mean, P, first[steps])}, 3)
-    ours, bytes_read = seconds["ours"] / RECORD, 8.0 * n * (n + 2 * 16)
+    ours = seconds["ours"] / RECORD
+    bytes_read = 8.0 * n * (n + 2 * 16)
     yield Row("filtering", f"Kalman filter step with gains computed beforehand, n = {n}, m = 16",
               f"numpy {np.__version__}: F P Fᵀ + Q, S, K, P − K (H P)", ours, seconds["theirs"],
               "≤ 1/200",

@@ -21,14 +21,15 @@ def rows() -> Iterator[Row]:
     """All pairs from one table, against a covariance update for each; all are given the covariance
     before."""
     settled = settle(problem(CELLS[-1]))
-    start, filter_ = settled.problem.start, copy.copy(settled.ours)
+    start = settled.problem.start
+    filter_ = copy.copy(settled.ours)
     filter_.predict()
     F = start.transition
     P = F @ settled.covariance @ F.T + settled.problem.noise
     model = PIPE_2D.model()
     resistance, table = model.observation.resistance_derivatives(start.mean)
-    derivative, mass = np.ascontiguousarray(np.moveaxis(table, 0,
-                                                        2)), mass_matrix(model.transport.mesh)
+    derivative = np.ascontiguousarray(np.moveaxis(table, 0, 2))
+    mass = mass_matrix(model.transport.mesh)
     L, n = derivative.shape[1:]
     pairs = electrode_pairs(L)
     i, j = pairs.T

@@ -50,7 +50,8 @@ def problem(cells: tuple[int, int], steps: int = WARM_UP + STEPS) -> Problem:
     inflow = PIPE_2D.target.draw_inflow(PIPE_2D, rng)
     at_inlet = transport.mesh.points[transport.inlet]
     linearised = LinearisedObservations(seen, PIPE_2D.noise, start.mean)
-    state, observations = np.full(len(start.mean), PIPE_2D.background), []
+    state = np.full(len(start.mean), PIPE_2D.background)
+    observations = []
     currents = PIPE_2D.currents
     for t in range(steps):
         state = evolution.F @ state + evolution.Y @ inflow(at_inlet, t * PIPE_2D.time_step)
@@ -65,7 +66,8 @@ def problem(cells: tuple[int, int], steps: int = WARM_UP + STEPS) -> Problem:
 def pipe_model(cells: tuple[int, int]) -> Discretisation:
     """The estimators' model, but with so many cells of concentration along and across the pipe."""
     told = PIPE_2D.model()
-    pipe, known = PIPE_2D.vessel, told.transport
+    pipe = PIPE_2D.vessel
+    known = told.transport
     assert isinstance(known, ConvectionDiffusion)
     mesh = rectangle_mesh(np.linspace(0.0, pipe.length, cells[0] + 1),
                           np.linspace(-pipe.half_width, pipe.half_width, cells[1] + 1))

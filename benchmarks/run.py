@@ -28,16 +28,18 @@ SECTIONS = {"forward": "Complete electrode model", "kernels": "What the compiled
 
 INTRODUCTION = """# Speed
 
-Ours against others, measured in the same run, everything on one thread. A ratio is our time in parts of the
-reference's, or, where it says faster, the reverse. Each time is the fastest of several calls, between which the
-candidates take turns; references that run for seconds run once or twice. Results are compared with the reference's
-before, except with pyEIT, whose model differs. *Ours with scipy's SuperLU and sparse products* is the
-reference in `tests/references.py`. On a machine that others share, a ratio may differ by a third
-from run to run. *Limited by* says what our time goes into, *ceiling* how much we reach of what this
-machine can do at best, measured in the same process. Targets were set before measuring.
+Ours against others, measured in the same run, everything on one thread. A ratio is our time in
+parts of the reference's, or, where it says faster, the reverse. Each time is the fastest of several
+calls, between which the candidates take turns; references that run for seconds run once or twice.
+Results are compared with the reference's before, except with pyEIT, whose model differs. *Ours with
+scipy's SuperLU and sparse products* is the reference in `tests/references.py`. On a machine that
+others share, a ratio may differ by a third from run to run. *Limited by* says what our time goes
+into, *ceiling* how much we reach of what this machine can do at best, measured in the same process.
+Targets were set before measuring.
 
 ```sh
-python3 -m venv peers && peers/bin/pip install -c constraints.txt -e . -r benchmarks/requirements.txt
+python3 -m venv peers
+peers/bin/pip install -c constraints.txt -e . -r benchmarks/requirements.txt
 peers/bin/python benchmarks/run.py            # or only some: run.py forward
 ```
 
@@ -106,8 +108,8 @@ def page(record: dict[str, Any]) -> str:
 
 
 def conditions(record: dict[str, Any]) -> str:
-    on, best = ", ".join(f"{name}: {value}" for name,
-                         value in record["machine"].items()), record["ceilings"]
+    on = ", ".join(f"{name}: {value}" for name, value in record["machine"].items())
+    best = record["ceilings"]
     return (f"*{on}. Ceilings: dgemm {best['gflops']:.0f} GFlop/s, reading {best['read']:.0f} "
             "GB/s, copying "
             f"{best['copy']:.0f} GB/s, an empty Python call {quantity(best['call'], 's')}.*\n")
@@ -126,8 +128,7 @@ def growth(record: dict[str, Any]) -> str:
         ends = [f"{f'{y:,.0f}' if y >= 100 else f'{y:.3g}'} at {x:,.0f} {curve['x_label']}"
                 for x, y in list(zip(curve["x"], curve["y"], strict=True))[::len(curve["x"]) - 1]]
         lines.append(f"| {curve['column']}: {curve['label']} | {curve['y_label']} | {ends[0]} | "
-                     f"{ends[1]} | "
-                     f"{curve['exponent']:.2f} |")
+                     f"{ends[1]} | {curve['exponent']:.2f} |")
     return "![Time and memory against size](scaling.png)\n\n" + "\n".join(lines) + "\n"
 
 

@@ -89,11 +89,11 @@ def kalman_step(cells: tuple[int, int]) -> tuple[float, float, float]:
         kalman_filter(copy.copy(ours), record.observations[WARM_UP:])
 
     covariance = record.start.covariance
-    held = ours.transition.nbytes + covariance.limit.nbytes + sum(U.nbytes for U,
-                                                                  _ in covariance._transients)
+    held = (ours.transition.nbytes + covariance.limit.nbytes
+            + sum(U.nbytes for U, _ in covariance._transients))
     seconds = best_of(steps, 5) / STEPS
-    return record.n, seconds, held + peak_growth(lambda: kalman_filter(copy.copy(ours),
-                                                                       record.observations[-1:]))
+    step = peak_growth(lambda: kalman_filter(copy.copy(ours), record.observations[-1:]))
+    return record.n, seconds, held + step
 
 
 def draw(curves: list[Curve], path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Bare numeric refactorisations by other people's sparse solvers: new values on a pattern that is known already.
+"""Bare numeric refactorisations by other people's sparse solvers: new values on a known pattern.
 
 Each is given its matrix in the form that it likes best, outside the clock, and solves nothing.
 """
@@ -13,11 +13,12 @@ import scipy.sparse as sp
 from common import Work, peer
 from scipy.sparse.linalg import splu
 
+Integrate = Callable[[np.ndarray, np.ndarray], np.ndarray]
 SYMMETRIC = {"diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
 
 
 def refactorisations(K: sp.csc_matrix) -> tuple[dict[str, Work], list[str]]:
-    """Name and version → what to call, for a symmetric positive definite K; and the names of missing peers."""
+    """Name and version → what to call, for a symmetric positive definite K; and missing peers."""
     found: dict[str, Work] = {}
     missing = []
     for package, prepare in (("qdldl", _qdldl), ("cholespy", _cholespy), ("pypardiso", _pardiso),
@@ -45,7 +46,8 @@ def _cholespy(K: sp.csc_matrix) -> tuple[Work, str]:
 
 def _pardiso(K: sp.csc_matrix) -> tuple[Work, str]:
     from pypardiso import PyPardisoSolver
-    upper, nothing = sp.csr_matrix(sp.triu(K)), np.zeros((K.shape[0], 1))
+    upper = sp.csr_matrix(sp.triu(K))
+    nothing = np.zeros((K.shape[0], 1))
     upper.sort_indices()
     solver = PyPardisoSolver(mtype=2)                    # real, symmetric positive definite
     solver._check_A(upper)
@@ -72,14 +74,14 @@ def _superlu(K: sp.csc_matrix) -> tuple[Work, str]:
 
 
 def splu_and_solves(K: sp.csc_matrix, n_ports: int) -> Callable[[], np.ndarray]:
-    """What one writes first: factorise by SuperLU with a symmetric ordering, solve for every electrode."""
+    """What one writes first: factorise by SuperLU, ordered symmetrically; solve every electrode."""
     loads = np.eye(K.shape[0], n_ports, n_ports - K.shape[0])
     return lambda: splu(K, permc_spec="MMD_AT_PLUS_A", **SYMMETRIC).solve(loads)[-n_ports:]
 
 
-def entry_by_entry(K: sp.csc_matrix, n_ports: int, integrate: Callable[[np.ndarray, np.ndarray], np.ndarray]
-                   ) -> np.ndarray:
-    """Derivatives of the ports' block of K⁻¹, (n_nodes, m, m): for each entry a forward and an adjoint solution."""
+def entry_by_entry(K: sp.csc_matrix, n_ports: int, integrate: Integrate) -> np.ndarray:
+    """Derivatives of the ports' block of K⁻¹, (n_nodes, m, m): for each entry a forward and an
+    adjoint solution."""
     n = K.shape[0]
     factors = splu(K, permc_spec="MMD_AT_PLUS_A", **SYMMETRIC)
     entries = {}
@@ -87,12 +89,13 @@ def entry_by_entry(K: sp.csc_matrix, n_ports: int, integrate: Callable[[np.ndarr
         forward, adjoint = np.zeros((2, n))
         forward[n - n_ports + l] = adjoint[n - n_ports + m] = 1.0
         entries[m, l] = entries[l, m] = -integrate(factors.solve(forward), factors.solve(adjoint))
-    return np.stack([entries[m, l] for m, l in np.ndindex(n_ports, n_ports)], axis=1).reshape(-1, n_ports, n_ports)
+    columns = [entries[m, l] for m, l in np.ndindex(n_ports, n_ports)]
+    return np.stack(columns, axis=1).reshape(-1, n_ports, n_ports)
 
 
-def pair_by_pair(K: sp.csc_matrix, currents: np.ndarray, integrate: Callable[[np.ndarray, np.ndarray], np.ndarray]
-                 ) -> np.ndarray:
-    """Derivatives of the ports' voltages, (patterns, m, n_nodes), for currents (patterns, m): two solutions a row."""
+def pair_by_pair(K: sp.csc_matrix, currents: np.ndarray, integrate: Integrate) -> np.ndarray:
+    """Derivatives of the ports' voltages, (patterns, m, n_nodes), for currents (patterns, m): two
+    solutions a row."""
     n, n_ports = K.shape[0], currents.shape[1]
     factors = splu(K, permc_spec="MMD_AT_PLUS_A", **SYMMETRIC)
     rows = []

@@ -55,9 +55,9 @@ def estimation() -> Iterator[Row]:
               "entries of M̃")
     ours = vector_step(gym.make_vec(ESTIMATION, num_envs=ENVS,
                                     vectorization_mode="vector_entry_point"), choose)
-    limit, ceiling = "bytes: estimates are checked, transposed and weighed", (
-        f"{8e-9 * estimate.size / ours:.1f} GB/s of estimates taken in, read at "
-        f"{ceilings().read:.0f}")
+    limit = "bytes: estimates are checked, transposed and weighed"
+    ceiling = (f"{8e-9 * estimate.size / ours:.1f} GB/s of estimates taken in, read at "
+               f"{ceilings().read:.0f}")
     for mode, reference in (("sync", "SyncVectorEnv"), ("async", "AsyncVectorEnv")):
         theirs = vector_step(gym.make_vec(ESTIMATION, num_envs=ENVS, vectorization_mode=mode),
                              choose, episodes=1)
@@ -98,7 +98,9 @@ def scalar_step(env: gym.Env, choose: Callable[[], object], episodes: int = 12) 
     """Seconds a step, of the fastest of several episodes after the first two."""
     best = np.inf
     for seed in range(episodes):
-        begin, steps, ended = time.perf_counter(), 0, False
+        begin = time.perf_counter()
+        steps = 0
+        ended = False
         env.reset(seed=seed)
         while not ended:
             ended = env.step(choose())[2]
@@ -114,7 +116,9 @@ def vector_step(envs: gym.vector.VectorEnv, choose: Callable[[], np.ndarray],
     first."""
     best = np.inf
     for round_ in range(episodes + 1):
-        begin, steps, ended = time.perf_counter(), 0, False
+        begin = time.perf_counter()
+        steps = 0
+        ended = False
         envs.reset(seed=[(k + round_) % EPISODES for k in range(envs.num_envs)])
         while not ended:
             ended = bool(envs.step(choose())[2][0])

@@ -23,7 +23,8 @@ TOLERANCES = (1e-6, 1e-4, 1e-3, 1e-2, 1e-1)
 
 def main() -> None:
     env = EstimationEnv("eitbench/Pipe3D-v0")
-    task, world = env.task, env.world
+    task = env.task
+    world = env.world
     env.reset(seed=0)
     voltages = cycle_voltages(world, 0, recording(world, 0))
     currents = task.currents[np.arange(task.n_steps) % len(task.currents)]
@@ -33,8 +34,7 @@ def main() -> None:
     begin = time.perf_counter()
     start = table_5_1(task.transport, task.prior, first.c_bh)
     print(f"n = {task.mesh.n_nodes}, {task.currents.shape[1]} readings an injection; evolution "
-          "model and covariance "
-          f"without data, once a process: {time.perf_counter() - begin:.0f} s")
+          f"model and covariance without data, once a process: {time.perf_counter() - begin:.0f} s")
     linear = LinearisedObservations(task.observation, task.noise, start.mean)
     observations = [linear(*measured) for measured in zip(voltages, currents, strict=True)]
     interpolation, mass = score_operators(world)
@@ -50,7 +50,9 @@ def main() -> None:
 
     n = task.mesh.n_nodes
     dense = DenseKalmanFilter(start.mean, start.covariance.apply(0, np.eye(n)))
-    noise, steps, begin = start.covariance.apply_noise(np.eye(n)), [], time.perf_counter()
+    noise = start.covariance.apply_noise(np.eye(n))
+    steps = []
+    begin = time.perf_counter()
     for observation in observations:
         dense.predict(start.transition, start.forcing, noise)
         steps.append(dense.update(observation))
@@ -63,7 +65,8 @@ def main() -> None:
     row("full, n × n", steps, seconds, n)
     for tolerance in TOLERANCES:
         filter_ = table_5_1(task.transport, task.prior, first.c_bh, rank_tolerance=tolerance)
-        steps, begin = [], time.perf_counter()
+        steps = []
+        begin = time.perf_counter()
         for observation in observations:
             filter_.predict()
             steps.append(filter_.update(observation))

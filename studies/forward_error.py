@@ -54,15 +54,16 @@ def main() -> None:
         e = np.array(errors[name])
         print(f"{name}: {discretisation.observation.cem.n_unknowns} unknowns, "
               f"error rms {np.sqrt((e**2).mean()):.3f}, 99 % below "
-              f"{np.quantile(np.abs(e), 0.99):.3f}, "
-              f"largest {np.abs(e).max():.3f} noise std")
+              f"{np.quantile(np.abs(e), 0.99):.3f}, largest {np.abs(e).max():.3f} noise std")
 
 
 def _transport_error(world: World, model: Discretisation, to_model: sp.csr_array,
                      truth: np.ndarray) -> float:
-    transport, mass = model.transport, mass_matrix(model.transport.mesh)
+    transport = model.transport
+    mass = mass_matrix(model.transport.mesh)
     exact = (to_model @ truth.astype(float).T).T
-    c, inlet = exact[0], transport.inlet
+    c = exact[0]
+    inlet = transport.inlet
     errors = []
     for before, after in itertools.pairwise(exact):
         c = transport.step(c, before[inlet], after[inlet])

@@ -55,7 +55,8 @@ def main() -> None:
 
 def coverage(draw: Callable[..., np.ndarray], truth: float, n: int) -> float:
     """In %, of the mean of n numbers."""
-    random, held = np.random.default_rng(0), 0
+    random = np.random.default_rng(0)
+    held = 0
     for seed in range(1000):
         _, low, high = stratified_bootstrap({"": draw(random, n)}, mean_over_environments,
                                             draws=2000, seed=seed)
@@ -72,7 +73,8 @@ def found(world: str, floor: str, said: str, true: str, held: int,
               if record["environment"]["name"] == f"eitbench-{world}-v0"}
     zero, a, b = (np.array([errors[name][seed] for seed in sorted(errors[floor])])
                   for name in (floor, said, true))
-    random, hits = np.random.default_rng(0), np.zeros(2)
+    random = np.random.default_rng(0)
+    hits = np.zeros(2)
     for _ in range(repeats):
         i, j = random.integers(len(a), size=len(a)), random.integers(len(a), size=held)
         for place, (statistic, record, new) in enumerate((

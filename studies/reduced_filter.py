@@ -34,7 +34,8 @@ def main() -> None:
     for world, policies in PLAYED.items():
         for policy in policies:
             record = records[f"eitbench-{world}-v0", policy]
-            exact, full = scores_by_seed(record, "error"), job_of(record, isolate="never")
+            exact = scores_by_seed(record, "error")
+            full = job_of(record, isolate="never")
             reduced = Environment(full.environment.id, json.dumps({"estimator": "reduced"}))
             steps = [exact[seed]
                      - run_episode(Job(reduced, full.method,

@@ -50,7 +50,8 @@ def play(env: InjectionVectorEnv, seeds: list[int], act: Callable[[int, np.ndarr
     world = env.rules.world
     steps = world.n_steps - len(world.currents)
     seen, _ = env.reset(seed=seeds)
-    actions, rewards = [], []
+    actions = []
+    rewards = []
     for k in range(steps):
         actions.append(act(k, seen))  # type: ignore[arg-type]
         seen, reward, *_ = env.step(actions[-1])

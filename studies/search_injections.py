@@ -26,8 +26,10 @@ from eitbench.data.seeds import SPLITS
 from eitbench.envs.injection import InjectionVectorEnv
 from eitbench.worlds import entries
 
-BEST, LONGEST = 12, 4
-RESTARTS, VALUES = 6, (-1.0, -0.5, 0.0, 0.5, 1.0)
+BEST = 12
+LONGEST = 4
+RESTARTS = 6
+VALUES = (-1.0, -0.5, 0.0, 0.5, 1.0)
 
 
 class Search:
@@ -37,21 +39,26 @@ class Search:
         made: Any = gym.make_vec(env_id, num_envs=episodes, vectorization_mode="vector_entry_point",
                                  observation="raw")
         assert isinstance(made, InjectionVectorEnv)
-        self.env, self.seeds, self.steps = made, list(SPLITS["train"][:episodes]), 0
+        self.env = made
+        self.seeds = list(SPLITS["train"][:episodes])
+        self.steps = 0
         self.played: dict[tuple[Any, ...], float] = {}
 
     def __call__(self, cycle: Sequence[Any]) -> float:
         """Mean reward of a scored state under this cycle of pairs, or of tuples of currents."""
         key = tuple(cycle)
         if key not in self.played:
-            env, rules, injected, total = self.env, self.env.rules, 0, 0.0
+            env = self.env
+            rules = self.env.rules
+            injected = 0
+            total = 0.0
             observation, _ = env.reset(seed=self.seeds)
             world = rules.world
             for _ in range(world.n_steps - len(world.currents)):
                 now = rules.spaced(observation["left"][0])
                 chosen = key[injected % len(key)] if now else None
-                action = np.array(chosen, np.float32) if isinstance(chosen,
-                                                                    tuple) else rules.action(chosen)
+                action = (np.array(chosen, np.float32) if isinstance(chosen, tuple)
+                          else rules.action(chosen))
                 observation, reward, *_ = env.step(np.array([action] * env.num_envs))
                 injected += now
                 total += reward.mean()
@@ -79,13 +86,15 @@ def main() -> None:
 
 def search_currents(search: Search, best: Sequence[int]) -> None:
     """The currents that stay, from several beginnings."""
-    rules, random = search.env.rules, np.random.default_rng(0)
+    rules = search.env.rules
+    random = np.random.default_rng(0)
     L = rules.world.currents.shape[1]
     begins = [rules.action(best[0]), np.repeat([1.0, -1.0], L // 2),
               *random.choice([-1.0, 1.0], (RESTARTS, L))]
     found = []
     for begin in tqdm(begins, desc="beginnings", disable=None):
-        currents, before = tuple(map(float, begin)), None
+        currents = tuple(map(float, begin))
+        before = None
         while before != currents:
             before = currents
             for k in range(L):
@@ -96,13 +105,13 @@ def search_currents(search: Search, best: Sequence[int]) -> None:
         print(f"    {search([currents]):.6f}: {currents}")
     currents = max(found, key=lambda each: search([each]))
     print(f"currents: {list(currents)}, mean reward {search([currents]):.6f} of "
-          f"{len(search.seeds)} episodes, "
-          f"{search.steps} environment steps")
+          f"{len(search.seeds)} episodes, {search.steps} environment steps")
 
 
 def search_cycle(search: Search, best: Sequence[int]) -> None:
     """Up to `LONGEST` of these pairs in turn."""
-    pairs, cycle = search.env.rules.pairs, list(best[:1])
+    pairs = search.env.rules.pairs
+    cycle = list(best[:1])
     while len(cycle) < LONGEST:
         longer = max(([*cycle, pair] for pair in tqdm(best, desc="longer", disable=None)),
                      key=search)
@@ -120,8 +129,7 @@ def search_cycle(search: Search, best: Sequence[int]) -> None:
 
 def report(what: str, search: Search, pairs: np.ndarray, cycle: Sequence[int]) -> None:
     print(f"{what}: {pairs[list(cycle)].tolist()}, mean reward {search(cycle):.6f} of "
-          f"{len(search.seeds)} episodes, "
-          f"{search.steps} environment steps")
+          f"{len(search.seeds)} episodes, {search.steps} environment steps")
 
 
 if __name__ == "__main__":

@@ -30,17 +30,16 @@ def main() -> None:
         episode = simulate(PIPE_2D, seed)
         for state in STATES:
             clean = task.currents @ episode.transfer_resistance[state - 1]
-            draws = np.random.default_rng(np.random.SeedSequence([seed,
-                                                                  state])).standard_normal(clean.shape)
+            random = np.random.default_rng(np.random.SeedSequence([seed, state]))
+            draws = random.standard_normal(clean.shape)
             voltages = clean + PIPE_2D.noise.std(clean) * draws
-            start = np.full(task.mesh.n_nodes, best_homogeneous(
-                task.observation, task.noise, task.mesh.n_nodes, voltages, task.currents,
-                task.expected_concentration))
+            c_bh = best_homogeneous(task.observation, task.noise, task.mesh.n_nodes, voltages,
+                                    task.currents, task.expected_concentration)
+            start = np.full(task.mesh.n_nodes, c_bh)
+            std = task.noise.std(voltages)
             for alpha in errors:
-                image = start if alpha == 0 else gauss_newton(task.observation, voltages,
-                                                              task.currents,
-                                                              task.noise.std(voltages),
-                                                              alpha**2 * stiffness, start)
+                image = start if alpha == 0 else gauss_newton(
+                    task.observation, voltages, task.currents, std, alpha**2 * stiffness, start)
                 truth = episode.concentration[state][None].astype(float)
                 errors[alpha].append(relative_error((interpolation @ image)[None], truth, mass))
     for alpha, values in errors.items():

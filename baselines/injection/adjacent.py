@@ -10,9 +10,10 @@ from eitbench.estimation.onboard.rules import Rules
 
 class Policy:
     def __init__(self, rules: Rules, random: np.random.Generator) -> None:
-        self.rules, L = rules, rules.world.currents.shape[1]
+        self.rules = rules
+        L = rules.world.currents.shape[1]
         numbers = {frozenset(pair): k for k, pair in enumerate(rules.pairs.tolist())}
-        self.cycle = cycle(numbers[frozenset(pair)] for pair in ((i, (i + 1) % L) for i in range(L)))
+        self.cycle = cycle(numbers[frozenset((i, (i + 1) % L))] for i in range(L))
 
     def act(self, observation: dict[str, np.ndarray]) -> Any:
         now = self.rules.spaced(observation["left"])

@@ -1,4 +1,5 @@
-"""Best fixed currents: one for each electrode, the same at every step, the best found on training episodes."""
+"""Best fixed currents: one for each electrode, the same at every step, the best found on training \
+episodes."""
 
 from typing import Any
 
@@ -11,13 +12,14 @@ class Policy:
     # Found by `python studies/search_injections.py eitbench/Pipe2DInjectionCurrents-v0`.
     parameters: dict[str, Any] = {  # noqa: RUF012
         "world": "Pipe2D", "limit": "Linf", "environment_steps": 5_153_536,
-        "currents": [1.0, -0.5, -0.5, -0.5, 0.0, -0.5, 0.0, 0.0, -1.0, 0.0, 0.0, 0.5, -0.5, 0.0, -1.0, 0.0]}
+        "currents": [1.0, -0.5, -0.5, -0.5, 0.0, -0.5, 0.0, 0.0,
+                     -1.0, 0.0, 0.0, 0.5, -0.5, 0.0, -1.0, 0.0]}
 
     @classmethod
     def suits(cls, rules: Rules) -> bool:
-        electrodes = rules.world.currents.shape[1]
-        return (rules.name, rules.limit, electrodes) == (
-            cls.parameters["world"], cls.parameters["limit"], len(cls.parameters["currents"]))
+        found = cls.parameters
+        return (rules.name, rules.limit, rules.world.currents.shape[1]) == (
+            found["world"], found["limit"], len(found["currents"]))
 
     def __init__(self, rules: Rules, random: np.random.Generator) -> None:
         self.currents = np.array(self.parameters["currents"], dtype=np.float32)

@@ -1,4 +1,5 @@
-"""Best cycle: up to four pairs in turn, the best of a search on training episodes; a budget is spread evenly."""
+"""Best cycle: up to four pairs in turn, the best of a search on training episodes; a budget is \
+spread evenly."""
 
 from itertools import cycle
 from typing import Any
@@ -12,21 +13,23 @@ class Policy:
     # Found by `python studies/search_injections.py`; electrodes by world.
     parameters: dict[str, Any] = {  # noqa: RUF012
         "cycle": {"Pipe2D": [[0, 8]], "Pipe2D with faults": [[8, 11], [0, 4], [2, 8], [0, 14]],
-                  "Pipe2DIntermittent with a budget": [[0, 10]], "Pipe2DDriftingVelocity": [[7, 8], [1, 7]],
-                  "RotatingTank2D": [[9, 15]]},
-        "environment_steps": {"Pipe2D": 346_368, "Pipe2D with faults": 608_768,
-                              "Pipe2DIntermittent with a budget": 768_768, "Pipe2DDriftingVelocity": 217_792,
-                              "RotatingTank2D": 333_696}}
+                  "Pipe2DIntermittent with a budget": [[0, 10]],
+                  "Pipe2DDriftingVelocity": [[7, 8], [1, 7]], "RotatingTank2D": [[9, 15]]},
+        "environment_steps": {
+            "Pipe2D": 346_368, "Pipe2D with faults": 608_768,
+            "Pipe2DIntermittent with a budget": 768_768, "Pipe2DDriftingVelocity": 217_792,
+            "RotatingTank2D": 333_696}}
 
     @classmethod
     def suits(cls, rules: Rules) -> bool:
         pairs = rules.pairs.tolist()
-        return rules.name in cls.parameters["cycle"] and all(
-            pair in pairs for pair in cls.parameters["cycle"][rules.name])
+        found = cls.parameters["cycle"].get(rules.name, [None])
+        return all(pair in pairs for pair in found)
 
     def __init__(self, rules: Rules, random: np.random.Generator) -> None:
         pairs = rules.pairs.tolist()
-        self.rules, self.cycle = rules, cycle(pairs.index(pair) for pair in self.parameters["cycle"][rules.name])
+        self.rules = rules
+        self.cycle = cycle(pairs.index(pair) for pair in self.parameters["cycle"][rules.name])
 
     def act(self, observation: dict[str, np.ndarray]) -> Any:
         now = self.rules.spaced(observation["left"])

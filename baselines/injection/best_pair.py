@@ -1,4 +1,5 @@
-"""Best fixed pair: the same one at every step, the best of all on training episodes; a budget is spread evenly."""
+"""Best fixed pair: the same one at every step, the best of all on training episodes; a budget is \
+spread evenly."""
 
 from typing import Any
 
@@ -10,18 +11,21 @@ from eitbench.estimation.onboard.rules import Rules
 class Policy:
     # Found by `python studies/search_injections.py`; electrodes by world.
     parameters: dict[str, Any] = {  # noqa: RUF012
-        "pair": {"Pipe2D": [0, 8], "Pipe2D with faults": [0, 8], "Pipe2DIntermittent with a budget": [0, 10],
-                 "Pipe2DDriftingVelocity": [7, 9], "RotatingTank2D": [9, 15]},
-        "environment_steps": {"Pipe2D": 314_880, "Pipe2D with faults": 314_880,
-                              "Pipe2DIntermittent with a budget": 698_880, "Pipe2DDriftingVelocity": 157_440,
-                              "RotatingTank2D": 303_360}}
+        "pair": {"Pipe2D": [0, 8], "Pipe2D with faults": [0, 8],
+                 "Pipe2DIntermittent with a budget": [0, 10], "Pipe2DDriftingVelocity": [7, 9],
+                 "RotatingTank2D": [9, 15]},
+        "environment_steps": {
+            "Pipe2D": 314_880, "Pipe2D with faults": 314_880,
+            "Pipe2DIntermittent with a budget": 698_880, "Pipe2DDriftingVelocity": 157_440,
+            "RotatingTank2D": 303_360}}
 
     @classmethod
     def suits(cls, rules: Rules) -> bool:
         return cls.parameters["pair"].get(rules.name) in rules.pairs.tolist()
 
     def __init__(self, rules: Rules, random: np.random.Generator) -> None:
-        self.rules, self.pair = rules, rules.pairs.tolist().index(self.parameters["pair"][rules.name])
+        self.rules = rules
+        self.pair = rules.pairs.tolist().index(self.parameters["pair"][rules.name])
 
     def act(self, observation: dict[str, np.ndarray]) -> Any:
         return self.rules.action(self.pair if self.rules.spaced(observation["left"]) else None)

@@ -1,9 +1,13 @@
 """Clairvoyant: knows what is broken and what flows through the pipe; a bound for the others.
 
-It plays a few plans ahead on the very episode and then follows the best of them: greedy A-optimal among the electrodes
-that are sound, each of a few fixed pairs, the best fixed currents where each electrode may have its own, and, where
-there is a budget, injecting when its true error is large. Where the flow is unknown its variances are those about the
-true one and weigh errors by what they will do in the next steps; it tries more pairs, and cycles of them, and goes over
+It plays a few plans ahead on the very episode and then follows the best of them: greedy A-optimal \
+among the electrodes
+that are sound, each of a few fixed pairs, the best fixed currents where each electrode may have \
+its own, and, where
+there is a budget, injecting when its true error is large. Where the flow is unknown its variances \
+are those about the
+true one and weigh errors by what they will do in the next steps; it tries more pairs, and cycles \
+of them, and goes over
 from one plan to another wherever that turns out better.
 """
 
@@ -19,31 +23,38 @@ from eitbench.estimation.onboard.belief import Belief
 from eitbench.estimation.onboard.rules import Rules
 
 NOTHING, CURRENTS = -1, -2
-"""What plans say, besides the number of a pair, of a step where nothing is injected, or the best fixed currents."""
+"""What plans say, beside the number of a pair, where nothing or the best currents are injected."""
 
 
 class Policy:
     privileged = True
     role = "reference"
-    # The cycles are for an unknown flow; those of one pair were found by `python studies/search_injections.py`.
-    parameters: dict[str, Any] = {"fixed_pairs": [[0, 8], [0, 10]], "thresholds": [1e-4, 3e-2, 16],  # noqa: RUF012
-                                  "intervals": [1, 2, 3], "horizons": [0, 2, 4, 8, 16], "changes": 10, "cycles": [
-        [[7, 9]], [[7, 8]], [[8, 15]], [[9, 15]], [[1, 7]], [[6, 9]], [[1, 6]], [[8, 14]], [[0, 7]], [[7, 8], [1, 7]],
-        [[7, 8], [8, 15]], [[7, 8], [1, 7], [9, 15], [0, 7]]]}
+    # The cycles are for an unknown flow; those of one pair were found by
+    # `python studies/search_injections.py`.
+    parameters: dict[str, Any] = {  # noqa: RUF012
+        "fixed_pairs": [[0, 8], [0, 10]], "thresholds": [1e-4, 3e-2, 16], "intervals": [1, 2, 3],
+        "horizons": [0, 2, 4, 8, 16], "changes": 10,
+        "cycles": [[[7, 9]], [[7, 8]], [[8, 15]], [[9, 15]], [[1, 7]], [[6, 9]], [[1, 6]],
+                   [[8, 14]], [[0, 7]], [[7, 8], [1, 7]], [[7, 8], [8, 15]],
+                   [[7, 8], [1, 7], [9, 15], [0, 7]]]}
 
     def __init__(self, rules: Rules, random: np.random.Generator, core: InjectionCore) -> None:
-        self.rules, self.core = rules, core
+        self.rules = rules
+        self.core = core
         if rules.world.velocity_model is not None and rules.budget is None:
             self.plan = iter(self.changing().tolist())
             return
-        pairs, every = rules.pairs.tolist(), np.ones(core.length, dtype=int)
+        pairs = rules.pairs.tolist()
+        every = np.ones(core.length, dtype=int)
         best = load_method("best_pair", "injection").parameters["pair"].get(rules.name)
-        fixed = sorted({pairs.index(pair) for pair in [*self.parameters["fixed_pairs"], best] if pair in pairs})
+        fixed = sorted({pairs.index(pair) for pair in [*self.parameters["fixed_pairs"], best]
+                        if pair in pairs})
         if rules.budget is None:
             any_currents = load_method("best_currents", "injection")
             self.currents = np.array(any_currents.parameters["currents"], dtype=np.float32)
-            currents = [CURRENTS] * any_currents.suits(rules)
-            errors, plans = self.ahead(np.array([self.greedy(), *(option * every for option in fixed + currents)]))
+            options = fixed + [CURRENTS] * any_currents.suits(rules)
+            errors, plans = self.ahead(
+                np.array([self.greedy(), *(option * every for option in options)]))
         else:
             first, last, count = self.parameters["thresholds"]
             tried = product(fixed, np.geomspace(first, last, count), self.parameters["intervals"])
@@ -60,15 +71,18 @@ class Policy:
         return self.rules.action(None if number == NOTHING else number)
 
     def greedy(self, horizon: int = 0) -> np.ndarray:
-        """(steps,) pairs after which the variance is least, summed over so many steps more, of electrodes without a
-        fault."""
+        """(steps,) pairs after which the variance is least, summed over so many steps more, of
+        electrodes without a fault."""
         core = self.core
-        belief, covariance = Belief(self.rules, {name: array[0] for name, array in core.observe().items()}), None
+        seen = {name: array[0] for name, array in core.observe().items()}
+        belief = Belief(self.rules, seen)
+        covariance = None
+        faults = core.faults
         if self.rules.world.velocity_model is not None:
             belief.told(recording(self.rules.world, core.seeds[0])[core.t - 1:])
         plan = np.empty(core.length, dtype=int)
         for k in range(core.length):
-            sound = (core.t + k + 1 < core.faults.broken_from[0]) & (core.faults.resistance[0] == 0.0)
+            sound = (core.t + k + 1 < faults.broken_from[0]) & (faults.resistance[0] == 0.0)
             predicted = belief.predicted(covariance, k)
             weight = belief.foresight(horizon, k) if horizon else None
             plan[k] = belief.gains(predicted, sound, weight=weight)[0].argmax()
@@ -76,8 +90,11 @@ class Policy:
         return plan
 
     def changing(self) -> np.ndarray:
-        """(steps,) pairs of the best of many plans, with changes to another one after every so many steps."""
-        pairs, steps, options = self.rules.pairs.tolist(), np.arange(self.core.length), self.parameters
+        """(steps,) pairs of the best of many plans, with changes to another one after every so many
+        steps."""
+        pairs = self.rules.pairs.tolist()
+        steps = np.arange(self.core.length)
+        options = self.parameters
         cycles = [[pairs.index(pair) for pair in cycle] for cycle in options["cycles"]]
         plans = np.array([*map(self.greedy, options["horizons"]),
                           *(np.array(cycle)[steps % len(cycle)] for cycle in cycles)])
@@ -87,19 +104,22 @@ class Policy:
             best = tried[self.ahead(tried)[0].argmin()]
         return best
 
-    def ahead(self, plans: np.ndarray, threshold: np.ndarray | None = None, interval: np.ndarray | None = None,
-              ) -> tuple[np.ndarray, np.ndarray]:
+    def ahead(self, plans: np.ndarray, threshold: np.ndarray | None = None,
+              interval: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Play plans (B, steps) side by side: mean errors (B,) and what was injected (B, steps).
 
-        With a ``threshold`` (B,) nothing is injected while the true error lies below, nor before the ``interval`` (B,)
-        from the last injection is over.
+        With a ``threshold`` (B,) nothing is injected while the true error lies below, nor before
+        the ``interval`` (B,) from the last injection is over.
         """
-        twin, plans, errors = InjectionCore(self.rules, "reduced"), plans.copy(), []
+        twin = InjectionCore(self.rules, "reduced")
+        plans = plans.copy()
+        errors = []
         twin.begin(self.core.seeds * len(plans))
         last = np.full(len(plans), -twin.length)
         for k in range(twin.length):
             if threshold is not None:
-                silent = ~(twin.errors() > threshold) | (k < last + interval) | (twin.spent >= self.rules.budget)
+                silent = (~(twin.errors() > threshold) | (k < last + interval)
+                          | (twin.spent >= self.rules.budget))
                 plans[silent, k] = NOTHING
                 last[~silent] = k
             twin.act(np.array([self.action(number) for number in plans[:, k]]))

@@ -1,6 +1,8 @@
-"""Event-triggered: probes now and then, and looks closely while what it reads is not what was predicted.
+"""Event-triggered: probes now and then, and looks closely while what it reads is not what was \
+predicted.
 
-What is left of the budget is spread over what is left of the episode; a part is kept back for surprises.
+What is left of the budget is spread over what is left of the episode; a part is kept back for \
+surprises.
 """
 
 from typing import Any
@@ -12,7 +14,8 @@ from eitbench.estimation.onboard.rules import Rules
 
 
 class Policy:
-    parameters: dict[str, Any] = {"alarm": 0.7, "calm": 1.0, "stretch": 1.2, "quick": 2, "slowest": 8}  # noqa: RUF012
+    parameters: dict[str, Any] = {  # noqa: RUF012
+        "alarm": 0.7, "calm": 1.0, "stretch": 1.2, "quick": 2, "slowest": 8}
 
     @classmethod
     def suits(cls, rules: Rules) -> bool:
@@ -21,14 +24,16 @@ class Policy:
     def __init__(self, rules: Rules, random: np.random.Generator) -> None:
         self.rules = rules
         self.belief: Belief | None = None
-        self.waited, self.alarmed = 0, False
+        self.waited = 0
+        self.alarmed = False
 
     def act(self, observation: dict[str, np.ndarray]) -> Any:
         self.belief = Belief.follow(self.belief, self.rules, observation)
         if observation["currents"].any():
             self.waited = 0
-            # In predicted standard deviations: 0.4 to 0.6 in quiet fluid, which does less than the model expects. What
-            # rises above that is a slug's front; as long as it is not understood, innovations are large.
+            # In predicted standard deviations: 0.4 to 0.6 in quiet fluid, which does less than the
+            # model expects. What rises above that is a slug's front; as long as it is not
+            # understood, innovations are large.
             surprise = float(np.sqrt(np.mean(observation["innovations"]**2)))
             self.alarmed = surprise > self.parameters["calm" if self.alarmed else "alarm"]
         self.waited += 1

@@ -1,4 +1,5 @@
-"""Fault-aware greedy: A-optimal among the electrodes that recent readings give no reason to doubt."""
+"""Fault-aware greedy: A-optimal among the electrodes that recent readings give no reason to \
+doubt."""
 
 from typing import Any
 

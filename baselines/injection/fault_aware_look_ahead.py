@@ -1,4 +1,5 @@
-"""Fault-aware look-ahead: beam search over the next three injections, among the electrodes that are not in doubt."""
+"""Fault-aware look-ahead: beam search over the next three injections, among the electrodes that \
+are not in doubt."""
 
 from typing import Any
 
@@ -9,7 +10,8 @@ from eitbench.estimation.onboard.rules import Rules
 
 
 class Policy:
-    parameters: dict[str, Any] = {"depth": 3, "width": 4, "doubtful": DOUBTFUL, "forgiven": FORGIVEN}  # noqa: RUF012
+    parameters: dict[str, Any] = {  # noqa: RUF012
+        "depth": 3, "width": 4, "doubtful": DOUBTFUL, "forgiven": FORGIVEN}
 
     @classmethod
     def suits(cls, rules: Rules) -> bool:

@@ -1,7 +1,10 @@
-"""Foresighted: the pair that leaves least variance where and when it will count; a budget is spread evenly.
+"""Foresighted: the pair that leaves least variance where and when it will count; a budget is \
+spread evenly.
 
-A-optimal for what the fluid brings: the flow carries what is uncertain now, and what of it lies in the region of
-interest is summed over the next steps. Where the flow is unknown a pair that was injected rests for a while: the filter
+A-optimal for what the fluid brings: the flow carries what is uncertain now, and what of it lies \
+in the region of
+interest is summed over the next steps. Where the flow is unknown a pair that was injected rests \
+for a while: the filter
 is surer of the velocity than it should be, and other pairs show where it is wrong.
 """
 
@@ -28,7 +31,7 @@ class Policy:
         self.belief = belief = Belief.follow(self.belief, self.rules, observation)
         if not self.rules.spaced(observation["left"]):
             return self.rules.action(None)
-        # The state at the next measurement lies one step ahead; after the episode's end nothing counts.
+        # The next measurement's state lies one step ahead; after the episode's end nothing counts.
         steps = min(self.parameters["steps"], int(observation["left"][0]) - 1)
         gains = belief.gains(belief.predicted(), weight=belief.foresight(steps))[0]
         gains[self.recent] = -np.inf

@@ -1,4 +1,5 @@
-"""Greedy, A-optimal: the pair that leaves the least variance, linear about the estimate; a budget is spread evenly."""
+"""Greedy, A-optimal: the pair that leaves the least variance, linear about the estimate; a budget \
+is spread evenly."""
 
 from typing import Any
 

@@ -1,4 +1,5 @@
-"""Greedy, D-optimal: the pair that tells most bits, linear about the estimate; a budget is spread evenly."""
+"""Greedy, D-optimal: the pair that tells most bits, linear about the estimate; a budget is spread \
+evenly."""
 
 from typing import Any
 

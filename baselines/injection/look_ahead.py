@@ -1,4 +1,5 @@
-"""Look-ahead: beam search over the next three injections for the least sum of variances; a budget is spread evenly."""
+"""Look-ahead: beam search over the next three injections for the least sum of variances; a budget \
+is spread evenly."""
 
 from typing import Any
 

@@ -10,9 +10,10 @@ from eitbench.estimation.onboard.rules import Rules
 
 class Policy:
     def __init__(self, rules: Rules, random: np.random.Generator) -> None:
-        self.rules, L = rules, rules.world.currents.shape[1]
+        self.rules = rules
+        half = rules.world.currents.shape[1] // 2
         numbers = {frozenset(pair): k for k, pair in enumerate(rules.pairs.tolist())}
-        self.cycle = cycle(numbers[frozenset(pair)] for pair in ((i, i + L // 2) for i in range(L // 2)))
+        self.cycle = cycle(numbers[frozenset((i, half + i))] for i in range(half))
 
     def act(self, observation: dict[str, np.ndarray]) -> Any:
         now = self.rules.spaced(observation["left"])

@@ -11,7 +11,8 @@ class Policy:
     role = "floor"
 
     def __init__(self, rules: Rules, random: np.random.Generator) -> None:
-        self.rules, self.random = rules, random
+        self.rules = rules
+        self.random = random
 
     def act(self, observation: dict[str, np.ndarray]) -> Any:
         if not self.rules.spaced(observation["left"]):

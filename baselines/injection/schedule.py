@@ -1,6 +1,7 @@
 """Offline schedule: every injection chosen beforehand, for the least variances by the model alone.
 
-Greedy first, then, step by step, exchange for a better one; where there is a budget injections move in time, too. The
+Greedy first, then, step by step, exchange for a better one; where there is a budget injections \
+move in time, too. The
 variances of the model do not depend on what will be measured; where the flow is unknown they do.
 """
 
@@ -12,19 +13,25 @@ import numpy as np
 from eitbench.estimation.onboard.belief import Belief
 from eitbench.estimation.onboard.rules import Rules
 
-CANDIDATES, SWEEPS, AFTERWARDS = 6, 2, 16
-"""Pairs that are tried at a step, how often all steps are gone through, and steps on which an exchange is judged."""
+CANDIDATES = 6
+"""Pairs that are tried at a step."""
+SWEEPS = 2
+"""How often all steps are gone through."""
+AFTERWARDS = 16
+"""Steps on which an exchange is judged."""
 
 
 class Policy:
-    parameters: dict[str, Any] = {"candidates": CANDIDATES, "sweeps": SWEEPS, "afterwards": AFTERWARDS}  # noqa: RUF012
+    parameters: dict[str, Any] = {  # noqa: RUF012
+        "candidates": CANDIDATES, "sweeps": SWEEPS, "afterwards": AFTERWARDS}
 
     @classmethod
     def suits(cls, rules: Rules) -> bool:
         return rules.world.velocity_model is None
 
     def __init__(self, rules: Rules, random: np.random.Generator) -> None:
-        self.rules, self.plan = rules, iter(plan_of(rules))
+        self.rules = rules
+        self.plan = iter(plan_of(rules))
 
     def act(self, observation: dict[str, np.ndarray]) -> Any:
         return self.rules.action(next(self.plan))
@@ -35,15 +42,18 @@ def plan_of(rules: Rules) -> tuple[int | None, ...]:
     """The pair of each step, None for no injection."""
     belief = Belief.beforehand(rules)
     steps = rules.world.n_steps - len(rules.world.currents)
-    plan: list[int | None] = [-1 if rules.spaced(np.array([steps - k])) else None for k in range(steps)]
-    states: list[np.ndarray | None] = [None] * (steps + 1)     # before each step; None is the one after the first frame
+    plan: list[int | None] = [-1 if rules.spaced(np.array([steps - k])) else None
+                              for k in range(steps)]
+    # Before each step; None is the one after the first frame.
+    states: list[np.ndarray | None] = [None] * (steps + 1)
 
     def follow(covariance: np.ndarray | None, pair: int | None) -> np.ndarray:
         predicted = belief.predicted(covariance)
         return predicted if pair is None else belief.after(predicted, pair)
 
     def cost(k: int, pairs: list[int | None]) -> float:
-        covariance, total = states[k], 0.0
+        covariance = states[k]
+        total = 0.0
         for pair in pairs + plan[k + len(pairs):k + AFTERWARDS]:
             covariance = follow(covariance, pair)
             total += covariance.trace()
@@ -52,7 +62,8 @@ def plan_of(rules: Rules) -> tuple[int | None, ...]:
     for sweep in range(1 + SWEEPS):
         for k in range(steps):
             if plan[k] is not None:
-                best = np.argsort(-belief.gains(belief.predicted(states[k]))[0])[:CANDIDATES].tolist()
+                gains = belief.gains(belief.predicted(states[k]))[0]
+                best = np.argsort(-gains)[:CANDIDATES].tolist()
                 if sweep == 0:
                     plan[k] = best[0]
                 else:

@@ -13,10 +13,10 @@ DOWN = 3
 
 class Policy:
     def __init__(self, rules: Rules, random: np.random.Generator) -> None:
-        self.rules, L = rules, rules.world.currents.shape[1]
-        half = L // 2
+        self.rules = rules
+        half = rules.world.currents.shape[1] // 2
         numbers = {frozenset(pair): k for k, pair in enumerate(rules.pairs.tolist())}
-        self.cycle = cycle(numbers[frozenset(pair)] for pair in ((i, half + (i + DOWN) % half) for i in range(half)))
+        self.cycle = cycle(numbers[frozenset((i, half + (i + DOWN) % half))] for i in range(half))
 
     def act(self, observation: dict[str, np.ndarray]) -> Any:
         now = self.rules.spaced(observation["left"])

@@ -80,25 +80,17 @@ def official_methods() -> dict[str, str]:
 
 def read_card(name: str) -> dict[str, Any] | None:
     """A card as it is kept; None if there is none."""
-    if not card_path(name).is_file():
-        return None
-    card: dict[str, Any] = json.loads(card_path(name).read_text(encoding="utf-8"))
-    return card
+    path = card_path(name)
+    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
 
 
 def new_card(name: str, method: str) -> dict[str, Any]:
-    """What the first card of a method says, before it is played: the episode.
-
-    Raises
-    ------
-    ValueError
-        If the method plays none of the environments in `SHORT`.
-    """
+    """What the first card of a method says, before it is played: the episode. ``ValueError`` if it
+    plays none of the environments in `SHORT`."""
     for id, kwargs in SHORT.items():
         if _plays(method, id, kwargs):
-            tolerance = SINGLE if kwargs.get("estimator") == "reduced" else DOUBLE
             return {"method": name, "version": 1, "environment": id, "kwargs": kwargs, "seed": SEED,
-                    "tolerance": tolerance}
+                    "tolerance": SINGLE if kwargs.get("estimator") == "reduced" else DOUBLE}
     raise ValueError(f"method {name} plays none of the short worlds {', '.join(SHORT)}")
 
 
@@ -125,13 +117,13 @@ def played(card: dict[str, Any], method: str) -> dict[str, Any]:
 
 
 def moved(card: dict[str, Any], now: dict[str, Any]) -> list[str]:
-    """A sentence for each number of a card that is another one now; new scores are no difference."""
+    """A sentence for each number of a card that is another now; new scores are no difference."""
     tolerance = card["tolerance"]
     said = []
     for score, then in card["scores"].items():
-        value = now["scores"].get(score)
-        if value is None or not math.isclose(value, then, rel_tol=tolerance, abs_tol=1e-300):
-            said.append(f"{score} is {value}, the card says {then}")
+        value = now["scores"].get(score, math.nan)
+        if not math.isclose(value, then, rel_tol=tolerance, abs_tol=1e-300):
+            said.append(f"{score} is {now['scores'].get(score)}, the card says {then}")
     if not _same(card["answer"], now["answer"], tolerance):
         said.append(f"answer is {now['answer']}, the card says {card['answer']}")
     return said
@@ -148,10 +140,7 @@ def update(names: list[str], *, new_version: bool = False) -> Iterator[tuple[str
     name, what, differences
         ``what`` is ``new``, ``same``, ``moved``, or the new version.
 
-    Raises
-    ------
-    ValueError
-        If a name is none of ours.
+    ``ValueError`` if a name is none of ours.
     """
     methods = official_methods()
     if unknown := [name for name in names if name not in methods]:
@@ -167,8 +156,7 @@ def _updated(name: str, method: str, new_version: bool) -> tuple[str, list[str]]
     if differences and not new_version:
         return "moved", differences
     if card and not differences:
-        # Scores that came after the card was written are added; what is there stays to the last
-        # bit.
+        # Scores that came after the card was written are added; what is there stays to the bit.
         now = card | {"scores": now["scores"] | card["scores"]}
         what = "same"
     else:
@@ -194,8 +182,10 @@ def _plays(method: str, id: str, kwargs: dict[str, Any]) -> bool:
 
 def _text(card: dict[str, Any]) -> str:
     """JSON with a line for each field and score, so that changes can be read line by line."""
-    scores = ",\n".join(f"  {json.dumps(score)}: {value!r}" for score, value in sorted(card["scores"].items()))
-    lines = [f" {json.dumps(key)}: {json.dumps(value)}" for key, value in card.items() if key != "scores"]
+    scores = ",\n".join(f"  {json.dumps(score)}: {value!r}"
+                        for score, value in sorted(card["scores"].items()))
+    lines = [f" {json.dumps(key)}: {json.dumps(value)}"
+             for key, value in card.items() if key != "scores"]
     return "{\n" + ",\n".join([*lines, f' "scores": {{\n{scores}\n }}']) + "\n}\n"
 
 

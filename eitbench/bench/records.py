@@ -31,23 +31,16 @@ from eitbench.data.seeds import name_seed, parse_seeds
 
 SCHEMA = 3
 BOARDS = tracks.ALL_BOARDS
-SHARED = ("board", "title", "parameters", "role", "privileged", "version", "method_sha256", "checkpoint_sha256")
+SHARED = ("board", "title", "parameters", "role", "privileged", "version", "method_sha256",
+          "checkpoint_sha256")
 """What all episodes of a record have in common, beside environment and method."""
-
-
 OURS = re.compile(r"v([1-9][0-9]*)")
 """Versions of our own methods; of all others a version is eight digits of their file's sha256."""
 
 
 def write_record(folder: Path, record: dict[str, Any]) -> Path:
     """Write a record into ``folder``, whole or not at all, and return its path; what had its name
-    is replaced.
-
-    Raises
-    ------
-    ValueError
-        Naming the file and the fields, if it is not what the schema asks for.
-    """
+    is replaced. ``ValueError``, naming file and fields, if it is not what the schema asks for."""
     record = sealed(record)
     path = Path(folder) / _named_by_content(record)
     _check(path, record)
@@ -58,50 +51,49 @@ def write_record(folder: Path, record: dict[str, Any]) -> Path:
 def read_record(path: Path) -> dict[str, Any]:
     """A record as it was written; one of the format before as it would be written today.
 
-    Raises
-    ------
-    ValueError
-        Naming the file and the fields, if it cannot be read, is not what the schema asks for, was
-        changed since it was written, or has another name than its content asks for.
+    ``ValueError``, naming file and fields, if it cannot be read, is not what the schema asks for,
+    was changed since it was written, or has another name than its content asks for.
     """
     try:
         record = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse)
     except (OSError, ValueError) as error:
         raise ValueError(f"record {path} cannot be read: {error}") from None
-    written, name = record, None
+    written = record
+    name = None
     if isinstance(record, dict) and record.get("schema") == schema2.NUMBER:
         content, name = schema2.upgraded(path, record)
         record = sealed(content)
     _check(path, record)
     if written.get("sha256") != sealed(written)["sha256"]:
-        raise ValueError(f"record {path} was changed since it was written: its sha256 is no longer that of its content")
-    if path.name != (name or file_name(record)):
-        raise ValueError(f"record {path} must have the name {name or file_name(record)}, as its content asks for")
+        raise ValueError(f"record {path} was changed since it was written: its sha256 is no longer "
+                         "that of its content")
+    name = name or file_name(record)
+    if path.name != name:
+        raise ValueError(f"record {path} must have the name {name}, as its content asks for")
     return record
 
 
 def read_records(folder: Path) -> list[dict[str, Any]]:
     """All records of a folder, by file name; none if there is no such folder. Errors as
-    `read_record`.
-
-    Records of an environment that is not registered, or no longer in that version, are left out
-    with a warning.
-    """
-    records, known = [], set(tracks.ids())
+    `read_record`. Records of an environment that is not registered, or no longer in that version,
+    are left out with a warning."""
+    records = []
+    known = set(tracks.ids())
     for path in sorted(Path(folder).glob("*.json")):
         record = read_record(path)
-        if record["environment"]["id"] in known:
+        id = record["environment"]["id"]
+        if id in known:
             records.append(record)
         else:
-            warnings.warn(f"record {path} is left out: there is no environment {record['environment']['id']}",
-                          stacklevel=2)
+            warnings.warn(f"record {path} is left out: there is no environment {id}", stacklevel=2)
     return records
 
 
 def sealed(record: dict[str, Any]) -> dict[str, Any]:
     """The record with the ``sha256`` of its content: canonical JSON of all other fields."""
+    content = {key: value for key, value in record.items() if key != "sha256"}
     try:
-        content = json.loads(_json({key: value for key, value in record.items() if key != "sha256"}))
+        content = json.loads(_json(content))
     except (TypeError, ValueError) as error:  # NaN, or something that is no JSON at all
         raise ValueError(f"record cannot be written as JSON: {error}") from None
     text = _json(content, separators=(",", ":"))
@@ -109,9 +101,8 @@ def sealed(record: dict[str, Any]) -> dict[str, Any]:
 
 
 def file_name(record: dict[str, Any]) -> str:
-    """``ENV--METHOD--VERSION.json``; records of other seeds than test have their split in it too."""
-    parts = [record["environment"]["name"], record["method"], record["version"]]
-    return "--".join([*parts, *([] if record["split"] == "test" else [record["split"]])]) + ".json"
+    """``ENV--METHOD--VERSION.json``; of other seeds than test with their split in it too."""
+    return schema2.file_name(record, record["version"])
 
 
 def split_of(seed: str) -> str:
@@ -120,12 +111,12 @@ def split_of(seed: str) -> str:
 
 
 def alike(runs: Iterable[dict[str, Any]], *keys: str) -> list[list[dict[str, Any]]]:
-    """Runs grouped by code, machine and these ``keys``; the processes of a machine time its matrix
-    product each."""
+    """Runs grouped by code, these ``keys`` and machine, whose matrix product each process times."""
     groups: dict[str, list[dict[str, Any]]] = {}
     for run in runs:
         machine = {key: value for key, value in run["machine"].items() if key != "matmul_seconds"}
-        what = [machine, *(run[key] for key in ("commit", "dirty", "source", "versions", "blas", *keys))]
+        code = ("commit", "dirty", "source", "versions", "blas")
+        what = [machine, *(run[key] for key in (*code, *keys))]
         groups.setdefault(_json(what), []).append(run)
     return list(groups.values())
 
@@ -146,9 +137,12 @@ def newest(records: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], list[di
     for record in records:
         key = _lineage(record)
         highest[key] = max(highest.get(key, 0), version_number(record["version"]) or 0)
-    current = [version_number(record["version"]) in (None, highest[_lineage(record)]) for record in records]
-    return ([record for record, is_current in zip(records, current, strict=True) if is_current],
-            [record for record, is_current in zip(records, current, strict=True) if not is_current])
+    current: list[dict[str, Any]] = []
+    outdated: list[dict[str, Any]] = []
+    for record in records:
+        is_current = version_number(record["version"]) in (None, highest[_lineage(record)])
+        (current if is_current else outdated).append(record)
+    return current, outdated
 
 
 def version_number(version: str) -> int | None:
@@ -162,25 +156,27 @@ def _lineage(record: dict[str, Any]) -> tuple[str, ...]:
 
 
 def _check(path: Path, record: Any) -> None:
-    """``ValueError`` naming file and fields if a record is not as the schema says, or contradicts
-    itself."""
-    wrong = [f"{error.json_path}: {_shortened(error.message)}" for error in sorted(
-        _validator().iter_errors(record), key=lambda error: error.json_path)] or _contradictions(record)
-    if wrong:
+    """``ValueError`` naming file and fields if a record breaks the schema or contradicts itself."""
+    errors = sorted(_validator().iter_errors(record), key=lambda error: error.json_path)
+    wrong = [f"{error.json_path}: {_shortened(error.message)}" for error in errors]
+    if wrong := wrong or _contradictions(record):
         raise ValueError(f"record {path} is not valid: " + "; ".join(wrong[:5]))
 
 
 def _contradictions(record: dict[str, Any]) -> list[str]:
     """What the schema cannot say: fields of a valid record that do not fit each other."""
-    wrong, environment = [], record["environment"]
+    wrong = []
+    environment = record["environment"]
+    version = record["version"]
     name = tracks.named(environment["id"], environment["kwargs"])
     if environment["name"] != name:
         wrong.append(f"$.environment.name: must be {name}, as id and kwargs ask for")
-    if record["version"] != record["method_sha256"][:8] and version_number(record["version"]) is None:
+    if version != record["method_sha256"][:8] and version_number(version) is None:
         wrong.append("$.version: must be v1, v2, … of ours, or begin as method_sha256 does")
     if record["seeds"] != [episode["seed"] for episode in record["episodes"]]:
         wrong.append("$.seeds: must be those of the episodes, in their order")
-    wrong += [f"$.seeds: {seed!r} names no episode" for seed in record["seeds"] if not _names_an_episode(seed)]
+    wrong += [f"$.seeds: {seed!r} names no episode"
+              for seed in record["seeds"] if not _names_an_episode(seed)]
     if {split_of(seed) for seed in record["seeds"]} != {record["split"]}:
         wrong.append(f"$.seeds: must all be of the split {record['split']}")
     if record["official"] and any(run["commit"] is None or run["dirty"] for run in record["runs"]):
@@ -188,14 +184,15 @@ def _contradictions(record: dict[str, Any]) -> list[str]:
     for i, episode in enumerate(record["episodes"]):
         if episode["run"] >= len(record["runs"]):
             wrong.append(f"$.episodes[{i}].run: there are only {len(record['runs'])} runs")
-        steps = episode.get("step_errors")
-        if steps and not math.isclose(episode["scores"]["error"], sum(steps) / len(steps), rel_tol=1e-9):
-            wrong.append(f"$.episodes[{i}].scores.error: must be the mean of step_errors")
+        if steps := episode.get("step_errors"):
+            mean = sum(steps) / len(steps)
+            if not math.isclose(episode["scores"]["error"], mean, rel_tol=1e-9):
+                wrong.append(f"$.episodes[{i}].scores.error: must be the mean of step_errors")
     return wrong
 
 
 def _names_an_episode(seed: str) -> bool:
-    """Whether it lies within its split and is written as `name_seed` does: an episode has one name."""
+    """Whether it lies within its split, written as `name_seed` does: an episode has one name."""
     try:
         return name_seed(parse_seeds(seed)[0]) == seed
     except ValueError:
@@ -216,8 +213,7 @@ def _named_by_content(record: dict[str, Any]) -> str:
 
 
 def _text(record: dict[str, Any]) -> str:
-    """JSON with sorted keys, a line for each field, episode and run, so that changes can be read
-    line by line."""
+    """JSON with sorted keys, a line for each field, episode and run, for changes to be read by."""
     lines = []
     for key, value in sorted(record.items()):
         if key in ("episodes", "runs"):

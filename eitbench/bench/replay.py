@@ -1,16 +1,14 @@
-"""Play episodes of many records again, and say of each how far the numbers are from what it says."""
+"""Play episodes of many records again, and say how far the numbers are from what each says."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-import os
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 import pandas as pd
 from tqdm import tqdm
 
@@ -18,12 +16,12 @@ from eitbench import _check
 from eitbench._files import write_atomically
 from eitbench.bench.records import newest, read_record
 from eitbench.bench.run import run_episode
-from eitbench.bench.store import source_digest
+from eitbench.bench.store import read_json, source_digest
 from eitbench.bench.table import Cell, Table
-from eitbench.bench.verify import TOLERANCE, differences_of, job_of, outdated
+from eitbench.bench.verify import TOLERANCE, differences_of, drawn_of, job_of, outdated
 from eitbench.data.parallel import in_parallel
 from eitbench.data.seeds import parse_seeds
-from eitbench.data.store import CACHE_VARIABLE
+from eitbench.data.store import cache_in
 
 
 class Replay(NamedTuple):
@@ -38,40 +36,33 @@ class Replay(NamedTuple):
 
 def official_records(folder: Path, environments: Sequence[str] = ()) -> list[Path]:
     """Paths of the official records of a folder that are not outdated, of these environments or of
-    all.
-
-    Raises
-    ------
-    ValueError
-        If there are none, or one of all records is not valid.
-    """
+    all. ``ValueError`` if there are none, or one of all records is not valid."""
     read = {path: read_record(path) for path in sorted(folder.glob("*.json"))}
     current = newest(list(read.values()))[0]
     chosen = [path for path, record in read.items() if record["official"] and record in current
               and (not environments or record["environment"]["id"] in environments)]
     if not chosen:
-        raise ValueError(f"records must be a folder with official records, got {folder}"
-                         + (f", which has none of {', '.join(environments)}" if environments else ""))
+        none = f", which has none of {', '.join(environments)}" if environments else ""
+        raise ValueError(f"records must be a folder with official records, got {folder}{none}")
     return chosen
 
 
 def replays(records: Sequence[Path], episodes: int, seed: int, folder: Path) -> list[Replay]:
-    """``episodes`` drawn from each record with this ``seed``, environment by environment, cheap
-    ones first.
+    """``episodes`` drawn from each record with this ``seed``, cheap environments first.
 
     Records of the same episodes have the same ones drawn, so that each is simulated once.
     """
     found: dict[str, list[tuple[float, Replay]]] = {}
     for path in records:
         record = read_record(path)
-        drawn = np.random.default_rng(seed).permutation(len(record["episodes"]))[:episodes]
-        for number in sorted(int(place) for place in drawn):
+        for number in drawn_of(record, episodes, seed):
             said = record["episodes"][number]
             kept = folder / "outcomes" / f"{path.stem}--{said['seed'].replace(':', '-')}.json"
             found.setdefault(record["environment"]["name"], []).append(
                 (said["seconds"], Replay(path, number, kept)))
     cheap_first = sorted(found.values(), key=lambda timed: sum(seconds for seconds, _ in timed))
-    return [replay for timed in cheap_first for _, replay in sorted(timed, key=lambda pair: pair[0])]
+    return [replay for timed in cheap_first
+            for _, replay in sorted(timed, key=lambda pair: pair[0])]
 
 
 def verify_all(records: Sequence[Path], folder: Path, *, episodes: int = 1, seed: int = 0,
@@ -92,18 +83,11 @@ def verify_all(records: Sequence[Path], folder: Path, *, episodes: int = 1, seed
     _check.integer("episodes", episodes, low=1)
     todo = replays(records, episodes, seed, folder)
     left = [(replay, isolate) for replay in todo if _kept(replay) is None]
-    before = os.environ.get(CACHE_VARIABLE)
-    # nothing that was there before is believed
-    os.environ[CACHE_VARIABLE] = str((folder / "cache").absolute())
-    try:
-        for _ in tqdm(in_parallel(_replay, left, n_jobs, backend), total=len(todo), initial=len(todo) - len(left),
-                      desc="playing again", unit="episode", disable=None):
+    with cache_in((folder / "cache").absolute()):  # nothing that was there before is believed
+        for _ in tqdm(in_parallel(_replay, left, n_jobs, backend), total=len(todo),
+                      initial=len(todo) - len(left), desc="playing again", unit="episode",
+                      disable=None):
             pass
-    finally:
-        if before is None:
-            del os.environ[CACHE_VARIABLE]
-        else:
-            os.environ[CACHE_VARIABLE] = before
     return pd.DataFrame([_kept(replay) for replay in todo]).drop(columns="identity")
 
 
@@ -111,31 +95,30 @@ def _replay(replay: Replay, isolate: str) -> None:
     record = read_record(replay.record)
     said = record["episodes"][replay.episode]
     outcome: dict[str, Any] = {
-        "identity": _identity(replay), "record": replay.record.name, "environment": record["environment"]["id"],
-        "method": record["method"], "episode": said["seed"], "score": "", "difference": 0.0,
+        "identity": _identity(replay), "record": replay.record.name,
+        "environment": record["environment"]["id"], "method": record["method"],
+        "episode": said["seed"], "score": "", "difference": 0.0,
         "said": said.get("scores", {}).get("error"), "again": None, "problem": "", "remark": ""}
     try:
         job = job_of(record, None, isolate)._replace(seed=parse_seeds(said["seed"])[0])
     except ValueError as error:
         outcome["problem"] = str(error)
     else:
-        outcome["remark"] = outdated(record, job)
         again = json.loads(json.dumps(run_episode(job)[0]))
         off = differences_of(said, again)
-        outcome["score"] = max(off, key=lambda name: off[name], default="")
-        outcome["difference"] = min(off.get(outcome["score"], 0.0), 1e300)
-        outcome["again"] = again.get("scores", {}).get("error")
-        outcome["problem"] = again.get("message", "") if again["status"] != said["status"] else ""
+        worst = max(off, key=lambda name: off[name], default="")
+        outcome |= {
+            "remark": outdated(record, job), "score": worst,
+            "difference": min(off.get(worst, 0.0), 1e300),
+            "again": again.get("scores", {}).get("error"),
+            "problem": again.get("message", "") if again["status"] != said["status"] else ""}
     write_atomically(replay.outcome, json.dumps(outcome, indent=1).encode())
 
 
 def _kept(replay: Replay) -> dict[str, Any] | None:
     """What came out, if it is there and of this code."""
-    try:
-        outcome = json.loads(replay.outcome.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    return outcome if isinstance(outcome, dict) and outcome.get("identity") == _identity(replay) else None
+    outcome = read_json(replay.outcome) or {}
+    return outcome if outcome.get("identity") == _identity(replay) else None
 
 
 def _identity(replay: Replay) -> str:
@@ -145,25 +128,27 @@ def _identity(replay: Replay) -> str:
 
 def differing(rows: pd.DataFrame, tolerance: float = TOLERANCE) -> list[str]:
     """A sentence for each episode that is not as its record says, or could not be played."""
-    wrong = rows[(rows["difference"] > tolerance) | (rows["problem"] != "")]
     said = []
-    for _, row in wrong.iterrows():
+    for _, row in rows[_differ(rows, tolerance)].iterrows():
         what = row["problem"] or f"{row['score']} by {row['difference']:.2g}"
         remark = f" ({row['remark']})" if row["remark"] else ""
         said.append(f"{row['record']}, {row['episode']}: {what}{remark}")
     return said
 
 
+def _differ(rows: pd.DataFrame, tolerance: float) -> pd.Series:
+    return (rows["difference"] > tolerance) | (rows["problem"] != "")
+
+
 def by_environment(rows: pd.DataFrame, tolerance: float = TOLERANCE) -> str:
-    """Markdown: for each environment how many episodes are as their records say, and the greatest
-    difference."""
+    """Markdown: of each environment how many episodes are as recorded, and what differs most."""
     lines: list[dict[str, Cell | str]] = []
     for name, group in rows.groupby("environment", sort=False):
         worst = group.iloc[int(group["difference"].argmax())]
-        differs = (group["difference"] > tolerance) | (group["problem"] != "")
-        lines.append({"environment": str(name), "greatest difference in": f"{worst['score']} of {worst['method']}"
-                      if worst["difference"] else "none", "episodes": Cell(str(len(group))),
+        where = f"{worst['score']} of {worst['method']}" if worst["difference"] else "none"
+        lines.append({"environment": str(name), "greatest difference in": where,
+                      "episodes": Cell(str(len(group))),
                       "to the bit": Cell(str(int((group["difference"] == 0).sum()))),
-                      "differ": Cell(str(int(differs.sum()))),
+                      "differ": Cell(str(int(_differ(group, tolerance).sum()))),
                       "relative": Cell(f"{worst['difference']:.1g}")})
     return Table.of(lines).markdown()

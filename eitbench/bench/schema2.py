@@ -18,14 +18,9 @@ NUMBER = 2
 
 def upgraded(path: Path, record: dict[str, Any]) -> tuple[dict[str, Any], str]:
     """A record of schema 2 as one of schema 3, not sealed, and the name its file had to have.
-
-    Raises
-    ------
-    ValueError
-        Naming the file, if something is missing that the new record is made from.
-    """
+    ``ValueError``, naming the file, if something is missing that the new record is made from."""
     try:
-        return _upgraded(record), _file_name(record)
+        return _upgraded(record), file_name(record, record["method_sha256"][:8])
     except (AttributeError, KeyError, TypeError) as error:
         raise ValueError(f"record {path} is not valid as one of schema {NUMBER}: "
                          f"{type(error).__name__}: {error}") from None
@@ -39,7 +34,8 @@ def _upgraded(record: dict[str, Any]) -> dict[str, Any]:
     return kept | {
         "schema": 3,
         "version": "v1" if is_ours else record["method_sha256"][:8],
-        "environment": environment | {"kwargs": given, "name": tracks.named(environment["id"], given)},
+        "environment": environment | {"kwargs": given,
+                                      "name": tracks.named(environment["id"], given)},
         "runs": [run | {"source": record["source"]} for run in record["runs"]],
     }
 
@@ -47,12 +43,12 @@ def _upgraded(record: dict[str, Any]) -> dict[str, Any]:
 def _given(environment: dict[str, Any]) -> dict[str, Any]:
     """Arguments that differ from what is registered."""
     if environment["name"] == environment["id"].replace("/", "-"):
-        # The name said that nothing was given, whatever the id was registered with in those days.
+        # The name said that nothing was given, whatever the id was registered with then.
         return {}
     return tracks.changed(environment["id"], environment["kwargs"])
 
 
-def _file_name(record: dict[str, Any]) -> str:
-    parts = [record["environment"]["name"], record["method"], record["method_sha256"][:8]]
+def file_name(record: dict[str, Any], version: str) -> str:
+    """``ENV--METHOD--VERSION.json``; of other seeds than test with their split in it too."""
     split = [] if record["split"] == "test" else [record["split"]]
-    return "--".join([*parts, *split]) + ".json"
+    return "--".join([record["environment"]["name"], record["method"], version, *split]) + ".json"

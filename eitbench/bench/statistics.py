@@ -1,5 +1,4 @@
-"""Statistics of a board: interquartile mean, bootstrap intervals, comparisons seed by seed, shared
-ranks.
+"""Statistics of a board: interquartile mean, bootstrap intervals, paired comparisons, shared ranks.
 
 Methods play the same episodes, named by their seeds, in several environments. An environment is a
 stratum: episodes are resampled within it, the environments stay as they are. Intervals are
@@ -28,8 +27,7 @@ from scipy.stats import t as student
 Scores = Mapping[str, Mapping[str, float]]
 """Environment -> seed -> score: of one method, for comparisons seed by seed."""
 Statistic = Callable[..., Any]
-"""Takes one array (..., n_e) for each stratum and gives an array (...); n_e episodes, the axes
-before it are draws."""
+"""Takes an array (..., n_e) of n_e episodes for each stratum and gives (...), which are draws."""
 DRAWS = 10_000
 FEWEST = 6
 """With fewer episodes altogether no interval is claimed: where all n differences have one sign each
@@ -60,19 +58,20 @@ def interquartile_mean(*scores: ArrayLike) -> Any:
         raise ValueError("scores must hold at least one score")
     # scipy.stats.trim_mean(…, 0.25), but faster for many draws, and the same to the last bit in
     # whatever order
-    return np.sort(np.concatenate(strata, axis=-1), axis=-1)[..., total // 4:total - total // 4].mean(axis=-1)
+    ordered = np.sort(np.concatenate(strata, axis=-1), axis=-1)
+    return ordered[..., total // 4:total - total // 4].mean(axis=-1)
 
 
 def mean_over_environments(*scores: ArrayLike) -> Any:
-    """Mean of the environments' means, (...) of one array (..., n_e) each: all weigh the same,
-    however long."""
+    """Mean of the environments' means, (...) of an array (..., n_e) each: all weigh the same."""
     if not scores or not all(np.shape(stratum)[-1] for stratum in scores):
         raise ValueError("scores must hold at least one score of each environment")
-    return np.mean([np.mean(np.asarray(stratum, dtype=float), axis=-1) for stratum in scores], axis=0)
+    means = [np.mean(np.asarray(stratum, dtype=float), axis=-1) for stratum in scores]
+    return np.mean(means, axis=0)
 
 
-def stratified_bootstrap(scores_by_stratum: Mapping[str, ArrayLike], statistic: Statistic, *, draws: int = DRAWS,
-                         seed: int = 0) -> tuple[float, float, float]:
+def stratified_bootstrap(scores_by_stratum: Mapping[str, ArrayLike], statistic: Statistic, *,
+                         draws: int = DRAWS, seed: int = 0) -> tuple[float, float, float]:
     """A statistic with its 95 % percentile bootstrap interval, episodes resampled within each
     environment.
 
@@ -93,13 +92,11 @@ def stratified_bootstrap(scores_by_stratum: Mapping[str, ArrayLike], statistic: 
         With fewer than `FEWEST` episodes altogether, or fewer than two in an environment, low and
         high are infinite.
     """
-    strata = _strata("scores_by_stratum", scores_by_stratum)
-    low, high = _interval(strata, statistic, draws, seed) if _enough(strata) else (-math.inf, math.inf)
-    return float(statistic(*strata)), low, high
+    return _with_interval(_strata("scores_by_stratum", scores_by_stratum), statistic, draws, seed)
 
 
-def paired_difference(a: Scores, b: Scores, *, statistic: Statistic = mean_over_environments, draws: int = DRAWS,
-                      seed: int = 0) -> tuple[float, float, float]:
+def paired_difference(a: Scores, b: Scores, *, statistic: Statistic = mean_over_environments,
+                      draws: int = DRAWS, seed: int = 0) -> tuple[float, float, float]:
     """A statistic of a less that of b, on the episodes that both have, with its 95 % interval;
     below zero a is lower.
 
@@ -117,31 +114,30 @@ def paired_difference(a: Scores, b: Scores, *, statistic: Statistic = mean_over_
     draws, seed
         As in `stratified_bootstrap`; so are the three numbers returned.
 
-    Raises
-    ------
-    ValueError
-        If the environments differ, or there is one without any shared seed.
+    ``ValueError`` if the environments differ, or there is one without any shared seed.
     """
     pairs = [_sorted(pair) for _, pair in sorted(_pairs(a, b).items())]
 
     def difference(*positions: np.ndarray) -> Any:
-        ours, theirs = ([pair[i][drawn] for pair, drawn in zip(pairs, positions, strict=True)] for i in (0, 1))
+        ours, theirs = ([pair[i][drawn] for pair, drawn in zip(pairs, positions, strict=True)]
+                        for i in (0, 1))
         return statistic(*ours) - statistic(*theirs)
 
     positions = [np.arange(pair.shape[1]) for pair in pairs]
-    low, high = _interval(positions, difference, draws, seed) if _enough(positions) else (-math.inf, math.inf)
-    return float(difference(*positions)), low, high
+    return _with_interval(positions, difference, draws, seed)
 
 
-def paired_probability_of_improvement(a: Scores, b: Scores, *, higher_is_better: bool = False, draws: int = DRAWS,
-                                      seed: int = 0) -> tuple[float, float, float]:
+def paired_probability_of_improvement(a: Scores, b: Scores, *, higher_is_better: bool = False,
+                                      draws: int = DRAWS, seed: int = 0,
+                                      ) -> tuple[float, float, float]:
     """Share of the shared episodes in which a is better than b, with its 95 % interval; an equal
     score counts ½.
 
     The mean over environments of each one's share. Arguments, pairing and errors as in
     `paired_difference`; where there is no interval, 0 and 1 are its ends.
     """
-    wins = {environment: _wins(pair[0], pair[1], higher_is_better) for environment, pair in _pairs(a, b).items()}
+    wins = {environment: _wins(pair[0], pair[1], higher_is_better)
+            for environment, pair in _pairs(a, b).items()}
     value, low, high = stratified_bootstrap(wins, mean_over_environments, draws=draws, seed=seed)
     return value, max(low, 0.0), min(high, 1.0)
 
@@ -167,26 +163,28 @@ def probability_of_improvement(a: Mapping[str, ArrayLike], b: Mapping[str, Array
         infinity.
     """
     _same_environments(a, b)
-    ours, theirs = _strata("a", a), _strata("b", b)
+    ours = _strata("a", a)
+    theirs = _strata("b", b)
     # (n_a, n_b)
     wins = [_wins(x[:, None], y, higher_is_better) for x, y in zip(ours, theirs, strict=True)]
+    n = len(wins)
 
     def probability(*positions: np.ndarray) -> Any:
         # A resample is how often each episode is in it, which makes of all its combinations one
         # matrix product.
         shares = [((_counts(i) @ won) * _counts(j)).sum(axis=-1) / won.size
-                  for i, j, won in zip(positions[:len(wins)], positions[len(wins):], wins, strict=True)]
+                  for i, j, won in zip(positions[:n], positions[n:], wins, strict=True)]
         return np.mean(shares, axis=0)
 
     positions = [np.arange(len(stratum)) for stratum in [*ours, *theirs]]
-    enough = _enough(ours) and _enough(theirs)
-    low, high = _interval(positions, probability, draws, seed) if enough else (0.0, 1.0)
-    return float(probability(*positions)), low, high
+    if not (_enough(ours) and _enough(theirs)):
+        return float(probability(*positions)), 0.0, 1.0
+    return _with_interval(positions, probability, draws, seed)
 
 
 def shared_ranks(scores: Mapping[str, Scores], unranked: Collection[str] = (), *,
-                 statistic: Statistic = mean_over_environments, higher_is_better: bool = False, draws: int = DRAWS,
-                 seed: int = 0) -> dict[str, int | None]:
+                 statistic: Statistic = mean_over_environments, higher_is_better: bool = False,
+                 draws: int = DRAWS, seed: int = 0) -> dict[str, int | None]:
     """Rank of each method: 1 + the number of ranked methods that are significantly better than it.
 
     Better is one whose `paired_difference` has its whole interval on the better side of zero. Rank
@@ -219,33 +217,41 @@ def shared_ranks(scores: Mapping[str, Scores], unranked: Collection[str] = (), *
     for method in scores:
         _same_environments(next(iter(scores.values())), scores[method])
     sign = -1.0 if higher_is_better else 1.0
-    values = {method: sign * statistic(*_strata("scores", {name: list(episodes.values())
-                                                           for name, episodes in own.items()}))
-              for method, own in scores.items()}
+    values = {}
+    for method, own in scores.items():
+        strata = {name: list(episodes.values()) for name, episodes in own.items()}
+        values[method] = sign * statistic(*_strata("scores", strata))
     # equal values: not as they happen to come
     order = sorted(scores, key=lambda method: (values[method], method))
     ranks = {method: 1 for method in order if method not in unranked}
     for first, second in combinations(ranks, 2):
-        _, low, high = paired_difference(scores[first], scores[second], statistic=statistic, draws=draws, seed=seed)
+        _, low, high = paired_difference(scores[first], scores[second], statistic=statistic,
+                                         draws=draws, seed=seed)
         low, high = sorted((sign * low, sign * high))
         ranks[second] += high < 0
         ranks[first] += low > 0  # happens where each has episodes that the other has not
     return {method: ranks.get(method) for method in order}
 
 
-def _interval(strata: Sequence[np.ndarray], statistic: Statistic, draws: int, seed: int) -> tuple[float, float]:
-    """The points of a statistic, over resamples of each stratum (n_e,), beyond which `tail` percent
-    lie."""
+def _with_interval(strata: Sequence[np.ndarray], statistic: Statistic, draws: int,
+                   seed: int) -> tuple[float, float, float]:
+    """A statistic, and the points beyond which `tail` percent of it lie over resamples of each
+    stratum (n_e,); infinite where the episodes are too few."""
+    value = float(statistic(*strata))
+    if not _enough(strata):
+        return value, -math.inf, math.inf
     if draws < 1:
         raise ValueError(f"draws must be at least 1, got {draws}")
     random = np.random.default_rng(seed)
-    values = np.asarray(statistic(*(stratum[random.integers(len(stratum), size=(draws, len(stratum)))]
-                                    for stratum in strata)))
+    drawn = (stratum[random.integers(len(stratum), size=(draws, len(stratum)))]
+             for stratum in strata)
+    values = np.asarray(statistic(*drawn))
     if values.shape != (draws,):  # np.mean, say, would make one number of all draws
-        raise ValueError(f"statistic must reduce the last axis only: expected shape {(draws,)}, got {values.shape}")
+        raise ValueError("statistic must reduce the last axis only: expected shape "
+                         f"{(draws,)}, got {values.shape}")
     cut = tail([len(stratum) for stratum in strata])
     low, high = np.percentile(values, [cut, 100.0 - cut])
-    return float(low), float(high)
+    return value, float(low), float(high)
 
 
 def tail(sizes: Sequence[int]) -> float:
@@ -256,7 +262,8 @@ def tail(sizes: Sequence[int]) -> float:
     E degrees of freedom that E strata leave, and a normal quantile is less than Student's; this
     makes up for both.
     """
-    n, freedom = sum(sizes), sum(sizes) - len(sizes)
+    n = sum(sizes)
+    freedom = n - len(sizes)
     return float(100.0 * norm.cdf(-student.ppf(0.975, freedom) * math.sqrt(n / freedom)))
 
 
@@ -267,9 +274,12 @@ def _enough(strata: Sequence[np.ndarray]) -> bool:
 
 def _strata(name: str, scores: Mapping[str, ArrayLike]) -> list[np.ndarray]:
     """The scores of each environment, sorted; environments by name."""
-    strata = [np.sort(np.asarray(scores[environment], dtype=float), axis=-1) for environment in sorted(scores)]
-    if not strata or any(stratum.ndim != 1 or not stratum.size or not np.isfinite(stratum).all() for stratum in strata):
-        raise ValueError(f"{name} must hold finite scores (n_e,) of at least one episode for each of its environments")
+    strata = [np.sort(np.asarray(scores[environment], dtype=float), axis=-1)
+              for environment in sorted(scores)]
+    if not strata or not all(stratum.ndim == 1 and stratum.size and np.isfinite(stratum).all()
+                             for stratum in strata):
+        raise ValueError(f"{name} must hold finite scores (n_e,) of at least one episode for each "
+                         "of its environments")
     return strata
 
 
@@ -281,23 +291,25 @@ def _pairs(a: Scores, b: Scores) -> dict[str, np.ndarray]:
     pairs = {}
     for environment, own in a.items():
         other = b[environment]
-        pairs[environment] = np.array([(own[s], other[s]) for s in own if s in other], dtype=float).reshape(-1, 2).T
-        if not pairs[environment].size:
-            raise ValueError(f"a and b must share a seed in every environment; there is none in {environment}")
+        shared = [(own[seed], other[seed]) for seed in own if seed in other]
+        if not shared:
+            raise ValueError("a and b must share a seed in every environment; there is none in "
+                             f"{environment}")
+        pairs[environment] = np.array(shared, dtype=float).T
         if not np.isfinite(pairs[environment]).all():
             raise ValueError(f"a and b must hold finite scores; there are others in {environment}")
     return pairs
 
 
 def _sorted(pair: np.ndarray) -> np.ndarray:
-    """(2, n_e) by the difference and then by the first, so that no interval depends on how episodes
-    are listed."""
+    """(2, n_e) by the difference, then by the first, so that no interval depends on the listing."""
     return pair[:, np.lexsort((pair[0], pair[0] - pair[1]))]
 
 
 def _same_environments(a: Mapping[str, Any], b: Mapping[str, Any]) -> None:
     if set(a) != set(b):
-        raise ValueError(f"environments must be the same for both, got {', '.join(a)} and {', '.join(b)}")
+        raise ValueError("environments must be the same for both, got "
+                         f"{', '.join(a)} and {', '.join(b)}")
 
 
 def _wins(a: np.ndarray, b: np.ndarray, higher_is_better: bool) -> np.ndarray:
@@ -309,4 +321,5 @@ def _counts(positions: np.ndarray) -> np.ndarray:
     """How often each of 0 … n − 1 is among the n positions: (..., n) of (..., n)."""
     n = positions.shape[-1]
     rows = positions.reshape(-1, n)
-    return np.bincount((rows + n * np.arange(len(rows))[:, None]).ravel(), minlength=rows.size).reshape(positions.shape)
+    apart = rows + n * np.arange(len(rows))[:, None]
+    return np.bincount(apart.ravel(), minlength=rows.size).reshape(positions.shape)

@@ -6,8 +6,9 @@ import io
 import json
 import os
 import platform
+import re
 import subprocess
-import time
+import timeit
 import warnings
 from collections.abc import Iterable, Iterator
 from functools import lru_cache
@@ -23,10 +24,12 @@ from eitbench._files import PACKAGE, write_atomically
 from eitbench.bench.records import SCHEMA, SHARED, read_records, sealed, split_of, write_record
 from eitbench.data.seeds import name_seed
 
-PACKAGES = ("eitbench", "numpy", "scipy", "gymnasium", "scikit-fem", "numba", "stable-baselines3", "sb3-contrib",
-            "torch")
+PACKAGES = ("eitbench", "numpy", "scipy", "gymnasium", "scikit-fem", "numba", "stable-baselines3",
+            "sb3-contrib", "torch")
 """Whose versions a record names."""
-_NEEDED = {"identity", "seed", "method", "environment", "finished", "status", "run", *SHARED}
+_OF_ALL = ("environment", "method", *SHARED)
+"""What the results that make one record have in common."""
+_NEEDED = {"identity", "seed", "finished", "status", "run", *_OF_ALL}
 
 
 class EpisodeStore:
@@ -43,7 +46,7 @@ class EpisodeStore:
     def put(self, environment: str, method: str, seed: int, result: dict[str, Any],
             fields: dict[str, np.ndarray]) -> None:
         """Store one episode; the estimates first, so that a result never stands without them."""
-        path = self._path(environment, method, seed)
+        path = self._path(environment, method, name_seed(seed))
         if fields:
             content = io.BytesIO()
             np.savez_compressed(content, **fields)  # type: ignore[arg-type]
@@ -52,21 +55,19 @@ class EpisodeStore:
 
     def holds(self, environment: str, method: str, seed: int, identity: str) -> bool:
         """Whether a successful result of exactly this identity is there."""
-        result = _read(self._path(environment, method, seed))
+        result = _read(self._path(environment, method, name_seed(seed)))
         return result is not None and result["identity"] == identity and result["status"] == "ok"
 
     def results(self) -> Iterator[dict[str, Any]]:
         """All stored results; files that cannot be read are passed over."""
-        paths = self.folder.glob("episodes/*/*/*.json")
-        for path in sorted(paths):
-            result = _read(path)
-            if result is not None:
+        for path in sorted(self.folder.glob("episodes/*/*/*.json")):
+            if result := _read(path):
                 yield result
 
     def fields(self, result: dict[str, Any]) -> dict[str, np.ndarray]:
         """The estimates that belong to a result: ``mean`` and perhaps ``std``, (T, n) in mol/m³."""
-        folder = self.folder / "episodes" / result["environment"]["name"] / result["method"]
-        with np.load(folder / f"{result['seed'].replace(':', '-')}.npz", allow_pickle=False) as stored:
+        path = self._path(result["environment"]["name"], result["method"], result["seed"])
+        with np.load(path.with_suffix(".npz"), allow_pickle=False) as stored:
             return dict(stored)
 
     def records(self, also: Iterable[dict[str, Any]] = ()) -> list[dict[str, Any]]:
@@ -81,8 +82,9 @@ class EpisodeStore:
         records = []
         for key in dict.fromkeys([*own, *others]):
             fresh = _of_one_code(own.get(key, []))
-            version = max(fresh or others[key], key=lambda result: result["finished"])["version"]
-            records.append(_gathered([*fresh, *(each for each in others.get(key, []) if each["version"] == version)]))
+            version = _latest(fresh or others[key])["version"]
+            known = [each for each in others.get(key, []) if each["version"] == version]
+            records.append(_gathered([*fresh, *known]))
         return records
 
     def write_records(self) -> list[dict[str, Any]]:
@@ -101,33 +103,39 @@ class EpisodeStore:
                 written.append(record)
         return written
 
-    def _path(self, environment: str, method: str, seed: int) -> Path:
-        name = f"{name_seed(seed).replace(':', '-')}.json"
+    def _path(self, environment: str, method: str, seed: str) -> Path:
+        name = f"{seed.replace(':', '-')}.json"
         return self.folder / "episodes" / environment.replace("/", "-") / method / name
 
 
-def _by_record(results: Iterable[dict[str, Any]]) -> dict[tuple[str, str, str], list[dict[str, Any]]]:
+_Groups = dict[tuple[str, str, str], list[dict[str, Any]]]
+
+
+def _by_record(results: Iterable[dict[str, Any]]) -> _Groups:
     """Results that may stand in one record: of an environment, a method and a split."""
-    groups: dict[tuple[str, str, str], list[dict[str, Any]]] = {}
+    groups: _Groups = {}
     for result in results:
         key = (result["environment"]["name"], result["method"], split_of(result["seed"]))
         groups.setdefault(key, []).append(result)
     return groups
 
 
+def _latest(results: list[dict[str, Any]]) -> dict[str, Any]:
+    return max(results, key=lambda result: result["finished"])
+
+
 def _of_one_code(results: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Those of the library and the method's file that ran last."""
-    codes = [(result["run"]["source"], result["method_sha256"]) for result in results]
-    if not codes:
-        return []
-    latest = max(range(len(results)), key=lambda k: results[k]["finished"])
-    return [result for result, code in zip(results, codes, strict=True) if code == codes[latest]]
+    def code(result: dict[str, Any]) -> tuple[str, str]:
+        return result["run"]["source"], result["method_sha256"]
+
+    latest = code(_latest(results)) if results else None
+    return [result for result in results if code(result) == latest]
 
 
 def _gathered(results: list[dict[str, Any]]) -> dict[str, Any]:
-    """The record of one version's episodes, self-reported; of several results of a seed the first
-    successful one."""
-    latest = max(results, key=lambda result: result["finished"])
+    """The self-reported record of one version's episodes; of a seed's results the first success."""
+    latest = _latest(results)
     chosen: dict[str, dict[str, Any]] = {}
     for result in results:
         if chosen.setdefault(result["seed"], result)["status"] != "ok":
@@ -138,46 +146,48 @@ def _gathered(results: list[dict[str, Any]]) -> dict[str, Any]:
     for result in results:
         if result["run"] not in runs:
             runs.append(result["run"])
-    apart = {*SHARED, "environment", "method", "run"}
     return sealed({
-        "schema": SCHEMA, **{key: latest[key] for key in ("environment", "method", *SHARED)}, "official": False,
-        "split": split_of(latest["seed"]), "seeds": [result["seed"] for result in results], "runs": runs,
-        "episodes": [{key: value for key, value in result.items() if key not in apart}
+        "schema": SCHEMA, "official": False, "split": split_of(latest["seed"]),
+        **{key: latest[key] for key in _OF_ALL},
+        "seeds": [result["seed"] for result in results], "runs": runs,
+        "episodes": [{key: value for key, value in result.items() if key not in _OF_ALL}
                      | {"run": runs.index(result["run"])} for result in results],
     })
 
 
 def results_of(record: dict[str, Any]) -> list[dict[str, Any]]:
     """The results that were gathered into a record, as a store would hold them."""
-    shared = {key: record[key] for key in ("environment", "method", *SHARED)}
-    return [episode | shared | {"run": record["runs"][episode["run"]]} for episode in record["episodes"]]
+    shared = {key: record[key] for key in _OF_ALL}
+    return [episode | shared | {"run": record["runs"][episode["run"]]}
+            for episode in record["episodes"]]
 
 
 def results_in(folder: Path) -> list[dict[str, Any]]:
-    """The results that were gathered into the records of a folder. Errors as
-    `records.read_records`."""
+    """Those that were gathered into the records of a folder. Errors as `records.read_records`."""
     return [result for record in read_records(folder) for result in results_of(record)]
 
 
 def _read(path: Path) -> dict[str, Any] | None:
-    result = _read_json(path)
+    """A result, if it is there and whole."""
+    result = read_json(path)
     return result if result is not None and result.keys() >= _NEEDED else None
 
 
-def _read_json(path: Path) -> dict[str, Any] | None:
+def read_json(path: Path) -> dict[str, Any] | None:
+    """What a file says, if it can be read and says a dict."""
     try:
-        result = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    return result if isinstance(result, dict) else None
+    return content if isinstance(content, dict) else None
 
 
 @lru_cache(maxsize=1)
 def source_digest() -> str:
     """Hash of the code that scores depend on: stored results of other code are played again, and a
     record says of each run which it was."""
-    rooms = ("numerics/*", "physics/*", "worlds/*", "data/*", "estimation/**/*", "scoring", "envs/*", "rl/networks",
-             "rl/agents", "bench/run", "bench/score", "bench/policies")
+    rooms = ("numerics/*", "physics/*", "worlds/*", "data/*", "estimation/**/*", "scoring",
+             "envs/*", "rl/networks", "rl/agents", "bench/run", "bench/score", "bench/policies")
     return code_digest(package_files(*(f"{room}.py" for room in rooms)))
 
 
@@ -186,9 +196,11 @@ def provenance() -> dict[str, Any]:
     """Versions and commit of the code that this process runs."""
     # results, not code
     status = _git("--no-optional-locks", "status", "--porcelain", "--", ".", ":!leaderboards")
-    blas = np.show_config(mode="dicts")["Build Dependencies"]["blas"]  # type: ignore[index,call-overload]
+    config: Any = np.show_config(mode="dicts")  # type: ignore[call-overload]
+    blas = config["Build Dependencies"]["blas"]
+    packages = {name: _version(name) for name in PACKAGES}
     return {
-        "versions": {"python": platform.python_version(), **{name: _version(name) for name in PACKAGES}},
+        "versions": {"python": platform.python_version(), **packages},
         "blas": f"{blas['name']} {blas['version']}",
         "commit": _git("rev-parse", "HEAD"), "dirty": None if status is None else bool(status),
         "source": source_digest(),
@@ -197,9 +209,9 @@ def provenance() -> dict[str, Any]:
 
 @lru_cache(maxsize=1)
 def machine() -> dict[str, Any]:
-    """The machine of this process: in a cluster, another one than that of whoever started the run."""
-    return {"processor": _processor(), "cores": os.cpu_count(), "system": platform.system(), "blas_threads": 1,
-            "matmul_seconds": matmul_seconds()}
+    """The machine of this process: in a cluster, another one than that of who started the run."""
+    return {"processor": _processor(), "cores": os.cpu_count(), "system": platform.system(),
+            "blas_threads": 1, "matmul_seconds": matmul_seconds()}
 
 
 @lru_cache(maxsize=1)
@@ -210,13 +222,8 @@ def matmul_seconds() -> float:
     In units of it, times of different machines can be compared.
     """
     a, b = np.random.default_rng(0).normal(size=(2, 1000, 1000))
-    times = []
     with threadpool_limits(1):
-        for _ in range(3):
-            begin = time.perf_counter()
-            a @ b
-            times.append(time.perf_counter() - begin)
-    return float(np.median(times))
+        return float(np.median(timeit.repeat(lambda: a @ b, number=1, repeat=3)))
 
 
 def _version(package: str) -> str | None:
@@ -231,16 +238,16 @@ def _git(*arguments: str) -> str | None:
     if not (checkout / ".git").exists():  # installed: a repository around it is somebody else's
         return None
     try:
-        done = subprocess.run(["git", *arguments], cwd=checkout, capture_output=True, text=True,
-                              timeout=10, check=True)
+        return subprocess.run(["git", *arguments], cwd=checkout, capture_output=True, text=True,
+                              timeout=10, check=True).stdout.strip()
     except (OSError, subprocess.SubprocessError):
         return None
-    return done.stdout.strip()
 
 
 def _processor() -> str:
     try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        return platform.processor() or platform.machine()
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
+    except OSError:
+        text = ""
+    named = re.search(r"^model name[^:\n]*:(.*)", text, re.MULTILINE)
+    return named[1].strip() if named else platform.processor() or platform.machine()

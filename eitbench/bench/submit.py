@@ -1,5 +1,4 @@
-"""Play the test episodes with one method, or all of ours, and put what came out among the
-leaderboards' records."""
+"""Play the test episodes with one method, or all of ours, and write leaderboard records of them."""
 
 from __future__ import annotations
 
@@ -16,14 +15,12 @@ from eitbench.bench.text import seed_ranges
 from eitbench.data.seeds import name_seed
 
 
-def submit(method: str | None, environments: list[str], seeds: list[int] | None, store: EpisodeStore, to: Path, *,
-           policy: bool = False, official: bool = False, isolate: str = "others", n_jobs: int = 1,
-           backend: str = "loky", command: str = "") -> Iterator[Path]:
+def submit(method: str | None, environments: list[str], seeds: list[int] | None,
+           store: EpisodeStore, to: Path, *, policy: bool = False, official: bool = False,
+           isolate: str = "others", n_jobs: int = 1, backend: str = "loky",
+           command: str = "") -> Iterator[Path]:
     """Play what neither ``store`` nor a record holds yet, and write one record for each environment
-    into the folder ``to``.
-
-    Environment after environment, so that what was done when the run is interrupted has its
-    records.
+    into the folder ``to``, one after the other: what was done before an interruption has its own.
 
     Parameters
     ----------
@@ -56,39 +53,44 @@ def submit(method: str | None, environments: list[str], seeds: list[int] | None,
     """
     code = provenance()
     if official and (code["commit"] is None or code["dirty"]):
-        raise ValueError("official must be False unless this is a commit without changes, got official=True "
-                         + ("outside a checkout" if code["commit"] is None else f"and changes to {code['commit'][:8]}"))
+        where = f"and changes to {code['commit'][:8]}" if code["commit"] else "outside a checkout"
+        raise ValueError("official must be False unless this is a commit without changes, got "
+                         f"official=True {where}")
     outside = [name_seed(seed) for seed in seeds or [] if split_of(name_seed(seed)) != "test"]
     if outside:
-        raise ValueError(f"seeds of a submission must be of the test split, got {', '.join(outside)}")
+        raise ValueError(
+            f"seeds of a submission must be of the test split, got {', '.join(outside)}")
     if method is not None and not environments:
         raise ValueError("env must name at least one environment to submit for")
     asked = (_jobs(method, id, policy, seeds, isolate) for id in environments or tracks.ids())
     # what does not fit is said before anything is played
     for jobs in asked if method is None else list(asked):
         before = list[dict[str, Any]]()
-        for job in {(job.environment, job.method): job for job in jobs}.values():
-            for path, earlier in _earlier(Path(to), job.environment.name, job.load().name, job.load().version):
+        played = {(job.environment.name, job.load().name): job.load().version for job in jobs}
+        for (environment, name), version in played.items():
+            for path, earlier in _earlier(Path(to), environment, name, version):
                 _check_nothing_is_lost(path, earlier, official)
                 before += results_of(earlier) if earlier["official"] == official else []
         run_jobs(unplayed(jobs, before), store, n_jobs=n_jobs, backend=backend, command=command)
-        played = {(job.environment.name, job.load().name) for job in jobs}
-        made = [record | {"official": official} for record in store.records(also=before)
-                if (record["environment"]["name"], record["method"]) in played and record["split"] == "test"]
-        there = [_earlier(Path(to), record["environment"]["name"], record["method"], record["version"])
-                 for record in made]
-        for record, replaced in zip(made, there, strict=True):
-            for path, earlier in replaced:
+        made = []
+        for record in store.records(also=before):
+            key = record["environment"]["name"], record["method"]
+            if key in played and record["split"] == "test":
+                there = _earlier(Path(to), *key, record["version"])
+                made.append((record | {"official": official}, there))
+        for record, there in made:
+            for path, earlier in there:
                 _check_nothing_is_lost(path, earlier, official, record["seeds"])
-        for record, replaced in zip(made, there, strict=True):
+        for record, there in made:
             written = write_record(to, record)
-            for path, _ in replaced:
+            for path, _ in there:
                 if path != written:                        # of an older format, under another name
                     path.unlink()
             yield written
 
 
-def _jobs(method: str | None, id: str, policy: bool, seeds: list[int] | None, isolate: str) -> list[Job]:
+def _jobs(method: str | None, id: str, policy: bool, seeds: list[int] | None,
+          isolate: str) -> list[Job]:
     """What is to be played in one environment."""
     methods = [] if method is None else [method]
     asked = "injection" if policy else "estimation"
@@ -96,19 +98,21 @@ def _jobs(method: str | None, id: str, policy: bool, seeds: list[int] | None, is
     return suites.jobs(track, [id], methods, seeds, isolate=isolate)
 
 
-def _earlier(to: Path, environment: str, method: str, version: str) -> list[tuple[Path, dict[str, Any]]]:
-    """Records of test episodes of this version that are there; at most one, unless of several
-    formats."""
-    found = [(path, read_record(path)) for path in sorted(to.glob(f"{environment}--{glob.escape(method)}--*.json"))]
-    return [(path, record) for path, record in found
+def _earlier(to: Path, environment: str, method: str,
+             version: str) -> list[tuple[Path, dict[str, Any]]]:
+    """Records there of this version's test episodes; at most one, unless of several formats."""
+    paths = sorted(to.glob(f"{environment}--{glob.escape(method)}--*.json"))
+    return [(path, record) for path, record in zip(paths, map(read_record, paths), strict=True)
             if (record["method"], record["version"], record["split"]) == (method, version, "test")]
 
 
-def _check_nothing_is_lost(path: Path, earlier: dict[str, Any], official: bool, seeds: list[str] | None = None) -> None:
+def _check_nothing_is_lost(path: Path, earlier: dict[str, Any], official: bool,
+                           seeds: list[str] | None = None) -> None:
     """``ValueError`` if the record at ``path`` would lose what makes it worth more; before anything
     is played, without ``seeds``, as far as is known then."""
     missing = [] if seeds is None else [seed for seed in earlier["seeds"] if seed not in seeds]
     lost = [*["its being official"] * (earlier["official"] and not official),
             *([f"its episodes {seed_ranges(missing)}"] if missing else [])]
     if lost:
-        raise ValueError(f"to must not hold a record that says more; {path} would lose {' and '.join(lost)}")
+        raise ValueError("to must not hold a record that says more; "
+                         f"{path} would lose {' and '.join(lost)}")

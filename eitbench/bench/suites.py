@@ -95,8 +95,7 @@ def jobs(track: str, environments: list[str], methods: list[str], seeds: list[in
 
 
 def is_isolated(environment: Environment, method: str, isolate: str) -> bool:
-    """Whether a method plays in a process of its own; those of ours that are shown the truth never
-    do."""
+    """Whether a method plays in a process of its own; ours that are shown the truth never do."""
     if isolate not in ISOLATE:
         raise ValueError(f"isolate must be one of {', '.join(ISOLATE)}, got {isolate!r}")
     if isolate != "always" or not is_ours(method):
@@ -117,17 +116,15 @@ def _fits(method: Method, env: Any) -> bool:
 
 
 def _distinct(names: dict[str, str]) -> None:
-    """``ValueError`` if two of the methods, by the name of their file, would be kept under one
-    name."""
+    """``ValueError`` if two of the methods, by the name of their file, would be kept under one."""
     first: dict[str, str] = {}
     for file, name in names.items():
         if first.setdefault(name, file) != file:
-            raise ValueError(f"{first[name]} and {file} have the same name, under which results are "
-                             "kept; rename one")
+            raise ValueError(f"{first[name]} and {file} have the same name, under which results "
+                             "are kept; rename one")
 
 
 def _absolute(method: str) -> str:
-    """A path that worker processes find too, of an installed package's as well; a name of ours as
-    it is."""
+    """A path that workers find too, also of an installed method; a name of ours as it is."""
     path = installed_methods().get(method, Path(method))
     return str(path.absolute()) if is_path(str(path)) else method

@@ -1,5 +1,4 @@
-"""Numbers, seeds and tables as text, and the scores of a record in the units in which they are
-said."""
+"""Numbers, seeds and tables as text, and scores of a record in the units in which they are said."""
 
 from __future__ import annotations
 
@@ -13,31 +12,30 @@ from eitbench.bench.scores import scores
 
 
 def mean_and_interval(values: list[float]) -> tuple[float, float]:
-    """Mean, and half the width of its 95 % confidence interval (Student's t); infinite for fewer
-    than two values."""
+    """Mean, and half its 95 % confidence interval (Student's t), infinite for fewer than two."""
     mean = float(np.mean(values))
-    if len(values) < 2:
+    n = len(values)
+    if n < 2:
         return mean, math.inf
-    return mean, float(student.ppf(0.975, len(values) - 1) * np.std(values, ddof=1) / math.sqrt(len(values)))
+    return mean, float(student.ppf(0.975, n - 1) * np.std(values, ddof=1) / math.sqrt(n))
 
 
 def rounded(mean: float, half: float) -> str:
-    """``0.0053 ± 0.0004``: the interval to one significant digit (two if that is a 1), the mean to
-    the same place."""
+    """``0.0053 ± 0.0004``: one digit of the interval (two if that is a 1), the mean likewise."""
     place = _places(half)
     return f"{mean:.3g}" if place is None else f"{mean:z.{place}f} ± {half:.{place}f}"
 
 
 def with_interval(value: float, low: float, high: float) -> str:
-    """``0.0053 (0.0049 to 0.0058)``, rounded as `rounded` does by half the interval; without one,
-    the value."""
+    """``0.0053 (0.0049 to 0.0058)``, rounded by half the interval; without one, the value."""
     place = _places(0.5 * (high - low))
-    return f"{value:.3g}" if place is None else f"{value:z.{place}f} ({low:z.{place}f} to {high:z.{place}f})"
+    if place is None:
+        return f"{value:.3g}"
+    return f"{value:z.{place}f} ({low:z.{place}f} to {high:z.{place}f})"
 
 
 def _places(half: float) -> int | None:
-    """Decimal places that half an interval leaves significant; None if it is none, or below the
-    last place shown."""
+    """Decimal places that half an interval leaves; None if it is none, or below the last shown."""
     if not math.isfinite(half) or half < 5e-6:
         return None
     place = -math.floor(math.log10(half))
@@ -72,4 +70,6 @@ def seed_ranges(seeds: list[str]) -> str:
 
 def number(value: float) -> str:
     """Two digits below 1, three above, and all that stand before the point."""
-    return f"{value:.2g}" if abs(value) < 1 else f"{value:.3g}" if abs(value) < 999.5 else f"{value:.0f}"
+    if abs(value) >= 999.5:
+        return f"{value:.0f}"
+    return f"{value:.2g}" if abs(value) < 1 else f"{value:.3g}"

@@ -1,11 +1,9 @@
-"""Whether a record is true: play some of its episodes again, or others that nobody could prepare
-for, and compare."""
+"""Whether a record is true: play some of its episodes again, and compare."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -24,42 +22,45 @@ from eitbench.bench.suites import is_isolated
 from eitbench.bench.table import Cell, Table
 from eitbench.bench.tracks import Environment
 from eitbench.data.seeds import parse_seeds
-from eitbench.data.store import CACHE_VARIABLE
+from eitbench.data.store import cache_in
 
 OF_OURS = ("board", "role", "privileged")
-"""What must be as a record says of a method of ours, beside its numbers: its words may be mended."""
+"""What must be as a record says of a method of ours, beside numbers: its words may be mended."""
 TOLERANCE = 1e-6
-"""Relative difference of a score that is none, on one machine; sums are taken in another order on
-another."""
+"""Relative difference of a score that is none; another machine sums in another order."""
 
 
 def job_of(record: dict[str, Any], file: str | None = None, isolate: str = "always") -> Job:
     """What a record says was played, with the method in ``file`` (default: that of ours which has
-    its name).
-
-    Raises
-    ------
-    ValueError
-        If there is no such method, or the file of one that is not ours is not that of the record.
-    """
-    environment = Environment(record["environment"]["id"], json.dumps(record["environment"]["kwargs"]))
+    its name). ``ValueError`` if there is no such method, or the file of one that is not ours is not
+    that of the record."""
+    played = record["environment"]
+    environment = Environment(played["id"], json.dumps(played["kwargs"]))
     method = _own(record) if file is None else str(Path(file).absolute())
     if method is None:
-        raise ValueError(f"{record['method']} is none of ours: its file must be given, as --baseline or --policy")
+        raise ValueError(f"{record['method']} is none of ours: its file must be given, as "
+                         "--baseline or --policy")
     path = find_method(method, environment.track)
     found = hashlib.sha256(path.read_bytes()).hexdigest()
     if found != record["method_sha256"] and not is_ours(method):
-        raise ValueError(f"what the record says cannot be played here: the sha256 of {path.name} is {found}, that of "
-                         f"the record {record['method_sha256']}")
+        raise ValueError(f"what the record says cannot be played here: the sha256 of {path.name} "
+                         f"is {found}, that of the record {record['method_sha256']}")
     return Job(environment, method, 0, is_isolated(environment, method, isolate))
 
 
 def outdated(record: dict[str, Any], job: Job) -> str:
-    """A sentence if the record is of an older version than the method of ours is now; else nothing."""
+    """A sentence if the record is of an older version than the method of ours now; else nothing."""
     now, then = version_number(job.load().version), version_number(record["version"])
     if now is None or then is None or then >= now:
         return ""
-    return f"the record is of {record['version']}, and {record['method']} is now v{now}: other numbers are no wonder"
+    return (f"the record is of {record['version']}, and {record['method']} is now v{now}: "
+            "other numbers are no wonder")
+
+
+def drawn_of(record: dict[str, Any], episodes: int, seed: int) -> list[int]:
+    """The places of so many of a record's episodes, drawn with this ``seed``; in order."""
+    drawn = np.random.default_rng(seed).permutation(len(record["episodes"]))[:episodes]
+    return sorted(drawn.tolist())
 
 
 def verify(record: dict[str, Any], job: Job, *, episodes: int = 3, seed: int = 0,
@@ -82,17 +83,19 @@ def verify(record: dict[str, Any], job: Job, *, episodes: int = 3, seed: int = 0
     """
     _check.integer("episodes", episodes, low=1)
     stated = OF_OURS if is_ours(job.method) else (*SHARED, "method")
-    drawn = np.random.default_rng(seed).permutation(len(record["episodes"]))[:episodes]
-    rows, differences = [], list[str]()
-    for said in (record["episodes"][i] for i in sorted(drawn)):
-        again = json.loads(json.dumps(run_episode(job._replace(seed=parse_seeds(said["seed"])[0]))[0]))
+    rows = []
+    differences = list[str]()
+    for said in (record["episodes"][i] for i in drawn_of(record, episodes, seed)):
+        (number,) = parse_seeds(said["seed"])
+        again = json.loads(json.dumps(run_episode(job._replace(seed=number))[0]))
         wrong = differences_of(said, again)
         differences += [f"{said['seed']}: {_difference(name, said, again)}"
                         for name, off in wrong.items() if off > tolerance]
         differences += [f"{name} is {again[name]!r}, the record says {record[name]!r}"
                         for name in (*stated, "environment") if again[name] != record[name]]
         worst = max(wrong, key=lambda name: wrong[name], default="")
-        rows.append({"episode": said["seed"], "greatest difference in": worst if wrong.get(worst) else "none",
+        rows.append({"episode": said["seed"],
+                     "greatest difference in": worst if wrong.get(worst) else "none",
                      "relative": Cell(f"{wrong.get(worst, 0.0):.1g}"),
                      "record's ẽ_c": Cell(_value(said, "error")),
                      "ẽ_c again": Cell(_value(again, "error"))})
@@ -101,19 +104,12 @@ def verify(record: dict[str, Any], job: Job, *, episodes: int = 3, seed: int = 0
 
 @contextmanager
 def empty_cache() -> Iterator[None]:
-    """Within, nothing is taken from the cache folder: episodes and models are made anew, and thrown
-    away."""
-    before = os.environ.get(CACHE_VARIABLE)
-    with tempfile.TemporaryDirectory(prefix="eitbench-verify-") as folder:
-        os.environ[CACHE_VARIABLE] = folder
+    """Within, the cache folder is an empty one: episodes and models are made anew, thrown away."""
+    with tempfile.TemporaryDirectory(prefix="eitbench-verify-") as folder, cache_in(Path(folder)):
         try:
             yield
         finally:
             guests.close()
-            if before is None:
-                del os.environ[CACHE_VARIABLE]
-            else:
-                os.environ[CACHE_VARIABLE] = before
 
 
 def _own(record: dict[str, Any]) -> str | None:
@@ -126,8 +122,7 @@ def _own(record: dict[str, Any]) -> str | None:
 
 
 def differences_of(said: dict[str, Any], again: dict[str, Any]) -> dict[str, float]:
-    """Score -> relative difference between two results of an episode, of the scores that it had
-    then."""
+    """Score -> relative difference of two results of an episode, of the scores that it had then."""
     known = scores()
     if said["status"] != again["status"]:
         return {"status": np.inf}
@@ -140,15 +135,16 @@ def differences_of(said: dict[str, Any], again: dict[str, Any]) -> dict[str, flo
 
 def _relative(a: list[float | None], b: list[float | None]) -> float:
     """Greatest |a − b| / max(|a|, |b|); infinite where only one is a number."""
-    if len(a) != len(b):
-        return np.inf
-    return max(0.0 if x == y else np.inf if x is None or y is None else abs(x - y) / max(abs(x), abs(y))
-               for x, y in zip(a, b, strict=True))
+    def off(x: float | None, y: float | None) -> float:
+        if x == y:
+            return 0.0
+        return np.inf if x is None or y is None else abs(x - y) / max(abs(x), abs(y))
+
+    return max(map(off, a, b)) if len(a) == len(b) else np.inf
 
 
 def _difference(name: str, said: dict[str, Any], again: dict[str, Any]) -> str:
-    """What one score is now and was then; of the errors of all steps, the one that has changed
-    most."""
+    """What one score is now and was then; of the errors of all steps, what has changed most."""
     if name != "step_errors":
         return f"{name} is {_value(again, name)}, the record says {_value(said, name)}"
     now, then = again[name], said[name]
@@ -159,6 +155,8 @@ def _difference(name: str, said: dict[str, Any], again: dict[str, Any]) -> str:
 
 
 def _value(episode: dict[str, Any], name: str) -> str:
+    if name == "status" and "message" in episode:
+        return f"{episode['status']} ({episode['message']})"
     if name == "status" or episode["status"] == "failed":
-        return episode["status"] + (f" ({episode['message']})" if "message" in episode and name == "status" else "")
+        return str(episode["status"])
     return str(episode["scores"].get(name))

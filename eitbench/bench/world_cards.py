@@ -1,5 +1,4 @@
-"""World cards: reference numbers of a few episodes of each registered id, committed, by which a
-change of numbers shows.
+"""World cards: committed numbers of a few episodes of each registered id: a change shows.
 
 What must not change silently are numbers, not the text of the code: a card that no longer agrees
 means that the id needs a new version. Numbers are compared relative to the largest of their kind,
@@ -31,8 +30,7 @@ CARDS = PACKAGE / "worlds" / "cards"
 SEEDS = ("train:0", "dev:0")
 """The episodes of a card."""
 LAST = 24
-"""Only so many injections are simulated: the first scored ones are among them in every world of
-ours."""
+"""So many injections are simulated: the first scored ones are among them in our worlds."""
 TOLERANCE = 1e-6
 """Relative difference that is none; moments are kept in single precision."""
 
@@ -60,8 +58,7 @@ def numbers(world: World) -> dict[str, Any]:
 
 
 def disagreements(id: str) -> list[str]:
-    """A sentence for each number of an id, simulated anew, that is not what its card says; one if
-    the card is missing or damaged."""
+    """A sentence for each number that is not as on the card; one if that is missing or damaged."""
     try:
         kept = json.loads(path_of(id).read_text(encoding="utf-8"))
     except FileNotFoundError:

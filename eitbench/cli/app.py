@@ -12,41 +12,23 @@ from typing import Annotated, Any
 
 import typer
 
+from eitbench.cli import options
 from eitbench.cli.maintain import cards, held_out, migrate
-from eitbench.cli.options import CORES, Backend, Backends, Isolate, Isolation, Jobs, Out, clear_errors
 from eitbench.cli.studies import thesis
 from eitbench.cli.trust import verify
 
-app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, context_settings={
-    "help_option_names": ["-h", "--help"]}, help="""
+app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
+                  context_settings={"help_option_names": ["-h", "--help"]}, help="""
 Benchmark estimators that see a flow only through voltages on the pipe's wall.
 
-A first look:  eitbench run  — runs our baselines on four test episodes, prints the table, writes results/index.html.
+A first look:  eitbench run  — runs our baselines on four test episodes, prints the table, \
+writes results/index.html.
 """)
 
-
-
-class Suite(StrEnum):
-    """What to run when not told in detail."""
-
-    quick = "quick"
-    full = "full"
-
-
-class Algorithm(StrEnum):
-    """What may learn."""
-
-    ppo = "ppo"
-    dqn = "dqn"
-    sac = "sac"
-    recurrent_ppo = "recurrent_ppo"
-    maskable_ppo = "maskable_ppo"
-
-
-Figure = StrEnum("Figure", {re.sub(r"\W", "_", name).upper(): name for name in thesis().FIGURES})  # type: ignore[misc]
-
-
-RECORDS = Path("leaderboards/results")
+Suite = StrEnum("Suite", ["quick", "full"])
+Algorithm = StrEnum("Algorithm", ["ppo", "dqn", "sac", "recurrent_ppo", "maskable_ppo"])
+Figure = StrEnum("Figure", {  # type: ignore[misc]
+    re.sub(r"\W", "_", name).upper(): name for name in thesis().FIGURES})
 
 
 @app.command("list")
@@ -59,13 +41,13 @@ def list_() -> None:
     typer.echo("environments")
     for name in ids("estimation"):
         env: Any = Environment(name).make()
-        world = env.world
-        typer.echo(f"  {name:40} {board_of(env):10}  lag {env.lag}, {world.n_steps - world.warm_up} scored of "
-                   f"{world.n_steps} states, {env.action_space.shape[0]} numbers each")
+        steps = env.world.n_steps
+        typer.echo(f"  {name:40} {board_of(env):10}  lag {env.lag}, {steps - env.world.warm_up} "
+                   f"scored of {steps} states, {env.action_space.shape[0]} numbers each")
     for name in ids("injection"):
         core = gym.make(name).unwrapped.core  # type: ignore[attr-defined]
         rules = core.rules
-        what = f"{len(rules.pairs)} electrode pairs" if rules.limit is None else f"{rules.limit} currents"
+        what = f"{rules.limit} currents" if rules.limit else f"{len(rules.pairs)} electrode pairs"
         allowed = "" if rules.budget is None else f", {rules.budget} of them allowed"
         typer.echo(f"  {name:40} injection   {what}, {core.length} injections{allowed}")
     typer.echo("baselines")
@@ -76,16 +58,20 @@ def list_() -> None:
 
 @app.command()
 def run(
-    suite: Annotated[Suite, typer.Option(help="quick: the 2D pipe, test:0-3, two minutes on two cores; full: every "
-                                              "environment, more seeds, methods that take long.")] = Suite.quick,
-    env: Annotated[list[str] | None, typer.Option(help="Environment id; may be repeated. Default: suite's.")] = None,
+    suite: Annotated[Suite, typer.Option(
+        help="quick: the 2D pipe, test:0-3, two minutes on two cores; full: every environment, "
+             "more seeds, methods that take long.")] = Suite.quick,
+    env: Annotated[list[str] | None, typer.Option(
+        help="Environment id; may be repeated. Default: suite's.")] = None,
     baseline: Annotated[list[str] | None, typer.Option(
-        help="Name of one of ours, or the path of your own .py file; may be repeated. Default: all of ours.")] = None,
-    seeds: Annotated[str | None, typer.Option(help="Episodes, as in dev:0-9 or test:3. Default: the suite's.")] = None,
-    isolate: Isolate = Isolation.others,
-    jobs: Jobs = CORES,
-    backend: Backends = Backend.loky,
-    out: Out = Path("results"),
+        help="Name of one of ours, or the path of your own .py file; may be repeated. Default: "
+             "all of ours.")] = None,
+    seeds: Annotated[str | None, typer.Option(
+        help="Episodes, as in dev:0-9 or test:3. Default: the suite's.")] = None,
+    isolate: options.Isolate = options.Isolation.others,
+    jobs: options.Jobs = options.CORES,
+    backend: options.Backends = options.Backend.loky,
+    out: options.Out = Path("results"),
 ) -> None:
     """Run baselines on environments, print the table and write the page.
 
@@ -95,9 +81,9 @@ def run(
     from eitbench.bench import suites
     from eitbench.bench.run import run_jobs
     from eitbench.bench.store import EpisodeStore
-    with clear_errors():
-        todo = suites.jobs("estimation", env or [], baseline or [], _numbers(seeds),
-                           suite=suite.value, isolate=isolate)
+    with options.clear_errors():
+        todo = suites.jobs("estimation", env or [], baseline or [], _numbers(seeds), suite=suite,
+                           isolate=isolate)
         run_jobs(todo, EpisodeStore(out), n_jobs=jobs, backend=backend, command=_command())
         _report(out)
 
@@ -106,8 +92,8 @@ def run(
 def bank(
     env: Annotated[str, typer.Option(help="Environment id.")] = "eitbench/Pipe2D-v0",
     seeds: Annotated[str, typer.Option(help="Episodes, such as train:0-999.")] = "train:0-99",
-    jobs: Jobs = CORES,
-    backend: Backends = Backend.loky,
+    jobs: options.Jobs = options.CORES,
+    backend: options.Backends = options.Backend.loky,
 ) -> None:
     """Simulate many episodes ahead of training and keep what an environment needs of them.
 
@@ -119,34 +105,40 @@ def bank(
     from eitbench.data.seeds import parse_seeds
     from eitbench.data.store import folder
     from eitbench.worlds.registry import entry
-    with clear_errors():
+    with options.clear_errors():
         numbers = parse_seeds(seeds)
         world = entry(env).world
-    place, each = folder(world), recording_bytes(world)
+    place = folder(world)
+    each = recording_bytes(world)
     try:
         place.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise typer.BadParameter(f"recordings cannot be kept in {place}: {error}") from error
     missing = len(missing_seeds(world, numbers))
-    typer.echo(f"{len(numbers)} episodes, {len(numbers) * each / 1e6:.0f} MB in {place}; {missing} to simulate")
+    typer.echo(f"{len(numbers)} episodes, {len(numbers) * each / 1e6:.0f} MB in {place}; "
+               f"{missing} to simulate")
     free = shutil.disk_usage(place).free
     if missing * each > free:
-        raise typer.BadParameter(f"seeds need {missing * each / 1e9:.1f} GB more, and {free / 1e9:.1f} GB are free")
-    with clear_errors():
+        raise typer.BadParameter(f"seeds need {missing * each / 1e9:.1f} GB more, and "
+                                 f"{free / 1e9:.1f} GB are free")
+    with options.clear_errors():
         made = fill(world, numbers, n_jobs=jobs, backend=backend)
     typer.echo(f"{made} simulated, {len(numbers) - made} were there")
 
 
 @app.command()
 def train(
-    env: Annotated[str, typer.Option(help="Id of an injection environment.")],
-    algo: Annotated[Algorithm, typer.Option(help="Algorithm of stable-baselines3 or sb3-contrib.")] = Algorithm.ppo,
-    config: Annotated[Path, typer.Option(help="A YAML file such as those in baselines/rl.")] = Path(
-        "baselines/rl/ppo.yml"),
-    seed: Annotated[int, typer.Option(min=0, help="Of the training; episodes are drawn from the train split.")] = 0,
-    steps: Annotated[int | None, typer.Option(min=0, help="Steps in place of the configuration's total_steps.")] = None,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder of the run. Default: "
-                                             "results/training/ENV/ALGO/seedK.")] = None,
+    env: options.InjectionId,
+    algo: Annotated[Algorithm, typer.Option(
+        help="Algorithm of stable-baselines3 or sb3-contrib.")] = Algorithm.ppo,
+    config: Annotated[Path, typer.Option(
+        help="A YAML file such as those in baselines/rl.")] = Path("baselines/rl/ppo.yml"),
+    seed: Annotated[int, typer.Option(
+        min=0, help="Of the training; episodes are drawn from the train split.")] = 0,
+    steps: Annotated[int | None, typer.Option(
+        min=0, help="Steps in place of the configuration's total_steps.")] = None,
+    out: Annotated[Path | None, typer.Option(
+        "--out", "-o", help="Folder of the run. Default: results/training/ENV/ALGO/seedK.")] = None,
 ) -> None:
     """Train an agent to choose injections.
 
@@ -154,31 +146,34 @@ def train(
     config.json, monitor.csv, evaluations.npz (scores on dev episodes) and logs for TensorBoard.
     """
     from dataclasses import replace
-    with clear_errors():
+    with options.clear_errors():
         from eitbench.rl import training
         asked = training.read_config(config)
-        folder = out or Path("results/training") / env.replace("/", "-") / algo.value / f"seed{seed}"
-        model = training.train(env, algo.value, asked if steps is None else replace(asked, total_steps=steps), seed,
-                               folder)
+        if steps is not None:
+            asked = replace(asked, total_steps=steps)
+        folder = out or Path("results/training") / env.replace("/", "-") / algo / f"seed{seed}"
+        model = training.train(env, algo.value, asked, seed, folder)
     typer.echo(f"wrote {model}")
 
 
 @app.command()
 def policies(
-    env: Annotated[str, typer.Option(help="Id of an injection environment.")],
+    env: options.InjectionId,
     policy: Annotated[list[str] | None, typer.Option(
-        help="Name of one of ours, the path of your own .py file, or of an agent's model.zip; may be repeated. "
-             "Default: all of ours.")] = None,
-    seeds: Annotated[str | None, typer.Option(help="Episodes, such as dev:0-49. Default: those of the boards.")] = None,
-    estimator: Annotated[str, typer.Option(help="full: the exact filter, for scores; reduced: that of training.")] = (
-        "full"),
-    isolate: Isolate = Isolation.others,
-    jobs: Jobs = CORES,
-    backend: Backends = Backend.loky,
-    out: Out = Path("results"),
+        help="Name of one of ours, the path of your own .py file, or of an agent's model.zip; may "
+             "be repeated. Default: all of ours.")] = None,
+    seeds: Annotated[str | None, typer.Option(
+        help="Episodes, such as dev:0-49. Default: those of the boards.")] = None,
+    estimator: Annotated[str, typer.Option(
+        help="full: the exact filter, for scores; reduced: that of training.")] = "full",
+    isolate: options.Isolate = options.Isolation.others,
+    jobs: options.Jobs = options.CORES,
+    backend: options.Backends = options.Backend.loky,
+    out: options.Out = Path("results"),
     records: Annotated[Path | None, typer.Option(
-        exists=True, file_okay=False, help="Folder of records, such as leaderboards/results: what they hold of these "
-                                           "episodes is not played again.")] = None,
+        exists=True, file_okay=False,
+        help="Folder of records, such as leaderboards/results: what they hold of these episodes is "
+             "not played again.")] = None,
 ) -> None:
     """Play injection policies, print their scores and the environment's adaptivity gap.
 
@@ -188,12 +183,11 @@ def policies(
     from eitbench.bench.store import EpisodeStore, results_in
     from eitbench.bench.suites import jobs as jobs_of
     from eitbench.report.policy_table import policy_rows, policy_table
-    with clear_errors():
+    with options.clear_errors():
         todo = jobs_of("injection", [env], policy or [], _numbers(seeds), estimator=estimator,
                        isolate=isolate)
         before = results_in(records) if records else []
-    store = EpisodeStore(out)
-    with clear_errors():
+        store = EpisodeStore(out)
         run_jobs(unplayed(todo, before), store, n_jobs=jobs, backend=backend, command=_command())
     asked = {job.load().name: job.load().privileged for job in todo}
     rows = policy_rows(todo, [*before, *store.results()])
@@ -204,19 +198,21 @@ def policies(
 
 @app.command()
 def submit(
-    env: Annotated[list[str] | None, typer.Option(help="Environment id; may be repeated.")] = None,
-    baseline: Annotated[str | None, typer.Option(help="Name of one of ours, or the path of your own .py file.")] = None,
+    env: options.Environments = None,
+    baseline: Annotated[str | None, typer.Option(
+        help="Name of one of ours, or the path of your own .py file.")] = None,
     policy: Annotated[str | None, typer.Option(
-        help="The same of an injection policy, or the path of a trained agent's model.zip. Without any method: all of "
-             "ours, by default in all environments.")] = None,
-    seeds: Annotated[str | None, typer.Option(help="Test episodes, as in test:0-9. Default: those of the "
-                                                   "boards.")] = None,
-    official: Annotated[bool, typer.Option("--official", help="For maintainers: a run of theirs.")] = False,
-    isolate: Isolate = Isolation.others,
-    jobs: Jobs = CORES,
-    backend: Backends = Backend.loky,
-    out: Out = Path("results"),
-    to: Annotated[Path, typer.Option(help="Folder of the records.")] = RECORDS,
+        help="The same of an injection policy, or the path of a trained agent's model.zip. Without "
+             "any method: all of ours, by default in all environments.")] = None,
+    seeds: Annotated[str | None, typer.Option(
+        help="Test episodes, as in test:0-9. Default: those of the boards.")] = None,
+    official: Annotated[bool, typer.Option(
+        "--official", help="For maintainers: a run of theirs.")] = False,
+    isolate: options.Isolate = options.Isolation.others,
+    jobs: options.Jobs = options.CORES,
+    backend: options.Backends = options.Backend.loky,
+    out: options.Out = Path("results"),
+    to: Annotated[Path, typer.Option(help="Folder of the records.")] = options.RECORDS,
 ) -> None:
     """Play the test episodes with one baseline or policy, or all of ours, and write records for the
     leaderboards.
@@ -226,15 +222,16 @@ def submit(
     from eitbench.bench.records import read_record
     from eitbench.bench.store import EpisodeStore
     from eitbench.bench.submit import submit
-    with clear_errors():
+    with options.clear_errors():
         if baseline and policy:
             raise ValueError("one of --baseline and --policy may be given, got both")
-        for path in submit(baseline or policy, env or [], _numbers(seeds),
-                           EpisodeStore(out), to, policy=policy is not None, official=official, isolate=isolate,
+        for path in submit(baseline or policy, env or [], _numbers(seeds), EpisodeStore(out), to,
+                           policy=policy is not None, official=official, isolate=isolate,
                            n_jobs=jobs, backend=backend, command=_command()):
-            record = read_record(path)
-            failed = sum(episode["status"] != "ok" for episode in record["episodes"])
-            typer.echo(f"wrote {path}: {len(record['seeds'])} episodes" + (f", {failed} failed" if failed else ""))
+            episodes = read_record(path)["episodes"]
+            failed = sum(episode["status"] != "ok" for episode in episodes)
+            typer.echo(f"wrote {path}: {len(episodes)} episodes"
+                       + (f", {failed} failed" if failed else ""))
 
 
 app.command()(verify)
@@ -245,21 +242,21 @@ app.command()(cards)
 
 @app.command()
 def leaderboard(
-    out: Out = Path("results"),
+    out: options.Out = Path("results"),
     records: Annotated[Path | None, typer.Option(
-        help="Folder of the leaderboards' records, such as leaderboards/results: render leaderboard.csv, "
-             "leaderboard.md and the pages site/ beside it instead.")] = None,
+        help="Folder of the leaderboards' records, such as leaderboards/results: render "
+             "leaderboard.csv, leaderboard.md and the pages site/ beside it instead.")] = None,
 ) -> None:
     """Print the table and write the page again from the results stored in a folder."""
     if records is None:
-        with clear_errors():
+        with options.clear_errors():
             return _report(out)
     from eitbench._files import write_atomically
     from eitbench.bench.records import read_records
     from eitbench.report.boards import boards
     from eitbench.report.site import read_media, render, render_site, write_site
     beside = records.parent
-    with clear_errors():
+    with options.clear_errors():
         if not records.is_dir():
             raise ValueError(f"records must be a folder that exists, got {records}")
         found = read_records(records)
@@ -273,9 +270,10 @@ def leaderboard(
 
 @app.command()
 def compare(
-    a: Annotated[str, typer.Argument(help="A record's file, or METHOD or METHOD@VERSION among the records.")],
+    a: Annotated[str, typer.Argument(
+        help="A record's file, or METHOD or METHOD@VERSION among the records.")],
     b: Annotated[str, typer.Argument(help="The same of the other.")],
-    records: Annotated[Path, typer.Option(help="Folder of the records.")] = RECORDS,
+    records: Annotated[Path, typer.Option(help="Folder of the records.")] = options.RECORDS,
     score: Annotated[str, typer.Option(help="By which score.")] = "error",
     html: Annotated[Path | None, typer.Option(help="Write a page too.")] = None,
 ) -> None:
@@ -283,7 +281,7 @@ def compare(
     better."""
     from eitbench._files import write_atomically
     from eitbench.report import compare as comparison
-    with clear_errors():
+    with options.clear_errors():
         ours, theirs = (comparison.find(name, records) for name in (a, b))
         table = comparison.compare(ours, theirs, score)
     names = comparison.names(ours[0], theirs[0])
@@ -296,20 +294,22 @@ def compare(
 @app.command()
 def render(
     env: Annotated[str, typer.Option(help="Environment id.")] = "eitbench/Pipe2D-v0",
-    baseline: Annotated[str, typer.Option(help="Name of one of ours, or the path of a .py file.")] = "kalman_filter",
+    baseline: Annotated[str, typer.Option(
+        help="Name of one of ours, or the path of a .py file.")] = "kalman_filter",
     policy: Annotated[str | None, typer.Option(
-        help="The same of an injection policy, or of an agent's model.zip, in place of a baseline where injections are "
-             "asked for.")] = None,
+        help="The same of an injection policy, or of an agent's model.zip, in place of a baseline "
+             "where injections are asked for.")] = None,
     seed: Annotated[str, typer.Option(help="The episode, such as dev:0.")] = "dev:0",
     step: Annotated[int | None, typer.Option(help="Only this state t, as a PNG.")] = None,
     every: Annotated[int, typer.Option(min=1, help="Draw one state in so many.")] = 1,
-    out: Annotated[Path, typer.Option("--out", "-o", help="An animation .gif or .webp, or a .png with --step.")] = Path(
-        "results/episode.gif"),
+    out: Annotated[Path, typer.Option(
+        "--out", "-o", help="An animation .gif or .webp, or a .png with --step.",
+    )] = Path("results/episode.gif"),
 ) -> None:
     """Draw an episode: truth, estimate, its spread, electrodes and the injected pair."""
     from eitbench.bench.tracks import track_of
     from eitbench.report.animate import animate
-    with clear_errors():
+    with options.clear_errors():
         if track_of(env) == "injection" and policy is None:
             raise ValueError(f"policy must be given for {env}, which asks for injections")
         typer.echo(f"wrote {animate(env, policy or baseline, seed, step, out, every=every)}")
@@ -317,14 +317,16 @@ def render(
 
 @app.command()
 def reproduce(
-    name: Annotated[Figure, typer.Argument(help="Figure or table of the thesis, or a study beside it.")],
-    seeds: Annotated[str | None, typer.Option(help="Episodes; pictures show the first, sweeps average over all. "
-                                                   "Default: dev:0-1; of the injection those of the boards.")] = None,
-    jobs: Jobs = CORES,
-    out: Out = Path("results/figures"),
+    name: Annotated[Figure, typer.Argument(
+        help="Figure or table of the thesis, or a study beside it.")],
+    seeds: Annotated[str | None, typer.Option(
+        help="Episodes; pictures show the first, sweeps average over all. Default: dev:0-1; of the "
+             "injection those of the boards.")] = None,
+    jobs: options.Jobs = options.CORES,
+    out: options.Out = Path("results/figures"),
 ) -> None:
     """Draw a figure of the thesis from our data, and say what agrees and what differs."""
-    with clear_errors():
+    with options.clear_errors():
         path, remark = thesis().FIGURES[name.value](_numbers(seeds), jobs, out)
     typer.echo(f"wrote {path}\n{remark}")
 
@@ -362,7 +364,8 @@ def _say_failures(records: list[dict[str, Any]]) -> None:
     for record in records:
         for episode in record["episodes"]:
             if episode["status"] != "ok":
-                typer.echo(f"failed: {record['method']} on {episode['seed']}: {episode['message']}", err=True)
+                typer.echo(f"failed: {record['method']} on {episode['seed']}: "
+                           f"{episode['message']}", err=True)
 
 
 if __name__ == "__main__":

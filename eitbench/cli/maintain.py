@@ -45,7 +45,8 @@ def cards(
 
 
 def migrate(
-    folder: Annotated[Path, typer.Argument(exists=True, file_okay=False, help="Folder of records.")],
+    folder: Annotated[Path, typer.Argument(
+        exists=True, file_okay=False, help="Folder of records.")],
 ) -> None:
     """For maintainers: rewrite records of an older format in that of today; no episode, score or
     run is lost."""
@@ -56,7 +57,8 @@ def migrate(
 
 
 def held_out(
-    new: Annotated[Path, typer.Option(help="Where to write a new salt; keep it secret, and keep it.")],
+    new: Annotated[Path, typer.Option(
+        help="Where to write a new salt; keep it secret, and keep it.")],
 ) -> None:
     """For maintainers: draw the salt of held-out episodes, and publish its hash in
     leaderboards/held_out.json, once."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -12,51 +14,49 @@ import typer
 from eitbench.data.parallel import WorkerLost
 
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+Backend = StrEnum("Backend", ["loky", "ray", "dask"])
+Isolation = StrEnum("Isolation", ["never", "others", "always"])
+
 Out = Annotated[Path, typer.Option("--out", "-o", help="Folder of the results.")]
-Jobs = Annotated[int, typer.Option("--jobs", "-j", min=1, help="Processes; each takes a core and 1 to 4 GB.")]
-
-
-class Backend(StrEnum):
-    """Who starts the processes."""
-
-    loky = "loky"
-    ray = "ray"
-    dask = "dask"
-
-
-Backends = Annotated[Backend, typer.Option("--backend", help="Who starts the processes: loky on this machine; ray or "
-                                           "dask (extra cluster) on the machines of one.")]
-
-
-class Isolation(StrEnum):
-    """Whose methods run in a process of their own."""
-
-    never = "never"
-    others = "others"
-    always = "always"
-
-
-Isolate = Annotated[Isolation, typer.Option(help="Whose methods run in a process of their own, out of reach of truths "
-                                                 "and files: those that are not ours, or all.")]
-
+Jobs = Annotated[int, typer.Option(
+    "--jobs", "-j", min=1, help="Processes; each takes a core and 1 to 4 GB.")]
+Backends = Annotated[Backend, typer.Option(
+    "--backend", help="Who starts the processes: loky on this machine; ray or dask (extra cluster) "
+                      "on the machines of one.")]
+Isolate = Annotated[Isolation, typer.Option(
+    help="Whose methods run in a process of their own, out of reach of truths and files: those "
+         "that are not ours, or all.")]
+Environments = Annotated[list[str] | None, typer.Option(help="Environment id; may be repeated.")]
+InjectionId = Annotated[str, typer.Option(help="Id of an injection environment.")]
+RECORDS = Path("leaderboards/results")
 
 RL = ("torch", "stable_baselines3", "sb3_contrib", "yaml")
 """What the extra rl installs for training and for trained agents."""
 
 
-class clear_errors:
+@contextmanager
+def clear_errors() -> Iterator[None]:
     """Turn a ValueError about an argument, the loss of a process, or the want of an extra into a
     message instead of a traceback."""
+    try:
+        yield
+    except WorkerLost as error:
+        typer.echo(error, err=True)
+        raise typer.Exit(1) from error
+    except ModuleNotFoundError as error:
+        if (error.name or "").split(".")[0] not in RL:
+            raise
+        typer.echo("training and trained agents need the extra rl, pip install -e '.[rl]': "
+                   f"{error}", err=True)
+        raise typer.Exit(1) from error
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from error
 
-    def __enter__(self) -> None:
-        pass
 
-    def __exit__(self, kind: type | None, error: BaseException | None, _: object) -> None:
-        if isinstance(error, WorkerLost):
-            typer.echo(error, err=True)
-            raise typer.Exit(1) from error
-        if isinstance(error, ModuleNotFoundError) and (error.name or "").split(".")[0] in RL:
-            typer.echo(f"training and trained agents need the extra rl, pip install -e '.[rl]': {error}", err=True)
-            raise typer.Exit(1) from error
-        if isinstance(error, ValueError):
-            raise typer.BadParameter(str(error)) from error
+def say_differences(sentences: Iterable[str]) -> None:
+    """What differs, one a line; then, if anything does, exit status 1."""
+    wrong = list(sentences)
+    for sentence in wrong:
+        typer.echo(f"differs: {sentence}", err=True)
+    if wrong:
+        raise typer.Exit(1)

@@ -3,33 +3,39 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from eitbench.cli.options import CORES, Backend, Backends, Isolate, Isolation, Jobs, clear_errors
+from eitbench.cli import options
 
 
 def verify(
     record: Annotated[Path | None, typer.Argument(help="A record's file.")] = None,
-    baseline: Annotated[str | None, typer.Option(help="The method's file, if it is not one of ours.")] = None,
+    baseline: Annotated[str | None, typer.Option(
+        help="The method's file, if it is not one of ours.")] = None,
     policy: Annotated[str | None, typer.Option(help="The same of an injection policy.")] = None,
     episodes: Annotated[int, typer.Option(min=0, help="How many are played again.")] = 3,
-    seed: Annotated[int | None, typer.Option(min=0, help="By which they are drawn. Default: any.")] = None,
+    seed: Annotated[int | None, typer.Option(
+        min=0, help="By which they are drawn. Default: any.")] = None,
     tolerance: Annotated[float, typer.Option(
         min=0.0, help="Relative difference of scores that is none.")] = 1e-6,
-    isolate: Isolate = Isolation.always,
+    isolate: options.Isolate = options.Isolation.always,
     held_out: Annotated[int, typer.Option(
-        "--held-out", min=0, help="For maintainers: play so many held-out episodes too, and compare the gains.")] = 0,
-    salt_file: Annotated[Path | None, typer.Option(help="From which they follow; see `eitbench held-out`.")] = None,
-    every: Annotated[bool, typer.Option("--all", help="Every official record of a folder; resumes.")] = False,
-    records: Annotated[Path, typer.Option(help="With --all: the folder of the records.")] = Path(
-        "leaderboards/results"),
-    env: Annotated[list[str] | None, typer.Option(help="With --all: only this environment; may be repeated.")] = None,
-    jobs: Jobs = CORES,
-    backend: Backends = Backend.loky,
-    out: Annotated[Path, typer.Option("--out", "-o", help="With --all: where what came out is kept.")] = Path(
-        "results/verify"),
+        "--held-out", min=0, help="For maintainers: play so many held-out episodes too, and "
+                                  "compare the gains.")] = 0,
+    salt_file: Annotated[Path | None, typer.Option(
+        help="From which they follow; see `eitbench held-out`.")] = None,
+    every: Annotated[bool, typer.Option(
+        "--all", help="Every official record of a folder; resumes.")] = False,
+    records: Annotated[Path, typer.Option(
+        help="With --all: the folder of the records.")] = options.RECORDS,
+    env: Annotated[list[str] | None, typer.Option(
+        help="With --all: only this environment; may be repeated.")] = None,
+    jobs: options.Jobs = options.CORES,
+    backend: options.Backends = options.Backend.loky,
+    out: Annotated[Path, typer.Option(
+        "--out", "-o", help="With --all: where what came out is kept.")] = Path("results/verify"),
 ) -> None:
     """Play episodes of a record again and say whether it is true: exit status 0 if so, 1 if not.
 
@@ -41,7 +47,8 @@ def verify(
     command again goes on where it was interrupted.
     """
     if every:
-        return _verify_all(records, env or [], out, episodes, seed or 0, tolerance, isolate, jobs, backend)
+        return _verify_all(records, env or [], out, tolerance, episodes=episodes, seed=seed or 0,
+                           isolate=isolate, n_jobs=jobs, backend=backend)
     if record is None:
         raise typer.BadParameter("a record's file must be given, or --all")
     import secrets
@@ -49,46 +56,43 @@ def verify(
     from eitbench.bench import held_out as beyond
     from eitbench.bench import verify as again
     from eitbench.bench.records import read_record
-    with clear_errors():
+    with options.clear_errors():
         if baseline and policy:
             raise ValueError("only one of --baseline and --policy may be given")
         if (held_out > 0) != (salt_file is not None):
             raise ValueError("--held-out and --salt-file belong together")
         if not episodes and not held_out:
-            raise ValueError("--episodes must be at least 1 where no --held-out episodes are played, got 0")
+            raise ValueError("--episodes must be at least 1 where no --held-out episodes are "
+                             "played, got 0")
         salt = beyond.read_salt(salt_file) if salt_file else b""
     seed = secrets.randbelow(2**32) if seed is None else seed
+    differences = list[str]()
     try:
         with again.empty_cache():
             claimed = read_record(record)
-            job, differences = again.job_of(claimed, baseline or policy, isolate), list[str]()
+            job = again.job_of(claimed, baseline or policy, isolate)
             if remark := again.outdated(claimed, job):
                 typer.echo(f"{remark}\n")
             if episodes:
-                table, differences = again.verify(claimed, job, episodes=episodes, seed=seed, tolerance=tolerance)
-                typer.echo(f"episodes drawn with --seed {seed}, isolation {job.isolation}\n\n{table}\n")
+                table, differences = again.verify(claimed, job, episodes=episodes, seed=seed,
+                                                  tolerance=tolerance)
+                typer.echo(f"episodes drawn with --seed {seed}, isolation {job.isolation}\n\n"
+                           f"{table}\n")
             if held_out:
                 table, more = beyond.held_out(claimed, job, salt, held_out, record.parent)
                 differences += more
-                typer.echo(f"held-out episodes of the salt with sha256 {beyond.hash_of(salt)}\n\n{table}\n")
+                typer.echo("held-out episodes of the salt with sha256 "
+                           f"{beyond.hash_of(salt)}\n\n{table}\n")
     except ValueError as error:
         differences = [str(error)]
-    for difference in differences:
-        typer.echo(f"differs: {difference}", err=True)
-    if differences:
-        raise typer.Exit(1)
+    options.say_differences(differences)
     typer.echo(f"{record.name}: what was played again is as it says")
 
 
-def _verify_all(folder: Path, environments: list[str], out: Path, episodes: int, seed: int, tolerance: float,
-                isolate: str, jobs: int, backend: str) -> None:
+def _verify_all(folder: Path, environments: list[str], out: Path, tolerance: float,
+                **how: Any) -> None:
     from eitbench.bench.replay import by_environment, differing, official_records, verify_all
-    with clear_errors():
-        chosen = official_records(folder, environments)
-        rows = verify_all(chosen, out, episodes=episodes, seed=seed, isolate=isolate, n_jobs=jobs, backend=backend)
+    with options.clear_errors():
+        rows = verify_all(official_records(folder, environments), out, **how)
     typer.echo(by_environment(rows, tolerance))
-    wrong = differing(rows, tolerance)
-    for sentence in wrong:
-        typer.echo(f"differs: {sentence}", err=True)
-    if wrong:
-        raise typer.Exit(1)
+    options.say_differences(differing(rows, tolerance))

@@ -6,9 +6,9 @@ matrix a step.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from functools import lru_cache
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache, wraps
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from tqdm import tqdm
@@ -19,6 +19,8 @@ from eitbench.worlds.instrument import Faults
 from eitbench.worlds.parts import Discretisation
 from eitbench.worlds.streams import randomness
 from eitbench.worlds.world import World
+
+Made = TypeVar("Made")
 
 
 class Episode(NamedTuple):
@@ -37,7 +39,8 @@ class Episode(NamedTuple):
         """Noisy voltages (L,) in V of a sound instrument when ``currents`` (L,) in A (A/m in 2D)
         are injected at step 1 … T."""
         k = slice(step - 1, step)
-        return world.instrument.measure(Faults.none(len(currents)), step, self.transfer_resistance[k], currents[None],
+        return world.instrument.measure(Faults.none(len(currents)), step,
+                                        self.transfer_resistance[k], currents[None],
                                         self.noise[k])[0]
 
 
@@ -67,17 +70,24 @@ def simulate(world: World, seed: int, *, cache: bool = True, progress: bool = Tr
     return Episode(**store.kept(path, Episode._fields, make, str(seed), small=True))
 
 
-@lru_cache(maxsize=4)
-def _truth(fluid: World) -> Discretisation:
-    return fluid.truth()
+def once(many: int) -> Callable[[Callable[[World], Made]], Callable[[World], Made]]:
+    """What a function makes of a world is made once a process for all worlds that differ in the
+    instrument only, and kept for so ``many``."""
+    def decorated(make: Callable[[World], Made]) -> Callable[[World], Made]:
+        kept = lru_cache(maxsize=many)(make)
+        return wraps(make)(lambda world: kept(world.fluid))
+
+    return decorated
 
 
+@once(4)
 def truth_discretisation(world: World) -> Discretisation:
-    """``world.truth()``, built once a process for all worlds that differ in the instrument only."""
-    return _truth(world.fluid)
+    """``world.truth()``."""
+    return world.truth()
 
 
-def simulate_together(world: World, seeds: Sequence[int], progress: bool = True) -> Iterator[Episode]:
+def simulate_together(world: World, seeds: Sequence[int],
+                      progress: bool = True) -> Iterator[Episode]:
     """The episodes of several seeds, bit for bit as `simulate` gives them and without the cache.
 
     Eight concentrations in one flow are carried on together in the time of two, and eight
@@ -85,11 +95,13 @@ def simulate_together(world: World, seeds: Sequence[int], progress: bool = True)
     """
     truth = truth_discretisation(world)
     label = f"simulating {world.name}, seed {', '.join(map(str, seeds))}"
-    with tqdm(total=(world.lead_in + 2 * world.n_steps) * len(seeds), desc=label, unit="step", leave=False,
-              disable=None if progress else True) as bar:
-        episodes = [randomness(seed) for seed in seeds]
-        for history, random in zip(world.evolve(episodes, truth, bar.update), episodes, strict=True):
-            noise = random.noise.standard_normal((world.n_steps, truth.observation.cem.n_electrodes))
+    electrodes = truth.observation.cem.n_electrodes
+    with tqdm(total=(world.lead_in + 2 * world.n_steps) * len(seeds), desc=label, unit="step",
+              leave=False, disable=None if progress else True) as bar:
+        streams = [randomness(seed) for seed in seeds]
+        for history, random in zip(world.evolve(streams, truth, bar.update), streams, strict=True):
+            noise = random.noise.standard_normal((world.n_steps, electrodes))
             resistance = truth.observation.transfer_resistance(history.concentration[1:])
             bar.update(world.n_steps)
-            yield Episode(history.concentration.astype(np.float32), resistance, noise, history.velocity)
+            concentration = history.concentration.astype(np.float32)
+            yield Episode(concentration, resistance, noise, history.velocity)

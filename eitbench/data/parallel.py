@@ -1,5 +1,4 @@
-"""Work spread over processes, each with one BLAS thread: more of them only get into each other's
-way."""
+"""Work spread over processes, each with one BLAS thread: more get into each other's way."""
 
 from __future__ import annotations
 
@@ -27,14 +26,8 @@ def in_parallel(function: Callable[..., Result], arguments: Sequence[tuple], n_j
 
     ``ray`` and ``dask`` give the work to the cluster that $RAY_ADDRESS or $DASK_SCHEDULER_ADDRESS
     names, and without one to ``n_jobs`` processes here. When one of their processes is killed
-    another takes up its work.
-
-    Raises
-    ------
-    ValueError
-        If there is no such backend, or what it needs is not installed.
-    WorkerLost
-        If a process was killed and nobody took up its work.
+    another takes up its work; else it is a `WorkerLost`. ``ValueError`` if there is no such
+    backend, or what it needs is not installed.
     """
     if backend not in BACKENDS:
         raise ValueError(f"backend must be one of {', '.join(BACKENDS)}, got {backend!r}")
@@ -45,44 +38,49 @@ def in_parallel(function: Callable[..., Result], arguments: Sequence[tuple], n_j
     except ModuleNotFoundError as error:
         if error.name not in ("ray", "distributed", "dask"):
             raise
-        raise ValueError(f"backend {backend} needs {error.name}, which the extra cluster installs") from None
+        raise ValueError(f"backend {backend} needs {error.name}, which the extra cluster installs"
+                         ) from None
 
 
-def _with_joblib(function: Callable[..., Result], arguments: Sequence[tuple], n_jobs: int, config: Any = None,
-                 lost: type[BaseException] = BrokenProcessPool) -> Iterator[Result]:
+def _with_joblib(function: Callable[..., Result], arguments: Sequence[tuple], n_jobs: int,
+                 config: Any = None, lost: type[BaseException] = BrokenProcessPool,
+                 ) -> Iterator[Result]:
     from joblib import Parallel, delayed
+    how = {"return_as": "generator_unordered", "batch_size": 1, "pre_dispatch": n_jobs}
     try:
-        with config or nullcontext(), Parallel(n_jobs=n_jobs, return_as="generator_unordered", batch_size=1,
-                                               pre_dispatch=n_jobs) as parallel:
+        with config or nullcontext(), Parallel(n_jobs=n_jobs, **how) as parallel:
             told = registered_by_hand()
             yield from parallel(delayed(_pinned)(told, function, *each) for each in arguments)
     except lost as error:
         raise _explained(error) from error
 
 
-def _with_dask(function: Callable[..., Result], arguments: Sequence[tuple], n_jobs: int) -> Iterator[Result]:
+def _with_dask(function: Callable[..., Result], arguments: Sequence[tuple], n_jobs: int,
+               ) -> Iterator[Result]:
     import distributed
     from joblib import parallel_config
     where = os.environ.get("DASK_SCHEDULER_ADDRESS")
     local = {"n_workers": n_jobs, "threads_per_worker": 1, "dashboard_address": None}
     with distributed.Client(where) if where else distributed.Client(**local) as client:
-        yield from _with_joblib(function, arguments, n_jobs, parallel_config("dask", client=client),
-                                distributed.KilledWorker)
+        config = parallel_config("dask", client=client)
+        yield from _with_joblib(function, arguments, n_jobs, config, distributed.KilledWorker)
 
 
-def _with_ray(function: Callable[..., Result], arguments: Sequence[tuple], n_jobs: int) -> Iterator[Result]:
-    """Without joblib: its backend for ray gives all results at the end, and none if a process was
-    killed."""
+def _with_ray(function: Callable[..., Result], arguments: Sequence[tuple], n_jobs: int,
+              ) -> Iterator[Result]:
+    """Without joblib, whose backend for ray gives all results at the end or, if one fails, none."""
     import ray
+    from ray.exceptions import NodeDiedError, OutOfMemoryError, WorkerCrashedError
     here = {} if "RAY_ADDRESS" in os.environ else {"num_cpus": n_jobs, "include_dashboard": False}
     if ours := not ray.is_initialized():
         ray.init(log_to_driver=False, **here)
     try:
-        waiting = [ray.remote(_pinned).remote(registered_by_hand(), function, *each) for each in arguments]
+        told = registered_by_hand()
+        waiting = [ray.remote(_pinned).remote(told, function, *each) for each in arguments]
         while waiting:
             done, waiting = ray.wait(waiting)
             yield from ray.get(done)
-    except (ray.exceptions.WorkerCrashedError, ray.exceptions.NodeDiedError, ray.exceptions.OutOfMemoryError) as error:
+    except (WorkerCrashedError, NodeDiedError, OutOfMemoryError) as error:
         raise _explained(error) from error
     finally:
         if ours:
@@ -90,8 +88,9 @@ def _with_ray(function: Callable[..., Result], arguments: Sequence[tuple], n_job
 
 
 def _explained(error: BaseException) -> WorkerLost:
-    return WorkerLost(f"a process was lost, killed perhaps for want of memory ({type(error).__name__}); what was "
-                      "finished is kept, and the same command goes on from there")
+    return WorkerLost("a process was lost, killed perhaps for want of memory "
+                      f"({type(error).__name__}); what was finished is kept, and the same command "
+                      "goes on from there")
 
 
 def _pinned(told: list[Entry], function: Callable[..., Result], *arguments: Any) -> Result:

@@ -8,9 +8,9 @@ the world's background,
 
 from __future__ import annotations
 
-import io
 import os
 import zlib
+from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -20,7 +20,7 @@ import numpy as np
 from eitbench import _check
 from eitbench._files import write_atomically
 from eitbench.data import store
-from eitbench.data.episodes import Episode, simulate, truth_discretisation
+from eitbench.data.episodes import Episode, once, simulate, truth_discretisation
 from eitbench.worlds.streams import randomness
 from eitbench.worlds.task import make_task
 
@@ -39,8 +39,7 @@ class Outline(NamedTuple):
     """What all episodes of a world have in common, as far as playing and scoring need it."""
 
     mass: sp.csr_array
-    """(n, n) upper triangle of M̃ in m² (m³ in 3D), entries beside the diagonal doubled: ĉᵀ·mass·ĉ
-    = ĉᵀ M̃ ĉ."""
+    """(n, n) triangle of M̃, m² (m³ in 3D), doubled beside the diagonal: ĉᵀ·mass·ĉ = ĉᵀM̃ĉ."""
     largest_voltage: float
     """V, of the cycle's injections into liquid of the expected concentration."""
 
@@ -52,17 +51,20 @@ def recording(world: World, seed: int) -> np.ndarray:
     -------
     (T,) structured array, read-only and memory-mapped, one entry for each t = 1 … T:
 
-    ``transfer_resistance``  (L, L) 𝓡 in Ω (Ω·m in 2D) ``noise``                (L,) standard normal
-    draws ``moment``               (n,) float32, b_t: scores are exact to 2e-10 ``deviation``
-    ∫(c_t − background)² ``square``               ∫c_t² ``velocity_moment``      (k,) ∫φ_k v_t
-    across the pipe; this and the next only where the flow is asked for too ``velocity_square``
-    ∫v_t² ``checksum``             of all these bytes
+    ``transfer_resistance``  (L, L) 𝓡 in Ω (Ω·m in 2D)
+    ``noise``                (L,) standard normal draws
+    ``moment``               (n,) float32, b_t: scores are exact to 2e-10
+    ``deviation``            ∫(c_t − background)²
+    ``square``               ∫c_t²
+    ``velocity_moment``      (k,) ∫φ_k v_t across the pipe, where the flow is asked for too
+    ``velocity_square``      ∫v_t², there too
+    ``checksum``             of all these bytes
     """
     seed = _check.integer("seed", seed, low=0)
-    path = recording_path(world, seed)
     stored = _load(world, seed)
     if stored is None:
         stored = make_recording(world, seed, simulate(world, seed))
+        path = recording_path(world, seed)
         try:
             store_recording(path, stored)
         except OSError as error:
@@ -82,17 +84,13 @@ def is_recorded(world: World, seed: int) -> bool:
 
 def make_recording(world: World, seed: int, episode: Episode) -> np.ndarray:
     """The recording of ``episode``, which `simulate` gives for this seed."""
-    interpolation, mass = score_operators(world)
-    c = episode.concentration[1:].astype(float)
-    deviation = c - world.background
-    weighted = mass @ deviation.T
+    operators = score_operators(world)
     velocity = world.velocity_model
-    entries = np.zeros(len(episode.noise), recording_type(world, interpolation.shape[1]))
+    entries = np.zeros(len(episode.noise), recording_type(world, operators[0].shape[1]))
     entries["transfer_resistance"] = episode.transfer_resistance
     entries["noise"] = episode.noise
-    entries["moment"] = (interpolation.T @ weighted).T
-    entries["deviation"] = np.einsum("tn,nt->t", deviation, weighted)
-    entries["square"] = np.einsum("tn,nt->t", c, mass @ c.T)
+    entries["moment"], entries["deviation"], entries["square"] = integrate(
+        episode, world.background, *operators)
     if velocity is not None:
         entries["velocity_moment"] = (episode.velocity * velocity.weights) @ velocity.profiles
         entries["velocity_square"] = episode.velocity**2 @ velocity.weights
@@ -101,19 +99,28 @@ def make_recording(world: World, seed: int, episode: Episode) -> np.ndarray:
     return entries
 
 
+def integrate(episode: Episode, background: float, interpolation: sp.csr_array, mass: sp.csr_array,
+              ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """b_t (T, n), ∫(c_t − background)² and ∫c_t² (T,) of an episode, for these P and M."""
+    c = episode.concentration[1:].astype(float)
+    deviation = c - background
+    weighted = mass @ deviation.T
+    return ((interpolation.T @ weighted).T, np.einsum("tn,nt->t", deviation, weighted),
+            np.einsum("tn,nt->t", c, mass @ c.T))
+
+
 def store_recording(path: Path, entries: np.ndarray) -> None:
     """Write a recording where `recording` finds it."""
-    content = io.BytesIO()
-    np.save(content, entries)
-    write_atomically(path, content.getvalue())
+    write_atomically(path, store.npy(entries))
 
 
 def recording_type(world: World, n_nodes: int) -> np.dtype:
     """Of one step of a recording with so many nodes in the estimators' mesh."""
-    n_electrodes = world.vessel.n_electrodes
+    L = world.vessel.n_electrodes
     velocity = world.velocity_model
-    flow = [] if velocity is None else [("velocity_moment", "<f8", (velocity.size,)), ("velocity_square", "<f8")]
-    return np.dtype([("transfer_resistance", "<f8", (n_electrodes, n_electrodes)), ("noise", "<f8", (n_electrodes,)),
+    flow = [] if velocity is None else [
+        ("velocity_moment", "<f8", (velocity.size,)), ("velocity_square", "<f8")]
+    return np.dtype([("transfer_resistance", "<f8", (L, L)), ("noise", "<f8", (L,)),
                      ("moment", "<f4", (n_nodes,)), ("deviation", "<f8"), ("square", "<f8"), *flow,
                      ("checksum", "<u4")])
 
@@ -126,23 +133,24 @@ def outline(world: World) -> Outline:
 @lru_cache(maxsize=4)
 def _outline(fluid: World) -> Outline:
     def make() -> dict[str, np.ndarray]:
-        interpolation, mass = score_operators(fluid)
-        half = doubled_triangle(interpolation.T @ mass @ interpolation)
-        level = np.full(half.shape[0], fluid.expected_concentration)
-        largest = np.abs(make_task(fluid).observation.voltages(level, fluid.currents)).max()
-        return {name: getattr(half, name) for name in SPARSE} | {"largest": np.array(largest)}
+        task = make_task(fluid)
+        level = np.full(task.mesh.n_nodes, fluid.expected_concentration)
+        largest = np.abs(task.observation.voltages(level, fluid.currents)).max()
+        return half_mass(*score_operators(fluid)) | {"largest": np.array(largest)}
 
     stored = store.kept(store.folder(fluid) / "outline.npz", (*SPARSE, "largest"), make)
     return Outline(sparse_of(stored), float(stored["largest"]))
 
 
-def doubled_triangle(full: sp.csr_array) -> sp.csr_array:
-    """The upper triangle of a symmetric matrix, its entries beside the diagonal doubled."""
+def half_mass(interpolation: sp.csr_array, mass: sp.csr_array) -> dict[str, np.ndarray]:
+    """`SPARSE` arrays of M̃'s upper triangle, its entries beside the diagonal doubled."""
     import scipy.sparse as sp
-    return sp.csr_array(sp.triu(full) + sp.triu(full, 1))
+    full = interpolation.T @ mass @ interpolation
+    half = sp.csr_array(sp.triu(full) + sp.triu(full, 1))
+    return {name: getattr(half, name) for name in SPARSE}
 
 
-def sparse_of(arrays: dict[str, np.ndarray] | store.Mapping[str, np.ndarray]) -> sp.csr_array:
+def sparse_of(arrays: Mapping[str, np.ndarray]) -> sp.csr_array:
     """The square matrix that `SPARSE` arrays hold; read-only, since all environments share it."""
     import scipy.sparse as sp
     data, indices, indptr = (arrays[name] for name in SPARSE)
@@ -150,16 +158,12 @@ def sparse_of(arrays: dict[str, np.ndarray] | store.Mapping[str, np.ndarray]) ->
     return sp.csr_array((data, indices, indptr), shape=(len(indptr) - 1,) * 2)
 
 
+@once(2)
 def score_operators(world: World) -> tuple[sp.csr_array, sp.csr_array]:
     """(interpolation from the model's CD mesh to the truth's, the truth's mass matrix)."""
-    return _score_operators(world.fluid)
-
-
-@lru_cache(maxsize=2)
-def _score_operators(fluid: World) -> tuple[sp.csr_array, sp.csr_array]:
     from eitbench.numerics.fem import mass_matrix
-    truth = truth_discretisation(fluid).transport.mesh
-    return fluid.vessel.carrier(fine=False)[0].interpolation_to(truth.points), mass_matrix(truth)
+    truth = truth_discretisation(world).transport.mesh
+    return world.vessel.carrier(fine=False)[0].interpolation_to(truth.points), mass_matrix(truth)
 
 
 def faults_of(world: World, seed: int) -> Faults:
@@ -171,24 +175,23 @@ def cycle_voltages(world: World, seed: int, entries: np.ndarray) -> np.ndarray:
     """(T, L) noisy voltages in V of the world's injection cycle in the episode of this seed."""
     cycle = world.currents
     steps = np.arange(len(entries))
-    return world.instrument.measure(faults_of(world, seed), steps + 1, entries["transfer_resistance"],
-                                    cycle[steps % len(cycle)], entries["noise"])
+    return world.instrument.measure(faults_of(world, seed), steps + 1,
+                                    entries["transfer_resistance"], cycle[steps % len(cycle)],
+                                    entries["noise"])
 
 
-def step_error(mass: sp.csr_array, estimate: np.ndarray, moment: np.ndarray, deviation: np.ndarray | float,
-               square: np.ndarray | float) -> np.ndarray:
-    """∫(ĉ_t − c_t)² / ∫c_t² for ``estimate`` (..., n) less the background, with the entries of
-    recordings."""
+def step_error(mass: sp.csr_array, estimate: np.ndarray, moment: np.ndarray,
+               deviation: np.ndarray | float, square: np.ndarray | float) -> np.ndarray:
+    """∫(ĉ_t − c_t)² / ∫c_t² for ``estimate`` (..., n) less the background, by a recording."""
     # Contiguous: else the order of the sums, and so the last bit, would depend on how many
     # estimates there are.
     quadratic = np.einsum("...n,...n->...", estimate, np.ascontiguousarray((mass @ estimate.T).T))
     return (quadratic - 2.0 * np.einsum("...n,...n->...", estimate, moment) + deviation) / square
 
 
-def velocity_error(velocity: VelocityModel, parameters: np.ndarray, moment: np.ndarray, square: np.ndarray | float,
-                   ) -> np.ndarray:
-    """∫(v̂_t − v_t)² / ∫v_t² across the pipe for ``parameters`` (..., k) in m/s, with the entries
-    of recordings."""
+def velocity_error(velocity: VelocityModel, parameters: np.ndarray, moment: np.ndarray,
+                   square: np.ndarray | float) -> np.ndarray:
+    """∫(v̂_t − v_t)² / ∫v_t² across the pipe for ``parameters`` (..., k) in m/s, by a recording."""
     gram = velocity.profiles.T @ (velocity.weights[:, None] * velocity.profiles)
     quadratic = np.einsum("...k,kl,...l->...", parameters, gram, parameters)
     return (quadratic - 2.0 * np.einsum("...k,...k->...", parameters, moment) + square) / square
@@ -206,8 +209,9 @@ def _load(world: World, seed: int) -> np.ndarray | None:
         entries = np.asarray(np.memmap(path, kind, "r", len(header), (length,)))
         if _sound.get(path) != (status.st_size, status.st_mtime_ns):
             with path.open("rb") as file:
-                if file.read(len(header)) != header or (entries["checksum"] != _checksums(entries, seed)).any():
-                    return None
+                begins_well = file.read(len(header)) == header
+            if not begins_well or (entries["checksum"] != _checksums(entries, seed)).any():
+                return None
             _sound[path] = status.st_size, status.st_mtime_ns
         return entries
     except (FileNotFoundError, ValueError):        # missing, cut short
@@ -216,12 +220,10 @@ def _load(world: World, seed: int) -> np.ndarray | None:
 
 @lru_cache(maxsize=16)
 def _layout(fluid: World) -> tuple[np.dtype, bytes, int]:
-    """Of a recording's file: the type of a step, what numpy writes before the first, and their
-    number."""
+    """Of a recording's file: the type of a step, what numpy writes before them, their number."""
     kind = recording_type(fluid, outline(fluid).mass.shape[0])
-    content = io.BytesIO()
-    np.save(content, np.zeros(fluid.n_steps, kind))
-    return kind, content.getvalue()[:-fluid.n_steps * kind.itemsize], fluid.n_steps
+    content = store.npy(np.zeros(fluid.n_steps, kind))
+    return kind, content[:-fluid.n_steps * kind.itemsize], fluid.n_steps
 
 
 def _checksums(entries: np.ndarray, seed: int) -> np.ndarray:

@@ -8,15 +8,21 @@ and kept in a file beside the recording. Without a region they are the recording
 
 from __future__ import annotations
 
-from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from eitbench.data import store
-from eitbench.data.episodes import Episode, simulate, truth_discretisation
-from eitbench.data.recordings import SPARSE, doubled_triangle, outline, score_operators, sparse_of
+from eitbench.data.episodes import Episode, once, simulate, truth_discretisation
+from eitbench.data.recordings import (
+    SPARSE,
+    half_mass,
+    integrate,
+    outline,
+    score_operators,
+    sparse_of,
+)
 
 if TYPE_CHECKING:
     import scipy.sparse as sp
@@ -55,17 +61,15 @@ def integrals_path(world: World, seed: int) -> Path:
 
 def are_kept(world: World, seed: int) -> bool:
     """Whether the file of the region, if the world has one, is there and sound."""
-    return world.region is None or store.load(integrals_path(world, seed), Integrals._fields, str(seed)) is not None
+    if world.region is None:
+        return True
+    return store.load(integrals_path(world, seed), Integrals._fields, str(seed)) is not None
 
 
 def make_integrals(world: World, episode: Episode) -> Integrals:
     """The integrals over the world's region; ``episode`` is its truth."""
-    interpolation, mass = region_operators(world)
-    c = episode.concentration[1:].astype(float)
-    deviation = c - world.background
-    weighted = mass @ deviation.T
-    return Integrals((interpolation.T @ weighted).T.astype(np.float32), np.einsum("tn,nt->t", deviation, weighted),
-                     np.einsum("tn,nt->t", c, mass @ c.T))
+    moment, deviation, square = integrate(episode, world.background, *region_operators(world))
+    return Integrals(moment.astype(np.float32), deviation, square)
 
 
 def store_integrals(path: Path, seed: int, made: Integrals) -> None:
@@ -73,38 +77,26 @@ def store_integrals(path: Path, seed: int, made: Integrals) -> None:
     store.save(path, made._asdict(), str(seed))
 
 
+@once(4)
 def score_mass(world: World) -> sp.csr_array:
-    """(n, n) M̃ of what counts, its upper triangle with the entries beside the diagonal doubled, as
-    `Outline.mass`."""
-    return outline(world).mass if world.region is None else _region_mass(world.fluid)
+    """(n, n) M̃ of what counts, one triangle with doubled entries as `Outline.mass`."""
+    if world.region is None:
+        return outline(world).mass
+    return sparse_of(store.kept(store.folder(world) / "region.npz", SPARSE,
+                                lambda: half_mass(*region_operators(world))))
 
 
-@lru_cache(maxsize=4)
-def _region_mass(fluid: World) -> sp.csr_array:
-    def make() -> dict[str, np.ndarray]:
-        interpolation, mass = region_operators(fluid)
-        half = doubled_triangle(interpolation.T @ mass @ interpolation)
-        return {name: getattr(half, name) for name in SPARSE}
-
-    return sparse_of(store.kept(store.folder(fluid) / "region.npz", SPARSE, make))
-
-
+@once(2)
 def region_operators(world: World) -> tuple[sp.csr_array, sp.csr_array]:
-    """(interpolation from the model's CD mesh to the truth's, the truth's mass matrix over the
-    region)."""
+    """As `score_operators`, with the truth's mass matrix over the region."""
     interpolation, mass = score_operators(world)
-    return interpolation, mass if world.region is None else _mass_of_region(world.fluid)
-
-
-@lru_cache(maxsize=2)
-def _mass_of_region(fluid: World) -> sp.csr_array:
-    assert fluid.region is not None
-    return mass_between(truth_discretisation(fluid).transport.mesh, *fluid.region)
+    if world.region is not None:
+        mass = mass_between(truth_discretisation(world).transport.mesh, *world.region)
+    return interpolation, mass
 
 
 def mass_between(mesh: Mesh, begin: float, end: float) -> sp.csr_array:
-    """(n, n) P1 mass matrix ∫φᵢφⱼ in m² (m³ in 3D) over the cells whose centroids lie in begin < x
-    < end (m)."""
+    """(n, n) P1 mass matrix in m² (m³ in 3D) of the cells with centroids in begin < x < end (m)."""
     import scipy.sparse as sp
     middle = mesh.points[mesh.cells][:, :, 0].mean(axis=1)
     inside = (begin < middle) & (middle < end)

@@ -1,22 +1,18 @@
-"""Public episode seeds in disjoint ranges: learn on ``train``, choose on ``dev``, report on
-``test``."""
+"""Public episode seeds in disjoint ranges: learn on `train`, choose on `dev`, report on `test`."""
 
 from __future__ import annotations
 
 import re
 
-SPLITS = {"train": range(0, 100_000), "dev": range(100_000, 200_000), "test": range(200_000, 300_000)}
+SPLITS = {"train": range(0, 100_000), "dev": range(100_000, 200_000),
+          "test": range(200_000, 300_000)}
 
 
 def parse_seeds(text: str) -> list[int]:
     """Episode seeds from text such as ``test:0-4``, ``dev:3``, ``dev:0-9,15`` or plain ``17``.
 
     Within a split numbers count from its beginning; without one they are the seeds themselves.
-
-    Raises
-    ------
-    ValueError
-        If the text has another form, names an unknown split, or leaves the split's range.
+    ``ValueError`` if the text has another form, names an unknown split, or leaves its range.
     """
     split, colon, numbers = text.rpartition(":")
     if colon and split not in SPLITS:
@@ -29,13 +25,14 @@ def parse_seeds(text: str) -> list[int]:
             raise ValueError(f"seeds must look like 'test:0-4', 'dev:3,7' or '17', got {text!r}")
         first, last = int(match[1]), int(match[2] or match[1])
         if first > last or last >= len(allowed):
-            raise ValueError(f"seeds {part!r} must increase and stay below {len(allowed)}, in {text!r}")
-        seeds += [allowed[i] for i in range(first, last + 1)]
+            raise ValueError(
+                f"seeds {part!r} must increase and stay below {len(allowed)}, in {text!r}")
+        seeds += allowed[first:last + 1]
     return list(dict.fromkeys(seeds))
 
 
 def name_seed(seed: int) -> str:
-    """``test:4`` for the seed that `parse_seeds` makes of it; plain ``300017`` outside the splits."""
+    """``test:4`` for the seed that `parse_seeds` makes of it; ``300017`` outside the splits."""
     for split, seeds in SPLITS.items():
         if seed in seeds:
             return f"{split}:{seed - seeds.start}"

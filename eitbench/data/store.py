@@ -1,5 +1,4 @@
-"""The cache folder: arrays kept under a name, whole or not at all, and believed only if their
-checksum is right."""
+"""The cache folder: arrays kept under a name, whole or not at all, believed by their checksum."""
 
 from __future__ import annotations
 
@@ -9,7 +8,8 @@ import json
 import os
 import warnings
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from functools import lru_cache
 from importlib.metadata import version
@@ -29,8 +29,7 @@ CODE = ("numerics/*.py", "physics/*.py", "worlds/*.py", "data/*.py")
 
 
 def cache_folder() -> Path:
-    """Where episodes are kept: $EITBENCH_CACHE, else $XDG_CACHE_HOME/eitbench, else
-    ~/.cache/eitbench."""
+    """$EITBENCH_CACHE, else $XDG_CACHE_HOME/eitbench, else ~/.cache/eitbench."""
     if os.environ.get(CACHE_VARIABLE):
         return Path(os.environ[CACHE_VARIABLE])
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "eitbench"
@@ -74,13 +73,35 @@ def load(path: Path, names: Sequence[str], label: str = "") -> dict[str, np.ndar
     try:
         with np.load(path, allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in names}
-            return arrays if int(stored["checksum"]) == _checksum(path, arrays, label) else None
+            is_sound = int(stored["checksum"]) == _checksum(path, arrays, label)
+            return arrays if is_sound else None
     # a damaged archive may raise anything: zlib.error, NotImplementedError, RuntimeError, …
     except Exception:
         return None
 
 
-def save(path: Path, arrays: Mapping[str, np.ndarray], label: str = "", *, small: bool = False) -> None:
+def npy(array: np.ndarray) -> bytes:
+    """An array as numpy's own file."""
+    content = io.BytesIO()
+    np.save(content, array)
+    return content.getvalue()
+
+
+@contextmanager
+def cache_in(folder: Path) -> Iterator[None]:
+    """Within, this is the cache folder, of processes that are started too."""
+    before = os.environ.get(CACHE_VARIABLE)
+    os.environ[CACHE_VARIABLE] = str(folder)
+    try:
+        yield
+    finally:
+        del os.environ[CACHE_VARIABLE]
+        if before is not None:
+            os.environ[CACHE_VARIABLE] = before
+
+
+def save(path: Path, arrays: Mapping[str, np.ndarray], label: str = "", *,
+         small: bool = False) -> None:
     """Keep arrays at ``path``, ``small``: compressed. ``label`` says whose they are."""
     content = io.BytesIO()
     write = np.savez_compressed if small else np.savez
@@ -88,8 +109,8 @@ def save(path: Path, arrays: Mapping[str, np.ndarray], label: str = "", *, small
     write_atomically(path, content.getvalue())
 
 
-def kept(path: Path, names: Sequence[str], make: Callable[[], Mapping[str, np.ndarray]], label: str = "", *,
-         small: bool = False) -> Mapping[str, np.ndarray]:
+def kept(path: Path, names: Sequence[str], make: Callable[[], Mapping[str, np.ndarray]],
+         label: str = "", *, small: bool = False) -> Mapping[str, np.ndarray]:
     """The arrays at ``path``; made and kept, if they are not there. See `load` and `save`."""
     found = load(path, names, label)
     if found is not None:

@@ -30,16 +30,13 @@ def animate(environment: str, method: str, seed: str, step: int | None, path: Pa
     """Play a baseline, or a policy, on one episode and draw its scored states into ``path``, one in
     ``every``, or only state ``step``.
 
-    Raises
-    ------
-    ValueError
-        If the method cannot play the environment, or the path's suffix is not .gif or .webp (.png
-        with ``step``).
+    ``ValueError`` if the method cannot play the environment, or the path's suffix is not .gif or
+    .webp (.png with ``step``).
     """
     suffixes = MOVING if step is None else (".png",)
     if path.suffix not in suffixes:
-        raise ValueError(f"out must end in {' or '.join(suffixes)} {'without' if step is None else 'with'} step, got "
-                         f"{path.name}")
+        how = "without" if step is None else "with"
+        raise ValueError(f"out must end in {' or '.join(suffixes)} {how} step, got {path.name}")
     seeds = parse_seeds(seed)
     if len(seeds) != 1:
         raise ValueError(f"seed must name one episode, got {seed!r}")
@@ -53,8 +50,8 @@ def animate(environment: str, method: str, seed: str, step: int | None, path: Pa
             states = injections(env, loaded, seeds[0])
         else:
             if board_of(env) not in loaded.boards:
-                raise ValueError(f"baseline {loaded.name} plays {', '.join(loaded.boards)}, but {environment} is a "
-                                 f"{board_of(env)} environment")
+                raise ValueError(f"baseline {loaded.name} plays {', '.join(loaded.boards)}, but "
+                                 f"{environment} is a {board_of(env)} environment")
             begin = 1
             states = estimates(env, loaded, seeds[0])
         first, last = env.world.warm_up + 1, env.world.n_steps
@@ -67,23 +64,23 @@ def animate(environment: str, method: str, seed: str, step: int | None, path: Pa
             if t == last:
                 break
     path.parent.mkdir(parents=True, exist_ok=True)
-    how: dict[str, Any] = {}
+    options: dict[str, Any] = {}
     if path.suffix == ".gif":
         palette = _palette()
         frames = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     elif path.suffix == ".webp":
-        how = {"quality": 30, "method": 6}  # a fifth of the GIF, and the letters are still sharp
+        options = {"quality": 30, "method": 6}  # a fifth of the GIF, and letters are still sharp
     if step is None:
-        how |= {"save_all": True, "append_images": frames[1:], "loop": 0,
-                "duration": every * 1000 // env.metadata["render_fps"]}
-    frames[0].save(path, **how)
+        options |= {"save_all": True, "append_images": frames[1:], "loop": 0,
+                    "duration": every * 1000 // env.metadata["render_fps"]}
+    frames[0].save(path, **options)
     return path
 
 
 def _palette() -> Image.Image:
-    """The 256 colours of a frame: both colour maps, greys, and the electrodes; one for all frames
-    keeps them steady."""
-    colours = [colormaps[name](np.linspace(0, 1, n))[:, :3] for name, n in ((FIELD_MAP, 120), (SPREAD_MAP, 100))]
+    """The 256 colours of all frames, which keeps them steady: colour maps, greys, electrodes."""
+    colours = [colormaps[name](np.linspace(0, 1, n))[:, :3]
+               for name, n in ((FIELD_MAP, 120), (SPREAD_MAP, 100))]
     greys = np.linspace(0, 1, 27)[:, None].repeat(3, axis=1)
     pairs = [to_rgb(colour) for colour in (SOURCE, SINK, IDLE)]
     halves = [tuple(0.5 + 0.5 * c for c in colour) for colour in pairs]  # at the edges of the bars

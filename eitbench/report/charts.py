@@ -1,9 +1,9 @@
-"""Small charts as inline SVG, coloured by the page's style sheet so that they follow light and
-dark."""
+"""Small charts as inline SVG, coloured by the page's style sheet: they follow light and dark."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from html import escape
 from itertools import pairwise
 from typing import NamedTuple
@@ -16,7 +16,7 @@ COLOURS = 12
 LETTER = 7.0
 """Width of a letter in px, about."""
 LONGEST, LONGEST_BESIDE = 36, 60
-"""Letters of a name within a chart and beside one; whole names are in titles, legends and tables."""
+"""Letters of a name in a chart and beside one; whole names are in titles, legends and tables."""
 
 
 class Series(NamedTuple):
@@ -71,15 +71,14 @@ def lines(x: np.ndarray, series: list[Series], x_label: str, y_label: str) -> st
     parts = _frame(px, py, x_label, y_label)
     for s in sorted(series, key=lambda s: not s.faint):
         at = x if s.at is None else s.at
-        points = " ".join(f"{px(a):.1f},{py(b):.1f}" for a, b in zip(at, s.values, strict=False))
-        parts.append(f'<polyline class="series{" faint" * s.faint}" style="{_stroke(s.colour)}" points="{points}">'
-                     f'<title>{escape(s.name)}</title></polyline>')
+        points = _points((px(a), py(b)) for a, b in zip(at, s.values, strict=False))
+        parts.append(f'<polyline class="series{" faint" * s.faint}" style="{_stroke(s.colour)}" '
+                     f'points="{points}"><title>{escape(s.name)}</title></polyline>')
     return "".join([*parts, "</svg>"])
 
 
 def front(points: list[Point], x_label: str, y_label: str) -> str:
-    """Marks over two logarithmic axes, on which small is good; those that are `optimal` are filled
-    and joined.
+    """Marks over two logarithmic axes, where small is good; `optimal` ones are filled and joined.
 
     Names stand beside their marks as far as there is room.
     """
@@ -91,27 +90,26 @@ def front(points: list[Point], x_label: str, y_label: str) -> str:
     py = Axis(*span([p.y for p in points]), HEIGHT - BOTTOM, TOP, log=True)
     parts = _frame(px, py, x_label, y_label)
     best = optimal(points)
-    stairs = " ".join(f"{px(p.x):.1f},{py(p.y):.1f}" for p in best)
-    parts.append(f'<polyline class="front" points="{stairs}"/>')
+    parts.append(f'<polyline class="front" points="{_points((px(p.x), py(p.y)) for p in best)}"/>')
     taken = [(px(p.x) - 6, py(p.y) - 6, px(p.x) + 6, py(p.y) + 6) for p in points]
     for a, b in pairwise(best):  # names keep off the line too
-        along = [np.linspace(axis(begin), axis(end), 40) for axis, begin, end in ((px, a.x, b.x), (py, a.y, b.y))]
+        along = (np.linspace(px(a.x), px(b.x), 40), np.linspace(py(a.y), py(b.y), 40))
         taken += [(x - 1, y - 1, x + 1, y + 1) for x, y in zip(*along, strict=True)]
     for p in [*best, *(p for p in points if p not in best)]:  # the best choose their places first
-        colour = f"var(--c{p.colour % COLOURS})"
+        colour = _colour(p.colour)
         fill = colour if p in best else "var(--card)"
-        parts.append(f'<circle style="fill:{fill};stroke:{colour};stroke-width:2" cx="{px(p.x):.1f}" '
-                     f'cy="{py(p.y):.1f}" r="5"><title>{escape(p.name)}: {p.x:.3g}, {p.y:.3g}</title></circle>')
+        parts.append(_dot(f"fill:{fill};stroke:{colour};stroke-width:2", px(p.x), py(p.y),
+                          f"{escape(p.name)}: {p.x:.3g}, {p.y:.3g}"))
         name = _shortened(p.name, LONGEST)
         if place := _room(px(p.x), py(p.y), LETTER * len(name), taken):
             x, y, anchor = place
-            parts.append(f'<text class="name" x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{escape(name)}</text>')
+            parts.append(f'<text class="name" x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">'
+                         f'{escape(name)}</text>')
     return "".join([*parts, "</svg>"])
 
 
 def optimal(points: list[Point]) -> list[Point]:
-    """Of those that compete, whom no other beats in one and equals or beats in the other, by x; of
-    equals one."""
+    """Who competes and is not beaten in one and at best equal in the other, by x; of equals one."""
     best: list[Point] = []
     for p in sorted((p for p in points if p.competes), key=lambda p: (p.x, p.y)):
         if not best or p.y < best[-1].y:
@@ -119,27 +117,32 @@ def optimal(points: list[Point]) -> list[Point]:
     return best
 
 
-def calibration(series: list[Series], nominal: tuple[float, ...], x_label: str, y_label: str) -> str:
+def calibration(series: list[Series], nominal: tuple[float, ...], x_label: str,
+                y_label: str) -> str:
     """Observed over nominal parts, both in %; on the diagonal what is claimed is true."""
-    px, py = (Axis(0.0, 100.0, a, b, log=False) for a, b in ((LEFT, WIDTH - RIGHT), (HEIGHT - BOTTOM, TOP)))
+    px = Axis(0.0, 100.0, LEFT, WIDTH - RIGHT, log=False)
+    py = Axis(0.0, 100.0, HEIGHT - BOTTOM, TOP, log=False)
     parts = _frame(px, py, x_label, y_label)
     parts.append(f'<line class="front" x1="{px(0)}" y1="{py(0)}" x2="{px(100)}" y2="{py(100)}"/>')
     for s in series:
         places = [(px(a), py(b)) for a, b in zip(nominal, s.values, strict=True)]
-        parts.append(f'<g><title>{escape(s.name)}: {", ".join(f"{value:.0f} %" for value in s.values)}</title>'
-                     f'<polyline class="series" style="{_stroke(s.colour)}" '
-                     f'points="{" ".join(f"{x:.1f},{y:.1f}" for x, y in places)}"/>')
-        parts += [f'<circle style="fill:var(--c{s.colour % COLOURS})" cx="{x:.1f}" cy="{y:.1f}" r="5"/>'
-                  for x, y in places] + ["</g>"]
+        told = ", ".join(f"{value:.0f} %" for value in s.values)
+        parts += [f'<g><title>{escape(s.name)}: {told}</title>'
+                  f'<polyline class="series" style="{_stroke(s.colour)}" '
+                  f'points="{_points(places)}"/>',
+                  *(_dot(f"fill:{_colour(s.colour)}", x, y) for x, y in places), "</g>"]
     return "".join([*parts, "</svg>"])
 
 
-def intervals(rows: list[Series], x_label: str, *, log: bool = True, mark: float | None = None) -> str:
-    """A dot and its interval a row, over a logarithmic or a linear axis, with a line at ``mark``."""
+def intervals(rows: list[Series], x_label: str, *, log: bool = True,
+              mark: float | None = None) -> str:
+    """A dot and its interval a row, over a logarithmic or linear axis, with a line at ``mark``."""
     names = [_shortened(s.name, LONGEST_BESIDE) for s in rows]
-    row_height, label = 28, 24 + LETTER * max(8, *map(len, names))
+    row_height = 28
+    label = 24 + LETTER * max(8, *map(len, names))
     height = TOP + row_height * len(rows) + BOTTOM
-    known = [value for s in rows for value in s.values if math.isfinite(value)] + ([] if mark is None else [mark])
+    known = [value for s in rows for value in s.values if math.isfinite(value)]
+    known += [] if mark is None else [mark]
     if log:
         least = min((float(s.values[0]) for s in rows if s.values[0] > 0), default=1.0)
         # what reaches below is cut
@@ -148,22 +151,18 @@ def intervals(rows: list[Series], x_label: str, *, log: bool = True, mark: float
         margin = 0.05 * (max(known) - min(known)) or 1.0
         low, high = min(known) - margin, max(known) + margin
     px = Axis(low, high, label, WIDTH - RIGHT, log=log)
-    parts = [_open(height, x_label)]
-    for tick in px.ticks():
-        parts.append(f'<line class="grid" x1="{px(tick):.1f}" x2="{px(tick):.1f}" y1="{TOP}" y2="{height - BOTTOM}"/>'
-                     f'<text x="{px(tick):.1f}" y="{height - BOTTOM + 18}" text-anchor="middle">{_said(tick)}</text>')
+    parts = [_open(height, x_label), *_x_ticks(px, TOP, height - BOTTOM, height - BOTTOM)]
     if mark is not None:
-        parts.append(f'<line class="front" x1="{px(mark):.1f}" x2="{px(mark):.1f}" y1="{TOP}" y2="{height - BOTTOM}"/>')
+        parts.append(_upright("front", px(mark), TOP, height - BOTTOM))
     for i, (s, name) in enumerate(zip(rows, names, strict=True)):
         y = TOP + row_height * (i + 0.5)
         value, a, b = (float(end) if math.isfinite(end) else float(s.values[0]) for end in s.values)
-        parts.append(f'<text x="{label - 12}" y="{y + 4}" text-anchor="end">{escape(name)}</text>'
-                     f'<line style="stroke:var(--c{s.colour % COLOURS});stroke-width:3" x1="{px(a):.1f}" '
-                     f'x2="{px(b):.1f}" y1="{y}" y2="{y}"/><circle style="fill:var(--c{s.colour % COLOURS})" '
-                     f'cx="{px(value):.1f}" cy="{y}" r="5"><title>{value:.3g}</title></circle>')
-    parts.append(f'<text x="{(label + WIDTH - RIGHT) / 2}" y="{height - 6}" text-anchor="middle">{escape(x_label)}'
-                 '</text></svg>')
-    return "".join(parts)
+        parts += [_text(label - 12, y + 4, "end", name),
+                  f'<line style="stroke:{_colour(s.colour)};stroke-width:3" x1="{px(a):.1f}" '
+                  f'x2="{px(b):.1f}" y1="{y}" y2="{y}"/>',
+                  _dot(f"fill:{_colour(s.colour)}", px(value), y, f"{value:.3g}")]
+    parts.append(_text((label + WIDTH - RIGHT) / 2, height - 6, "middle", x_label))
+    return "".join([*parts, "</svg>"])
 
 
 def cell(three: tuple[float, float, float], low: float, high: float, *, log: bool = False,
@@ -173,8 +172,7 @@ def cell(three: tuple[float, float, float], low: float, high: float, *, log: boo
     hidden from those who listen."""
     px = Axis(low, high if high > low else low + 1.0, 4, 76, log=log)
     value, a, b = (min(end if math.isfinite(end) else three[0], px.high) for end in three)
-    line = "" if mark is None else (
-        f'<path class="grid" d="M{px(mark):.1f} 0V14"/>')
+    line = "" if mark is None else f'<path class="grid" d="M{px(mark):.1f} 0V14"/>'
     return (f'<svg class="cell" viewBox="0 0 80 14" aria-hidden="true">{line}'
             f'<line x1="{px(a):.1f}" x2="{px(b):.1f}" y1="7" y2="7"/>'
             f'<circle cx="{px(value):.1f}" cy="7" r="3"/></svg>')
@@ -184,24 +182,48 @@ def _frame(px: Axis, py: Axis, x_label: str, y_label: str) -> list[str]:
     """A chart's beginning: grid, ticks and labels."""
     parts = [_open(HEIGHT, f"{y_label} over {x_label}")]
     for tick in py.ticks():
-        parts.append(f'<line class="grid" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{py(tick):.1f}" y2="{py(tick):.1f}"/>'
-                     f'<text x="{LEFT - 8}" y="{py(tick) + 4:.1f}" text-anchor="end">{_said(tick)}</text>')
-    for tick in px.ticks():
-        parts.append(f'<line class="grid" x1="{px(tick):.1f}" x2="{px(tick):.1f}" y1="{HEIGHT - BOTTOM}" '
-                     f'y2="{HEIGHT - BOTTOM + 5}"/>'
-                     f'<text x="{px(tick):.1f}" y="{HEIGHT - BOTTOM + 18}" text-anchor="middle">{_said(tick)}</text>')
-    middle = (LEFT + WIDTH - RIGHT) / 2
-    return [*parts, f'<text x="{middle}" y="{HEIGHT - 6}" text-anchor="middle">{escape(x_label)}</text>'
-            f'<text text-anchor="middle" transform="translate(14 {(HEIGHT - BOTTOM + TOP) / 2}) rotate(-90)">'
-            f'{escape(y_label)}</text>']
+        y = f"{py(tick):.1f}"
+        parts += [f'<line class="grid" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{y}" y2="{y}"/>',
+                  _text(LEFT - 8, f"{py(tick) + 4:.1f}", "end", _said(tick))]
+    parts += _x_ticks(px, HEIGHT - BOTTOM, HEIGHT - BOTTOM + 5, HEIGHT - BOTTOM)
+    return [*parts, _text((LEFT + WIDTH - RIGHT) / 2, HEIGHT - 6, "middle", x_label),
+            '<text text-anchor="middle" transform="translate(14 '
+            f'{(HEIGHT - BOTTOM + TOP) / 2}) rotate(-90)">{escape(y_label)}</text>']
+
+
+def _x_ticks(px: Axis, top: float, bottom: float, axis: float) -> list[str]:
+    """A line at each tick, and what it says below the axis."""
+    return [_upright("grid", px(tick), top, bottom)
+            + _text(f"{px(tick):.1f}", axis + 18, "middle", _said(tick)) for tick in px.ticks()]
+
+
+def _upright(kind: str, x: float, top: float, bottom: float) -> str:
+    return f'<line class="{kind}" x1="{x:.1f}" x2="{x:.1f}" y1="{top}" y2="{bottom}"/>'
+
+
+def _text(x: float | str, y: float | str, anchor: str, words: str) -> str:
+    return f'<text x="{x}" y="{y}" text-anchor="{anchor}">{escape(words)}</text>'
+
+
+def _dot(style: str, x: float, y: float, title: str = "") -> str:
+    rest = f"><title>{title}</title></circle>" if title else "/>"
+    return f'<circle style="{style}" cx="{x:.1f}" cy="{y:.1f}" r="5"{rest}'
+
+
+def _points(places: Iterable[tuple[float, float]]) -> str:
+    return " ".join(f"{x:.1f},{y:.1f}" for x, y in places)
 
 
 def _open(height: float, label: str) -> str:
     return f'<svg viewBox="0 0 {WIDTH} {height}" role="img" aria-label="{escape(label)}">'
 
 
+def _colour(number: int) -> str:
+    return f"var(--c{number % COLOURS})"
+
+
 def _stroke(colour: int) -> str:
-    return f"stroke:var(--c{colour % COLOURS})" + (";stroke-dasharray:6 3" if colour >= COLOURS else "")
+    return f"stroke:{_colour(colour)}" + (";stroke-dasharray:6 3" if colour >= COLOURS else "")
 
 
 def _said(tick: float) -> str:
@@ -215,15 +237,16 @@ def _shortened(name: str, letters: int) -> str:
 
 def _room(x: float, y: float, width: float, taken: list[tuple[float, float, float, float]]
           ) -> tuple[float, float, str] | None:
-    """Where a name of this width fits beside (x, y) without touching what is ``taken``, to which it
-    is added."""
-    for left, dy, anchor in ((x + 10, 4, "start"), (x - 10 - width, 4, "end"), (x + 6, -9, "start"),
-                             (x + 6, 18, "start"), (x - 6 - width, -9, "end"), (x - 6 - width, 18, "end")):
-        box = (left, y + dy - 11, left + width, y + dy + 3)
-        inside = box[0] > LEFT and box[2] < WIDTH - 2 * LETTER and box[1] > 0 and box[3] < HEIGHT - BOTTOM
-        if inside and not any(box[0] < b[2] and b[0] < box[2] and box[1] < b[3] and b[1] < box[3] for b in taken):
-            taken.append(box)
-            return (left if anchor == "start" else left + width), y + dy, anchor
+    """Where a name of this width fits beside (x, y) clear of ``taken``, to which it is added."""
+    for dx, dy, anchor in ((10, 4, "start"), (-10, 4, "end"), (6, -9, "start"), (6, 18, "start"),
+                           (-6, -9, "end"), (-6, 18, "end")):
+        left = x + dx - width * (anchor == "end")
+        right, top, bottom = left + width, y + dy - 11, y + dy + 3
+        inside = left > LEFT and right < WIDTH - 2 * LETTER and top > 0 and bottom < HEIGHT - BOTTOM
+        if inside and not any(left < b[2] and b[0] < right and top < b[3] and b[1] < bottom
+                              for b in taken):
+            taken.append((left, top, right, bottom))
+            return (left if anchor == "start" else right), y + dy, anchor
     return None
 
 

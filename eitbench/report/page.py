@@ -5,11 +5,13 @@ from __future__ import annotations
 import base64
 import io
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -27,13 +29,11 @@ from eitbench.worlds.task import Task
 
 SHOWN = (("kalman_filter", "filter"), ("joint_extended_kalman_filter", "filter"),
          ("fixed_interval_smoother", "smoothing"), ("gauss_newton", "smoothing"))
-"""Beside the truth, in the snapshots: thesis Figs 5.4 and 5.6, and who estimates the flow too where
-it is asked for."""
+"""Beside the truth in the snapshots: thesis Figs 5.4 and 5.6, and who estimates the flow too."""
 
 
 def write_page(store: EpisodeStore, records: list[dict[str, Any]], table: pd.DataFrame) -> Path:
-    """Write ``index.html`` into the store's folder and return its path; it needs no other file and
-    no network."""
+    """Write ``index.html``, which needs no other file and no network, and return its path."""
     sections = [_section(store, records, str(name), rows.reset_index(drop=True))
                 for name, rows in table.groupby("world", sort=False)]
     headings = {heading for section in sections for heading in section["table"].headings}
@@ -45,13 +45,14 @@ def write_page(store: EpisodeStore, records: list[dict[str, Any]], table: pd.Dat
     return path
 
 
-def _section(store: EpisodeStore, records: list[dict[str, Any]], name: str, table: pd.DataFrame) -> dict[str, Any]:
-    """What the page shows of one world; ``table`` has its rows, numbered from 0, which choose the
-    colours."""
+def _section(store: EpisodeStore, records: list[dict[str, Any]], name: str,
+             table: pd.DataFrame) -> dict[str, Any]:
+    """What the page shows of one world; the numbers of ``table``'s rows choose the colours."""
     ordered = [_record_of(records, row) for _, row in table.iterrows()]
     return {
         "name": name, "table": shown(table, grouped=True),
-        "intervals": _intervals(table), "curves": _curves(ordered), "legend": _legend(ordered),
+        "intervals": _intervals(table), "curves": _curves(ordered),
+        "legend": [(i % charts.COLOURS, _title(record)) for i, record in enumerate(ordered)],
         "snapshots": _snapshots(store, ordered),
         "failures": [(method(record), episode["seed"], episode["message"]) for record in ordered
                      for episode in record["episodes"] if episode["status"] != "ok"],
@@ -60,7 +61,8 @@ def _section(store: EpisodeStore, records: list[dict[str, Any]], name: str, tabl
 
 def _runs(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """The distinct runs behind the records, each with its command, versions, commit and machine."""
-    return [group[0] for group in alike((run for record in records for run in record["runs"]), "command")]
+    runs = (run for record in records for run in record["runs"])
+    return [group[0] for group in alike(runs, "command")]
 
 
 def _record_of(records: list[dict[str, Any]], row: pd.Series) -> dict[str, Any]:
@@ -73,29 +75,32 @@ def _label(record: dict[str, Any] | pd.Series, title: str) -> str:
     return f"{title} · {board_label(record)}"
 
 
+def _title(record: dict[str, Any]) -> str:
+    return _label(record, method(record))
+
+
+def _ok(record: dict[str, Any]) -> list[dict[str, Any]]:
+    """The episodes that were played to their end."""
+    return [episode for episode in record["episodes"] if episode["status"] == "ok"]
+
+
 def _intervals(table: pd.DataFrame) -> str:
-    rows = [charts.Series(_label(row, row["method"]), int(str(i)), _ends(*row["error"]))
-            for i, row in table.iterrows() if row["error"] is not None]
+    rows = []
+    for i, row in table.iterrows():
+        if row["error"] is not None:
+            mean, half = row["error"]
+            ends = np.array([mean, mean - half, mean + half])
+            rows.append(charts.Series(_label(row, row["method"]), int(str(i)), ends))
     return charts.intervals(sorted(rows, key=lambda s: s.values[0]), "ẽ_c") if rows else ""
-
-
-def _ends(mean: float, half: float) -> np.ndarray:
-    return np.array([mean, mean - half, mean + half])
-
-
-def _legend(ordered: list[dict[str, Any]]) -> list[tuple[int, str]]:
-    return [(i % charts.COLOURS, _label(record, method(record))) for i, record in enumerate(ordered)]
 
 
 def _curves(ordered: list[dict[str, Any]]) -> str:
     """Error of each scored step, averaged over the seeds."""
-    series, steps = [], 0
-    for i, record in enumerate(ordered):
-        errors = [episode["step_errors"] for episode in record["episodes"] if episode["status"] == "ok"]
-        if errors:
-            series.append(charts.Series(_label(record, method(record)), i, np.mean(errors, axis=0)))
-            steps = max(steps, len(errors[0]))
-    return charts.lines(np.arange(1, steps + 1), series, "scored injection", "relative error") if series else ""
+    played = [[episode["step_errors"] for episode in _ok(record)] for record in ordered]
+    series = [charts.Series(_title(ordered[i]), i, np.mean(errors, axis=0))
+              for i, errors in enumerate(played) if errors]
+    steps = np.arange(1, max((len(s.values) for s in series), default=0) + 1)
+    return charts.lines(steps, series, "scored injection", "relative error") if series else ""
 
 
 def _snapshots(store: EpisodeStore, records: list[dict[str, Any]]) -> dict[str, Any] | None:
@@ -104,12 +109,12 @@ def _snapshots(store: EpisodeStore, records: list[dict[str, Any]]) -> dict[str, 
     The records are of one world, which has one mesh and one time step. The episode is of the split
     that comes first in the table: methods that played other seeds share none with it.
     """
-    records = [record for record in records if any(e["status"] == "ok" for e in record["episodes"])]
+    records = [record for record in records if _ok(record)]
     records = [record for record in records if record["split"] == records[0]["split"]]
-    chosen = [record for name, board in SHOWN for record in records
-              if record["method"] == name and record["board"] == board]
+    chosen = [record for shown in SHOWN for record in records
+              if (record["method"], record["board"]) == shown]
     chosen = chosen or records[:3]
-    played = [{e["seed"] for e in record["episodes"] if e["status"] == "ok"} for record in chosen]
+    played = [{episode["seed"] for episode in _ok(record)} for record in chosen]
     shared = sorted(set.intersection(*played)) if played else []
     if not shared:
         return None
@@ -121,7 +126,8 @@ def _snapshots(store: EpisodeStore, records: list[dict[str, Any]]) -> dict[str, 
     world = chosen[0]["environment"]
     env: Any = Environment(world["id"], json.dumps(world["kwargs"])).make()
     env.reset(seed=parse_seeds(seed)[0])
-    task, truth = env.task, env.truth()
+    task = env.task
+    truth = env.truth()
     times = task.warm_up + np.linspace(0.12, 0.88, 4) * (task.n_steps - task.warm_up)
     rows = []
     for t in np.maximum(times.astype(int), task.warm_up + 1):
@@ -129,7 +135,7 @@ def _snapshots(store: EpisodeStore, records: list[dict[str, Any]]) -> dict[str, 
         pictures += [_picture(task, task.mesh, field[t - 1]) for field in fields]
         rows.append((f"t = {1e3 * t * task.transport.time_step:.0f} ms", pictures))
     low, high = colour_range(task)
-    return {"seed": seed, "columns": ["Truth", *(method(record) for record in chosen)], "rows": rows,
+    return {"seed": seed, "columns": ["Truth", *map(method, chosen)], "rows": rows,
             "low": f"{low:g}", "high": f"{high:g}", "size": _size(task), "tank": _is_tank(task)}
 
 
@@ -143,30 +149,31 @@ def _size(task: Task) -> str:
     size = [f"{length:.3g} cm" for length in 100 * np.ptp(task.mesh.points, axis=0)]
     if task.mesh.dim == 3:
         return f"{size[2]} long, {size[0]} across, cut along the axis; flow from left to right"
-    return f"{size[0]} across" if _is_tank(task) else f"{size[0]} × {size[1]}; flow from left to right"
+    if _is_tank(task):
+        return f"{size[0]} across"
+    return f"{size[0]} × {size[1]}; flow from left to right"
 
 
 def _picture(task: Task, mesh: Mesh, values: np.ndarray) -> str:
-    """The field without axes, transparent outside, as a data URI; in 3D the slice along the axis."""
+    """The field without axes, transparent outside, as a data URI; in 3D the slice on the axis."""
     extent = np.ptp(mesh.points, axis=0)
     length, height = (extent[2], extent[1]) if mesh.dim == 3 else extent
     width = 2.6 if _is_tank(task) else 4.0  # inches; the style sheet keeps tanks small too
-    figure = Figure(figsize=(width, width * height / length), dpi=90)
-    axes = figure.add_axes((0, 0, 1, 1))
-    draw_field(axes, mesh, values, *colour_range(task))
-    axes.axis("off")
-    return _data_uri(figure)
+    return _data_uri(width, width * height / length,
+                     lambda axes: draw_field(axes, mesh, values, *colour_range(task)))
 
 
 def _colour_bar() -> str:
-    figure = Figure(figsize=(3.0, 0.12), dpi=90)
+    bar = np.linspace(0, 1, 256)[None]
+    return _data_uri(3.0, 0.12, lambda axes: axes.imshow(bar, cmap=FIELD_MAP, aspect="auto"))
+
+
+def _data_uri(width: float, height: float, draw: Callable[[Axes], object]) -> str:
+    """What is drawn on bare axes of this size in inches, as a PNG."""
+    figure = Figure(figsize=(width, height), dpi=90)
     axes = figure.add_axes((0, 0, 1, 1))
-    axes.imshow(np.linspace(0, 1, 256)[None], cmap=FIELD_MAP, aspect="auto")
+    draw(axes)
     axes.axis("off")
-    return _data_uri(figure)
-
-
-def _data_uri(figure: Figure) -> str:
     content = io.BytesIO()
     FigureCanvasAgg(figure)
     figure.savefig(content, format="png", transparent=True)

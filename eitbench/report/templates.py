@@ -1,5 +1,4 @@
-"""The templates of our pages: one environment, in which whatever a method calls itself is text and
-nothing more."""
+"""The templates of our pages, in which whatever a method calls itself is text and nothing more."""
 
 from __future__ import annotations
 

@@ -29,14 +29,15 @@ class Agent:
 
     @classmethod
     def suits(cls, rules: Rules) -> bool:
-        """Whether the world shows and takes arrays of the shapes that the model was trained on,
-        whatever they mean."""
-        zeros = {name: np.zeros(space.shape or ()) for name, space in InjectionCore(rules, "reduced").space().items()}
+        """Whether arrays have the shapes that the model was trained on, whatever they mean."""
+        spaces = InjectionCore(rules, "reduced").space().items()
+        seen = scaled(rules, {name: np.zeros(space.shape or ()) for name, space in spaces})
         return bool(cls.model.action_space == rules.action_space
-                    and cls.model.observation_space.shape == scaled(rules, zeros).shape)
+                    and cls.model.observation_space.shape == seen.shape)
 
     def __init__(self, rules: Rules, random: np.random.Generator) -> None:
-        self.rules, self.memory = rules, None
+        self.rules = rules
+        self.memory = None
         self.console: Console | None = None
 
     def act(self, observation: dict[str, np.ndarray]) -> Any:
@@ -51,9 +52,11 @@ class Agent:
         masks = {}
         if self.masked:
             spent = self.rules.budget is not None and observation["left"][1] == 0.0
-            masks["action_masks"] = np.arange(self.model.action_space.n) >= spent * (self.model.action_space.n - 1)
-        action, self.memory = self.model.predict(scaled(self.rules, observation), state=self.memory,
-                                                 episode_start=np.array([begins]), deterministic=True, **masks)
+            n = self.model.action_space.n
+            masks["action_masks"] = np.arange(n) >= spent * (n - 1)
+        action, self.memory = self.model.predict(
+            scaled(self.rules, observation), state=self.memory, episode_start=np.array([begins]),
+            deterministic=True, **masks)
         return action
 
 
@@ -62,23 +65,19 @@ def load_agent(path: Path, content: bytes) -> tuple[str, str, type[Agent], dict[
 
     The name is ALGO_seedK for our own agents, and bears a mark of the configuration,
     ALGO_MARK_seedK, for all others. A model is unpickled, so it is code: the folder must hold its
-    ``sha256``, and a file that differs is not opened.
-
-    Raises
-    ------
-    ValueError
-        If ``config.json`` or ``sha256`` is missing beside it, or the file is not the one that was
-        left there.
+    ``sha256``, and a file that differs is not opened. ``ValueError`` if that, or ``config.json`` or
+    ``sha256`` is missing beside it.
     """
     try:
         asked = json.loads((path.parent / "config.json").read_text())
         expected = (path.parent / "sha256").read_text().split()[0]
     except (OSError, ValueError, IndexError) as error:
-        raise ValueError(f"policy {path} must lie beside the config.json and sha256 that `eitbench train` leaves: "
-                         f"{error}") from None
+        raise ValueError(f"policy {path} must lie beside the config.json and sha256 that "
+                         f"`eitbench train` leaves: {error}") from None
     found = hashlib.sha256(content).hexdigest()
     if found != expected:
-        raise ValueError(f"policy {path} must have the sha256 that lies beside it, {expected}; it has {found}")
+        raise ValueError(f"policy {path} must have the sha256 that lies beside it, {expected}; "
+                         f"it has {found}")
     from eitbench.rl import networks
     from eitbench.rl.training import algorithm_of
     # as older models name their networks' module
@@ -86,18 +85,19 @@ def load_agent(path: Path, content: bytes) -> tuple[str, str, type[Agent], dict[
     algo, seed = asked["algo"], asked["seed"]
     model = algorithm_of(algo).load(io.BytesIO(content), device="cpu")
     policy = type("Policy", (Agent,), {"model": model, "masked": algo.startswith("maskable")})
-    name = f"{algo}{'' if _is_shipped(asked, found) else '_' + _mark(asked)}_seed{seed}"
-    return name, f"{algo} trained with seed {seed}", policy, {"env": asked["env"], **asked["config"]}
+    mark = "" if _is_shipped(asked, found) else f"_{_mark(asked)}"
+    parameters = {"env": asked["env"], **asked["config"]}
+    return f"{algo}{mark}_seed{seed}", f"{algo} trained with seed {seed}", policy, parameters
 
 
 def _is_shipped(asked: dict[str, Any], sha256: str) -> bool:
     """Whether it is one of our own agents, wherever its copy lies: a guest is given one."""
-    ours = baseline_folder() / "checkpoints" / asked["env"].replace("/", "-") / asked["algo"] / f"seed{asked['seed']}"
-    return (ours / "sha256").is_file() and (ours / "sha256").read_text().split()[:1] == [sha256]
+    ours = (baseline_folder() / "checkpoints" / asked["env"].replace("/", "-") / asked["algo"]
+            / f"seed{asked['seed']}" / "sha256")
+    return ours.is_file() and ours.read_text().split()[:1] == [sha256]
 
 
 def _mark(asked: dict[str, Any]) -> str:
-    """Six digits for what was asked of the training but its seed, so that results of two
-    configurations stay apart."""
-    words = json.dumps({name: value for name, value in asked.items() if name != "seed"}, sort_keys=True)
-    return hashlib.sha256(words.encode()).hexdigest()[:6]
+    """Six digits for what was asked of the training but its seed: configurations stay apart."""
+    rest = {name: value for name, value in asked.items() if name != "seed"}
+    return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()[:6]

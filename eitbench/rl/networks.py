@@ -1,5 +1,4 @@
-"""Networks for choosing electrode pairs: an electrode's worth is shared by all the pairs it belongs
-to.
+"""Networks for choosing electrode pairs: an electrode's worth is shared by all its pairs.
 
 A plain network has to learn 120 times that an electrode is dead; here a pair's logit is the sum of
 what its two electrodes are worth as source and as sink, and of a part of its own.
@@ -18,8 +17,7 @@ from torch import nn
 
 
 class PairLogits(nn.Module):
-    """Logits of all pairs of L electrodes, and of further actions, from h features; the pairs' own
-    part begins at zero.
+    """Logits of all pairs of L electrodes, and of further actions, from h features; small at first.
 
     Parameters
     ----------
@@ -36,7 +34,8 @@ class PairLogits(nn.Module):
         for k, (i, j) in enumerate(combinations(range(electrodes), 2)):
             incidence[k, i] = incidence[k, electrodes + j] = 1.0
         self.register_buffer("incidence", incidence)
-        self.worth, self.own = nn.Linear(features, 2 * electrodes), nn.Linear(features, actions)
+        self.worth = nn.Linear(features, 2 * electrodes)
+        self.own = nn.Linear(features, actions)
         for layer in (self.worth, self.own):
             nn.init.orthogonal_(layer.weight, gain=0.01)
             nn.init.zeros_(layer.bias)
@@ -64,4 +63,5 @@ class MaskablePairPolicy(MaskableActorCriticPolicy):
 
 def _with_pairs(policy: Any, lr_schedule: Schedule) -> None:
     policy.action_net = PairLogits(policy.mlp_extractor.latent_dim_pi, int(policy.action_space.n))
-    policy.optimizer = policy.optimizer_class(policy.parameters(), lr=lr_schedule(1), **policy.optimizer_kwargs)
+    policy.optimizer = policy.optimizer_class(policy.parameters(), lr=lr_schedule(1),
+                                              **policy.optimizer_kwargs)

@@ -13,8 +13,7 @@ from eitbench.envs.injection import InjectionVectorEnv
 
 
 class InjectionVecEnv(VecEnv):
-    """`InjectionVectorEnv` as a `VecEnv`: when the episodes end, which they do together, the next
-    ones begin at once.
+    """`InjectionVectorEnv` as a `VecEnv`: episodes end together, and the next ones begin at once.
 
     Parameters
     ----------
@@ -30,15 +29,19 @@ class InjectionVecEnv(VecEnv):
 
     def __init__(self, envs: InjectionVectorEnv, *, reward_scale: float = 1.0,
                  reference: np.ndarray | None = None) -> None:
-        self.envs, self.reward_scale, self.reference = envs, reward_scale, reference
+        self.envs = envs
+        self.reward_scale = reward_scale
+        self.reference = reference
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
 
     def reset(self) -> Any:
-        """Begin training episodes; after ``seed(s)`` they are drawn from a sequence that s
-        determines."""
+        """Begin training episodes; after ``seed(s)`` they are drawn as s determines."""
         first = self._seeds[0]
-        seeds = None if first is None else np.random.default_rng(first).choice(
-            self.envs.episodes, size=self.num_envs, replace=self.num_envs > self.envs.episodes).tolist()
+        seeds = None
+        if first is not None:
+            scarce = self.num_envs > self.envs.episodes
+            seeds = np.random.default_rng(first).choice(
+                self.envs.episodes, size=self.num_envs, replace=scarce).tolist()
         self._reset_seeds()
         return self._begin(seeds)
 
@@ -65,7 +68,8 @@ class InjectionVecEnv(VecEnv):
     def close(self) -> None:
         self.envs.close()
 
-    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+    def env_method(self, method_name: str, *args: Any, indices: Any = None,
+                   **kwargs: Any) -> list[Any]:
         """`action_masks` of each environment."""
         every = getattr(self.envs, method_name)(*args, **kwargs)
         return [every[k] for k in self._get_indices(indices)]
@@ -75,9 +79,6 @@ class InjectionVecEnv(VecEnv):
         spaces = ("observation_space", "action_space")
         value = getattr(self.envs, f"single_{attr_name}" if attr_name in spaces else attr_name)
         return [value for _ in self._get_indices(indices)]
-
-    def has_attr(self, attr_name: str) -> bool:
-        return hasattr(self.envs, attr_name)
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         setattr(self.envs, attr_name, value)

@@ -25,22 +25,18 @@ def _later(place: str, default: str | None = "dev:0-1") -> Draw:
         module, function = place.split(":")
         if seeds is None and default is not None:
             seeds = parse_seeds(default)
-        result: tuple[Path, str] = getattr(import_module(f"{__name__}.{module}"), function)(seeds,
-                                                                                            jobs,
-                                                                                            out)
-        return result
+        figure: Draw = getattr(import_module(f"{__name__}.{module}"), function)
+        return figure(seeds, jobs, out)
 
     return draw
 
 
 FIGURES: dict[str, Draw] = {name: _later(place) for name, place in {
     "fig5.4": "pipe2d:fig5_4", "fig5.5": "pipe2d:fig5_5", "fig5.6": "pipe2d:fig5_6",
-    "fig5.7": "pipe2d:fig5_7",
-    "fig5.8": "pipe2d:fig5_8",
+    "fig5.7": "pipe2d:fig5_7", "fig5.8": "pipe2d:fig5_8",
     "fig5.10": "pipe3d:fig5_10", "table5.1": "parameters:table5_1",
     "fig6.1": "velocity:fig6_1", "fig6.2": "velocity:fig6_2", "fig6.3": "velocity:fig6_3",
-    "fig6.4": "velocity:fig6_4",
-    "fig6.5": "velocity:fig6_5", "fig6.6": "velocity:fig6_6",
+    "fig6.4": "velocity:fig6_4", "fig6.5": "velocity:fig6_5", "fig6.6": "velocity:fig6_6",
     "fig7.2": "tanks:fig7_2", "fig7.3": "tanks:fig7_3", "fig7.4": "tanks:fig7_4",
     "profiles": "profiles:profiles", "obstacle": "obstacle:obstacle",
 }.items()} | {"injection": _later("injection:injection", default=None)}

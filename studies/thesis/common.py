@@ -30,9 +30,8 @@ def estimates_of(env: EstimationEnv, baseline: str, seed: int) -> list[Estimate]
     """What a baseline says of t = 1 … T."""
     steps = estimates(env, load_method(baseline, "estimation"), seed)
     with threadpool_limits(1):
-        return [estimate for _,
-                estimate in tqdm(steps, total=env.task.n_steps, desc=baseline, unit="state",
-                                                 disable=None, leave=False)]
+        return [estimate for _, estimate in tqdm(steps, total=env.task.n_steps, desc=baseline,
+                                                 unit="state", disable=None, leave=False)]
 
 
 def error_of(env: EstimationEnv, estimates: list[Estimate]) -> float:
@@ -85,7 +84,8 @@ def draw_fields(env: EstimationEnv, axes: np.ndarray, times: list[int],
                 columns: Sequence[list[Estimate]]):
     """Truth in the first column of ``axes``, estimates beside it, one state a row; returns the
     mappable."""
-    truth, (low, high) = env.truth(), colour_range(env.task)
+    truth = env.truth()
+    (low, high) = colour_range(env.task)
     for row, t in zip(axes, times, strict=True):
         fields = [(env.truth_mesh(), truth[t - 1])]
         fields += [(env.task.mesh, estimates[t - 1].mean) for estimates in columns]

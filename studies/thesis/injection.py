@@ -49,9 +49,11 @@ def injection(seeds: list[int] | None, jobs: int, out: Path) -> tuple[Path, str]
     """Scores with the exact filter, of all our policies on these episodes, by default the boards';
     what the leaderboards' records hold, of this very code, is not played again. An episode with an
     unknown flow takes one to two minutes."""
-    store, before = EpisodeStore(out), results_in(shipped("leaderboards") / "results")
+    store = EpisodeStore(out)
+    before = results_in(shipped("leaderboards") / "results")
     figure = Figure(figsize=(13.5, 13.8), dpi=110, layout="constrained")
-    panels, said = figure.subplots(3, 3, height_ratios=(4, 4, 3)), []
+    panels = figure.subplots(3, 3, height_ratios=(4, 4, 3))
+    said = []
     for (env, title), axes in zip(WORLDS.items(), panels[:2].flat, strict=True):
         todo = jobs_of("injection", [env], [], seeds)
         run_jobs(unplayed(todo, before), store, n_jobs=jobs, command="eitbench reproduce injection")
@@ -65,8 +67,9 @@ def injection(seeds: list[int] | None, jobs: int, out: Path) -> tuple[Path, str]
         axes.set_title(WORLDS[env], fontsize=11)
     figure.legend(handles=[Line2D([], [], marker="o", linestyle="", color=colour, label=meaning)
                            for colour, meaning in KINDS.items()]
-                  + [Line2D([], [], color=TRUE, linewidth=width, label=meaning) for width,
-                     meaning in LINES.items()], frameon=False, ncols=5, loc="outside upper center")
+                  + [Line2D([], [], color=TRUE, linewidth=width, label=meaning)
+                     for width, meaning in LINES.items()],
+                  frameon=False, ncols=5, loc="outside upper center")
     path = out / "injection.png"
     save(figure, path)
     first = jobs_of("injection", [AT_WORK[0]], [AT_WORK[1]], seeds)[0].seed

@@ -32,7 +32,8 @@ def _env(flow: str) -> EstimationEnv:
 
 def obstacle(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
     """The flow, true and assumed, and Kalman filters with either."""
-    columns, errors = [], []
+    columns = []
+    errors = []
     for flow in ("parabolic", "real"):
         env = _env(flow)
         columns.append(estimates_of(env, "kalman_filter", seeds[0]))
@@ -65,7 +66,8 @@ def obstacle(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
 def _draw_flows(axes: np.ndarray, figure, env: EstimationEnv, world: World) -> float:
     """The real and the assumed flow side by side; returns the part of the pipe's area where the
     real one turns back."""
-    pipe, mesh = world.vessel, env.truth_mesh()
+    pipe = world.vessel
+    mesh = env.truth_mesh()
     real = world.flow.nominal(world, fine=True)
     assert real is not None
     velocity = real(mesh.points)

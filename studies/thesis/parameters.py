@@ -69,16 +69,14 @@ def table5_1(seeds: list[int], jobs: int, out: Path) -> tuple[Path, str]:
             f"{LABELS[name]} × {factor:g}" for name, factor in best._asdict().items()
             if factor != 1) or "the same")
         + f"), so that the table is {100 * (table / errors[best] - 1):.1f} % above the best. Mean "
-          f"of {len(seeds)} "
-        f"episode{'s' * (len(seeds) > 1)}.",
+          f"of {len(seeds)} episode{'s' * (len(seeds) > 1)}.",
         "Changed alone, four times less to four times more, ẽ_c rises by at most "
         + ", ".join(f"{100 * worst[name]:.1f} % ({label}, × {FACTORS[alone[name].argmax()]:g})"
                     for name, label in LABELS.items()) + ".",
         verdict("the table's values are a good choice: within 10 % of the best",
                 table < 1.1 * errors[best]), f"What matters most is the {LABELS[most]}.",
         "By choice: stds of e and of the initial state are ours, illegible in our copy of the "
-        "table; the truth's κ "
-        "stays what it is."])
+        "table; the truth's κ stays what it is."])
 
 
 def sweep(seeds: list[int], jobs: int) -> dict[Factors, float]:
@@ -123,7 +121,8 @@ def _played(env: EstimationEnv, task: Task, seed: int) -> float:
     """ẽ_c of a Kalman filter that believes ``task`` in an episode of ``env``."""
     estimator = load_method("kalman_filter", "estimation").make(task)
     observation, _ = env.reset(seed=seed)
-    done, rewards = False, []
+    done = False
+    rewards = []
     while not done:
         observation, reward, done, _, _ = env.step(estimator.update(**observation).mean)
         rewards.append(reward)

@@ -75,7 +75,8 @@ def fig5_5(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
     path = out / "fig5.5.png"
     save(figure, path)
     by_filter, by_smoother = (np.asarray(variance) for variance in variances)
-    x, third = env.task.mesh.points[:, 0], np.ptp(env.task.mesh.points[:, 0]) / 3
+    x = env.task.mesh.points[:, 0]
+    third = np.ptp(env.task.mesh.points[:, 0]) / 3
     along = [by_filter[(x >= k * third) & (x <= (k + 1) * third)].mean() for k in range(3)]
     return path, "\n".join([
         f"Mean variance {by_filter.mean():.2f} (mol/m³)² for the filter, {by_smoother.mean():.2f} "
@@ -92,7 +93,8 @@ def fig5_6(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
     """Stationary reconstructions of four frames of the moving target."""
     env = _env("all")
     images = estimates_of(env, "gauss_newton", seeds[0])
-    frame, truth = len(env.task.currents), env.truth()
+    frame = len(env.task.currents)
+    truth = env.truth()
     begins = [frame * k for k in range(1, 5)]
     figure, axes = pipe_grid(len(begins), 2,
                              ["true average over the frame", "stationary Gauss–Newton"])
@@ -112,12 +114,11 @@ def fig5_6(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
     interpolation, mass = score_operators(env.world)
     of_average = scoring.relative_error(np.array([interpolation @ images[b].mean for b in begins]),
                                         np.array(averages), mass)
-    error, constant = error_of(env, images), error_of(env,
-                                                      estimates_of(env, "homogeneous", seeds[0]))
+    error = error_of(env, images)
+    constant = error_of(env, estimates_of(env, "homogeneous", seeds[0]))
     return path, "\n".join([
         f"ẽ_c is {error:.4f}, of the homogeneous estimate {constant:.4f}; against the true average "
-        "of its frame an "
-        f"image errs by {of_average:.4f}.",
+        f"of its frame an image errs by {of_average:.4f}.",
         verdict("the images are of no use: worse than a constant", error > constant),
         verdict("they are not temporal averages of the target either", of_average > 0.5 * error),
         "By choice: the artefacts depend on the order of our injections."])
@@ -126,7 +127,8 @@ def fig5_6(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
 def fig5_7(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
     """Kalman filter estimates when the model's mean velocity is 200 or 700 cm/s; the truth is
     450."""
-    columns, errors = {}, []
+    columns = {}
+    errors = []
     for velocity in (2.0, 7.0):
         env = _env(mean_velocity=velocity)
         estimates = estimates_of(env, "kalman_filter", seeds[0])
@@ -139,15 +141,14 @@ def fig5_7(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
     constant = error_of(right, estimates_of(right, "homogeneous", seeds[0]))
     return path, "\n".join([
         f"ẽ_c is {errors[0]:.4f} with 200 cm/s and {errors[1]:.4f} with 700 cm/s, {error:.4f} with "
-        "the true 450 cm/s "
-        f"and {constant:.4f} for the homogeneous estimate.",
+        f"the true 450 cm/s and {constant:.4f} for the homogeneous estimate.",
         verdict("a wrong velocity costs accuracy", min(errors) > error),
         verdict("yet the estimates are still of use: better than a constant",
                 max(errors) < constant)])
 
 
-def velocity_sweep(seeds: list[int], jobs: int, velocities: np.ndarray = VELOCITIES) -> dict[str,
-                                                                                             np.ndarray]:
+def velocity_sweep(seeds: list[int], jobs: int,
+                   velocities: np.ndarray = VELOCITIES) -> dict[str, np.ndarray]:
     """Scores of the Kalman filter by assumed mean velocity: ``error``, ``voltage_discrepancy``
     (V²), ``nis``.
 
@@ -185,8 +186,7 @@ def fig5_8(seeds: list[int], jobs: int, out: Path) -> tuple[Path, str]:
     save(figure, path)
     return path, "\n".join([
         f"Minimum at {best['error']:.0f} cm/s for ẽ_c, {best['voltage_discrepancy']:.0f} for ẽ_V, "
-        f"{best['nis']:.0f} "
-        f"for NIS, over {len(seeds)} episodes; the truth is 450.",
+        f"{best['nis']:.0f} for NIS, over {len(seeds)} episodes; the truth is 450.",
         verdict("the error is smallest near the true velocity", 400 <= best["error"] <= 500),
         verdict("the voltages alone tell roughly which velocity is right (500 in the thesis)",
                  400 <= best["voltage_discrepancy"] <= 550),

@@ -23,7 +23,9 @@ def fig5_10(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
     constant = error_of(env, estimates_of(env, "homogeneous", seeds[0]))
     first = env.task.warm_up + 6
     times = list(range(first, first + 20, 5))
-    truth, (low, high), level = env.truth(), colour_range(env.task), env.task.expected_concentration
+    truth = env.truth()
+    (low, high) = colour_range(env.task)
+    level = env.task.expected_concentration
     poor, rich = 1.08 * level, 1.32 * level
     figure = Figure(figsize=(17.0, 4.9), dpi=120, layout="constrained")
     axes = figure.subplots(len(times), 6)
@@ -50,8 +52,7 @@ def fig5_10(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
     save(figure, path)
     return path, "\n".join([
         f"ẽ_c is {by_filter:.4f} for the filter, {by_smoother:.4f} for the smoother and "
-        f"{constant:.4f} for the "
-        f"homogeneous estimate, on {env.task.mesh.n_nodes} nodes.",
+        f"{constant:.4f} for the homogeneous estimate, on {env.task.mesh.n_nodes} nodes.",
         verdict("both estimates show the slugs where they are: much better than a constant",
                 by_filter < 0.6 * constant),
         verdict("the smoother is better than the filter", by_smoother < by_filter),

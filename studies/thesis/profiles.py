@@ -96,11 +96,10 @@ def _errors(seeds: list[int], jobs: int) -> dict[tuple[str, str], np.ndarray]:
     """ẽ_c (seeds,) by method and assumed profile."""
     cases = list(product(METHODS, PROFILES))
     with Parallel(n_jobs=jobs, return_as="generator", batch_size=1, pre_dispatch=jobs) as parallel:
-        done = parallel(delayed(_error)(*METHODS[method][:2], name, seeds) for method,
-                        name in cases)
-        return dict(zip(cases,
-                        tqdm(done, total=len(cases), desc="assumed profiles", unit="case",
-                             disable=None), strict=True))
+        done = parallel(delayed(_error)(*METHODS[method][:2], name, seeds)
+                        for method, name in cases)
+        bar = tqdm(done, total=len(cases), desc="assumed profiles", unit="case", disable=None)
+        return dict(zip(cases, bar, strict=True))
 
 
 def _error(lag: int | str, baseline: str, profile: str, seeds: list[int]) -> np.ndarray:

@@ -69,8 +69,10 @@ def _picture(ax: Axes, task: Task, mesh: Mesh, values: np.ndarray, scale: tuple[
 def fig7_2(_seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
     """The mesh with its electrodes, and the flow."""
     env = _stirred()
-    world, mesh = env.world, env.task.observation.cem.mesh
-    flow, radius = world.flow.nominal(world, fine=True), world.vessel.radius
+    world = env.world
+    mesh = env.task.observation.cem.mesh
+    flow = world.flow.nominal(world, fine=True)
+    radius = world.vessel.radius
     figure = Figure(figsize=(10.4, 4.6), dpi=130, layout="constrained")
     left, right = figure.subplots(1, 2)
     left.triplot(100 * mesh.points[:, 0], 100 * mesh.points[:, 1], mesh.cells, color="0.45",
@@ -160,11 +162,13 @@ def _distances(env: EstimationEnv, estimates: list[Estimate], centres: np.ndarra
 
 def _ball_figure(path: Path, env: EstimationEnv, filtered: list[Estimate],
                  centres: np.ndarray, distances: list[np.ndarray]) -> None:
-    world, half = env.world, len(SHOWN) // 2
+    world = env.world
+    half = len(SHOWN) // 2
     radius = world.target.radius
     figure = Figure(figsize=(11.6, 12.6), dpi=110, layout="constrained")
     top, bottom = np.asarray(figure.subfigures(2, 1, height_ratios=(4.2, 1.1)))
-    axes, truth = top.subplots(4, half, sharex=True, sharey=True), env.truth()
+    axes = top.subplots(4, half, sharex=True, sharey=True)
+    truth = env.truth()
     scale = 0.0, 1.4 * world.expected_concentration
     for k, t in enumerate(SHOWN):
         pair = axes[2 * (k // half):2 * (k // half) + 2, k % half]
@@ -174,7 +178,8 @@ def _ball_figure(path: Path, env: EstimationEnv, filtered: list[Estimate],
                             f"filter, t = {t}")
     top.colorbar(mappable, ax=axes, label="concentration / (mol/m³)", extend="both", aspect=50,
                  shrink=0.8)
-    ax, times = bottom.subplots(), np.arange(1, len(centres) + 1)
+    ax = bottom.subplots()
+    times = np.arange(1, len(centres) + 1)
     for distance, colour, label in zip(distances, (INK, ACCENT),
                                        ("Kalman filter", "stationary Gauss–Newton"), strict=True):
         ax.plot(times, 100 * distance, color=colour, label=label, linewidth=1.4)
@@ -199,7 +204,8 @@ def fig7_4(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
     frame = len(env.task.currents)
     filtered = [estimate.mean for estimate in estimates_of(env, "kalman_filter", seeds[0])]
     fitted = estimates_of(env, "map_estimate", seeds[0])[frame - 1].mean
-    cylinders, truth = world.target.draw(world, randomness(seeds[0]).flow), env.truth()[0]
+    cylinders = world.target.draw(world, randomness(seeds[0]).flow)
+    truth = env.truth()[0]
     scale = 0.5 * world.background, float(np.ceil(max(filtered[frame - 1].max(), fitted.max()) / 10)
                                           * 10)
     figure = Figure(figsize=(12.4, 6.2), dpi=130, layout="constrained")
@@ -248,7 +254,6 @@ def _both_found(mesh: Mesh, values: np.ndarray,
         np.maximum.at(highest, corner, values[mesh.cells].max(axis=1))
     peaks = np.flatnonzero(values >= highest)
     peaks = peaks[np.argsort(values[peaks])[::-1][:2]]
-    near = np.array([[np.hypot(*(mesh.points[peak] - centre)) < radius + 0.01 for centre,
-                      radius in cylinders]
-                     for peak in peaks])
+    near = np.array([[np.hypot(*(mesh.points[peak] - centre)) < radius + 0.01
+                      for centre, radius in cylinders] for peak in peaks])
     return near.shape == (2, 2) and bool((near[0, 0] and near[1, 1]) or (near[0, 1] and near[1, 0]))

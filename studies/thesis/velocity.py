@@ -93,7 +93,8 @@ def run(flow: str, seed: int) -> Run:
 
 
 def _beside(played: Run) -> str:
-    fallbacks, trusted = played.fallbacks, played.model.nominal[0]
+    fallbacks = played.fallbacks
+    trusted = played.model.nominal[0]
     return (f"ẽ_c is {played.error:.4f}; {fallbacks['kalman_filter']:.4f} for the Kalman "
             "filter that "
             f"trusts {trusted:g} m/s, {fallbacks['filter_bank']:.4f} for a bank of nine filters.")
@@ -179,7 +180,8 @@ def fig6_2(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
     path = out / "fig6.2.png"
     _over_time(played, path)
     true, mean = played.mean(played.env.true_velocity()), played.mean(played.profiles)
-    warm_up, deviation = played.env.task.warm_up, played.deviations[:, 0]
+    warm_up = played.env.task.warm_up
+    deviation = played.deviations[:, 0]
     off = np.abs(mean - true)[warm_up:]
     return path, "\n".join([
         f"The true mean velocity is {true[-1]:.2f} m/s, the last estimate {mean[-1]:.2f} ± "
@@ -207,8 +209,7 @@ def fig6_3(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
         f"The mean velocity runs from {true.min():.2f} to {true.max():.2f} m/s; the estimate is "
         f"{rms:.2f} m/s off "
         f"(root mean square), the best constant would be {constant:.2f}. It follows {lag} "
-        "injections behind "
-        f"(correlation {correlation:.2f}). {_beside(played)}",
+        f"injections behind (correlation {correlation:.2f}). {_beside(played)}",
         verdict("the estimate follows the changing velocity: closer than any constant",
                 bool(rms < constant)),
         verdict("it follows with a visible lag: one injection or more", lag >= 1),
@@ -226,7 +227,8 @@ def lag_of(estimate: np.ndarray, truth: np.ndarray, longest: int = 20) -> tuple[
 
 
 def _over_time(played: Run, path: Path) -> None:
-    times, warm_up = played.times(), played.env.task.warm_up
+    times = played.times()
+    warm_up = played.env.task.warm_up
     true, mean, deviation = (played.mean(played.env.true_velocity()), played.mean(played.profiles),
                              played.deviations[:, 0])       # the one parameter is the mean velocity
     figure = Figure(figsize=(10.4, 3.4), dpi=130, layout="constrained")
@@ -270,7 +272,8 @@ def fig6_4(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
     """The true profile that is not symmetric, and the three basis profiles."""
     env = _env("skewed")
     env.reset(seed=seeds[0])
-    model, truth = env.task.velocity, env.true_velocity()[0]
+    model = env.task.velocity
+    truth = env.true_velocity()[0]
     assert model is not None
     fit = _best_fit(model, truth)
     figure = Figure(figsize=(10.4, 3.4), dpi=130, layout="constrained")

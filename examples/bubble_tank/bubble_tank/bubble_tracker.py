@@ -1,4 +1,7 @@
-"""Bubble tracker: a Kalman filter whose estimate is cut off above, since a bubble conducts less than its liquid."""
+"""Bubble tracker: a Kalman filter whose estimate is cut off above.
+
+A bubble conducts less than its liquid.
+"""
 
 import numpy as np
 
@@ -22,8 +25,9 @@ class Estimator:
         return self.take_in(voltages, currents)
 
     def start(self) -> None:
-        self.filter = starting_filter(self.task.transport, self.task.prior, self.first.c_bh)
-        self.linear = LinearisedObservations(self.task.observation, self.task.noise, self.first.mean)
+        task = self.task
+        self.filter = starting_filter(task.transport, task.prior, self.first.c_bh)
+        self.linear = LinearisedObservations(task.observation, task.noise, self.first.mean)
         for measurement in self.first.measurements:
             self.take_in(*measurement)
 

@@ -19,5 +19,5 @@ def distance(outcome: Outcome) -> float | None:
 
 
 register_score(Score(
-    "bubble_distance", "distance", "how far the bubble is from where the estimate has it, mm", distance,
-    needs=("mean", "truth"), factor=1e3))
+    "bubble_distance", "distance", "how far the bubble is from where the estimate has it, mm",
+    distance, needs=("mean", "truth"), factor=1e3))

@@ -1,4 +1,7 @@
-"""A square tank with twelve electrodes, in which a bubble rises: two parts of our own, all others are eitbench's."""
+"""A square tank with twelve electrodes, in which a bubble rises: two parts of our own.
+
+All others are eitbench's.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,8 @@ from eitbench.worlds.schedule import Schedule
 
 @dataclass(frozen=True)
 class SquareTank:
-    """A flat square tank with three electrodes on each side; number 0 is the first of the bottom, counter-clockwise."""
+    """A flat square tank with three electrodes on each side, counter-clockwise; number 0 is the
+    first of the bottom."""
 
     side: float = 0.20
     """m"""
@@ -94,7 +98,7 @@ class Bubble(Target):
 
 @dataclass(frozen=True)
 class Opposite:
-    """Each electrode and the one six further on, in an order that comes back to the same side soon."""
+    """Each electrode and the one six further on, ordered to come back to the same side soon."""
 
     def __call__(self, vessel: SquareTank) -> np.ndarray:
         currents = np.zeros((6, vessel.n_electrodes))
@@ -111,8 +115,8 @@ BUBBLE_TANK = World(
     prior=Prior(nodal_std=0.1, initial_std=0.25, initial_length=0.02))
 
 ABOUT = """
-A bubble rises through a square tank of saline with twelve electrodes. Nobody knows how it moves: the estimators' model
-is a liquid at rest in which every node changes a little at every step.
+A bubble rises through a square tank of saline with twelve electrodes. Nobody knows how it moves:
+the estimators' model is a liquid at rest in which every node changes a little at every step.
 """
 
 register(BUBBLE_TANK, "bubbles/BubbleTank-v0", about=ABOUT)
