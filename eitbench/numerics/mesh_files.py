@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from eitbench import _check
-from eitbench.numerics.mesh import Mesh
+from eitbench.numerics.mesh import Mesh, as_set, checked_facets
 
 _CELL = {2: "triangle", 3: "tetra"}
 _FACET = {2: "line", 3: "triangle"}
@@ -83,7 +83,7 @@ def read_mesh(path: str | PathLike[str], sha256: str | None = None, *,
         raise ValueError(f"{path}: {error}") from None
     number = np.full(len(points), -1)
     number[used] = np.arange(len(used))
-    boundary = _rows(mesh.boundary_facets)
+    boundary = as_set(mesh.boundary_facets)
     groups = {}
     for name, facets in _facet_groups(path, content, dim).items():
         numbered = np.sort(number[facets], axis=1)
@@ -231,23 +231,12 @@ def _named_facets(path: Path, content: Any, dim: int, names: dict[int, str]
                 yield name, block.data[np.asarray(sets[number], dtype=int)]
 
 
-# -- facets ---------------------------------------------------------------------------------------
-
-
-def _rows(facets: np.ndarray) -> set[tuple[int, ...]]:
-    return set(map(tuple, facets.tolist()))
-
-
 def _checked_facets(name: object, facets: np.ndarray, mesh: Mesh) -> np.ndarray:
     if not isinstance(name, str) or not name.isprintable() or not name or set(name) & set('"\\'):
         raise ValueError("groups must have names of printable characters, without quotation marks "
                          f"and backslashes, got {name!r}")
-    facets = np.asarray(facets)
-    if (facets.ndim != 2 or facets.shape[1] != mesh.dim or len(facets) == 0
-            or not np.issubdtype(facets.dtype, np.integer)):
-        raise ValueError(f"group {name!r} must be integers of shape (n_facets ≥ 1, {mesh.dim}), "
-                         f"got {facets.dtype} of shape {facets.shape}")
-    strange = _rows(np.sort(facets, axis=1)) - _rows(mesh.boundary_facets)
+    facets = checked_facets(f"group {name!r}", facets, mesh)
+    strange = as_set(np.sort(facets, axis=1)) - as_set(mesh.boundary_facets)
     if strange:
         raise ValueError(f"group {name!r} must lie on the mesh's boundary, got facet "
                          f"{min(strange)}, which does not")

@@ -1,5 +1,4 @@
-"""Axial flow in a plane channel by its profile across: one that is drawn, and a family whose
-members are estimated."""
+"""Axial flow in a plane channel by its profile: one that is drawn, and a family to be estimated."""
 
 from __future__ import annotations
 
@@ -7,8 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.polynomial.polynomial import polyval
 
 from eitbench import _check
+from eitbench.physics.flow import AxialFlow
 
 _ETA, _WEIGHTS = np.polynomial.legendre.leggauss(24)
 """Gauss–Legendre points and weights on [−1, 1]; integrals of products of profiles are exact to
@@ -16,7 +17,7 @@ rounding."""
 
 
 @dataclass(frozen=True)
-class SkewedChannelFlow:
+class SkewedChannelFlow(AxialFlow):
     """v = C·(1 − η²)·exp(k·η) along x with η = y/R; C makes the mean v̄, and k = 0 is the parabola.
 
     Parameters
@@ -38,13 +39,7 @@ class SkewedChannelFlow:
         _check.number("half_width", self.half_width, low=0.0, open_low=True, units="m")
         _check.number("skewness", self.skewness, low=-5.0, high=5.0)
 
-    def __call__(self, points: np.ndarray) -> np.ndarray:
-        velocity = np.zeros_like(points, dtype=float)
-        velocity[:, 0] = self.profile(points[:, 1])
-        return velocity
-
     def profile(self, y: np.ndarray) -> np.ndarray:
-        """Axial velocity in m/s at heights ``y`` in m."""
         mean = 0.5 * _WEIGHTS @ self._shape(_ETA)
         return self.mean_velocity / mean * self._shape(y / self.half_width)
 
@@ -53,17 +48,16 @@ class SkewedChannelFlow:
 
 
 @dataclass(frozen=True)
-class PolynomialFlow:
-    """Axial flow v = Σ a_j (y/R)ʲ along x between walls y = ±R; ``coefficients`` a_j in m/s,
-    ``half_width`` R in m."""
+class PolynomialFlow(AxialFlow):
+    """v = Σ a_j (y/R)ʲ along x between walls y = ±R."""
 
     coefficients: tuple[float, ...]
+    """a_j in m/s"""
     half_width: float
+    """R in m"""
 
-    def __call__(self, points: np.ndarray) -> np.ndarray:
-        velocity = np.zeros_like(points, dtype=float)
-        velocity[:, 0] = np.polynomial.polynomial.polyval(points[:, 1] / self.half_width, self.coefficients)
-        return velocity
+    def profile(self, y: np.ndarray) -> np.ndarray:
+        return polyval(y / self.half_width, self.coefficients)
 
 
 @dataclass(frozen=True)
@@ -93,7 +87,8 @@ class VelocityModel:
     def __post_init__(self) -> None:
         _check.number("half_width", self.half_width, low=0.0, open_low=True, units="m")
         if not self.basis or not all(self.basis):
-            raise ValueError(f"basis must hold at least one profile, each with a coefficient, got {self.basis!r}")
+            raise ValueError("basis must hold at least one profile, each with a coefficient, "
+                             f"got {self.basis!r}")
         for name in ("nominal", "initial_std", "walk_std"):
             numbers = _check.array(name, getattr(self, name), (len(self.basis),), units="m/s")
             if name != "nominal" and (numbers < 0).any():
@@ -117,7 +112,7 @@ class VelocityModel:
     @property
     def profiles(self) -> np.ndarray:
         """(p, k) φ_k at `points`."""
-        return np.stack([np.polynomial.polynomial.polyval(_ETA, shape) for shape in self.basis], axis=1)
+        return np.stack([polyval(_ETA, shape) for shape in self.basis], axis=1)
 
     @property
     def directions(self) -> list[PolynomialFlow]:
@@ -132,6 +127,8 @@ class VelocityModel:
         return PolynomialFlow(tuple((theta @ shapes).tolist()), self.half_width)
 
 
-def parabola(half_width: float, mean_velocity: float, initial_std: float, walk_std: float) -> VelocityModel:
+def parabola(half_width: float, mean_velocity: float, initial_std: float,
+             walk_std: float) -> VelocityModel:
     """The parabolic profile with an unknown mean velocity, all in m/s: θ is that mean."""
-    return VelocityModel(half_width, ((1.5, 0.0, -1.5),), (mean_velocity,), (initial_std,), (walk_std,))
+    basis = ((1.5, 0.0, -1.5),)
+    return VelocityModel(half_width, basis, (mean_velocity,), (initial_std,), (walk_std,))

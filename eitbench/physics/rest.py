@@ -32,8 +32,8 @@ class AtRest:
         """No node."""
         return np.empty(0, dtype=np.int64)
 
-    def step(self, c: np.ndarray, inflow_before: np.ndarray | float = 0.0, inflow_after: np.ndarray | float = 0.0,
-             ) -> np.ndarray:
+    def step(self, c: np.ndarray, inflow_before: np.ndarray | float = 0.0,
+             inflow_after: np.ndarray | float = 0.0) -> np.ndarray:
         """The same concentration; there is no inlet for an inflow to enter by."""
         return np.array(c, dtype=float)
 

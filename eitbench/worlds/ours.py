@@ -17,6 +17,7 @@ from eitbench.worlds import (  # noqa: I001 (the order in which boards and pages
     rotating_tank_injection,
 )
 
-__all__ = ["pipe2d", "pipe2d_biased", "pipe2d_drifting", "pipe2d_faults", "pipe2d_injection", "pipe2d_intermittent",
-           "pipe2d_obstacle", "pipe2d_skewed", "pipe2d_time_varying", "pipe2d_unknown", "pipe3d", "rotating_tank",
-           "rotating_tank_injection", "stationary_tank"]
+__all__ = ["pipe2d", "pipe2d_biased", "pipe2d_drifting", "pipe2d_faults", "pipe2d_injection",
+           "pipe2d_intermittent", "pipe2d_obstacle", "pipe2d_skewed", "pipe2d_time_varying",
+           "pipe2d_unknown", "pipe3d", "rotating_tank", "rotating_tank_injection",
+           "stationary_tank"]

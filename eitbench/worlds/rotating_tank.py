@@ -1,5 +1,4 @@
-"""The stirred tank (thesis 7.1): a resistive ball is carried round, and one pair of electrodes
-injects all the time."""
+"""The stirred tank (thesis 7.1): a resistive ball is carried round while one pair injects."""
 
 from eitbench.worlds.bodies import Ball
 from eitbench.worlds.flows import StirredFlow
@@ -20,11 +19,12 @@ so far that a ball near the stirrer's circle, where the flow shears most, is los
 ``docs/tanks.md``)."""
 
 register(ROTATING_TANK_2D, "eitbench/RotatingTank2D-v0", about="""
-A flat round tank of stirred saline carries a ball round that hardly conducts; sixteen electrodes on the wall. One pair
-of them injects all the time. A stationary image of one injection shows nothing, but the flow carries the target through
-the pair's field, and a filter that knows the flow can follow it (Seppänen 2005, 7.1, Figs 7.2 and 7.3).
+A flat round tank of stirred saline carries a ball round that hardly conducts; sixteen electrodes on
+the wall. One pair of them injects all the time. A stationary image of one injection shows nothing,
+but the flow carries the target through the pair's field, and a filter that knows the flow can
+follow it (Seppänen 2005, 7.1, Figs 7.2 and 7.3).
 
-The truth is a rigid ball on a path of its own; the model in `env.unwrapped.task` is a liquid without any ball, in which
-concentration is carried and spreads, as in the thesis. The ball begins between 0.25 and 0.48 of the radius from the
-middle, at any angle; the flow is steady.
+The truth is a rigid ball on a path of its own; the model in `env.unwrapped.task` is a liquid
+without any ball, in which concentration is carried and spreads, as in the thesis. The ball begins
+between 0.25 and 0.48 of the radius from the middle, at any angle; the flow is steady.
 """)

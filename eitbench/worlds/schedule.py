@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from eitbench import _check
+from eitbench.worlds.parts import check_positive
 
 if TYPE_CHECKING:
     from eitbench.worlds.vessels import PlanePipe, RoundPipe, RoundTank
@@ -19,7 +20,6 @@ class Pattern(Protocol):
 
     def __call__(self, vessel: Any) -> np.ndarray:
         """(K, L), each row summing to zero."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -86,8 +86,7 @@ class OnePair:
 
 @dataclass(frozen=True)
 class AroundTheTank:
-    """Eight injections straight across a tank, then eight aslant, each far from the one before
-    [ours]."""
+    """Eight injections straight across a tank, then eight aslant, far from the last ones [ours]."""
 
     def __call__(self, vessel: RoundTank) -> np.ndarray:
         half = vessel.n_electrodes // 2
@@ -124,7 +123,7 @@ class Schedule:
     every step"""
 
     def __post_init__(self) -> None:
-        _check.number("time_step", self.time_step, low=0.0, open_low=True, units="s")
+        check_positive(self, time_step="s")
         _check.integer("scored_steps", self.scored_steps, low=1)
         for name, low in (("warm_up", 0), ("calibration", 1), ("budget", 0)):
             if getattr(self, name) is not None:

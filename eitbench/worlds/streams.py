@@ -1,5 +1,4 @@
-"""The random streams of an episode: every draw comes from one of these, and its seed says all of
-them."""
+"""The random streams of an episode: every draw comes from one, and its seed says all of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`Task`: all that an estimator may know about a world, and nothing of what happened in an episode."""
+"""`Task`: all that an estimator may know about a world, and nothing of what happened in it."""
 
 from __future__ import annotations
 
@@ -62,13 +62,12 @@ class Task:
         Rough level in mol/m³, where the search for the best homogeneous estimate begins.
     calibration : int
         First injections, all but always within the warm-up, from which the best homogeneous
-        estimate is found.
+        First injections, which the best homogeneous estimate is found from; all but always within
+        the warm-up.
     prior : Prior
-        What is believed of the target, in parts of the best homogeneous estimate (thesis Table
-        5.1).
+        Believed of the target, in parts of the best homogeneous estimate (thesis Table 5.1).
     velocity : VelocityModel or None
-        How the flow may be written where it is asked for too; ``transport`` then has the flow
-        believed at first.
+        How the flow may be written if it is asked for too; ``transport`` has that believed first.
     vessel : Vessel
         Its sizes and electrodes.
     """
@@ -92,8 +91,7 @@ class Task:
         return self.transport.mesh
 
     def transport_at(self, parameters: np.ndarray) -> ConvectionDiffusion:
-        """The evolution model with the flow's ``parameters`` θ (k,) in m/s; ``ValueError`` where it
-        is not asked for."""
+        """The model with the flow's ``parameters`` θ (k,) in m/s; ``ValueError`` if it has none."""
         from eitbench.physics.transport import ConvectionDiffusion
         if self.velocity is None or not isinstance(self.transport, ConvectionDiffusion):
             raise ValueError("the flow has no parameters in this task")
@@ -101,8 +99,7 @@ class Task:
 
     @property
     def evolution(self) -> EvolutionModel:
-        """F, Y, H of the transport; computed on first use and shared by all tasks with the same
-        model."""
+        """F, Y, H of the transport; made on first use, shared by all tasks with the same model."""
         return self.transport.evolution_model()
 
 
@@ -115,16 +112,15 @@ def make_task(world: World, lag: int | str = 0, **assumed: Any) -> Task:
     lag : int or "all"
         See `Task`; "all" means the whole record.
     assumed
-        What the estimator wrongly believes of the flow, such as ``mean_velocity``; see
-        `World.model`.
+        What the estimator wrongly believes of the flow, as ``mean_velocity``; see `World.model`.
     """
     steps = lag_steps(world, lag)
     model = _model(world.fluid, tuple(sorted(assumed.items())))
     currents = world.currents
     currents.setflags(write=False)                                # shared by all who play this task
-    return Task(model.transport, model.observation, world.instrument.believed_noise, currents, world.n_steps,
-                world.warm_up, steps, world.expected_concentration, world.calibration, world.prior,
-                world.velocity_model, world.vessel)
+    return Task(model.transport, model.observation, world.instrument.believed_noise, currents,
+                world.n_steps, world.warm_up, steps, world.expected_concentration,
+                world.calibration, world.prior, world.velocity_model, world.vessel)
 
 
 def lag_steps(world: World, lag: int | str) -> int:
