@@ -1,8 +1,6 @@
-"""Gains computed once: with fixed injections a linear filter's covariances do not depend on what is
-measured.
+"""Gains computed once: a linear filter's covariances depend on the injections, not on the data.
 
-What is left for an episode is a handful of matrix–vector products a step, in the filter and in the
-smoother.
+An episode is left with a few matrix–vector products a step, in the filter and in the smoother.
 """
 
 from __future__ import annotations
@@ -18,8 +16,7 @@ from eitbench.estimation.kalman import KalmanFilter, Observation
 
 @dataclass(frozen=True)
 class GainSequence:
-    """What the Kalman filter of c⁺ = F c + s + w does at t = 1 … T, whatever is measured; made by
-    `gain_sequence`.
+    """What the Kalman filter of c⁺ = F c + s + w does at t = 1 … T; made by `gain_sequence`.
 
     Parameters
     ----------
@@ -44,7 +41,8 @@ class GainSequence:
     innovation_covariances: np.ndarray
     variances: np.ndarray
 
-    def filtered(self, mean: np.ndarray, forcing: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def filtered(self, mean: np.ndarray, forcing: np.ndarray,
+                 values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Means c_{t|t} (T, n) and innovations (T, m).
 
         Parameters
@@ -56,7 +54,8 @@ class GainSequence:
         values : (T, m)
             What is measured, as in `Observation.value`.
         """
-        means, innovations = np.empty((len(values), len(mean))), np.empty(values.shape)
+        means = np.empty((len(values), len(mean)))
+        innovations = np.empty(values.shape)
         for t, value in enumerate(values):
             mean = self.transition @ mean + forcing
             innovations[t] = value - self.matrices[t] @ mean
@@ -78,7 +77,8 @@ class GainSequence:
         for t in range(len(values) - 1, -1, -1):
             adjoints[t] = later + self.matrices[t].T @ (weighted[t] - self.gains[t].T @ later)
             later = self.transition.T @ adjoints[t]
-        state, smoothed = mean + self.covariance.apply(0, later[:, None])[:, 0], adjoints
+        state = mean + self.covariance.apply(0, later[:, None])[:, 0]
+        smoothed = adjoints
         for t, adjoint in enumerate(adjoints):
             state = self.transition @ state + forcing + self.covariance.apply_noise(adjoint)
             smoothed[t] = state  # takes the place of the adjoint just used
@@ -86,13 +86,15 @@ class GainSequence:
 
 
 def gain_sequence(start: KalmanFilter, observations: Sequence[Observation]) -> GainSequence:
-    """Run a filter that stands at t = 0 over a record once, whatever was measured: only H_t and the
-    noise count."""
-    n_steps, (m, n) = len(observations), observations[0].matrix.shape
-    gains, S, variances = np.empty((n_steps, n, m)), np.empty((n_steps, m, m)), np.empty((n_steps, n))
-    for t, observation in enumerate(observations):
+    """Run a filter that stands at t = 0 over a record; only its H_t and its noise count."""
+    gains: list[np.ndarray] = []
+    S: list[np.ndarray] = []
+    variances: list[np.ndarray] = []
+    for observation in observations:
         start.predict()
         step = start.update(observation)
-        gains[t] = np.linalg.solve(step.innovation_covariance, step.cross_covariance.T).T
-        S[t], variances[t] = step.innovation_covariance, step.variance
-    return GainSequence(start.transition, start.covariance, [o.matrix for o in observations], gains, S, variances)
+        gains.append(np.linalg.solve(step.innovation_covariance, step.cross_covariance.T).T)
+        S.append(step.innovation_covariance)
+        variances.append(step.variance)
+    return GainSequence(start.transition, start.covariance, [o.matrix for o in observations],
+                        np.array(gains), np.array(S), np.array(variances))

@@ -10,11 +10,9 @@ from eitbench.estimation.kalman import Expected, Observation
 
 
 def believable(innovation: np.ndarray, variance: np.ndarray, gate: float) -> np.ndarray:
-    """Which readings a filter should take in: those within ``gate`` predicted standard deviations
-    of the prediction.
+    """Which readings to take in: those within ``gate`` predicted deviations of the prediction.
 
-    Where more than a third of an injection's readings lie beyond, the injection itself has failed,
-    and none counts.
+    Where more than a third lie beyond, the injection itself has failed, and none counts.
 
     Parameters
     ----------
@@ -32,16 +30,19 @@ def believable(innovation: np.ndarray, variance: np.ndarray, gate: float) -> np.
     return kept & ~failed
 
 
-class _Filter(Protocol):
+class Filter(Protocol):
+    """What takes in measurements of its present state in two steps."""
+
     def expect(self, observation: Observation) -> Expected: ...
+    def take_in(self, H: np.ndarray, cross: np.ndarray, innovation: np.ndarray,
+                S: np.ndarray) -> object: ...
 
-    def take_in(self, H: np.ndarray, cross: np.ndarray, innovation: np.ndarray, S: np.ndarray) -> object: ...
 
-
-def gated_update(filter_: _Filter, observation: Observation, gate: float) -> tuple[np.ndarray, np.ndarray]:
-    """Take in what is `believable` of a measurement; returns its innovations in predicted standard
-    deviations (m,) and which readings were taken in (m,)."""
+def gated_update(filter_: Filter, observation: Observation,
+                 gate: float) -> tuple[np.ndarray, np.ndarray]:
+    """Take in what is `believable`; returns innovations in predicted deviations, and what was."""
     cross, innovation, S = filter_.expect(observation)
     kept = believable(innovation, S.diagonal(), gate)
-    filter_.take_in(observation.matrix[kept], cross[:, kept], innovation[kept], S[np.ix_(kept, kept)])
+    both = np.ix_(kept, kept)
+    filter_.take_in(observation.matrix[kept], cross[:, kept], innovation[kept], S[both])
     return innovation / np.sqrt(S.diagonal()), kept

@@ -1,4 +1,4 @@
-"""Stationary reconstruction: one frame of injections, as if the target stood still (thesis 5.11)."""
+"""Stationary reconstruction: a frame of injections, as if the target stood still (thesis 5.11)."""
 
 from __future__ import annotations
 
@@ -15,12 +15,13 @@ from eitbench.numerics.sparse_lu import SparseLU
 
 class _ObservationModel(Protocol):
     def voltages(self, concentration: np.ndarray, currents: np.ndarray) -> np.ndarray: ...
+    def linearise(self, concentration: np.ndarray,
+                  currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]: ...
 
-    def linearise(self, concentration: np.ndarray, currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]: ...
 
-
-def gauss_newton(model: _ObservationModel, voltages: np.ndarray, currents: np.ndarray, noise_std: np.ndarray,
-                 penalty: Any, start: np.ndarray, *, tolerance: float = 1e-3, max_iterations: int = 20) -> np.ndarray:
+def gauss_newton(model: _ObservationModel, voltages: np.ndarray, currents: np.ndarray,
+                 noise_std: np.ndarray, penalty: Any, start: np.ndarray, *,
+                 tolerance: float = 1e-3, max_iterations: int = 20) -> np.ndarray:
     """argmin_c ‖(V − R(c))/std‖² + cᵀ penalty c, by Gauss–Newton with step halving.
 
     Parameters

@@ -94,7 +94,7 @@ class Mesh:
         return facets[count == 1], first[count == 1] % len(self.cells)
 
     def facets_where(self, predicate: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-        """(n_facets, d): the boundary facets with all nodes in ``predicate(points) -> bool (k,)``."""
+        """(n_facets, d): boundary facets with all nodes in ``predicate(points (k, d)) -> bool (k,)``."""
         inside = np.asarray(predicate(self.points), dtype=bool)
         return self.boundary_facets[inside[self.boundary_facets].all(axis=1)]
 

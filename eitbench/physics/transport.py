@@ -333,7 +333,8 @@ def _supg_matrices(mesh: Mesh, velocity: VelocityField,
 
 
 def _supg_derivatives(mesh: Mesh, velocity: VelocityField, diffusivity: float,
-                      directions: Sequence[VelocityField]) -> list[tuple[sp.csr_array, sp.csr_array]]:
+                      directions: Sequence[VelocityField],
+                      ) -> list[tuple[sp.csr_array, sp.csr_array]]:
     """∂M/∂θ_k and ∂K/∂θ_k, each (n, n), at θ = 0 for the velocity v + Σ θ_k v_k."""
     basis = _supg_basis(mesh)
     x = np.asarray(basis.global_coordinates())
