@@ -10,7 +10,8 @@ class FreeCovariance:
 
     Π_t depends on no data, so it is computed once and shared by all episodes. It is kept as Π_t =
     Π_∞ + U D Uᵀ with D = diag(±1): what is left of the initial covariance, U ← F U, loses rank
-    quickly because the flow carries it away and diffusion smooths it.
+    quickly because the flow carries it away and diffusion smooths it. ``ValueError`` if Π_t has no
+    limit.
 
     Parameters
     ----------
@@ -22,11 +23,6 @@ class FreeCovariance:
         Γ_{0|0}; by default Π_∞.
     tolerance : float
         Eigenvalues of U D Uᵀ below this part of Π_∞'s largest entry are dropped.
-
-    Raises
-    ------
-    ValueError
-        If Π_t has no limit.
     """
 
     def __init__(self, transition: np.ndarray, noise: np.ndarray,

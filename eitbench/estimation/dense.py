@@ -15,8 +15,7 @@ from eitbench.estimation.kalman import Expected, Observation, expected
 _BLOCK = 128
 """columns copied at once when a triangle is mirrored: small enough for the processor's cache"""
 _PANEL = 64
-"""columns that a transition given as a callable is handed at once; few, so that they stay in the
-cache, but not so few that the calls count"""
+"""columns that a callable transition is handed at once: they fit the cache, few calls are made"""
 
 Transition = np.ndarray | Callable[[np.ndarray], np.ndarray]
 """F (n, n), or X (n, k) -> F X."""
@@ -44,26 +43,18 @@ class DenseKalmanFilter:
     `KalmanFilter` is far cheaper, but wants a constant F and a covariance with a limit. Where F = I
     (a target at rest, a closed vessel) a prediction costs next to nothing here; an update costs
     O(n² m) in any case. The covariance stays symmetric to the bit and its diagonal is kept from
-    falling below zero.
+    falling below zero. ``ValueError`` naming the argument if it is of the wrong shape or not
+    finite.
 
     Parameters
     ----------
-    mean : (n,)
-        c_{0|0}.
-    covariance : (n, n)
-        Γ_{0|0}.
+    mean, covariance : (n,), (n, n)
+        c_{0|0} and Γ_{0|0}.
 
     Attributes
     ----------
-    mean : (n,)
-        Of the present state.
-    covariance : (n, n)
-        Of the present state; written in place.
-
-    Raises
-    ------
-    ValueError
-        Naming the argument, if it is of the wrong shape or not finite.
+    mean, covariance
+        Of the present state; the covariance is written in place.
     """
 
     def __init__(self, mean: np.ndarray, covariance: np.ndarray) -> None:

@@ -17,8 +17,9 @@ if TYPE_CHECKING:
 
 def pair_gains(covariance_of: np.ndarray, weighted: np.ndarray, pairs: np.ndarray,
                noise_variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What each pair would teach if it were injected now.
+    """What each pair would teach if it were injected now, (p,) and (p,).
 
+    By how much tr(W P) falls (A-optimality), and ½ ln by what factor det P does (D-optimality).
     With D the derivatives of the voltages under a current into one electrode, (L, L, n) for n
     states, read as L² rows:
 
@@ -32,11 +33,6 @@ def pair_gains(covariance_of: np.ndarray, weighted: np.ndarray, pairs: np.ndarra
         Where the current enters and leaves.
     noise_variance : (p, L)
         Of each pair's voltages, per current squared; infinite for readings not to be believed.
-
-    Returns
-    -------
-    (p,), (p,)
-        By how much tr(W P) falls (A-optimality), and ½ ln by what factor det P does (D-optimality).
     """
     i, j = pairs.T
     L = covariance_of.shape[0]
@@ -61,7 +57,7 @@ def independent_rows(derivative: np.ndarray) -> np.ndarray:
 
 def pair_tables(rows: np.ndarray, cross: np.ndarray,
                 mass: np.ndarray | sp.csr_array) -> tuple[np.ndarray, np.ndarray]:
-    """The tables D P Dᵀ and D P W P Dᵀ that `pair_gains` wants, where n is large.
+    """D P Dᵀ and D P W P Dᵀ, (L, L, L, L) each, that `pair_gains` wants, where n is large.
 
     Parameters
     ----------
@@ -71,10 +67,6 @@ def pair_tables(rows: np.ndarray, cross: np.ndarray,
         P rowsᵀ, such as `KalmanFilter.apply_covariance` gives once it has predicted.
     mass : (n, n), dense or sparse
         W.
-
-    Returns
-    -------
-    (L, L, L, L), (L, L, L, L)
     """
     return _all_rows(rows @ cross), _all_rows(cross.T @ (mass @ cross))
 

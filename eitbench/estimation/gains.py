@@ -16,30 +16,20 @@ from eitbench.estimation.kalman import KalmanFilter, Observation
 
 @dataclass(frozen=True)
 class GainSequence:
-    """What the Kalman filter of c⁺ = F c + s + w does at t = 1 … T; made by `gain_sequence`.
-
-    Parameters
-    ----------
-    transition : (n, n)
-        F.
-    covariance : FreeCovariance
-        Knows Γ_w and Γ_{0|0}.
-    matrices : T arrays (m, n)
-        H_t; equal injections may share one array.
-    gains : (T, n, m)
-        K_t.
-    innovation_covariances : (T, m, m)
-        S_t.
-    variances : (T, n)
-        Diagonals of Γ_{t|t}.
-    """
+    """What the Kalman filter of c⁺ = F c + s + w does at t = 1 … T; made by `gain_sequence`."""
 
     transition: np.ndarray
+    """(n, n) F"""
     covariance: FreeCovariance
+    """knows Γ_w and Γ_{0|0}"""
     matrices: Sequence[np.ndarray]
+    """T of (m, n) H_t; equal injections may share one array"""
     gains: np.ndarray
+    """(T, n, m) K_t"""
     innovation_covariances: np.ndarray
+    """(T, m, m) S_t"""
     variances: np.ndarray
+    """(T, n) diagonals of Γ_{t|t}"""
 
     def filtered(self, mean: np.ndarray, forcing: np.ndarray,
                  values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -10,7 +10,7 @@ from eitbench.estimation.kalman import Expected, Observation
 
 
 def believable(innovation: np.ndarray, variance: np.ndarray, gate: float) -> np.ndarray:
-    """Which readings to take in: those within ``gate`` predicted deviations of the prediction.
+    """(..., m) bool: readings to take in, within ``gate`` predicted deviations of the prediction.
 
     Where more than a third lie beyond, the injection itself has failed, and none counts.
 
@@ -20,10 +20,6 @@ def believable(innovation: np.ndarray, variance: np.ndarray, gate: float) -> np.
         Measured less predicted, and the diagonal of its predicted covariance.
     gate : float
         > 0; infinite: all are believed.
-
-    Returns
-    -------
-    (..., m) bool
     """
     kept = np.abs(innovation) <= gate * np.sqrt(variance)
     failed = (~kept).mean(axis=-1, keepdims=True) > 1 / 3

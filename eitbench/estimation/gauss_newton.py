@@ -24,6 +24,8 @@ def gauss_newton(model: _ObservationModel, voltages: np.ndarray, currents: np.nd
                  tolerance: float = 1e-3, max_iterations: int = 20) -> np.ndarray:
     """argmin_c ‖(V − R(c))/std‖² + cᵀ penalty c, by Gauss–Newton with step halving.
 
+    (n,) in mol/m³; the best so far if ``max_iterations`` run out or no step lowers the objective.
+
     Parameters
     ----------
     model
@@ -36,11 +38,6 @@ def gauss_newton(model: _ObservationModel, voltages: np.ndarray, currents: np.nd
         First guess in mol/m³.
     tolerance : float
         Stop when a full step would lower the objective by less than this part of it.
-
-    Returns
-    -------
-    (n,) concentration in mol/m³; the best found so far if ``max_iterations`` run out or no step
-    lowers the objective.
     """
     normal = _NormalEquations(penalty)
     weight = (1.0 / noise_std).ravel()

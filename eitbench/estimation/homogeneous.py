@@ -15,6 +15,8 @@ def best_homogeneous(model: ObservationModel, noise: VoltageNoise, n: int, volta
                      max_iterations: int = 30) -> float:
     """ĉ_bh = argmin_c Σ ((V − R(c·1))/std)², by Gauss–Newton in ln c (``docs/methods.md``, 3).
 
+    ``RuntimeError`` if the iteration does not settle.
+
     Parameters
     ----------
     model
@@ -27,11 +29,6 @@ def best_homogeneous(model: ObservationModel, noise: VoltageNoise, n: int, volta
         Measurements in V and injections in A (A/m in 2D).
     start : float
         First guess in mol/m³, > 0.
-
-    Raises
-    ------
-    RuntimeError
-        If the iteration does not settle.
     """
     # Injections repeat: R(c·1) is needed once for each distinct pattern.
     patterns, which = np.unique(currents, axis=0, return_inverse=True)

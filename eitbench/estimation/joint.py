@@ -43,7 +43,8 @@ class JointFilter:
     The velocity stays physical: after each measurement it must have the sign that it had at the
     start, and a size within ``bounds``, at all points of ``profiles``. Where it does not, θ is
     moved back along the line towards its start θ_0, just as far as needed; concentration and
-    covariance stay what they are.
+    covariance stay what they are. ``ValueError`` naming the argument if it is out of range, of the
+    wrong shape, or not finite.
 
     Parameters
     ----------
@@ -66,11 +67,6 @@ class JointFilter:
     bounds : (float, float)
         Least and largest axial velocity at each point in parts of what θ_0 gives there, so that
         points close to a wall bind no more than others; 0 < least < 1 < largest.
-
-    Raises
-    ------
-    ValueError
-        Naming the argument, if it is out of range, of the wrong shape, or not finite.
     """
 
     def __init__(self, transport_at: Callable[[np.ndarray], ConvectionDiffusion],

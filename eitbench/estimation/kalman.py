@@ -62,8 +62,7 @@ class KalmanFilter:
     """The Kalman filter of c⁺ = F c + s + w for small m and large n, without n×n products.
 
     The covariance is Π_t − Z Zᵀ: Π_t, the covariance without data, is known beforehand; Z gains m
-    columns at every measurement, moves with F, and is compressed to its numerical rank, which stays
-    far below n.
+    columns at every measurement, moves with F, and is compressed to its rank, far below n.
 
     Parameters
     ----------

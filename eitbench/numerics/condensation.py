@@ -32,9 +32,8 @@ class Condensation:
         Symmetric, with a full diagonal.
     n_ports : int
     places : (n − n_ports, d), optional
-        Where the unknowns lie; if given, they are ordered by nested dissection. In 3D that takes a
-        half of the operations of minimum degree, and less on large meshes; in 2D minimum degree is
-        better.
+        Where the unknowns lie; if given, they are ordered by nested dissection. In 3D that takes
+        half of minimum degree's operations, and less on large meshes; in 2D that is better.
 
     Attributes
     ----------

@@ -19,18 +19,15 @@ from eitbench import _check
 class Mesh:
     """A mesh of triangles (2D) or tetrahedra (3D).
 
+    ``ValueError`` if shapes are wrong, a coordinate is not finite, a node number is out of range, a
+    node belongs to no cell, or a cell has no volume.
+
     Parameters
     ----------
     points : (n_nodes, d) float
         Node coordinates in m, d = 2 or 3.
     cells : (n_cells, d + 1) int
         Node numbers of each simplex; the orientation does not matter.
-
-    Raises
-    ------
-    ValueError
-        If shapes are wrong, a coordinate is not finite, a node number is out of range, a node
-        belongs to no cell, or a cell has no volume.
     """
 
     points: np.ndarray
@@ -94,7 +91,7 @@ class Mesh:
         return facets[count == 1], first[count == 1] % len(self.cells)
 
     def facets_where(self, predicate: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-        """(n_facets, d): boundary facets with all nodes in ``predicate(points (k, d)) -> bool (k,)``."""
+        """(n_facets, d): boundary facets with all nodes in ``predicate(points) -> bool (k,)``."""
         inside = np.asarray(predicate(self.points), dtype=bool)
         return self.boundary_facets[inside[self.boundary_facets].all(axis=1)]
 
@@ -107,7 +104,12 @@ class Mesh:
         return _tree(self.points[self.boundary_facets])
 
     def locate(self, points: np.ndarray, candidates: int = 32) -> tuple[np.ndarray, np.ndarray]:
-        """The cell that holds each of ``points``, and the point's barycentric coordinates there.
+        """The cell (k,) int that holds each of ``points``, and its weights (k, d + 1) there.
+
+        Weights are barycentric coordinates, in the order of the cell's nodes: not negative, with
+        rows that sum to one.
+
+        ``ValueError`` if ``points`` has the wrong shape or is not finite.
 
         Parameters
         ----------
@@ -118,19 +120,6 @@ class Mesh:
         candidates : int
             How many cells, nearest by centroid, are searched first; points found in none are
             searched in all cells whose centroid is near enough.
-
-        Returns
-        -------
-        cells : (k,) int
-            Cell numbers; for a point outside, the cell that the nearest boundary facet belongs to.
-        barycentric : (k, d + 1) float
-            Weights of the cell's nodes, in the order of ``cells``: not negative, with rows that sum
-            to one.
-
-        Raises
-        ------
-        ValueError
-            If ``points`` has the wrong shape or is not finite.
         """
         points = _check.array("points", points, (None, self.dim), units="m")
         k = min(candidates, len(self.cells))
@@ -152,7 +141,7 @@ class Mesh:
         return best, weights
 
     def interpolation_to(self, points: np.ndarray, candidates: int = 32) -> sp.csr_array:
-        """Matrix of linear interpolation from nodal values here to ``points``.
+        """(k, n_nodes) matrix of linear interpolation to ``points``, with rows that sum to one.
 
         Parameters
         ----------
@@ -161,10 +150,6 @@ class Mesh:
             point of the boundary.
         candidates : int
             See `locate`.
-
-        Returns
-        -------
-        (k, n_nodes) sparse array with rows that sum to one.
         """
         cells, weights = self.locate(points, candidates)
         rows = np.repeat(np.arange(len(cells)), self.dim + 1)

@@ -34,13 +34,20 @@ class MeshFile(NamedTuple):
 
     mesh: Mesh
     groups: dict[str, np.ndarray]
-    """Boundary facets by the name of their group: (k, d) node numbers, sorted in each row, each
-    facet once."""
+    """Boundary facets by their group's name: (k, d) node numbers, rows sorted, each facet once."""
 
 
 def read_mesh(path: str | PathLike[str], sha256: str | None = None, *,
               scale: float = 1.0) -> MeshFile:
     """A mesh of triangles or tetrahedra, and its named boundary facets.
+
+    It is 2D if there are no tetrahedra; the third coordinate must be zero then. Nodes stay in the
+    file's order; those of no cell are left out, such as the centres of circles. Groups of other
+    than boundary facets, such as the fluid, have no entry.
+
+    ``ValueError`` naming the file if it is not there, is not the one with this SHA-256, cannot be
+    read, holds no triangles or tetrahedra or other cells too, is of second order (curved), or if a
+    group of facets has no name, no facets, or one that is not on the boundary.
 
     Parameters
     ----------
@@ -52,20 +59,6 @@ def read_mesh(path: str | PathLike[str], sha256: str | None = None, *,
         What the SHA-256 of the file must be, in hexadecimal digits.
     scale : float
         Metres in a unit of the file, > 0: 1e-3 for one in mm.
-
-    Returns
-    -------
-    MeshFile
-        2D if there are no tetrahedra; the third coordinate must be zero then. Nodes stay in the
-        file's order; those of no cell are left out, such as the centres of circles. Groups of
-        other than boundary facets, such as the fluid, have no entry.
-
-    Raises
-    ------
-    ValueError
-        Naming the file, if it is not there, is not the one with this SHA-256, cannot be read, holds
-        no triangles or tetrahedra or other cells too, is of second order (curved), or if a group
-        of facets has no name, no facets, or one that is not on the boundary.
     """
     path = Path(path)
     scale = _check.number("scale", scale, low=0.0, open_low=True, units="m")
@@ -100,6 +93,9 @@ def write_mesh(path: str | PathLike[str], mesh: Mesh,
                groups: Mapping[str, np.ndarray] | None = None) -> None:
     """Write a mesh and its groups as text, in gmsh's format 2.2; `read_mesh` finds the same bits.
 
+    ``ValueError`` if the file's name ends otherwise, a group's name cannot be written, or what it
+    holds are not boundary facets.
+
     Parameters
     ----------
     path : path of a file
@@ -107,12 +103,6 @@ def write_mesh(path: str | PathLike[str], mesh: Mesh,
     mesh : Mesh
     groups : mapping from str to (k ≥ 1, d) int, optional
         Boundary facets by name; a facet may be in several groups.
-
-    Raises
-    ------
-    ValueError
-        If the file's name ends otherwise, a group's name cannot be written, or what it holds are
-        not boundary facets.
     """
     import meshio
 

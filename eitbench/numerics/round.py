@@ -19,11 +19,12 @@ TURN = 2.0 * np.pi
 
 
 def disc_mesh(radii: Sequence[float] | np.ndarray, angles: Sequence[np.ndarray]) -> Mesh:
-    """Triangles of a disc, with nodes at its centre and on rings that need not hold equally many.
+    """Triangles of a disc with nodes at its centre (0), then on rings, outwards, by their angles.
 
-    Between two rings every edge of either is joined to that node of the other whose share of the
-    turn, from the middle of the edge before it to the middle of the edge behind it, holds the
-    middle of this edge.
+    Rings need not hold equally many. Every edge of either of two rings is joined to that node of
+    the other whose share of the turn, from the middle of the edge before it to the middle of the
+    edge behind it, holds the middle of this edge. ``ValueError`` naming the argument if a shape or
+    an order is wrong, or if the rings are so unlike that triangles overlap.
 
     Parameters
     ----------
@@ -31,17 +32,6 @@ def disc_mesh(radii: Sequence[float] | np.ndarray, angles: Sequence[np.ndarray])
         Radius of each ring in m, > 0 and increasing; the last one is the wall, a polygon.
     angles : K sequences of (n_k ≥ 3,) float
         Where each ring's nodes stand, in rad, increasing and within one turn.
-
-    Returns
-    -------
-    Mesh
-        Node 0 is the centre, then come the rings outwards, each in the order of its angles.
-
-    Raises
-    ------
-    ValueError
-        Naming the argument, if a shape or an order is wrong, or if the rings are so unlike that
-        triangles overlap.
     """
     radii = _check.array("radii", radii, (None,), units="m", positive=True)
     if len(radii) == 0 or (np.diff(radii) <= 0).any():
@@ -110,7 +100,9 @@ def electrode_disc(radius: float, spans: np.ndarray, cells_at_electrodes: int, r
     """EIT mesh of a disc, refined at the electrode edges and the wall.
 
     Inwards the rings hold ever fewer nodes, about as far apart as the rings are, and stand ever
-    more evenly.
+    more evenly. ``ValueError`` naming the argument if it is out of range, of the wrong shape, or if
+    electrodes touch or overlap; also if the wall has cells so long that they cut through the rings
+    next to it.
 
     Parameters
     ----------
@@ -127,12 +119,6 @@ def electrode_disc(radius: float, spans: np.ndarray, cells_at_electrodes: int, r
         with 16 electrodes the default is within a few per cent of the smallest voltage error at
         equal numbers of unknowns. Angles stay above 15° where the wall's cells are about as long as
         the rings next to them are wide.
-
-    Raises
-    ------
-    ValueError
-        Naming the argument, if it is out of range, of the wrong shape, or if electrodes touch or
-        overlap; also if the wall has cells so long that they cut through the rings next to it.
     """
     _check.number("radius", radius, low=0.0, open_low=True, units="m")
     _check.integer("cells_at_electrodes", cells_at_electrodes, low=1)
@@ -163,12 +149,8 @@ def extrude(section: Mesh, z: Sequence[float] | np.ndarray) -> Mesh:
     second, and so on. Every triangle and two neighbouring ``z`` bound a prism of three tetrahedra.
     On a prism's side the diagonal leads up from the lower node number to the higher one, so that
     neighbours agree about it; in every other layer it leads down, which makes the mesh its own
-    mirror image in z.
-
-    Raises
-    ------
-    ValueError
-        If ``section`` is not a mesh in 2D, or ``z`` does not increase.
+    mirror image in z. ``ValueError`` if ``section`` is not a mesh in 2D, or ``z`` does not
+    increase.
     """
     z = increasing("z", z)
     if section.dim != 2:
@@ -191,6 +173,9 @@ def round_pipe_mesh(length: float, radius: float, spans_around: np.ndarray,
                     grading: tuple[float, float, float] = (2.0, 1.5, 2.0)) -> Mesh:
     """EIT mesh of a round pipe 0 ≤ z ≤ length, electrodes at all pairs of spans around and along.
 
+    ``ValueError`` naming the argument if it is out of range, of the wrong shape, or if electrodes
+    touch or overlap.
+
     Parameters
     ----------
     length, radius : float
@@ -206,12 +191,6 @@ def round_pipe_mesh(length: float, radius: float, spans_around: np.ndarray,
         Cells from the axis to the wall.
     grading : (float, float, float)
         Exponents of the clustering around, across and along the pipe, see `graded`.
-
-    Raises
-    ------
-    ValueError
-        Naming the argument, if it is out of range, of the wrong shape, or if electrodes touch or
-        overlap.
     """
     _check.number("length", length, low=0.0, open_low=True, units="m")
     around, along = cells_at_electrodes

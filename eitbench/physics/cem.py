@@ -26,7 +26,9 @@ class CompleteElectrodeModel:
     """Electrode voltages, and their derivatives, for a nodal conductivity.
 
     Voltages are linear in the currents, so for one conductivity everything is in one symmetric L×L
-    matrix, U = 𝓡 I with 𝓡1 = 0: one sparse factorisation serves every injection.
+    matrix, U = 𝓡 I with 𝓡1 = 0: one sparse factorisation serves every injection. ``ValueError`` if
+    the mesh falls apart, there are fewer than two electrodes, a facet is not on the boundary, two
+    electrodes share a facet, or a contact impedance is not positive.
 
     Parameters
     ----------
@@ -39,12 +41,6 @@ class CompleteElectrodeModel:
     order : int
         1 or 2: polynomial order of the potential. First order is wrong by several noise standard
         deviations on meshes of a few thousand unknowns.
-
-    Raises
-    ------
-    ValueError
-        If the mesh falls apart, there are fewer than two electrodes, a facet is not on the
-        boundary, two electrodes share a facet, or a contact impedance is not positive.
     """
 
     def __init__(self, mesh: Mesh, electrodes: Sequence[np.ndarray],
@@ -82,17 +78,12 @@ class CompleteElectrodeModel:
     # -- public ------------------------------------------------------------------------------------
 
     def transfer_resistance(self, conductivity: np.ndarray) -> np.ndarray:
-        """𝓡 with U = 𝓡 I for every injection.
+        """(..., L, L) 𝓡 with U = 𝓡 I, in Ω (in 2D Ω·m); symmetric, rows sum to zero.
 
         Parameters
         ----------
         conductivity : (..., n_nodes) float
             σ at the mesh nodes in S/m, finite and > 0.
-
-        Returns
-        -------
-        (..., L, L) array in Ω (Ω·m in 2D, where currents are per metre of depth); symmetric, rows
-        sum to zero.
         """
         sigma = self._checked_conductivity(conductivity, batched=True)
         if sigma.ndim == 1:
@@ -130,18 +121,10 @@ class CompleteElectrodeModel:
             self, conductivity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """𝓡 and its derivatives by nodal conductivity, from one factorisation for every injection.
 
+        They are (L, L) in Ω (Ω·m in 2D) and (n_nodes, L, L) in Ω·m/S (Ω·m²/S in 2D), for
+        ``conductivity`` (n_nodes,) in S/m, > 0.
         The field of any injection is a combination of the L fields w_m of unit currents, taken out
         evenly at all electrodes, so that ∂𝓡_ml/∂σ_j = −∫ φ_j ∇w_m·∇w_l.
-
-        Parameters
-        ----------
-        conductivity : (n_nodes,) float
-            In S/m, > 0.
-
-        Returns
-        -------
-        𝓡 : (L, L) in Ω (Ω·m in 2D)
-        table : (n_nodes, L, L) in Ω·m/S (Ω·m²/S in 2D)
         """
         values = self._assemble(self._checked_conductivity(conductivity))
         columns = self._system.port_columns(values)

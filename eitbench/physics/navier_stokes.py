@@ -33,8 +33,7 @@ class SteadyFlow:
 
     mesh: Mesh
     cell_velocity: np.ndarray
-    """(n_cells, 6, 2) velocity in m/s at the three nodes of each cell and at the middles of its
-    edges 01, 12 and 20."""
+    """(n_cells, 6, 2) velocity in m/s at each cell's nodes and middles of edges 01, 12 and 20."""
     pressure: np.ndarray
     """(n_nodes,) kinematic pressure (pressure over density) in m²/s²."""
 
@@ -51,6 +50,11 @@ def steady_flow(mesh: Mesh, viscosity: float, walls: Sequence[tuple[np.ndarray, 
     The error is of third order in the cell size for the velocity and of second for the pressure (L2
     norms). Nothing is upwinded: a mesh too coarse for the Reynolds number gives wiggles, or no
     solution. Where there are several steady flows one of them is found, be it stable or not.
+    ``ValueError`` naming the argument if the mesh is not 2D, if a value is out of range, of the
+    wrong shape or not finite, if a facet is not on the boundary, or if walls all round let more
+    fluid in than out: by more than 10⁻⁴ of the largest speed times the perimeter. (Less is the
+    error of interpolation, and spread as a uniform divergence.) ``RuntimeError`` if no steady flow
+    was found.
 
     Parameters
     ----------
@@ -66,16 +70,6 @@ def steady_flow(mesh: Mesh, viscosity: float, walls: Sequence[tuple[np.ndarray, 
         facets are outflow, ν∂v/∂n − pn = 0; without any, the pressure has mean zero.
     force : callable, optional
         Force per mass, points (k, 2) in m -> acceleration (k, 2) in m/s²; default: none.
-
-    Raises
-    ------
-    ValueError
-        Naming the argument, if the mesh is not 2D, if a value is out of range, of the wrong shape
-        or not finite, if a facet is not on the boundary, or if walls all round let more fluid in
-        than out: by more than 10⁻⁴ of the largest speed times the perimeter. (Less is the error of
-        interpolation, and spread as a uniform divergence.)
-    RuntimeError
-        If no steady flow was found.
     """
     if mesh.dim != 2:
         raise ValueError(f"mesh must be 2D, got {mesh.dim}D")

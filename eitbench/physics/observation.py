@@ -25,15 +25,10 @@ class ConductivityLaw(Protocol):
 
 @dataclass(frozen=True)
 class LinearConductivity:
-    """σ = Λ c, as in the thesis' pipe example (5.1.1).
-
-    Parameters
-    ----------
-    molar_conductivity : float
-        Λ in S·m²/mol, > 0. Sodium chloride around 30 mol/m³: about 0.011.
-    """
+    """σ = Λ c, as in the thesis' pipe example (5.1.1)."""
 
     molar_conductivity: float
+    """Λ in S·m²/mol, > 0; sodium chloride around 30 mol/m³: about 0.011"""
 
     def __post_init__(self) -> None:
         _check.number("molar_conductivity", self.molar_conductivity, low=0.0, open_low=True,
@@ -52,17 +47,12 @@ class KohlrauschConductivity:
 
     The defaults are sodium chloride in water at 25 °C by Onsager's limiting law, Λ₀ = 126.45 and
     K = 89.1 in S·cm²/mol with c in mol/l (Robinson & Stokes, *Electrolyte Solutions*, 1959).
-
-    Parameters
-    ----------
-    limiting_molar_conductivity : float
-        Λ₀ in S·m²/mol, > 0.
-    kohlrausch_coefficient : float
-        K in S·m²/mol per √(mol/m³), ≥ 0.
     """
 
     limiting_molar_conductivity: float = 0.012645
+    """Λ₀ in S·m²/mol, > 0"""
     kohlrausch_coefficient: float = 89.1e-4 / np.sqrt(1000.0)
+    """K in S·m²/mol per √(mol/m³), ≥ 0"""
 
     def __post_init__(self) -> None:
         _check.number("limiting_molar_conductivity", self.limiting_molar_conductivity, low=0.0,
@@ -85,20 +75,14 @@ class VoltageNoise:
 
     std² = (relative·reading)² + (of_largest·largest voltage)² + floor². Without ``floor`` the noise
     scales with the current.
-
-    Parameters
-    ----------
-    relative : float
-        Part of the reading, ≥ 0; the thesis has 0.01.
-    of_largest : float
-        Part of the largest voltage of the injection, ≥ 0; the thesis has 0.001.
-    floor : float
-        Absolute std in V, ≥ 0; the thesis has none.
     """
 
     relative: float = 0.01
+    """part of the reading, ≥ 0; the thesis has 0.01"""
     of_largest: float = 0.001
+    """part of the largest voltage of the injection, ≥ 0; the thesis has 0.001"""
     floor: float = 0.0
+    """absolute std in V, ≥ 0; the thesis has none"""
 
     def __post_init__(self) -> None:
         for name in ("relative", "of_largest"):

@@ -9,34 +9,21 @@ import numpy as np
 from numpy.polynomial.polynomial import polyval
 
 from eitbench import _check
-from eitbench.physics.flow import AxialFlow
+from eitbench.physics.flow import AxialFlow, ChannelFlow
 
 _ETA, _WEIGHTS = np.polynomial.legendre.leggauss(24)
-"""Gauss–Legendre points and weights on [−1, 1]; integrals of products of profiles are exact to
-rounding."""
+"""Gauss–Legendre points and weights on [−1, 1]: exact to rounding for products of profiles."""
 
 
 @dataclass(frozen=True)
-class SkewedChannelFlow(AxialFlow):
-    """v = C·(1 − η²)·exp(k·η) along x with η = y/R; C makes the mean v̄, and k = 0 is the parabola.
+class SkewedChannelFlow(ChannelFlow):
+    """v = C·(1 − η²)·exp(k·η) along x with η = y/R; C makes the mean v̄; k = 0: a parabola."""
 
-    Parameters
-    ----------
-    mean_velocity : float
-        v̄ in m/s, ≥ 0.
-    half_width : float
-        R in m, > 0.
-    skewness : float
-        k: how far the fastest fluid moves towards the upper wall (k > 0) or the lower one.
-    """
-
-    mean_velocity: float
-    half_width: float
     skewness: float = 0.0
+    """k: how far the fastest fluid moves towards the upper wall (k > 0) or the lower one"""
 
     def __post_init__(self) -> None:
-        _check.number("mean_velocity", self.mean_velocity, low=0.0, units="m/s")
-        _check.number("half_width", self.half_width, low=0.0, open_low=True, units="m")
+        super().__post_init__()
         _check.number("skewness", self.skewness, low=-5.0, high=5.0)
 
     def profile(self, y: np.ndarray) -> np.ndarray:
@@ -62,27 +49,18 @@ class PolynomialFlow(AxialFlow):
 
 @dataclass(frozen=True)
 class VelocityModel:
-    """An unknown flow written as v = Σ θ_k φ_k(y/R) along x, θ a random walk (thesis ch. 6).
-
-    Parameters
-    ----------
-    half_width : float
-        R in m.
-    basis : tuple of tuples
-        φ_k as polynomials in y/R: coefficients of 1, y/R, (y/R)², …; no unit.
-    nominal : (k,) tuple
-        θ_0 in m/s: what is believed at first.
-    initial_std : (k,) tuple
-        Its standard deviation in m/s.
-    walk_std : (k,) tuple
-        Standard deviation in m/s of the random walk's steps, one a time step.
-    """
+    """An unknown flow written as v = Σ θ_k φ_k(y/R) along x, θ a random walk (thesis ch. 6)."""
 
     half_width: float
+    """R in m"""
     basis: tuple[tuple[float, ...], ...]
+    """φ_k as polynomials in y/R: coefficients of 1, y/R, (y/R)², …; no unit"""
     nominal: tuple[float, ...]
+    """(k,) θ_0 in m/s: what is believed at first"""
     initial_std: tuple[float, ...]
+    """(k,) its standard deviation in m/s"""
     walk_std: tuple[float, ...]
+    """(k,) standard deviation in m/s of the random walk's steps, one a time step"""
 
     def __post_init__(self) -> None:
         _check.number("half_width", self.half_width, low=0.0, open_low=True, units="m")

@@ -14,18 +14,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class AtRest:
-    """A `Transport` in which nothing flows, spreads or enters.
-
-    Parameters
-    ----------
-    mesh : Mesh
-        Where the concentration lives.
-    time_step : float
-        s between two injections.
-    """
+    """A `Transport` in which nothing flows, spreads or enters."""
 
     mesh: Mesh
+    """where the concentration lives"""
     time_step: float
+    """s between two injections"""
 
     @property
     def inlet(self) -> np.ndarray:

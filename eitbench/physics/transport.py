@@ -79,7 +79,8 @@ class ConvectionDiffusion:
     from the old to the new one. Second order in space and in the sub-step; between those, at cell
     Péclet numbers of about 2–8, the order in space sinks to 1.5, as P1 has no ∇·(κ∇c) to weigh.
     Because every step starts anew with the two halves, shorter steps at equal ``substeps`` are
-    first order only.
+    first order only. ``ValueError`` naming the argument if it is out of range, of the wrong shape,
+    or not finite.
 
     Parameters
     ----------
@@ -94,13 +95,7 @@ class ConvectionDiffusion:
     substeps : int
         Crank–Nicolson steps per time step, ≥ 1.
     inlet : (n_inlet,) int, optional
-        Nodes where the concentration is given; default: nodes of the boundary facets through which
-        fluid enters.
-
-    Raises
-    ------
-    ValueError
-        Naming the argument, if it is out of range, of the wrong shape, or not finite.
+        Nodes where the concentration is given; default: those where fluid enters.
     """
 
     def __init__(self, mesh: Mesh, velocity: VelocityField, diffusivity: float, time_step: float, *,
@@ -134,7 +129,7 @@ class ConvectionDiffusion:
 
     def step(self, c: np.ndarray, inflow_before: np.ndarray | float,
              inflow_after: np.ndarray | float) -> np.ndarray:
-        """The concentration one time step later.
+        """The concentration one time step later, shaped like ``c``.
 
         Parameters
         ----------
@@ -142,10 +137,6 @@ class ConvectionDiffusion:
             Nodal concentration; its inlet entries are replaced by ``inflow_before``.
         inflow_before, inflow_after : float, (n_inlet,) or (n_inlet, batch)
             Inlet concentration at the beginning and at the end of the step, in the unit of ``c``.
-
-        Returns
-        -------
-        Array shaped like ``c``.
         """
         c = np.asarray(c, dtype=float)
         if c.ndim not in (1, 2) or len(c) != self.mesh.n_nodes:
@@ -159,7 +150,7 @@ class ConvectionDiffusion:
     def velocity_derivatives(self, c: np.ndarray, inflow_before: np.ndarray | float,
                              inflow_after: np.ndarray | float,
                              directions: Sequence[VelocityField]) -> tuple[np.ndarray, np.ndarray]:
-        """The step and its derivatives by θ when the velocity is v + Σ θ_k v_k, at θ = 0.
+        """The step (n,) and its derivatives (n, K) by θ, at θ = 0, for the velocity v + Σ θ_k v_k.
 
         They are those of the discrete step, with the test functions, which depend on the velocity
         too, the Rannacher start and all sub-steps; the inlet nodes stay what they are. For k
@@ -169,25 +160,14 @@ class ConvectionDiffusion:
         The cell's length along the flow has a kink where the flow passes along the side of a cell;
         there the derivative is the mean of both one-sided ones. Where v = 0 it is exact along each
         direction, but the scheme is not linear in the direction there unless all directions are
-        parallel.
+        parallel. ``ValueError`` naming the argument if it is of the wrong shape or not finite.
 
         Parameters
         ----------
-        c : (n,) float
-            Nodal concentration; its inlet entries are replaced by ``inflow_before``.
-        inflow_before, inflow_after : float or (n_inlet,)
-            Inlet concentration at the beginning and at the end of the step, in the unit of ``c``.
+        c, inflow_before, inflow_after : (n,), float or (n_inlet,)
+            As in `step`.
         directions : K callables
             v_k, each points (k, d) in m -> velocity (k, d) in m/s for θ_k = 1, divergence-free.
-
-        Returns
-        -------
-        (n,) the concentration one time step later, (n, K) its derivatives; in the unit of ``c``.
-
-        Raises
-        ------
-        ValueError
-            Naming the argument, if it is of the wrong shape or not finite.
         """
         if not len(directions):
             raise ValueError("directions must hold at least one velocity field, got none")

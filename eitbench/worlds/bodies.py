@@ -23,14 +23,12 @@ BALL_POINTS = np.concatenate([np.zeros((1, 2)), np.sqrt(2 / 3) * np.stack(
     [np.cos(np.arange(6) * np.pi / 3), np.sin(np.arange(6) * np.pi / 3)], axis=1)])
 """Where the flow is averaged over a disc of radius one, …"""
 BALL_WEIGHTS = np.array([1 / 4, *[1 / 8] * 6])
-"""… and with which weights: exact for polynomials of the fifth degree (Abramowitz & Stegun
-25.4.61)."""
+"""… and with which weights: exact for the fifth degree (Abramowitz & Stegun 25.4.61)."""
 
 
 @dataclass(frozen=True)
 class Ball(Target):
-    """A rigid ball (a disc, in 2D) that hardly conducts; its centre moves with the fluid's mean
-    velocity over its area (thesis 7.1). All numbers are ours."""
+    """A rigid disc that hardly conducts; the fluid's mean over it moves it (thesis 7.1) [ours]."""
 
     background: float = 30.0
     """mol/m³, about 0.3 S/m: weak saline"""
@@ -108,8 +106,8 @@ class Cylinders(Target):
     gap: float = 0.05
     """m at least between the cylinders' walls [ours]"""
     metal: float = 5.0
-    """concentration of the metal in parts of the background: its surface resists, and from
-    five-fold on EIT hardly tells how well a small thing conducts [ours]"""
+    """of the background: its surface resists, and from 5 on EIT hardly tells how well it conducts
+    [ours]"""
 
     is_carried = False
     stands_still = True

@@ -47,8 +47,7 @@ class PipeFlow(Flow):
 
 @dataclass(frozen=True)
 class LaminarFlow(PipeFlow):
-    """Laminar flow through a pipe with a known mean velocity; [T]: the thesis' number; [ours]: our
-    choice."""
+    """Laminar flow with a known mean velocity; [T]: the thesis' number; [ours]: our choice."""
 
     mean_velocity: float = 4.5
     """v̄ in m/s [T]"""
@@ -77,8 +76,7 @@ class DrawnFlow(LaminarFlow):
     diffusivity: float = 5e-4
     """κ in m²/s [ours]"""
     velocity_range: tuple[float, float] = (2.5, 7.0)
-    """m/s; the true mean velocity is drawn evenly from it. The thesis assumes 2 and 7 for a true
-    4.5 [ours]"""
+    """m/s, of the true mean, drawn evenly; the thesis assumes 2 and 7 for a true 4.5 [ours]"""
     swing_range: tuple[float, float] = (0.0, 0.0)
     """amplitude of the mean velocity's sine in time, in parts of the mean"""
     period_range: tuple[float, float] = (0.4, 0.8)
@@ -86,8 +84,7 @@ class DrawnFlow(LaminarFlow):
     skewness_range: tuple[float, float] = (0.0, 0.0)
     """|k|, either sign; 0 is the parabola"""
     profiles: str | None = None
-    """what estimators are asked for: None, the ``mean`` velocity of a parabola, or ``three``
-    numbers of a profile"""
+    """what is asked for: None, the ``mean`` of a parabola, or ``three`` numbers of a profile"""
     velocity_std: float = 1.0
     """m/s, standard deviation of what is believed of it at first [ours]"""
     velocity_walk: float = 0.02
@@ -139,8 +136,7 @@ class DrawnFlow(LaminarFlow):
 
 @dataclass(frozen=True)
 class WanderingFlow(PipeFlow):
-    """A parabolic flow through a plane pipe whose mean velocity is a random walk; all numbers are
-    ours.
+    """A parabolic flow in a plane pipe whose mean velocity is a random walk; numbers are ours.
 
     At every time step it goes up or down by ``velocity_walk``, which is also the walk that
     estimators are told of; at the ends of ``velocity_range`` it turns back.
@@ -187,8 +183,7 @@ class WanderingFlow(PipeFlow):
 
 @dataclass(frozen=True)
 class FlowPastBulge(PipeFlow):
-    """The steady Navier–Stokes flow through a plane pipe with a bulge: the flow separates behind
-    it.
+    """The steady Navier–Stokes flow through a plane pipe with a bulge, behind which it separates.
 
     Better fluid models are what the thesis names as its next step (5.1.1). Estimators know the
     walls, but of the flow only that it is parabolic between them at each x, unless they are given
@@ -231,11 +226,9 @@ class FlowPastBulge(PipeFlow):
 
 @dataclass(frozen=True)
 class StirredFlow(Flow):
-    """A steady Navier–Stokes flow in a round tank, driven by a stirrer off the middle (thesis 7.1);
-    numbers are ours.
+    """A steady Navier–Stokes flow in a round tank with a stirrer (thesis 7.1); numbers are ours.
 
-    At rest on the wall, driven along the circle that the stirrer sweeps: force·exp(−((d −
-    swept)/width)²/2).
+    At rest on the wall, driven along the stirrer's circle: force·exp(−((d − swept)/width)²/2).
     """
 
     viscosity: float = 2e-4
@@ -276,17 +269,14 @@ class LocalParabola:
     """The flow along a bent wall with the stream function 1.5·v̄·R·(η − η³/3), without divergence.
 
     η goes from −1 at the lower wall to 1 at the upper one: a parabola at each x.
-    Parameters
-    ----------
-    mean_velocity, half_width : float
-        v̄ in m/s and R in m.
-    bulge : Bulge or None
-        Of the lower wall. An estimator is given this, and through it nothing else of the world.
     """
 
     mean_velocity: float
+    """v̄ in m/s"""
     half_width: float
+    """R in m"""
     bulge: Bulge | None
+    """of the lower wall; an estimator is given this, and through it nothing else of the world"""
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
         if self.bulge is None:

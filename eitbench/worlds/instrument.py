@@ -34,8 +34,7 @@ class Faults(NamedTuple):
 
 @dataclass(frozen=True)
 class Instrument:
-    """Current sources and voltmeters; by default sound ones. [T]: the thesis' number; all others
-    are ours.
+    """Current sources and voltmeters, by default sound. [T]: the thesis' number; others are ours.
 
     A broken wire leaves the electrode in place, so the field is that of an electrode without net
     current: the transfer resistances of the episode stay exact. A current that would have to pass a
@@ -53,8 +52,7 @@ class Instrument:
     noise_floor: float = 0.0
     """V; std of an absolute noise beside the relative one"""
     limit: str | None = None
-    """what an agent may ask for. None: pairs of electrodes. "L1", "L2" or "Linf": a current for
-    each electrode, scaled down to this norm of a pair's currents where it exceeds it"""
+    """None: pairs are asked for. "L1", "L2" or "Linf": currents, scaled down to a pair's norm"""
     dead: tuple[int, int] = (0, 0)
     """least and most electrodes whose wire is broken from the beginning"""
     failing: tuple[int, int] = (0, 0)

@@ -38,8 +38,7 @@ class History(NamedTuple):
 
 
 class Vessel(Protocol):
-    """What holds the liquid, with the electrodes on its wall. A frozen dataclass of plain numbers
-    in SI units."""
+    """What holds the liquid, with electrodes on its wall: a frozen dataclass of SI numbers."""
 
     @property
     def contact_impedance(self) -> float:
@@ -76,8 +75,7 @@ class Vessel(Protocol):
 
 
 class Flow(Protocol):
-    """How the fluid moves. A frozen dataclass of plain numbers in SI units; what is said here holds
-    where it says nothing else."""
+    """How the fluid moves: a frozen dataclass of SI numbers. What is said here is the default."""
 
     @property
     def diffusivity(self) -> float:
@@ -148,7 +146,7 @@ def check_range(part: object, name: str, units: str = "", open_low: bool = True)
 
 
 class Target(Protocol):
-    """What is to be seen. A frozen dataclass of plain numbers in SI units."""
+    """What is to be seen: a frozen dataclass of SI numbers."""
 
     @property
     def background(self) -> float:
@@ -173,8 +171,7 @@ class Target(Protocol):
 
 @dataclass(frozen=True)
 class Prior:
-    """What is believed before anything is measured; standard deviations in parts of ĉ_bh (thesis
-    Table 5.1)."""
+    """What is believed before any measurement; deviations in parts of ĉ_bh (thesis Table 5.1)."""
 
     expected_concentration: float = 25.0
     """mol/m³; a rough level, deliberately not the background [ours]"""

@@ -52,6 +52,8 @@ def register(world: World, id: str, *, track: str = "estimation", about: str = "
              seeds: str = "test:0-9", **settings: Any) -> None:
     """Make a world playable under an id, for `gymnasium.make` and for everything here.
 
+    ``ValueError`` if the id has another form or belongs to another world, or a setting is unknown.
+
     Parameters
     ----------
     world : World
@@ -64,13 +66,7 @@ def register(world: World, id: str, *, track: str = "estimation", about: str = "
     seeds : str
         The test episodes of its board.
     settings
-        Of the environment: ``lag`` and ``assume`` where estimates are asked for, ``gate`` where
-        injections are.
-
-    Raises
-    ------
-    ValueError
-        If the id has another form or belongs to another world, or a setting is unknown.
+        Of the environment: ``lag`` and ``assume`` for estimates, ``gate`` for injections.
     """
     if not re.fullmatch(r"[\w.-]+/[\w.-]+-v\d+", id):
         raise ValueError(f"id must look like 'namespace/Name-v0', got {id!r}")

@@ -15,8 +15,7 @@ if TYPE_CHECKING:
 
 
 class Pattern(Protocol):
-    """The cycle of injections, in parts of the instrument's current. A frozen dataclass of plain
-    numbers."""
+    """The cycle of injections, in parts of the current: a frozen dataclass of plain numbers."""
 
     def __call__(self, vessel: Any) -> np.ndarray:
         """(K, L), each row summing to zero."""
@@ -77,8 +76,7 @@ class RingsInTurn:
 
 @dataclass(frozen=True)
 class OnePair:
-    """The same pair of electrodes all the time: number 0, and the one opposite [T: one pair; ours:
-    which]."""
+    """The same pair all the time: electrode 0, and the one opposite [T: one pair; ours: which]."""
 
     def __call__(self, vessel: RoundTank) -> np.ndarray:
         return _pair(vessel, 0, vessel.n_electrodes // 2)[None]
@@ -114,13 +112,11 @@ class Schedule:
     pattern: Pattern = field(default_factory=AcrossAndAslant)
     """the cycle of injections"""
     warm_up: int | None = None
-    """injections not scored; None: the mean flow flushes the vessel once, and there is a whole
-    frame"""
+    """injections not scored; None: until the mean flow has flushed the vessel, and a whole frame"""
     calibration: int | None = None
     """first injections, from which ĉ_bh is found; None: a whole turn of the pattern"""
     budget: int | None = None
-    """injections that an agent may make, where it may also inject nothing; None: it injects at
-    every step"""
+    """injections that an agent may make, who may make none; None: it injects at every step"""
 
     def __post_init__(self) -> None:
         check_positive(self, time_step="s")

@@ -18,8 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Bulge:
-    """A dent of a plane pipe's lower wall, electrodes and all: y = −R + h·exp(−((x − x₀)/w)²). All
-    numbers are ours."""
+    """A dent of the lower wall, electrodes and all: y = −R + h·exp(−((x − x₀)/w)²) [all ours]."""
 
     height: float = 0.02
     """h in m: a fifth of the pipe's width"""

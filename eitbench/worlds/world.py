@@ -25,28 +25,23 @@ if TYPE_CHECKING:
 class World:
     """What is simulated: parts that can be swapped, each a frozen dataclass of plain numbers.
 
-    Parameters
-    ----------
-    name : str
-        Under which its episodes are kept.
-    vessel, flow, target, instrument, schedule
-        A `Vessel`, `Flow`, `Target`, `Instrument` and `Schedule`. A part may ask more of another
-        than its protocol promises, as slugs ask for an inlet.
-    prior : Prior
-        What estimators are told to believe.
-    region : (float, float) or None
-        m along the vessel's first axis; only errors between these cross-sections count. None: all.
+    A part may ask more of another than its protocol promises, as slugs ask for an inlet.
     """
 
     name: str
+    """under which its episodes are kept"""
     vessel: Any
+    """a `Vessel`"""
     flow: Any
+    """a `Flow`"""
     target: Any
+    """a `Target`"""
     instrument: Instrument = field(default_factory=Instrument)
     schedule: Schedule = field(default_factory=Schedule)
     prior: Prior = field(default_factory=Prior)
+    """what estimators are told to believe"""
     region: tuple[float, float] | None = None
-    """m along the vessel; errors count between these cross-sections only. None: everywhere"""
+    """m along the vessel's axis; only errors between these cross-sections count. None: all"""
 
     def __post_init__(self) -> None:
         for part in (self.vessel, self.flow, self.target):
@@ -90,8 +85,7 @@ class World:
 
     @property
     def warm_up(self) -> int:
-        """Injections that are measured but not scored: by default the mean flow flushes the vessel
-        once, and there is a whole turn of the pattern."""
+        """Injections measured but not scored; by default a flush, and a turn of the pattern."""
         if self.schedule.warm_up is not None:
             return self.schedule.warm_up
         return max(self.flush_steps, len(self.currents))
@@ -203,11 +197,8 @@ class World:
     def changed(self, changes: Mapping[str, Any] | None) -> World:
         """This world with some numbers changed, as in ``{"instrument": {"noise_relative": 0.02}}``.
 
-        Raises
-        ------
-        ValueError
-            Naming what there is, if a part or a number has another name, or what is allowed, if it
-            is out of range.
+        ``ValueError`` naming what there is, if a part or a number has another name, or what is
+        allowed, if it is out of range.
         """
         if changes is None:
             return self
