@@ -185,9 +185,6 @@ class EstimationEnv(gym.Env[Observation, np.ndarray], EzPickle):
 
     def _observe(self) -> Observation:
         k = self._step - 1
-        if k >= len(self._voltages):
-            nothing = np.zeros_like(self._voltages[0])
-            return {"voltages": nothing, "currents": nothing.copy()}
         return {"voltages": self._voltages[k].copy(), "currents": self._currents[k].copy()}
 
 
@@ -223,9 +220,9 @@ def estimation_spaces(world: World) -> tuple[spaces.Dict, spaces.Box]:
 
 
 def cycle_currents(world: World, lag: int) -> np.ndarray:
-    """(T + lag, L) currents of every step: the cycle, then none."""
+    """(T + lag + 1, L) currents of every step and after the last: the cycle, then none."""
     cycle = world.currents
-    currents = np.zeros((world.n_steps + lag, cycle.shape[1]))
+    currents = np.zeros((world.n_steps + lag + 1, cycle.shape[1]))
     currents[:world.n_steps] = cycle[np.arange(world.n_steps) % len(cycle)]
     return currents
 

@@ -36,7 +36,7 @@ class EstimationVectorEnv(LockstepVectorEnv):
 
     def _begin(self, seeds: list[int]) -> None:
         world = self.world
-        self._voltages = np.zeros((self._length, self.num_envs, self._currents.shape[1]))
+        self._voltages = np.repeat(np.zeros_like(self._currents)[:, None], self.num_envs, axis=1)
         self._deviations, self._squares = np.empty((2, world.n_steps, self.num_envs))
         self._moments: list[np.ndarray] = []
         self._flows: list[tuple[np.ndarray, np.ndarray]] = []
@@ -71,9 +71,6 @@ class EstimationVectorEnv(LockstepVectorEnv):
         return rewards
 
     def _observe(self) -> Observation:
-        if self._step > self._length:
-            nothing = np.zeros_like(self._voltages[0])
-            return {"voltages": nothing, "currents": nothing.copy()}
         currents = self._currents[self._step - 1]
         return {"voltages": self._voltages[self._step - 1].copy(),
                 "currents": np.repeat(currents[None], self.num_envs, axis=0)}

@@ -34,11 +34,8 @@ class InjectionEnv(gym.Env[Any, Any], EzPickle):
 
     Parameters
     ----------
-    name : str
-        A registered id; `eitbench.worlds.register`.
-    world : dict, optional
-        Numbers of the world's parts to change, as in ``{"schedule": {"budget": 20}}``; see
-        `World.changed`.
+    name, world, episodes, render_mode
+        As in `EstimationEnv`.
     estimator : "reduced", "full" or "none"
         "reduced": a Kalman filter of reduced order, for training. "full": the exact one, for
         scores. The first frame is measured with the world's own cycle, from which ĉ_bh and the
@@ -50,9 +47,6 @@ class InjectionEnv(gym.Env[Any, Any], EzPickle):
     gate : float, optional
         The filter leaves out readings further from its prediction than so many standard deviations;
         default: as the id says, or none.
-    episodes : int
-        How many training episodes an unseeded ``reset`` draws from.
-    render_mode : "rgb_array" or None
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 8}  # noqa: RUF012 (gymnasium's form)

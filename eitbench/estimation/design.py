@@ -51,7 +51,7 @@ def pair_gains(covariance_of: np.ndarray, weighted: np.ndarray, pairs: np.ndarra
 
 
 def independent_rows(derivative: np.ndarray) -> np.ndarray:
-    """(L(L−1)/2, n) of the derivatives (L, L, n) of 𝓡; with 𝓡 = 𝓡ᵀ and 𝓡1 = 0 they are all."""
+    """(L(L−1)/2, n) of the derivatives (L, L, n) of 𝓡; 𝓡 = 𝓡ᵀ and 𝓡1 = 0 give the others."""
     return np.asarray(derivative[np.triu_indices(len(derivative), 1)])
 
 

@@ -56,9 +56,7 @@ class GainSequence:
     def smoothed(self, mean: np.ndarray, forcing: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Means c_{t|T} (T, n); arguments as in `filtered`.
 
-        The adjoint λ_t = Hᵀ S⁻¹ ν + (I − K H)ᵀ Fᵀ λ_{t+1} runs back over the innovations, and the
-        smoothed state follows forwards from c_{0|T} = c_{0|0} + Γ_{0|0} Fᵀ λ_1 as c_t = F c_{t−1} +
-        s + Γ_w λ_t (``docs/methods.md``, 6).
+        The adjoints run back and the state follows forwards as in `smoothed_means`.
         """
         _, innovations = self.filtered(mean, forcing, values)
         weighted = np.linalg.solve(self.innovation_covariances, innovations[..., None])[..., 0]

@@ -10,7 +10,7 @@ from eitbench.estimation.kalman import Expected, Observation
 
 
 def believable(innovation: np.ndarray, variance: np.ndarray, gate: float) -> np.ndarray:
-    """(..., m) bool: readings to take in, within ``gate`` predicted deviations of the prediction.
+    """(..., m) bool: readings within ``gate`` predicted standard deviations of the prediction.
 
     Where more than a third lie beyond, the injection itself has failed, and none counts.
 
@@ -36,7 +36,8 @@ class Filter(Protocol):
 
 def gated_update(filter_: Filter, observation: Observation,
                  gate: float) -> tuple[np.ndarray, np.ndarray]:
-    """Take in what is `believable`; returns innovations in predicted deviations, and what was."""
+    """Take in what is `believable` of a measurement; returns its innovations in predicted standard
+    deviations (m,) and which readings were taken in (m,)."""
     cross, innovation, S = filter_.expect(observation)
     kept = believable(innovation, S.diagonal(), gate)
     both = np.ix_(kept, kept)

@@ -15,7 +15,7 @@ def best_homogeneous(model: ObservationModel, noise: VoltageNoise, n: int, volta
                      max_iterations: int = 30) -> float:
     """ĉ_bh = argmin_c Σ ((V − R(c·1))/std)², by Gauss–Newton in ln c (``docs/methods.md``, 3).
 
-    ``RuntimeError`` if the iteration does not settle.
+    Steps in ln c keep it positive. ``RuntimeError`` if the iteration does not settle.
 
     Parameters
     ----------

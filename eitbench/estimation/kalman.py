@@ -139,7 +139,7 @@ class KalmanFilter:
 
 
 def expected(observation: Observation, mean: np.ndarray, cross: np.ndarray) -> Expected:
-    """`Expected` for a state with this mean (n,), its covariance with what is seen ``cross``."""
+    """`Expected` for this mean (n,), with ``cross`` (n, m) the covariance with what is seen."""
     S = observation.matrix @ cross
     return Expected(cross, observation.value - observation.matrix @ mean,
                     0.5 * (S + S.T) + np.diag(observation.noise_variance))

@@ -1,4 +1,4 @@
-"""Smoothing without n×n matrices inverted or stored (Bryson & Frazier 1963; methods.md, 6)."""
+"""Smoothing that inverts and stores no n×n matrix (Bryson & Frazier 1963; docs/methods.md, 6)."""
 
 from __future__ import annotations
 

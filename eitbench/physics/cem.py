@@ -96,10 +96,7 @@ class CompleteElectrodeModel:
         return result.reshape(*sigma.shape[:-1], self.n_electrodes, self.n_electrodes)
 
     def voltages(self, conductivity: np.ndarray, currents: np.ndarray) -> np.ndarray:
-        """Electrode potentials (K, L) in V for currents (K, L) in A (A/m in 2D); rows sum to zero.
-
-        So must the currents'.
-        """
+        """Potentials (K, L) in V for currents (K, L) in A (A/m in 2D); rows of both sum to zero."""
         currents = self._checked_currents(currents)
         return currents @ self.transfer_resistance(self._checked_conductivity(conductivity))
 

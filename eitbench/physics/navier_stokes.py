@@ -1,4 +1,4 @@
-"""Steady incompressible flow in 2D: v·∇v − ν∆v + ∇p = f, ∇·v = 0, by Taylor–Hood elements."""
+"""Steady flow in 2D: v·∇v − ν∆v + ∇p = f, ∇·v = 0; Taylor–Hood elements (P2 for v, P1 for p)."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class SteadyFlow:
 
 def steady_flow(mesh: Mesh, viscosity: float, walls: Sequence[tuple[np.ndarray, VelocityField]], *,
                 force: VelocityField | None = None) -> SteadyFlow:
-    """A steady flow, by Newton's method from the Stokes flow or, if need be, from viscous ones.
+    """A steady flow by Newton's method from the Stokes flow, or else by continuation in viscosity.
 
     The error is of third order in the cell size for the velocity and of second for the pressure (L2
     norms). Nothing is upwinded: a mesh too coarse for the Reynolds number gives wiggles, or no

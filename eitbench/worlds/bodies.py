@@ -28,7 +28,8 @@ BALL_WEIGHTS = np.array([1 / 4, *[1 / 8] * 6])
 
 @dataclass(frozen=True)
 class Ball(Target):
-    """A rigid disc that hardly conducts; the fluid's mean over it moves it (thesis 7.1) [ours]."""
+    """A rigid ball (a disc, in 2D) that hardly conducts; its centre moves with the fluid's mean
+    velocity over its area (thesis 7.1). All numbers are ours."""
 
     background: float = 30.0
     """mol/m³, about 0.3 S/m: weak saline"""
@@ -106,8 +107,8 @@ class Cylinders(Target):
     gap: float = 0.05
     """m at least between the cylinders' walls [ours]"""
     metal: float = 5.0
-    """of the background: its surface resists, and from 5 on EIT hardly tells how well it conducts
-    [ours]"""
+    """concentration of the metal in parts of the background: its surface resists, and from
+    five-fold on EIT hardly tells how well a small thing conducts [ours]"""
 
     is_carried = False
     stands_still = True

@@ -297,7 +297,7 @@ def steps_through(world: World, velocity: float) -> int:
 
 def laminar_assumption(world: World, mean_velocity: float,
                        assumed: Mapping[str, Any]) -> VelocityField:
-    """What a model of a pipe is told to believe; ``ValueError`` for what there is not."""
+    """What a model of a pipe is told to believe; ``ValueError`` for another name or value."""
     plane = isinstance(world.vessel, PlanePipe)
     refuse_assumptions(assumed, ("mean_velocity", "profile") if plane else ("mean_velocity",))
     mean = assumed.get("mean_velocity")

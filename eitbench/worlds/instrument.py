@@ -52,7 +52,8 @@ class Instrument:
     noise_floor: float = 0.0
     """V; std of an absolute noise beside the relative one"""
     limit: str | None = None
-    """None: pairs are asked for. "L1", "L2" or "Linf": currents, scaled down to a pair's norm"""
+    """what an agent may ask for. None: pairs of electrodes. "L1", "L2" or "Linf": a current for
+    each electrode, scaled down to this norm of a pair's currents where it exceeds it"""
     dead: tuple[int, int] = (0, 0)
     """least and most electrodes whose wire is broken from the beginning"""
     failing: tuple[int, int] = (0, 0)

@@ -1,4 +1,4 @@
-"""The thesis' 2D pipe with a mean velocity that estimators do not assume (5.1.2, Figs 5.7, 5.8)."""
+"""The thesis' 2D pipe with another mean velocity than estimators assume (5.1.2, Figs 5.7, 5.8)."""
 
 from eitbench.worlds.flows import DrawnFlow
 from eitbench.worlds.registry import register

@@ -8,7 +8,7 @@ from eitbench.worlds.world import World
 PIPE_2D_FAULTS = World(
     "Pipe2D", PIPE_2D.vessel, PIPE_2D.flow, PIPE_2D.target,
     Instrument(noise_floor=1e-4, interference=0.5, dead=(2, 4), failing=(1, 2), loose=(0, 2)))
-"""A bad contact has 0.5 to 2 Ω·m more (a sound one: 0.08) and five times the noise. All ours."""
+"""A bad contact has 0.5 to 2 Ω·m more (a sound one: 0.08) and five times the noise [all ours]."""
 
 register(PIPE_2D_FAULTS, "eitbench/Pipe2DInjectionFaults-v0", track="injection",
          seeds="test:0-49", gate=8.0, about="""

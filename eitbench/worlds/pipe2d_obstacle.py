@@ -1,4 +1,4 @@
-"""The 2D pipe with a dent in its wall: the flow separates behind it, and is no parabola."""
+"""The 2D pipe with a dent in its lower wall: the flow separates, and no parabola describes it."""
 
 from eitbench.worlds.flows import FlowPastBulge
 from eitbench.worlds.registry import register

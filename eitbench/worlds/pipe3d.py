@@ -9,7 +9,8 @@ from eitbench.worlds.world import World
 
 PIPE_3D = World("Pipe3D", RoundPipe(), LaminarFlow(), Slugs(),
                 schedule=Schedule(scored_steps=48, pattern=RingsInTurn()))
-"""The page at hand shows the figure only: the rest is the 2D pipe's. Three frames scored [ours]."""
+"""The page at hand shows the figure only: times, velocity and noise are those of the thesis' 2D
+pipe. Three frames are scored [ours]."""
 
 ABOUT = """
 Fluid streams through a round pipe, 40 cm long and 10 cm wide, at 4.5 m/s on average; slugs of

@@ -12,11 +12,9 @@ ROTATING_TANK_2D = World(
     "RotatingTank2D", RoundTank(), StirredFlow(), Ball(),
     schedule=Schedule(time_step=0.025, scored_steps=64, pattern=OnePair(), warm_up=16),
     prior=Prior(nodal_std=0.15, initial_std=0.25, initial_length=0.02))
-"""The truth is a rigid ball on a path of its own. The estimators' model is that of a liquid without
-any ball, in which concentration is carried and spreads: wrong, as in the thesis. The thesis gives
-neither sizes nor times: all numbers are ours. The pipe's nodal noise of 0.02 trusts the wrong model
-so far that a ball near the stirrer's circle, where the flow shears most, is lost (dev episodes;
-``docs/tanks.md``)."""
+"""The thesis gives neither sizes nor times: all numbers are ours. The pipe's nodal noise of 0.02
+trusts the model, which is wrong as in the thesis, so far that a ball near the stirrer's circle,
+where the flow shears most, is lost (dev episodes; ``docs/tanks.md``)."""
 
 register(ROTATING_TANK_2D, "eitbench/RotatingTank2D-v0", about="""
 A flat round tank of stirred saline carries a ball round that hardly conducts; sixteen electrodes on

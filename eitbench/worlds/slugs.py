@@ -72,7 +72,7 @@ class NowAndThen:
 
 @dataclass(frozen=True)
 class Slugs(Target):
-    """Slugs of both signs, Gaussian in space and time: background·exp(Σ ±a·g(r)·g(t)) [ours]."""
+    """Slugs of both signs, Gaussian in r and t: c_in = background·exp(Σ ±a·g(r)·g(t)) [ours]."""
 
     background: float = 30.0
     """mol/m³, about 0.3 S/m: weak saline"""

@@ -85,7 +85,8 @@ class World:
 
     @property
     def warm_up(self) -> int:
-        """Injections measured but not scored; by default a flush, and a turn of the pattern."""
+        """Injections that are measured but not scored: by default the mean flow flushes the vessel
+        once, and there is a whole turn of the pattern."""
         if self.schedule.warm_up is not None:
             return self.schedule.warm_up
         return max(self.flush_steps, len(self.currents))
