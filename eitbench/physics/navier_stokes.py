@@ -213,7 +213,8 @@ def _sample(name: str, field: VelocityField, points: np.ndarray) -> np.ndarray:
 
 def _continuation(equations: _Equations, viscosity: float) -> np.ndarray:
     """The solution x at this viscosity, if need be by way of higher ones."""
-    at, ratio = viscosity, 4.0
+    at = viscosity
+    ratio = 4.0
     found = _newton(equations, at)
     while found is None and at < 1e12 * viscosity:
         at *= ratio
