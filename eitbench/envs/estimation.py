@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from eitbench.physics.transport import Transport
 
 Observation = dict[str, np.ndarray]
+RESET_NEEDED = "call reset() before step(), and again when an episode has ended"
 
 
 class Revealed(NamedTuple):
@@ -36,10 +37,9 @@ class Revealed(NamedTuple):
     currents: np.ndarray
     """(T, L) A (A/m in 2D)"""
     transport: Callable[[int], Transport]
-    """t = 1 … T -> the model, on the task's mesh, with the flow that there really is from t − 1 to
-    t"""
+    """t = 1 … T -> the model, on the task's mesh, with the real flow from t − 1 to t"""
     velocity: np.ndarray
-    """(T, p) axial velocity in m/s at `VelocityModel.points`; p = 0 where the flow is not asked for"""
+    """(T, p) axial velocity in m/s at `VelocityModel.points`; p = 0 where it is not asked for"""
 
 
 class EstimationEnv(gym.Env[Observation, np.ndarray], EzPickle):
@@ -69,13 +69,16 @@ class EstimationEnv(gym.Env[Observation, np.ndarray], EzPickle):
     render_mode : None or "rgb_array"
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 8}  # noqa: RUF012 (gymnasium's own form)
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 8}  # noqa: RUF012 (gymnasium's form)
 
-    def __init__(self, name: str, *, world: dict[str, Any] | None = None, lag: int | str | None = None,
-                 assume: dict[str, Any] | None = None, episodes: int = 1000, render_mode: str | None = None) -> None:
-        EzPickle.__init__(self, name, world=world, lag=lag, assume=assume, episodes=episodes, render_mode=render_mode)
+    def __init__(self, name: str, *, world: dict[str, Any] | None = None,
+                 lag: int | str | None = None, assume: dict[str, Any] | None = None,
+                 episodes: int = 1000, render_mode: str | None = None) -> None:
+        EzPickle.__init__(self, name, world=world, lag=lag, assume=assume, episodes=episodes,
+                          render_mode=render_mode)
         if render_mode not in (None, *self.metadata["render_modes"]):
-            raise ValueError(f"render_mode must be None or one of {self.metadata['render_modes']}, got {render_mode!r}")
+            raise ValueError("render_mode must be None or one of "
+                             f"{self.metadata['render_modes']}, got {render_mode!r}")
         self.render_mode = render_mode
         self.episodes = _check.integer("episodes", episodes, low=1)
         self.spread: np.ndarray | None = None
@@ -92,14 +95,12 @@ class EstimationEnv(gym.Env[Observation, np.ndarray], EzPickle):
 
     @cached_property
     def task(self) -> Task:
-        """What the agent may know; its models are built on first use, since playing needs none of
-        them."""
+        """What the agent may know; built on first use, since playing needs none of its models."""
         return make_task(self.world, self.lag, **self._assumed)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None,
-              ) -> tuple[Observation, dict[str, Any]]:
-        """Begin the episode with this seed (see `eitbench.data.seeds`), or without one a random
-        training episode."""
+    def reset(self, *, seed: int | None = None,
+              options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
+        """Begin the episode with this seed (`eitbench.data.seeds`), or a random training one."""
         super().reset(seed=seed)
         self._seed = int(self.np_random.integers(self.episodes)) if seed is None else seed
         self._entries = recording(self.world, self._seed)
@@ -112,14 +113,13 @@ class EstimationEnv(gym.Env[Observation, np.ndarray], EzPickle):
         return self._observe(), {"step": 1}
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Take the estimate (n,) in mol/m³ of the state asked for, and the flow's (k,) in m/s where
-        it is asked for.
+        """Take the estimate of the state asked for, (n,) in mol/m³, and of the flow, (k,) in m/s.
 
-        ``ValueError`` if it is not in the action space.
+        The flow's only where it is asked for. ``ValueError`` if it is not in the action space.
         """
         last_step = self.world.n_steps + self.lag
         if self._seed is None or self._step > last_step:
-            raise gym.error.ResetNeeded("call reset() before step(), and again when an episode has ended")
+            raise gym.error.ResetNeeded(RESET_NEEDED)
         action = checked_actions(action, self.action_space, self.n_nodes)  # type: ignore[arg-type]
         estimate, parameters = np.split(action, [self.n_nodes])
         t = self._step - self.lag
@@ -127,9 +127,9 @@ class EstimationEnv(gym.Env[Observation, np.ndarray], EzPickle):
         if t >= 1:
             self._last = estimate.copy()
         if t > self.world.warm_up:
-            moments, deviations, squares = self._integrals
-            reward = -float(step_error(score_mass(self.world), estimate - self.world.background, moments[t - 1],
-                                       deviations[t - 1], squares[t - 1]))
+            integrals_then = (part[t - 1] for part in self._integrals)
+            beyond = estimate - self.world.background
+            reward = -float(step_error(score_mass(self.world), beyond, *integrals_then))
             velocity = self.world.velocity_model
             if velocity is not None:
                 entry = self._entries[t - 1]
@@ -139,38 +139,38 @@ class EstimationEnv(gym.Env[Observation, np.ndarray], EzPickle):
         return self._observe(), reward, self._step > last_step, False, {"step": self._step}
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
-        """(height, width, 3) uint8: truth, the last estimate, its spread, the electrodes and the
-        active pair."""
+        """(height, width, 3) uint8: truth, last estimate, its spread, electrodes, active pair."""
         if self.render_mode is None:
             gym.logger.warn("render() needs gym.make(..., render_mode='rgb_array')")
             return None
         from eitbench.envs.rendering import draw_frame
         t = min(max(self._step - 1 - self.lag, 0), self.world.n_steps)
         concentration = self._episode("render").concentration[t]
-        level = np.full(self.task.mesh.n_nodes, self.task.expected_concentration)
-        return draw_frame(self.task, self.truth_mesh(), concentration, level if self._last is None else self._last,
-                          self.spread, self._currents[t - 1] if t else np.zeros_like(self._currents[0]),
-                          t * self.world.time_step)
+        estimate = self._last
+        if estimate is None:
+            estimate = np.full(self.task.mesh.n_nodes, self.task.expected_concentration)
+        currents = self._currents[t - 1] if t else np.zeros_like(self._currents[0])
+        return draw_frame(self.task, self.truth_mesh(), concentration, estimate, self.spread,
+                          currents, t * self.world.time_step)
 
     def truth(self) -> np.ndarray:
-        """(T, n_truth) concentration in mol/m³ of this episode, t = 1 … T; for scoring, never for
-        agents."""
+        """(T, n_truth) concentration in mol/m³, t = 1 … T; for scoring, never for agents."""
         return self._episode("truth").concentration[1:].astype(float)
 
     def true_velocity(self) -> np.ndarray:
-        """(T, p) axial velocity in m/s at `VelocityModel.points` of this episode; for scoring,
-        never for agents."""
+        """(T, p) axial velocity in m/s at `VelocityModel.points`; for scoring, never for agents."""
         return self._episode("true_velocity").velocity
 
     def reveal(self) -> Revealed:
         """This episode's record and flow; for references, never for agents."""
-        if self._seed is None:
-            raise gym.error.ResetNeeded("call reset() before reveal()")
+        velocity = self._episode("reveal").velocity.copy()
+        assert self._seed is not None
         n_steps = self.world.n_steps
         told_nothing_wrong = make_task(self.world, self.lag)
         model = Discretisation(told_nothing_wrong.transport, told_nothing_wrong.observation)
+        transport = self.world.true_transport(model, randomness(self._seed).flow)
         return Revealed(self._voltages[:n_steps].copy(), self._currents[:n_steps].copy(),
-                        self.world.true_transport(model, randomness(self._seed).flow), self.true_velocity().copy())
+                        transport, velocity)
 
     def truth_mesh(self) -> Mesh:
         """The mesh of `truth`."""
@@ -184,15 +184,13 @@ class EstimationEnv(gym.Env[Observation, np.ndarray], EzPickle):
         return simulate(self.world, self._seed)
 
     def _observe(self) -> Observation:
-        if self._step > len(self._voltages):
-            return {"voltages": np.zeros_like(self._voltages[0]), "currents": np.zeros_like(self._voltages[0])}
-        return {"voltages": self._voltages[self._step - 1].copy(), "currents": self._currents[self._step - 1].copy()}
+        k = self._step - 1
+        return {"voltages": self._voltages[k].copy(), "currents": self._currents[k].copy()}
 
 
 def asked_for(name: str, changes: dict[str, Any] | None, lag: int | str | None,
               assumed: dict[str, Any] | None) -> tuple[World, int, dict[str, Any]]:
-    """The world, the lag, and what models believe, of an id and the arguments given for it;
-    ``ValueError`` if one of them is not allowed."""
+    """World, lag, and what models believe, of an id and its arguments; ``ValueError`` if not."""
     registered = entry(name)
     world = registered.world.changed(changes)
     if lag is None:
@@ -208,32 +206,34 @@ def asked_for(name: str, changes: dict[str, Any] | None, lag: int | str | None,
 
 def estimation_spaces(world: World) -> tuple[spaces.Dict, spaces.Box]:
     """What one environment shows and takes."""
-    stage, level = outline(world), world.expected_concentration
-    largest_voltage, largest_current = 100.0 * stage.largest_voltage, np.abs(world.currents).max()
+    stage = outline(world)
+    voltage = 100.0 * stage.largest_voltage
+    current = np.abs(world.currents).max()
     shape = world.currents.shape[1:]
-    observed = spaces.Dict({"voltages": spaces.Box(-largest_voltage, largest_voltage, shape, np.float64),
-                            "currents": spaces.Box(-largest_current, largest_current, shape, np.float64)})
-    limit, velocity = np.full(stage.mass.shape[0], 10.0 * level), world.velocity_model
+    observed = spaces.Dict({"voltages": spaces.Box(-voltage, voltage, shape, np.float64),
+                            "currents": spaces.Box(-current, current, shape, np.float64)})
+    limit = np.full(stage.mass.shape[0], 10.0 * world.expected_concentration)
+    velocity = world.velocity_model
     if velocity is not None:
         limit = np.append(limit, np.full(velocity.size, 10.0 * max(velocity.nominal)))
     return observed, spaces.Box(-limit, limit, dtype=np.float64)
 
 
 def cycle_currents(world: World, lag: int) -> np.ndarray:
-    """(T + lag, L) currents of every step: the cycle, then none."""
+    """(T + lag + 1, L) currents of every step and after the last: the cycle, then none."""
     cycle = world.currents
-    currents = np.zeros((world.n_steps + lag, cycle.shape[1]))
+    currents = np.zeros((world.n_steps + lag + 1, cycle.shape[1]))
     currents[:world.n_steps] = cycle[np.arange(world.n_steps) % len(cycle)]
     return currents
 
 
 def checked_actions(actions: np.ndarray, space: spaces.Box, n_nodes: int) -> np.ndarray:
-    """``actions`` as float64, finite and in ``space``; else a ``ValueError`` that says what is
-    wrong with them.
+    """``actions`` as float64, finite and in ``space``; else a ``ValueError`` that says what is not.
 
     The first ``n_nodes`` numbers are concentrations, the others velocities.
     """
-    plain = type(actions) is np.ndarray and actions.shape == space.shape and actions.dtype == np.float64
+    plain = (type(actions) is np.ndarray and actions.shape == space.shape
+             and actions.dtype == np.float64)
     if plain and (np.abs(actions) <= space.high).all():             # false for NaN too
         return actions
     checked = _check.array("action", actions, space.shape, units="mol/m³")
@@ -241,5 +241,6 @@ def checked_actions(actions: np.ndarray, space: spaces.Box, n_nodes: int) -> np.
     if len(outside):
         place = tuple(outside[0])
         units = "mol/m³" if place[-1] < n_nodes else "m/s"
-        raise ValueError(f"action must lie within ±{space.high[place]:g} {units}, got {abs(checked[place]):g}")
+        raise ValueError(f"action must lie within ±{space.high[place]:g} {units}, "
+                         f"got {abs(checked[place]):g}")
     return checked

@@ -22,11 +22,11 @@ TOGETHER = 16
 
 
 class EstimationVectorEnv(LockstepVectorEnv):
-    """`EstimationEnv`, many times; parameters as there and in `LockstepVectorEnv`. Rewards agree to
-    rounding."""
+    """`EstimationEnv`, many times; see there and `LockstepVectorEnv`. Rewards agree to rounding."""
 
     def __init__(self, name: str, *, num_envs: int = 1, world: dict[str, Any] | None = None,
-                 lag: int | str | None = None, assume: dict[str, Any] | None = None, episodes: int = 1000) -> None:
+                 lag: int | str | None = None, assume: dict[str, Any] | None = None,
+                 episodes: int = 1000) -> None:
         super().__init__(num_envs, episodes)
         self.world, self._lag, _ = asked_for(name, world, lag, assume)
         self._show(*estimation_spaces(self.world))
@@ -36,7 +36,7 @@ class EstimationVectorEnv(LockstepVectorEnv):
 
     def _begin(self, seeds: list[int]) -> None:
         world = self.world
-        self._voltages = np.zeros((self._length, self.num_envs, self._currents.shape[1]))
+        self._voltages = np.repeat(np.zeros_like(self._currents)[:, None], self.num_envs, axis=1)
         self._deviations, self._squares = np.empty((2, world.n_steps, self.num_envs))
         self._moments: list[np.ndarray] = []
         self._flows: list[tuple[np.ndarray, np.ndarray]] = []
@@ -47,28 +47,30 @@ class EstimationVectorEnv(LockstepVectorEnv):
             moments, self._deviations[:, k], self._squares[:, k] = integrals(world, seed, entries)
             self._moments.append(moments[world.warm_up:].copy())
             if world.velocity_model is not None:
-                self._flows.append((entries["velocity_moment"].copy(), entries["velocity_square"].copy()))
+                self._flows.append((entries["velocity_moment"].copy(),
+                                    entries["velocity_square"].copy()))
 
     def _act(self, actions: np.ndarray) -> np.ndarray:
-        checked = checked_actions(actions, self.action_space, self._n_nodes)  # type: ignore[arg-type]
-        estimates, parameters = checked[:, :self._n_nodes], checked[:, self._n_nodes:]
-        t = self._step - self._lag
-        if t <= self.world.warm_up:
+        space = self.action_space
+        checked = checked_actions(actions, space, self._n_nodes)  # type: ignore[arg-type]
+        estimates, parameters = np.split(checked, [self._n_nodes], axis=1)
+        world = self.world
+        k = self._step - self._lag - 1
+        if k < world.warm_up:
             return np.zeros(self.num_envs)
-        rewards, world = np.empty(self.num_envs), self.world
+        rewards = np.empty(self.num_envs)
         for first in range(0, self.num_envs, TOGETHER):
             part = slice(first, first + TOGETHER)
-            moments = np.stack([moments[t - 1 - world.warm_up] for moments in self._moments[part]])
-            rewards[part] = -step_error(score_mass(world), estimates[part] - world.background, moments,
-                                        self._deviations[t - 1, part], self._squares[t - 1, part])
+            moments = np.stack([moments[k - world.warm_up] for moments in self._moments[part]])
+            beyond = estimates[part] - world.background
+            rewards[part] = -step_error(score_mass(world), beyond, moments,
+                                        self._deviations[k, part], self._squares[k, part])
         if world.velocity_model is not None:
-            moments, squares = (np.stack([flow[i][t - 1] for flow in self._flows]) for i in range(2))
+            moments, squares = (np.stack([flow[i][k] for flow in self._flows]) for i in range(2))
             rewards -= velocity_error(world.velocity_model, parameters, moments, squares)
         return rewards
 
     def _observe(self) -> Observation:
-        if self._step > self._length:
-            return {"voltages": np.zeros_like(self._voltages[0]), "currents": np.zeros_like(self._voltages[0])}
         currents = self._currents[self._step - 1]
         return {"voltages": self._voltages[self._step - 1].copy(),
                 "currents": np.repeat(currents[None], self.num_envs, axis=0)}

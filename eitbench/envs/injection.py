@@ -1,4 +1,4 @@
-"""Choose the injection: at every step the agent says where the current enters and where it leaves."""
+"""Choose the injection: at every step the agent says where the current enters and leaves."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from gymnasium import spaces
 from gymnasium.utils import EzPickle
 
 from eitbench import _check
+from eitbench.envs.estimation import RESET_NEEDED
 from eitbench.envs.injection_core import FURTHEST, InjectionCore, scaled
 from eitbench.envs.lockstep import LockstepVectorEnv
 from eitbench.estimation.onboard.rules import Rules
@@ -33,11 +34,8 @@ class InjectionEnv(gym.Env[Any, Any], EzPickle):
 
     Parameters
     ----------
-    name : str
-        A registered id; `eitbench.worlds.register`.
-    world : dict, optional
-        Numbers of the world's parts to change, as in ``{"schedule": {"budget": 20}}``; see
-        `World.changed`.
+    name, world, episodes, render_mode
+        As in `EstimationEnv`.
     estimator : "reduced", "full" or "none"
         "reduced": a Kalman filter of reduced order, for training. "full": the exact one, for
         scores. The first frame is measured with the world's own cycle, from which ĉ_bh and the
@@ -49,18 +47,16 @@ class InjectionEnv(gym.Env[Any, Any], EzPickle):
     gate : float, optional
         The filter leaves out readings further from its prediction than so many standard deviations;
         default: as the id says, or none.
-    episodes : int
-        How many training episodes an unseeded ``reset`` draws from.
-    render_mode : "rgb_array" or None
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 8}  # noqa: RUF012 (gymnasium's own form)
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 8}  # noqa: RUF012 (gymnasium's form)
 
-    def __init__(self, name: str, *, world: dict[str, Any] | None = None, estimator: str = "reduced",
-                 observation: str = "scaled", gate: float | None = None, episodes: int = 1000,
+    def __init__(self, name: str, *, world: dict[str, Any] | None = None,
+                 estimator: str = "reduced", observation: str = "scaled",
+                 gate: float | None = None, episodes: int = 1000,
                  render_mode: str | None = None) -> None:
-        EzPickle.__init__(self, name, world=world, estimator=estimator, observation=observation, gate=gate,
-                          episodes=episodes, render_mode=render_mode)
+        EzPickle.__init__(self, name, world=world, estimator=estimator, observation=observation,
+                          gate=gate, episodes=episodes, render_mode=render_mode)
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be 'rgb_array' or None, got {render_mode!r}")
         self.render_mode = render_mode
@@ -70,16 +66,17 @@ class InjectionEnv(gym.Env[Any, Any], EzPickle):
         self._core = InjectionCore(self.rules, estimator)
         self._scaled = check_observation(observation, estimator)
         self.observation_space, self.action_space = spaces_of(self._core, self._scaled)
-        self._step, self._seed = 0, -1
+        self._step = 0
+        self._seed = -1
 
     @cached_property
     def task(self) -> Task:
         """What an estimator of one's own may know; built on first use."""
         return make_task(self.world)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Begin the episode with this seed (see `eitbench.data.seeds`), or without one a random
-        training episode."""
+    def reset(self, *, seed: int | None = None,
+              options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begin the episode with this seed (`eitbench.data.seeds`), or a random training one."""
         super().reset(seed=seed)
         self._seed = int(self.np_random.integers(self.episodes)) if seed is None else seed
         self._core.begin([self._seed])
@@ -87,20 +84,20 @@ class InjectionEnv(gym.Env[Any, Any], EzPickle):
         return self._observe(), {"step": 1}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Inject what the action asks for and measure; ``ValueError`` if there is no such action."""
+        """Inject what the action asks for, and measure; ``ValueError`` if there is no such one."""
         if not 1 <= self._step <= self._core.length:
-            raise gym.error.ResetNeeded("call reset() before step(), and again when an episode has ended")
-        if isinstance(self.action_space, spaces.Discrete):
-            chosen = np.array([_check.integer("action", action, low=0, high=int(self.action_space.n) - 1)])
+            raise gym.error.ResetNeeded(RESET_NEEDED)
+        space = self.action_space
+        if isinstance(space, spaces.Discrete):
+            chosen = np.array([_check.integer("action", action, low=0, high=int(space.n) - 1)])
         else:
-            chosen = _check.array("action", action, self.action_space.shape)[None]  # type: ignore[arg-type]
+            chosen = _check.array("action", action, space.shape)[None]  # type: ignore[arg-type]
         reward = float(self._core.act(chosen)[0])
         self._step += 1
         return self._observe(), reward, self._step > self._core.length, False, {"step": self._step}
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
-        """(height, width, 3) uint8 picture of truth, estimate, spread and the last injection; None
-        without a mode."""
+        """(height, width, 3) uint8: truth, estimate, spread, injection; None without a mode."""
         if self.render_mode is None:
             gym.logger.warn("render() needs gym.make(..., render_mode='rgb_array')")
             return None
@@ -108,14 +105,15 @@ class InjectionEnv(gym.Env[Any, Any], EzPickle):
             raise gym.error.ResetNeeded("call reset() before render()")
         from eitbench.data.episodes import simulate, truth_discretisation
         from eitbench.envs.rendering import draw_frame
-        mean, spread, t = *self._core.estimate(), self._core.first + self._step - 1
+        mean, spread = self._core.estimate()
+        t = self._core.first + self._step - 1
         truth = simulate(self.world, self._seed).concentration[t].astype(float)
-        return draw_frame(self.task, truth_discretisation(self.world).transport.mesh, truth, mean[0], spread[0],
-                          self._core.last_currents[0], t * self.world.time_step, self.world.region)
+        return draw_frame(self.task, truth_discretisation(self.world).transport.mesh, truth,
+                          mean[0], spread[0], self._core.last_currents[0],
+                          t * self.world.time_step, self.world.region)
 
     def action_masks(self) -> np.ndarray:
-        """(actions,) which numbered actions do something: with the budget spent only the last, no
-        injection."""
+        """(actions,) which numbers do something: with the budget spent the last, no injection."""
         return self._core.action_masks()[0]
 
     @property
@@ -125,8 +123,10 @@ class InjectionEnv(gym.Env[Any, Any], EzPickle):
 
     @property
     def error(self) -> float | None:
-        """Relative error (5.12) of the present estimate; None if this state is not scored, or
-        nothing estimates. ``ResetNeeded`` before the first episode."""
+        """Relative error (5.12) of the present estimate; None if it is not scored, or nobody's.
+
+        ``ResetNeeded`` before the first episode.
+        """
         if self._step == 0:
             raise gym.error.ResetNeeded("call reset() before error")
         error = float(self._core.errors()[0])
@@ -137,9 +137,9 @@ class InjectionEnv(gym.Env[Any, Any], EzPickle):
         return scaled(self.rules, seen) if self._scaled else seen
 
 
-def asked_for(name: str, changes: dict[str, Any] | None, gate: float | None, estimator: str) -> Rules:
-    """The rules of an id and the arguments given for it; ``ValueError`` if one of them is not
-    allowed."""
+def asked_for(name: str, changes: dict[str, Any] | None, gate: float | None,
+              estimator: str) -> Rules:
+    """The rules of an id and its arguments; ``ValueError`` if one of them is not allowed."""
     registered = entry(name)
     if gate is None:
         gate = registered.settings.get("gate", np.inf)
@@ -149,16 +149,18 @@ def asked_for(name: str, changes: dict[str, Any] | None, gate: float | None, est
 def check_observation(observation: str, estimator: str) -> bool:
     """Whether observations are to be scaled; without an estimator they are raw."""
     if observation not in OBSERVATIONS:
-        raise ValueError(f"observation must be one of {', '.join(OBSERVATIONS)}, got {observation!r}")
+        known = ", ".join(OBSERVATIONS)
+        raise ValueError(f"observation must be one of {known}, got {observation!r}")
     return observation == "scaled" and estimator != "none"
 
 
 def spaces_of(core: InjectionCore, is_scaled: bool) -> tuple[spaces.Space, spaces.Space]:
     """What one environment shows and takes."""
-    shown: spaces.Space = core.space()
-    if is_scaled:
-        zeros: Observation = {name: np.zeros(space.shape or ()) for name, space in core.space().items()}
-        shown = spaces.Box(-FURTHEST, FURTHEST, scaled(core.rules, zeros).shape, np.float32)
+    raw = core.space()
+    if not is_scaled:
+        return raw, core.rules.action_space
+    zeros: Observation = {name: np.zeros(space.shape or ()) for name, space in raw.items()}
+    shown = spaces.Box(-FURTHEST, FURTHEST, scaled(core.rules, zeros).shape, np.float32)
     return shown, core.rules.action_space
 
 
@@ -183,7 +185,8 @@ class InjectionVectorEnv(LockstepVectorEnv):
         size = num_envs if estimator == "none" else max(1, min(16, -(-num_envs // threads)))
         self._parts = [slice(first, first + size) for first in range(0, num_envs, size)]
         self._cores = [InjectionCore(rules, estimator) for _ in self._parts]
-        self._length, self._scaled = self._cores[0].length, check_observation(observation, estimator)
+        self._length = self._cores[0].length
+        self._scaled = check_observation(observation, estimator)
         self._show(*spaces_of(self._cores[0], self._scaled))
         self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
         self._map = self._pool.map if self._pool else map
@@ -203,8 +206,7 @@ class InjectionVectorEnv(LockstepVectorEnv):
         return np.concatenate([core.action_masks() for core in self._cores])
 
     def errors(self) -> np.ndarray:
-        """(num_envs,) relative errors (5.12) of the present estimates, not a number where the state
-        is not scored; for scoring, never for agents."""
+        """(num_envs,) relative errors (5.12), NaN if not scored; for scoring, never for agents."""
         return np.concatenate([core.errors() for core in self._cores])
 
     def _begin(self, seeds: list[int]) -> None:
@@ -212,19 +214,23 @@ class InjectionVectorEnv(LockstepVectorEnv):
             core.begin(seeds[part])
 
     def _act(self, actions: np.ndarray) -> np.ndarray:
-        chosen, space = np.asarray(actions), self.single_action_space
+        chosen = np.asarray(actions)
+        space = self.single_action_space
         if isinstance(space, spaces.Box):
             chosen = _check.array("actions", chosen, (self.num_envs, *space.shape))
         else:
             assert isinstance(space, spaces.Discrete)
             if chosen.shape != (self.num_envs,) or not np.issubdtype(chosen.dtype, np.integer):
-                raise ValueError(f"actions must be integers of shape ({self.num_envs},), got {chosen.dtype} of shape "
-                                 f"{chosen.shape}")
+                raise ValueError(f"actions must be integers of shape ({self.num_envs},), "
+                                 f"got {chosen.dtype} of shape {chosen.shape}")
             if chosen.min() < 0 or chosen.max() >= space.n:
-                raise ValueError(f"actions must lie in [0, {space.n - 1}], got {chosen.min()} … {chosen.max()}")
-        return np.concatenate(list(self._map(InjectionCore.act, self._cores, [chosen[part] for part in self._parts])))
+                raise ValueError(f"actions must lie in [0, {space.n - 1}], "
+                                 f"got {chosen.min()} … {chosen.max()}")
+        by_core = [chosen[part] for part in self._parts]
+        return np.concatenate(list(self._map(InjectionCore.act, self._cores, by_core)))
 
     def _observe(self) -> Any:
         shown = list(self._map(InjectionCore.observe, self._cores))
-        seen: Observation = {name: np.concatenate([part[name] for part in shown]) for name in shown[0]}
+        seen: Observation = {name: np.concatenate([part[name] for part in shown])
+                             for name in shown[0]}
         return scaled(self.rules, seen) if self._scaled else seen

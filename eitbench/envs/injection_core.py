@@ -24,8 +24,9 @@ if TYPE_CHECKING:
 FURTHEST = 5.0
 """Largest entry of a scaled observation."""
 OPERATORS: dict[str, tuple[type[Operator], type[Operator]] | None] = {
-    "reduced": (ReducedOperator, JointReducedOperator), "full": (FullOperator, JointFullOperator), "none": None}
-"""Estimators by name: where the flow is known, and where its mean velocity is to be estimated too."""
+    "reduced": (ReducedOperator, JointReducedOperator), "full": (FullOperator, JointFullOperator),
+    "none": None}
+"""Estimators by name: where the flow is known, and where its mean is to be estimated too."""
 RECENT = 4
 """Injections that an observation remembers."""
 
@@ -48,12 +49,15 @@ def scaled(rules: Rules, observation: Observation) -> np.ndarray:
     """
     world, level = rules.world, rules.world.expected_concentration
     left = np.array([world.n_steps, rules.budget or 1][:observation["left"].shape[-1]])
-    parts = [observation["voltages"] / outline(world).largest_voltage, observation["recent"] / rules.amplitude,
+    parts = [observation["voltages"] / outline(world).largest_voltage,
+             observation["recent"] / rules.amplitude,
              observation["innovations"] / 3.0, 2.0 * (observation["mean"] / level - 1.0),
-             observation["std"] / (world.prior.inflow_std * level), observation["doubt"], observation["left"] / left]
+             observation["std"] / (world.prior.inflow_std * level), observation["doubt"],
+             observation["left"] / left]
     if world.velocity_model is not None:
         flow = world.velocity_model
-        parts += [2.0 * (observation["velocity"] / flow.nominal - 1.0), observation["velocity_std"] / flow.initial_std]
+        parts += [2.0 * (observation["velocity"] / flow.nominal - 1.0),
+                  observation["velocity_std"] / flow.initial_std]
     batch = observation["voltages"].shape[:-1]
     flat = np.concatenate([part.reshape(*batch, -1) for part in parts], axis=-1)
     return np.clip(flat, -FURTHEST, FURTHEST).astype(np.float32)
@@ -84,8 +88,9 @@ class InjectionCore:
         L, level = world.currents.shape[1], world.expected_concentration
         # "L2" goes up to √2
         largest, current = 1e3 * outline(world).largest_voltage, 1.5 * rules.amplitude
-        shown: dict[str, spaces.Space] = {"voltages": spaces.Box(-largest, largest, (L,), np.float64),
-                                          "currents": spaces.Box(-current, current, (L,), np.float64)}
+        shown: dict[str, spaces.Space] = {
+            "voltages": spaces.Box(-largest, largest, (L,), np.float64),
+            "currents": spaces.Box(-current, current, (L,), np.float64)}
         if self._operator_type:
             columns, rows = world.vessel.patches
             patches = (columns * rows,)
@@ -96,11 +101,13 @@ class InjectionCore:
                       "std": spaces.Box(0.0, 1e3 * level, patches, np.float64),
                       "doubt": spaces.Box(0.0, 1.0, (2, L), np.float64)}
             if world.velocity_model is not None:
-                k, fastest = world.velocity_model.size, 100.0 * max(world.velocity_model.nominal)
+                k = world.velocity_model.size
+                fastest = 100.0 * max(world.velocity_model.nominal)
                 shown |= {"velocity": spaces.Box(-fastest, fastest, (k,), np.float64),
                           "velocity_std": spaces.Box(0.0, fastest, (k,), np.float64)}
         left = [world.n_steps] if rules.budget is None else [world.n_steps, rules.budget]
-        shown["left"] = spaces.Box(np.zeros(len(left)), np.array(left, dtype=float), dtype=np.float64)
+        shown["left"] = spaces.Box(np.zeros(len(left)), np.array(left, dtype=float),
+                                   dtype=np.float64)
         return spaces.Dict(shown)
 
     def begin(self, seeds: Sequence[int]) -> None:
@@ -116,7 +123,8 @@ class InjectionCore:
         # all is copied: a mapped file is open, and there may be more than may be
         for k, seed in enumerate(seeds):
             entries = recording(world, seed)
-            self._resistance[:, k], self._draws[:, k] = entries["transfer_resistance"], entries["noise"]
+            self._resistance[:, k] = entries["transfer_resistance"]
+            self._draws[:, k] = entries["noise"]
             moment, self._deviations[k], self._squares[k] = integrals(world, seed, entries)
             totals[k] = moment.sum(axis=1, dtype=float)
             faults.append(faults_of(world, seed))
@@ -136,11 +144,13 @@ class InjectionCore:
             self._recent[:, k] = world.currents[(self.first - 1 - k) % self.first]
         level = self._operator.concentration[:, None] - world.background
         area = score_mass(world).sum()
-        self._homogeneous = (area * level**2 - 2.0 * level * totals + self._deviations) / self._squares
+        error = area * level**2 - 2.0 * level * totals + self._deviations
+        self._homogeneous = error / self._squares
 
     def _measure(self, k: int, currents: np.ndarray) -> np.ndarray:
         """(B, L) voltages of injection t = k + 1."""
-        return self.rules.instrument.measure(self._faults, k + 1, self._resistance[k], currents, self._draws[k])
+        return self.rules.instrument.measure(self._faults, k + 1, self._resistance[k], currents,
+                                             self._draws[k])
 
     def act(self, actions: np.ndarray) -> np.ndarray:
         """Inject what actions (B,) or (B, L) ask for and return the rewards (B,)."""
@@ -158,8 +168,10 @@ class InjectionCore:
             return np.zeros(len(currents))
         rewards = self._homogeneous[:, self._t - 1] - self.errors()
         if not np.isfinite(rewards).all():
-            broken = [seed for seed, reward in zip(self.seeds, rewards, strict=True) if not np.isfinite(reward)]
-            raise FloatingPointError(f"the estimate of state {self._t} is not finite in the episodes {broken}")
+            broken = [seed for seed, reward in zip(self.seeds, rewards, strict=True)
+                      if not np.isfinite(reward)]
+            raise FloatingPointError(f"the estimate of state {self._t} is not finite in the "
+                                     f"episodes {broken}")
         return np.asarray(rewards)
 
     def errors(self) -> np.ndarray:
@@ -168,14 +180,15 @@ class InjectionCore:
         if self._t <= self.world.warm_up or not self._operator_type:
             return np.full(len(self._spent), np.nan)
         k = self._t - 1
-        return self._operator.errors(self._moments[:, k], self._deviations[:, k], self._squares[:, k])
+        return self._operator.errors(self._moments[:, k], self._deviations[:, k],
+                                     self._squares[:, k])
 
     def estimate(self) -> tuple[np.ndarray, np.ndarray]:
         """Present means and standard deviations (B, n) in mol/m³; without an estimator the expected
         level and zero."""
         if not self._operator_type:
-            n, level = outline(self.world).mass.shape[0], self.world.expected_concentration
-            return np.full((len(self._spent), n), level), np.zeros((len(self._spent), n))
+            shape = (len(self._spent), outline(self.world).mass.shape[0])
+            return np.full(shape, self.world.expected_concentration), np.zeros(shape)
         return self._operator.means(), self._operator.spreads()
 
     @property
@@ -202,7 +215,8 @@ class InjectionCore:
         """(B, actions) which numbered actions do something: with the budget spent only the last, no
         injection."""
         if self._table is None:
-            raise ValueError("action_masks is for environments whose actions are numbers; here they are currents")
+            raise ValueError("action_masks is for environments whose actions are numbers; here "
+                             "they are currents")
         masks = np.ones((len(self._spent), len(self._table)), dtype=bool)
         if self.rules.budget is not None:
             masks[self._spent >= self.rules.budget, :-1] = False
@@ -213,7 +227,8 @@ class InjectionCore:
         (B, …)."""
         shown = {"voltages": self._voltages.copy(), "currents": self._currents.copy()}
         if self._operator_type:
-            shown |= {"recent": self._recent.copy(), "frame": self._frames.copy()} | self._console.shown()
+            shown |= {"recent": self._recent.copy(), "frame": self._frames.copy()}
+            shown |= self._console.shown()
         left = [np.full(len(self._spent), float(self.world.n_steps - self._t))]
         if self.rules.budget is not None:
             left.append(self.rules.budget - self._spent.astype(float))

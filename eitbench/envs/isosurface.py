@@ -11,13 +11,12 @@ from eitbench.numerics.mesh import Mesh
 from eitbench.physics.cem import CompleteElectrodeModel
 
 RICH, POOR = "#e08e0b", "#2f6db5"
-_EYE = np.linalg.qr(np.array([[0.30, 0.0, 1.0], [0.22, 1.0, 0.0], [0.9, -0.3, -0.3]]).T)[0].T * [[-1.0], [-1.0], [-1.0]]
+_EYE = -np.linalg.qr(np.array([[0.30, 0.0, 1.0], [0.22, 1.0, 0.0], [0.9, -0.3, -0.3]]).T)[0].T
 """Rows: what is right, up and near on the picture; the pipe's axis z runs to the right."""
 
 
 def isosurface(mesh: Mesh, values: np.ndarray, level: float) -> np.ndarray:
-    """(k, 3, 3) corners in m of the triangles on which the linear interpolant of nodal ``values``
-    is ``level``.
+    """(k, 3, 3) corners in m of triangles on which linearly interpolated ``values`` are ``level``.
 
     A tetrahedron with one corner on either side of the level is cut in a triangle, one with two in
     a quadrilateral, given as two triangles.
@@ -42,8 +41,7 @@ def isosurface(mesh: Mesh, values: np.ndarray, level: float) -> np.ndarray:
 
 
 def draw_isosurfaces(axes: Axes, mesh: Mesh, values: np.ndarray, poor: float, rich: float) -> None:
-    """Surfaces where the concentration is ``poor`` (blue) and ``rich`` (orange), mol/m³, in the
-    outline of the pipe."""
+    """Surfaces of ``poor`` (blue) and ``rich`` (orange) mol/m³ in the outline of the pipe."""
     surfaces = [isosurface(mesh, values, level) for level in (poor, rich)]
     _draw(axes, np.concatenate(surfaces), np.repeat([POOR, RICH], list(map(len, surfaces))), 0.5)
     _outline(axes, mesh)
@@ -61,7 +59,7 @@ def draw_electrodes_in_space(axes: Axes, cem: CompleteElectrodeModel, currents: 
 
 
 def _draw(axes: Axes, triangles: np.ndarray, colours: np.ndarray, alpha: float) -> None:
-    """Triangles (k, 3, 3) in m as seen by `_EYE`, the furthest first, shaded by how they face it."""
+    """Triangles (k, 3, 3) in m as `_EYE` sees them, the furthest first, shaded by their facing."""
     if not len(triangles):
         return
     seen = 100.0 * triangles @ _EYE.T
@@ -70,14 +68,17 @@ def _draw(axes: Axes, triangles: np.ndarray, colours: np.ndarray, alpha: float) 
     shaded = to_rgba_array(colours.tolist(), alpha)
     shaded[:, :3] *= (0.55 + 0.45 * facing)[:, None]
     order = np.argsort(seen[:, :, 2].mean(axis=1))
-    axes.add_collection(PolyCollection(list(seen[order, :, :2]), facecolors=shaded[order], edgecolors="none"))
+    axes.add_collection(PolyCollection(list(seen[order, :, :2]), facecolors=shaded[order],
+                                       edgecolors="none"))
 
 
 def _outline(axes: Axes, mesh: Mesh) -> None:
     """Both ends of the pipe and two lines between them."""
     low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
-    angle, radius = np.linspace(0.0, 2.0 * np.pi, 61), 0.5 * (high - low)[0]
-    ends = [100.0 * np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full_like(angle, z)], axis=1) @ _EYE.T
+    angle = np.linspace(0.0, 2.0 * np.pi, 61)
+    radius = 0.5 * (high - low)[0]
+    x, y = radius * np.cos(angle), radius * np.sin(angle)
+    ends = [100.0 * np.stack([x, y, np.full_like(angle, z)], axis=1) @ _EYE.T
             for z in (low[2], high[2])]
     for end in ends:
         axes.plot(end[:, 0], end[:, 1], color="0.5", linewidth=0.8)

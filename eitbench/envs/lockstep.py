@@ -28,34 +28,38 @@ class LockstepVectorEnv(gym.vector.VectorEnv[Observation, np.ndarray, np.ndarray
         How many training episodes an unseeded reset draws from.
     """
 
-    metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012 (gymnasium's own form)
+    metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
 
     def __init__(self, num_envs: int, episodes: int) -> None:
         self.num_envs = _check.integer("num_envs", num_envs, low=1)
         self.episodes = _check.integer("episodes", episodes, low=1)
         self._randoms: list[np.random.Generator | None] = [None] * num_envs
-        self._step, self._ended = 0, False
+        self._step = 0
+        self._ended = False
 
     def _show(self, observation_space: gym.Space, action_space: gym.Space) -> None:
         """Say what one environment shows and takes."""
-        self.single_observation_space, self.single_action_space = observation_space, action_space
+        self.single_observation_space = observation_space
+        self.single_action_space = action_space
         self.observation_space = batch_space(observation_space, self.num_envs)
         self.action_space = batch_space(action_space, self.num_envs)
 
-    def reset(self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None,
-              ) -> tuple[Observation, dict[str, Any]]:
-        """Begin episodes seed, seed + 1, …, or those of a list; without a seed random training
-        episodes."""
+    def reset(self, *, seed: int | list[int | None] | None = None,
+              options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
+        """Begin episodes seed, seed + 1, …, or those of a list; or random training episodes."""
         if options and "reset_mask" in options:
-            raise ValueError("options must not hold 'reset_mask': all environments begin and end together")
+            raise ValueError("options must not hold 'reset_mask': all environments begin and end "
+                             "together")
         chosen = []
         for k, one in enumerate(self._seeds(seed)):
             if one is not None or self._randoms[k] is None:
                 self._randoms[k] = seeding.np_random(one)[0]
             random = self._randoms[k]
-            chosen.append(int(random.integers(self.episodes)) if one is None else one)  # type: ignore[union-attr]
+            assert random is not None
+            chosen.append(int(random.integers(self.episodes)) if one is None else one)
         self._begin(chosen)
-        self._step, self._ended = 1, False
+        self._step = 1
+        self._ended = False
         return self._observe(), self._info()
 
     def _seeds(self, seed: int | list[int | None] | None) -> list[int | None]:
@@ -65,12 +69,13 @@ class LockstepVectorEnv(gym.vector.VectorEnv[Observation, np.ndarray, np.ndarray
             first = _check.integer("seed", seed, low=0)
             return [first + k for k in range(self.num_envs)]
         if len(seed) != self.num_envs:
-            raise ValueError(f"seed must be an integer or a list of {self.num_envs}, got {len(seed)} entries")
+            raise ValueError(f"seed must be an integer or a list of {self.num_envs}, "
+                             f"got {len(seed)} entries")
         return [None if one is None else _check.integer("seed", one, low=0) for one in seed]
 
-    def step(self, actions: np.ndarray) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """One step of every environment; after an episode's end the actions are ignored and the
-        next one begins."""
+    def step(self, actions: np.ndarray,
+             ) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """One step of each environment; after an episode's end, whatever the actions, a new one."""
         if self._step == 0:
             raise gym.error.ResetNeeded("call reset() before step()")
         nothing = np.zeros(self.num_envs, dtype=bool)

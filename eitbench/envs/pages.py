@@ -1,5 +1,4 @@
-"""The page of an environment: what the world says of itself, and the sizes of what its objects
-really are."""
+"""The page of an environment: what the world says of itself, and the sizes of its objects."""
 
 from __future__ import annotations
 
@@ -38,16 +37,16 @@ ESTIMATION_ARGUMENTS = """
 |---|---|---|
 | `lag` | {lag} | an integer from 0 to {last}, or "all" (= {last}): whole record first |
 | `assume` | None | dict of what the task's model wrongly believes of the flow |
-| `world` | None | dict of numbers to change, as in `{{"instrument": {{"noise_relative": 0.02}}}}`; see below |
+| `world` | None | numbers to change, as in `{{"instrument": {{"noise_relative": 0.02}}}}` |
 | `episodes` | 1000 | number of training episodes for unseeded resets |
 | `render_mode` | None | "rgb_array": truth, estimate, spread and active pair |
 """
 INJECTION_ARGUMENTS = """
 | name | default | meaning |
 |---|---|---|
-| `estimator` | "reduced" | "reduced": a filter with few states, for training; "full": the exact one; "none" |
+| `estimator` | "reduced" | a filter with few states, for training; "full": the exact one; "none" |
 | `observation` | "scaled" | or "raw" |
-| `gate` | {gate} | standard deviations beyond which the filter does not believe a reading; None: it believes all |
+| `gate` | {gate} | standard deviations beyond which no reading is believed; None: all are |
 | `world` | None | dict of numbers to change, as in `{{"schedule": {{"budget": 20}}}}`; see below |
 | `episodes` | 1000 | number of training episodes for unseeded resets |
 | `render_mode` | None | "rgb_array": truth, estimate, spread, injection |
@@ -56,14 +55,14 @@ INJECTION_ARGUMENTS = """
 
 
 def page(id: str) -> str:
-    """Markdown: what a registered environment asks for, shows, pays, and takes; ``ValueError`` if
-    there is none."""
+    """Markdown: what an environment asks for, shows, pays, and takes; ``ValueError`` if none."""
     registered = entry(id)
     env: Any = gym.make(id, disable_env_checker=True).unwrapped
     parts = _estimation(env) if registered.track == "estimation" else _injection(env)
     numbers = _numbers(registered.world)
     sections = {"Description": registered.about.strip(), **parts, "Numbers of the world": numbers}
-    return "\n\n".join(f"## {heading}\n\n{text.strip()}" for heading, text in sections.items()) + "\n"
+    texts = [f"## {heading}\n\n{text.strip()}" for heading, text in sections.items()]
+    return "\n\n".join(texts) + "\n"
 
 
 def _estimation(env: EstimationEnv) -> dict[str, str]:
@@ -76,15 +75,17 @@ def _estimation(env: EstimationEnv) -> dict[str, str]:
         reward += " − ∫(v̂_t − v_t)² dy / ∫v_t² dy"
     first = world.warm_up + 1
     return {
-        "Action space": f"`{_short(env.action_space)}`: {asked}. Ignored while nothing is asked for yet.",
+        "Action space": f"`{_short(env.action_space)}`: {asked}. Ignored while nothing is asked "
+                        "for yet.",
         "Observation space": "`Dict`, zeros once the record has been played:\n\n"
                              + _table(env.observation_space, world),
         "Reward": f"{reward} for the {world.schedule.scored_steps} scored states "
                   f"t = {first} … {world.n_steps}, else 0: minus the mean of "
                   "the first term over the scored states is ẽ_c (thesis 5.12).",
-        "Starting state": f"{_flowing(world)}`reset(seed=s)` plays episode s (train, dev and test have ranges of their "
-                          "own); without a seed a random one of the first `episodes` training episodes. The first use "
-                          "of a seed simulates its truth, which is then kept on disk; `eitbench bank` does so for many "
+        "Starting state": f"{_flowing(world)}`reset(seed=s)` plays episode s (train, dev and test "
+                          "have ranges of their own); without a seed a random one of the first "
+                          "`episodes` training episodes. The first use of a seed simulates its "
+                          "truth, which is then kept on disk; `eitbench bank` does so for many "
                           "seeds ahead of time.",
         "Episode end": f"Terminated after {world.n_steps + env.lag} steps. Never truncated.",
         "Arguments": ESTIMATION_ARGUMENTS.format(lag=env.lag, last=world.n_steps - 1)}
@@ -94,29 +95,33 @@ def _injection(env: InjectionEnv) -> dict[str, str]:
     world = env.world
     rules = env.rules
     if isinstance(env.action_space, spaces.Discrete):
-        actions = (f"`Discrete({env.action_space.n})`: electrode pairs (0, 1), (0, 2), … (`electrode_pairs`); current "
-                   "enters at the first and leaves at the second.")
+        actions = (f"`Discrete({env.action_space.n})`: electrode pairs (0, 1), (0, 2), … "
+                   "(`electrode_pairs`); current enters at the first and leaves at the second.")
         actions += " The last action is no injection." if rules.budget is not None else ""
     else:
-        actions = f"`{_short(env.action_space)}`: a current for each electrode, in parts of the instrument's."
-    raw = env.core.space()
-    over = "" if world.region is None else f" over {world.region[0]:g} … {world.region[1]:g} m along the pipe"
-    alone = world.n_steps
+        actions = (f"`{_short(env.action_space)}`: a current for each electrode, in parts of the "
+                   "instrument's.")
+    over = ""
+    if world.region is not None:
+        over = " over {:g} … {:g} m along the pipe".format(*world.region)
+    gate = f"{rules.gate:g}" if rules.gate < 1e300 else None
     return {
         "Action space": actions,
-        "Observation space": f"`{_short(env.observation_space)}`, about between −1 and 1; with `observation=\"raw\"` a "
-                             f"dict in SI units, `float64`:\n\n{_table(raw, world)}\n\nWith `estimator=\"none\"` "
+        "Observation space": f"`{_short(env.observation_space)}`, about between −1 and 1; with "
+                             "`observation=\"raw\"` a dict in SI units, `float64`:\n\n"
+                             f"{_table(env.core.space(), world)}\n\nWith `estimator=\"none\"` "
                              "`voltages`, `currents` and `left` only, raw.",
-        "Reward": f"For the {world.schedule.scored_steps} scored states, else 0: ∫(ĉ_bh − c_t)² dΩ / ∫c_t² dΩ − "
-                  f"∫(ĉ_t − c_t)² dΩ / ∫c_t² dΩ{over}, by how much the error lies below that of the homogeneous "
-                  "estimate, which no injection can change. The score is ẽ_c (thesis 5.12), the mean of the second "
-                  "term. With `estimator=\"none\"` the reward is always 0.",
-        "Starting state": f"{_flowing(world)}The first {env.core.first} injections are the world's own "
-                          "cycle; the agent takes over after them. With `estimator=\"none\"` it "
-                          "chooses from the first one on.",
-        "Episode end": f"Terminated after {env.core.length} steps ({alone} with `estimator=\"none\"`). "
-                       "Never truncated.",
-        "Arguments": INJECTION_ARGUMENTS.format(gate=f"{rules.gate:g}" if rules.gate < 1e300 else None)}
+        "Reward": f"For the {world.schedule.scored_steps} scored states, else 0: "
+                  f"∫(ĉ_bh − c_t)² dΩ / ∫c_t² dΩ − ∫(ĉ_t − c_t)² dΩ / ∫c_t² dΩ{over}, by how much "
+                  "the error lies below that of the homogeneous estimate, which no injection can "
+                  "change. The score is ẽ_c (thesis 5.12), the mean of the second term. With "
+                  "`estimator=\"none\"` the reward is always 0.",
+        "Starting state": f"{_flowing(world)}The first {env.core.first} injections are the world's "
+                          "own cycle; the agent takes over after them. With `estimator=\"none\"` "
+                          "it chooses from the first one on.",
+        "Episode end": f"Terminated after {env.core.length} steps ({world.n_steps} with "
+                       "`estimator=\"none\"`). Never truncated.",
+        "Arguments": INJECTION_ARGUMENTS.format(gate=gate)}
 
 
 def _flowing(world: World) -> str:
@@ -157,7 +162,8 @@ def _rows(name: str, value: Any, meaning: str) -> list[str]:
     said = _meanings(kind)
     return [f"| `{name}` | {kind.__name__} | {first} |",
             *(row for each in fields(value)
-              for row in _rows(f"{name}.{each.name}", getattr(value, each.name), said.get(each.name, "")))]
+              for row in _rows(f"{name}.{each.name}", getattr(value, each.name),
+                               said.get(each.name, "")))]
 
 
 @lru_cache(maxsize=64)

@@ -25,19 +25,20 @@ def colour_range(task: Task) -> tuple[float, float]:
     return 0.6 * task.expected_concentration, 1.8 * task.expected_concentration
 
 
-def draw_field(axes: Axes, mesh: Mesh, values: np.ndarray, low: float, high: float, colours: str = FIELD_MAP):
-    """Nodal ``values`` as smooth colours with equal aspect, axes in cm; returns the mappable for a
-    colour bar.
+def draw_field(axes: Axes, mesh: Mesh, values: np.ndarray, low: float, high: float,
+               colours: str = FIELD_MAP):
+    """Nodal ``values`` as smooth colours, axes in cm; returns the mappable for a colour bar.
 
     In 3D the slice x = 0 is drawn, z to the right.
     """
     if mesh.dim == 3:
         mesh, onto = _slice(mesh)
         values = onto @ values
-    triangles = Triangulation(100 * mesh.points[:, 0], 100 * mesh.points[:, 1], mesh.cells)
-    mappable = axes.tripcolor(triangles, values, shading="gouraud", cmap=colours, vmin=low, vmax=high)
+    x, y = 100 * mesh.points.T
+    mappable = axes.tripcolor(Triangulation(x, y, mesh.cells), values, shading="gouraud",
+                              cmap=colours, vmin=low, vmax=high)
     axes.set_aspect("equal")
-    axes.set(xlim=(triangles.x.min(), triangles.x.max()), ylim=(triangles.y.min(), triangles.y.max()), ylabel="y / cm")
+    axes.set(xlim=(x.min(), x.max()), ylim=(y.min(), y.max()), ylabel="y / cm")
     return mappable
 
 
@@ -46,12 +47,12 @@ def _slice(mesh: Mesh) -> tuple[Mesh, sp.csr_array]:
     """The slice x = 0 of a pipe along z as a mesh in (z, y), and the interpolation onto it."""
     (_, low, begin), (_, high, end) = mesh.points.min(axis=0), mesh.points.max(axis=0)
     flat = rectangle_mesh(np.linspace(begin, end, 161), np.linspace(low, high, 41))
-    return flat, mesh.interpolation_to(np.column_stack([np.zeros(flat.n_nodes), flat.points[:, 1], flat.points[:, 0]]))
+    z, y = flat.points.T
+    return flat, mesh.interpolation_to(np.column_stack([np.zeros(flat.n_nodes), y, z]))
 
 
 def draw_electrodes(axes: Axes, task: Task, currents: np.ndarray, width: float = 5.0) -> None:
-    """Electrodes as bars on the wall: the source red, the sink blue, the others grey; in 3D those
-    at the slice."""
+    """Electrodes as bars on the wall, source red, sink blue, others grey; in 3D at the slice."""
     cem = task.observation.cem
     for facets, current in zip(cem.electrodes, currents, strict=True):
         colour = IDLE if current == 0 else SOURCE if current > 0 else SINK
@@ -60,15 +61,16 @@ def draw_electrodes(axes: Axes, task: Task, currents: np.ndarray, width: float =
             x, y, z = bars.reshape(-1, 3).T
             if x.min() > -1e-6 or x.max() < 1e-6:
                 continue
-            bars = np.array([[[z.min(), y[np.abs(y).argmax()]], [z.max(), y[np.abs(y).argmax()]]]])
-        axes.add_collection(LineCollection(list(bars), colors=colour, linewidths=width, antialiased=False,
-                                           clip_on=False, zorder=3))
+            furthest = y[np.abs(y).argmax()]
+            bars = np.array([[[z.min(), furthest], [z.max(), furthest]]])
+        axes.add_collection(LineCollection(list(bars), colors=colour, linewidths=width,
+                                           antialiased=False, clip_on=False, zorder=3))
 
 
-def draw_frame(task: Task, truth_mesh: Mesh, truth: np.ndarray, estimate: np.ndarray, spread: np.ndarray | None,
-               currents: np.ndarray, time: float, region: tuple[float, float] | None = None) -> np.ndarray:
-    """(height, width, 3) uint8 picture: truth and estimate in one colour scale, the estimate's
-    spread, electrodes.
+def draw_frame(task: Task, truth_mesh: Mesh, truth: np.ndarray, estimate: np.ndarray,
+               spread: np.ndarray | None, currents: np.ndarray, time: float,
+               region: tuple[float, float] | None = None) -> np.ndarray:
+    """(height, width, 3) uint8: truth and estimate in one colour scale, its spread, electrodes.
 
     Pipes lie one below the other, in 3D with isosurfaces beside them; tanks stand side by side.
 
@@ -87,8 +89,8 @@ def draw_frame(task: Task, truth_mesh: Mesh, truth: np.ndarray, estimate: np.nda
     spread_high = max(0.25, task.prior.initial_std) * task.expected_concentration
     solid = task.mesh.dim == 3
     tank = task.vessel is not None and not task.vessel.is_long
-    figure = Figure(figsize=(12.0, 4.4) if tank else (12.0, 6.4) if solid else (8.0, 6.4), dpi=100,
-                    layout="constrained")
+    size = (12.0, 4.4) if tank else (12.0, 6.4) if solid else (8.0, 6.4)
+    figure = Figure(figsize=size, dpi=100, layout="constrained")
     canvas = FigureCanvasAgg(figure)
     grid = figure.add_gridspec(1, 3) if tank else figure.add_gridspec(3, 2 if solid else 1)
     first = figure.add_subplot(grid[0, 0])
@@ -99,20 +101,19 @@ def draw_frame(task: Task, truth_mesh: Mesh, truth: np.ndarray, estimate: np.nda
     where = {"location": "bottom", "aspect": 40} if tank else {"aspect": 30}
     figure.colorbar(field, ax=panels[:2], label="concentration / (mol/m³)", extend="both", **where)
     if spread is None:
-        panels[2].text(0.5, 0.5, "no spread claimed", transform=panels[2].transAxes, ha="center", va="center")
-        draw = draw_field(panels[2], task.mesh, np.zeros(task.mesh.n_nodes), 0.0, spread_high, "Greys")
-        label = ""
-    else:
-        draw = draw_field(panels[2], task.mesh, spread, 0.0, spread_high, SPREAD_MAP)
-        label = "std / (mol/m³)"
+        panels[2].text(0.5, 0.5, "no spread claimed", transform=panels[2].transAxes, ha="center",
+                       va="center")
+    shown = np.zeros(task.mesh.n_nodes) if spread is None else spread
+    colours, label = ("Greys", "") if spread is None else (SPREAD_MAP, "std / (mol/m³)")
+    draw = draw_field(panels[2], task.mesh, shown, 0.0, spread_high, colours)
     if spread is not None or tank:                       # tanks keep their size beside each other
         where = {"location": "bottom", "aspect": 20} if tank else {"aspect": 12}
         bar = figure.colorbar(draw, ax=panels[2], label=label, extend="max", **where)
         if spread is None:                                # its place stays, with nothing to be seen
             for part in bar.ax.findobj():
                 part.set_alpha(0.0)
-    for axes, title in zip(panels, (f"truth, t = {1e3 * time:.0f} ms", "estimate",
-                                    "standard deviation of the estimate"), strict=True):
+    titles = (f"truth, t = {1e3 * time:.0f} ms", "estimate", "standard deviation of the estimate")
+    for axes, title in zip(panels, titles, strict=True):
         axes.set_title(title, loc="left", fontsize=10)
         draw_electrodes(axes, task, currents)
         for end in region or ():
@@ -126,16 +127,15 @@ def draw_frame(task: Task, truth_mesh: Mesh, truth: np.ndarray, estimate: np.nda
         panels[2].set_xlabel(f"{'z' if solid else 'x'} / cm    (flow →;   {current})")
     if solid:
         level = task.expected_concentration
-        draw_solids(figure, grid, task, [(truth_mesh, truth), (task.mesh, estimate)], (1.08 * level, 1.36 * level),
-                    currents)
+        draw_solids(figure, grid, task, [(truth_mesh, truth), (task.mesh, estimate)],
+                    (1.08 * level, 1.36 * level), currents)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
 def draw_solids(figure: Figure, grid: GridSpec, task: Task, fields: list[tuple[Mesh, np.ndarray]],
                 levels: tuple[float, float], currents: np.ndarray) -> None:
-    """Isosurfaces of truth and estimate in the second column of ``grid``, and below them the
-    injecting electrodes."""
+    """Isosurfaces of truth and estimate in ``grid``'s second column, electrodes below them."""
     from eitbench.envs.isosurface import draw_electrodes_in_space, draw_isosurfaces
     for row, (mesh, values) in enumerate(fields):
         axes = figure.add_subplot(grid[row, 1])

@@ -16,12 +16,18 @@ from eitbench.estimation.kalman import (
     linearised,
 )
 from eitbench.estimation.parameters import initial_covariance, starting_filter, table_5_1
-from eitbench.estimation.smoother import Smoothed, fixed_interval_smoother, smoothed_means, smoothed_state
+from eitbench.estimation.smoother import (
+    Smoothed,
+    fixed_interval_smoother,
+    smoothed_means,
+    smoothed_state,
+)
 from eitbench.estimation.smoothness import smoothness_covariance
 
 __all__ = [
-    "DenseKalmanFilter", "FilterStep", "Filtered", "FirstFrame", "FreeCovariance", "GainSequence", "JointFilter",
-    "JointStep", "KalmanFilter", "LinearisedObservations", "Observation", "Smoothed", "best_homogeneous",
-    "fixed_interval_smoother", "gain_sequence", "gauss_newton", "initial_covariance", "kalman_filter", "linearised",
-    "smoothed_means", "smoothed_state", "smoothness_covariance", "starting_filter", "table_5_1",
+    "DenseKalmanFilter", "FilterStep", "Filtered", "FirstFrame", "FreeCovariance", "GainSequence",
+    "JointFilter", "JointStep", "KalmanFilter", "LinearisedObservations", "Observation", "Smoothed",
+    "best_homogeneous", "fixed_interval_smoother", "gain_sequence", "gauss_newton",
+    "initial_covariance", "kalman_filter", "linearised", "smoothed_means", "smoothed_state",
+    "smoothness_covariance", "starting_filter", "table_5_1",
 ]

@@ -1,5 +1,4 @@
-"""The covariance without data, Π⁺ = F Π Fᵀ + Γ_w: what remains uncertain when nothing is ever
-measured."""
+"""The covariance without data, Π⁺ = F Π Fᵀ + Γ_w: what is uncertain when nothing is measured."""
 
 from __future__ import annotations
 
@@ -7,12 +6,12 @@ import numpy as np
 
 
 class FreeCovariance:
-    """Π_t for t = 0, 1, …, from which measurements then subtract: P = Π − Z Zᵀ
-    (``docs/methods.md``, 5).
+    """Π_t, t = 0, 1, …, from which measurements subtract: P = Π − Z Zᵀ (``docs/methods.md``, 5).
 
     Π_t depends on no data, so it is computed once and shared by all episodes. It is kept as Π_t =
     Π_∞ + U D Uᵀ with D = diag(±1): what is left of the initial covariance, U ← F U, loses rank
-    quickly because the flow carries it away and diffusion smooths it.
+    quickly because the flow carries it away and diffusion smooths it. ``ValueError`` if Π_t has no
+    limit.
 
     Parameters
     ----------
@@ -24,23 +23,19 @@ class FreeCovariance:
         Γ_{0|0}; by default Π_∞.
     tolerance : float
         Eigenvalues of U D Uᵀ below this part of Π_∞'s largest entry are dropped.
-
-    Raises
-    ------
-    ValueError
-        If Π_t has no limit.
     """
 
-    def __init__(self, transition: np.ndarray, noise: np.ndarray, initial: np.ndarray | None = None, *,
-                 tolerance: float = 1e-14) -> None:
+    def __init__(self, transition: np.ndarray, noise: np.ndarray,
+                 initial: np.ndarray | None = None, *, tolerance: float = 1e-14) -> None:
         self.scale = 1.0
         self.transition = transition
         self._noise = noise
         self.limit = _stationary(transition, noise)
         self._threshold = tolerance * np.abs(self.limit).max()
-        nothing = np.zeros((len(noise), 0)), np.zeros(0)
-        self._transients = [nothing if initial is None else  # (U, D) at t = 0, 1, …
-                            _signed_factor(initial - self.limit, self._threshold)]
+        left = (np.zeros((len(noise), 0)), np.zeros(0))
+        if initial is not None:
+            left = _signed_factor(initial - self.limit, self._threshold)
+        self._transients = [left]  # (U, D) at t = 0, 1, …
 
     def scaled(self, factor: float) -> FreeCovariance:
         """The same sequence times ``factor``, sharing all matrices."""
@@ -51,8 +46,7 @@ class FreeCovariance:
     def apply(self, t: int, X: np.ndarray, limit_times_X: np.ndarray | None = None) -> np.ndarray:
         """Π_t X for X (n, k).
 
-        Most of the work is ``limit @ X``, the same at all times: who asks for one X often may
-        compute it once.
+        Most of the work is ``limit @ X``, the same at all times: it may be computed once.
         """
         U, signs = self._transient(t)
         if limit_times_X is None:
@@ -82,7 +76,8 @@ class FreeCovariance:
 
 def _stationary(F: np.ndarray, noise: np.ndarray) -> np.ndarray:
     """The solution of Π = F Π Fᵀ + Γ_w, by doubling the number of steps until nothing is added."""
-    total, power = noise, F
+    total = noise
+    power = F
     for _ in range(40):
         added = power @ total @ power.T
         total = total + added
@@ -92,7 +87,8 @@ def _stationary(F: np.ndarray, noise: np.ndarray) -> np.ndarray:
         if np.abs(added).max() <= 1e-16 * np.abs(total).max():
             return total
         power = power @ power
-    raise ValueError("transition must have a spectral radius below one; the covariance without data has no limit")
+    raise ValueError("transition must have a spectral radius below one; the covariance without "
+                     "data has no limit")
 
 
 def _signed_factor(symmetric: np.ndarray, threshold: float) -> tuple[np.ndarray, np.ndarray]:

@@ -1,5 +1,4 @@
-"""Kalman filtering with the n×n covariance kept as it is: for transitions that change with time,
-and for F = I."""
+"""Kalman filtering with the n×n covariance kept: for transitions that change, and for F = I."""
 
 from __future__ import annotations
 
@@ -16,8 +15,7 @@ from eitbench.estimation.kalman import Expected, Observation, expected
 _BLOCK = 128
 """columns copied at once when a triangle is mirrored: small enough for the processor's cache"""
 _PANEL = 64
-"""columns that a transition given as a callable is handed at once; few, so that they stay in the
-cache, but not so few that the calls count"""
+"""columns that a callable transition is handed at once: they fit the cache, few calls are made"""
 
 Transition = np.ndarray | Callable[[np.ndarray], np.ndarray]
 """F (n, n), or X (n, k) -> F X."""
@@ -37,8 +35,7 @@ class Filtered(NamedTuple):
 
 
 class DenseKalmanFilter:
-    """The Kalman filter of c⁺ = F c + s + w with any F at each step, in about 3n³ operations a
-    prediction.
+    """The Kalman filter of c⁺ = F c + s + w with any F at each step, in some 3n³ operations.
 
     Where F X costs far less than a product of full matrices, such as solves with a sparse matrix,
     F is better given as a callable: a prediction then costs F X twice, for n columns.
@@ -46,26 +43,18 @@ class DenseKalmanFilter:
     `KalmanFilter` is far cheaper, but wants a constant F and a covariance with a limit. Where F = I
     (a target at rest, a closed vessel) a prediction costs next to nothing here; an update costs
     O(n² m) in any case. The covariance stays symmetric to the bit and its diagonal is kept from
-    falling below zero.
+    falling below zero. ``ValueError`` naming the argument if it is of the wrong shape or not
+    finite.
 
     Parameters
     ----------
-    mean : (n,)
-        c_{0|0}.
-    covariance : (n, n)
-        Γ_{0|0}.
+    mean, covariance : (n,), (n, n)
+        c_{0|0} and Γ_{0|0}.
 
     Attributes
     ----------
-    mean : (n,)
-        Of the present state.
-    covariance : (n, n)
-        Of the present state; written in place.
-
-    Raises
-    ------
-    ValueError
-        Naming the argument, if it is of the wrong shape or not finite.
+    mean, covariance
+        Of the present state; the covariance is written in place.
     """
 
     def __init__(self, mean: np.ndarray, covariance: np.ndarray) -> None:
@@ -92,7 +81,8 @@ class DenseKalmanFilter:
             something nonlinear.
         """
         if mean is not None and forcing is not None:
-            raise ValueError("forcing must not be given beside mean, which is what the state becomes")
+            raise ValueError("forcing must not be given beside mean, which is what the state "
+                             "becomes")
         n = len(self.mean)
         for name, value, shape in (("transition", transition, (n, n)), ("forcing", forcing, (n,)),
                                    ("noise", noise, (n, n)), ("mean", mean, (n,))):
@@ -116,15 +106,15 @@ class DenseKalmanFilter:
         """How a measurement of the present state compares with what is known before it."""
         return expected(observation, self.mean, self.covariance @ observation.matrix.T)
 
-    def take_in(self, H: np.ndarray, cross: np.ndarray, innovation: np.ndarray, S: np.ndarray) -> Filtered:
-        """Take in readings of the present state, with matrix (m, n) and what `expect` says of them."""
+    def take_in(self, H: np.ndarray, cross: np.ndarray, innovation: np.ndarray,
+                S: np.ndarray) -> Filtered:
+        """Take in readings of the present state: their matrix (m, n), and what `expect` says."""
         factor = cho_factor(S, lower=True)
         self.mean = self.mean + cross @ cho_solve(factor, innovation)
         gained = solve_triangular(factor[0], cross.T, lower=True).T                      # Γ Hᵀ L⁻ᵀ
         self.covariance -= np.matmul(gained, gained.T, out=self._work)
         diagonal = np.einsum("ii->i", self.covariance)                                   # a view
-        # precise measurements leave rounding of either sign
-        np.maximum(diagonal, 0.0, out=diagonal)
+        np.maximum(diagonal, 0.0, out=diagonal)  # precise measurements leave rounding of any sign
         return Filtered(self.mean, diagonal.copy(), innovation, S)
 
     def variances(self) -> np.ndarray:
@@ -143,16 +133,15 @@ class DenseKalmanFilter:
         return transition @ self.mean
 
     def _transform(self, F: np.ndarray) -> None:
-        """P ← F P Fᵀ by triangles: with P = L + Lᵀ and B = F L it is B Fᵀ + F Bᵀ, of which one half
-        is computed."""
+        """P ← F P Fᵀ by triangles: with P = L + Lᵀ and B = F L one half of B Fᵀ + F Bᵀ is made."""
         P, B = self.covariance, self._work
         diagonal = np.einsum("ii->i", P)
         diagonal *= 0.5
         np.copyto(B, F)
-        # BLAS thinks in columns and sees each array transposed: Lᵀ Fᵀ, from the lower triangle of
-        # Pᵀ.
+        # BLAS thinks in columns and sees arrays transposed: Lᵀ Fᵀ, from the lower triangle of Pᵀ.
         blas.dtrmm(1.0, P.T, B.T, lower=1, trans_a=1, overwrite_b=1)
-        blas.dsyr2k(1.0, np.asfortranarray(F.T), B.T, beta=0.0, c=P.T, trans=1, lower=1, overwrite_c=1)
+        blas.dsyr2k(1.0, np.asfortranarray(F.T), B.T, beta=0.0, c=P.T, trans=1, lower=1,
+                    overwrite_c=1)
         _mirror(P)
 
     def _transform_by_columns(self, apply: Callable[[np.ndarray], np.ndarray]) -> None:

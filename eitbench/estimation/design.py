@@ -1,5 +1,4 @@
-"""Which injection teaches most: criteria of optimal design for a Gaussian state, over all electrode
-pairs at once.
+"""Which injection teaches most: optimal design for a Gaussian state, over all pairs at once.
 
 The voltages are bilinear in the pair that drives and the electrode that is read, so one table of
 products of the covariance serves every pair (``docs/methods.md``, 8).
@@ -16,10 +15,11 @@ if TYPE_CHECKING:
     import scipy.sparse as sp
 
 
-def pair_gains(covariance_of: np.ndarray, weighted: np.ndarray, pairs: np.ndarray, noise_variance: np.ndarray,
-               ) -> tuple[np.ndarray, np.ndarray]:
-    """What each pair would teach if it were injected now.
+def pair_gains(covariance_of: np.ndarray, weighted: np.ndarray, pairs: np.ndarray,
+               noise_variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What each pair would teach if it were injected now, (p,) and (p,).
 
+    By how much tr(W P) falls (A-optimality), and ½ ln by what factor det P does (D-optimality).
     With D the derivatives of the voltages under a current into one electrode, (L, L, n) for n
     states, read as L² rows:
 
@@ -32,14 +32,7 @@ def pair_gains(covariance_of: np.ndarray, weighted: np.ndarray, pairs: np.ndarra
     pairs : (p, 2)
         Where the current enters and leaves.
     noise_variance : (p, L)
-        Of the voltages of each pair, per current squared; infinite for readings that will not be
-        believed.
-
-    Returns
-    -------
-    (p,), (p,)
-        By how much tr(W P) falls (A-optimality), and ½ ln of the ratio in which det P falls
-        (D-optimality).
+        Of each pair's voltages, per current squared; infinite for readings not to be believed.
     """
     i, j = pairs.T
     L = covariance_of.shape[0]
@@ -58,13 +51,13 @@ def pair_gains(covariance_of: np.ndarray, weighted: np.ndarray, pairs: np.ndarra
 
 
 def independent_rows(derivative: np.ndarray) -> np.ndarray:
-    """(L(L−1)/2, n) of the derivatives (L, L, n) of 𝓡; as 𝓡 is symmetric and 𝓡1 = 0, they determine
-    the others."""
+    """(L(L−1)/2, n) of the derivatives (L, L, n) of 𝓡; 𝓡 = 𝓡ᵀ and 𝓡1 = 0 give the others."""
     return np.asarray(derivative[np.triu_indices(len(derivative), 1)])
 
 
-def pair_tables(rows: np.ndarray, cross: np.ndarray, mass: np.ndarray | sp.csr_array) -> tuple[np.ndarray, np.ndarray]:
-    """The tables D P Dᵀ and D P W P Dᵀ that `pair_gains` wants, where n is large.
+def pair_tables(rows: np.ndarray, cross: np.ndarray,
+                mass: np.ndarray | sp.csr_array) -> tuple[np.ndarray, np.ndarray]:
+    """D P Dᵀ and D P W P Dᵀ, (L, L, L, L) each, that `pair_gains` wants, where n is large.
 
     Parameters
     ----------
@@ -74,10 +67,6 @@ def pair_tables(rows: np.ndarray, cross: np.ndarray, mass: np.ndarray | sp.csr_a
         P rowsᵀ, such as `KalmanFilter.apply_covariance` gives once it has predicted.
     mass : (n, n), dense or sparse
         W.
-
-    Returns
-    -------
-    (L, L, L, L), (L, L, L, L)
     """
     return _all_rows(rows @ cross), _all_rows(cross.T @ (mass @ cross))
 

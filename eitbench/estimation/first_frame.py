@@ -1,4 +1,4 @@
-"""The first frame of an episode: where ĉ_bh, and with it every parameter of Table 5.1, comes from."""
+"""The first frame of an episode: where ĉ_bh, and with it all of Table 5.1, comes from."""
 
 from __future__ import annotations
 
@@ -13,8 +13,7 @@ if TYPE_CHECKING:
 
 
 class FirstFrame:
-    """Collects the measurements of the first frame; after it an estimator knows ĉ_bh and starts
-    from t = 0.
+    """Collects the first frame; after it an estimator knows ĉ_bh and starts from t = 0.
 
     The frame lies within the warm-up, so that no scored estimate waits for it.
     """
@@ -37,7 +36,8 @@ class FirstFrame:
         if self.complete:
             task = self.task
             V, I = (np.array(part) for part in zip(*self.measurements, strict=True))
-            self.c_bh = best_homogeneous(task.observation, task.noise, task.mesh.n_nodes, V, I, self.c_bh)
+            self.c_bh = best_homogeneous(task.observation, task.noise, task.mesh.n_nodes, V, I,
+                                         self.c_bh)
         return self.complete
 
     @property

@@ -1,8 +1,6 @@
-"""Gains computed once: with fixed injections a linear filter's covariances do not depend on what is
-measured.
+"""Gains computed once: a linear filter's covariances depend on the injections, not on the data.
 
-What is left for an episode is a handful of matrix–vector products a step, in the filter and in the
-smoother.
+An episode is left with a few matrix–vector products a step, in the filter and in the smoother.
 """
 
 from __future__ import annotations
@@ -18,33 +16,23 @@ from eitbench.estimation.kalman import KalmanFilter, Observation
 
 @dataclass(frozen=True)
 class GainSequence:
-    """What the Kalman filter of c⁺ = F c + s + w does at t = 1 … T, whatever is measured; made by
-    `gain_sequence`.
-
-    Parameters
-    ----------
-    transition : (n, n)
-        F.
-    covariance : FreeCovariance
-        Knows Γ_w and Γ_{0|0}.
-    matrices : T arrays (m, n)
-        H_t; equal injections may share one array.
-    gains : (T, n, m)
-        K_t.
-    innovation_covariances : (T, m, m)
-        S_t.
-    variances : (T, n)
-        Diagonals of Γ_{t|t}.
-    """
+    """What the Kalman filter of c⁺ = F c + s + w does at t = 1 … T; made by `gain_sequence`."""
 
     transition: np.ndarray
+    """(n, n) F"""
     covariance: FreeCovariance
+    """knows Γ_w and Γ_{0|0}"""
     matrices: Sequence[np.ndarray]
+    """T of (m, n) H_t; equal injections may share one array"""
     gains: np.ndarray
+    """(T, n, m) K_t"""
     innovation_covariances: np.ndarray
+    """(T, m, m) S_t"""
     variances: np.ndarray
+    """(T, n) diagonals of Γ_{t|t}"""
 
-    def filtered(self, mean: np.ndarray, forcing: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def filtered(self, mean: np.ndarray, forcing: np.ndarray,
+                 values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Means c_{t|t} (T, n) and innovations (T, m).
 
         Parameters
@@ -56,7 +44,8 @@ class GainSequence:
         values : (T, m)
             What is measured, as in `Observation.value`.
         """
-        means, innovations = np.empty((len(values), len(mean))), np.empty(values.shape)
+        means = np.empty((len(values), len(mean)))
+        innovations = np.empty(values.shape)
         for t, value in enumerate(values):
             mean = self.transition @ mean + forcing
             innovations[t] = value - self.matrices[t] @ mean
@@ -67,9 +56,7 @@ class GainSequence:
     def smoothed(self, mean: np.ndarray, forcing: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Means c_{t|T} (T, n); arguments as in `filtered`.
 
-        The adjoint λ_t = Hᵀ S⁻¹ ν + (I − K H)ᵀ Fᵀ λ_{t+1} runs back over the innovations, and the
-        smoothed state follows forwards from c_{0|T} = c_{0|0} + Γ_{0|0} Fᵀ λ_1 as c_t = F c_{t−1} +
-        s + Γ_w λ_t (``docs/methods.md``, 6).
+        The adjoints run back and the state follows forwards as in `smoothed_means`.
         """
         _, innovations = self.filtered(mean, forcing, values)
         weighted = np.linalg.solve(self.innovation_covariances, innovations[..., None])[..., 0]
@@ -78,7 +65,8 @@ class GainSequence:
         for t in range(len(values) - 1, -1, -1):
             adjoints[t] = later + self.matrices[t].T @ (weighted[t] - self.gains[t].T @ later)
             later = self.transition.T @ adjoints[t]
-        state, smoothed = mean + self.covariance.apply(0, later[:, None])[:, 0], adjoints
+        state = mean + self.covariance.apply(0, later[:, None])[:, 0]
+        smoothed = adjoints
         for t, adjoint in enumerate(adjoints):
             state = self.transition @ state + forcing + self.covariance.apply_noise(adjoint)
             smoothed[t] = state  # takes the place of the adjoint just used
@@ -86,13 +74,15 @@ class GainSequence:
 
 
 def gain_sequence(start: KalmanFilter, observations: Sequence[Observation]) -> GainSequence:
-    """Run a filter that stands at t = 0 over a record once, whatever was measured: only H_t and the
-    noise count."""
-    n_steps, (m, n) = len(observations), observations[0].matrix.shape
-    gains, S, variances = np.empty((n_steps, n, m)), np.empty((n_steps, m, m)), np.empty((n_steps, n))
-    for t, observation in enumerate(observations):
+    """Run a filter that stands at t = 0 over a record; only its H_t and its noise count."""
+    gains: list[np.ndarray] = []
+    S: list[np.ndarray] = []
+    variances: list[np.ndarray] = []
+    for observation in observations:
         start.predict()
         step = start.update(observation)
-        gains[t] = np.linalg.solve(step.innovation_covariance, step.cross_covariance.T).T
-        S[t], variances[t] = step.innovation_covariance, step.variance
-    return GainSequence(start.transition, start.covariance, [o.matrix for o in observations], gains, S, variances)
+        gains.append(np.linalg.solve(step.innovation_covariance, step.cross_covariance.T).T)
+        S.append(step.innovation_covariance)
+        variances.append(step.variance)
+    return GainSequence(start.transition, start.covariance, [o.matrix for o in observations],
+                        np.array(gains), np.array(S), np.array(variances))

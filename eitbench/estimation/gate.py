@@ -10,11 +10,9 @@ from eitbench.estimation.kalman import Expected, Observation
 
 
 def believable(innovation: np.ndarray, variance: np.ndarray, gate: float) -> np.ndarray:
-    """Which readings a filter should take in: those within ``gate`` predicted standard deviations
-    of the prediction.
+    """(..., m) bool: readings within ``gate`` predicted standard deviations of the prediction.
 
-    Where more than a third of an injection's readings lie beyond, the injection itself has failed,
-    and none counts.
+    Where more than a third lie beyond, the injection itself has failed, and none counts.
 
     Parameters
     ----------
@@ -22,26 +20,26 @@ def believable(innovation: np.ndarray, variance: np.ndarray, gate: float) -> np.
         Measured less predicted, and the diagonal of its predicted covariance.
     gate : float
         > 0; infinite: all are believed.
-
-    Returns
-    -------
-    (..., m) bool
     """
     kept = np.abs(innovation) <= gate * np.sqrt(variance)
     failed = (~kept).mean(axis=-1, keepdims=True) > 1 / 3
     return kept & ~failed
 
 
-class _Filter(Protocol):
+class Filter(Protocol):
+    """What takes in measurements of its present state in two steps."""
+
     def expect(self, observation: Observation) -> Expected: ...
+    def take_in(self, H: np.ndarray, cross: np.ndarray, innovation: np.ndarray,
+                S: np.ndarray) -> object: ...
 
-    def take_in(self, H: np.ndarray, cross: np.ndarray, innovation: np.ndarray, S: np.ndarray) -> object: ...
 
-
-def gated_update(filter_: _Filter, observation: Observation, gate: float) -> tuple[np.ndarray, np.ndarray]:
+def gated_update(filter_: Filter, observation: Observation,
+                 gate: float) -> tuple[np.ndarray, np.ndarray]:
     """Take in what is `believable` of a measurement; returns its innovations in predicted standard
     deviations (m,) and which readings were taken in (m,)."""
     cross, innovation, S = filter_.expect(observation)
     kept = believable(innovation, S.diagonal(), gate)
-    filter_.take_in(observation.matrix[kept], cross[:, kept], innovation[kept], S[np.ix_(kept, kept)])
+    both = np.ix_(kept, kept)
+    filter_.take_in(observation.matrix[kept], cross[:, kept], innovation[kept], S[both])
     return innovation / np.sqrt(S.diagonal()), kept

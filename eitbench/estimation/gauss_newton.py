@@ -1,4 +1,4 @@
-"""Stationary reconstruction: one frame of injections, as if the target stood still (thesis 5.11)."""
+"""Stationary reconstruction: a frame of injections, as if the target stood still (thesis 5.11)."""
 
 from __future__ import annotations
 
@@ -15,13 +15,16 @@ from eitbench.numerics.sparse_lu import SparseLU
 
 class _ObservationModel(Protocol):
     def voltages(self, concentration: np.ndarray, currents: np.ndarray) -> np.ndarray: ...
+    def linearise(self, concentration: np.ndarray,
+                  currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]: ...
 
-    def linearise(self, concentration: np.ndarray, currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]: ...
 
-
-def gauss_newton(model: _ObservationModel, voltages: np.ndarray, currents: np.ndarray, noise_std: np.ndarray,
-                 penalty: Any, start: np.ndarray, *, tolerance: float = 1e-3, max_iterations: int = 20) -> np.ndarray:
+def gauss_newton(model: _ObservationModel, voltages: np.ndarray, currents: np.ndarray,
+                 noise_std: np.ndarray, penalty: Any, start: np.ndarray, *,
+                 tolerance: float = 1e-3, max_iterations: int = 20) -> np.ndarray:
     """argmin_c ‖(V − R(c))/std‖² + cᵀ penalty c, by Gauss–Newton with step halving.
+
+    (n,) in mol/m³; the best so far if ``max_iterations`` run out or no step lowers the objective.
 
     Parameters
     ----------
@@ -35,11 +38,6 @@ def gauss_newton(model: _ObservationModel, voltages: np.ndarray, currents: np.nd
         First guess in mol/m³.
     tolerance : float
         Stop when a full step would lower the objective by less than this part of it.
-
-    Returns
-    -------
-    (n,) concentration in mol/m³; the best found so far if ``max_iterations`` run out or no step
-    lowers the objective.
     """
     normal = _NormalEquations(penalty)
     weight = (1.0 / noise_std).ravel()

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-
-class _ObservationModel(Protocol):
-    def linearise(self, concentration: np.ndarray, currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]: ...
-
-
-class _Noise(Protocol):
-    def std(self, voltages: np.ndarray) -> np.ndarray: ...
+if TYPE_CHECKING:
+    from eitbench.physics.observation import ObservationModel, VoltageNoise
 
 
-def best_homogeneous(model: _ObservationModel, noise: _Noise, n: int, voltages: np.ndarray, currents: np.ndarray,
-                     start: float, *, tolerance: float = 1e-8, max_iterations: int = 30) -> float:
-    """ĉ_bh = argmin_c Σ ((V − R(c·1))/std)², by Gauss–Newton in ln c, which keeps it positive
-    (``docs/methods.md``, 3).
+def best_homogeneous(model: ObservationModel, noise: VoltageNoise, n: int, voltages: np.ndarray,
+                     currents: np.ndarray, start: float, *, tolerance: float = 1e-8,
+                     max_iterations: int = 30) -> float:
+    """ĉ_bh = argmin_c Σ ((V − R(c·1))/std)², by Gauss–Newton in ln c (``docs/methods.md``, 3).
+
+    Steps in ln c keep it positive. ``RuntimeError`` if the iteration does not settle.
 
     Parameters
     ----------
@@ -32,11 +29,6 @@ def best_homogeneous(model: _ObservationModel, noise: _Noise, n: int, voltages: 
         Measurements in V and injections in A (A/m in 2D).
     start : float
         First guess in mol/m³, > 0.
-
-    Raises
-    ------
-    RuntimeError
-        If the iteration does not settle.
     """
     # Injections repeat: R(c·1) is needed once for each distinct pattern.
     patterns, which = np.unique(currents, axis=0, return_inverse=True)
@@ -51,5 +43,5 @@ def best_homogeneous(model: _ObservationModel, noise: _Noise, n: int, voltages: 
         c *= float(np.exp(change))
         if abs(change) < tolerance:
             return c
-    raise RuntimeError(f"best homogeneous estimate did not settle in {max_iterations} iterations; last change "
-                       f"{change:g}, last value {c:g} mol/m³")
+    raise RuntimeError(f"best homogeneous estimate did not settle in {max_iterations} iterations; "
+                       f"last change {change:g}, last value {c:g} mol/m³")

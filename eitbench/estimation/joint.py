@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -11,17 +11,8 @@ from eitbench import _check
 from eitbench.estimation.dense import DenseKalmanFilter
 from eitbench.estimation.kalman import Expected, Observation
 
-VelocityField = Callable[[np.ndarray], np.ndarray]
-
-
-class _Transport(Protocol):
-    inlet: np.ndarray
-
-    def step(self, c: np.ndarray, inflow_before: np.ndarray | float,
-             inflow_after: np.ndarray | float) -> np.ndarray: ...
-
-    def velocity_derivatives(self, c: np.ndarray, inflow_before: np.ndarray | float, inflow_after: np.ndarray | float,
-                             directions: Sequence[VelocityField]) -> tuple[np.ndarray, np.ndarray]: ...
+if TYPE_CHECKING:
+    from eitbench.physics.transport import ConvectionDiffusion, VelocityField
 
 
 class JointStep(NamedTuple):
@@ -42,8 +33,7 @@ class JointStep(NamedTuple):
 
 
 class JointFilter:
-    """The extended Kalman filter of c⁺ = F(θ) c + Y(θ) c_in + w, θ⁺ = θ + ω: velocity v = Σ θ_k
-    v_k, θ unknown.
+    """The extended Kalman filter of c⁺ = F(θ) c + Y(θ) c_in + w, θ⁺ = θ + ω; velocity Σ θ_k v_k.
 
     Each step is linearised at the present estimate: the covariance of (c, θ) moves with [[F,
     ∂c⁺/∂θ], [0, I]], where F, Y and the derivative are those of the discrete step at θ̂. The noise
@@ -53,13 +43,13 @@ class JointFilter:
     The velocity stays physical: after each measurement it must have the sign that it had at the
     start, and a size within ``bounds``, at all points of ``profiles``. Where it does not, θ is
     moved back along the line towards its start θ_0, just as far as needed; concentration and
-    covariance stay what they are.
+    covariance stay what they are. ``ValueError`` naming the argument if it is out of range, of the
+    wrong shape, or not finite.
 
     Parameters
     ----------
     transport_at : callable
-        θ (k,) -> the transport model with that velocity, such as a `ConvectionDiffusion`; all with
-        the same inlet.
+        θ (k,) -> the model with that velocity, as a `ConvectionDiffusion`; all with one inlet.
     directions : k callables
         v_k, each points (p, d) in m -> velocity (p, d) in m/s for θ_k = 1.
     mean, covariance : (n,), (n, n)
@@ -67,30 +57,25 @@ class JointFilter:
     parameters, parameter_covariance : (k,), (k, k)
         Of θ at t = 0, in m/s and its square if the v_k have no unit.
     walk_std : (k,)
-        Standard deviations of ω, the steps of the random walk; zero for a velocity that is
-        constant.
+        Standard deviations of ω, the steps of the random walk; zero for a constant velocity.
     inflow, inflow_std : float
         c_in and the standard deviation of η in mol/m³; ĉ_bh and ĉ_bh/4 in the thesis.
     nodal_noise : (n, n)
         H Γ_e Hᵀ at the nominal velocity, (mol/m³)².
     profiles : (p, k)
-        Axial velocity of each v_k at p points across the flow, not on the walls; that of θ_0 must
-        be positive.
+        Axial velocity of each v_k at p points across the flow, off the walls; positive for θ_0.
     bounds : (float, float)
         Least and largest axial velocity at each point in parts of what θ_0 gives there, so that
         points close to a wall bind no more than others; 0 < least < 1 < largest.
-
-    Raises
-    ------
-    ValueError
-        Naming the argument, if it is out of range, of the wrong shape, or not finite.
     """
 
-    def __init__(self, transport_at: Callable[[np.ndarray], _Transport], directions: Sequence[VelocityField], *,
-                 mean: np.ndarray, covariance: np.ndarray, parameters: np.ndarray, parameter_covariance: np.ndarray,
-                 walk_std: np.ndarray, inflow: float, inflow_std: float, nodal_noise: np.ndarray,
-                 profiles: np.ndarray, bounds: tuple[float, float]) -> None:
-        self.transport_at, self.directions = transport_at, directions
+    def __init__(self, transport_at: Callable[[np.ndarray], ConvectionDiffusion],
+                 directions: Sequence[VelocityField], *, mean: np.ndarray, covariance: np.ndarray,
+                 parameters: np.ndarray, parameter_covariance: np.ndarray, walk_std: np.ndarray,
+                 inflow: float, inflow_std: float, nodal_noise: np.ndarray, profiles: np.ndarray,
+                 bounds: tuple[float, float]) -> None:
+        self.transport_at = transport_at
+        self.directions = directions
         k = len(directions)
         c = _check.array("mean", mean, (None,), units="mol/m³")
         n = self._n = len(c)
@@ -102,7 +87,8 @@ class JointFilter:
         shapes = _check.array("profiles", profiles, (None, k))
         nominal = shapes @ self._start
         if not (nominal > 0).all():
-            raise ValueError(f"profiles must give a positive velocity with parameters, got {nominal.min():g} m/s")
+            raise ValueError("profiles must give a positive velocity with parameters, "
+                             f"got {nominal.min():g} m/s")
         self._profiles = shapes / nominal[:, None]
         low, high = self._bounds = _check.array("bounds", bounds, (2,))
         if not 0 < low < 1 < high:
@@ -116,7 +102,7 @@ class JointFilter:
 
     @property
     def concentration(self) -> np.ndarray:
-        """(n,) present mean of the concentration: where the next observation is to be linearised."""
+        """(n,) present mean of the concentration, about which the next observation is linear."""
         return self._filter.mean[:self._n]
 
     @property
@@ -131,7 +117,9 @@ class JointFilter:
 
     def predict(self) -> None:
         """Move one time step on with the velocity estimated so far."""
-        n, c, theta = self._n, self.concentration, self.parameters
+        n = self._n
+        c = self.concentration
+        theta = self.parameters
         transport = self.transport_at(theta)
         inlet = transport.inlet
         after, by_theta = transport.velocity_derivatives(c, c[inlet], self._inflow, self.directions)
@@ -148,30 +136,29 @@ class JointFilter:
         self._filter.predict(carried, noise=self._noise, mean=np.concatenate([after, theta]))
 
     def update(self, observation: Observation) -> JointStep:
-        """Take in one measurement of the present concentration, linearised at `concentration` (see
-        `linearised`)."""
+        """Take in one measurement, `linearised` at the present `concentration`."""
         return self.take_in(observation.matrix, *self.expect(observation))
 
     def expect(self, observation: Observation) -> Expected:
-        """How a measurement of the present concentration compares with what is known before it; the
-        rows of the cross covariance are (c, θ)."""
+        """How a measurement of c compares with what is known; cross covariance rows: (c, θ)."""
         return self._filter.expect(observation._replace(matrix=self._blind(observation.matrix)))
 
-    def take_in(self, H: np.ndarray, cross: np.ndarray, innovation: np.ndarray, S: np.ndarray) -> JointStep:
-        """Take in readings of the present concentration, with matrix (m, n) and what `expect` says
-        of them."""
-        n, step = self._n, self._filter.take_in(self._blind(H), cross, innovation, S)
+    def take_in(self, H: np.ndarray, cross: np.ndarray, innovation: np.ndarray,
+                S: np.ndarray) -> JointStep:
+        """Take in readings of the present c: their matrix (m, n), and what `expect` says."""
+        n = self._n
+        step = self._filter.take_in(self._blind(H), cross, innovation, S)
         step.mean[n:] = self._physical(step.mean[n:])  # the filter's own array
-        return JointStep(step.mean[:n].copy(), step.variance[:n], step.mean[n:].copy(), self.covariance[n:, n:].copy(),
-                         step.innovation, step.innovation_covariance)
+        return JointStep(step.mean[:n].copy(), step.variance[:n], step.mean[n:].copy(),
+                         self.covariance[n:, n:].copy(), step.innovation,
+                         step.innovation_covariance)
 
     def _blind(self, matrix: np.ndarray) -> np.ndarray:
         """(m, n + k): θ itself is not seen."""
         return np.hstack([matrix, np.zeros((len(matrix), len(self._start)))])
 
     def _physical(self, parameters: np.ndarray) -> np.ndarray:
-        """``parameters``, or the point nearest to them on the line towards θ_0 that keeps to the
-        bounds."""
+        """``parameters``, or the nearest point within the bounds on the line towards θ_0."""
         change = self._profiles @ (parameters - self._start)  # in parts of the start
         room = np.where(change < 0, *self._bounds) - 1.0
         beyond = np.abs(change) > np.abs(room)

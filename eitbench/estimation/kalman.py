@@ -1,15 +1,17 @@
-"""Kalman filtering of a large state seen through few measurements, exactly: P = Π − Z Zᵀ
-(``docs/methods.md``, 5)."""
+"""Exact Kalman filtering of a large state, few readings: P = Π − Z Zᵀ (``docs/methods.md``, 5)."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from eitbench.estimation.covariance import FreeCovariance
+
+if TYPE_CHECKING:
+    from eitbench.physics.observation import ObservationModel, VoltageNoise
 
 
 class Observation(NamedTuple):
@@ -60,8 +62,7 @@ class KalmanFilter:
     """The Kalman filter of c⁺ = F c + s + w for small m and large n, without n×n products.
 
     The covariance is Π_t − Z Zᵀ: Π_t, the covariance without data, is known beforehand; Z gains m
-    columns at every measurement, moves with F, and is compressed to its numerical rank, which stays
-    far below n.
+    columns at every measurement, moves with F, and is compressed to its rank, far below n.
 
     Parameters
     ----------
@@ -78,9 +79,11 @@ class KalmanFilter:
         square of it.
     """
 
-    def __init__(self, transition: np.ndarray, forcing: np.ndarray, mean: np.ndarray, covariance: FreeCovariance, *,
-                 rank_tolerance: float = 1e-6) -> None:
-        self.transition, self.forcing, self.covariance = transition, forcing, covariance
+    def __init__(self, transition: np.ndarray, forcing: np.ndarray, mean: np.ndarray,
+                 covariance: FreeCovariance, *, rank_tolerance: float = 1e-6) -> None:
+        self.transition = transition
+        self.forcing = forcing
+        self.covariance = covariance
         self.rank_tolerance = rank_tolerance
         self.time = 0
         self.mean = np.array(mean, dtype=float)
@@ -100,9 +103,9 @@ class KalmanFilter:
         """Γ_{0|0} X for X (n, k)."""
         return self.covariance.apply(0, X)
 
-    def apply_covariance(self, X: np.ndarray, limit_times_X: np.ndarray | None = None) -> np.ndarray:
-        """Γ X for X (n, k), Γ the covariance of the present state; arguments as in
-        `FreeCovariance.apply`."""
+    def apply_covariance(self, X: np.ndarray,
+                         limit_times_X: np.ndarray | None = None) -> np.ndarray:
+        """Γ X for X (n, k), Γ that of the present state; arguments as in `FreeCovariance.apply`."""
         return self.covariance.apply(self.time, X, limit_times_X) - self.known @ (self.known.T @ X)
 
     def update(self, observation: Observation) -> FilterStep:
@@ -113,14 +116,17 @@ class KalmanFilter:
         """How a measurement of the present state compares with what is known before it."""
         return expected(observation, self.mean, self.apply_covariance(observation.matrix.T))
 
-    def take_in(self, H: np.ndarray, cross: np.ndarray, innovation: np.ndarray, S: np.ndarray) -> FilterStep:
-        """Take in readings of the present state, with matrix (m, n) and what `expect` says of them."""
-        before, known = self.mean, self.known
+    def take_in(self, H: np.ndarray, cross: np.ndarray, innovation: np.ndarray,
+                S: np.ndarray) -> FilterStep:
+        """Take in readings of the present state: their matrix (m, n), and what `expect` says."""
+        before = self.mean
+        known = self.known
         factor = cho_factor(S, lower=True)
         self.mean = before + cross @ cho_solve(factor, innovation)
         gained = solve_triangular(factor[0], cross.T, lower=True).T                      # Γ Hᵀ L⁻ᵀ
         self.known = compressed(np.hstack([known, gained]), self.rank_tolerance)
-        return FilterStep(self.time, before, known, self.mean, self.variances(), H, cross, innovation, S)
+        return FilterStep(self.time, before, known, self.mean, self.variances(), H, cross,
+                          innovation, S)
 
     def variances(self) -> np.ndarray:
         """Diagonal (n,) of the present state's covariance."""
@@ -133,8 +139,7 @@ class KalmanFilter:
 
 
 def expected(observation: Observation, mean: np.ndarray, cross: np.ndarray) -> Expected:
-    """`Expected` for a state with this mean (n,), whose covariance with what is seen is ``cross``
-    (n, m)."""
+    """`Expected` for this mean (n,), with ``cross`` (n, m) the covariance with what is seen."""
     S = observation.matrix @ cross
     return Expected(cross, observation.value - observation.matrix @ mean,
                     0.5 * (S + S.T) + np.diag(observation.noise_variance))
@@ -161,18 +166,9 @@ def kalman_filter(start: KalmanFilter, observations: Iterable[Observation]) -> l
 # -- nonlinear observations ------------------------------------------------------------------------
 
 
-class _ObservationModel(Protocol):
-    def linearise(self, concentration: np.ndarray, currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]: ...
-
-
-class _Noise(Protocol):
-    def std(self, voltages: np.ndarray) -> np.ndarray: ...
-
-
-def linearised(model: _ObservationModel, noise: _Noise, point: np.ndarray, voltages: np.ndarray,
-               currents: np.ndarray) -> Observation:
-    """V_t − R_t(c*) + J_t c* = J_t c + v (thesis 5.2), linearised at ``point`` (n,) for one
-    injection (L,).
+def linearised(model: ObservationModel, noise: VoltageNoise, point: np.ndarray,
+               voltages: np.ndarray, currents: np.ndarray) -> Observation:
+    """V_t − R_t(c*) + J_t c* = J_t c + v (thesis 5.2) about ``point`` (n,), for an injection (L,).
 
     The noise is that of the voltages computed at the point.
     """
@@ -183,13 +179,16 @@ def linearised(model: _ObservationModel, noise: _Noise, point: np.ndarray, volta
 class LinearisedObservations:
     """`linearised` at one point for all injections of an episode; each pattern is computed once."""
 
-    def __init__(self, model: _ObservationModel, noise: _Noise, point: np.ndarray) -> None:
-        self.model, self.noise, self.point = model, noise, point
+    def __init__(self, model: ObservationModel, noise: VoltageNoise, point: np.ndarray) -> None:
+        self.model = model
+        self.noise = noise
+        self.point = point
         self._seen: dict[bytes, Observation] = {}
 
     def __call__(self, voltages: np.ndarray, currents: np.ndarray) -> Observation:
         key = currents.tobytes()
         if key not in self._seen:
-            self._seen[key] = linearised(self.model, self.noise, self.point, np.zeros_like(voltages), currents)
+            nothing = np.zeros_like(voltages)
+            self._seen[key] = linearised(self.model, self.noise, self.point, nothing, currents)
         matrix, offset, variance = self._seen[key]
         return Observation(matrix, voltages + offset, variance)

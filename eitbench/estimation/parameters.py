@@ -1,5 +1,4 @@
-"""Parameters of the stochastic evolution model, all in terms of the best homogeneous estimate
-(thesis Table 5.1)."""
+"""Parameters of the evolution model, all in terms of ĉ_bh (thesis Table 5.1)."""
 
 from __future__ import annotations
 
@@ -20,8 +19,8 @@ if TYPE_CHECKING:
     from eitbench.worlds.parts import Prior
 
 
-def starting_filter(transport: Transport, prior: Prior, c_bh: float,
-                    ) -> KalmanFilter | ClosedVesselFilter:
+def starting_filter(transport: Transport, prior: Prior,
+                    c_bh: float) -> KalmanFilter | ClosedVesselFilter:
     """A Kalman filter for the target's motion at t = 0, with the parameters of Table 5.1.
 
     Where the fluid flows through the vessel it is `table_5_1`'s. Where nothing flows in, the
@@ -40,9 +39,11 @@ def starting_filter(transport: Transport, prior: Prior, c_bh: float,
         return table_5_1(transport, prior, c_bh)
     mean = np.full(transport.mesh.n_nodes, c_bh)
     initial = initial_covariance(transport.mesh, prior)
+    noise: np.ndarray | None
     if isinstance(transport, AtRest):
         walk = (c_bh * prior.nodal_std)**2
-        return ClosedVesselFilter(mean, c_bh**2 * initial, None, walk * np.eye(len(mean)) if walk else None)
+        noise = walk * np.eye(len(mean)) if walk else None
+        return ClosedVesselFilter(mean, c_bh**2 * initial, None, noise)
     noise = c_bh**2 * _state_noise(transport, prior)
     return ClosedVesselFilter(mean, c_bh**2 * initial, transport.evolution_model().F, noise)
 
@@ -54,8 +55,7 @@ deviation, in a quarter of the time where n = 3,003 (``docs/pipe3d.md``)."""
 
 def table_5_1(transport: Transport, prior: Prior, c_bh: float, *,
               rank_tolerance: float = RANK_TOLERANCE) -> KalmanFilter:
-    """The Kalman filter of c⁺ = F c + Y c_in + w, where the fluid flows through; arguments as in
-    `starting_filter`.
+    """The Kalman filter of c⁺ = F c + Y c_in + w; arguments as in `starting_filter`.
 
     Inflow and initial state have mean ĉ_bh; Γ_η and Γ_e are diagonal, Γ_{0|0} is diagonal or
     smooth. As all of them scale with ĉ_bh², the covariance without data is computed once for a
@@ -63,18 +63,19 @@ def table_5_1(transport: Transport, prior: Prior, c_bh: float, *,
     """
     F, Y, _ = transport.evolution_model()
     mean = np.full(len(F), c_bh)
-    return KalmanFilter(F, Y.sum(axis=1) * c_bh, mean, _free_covariance(transport, prior).scaled(c_bh**2),
-                        rank_tolerance=rank_tolerance)
+    covariance = _free_covariance(transport, prior).scaled(c_bh**2)
+    return KalmanFilter(F, Y.sum(axis=1) * c_bh, mean, covariance, rank_tolerance=rank_tolerance)
 
 
 class ClosedVesselFilter(DenseKalmanFilter):
-    """The Kalman filter of c⁺ = F c + w in a vessel that nothing enters; without F and Γ_w it all
-    stands still."""
+    """The Kalman filter of c⁺ = F c + w where nothing enters; at rest without F and Γ_w."""
 
     def __init__(self, mean: np.ndarray, covariance: np.ndarray, transition: np.ndarray | None,
                  noise: np.ndarray | None) -> None:
         super().__init__(mean, covariance)
-        self._transition, self._noise, self._initial = transition, noise, covariance
+        self._transition = transition
+        self._noise = noise
+        self._initial = covariance
         self.forcing = np.zeros_like(self.mean)
 
     @property
@@ -119,4 +120,5 @@ def _free_covariance(transport: Transport, prior: Prior) -> FreeCovariance:
 @lru_cache(maxsize=4)
 def _state_noise(transport: Transport, prior: Prior) -> np.ndarray:
     """Γ_w (5.16) for ĉ_bh = 1."""
-    return transport.evolution_model().state_noise_covariance(prior.inflow_std**2, prior.nodal_std**2)
+    model = transport.evolution_model()
+    return model.state_noise_covariance(prior.inflow_std**2, prior.nodal_std**2)

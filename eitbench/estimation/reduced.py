@@ -23,7 +23,7 @@ from eitbench.estimation.parameters import ClosedVesselFilter
 
 
 class ReducedModel(NamedTuple):
-    """a⁺ = A a + w for deviations c − s = Φ a from what the deterministic input alone would give."""
+    """a⁺ = A a + w for deviations c − s = Φ a from what the deterministic input alone gives."""
 
     basis: np.ndarray
     """(n, r) Φ, with Φᵀ M Φ = I"""
@@ -35,8 +35,9 @@ class ReducedModel(NamedTuple):
     """(r, r) covariance of a at t = 0"""
 
 
-def reduced_model(start: KalmanFilter | ClosedVesselFilter, mass: np.ndarray, observations: Iterable[Observation],
-                  rank: int, *, skip: int = 20) -> ReducedModel:
+def reduced_model(start: KalmanFilter | ClosedVesselFilter, mass: np.ndarray,
+                  observations: Iterable[Observation], rank: int, *,
+                  skip: int = 20) -> ReducedModel:
     """The model of ``start`` in the ``rank`` directions in which it learns most.
 
     Parameters
@@ -60,9 +61,9 @@ def reduced_model(start: KalmanFilter | ClosedVesselFilter, mass: np.ndarray, ob
                         weighted.T @ start.apply_initial(weighted))
 
 
-def learnt_of(start: KalmanFilter | ClosedVesselFilter, observations: Iterable[Observation], skip: int) -> np.ndarray:
-    """(n, n) by how much measurements reduce the covariance, summed over a record but for its first
-    ``skip`` steps."""
+def learnt_of(start: KalmanFilter | ClosedVesselFilter, observations: Iterable[Observation],
+              skip: int) -> np.ndarray:
+    """(n, n) by how much a record reduces the covariance, summed but for ``skip`` first steps."""
     # never sees a measurement
     blind = copy.deepcopy(start) if isinstance(start, ClosedVesselFilter) else None
     learnt = np.zeros((len(start.mean), len(start.mean)))
@@ -77,15 +78,16 @@ def learnt_of(start: KalmanFilter | ClosedVesselFilter, observations: Iterable[O
 
 
 def main_directions(learnt: np.ndarray, mass: np.ndarray, rank: int) -> np.ndarray:
-    """(n, r) the directions that carry most of ``learnt`` (n, n), as measured by the mass matrix M:
-    Φᵀ M Φ = I."""
-    root, n = np.linalg.cholesky(mass), len(mass)
+    """(n, r) directions that carry most of ``learnt`` (n, n) by the mass matrix M: Φᵀ M Φ = I."""
+    root = np.linalg.cholesky(mass)
+    n = len(mass)
     _, vectors = scipy.linalg.eigh(root.T @ learnt @ root, subset_by_index=[n - rank, n - 1])
     basis: np.ndarray = scipy.linalg.solve_triangular(root.T, vectors[:, ::-1], lower=False)
     return basis
 
 
-def _learnt(filter_: KalmanFilter | ClosedVesselFilter, blind: ClosedVesselFilter | None) -> np.ndarray:
+def _learnt(filter_: KalmanFilter | ClosedVesselFilter,
+            blind: ClosedVesselFilter | None) -> np.ndarray:
     """(n, n) by how much the measurements have reduced the covariance."""
     if isinstance(filter_, KalmanFilter):
         return filter_.known @ filter_.known.T
@@ -106,11 +108,16 @@ class ReducedFilter:
     """
 
     def __init__(self, model: ReducedModel, mean: np.ndarray, covariance: np.ndarray) -> None:
-        self.model, self.mean, self.covariance = model, mean, covariance.copy()
-        self._half, self._next = np.empty_like(covariance), np.empty_like(covariance)
-        A, r = model.transition, len(model.transition)
+        self.model = model
+        self.mean = mean
+        self.covariance = covariance.copy()
+        self._half = np.empty_like(covariance)
+        self._next = np.empty_like(covariance)
+        A = model.transition
+        r = len(A)
         splits = [k for k in range(1, r) if A[k, k - 1] == 0.0]
-        thirds = {min(splits, key=lambda k: abs(k - third)) for third in (r // 3, 2 * r // 3)} if splits else set()
+        thirds = {min(splits, key=lambda k: abs(k - third))
+                  for third in (r // 3, 2 * r // 3) if splits}
         self._edges = [0, *sorted(thirds), r]
 
     def predict(self) -> None:
@@ -128,23 +135,27 @@ class ReducedFilter:
                gate: float = math.inf) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Take in residual = matrix·a + v: (B, m, r), (B, m), (B, m).
 
-        Readings are left out that `believable` does not believe with this ``gate``. Returns
-        innovations (B, m), their predicted variances (B, m) and which were taken in (B, m), all of
-        them before any was left out.
+        Readings that are not `believable` with this ``gate`` are left out. Returns of all of them
+        the innovations, their predicted variances and which were taken in, (B, m) each.
         """
-        P, transposed, m = self.covariance, np.swapaxes(matrix, -1, -2), matrix.shape[1]
+        P = self.covariance
+        m = matrix.shape[1]
         cross = matrix @ P                                                                  # H P
-        S = cross @ transposed
+        S = cross @ np.swapaxes(matrix, -1, -2)
         S[:, np.arange(m), np.arange(m)] += noise_variance
-        innovation, variance = residual - (matrix @ self.mean[..., None])[..., 0], S.diagonal(axis1=1, axis2=2).copy()
-        kept, taken = believable(innovation, variance, gate), innovation
+        innovation = residual - (matrix @ self.mean[..., None])[..., 0]
+        variance = S.diagonal(axis1=1, axis2=2).copy()
+        kept = believable(innovation, variance, gate)
+        taken = innovation
         if not kept.all():  # a reading left out is one without a word on the state
-            cross, taken = cross * kept[..., None], innovation * kept
+            cross = cross * kept[..., None]
+            taken = innovation * kept
             S *= kept[:, :, None] & kept[:, None, :]
             S[:, np.arange(m), np.arange(m)] += ~kept
         inverse_root = np.linalg.inv(np.linalg.cholesky(S))
         W = inverse_root @ cross
+        gained = np.swapaxes(W, -1, -2)
         whitened = inverse_root @ taken[..., None]
-        self.mean = self.mean + (np.swapaxes(W, -1, -2) @ whitened)[..., 0]
-        P -= np.swapaxes(W, -1, -2) @ W
+        self.mean = self.mean + (gained @ whitened)[..., 0]
+        P -= gained @ W
         return innovation, variance, kept

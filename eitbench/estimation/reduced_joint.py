@@ -1,5 +1,4 @@
-"""Concentration and mean velocity estimated together in few coordinates, for very many records at
-once.
+"""Concentration and mean velocity estimated together in few coordinates, for very many records.
 
 `JointFilter` makes F(θ) anew at every step. Projected onto a basis Φ that serves all velocities
 (see `eitbench.estimation.reduced`) F(θ) is a smooth function of θ with small values: a cubic spline
@@ -18,8 +17,7 @@ from eitbench.estimation.reduced import ReducedFilter
 
 
 class JointModel(NamedTuple):
-    """a⁺ = A(θ) a + w, θ⁺ = θ + ω, for deviations c − s = Φ a from a liquid that the flow leaves as
-    it is."""
+    """a⁺ = A(θ) a + w, θ⁺ = θ + ω, for c − s = Φ a about a liquid that the flow leaves as it is."""
 
     basis: np.ndarray
     """(n, r) Φ, with Φᵀ M Φ = I"""
@@ -45,21 +43,24 @@ class JointTables:
 
     def __init__(self, model: JointModel, dtype: type = np.float64) -> None:
         self.velocities = model.velocities
-        self._transition, self._noise = (self._coefficients(table, dtype) for table in (model.transition, model.noise))
+        self._transition = self._coefficients(model.transition, dtype)
+        self._noise = self._coefficients(model.noise, dtype)
 
     def _coefficients(self, table: np.ndarray, dtype: type) -> np.ndarray:
         """(K − 1, 4, r, r) those of (θ − θ_k)³ … 1."""
-        return np.ascontiguousarray(np.moveaxis(CubicSpline(self.velocities, table).c, 0, 1).astype(dtype))
+        coefficients = np.moveaxis(CubicSpline(self.velocities, table).c, 0, 1)
+        return np.ascontiguousarray(coefficients.astype(dtype))
 
     def at(self, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """A(θ), dA/dθ and the covariance of w, (B, r, r) each, for θ (B,) in m/s; beyond the table
-        as at its ends."""
-        theta = np.clip(np.asarray(velocity, dtype=float), self.velocities[0], self.velocities[-1])
-        part = np.clip(np.searchsorted(self.velocities, theta, side="right") - 1, 0, len(self.velocities) - 2)
-        d = (theta - self.velocities[part]).astype(self._transition.dtype)[:, None, None]
+        """A(θ), dA/dθ and w's covariance, (B, r, r) each; θ (B,) in m/s, kept within the table."""
+        knots = self.velocities
+        theta = np.clip(np.asarray(velocity, dtype=float), knots[0], knots[-1])
+        part = np.clip(np.searchsorted(knots, theta, side="right") - 1, 0, len(knots) - 2)
+        d = (theta - knots[part]).astype(self._transition.dtype)[:, None, None]
         c3, c2, c1, c0 = (self._transition[part, k] for k in range(4))
         n3, n2, n1, n0 = (self._noise[part, k] for k in range(4))
-        return ((c3 * d + c2) * d + c1) * d + c0, (3 * c3 * d + 2 * c2) * d + c1, ((n3 * d + n2) * d + n1) * d + n0
+        slope = (3 * c3 * d + 2 * c2) * d + c1
+        return ((c3 * d + c2) * d + c1) * d + c0, slope, ((n3 * d + n2) * d + n1) * d + n0
 
 
 class ReducedJointFilter(ReducedFilter):
@@ -80,10 +81,13 @@ class ReducedJointFilter(ReducedFilter):
         m/s, least and largest θ.
     """
 
-    def __init__(self, tables: JointTables, mean: np.ndarray, covariance: np.ndarray, walk_std: float,
-                 bounds: tuple[float, float]) -> None:
-        self.tables, self.mean, self.covariance = tables, mean, covariance.copy()
-        self._walk_variance, self._bounds = walk_std**2, bounds
+    def __init__(self, tables: JointTables, mean: np.ndarray, covariance: np.ndarray,
+                 walk_std: float, bounds: tuple[float, float]) -> None:
+        self.tables = tables
+        self.mean = mean
+        self.covariance = covariance.copy()
+        self._walk_variance = walk_std**2
+        self._bounds = bounds
 
     def predict(self) -> None:
         """One time step on."""
@@ -94,39 +98,41 @@ class ReducedJointFilter(ReducedFilter):
         self.covariance = transition @ self.covariance @ np.swapaxes(transition, 1, 2) + noise
 
     def step_at(self, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """How small deviations from ``mean`` (B, r + 1) move, and the covariance of the noise; (B,
-        r + 1, r + 1) each.
-        """
+        """How deviations from ``mean`` (B, r + 1) move, and their noise; (B, r + 1, r + 1) each."""
         return joint_step(self.tables, mean, self._walk_variance)
 
     def update(self, matrix: np.ndarray, residual: np.ndarray, noise_variance: np.ndarray, *,
                gate: float = np.inf) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Take in residual = matrix·a + v: (B, m, r), (B, m), (B, m); see `ReducedFilter`."""
         blind = np.zeros((*matrix.shape[:2], 1), matrix.dtype)  # θ itself is not seen
-        result = super().update(np.concatenate([matrix, blind], axis=2), residual, noise_variance, gate=gate)
+        seen = np.concatenate([matrix, blind], axis=2)
+        result = super().update(seen, residual, noise_variance, gate=gate)
         np.clip(self.mean[:, -1], *self._bounds, out=self.mean[:, -1])  # the filter's own array
         return result
 
 
-def joint_step(tables: JointTables, mean: np.ndarray, walk_variance: float) -> tuple[np.ndarray, np.ndarray]:
-    """[[A, (dA/dθ) a], [0, 1]] and the covariance of (w, ω), (B, r + 1, r + 1) each, at ``mean``
-    (B, r + 1)."""
+def joint_step(tables: JointTables, mean: np.ndarray,
+               walk_variance: float) -> tuple[np.ndarray, np.ndarray]:
+    """[[A, (dA/dθ) a], [0, 1]] and (w, ω)'s covariance, (B, r + 1, r + 1); ``mean`` (B, r + 1)."""
     A, slope, W = tables.at(mean[:, -1])
     B, r = mean[:, :-1].shape
     transition, noise = np.zeros((2, B, r + 1, r + 1), A.dtype)
-    transition[:, :r, :r], transition[:, r, r] = A, 1.0
+    transition[:, :r, :r] = A
+    transition[:, r, r] = 1.0
     transition[:, :r, r] = (slope @ mean[:, :r, None])[..., 0]
-    noise[:, :r, :r], noise[:, r, r] = W, walk_variance
+    noise[:, :r, :r] = W
+    noise[:, r, r] = walk_variance
     return transition, noise
 
 
 def joint_model(basis: np.ndarray, mass: np.ndarray, initial: np.ndarray, velocities: np.ndarray,
                 steps: Iterable[tuple[np.ndarray, np.ndarray]]) -> JointModel:
-    """Galerkin's projection of F(θ) (n, n) and Γ_w(θ) (n, n), given for each of ``velocities``,
-    onto ``basis``."""
-    weighted, transition, noise = mass @ basis, [], []
+    """Galerkin's projection onto ``basis`` of F(θ) and Γ_w(θ), (n, n) at each of ``velocities``."""
+    weighted = mass @ basis
+    transition = []
+    noise = []
     for F, state_noise in steps:                           # one at a time: they are large
         transition.append(weighted.T @ (F @ basis))
         noise.append(weighted.T @ (state_noise @ weighted))
-    return JointModel(basis, np.asarray(velocities, dtype=float), np.array(transition), np.array(noise),
-                      weighted.T @ (initial @ weighted))
+    return JointModel(basis, np.asarray(velocities, dtype=float), np.array(transition),
+                      np.array(noise), weighted.T @ (initial @ weighted))

@@ -1,5 +1,4 @@
-"""Smoothing without inverses of n×n matrices and without storing any (Bryson & Frazier 1963;
-``docs/methods.md``, 6)."""
+"""Smoothing that inverts and stores no n×n matrix (Bryson & Frazier 1963; docs/methods.md, 6)."""
 
 from __future__ import annotations
 
@@ -9,7 +8,14 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
-from eitbench.estimation.kalman import Expected, FilterStep, KalmanFilter, Observation, compressed, kalman_filter
+from eitbench.estimation.gate import Filter
+from eitbench.estimation.kalman import (
+    FilterStep,
+    KalmanFilter,
+    Observation,
+    compressed,
+    kalman_filter,
+)
 
 
 class Smoothed(NamedTuple):
@@ -21,23 +27,23 @@ class Smoothed(NamedTuple):
     """(n,)"""
 
 
-def fixed_interval_smoother(start: KalmanFilter, observations: Iterable[Observation]) -> list[Smoothed]:
+def fixed_interval_smoother(start: KalmanFilter,
+                            observations: Iterable[Observation]) -> list[Smoothed]:
     """c_{t|T} for t = 1 … T: filter the record, then come back over it."""
     steps = kalman_filter(start, observations)
     return [_smoothed(start, step, later) for step, later in _backwards(start, steps)][::-1]
 
 
 def smoothed_state(filter_: KalmanFilter, steps: Sequence[FilterStep]) -> Smoothed:
-    """The state of the first of consecutive ``steps`` of ``filter_`` given the measurements of all
-    of them.
+    """The state of the first of consecutive ``steps``, given the measurements of all of them.
 
-    With the last k + 1 steps this is the fixed-lag smoother c_{t−k|t}.
+    With the last k + 1 steps of ``filter_`` this is the fixed-lag smoother c_{t−k|t}.
     """
     *_, (step, later) = _backwards(filter_, steps)
     return _smoothed(filter_, step, later)
 
 
-class _Moving(Protocol):
+class _Moving(Filter, Protocol):
     """A filter that moves on by itself; after `predict` the others say what it did."""
 
     mean: np.ndarray
@@ -50,25 +56,25 @@ class _Moving(Protocol):
     def apply_noise(self) -> Callable[[np.ndarray], np.ndarray]: ...
     def apply_initial(self, X: np.ndarray) -> np.ndarray: ...
     def predict(self) -> None: ...
-    def expect(self, observation: Observation) -> Expected: ...
-    def take_in(self, H: np.ndarray, cross: np.ndarray, innovation: np.ndarray, S: np.ndarray) -> object: ...
 
 
 def smoothed_means(start: _Moving, observations: Iterable[Observation]) -> np.ndarray:
-    """Means c_{t|T} (T, n) of a filter that stands at t = 0, whose motion may change from step to
-    step.
+    """Means c_{t|T} (T, n) of a filter that stands at t = 0 and may move otherwise at each step.
 
     The adjoint λ_t = Hᵀ S⁻¹ ν + (I − K H)ᵀ Fᵀ_{t+1} λ_{t+1} runs back over the innovations, and the
     smoothed state follows forwards from c_{0|T} = c_{0|0} + Γ_{0|0} F₁ᵀ λ_1 as c_t = F_t c_{t−1} +
     s_t + Γ_w λ_t (``docs/methods.md``, 6): without variances, and without a covariance being kept.
     """
-    mean, steps = start.mean, []
+    mean = start.mean
+    steps = []
     for observation in observations:
         start.predict()
         expected = start.expect(observation)
-        start.take_in(observation.matrix, *expected)
-        steps.append((observation.matrix, expected, start.transition, start.forcing, start.apply_noise))
-    smoothed, later = np.empty((len(steps), len(mean))), np.zeros_like(mean)
+        H = observation.matrix
+        start.take_in(H, *expected)
+        steps.append((H, expected, start.transition, start.forcing, start.apply_noise))
+    smoothed = np.empty((len(steps), len(mean)))
+    later = np.zeros_like(mean)
     for t in range(len(steps) - 1, -1, -1):
         H, (cross, innovation, S), F, *_ = steps[t]
         smoothed[t] = later + H.T @ np.linalg.solve(S, innovation - cross.T @ later)  # λ_t
@@ -79,7 +85,8 @@ def smoothed_means(start: _Moving, observations: Iterable[Observation]) -> np.nd
     return smoothed
 
 
-def _backwards(filter_: KalmanFilter, steps: Sequence[FilterStep]) -> Iterator[tuple[FilterStep, np.ndarray]]:
+def _backwards(filter_: KalmanFilter,
+               steps: Sequence[FilterStep]) -> Iterator[tuple[FilterStep, np.ndarray]]:
     """(step, [λ, B]) from the last step to the first: what its own and later measurements say.
 
     The adjoint λ and the information N = B Bᵀ obey, with S = L Lᵀ,

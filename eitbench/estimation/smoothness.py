@@ -9,7 +9,8 @@ import scipy.sparse as sp
 from eitbench import _check
 
 
-def smoothness_covariance(mass: sp.csr_array, stiffness: sp.csr_array, length: float, std: float) -> np.ndarray:
+def smoothness_covariance(mass: sp.csr_array, stiffness: sp.csr_array, length: float,
+                          std: float) -> np.ndarray:
     """Γ = s·(M + ℓ²K)⁻¹ M (M + ℓ²K)⁻¹, (n, n): a proper smoothness prior.
 
     The field x solves x − ℓ²∆x = white noise with ∂x/∂n = 0 on the wall: in free space a Matérn

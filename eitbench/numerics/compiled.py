@@ -8,10 +8,7 @@ from typing import Any
 def compiled_kernels() -> Any:
     """The module `eitbench.numerics.kernels`.
 
-    Raises
-    ------
-    RuntimeError
-        If numba is missing or does not work.
+    ``RuntimeError`` if numba is missing or does not work.
     """
     try:
         from eitbench.numerics import kernels

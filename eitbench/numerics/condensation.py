@@ -12,10 +12,10 @@ from __future__ import annotations
 
 import numpy as np
 import scipy.sparse as sp
-from scipy.sparse.linalg import splu
 
 from eitbench.numerics.compiled import compiled_kernels
 from eitbench.numerics.memory import scratch
+from eitbench.numerics.sparse_lu import eliminated
 
 _LEAF = 200
 """Unknowns of a part of the body that is not cut any more."""
@@ -32,9 +32,8 @@ class Condensation:
         Symmetric, with a full diagonal.
     n_ports : int
     places : (n − n_ports, d), optional
-        Where the unknowns lie; if given, they are ordered by nested dissection. In 3D that takes a
-        half of the operations of minimum degree, and less on large meshes; in 2D minimum degree is
-        better.
+        Where the unknowns lie; if given, they are ordered by nested dissection. In 3D that takes
+        half of minimum degree's operations, and less on large meshes; in 2D that is better.
 
     Attributes
     ----------
@@ -122,15 +121,12 @@ class Condensation:
 
 def _filled(pattern: sp.csc_array) -> sp.csc_array:
     """The Cholesky factor's pattern, as SuperLU finds it for a matrix on which nothing cancels."""
-    factors = splu(sp.csc_matrix(_diagonally_dominant(pattern)), permc_spec="NATURAL",
-                   diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    factors = eliminated(_diagonally_dominant(pattern), "NATURAL")
     back = np.argsort(factors.perm_c)      # SuperLU may have postordered the elimination tree
     lower = factors.L.tocoo()
     i, j = back[lower.row], back[lower.col]
     places = np.maximum(i, j), np.minimum(i, j)
-    filled = sp.csc_array((np.ones(lower.nnz), places), shape=pattern.shape)
-    filled.sort_indices()
-    return filled
+    return _sorted_pattern(places, pattern.shape)
 
 
 def _parents(filled: sp.csc_array) -> np.ndarray:
@@ -149,7 +145,8 @@ def _postorder(parents: np.ndarray, n_last: int) -> np.ndarray:
     size = [1] * n + [0]
     for j in range(n):
         size[parent[j]] += size[j]
-    rank, begin = list(range(len(parents))), [0] * (n + 1)
+    rank = list(range(len(parents)))
+    begin = [0] * (n + 1)
     for j in reversed(range(n)):                  # a column's place is the end of its subtree's
         begin[j] = begin[parent[j]]
         begin[parent[j]] += size[j]
@@ -162,7 +159,8 @@ def _supernodes(filled: sp.csc_array, n_last: int) -> tuple[np.ndarray, ...]:
 
     The ``n_last`` last columns are one supernode.
     """
-    n, count = filled.shape[0], np.diff(filled.indptr)
+    n = filled.shape[0]
+    count = np.diff(filled.indptr)
     begins = np.ones(n, dtype=bool)
     begins[1:] = (_parents(filled)[:-1] != np.arange(1, n)) | (count[:-1] != count[1:] + 1)
     begins[n - n_last:] = np.arange(n_last) == 0
@@ -179,8 +177,7 @@ def _supernodes(filled: sp.csc_array, n_last: int) -> tuple[np.ndarray, ...]:
 
 def _multifrontal_sizes(start: np.ndarray, first_row: np.ndarray, rows: np.ndarray,
                         _panel: np.ndarray, owner: np.ndarray) -> tuple[np.ndarray, int, int]:
-    """Children of each supernode in the elimination tree, and entries of the largest front and of
-    the fullest stack."""
+    """Children of each supernode, and entries of the largest front and of the fullest stack."""
     width, height = np.diff(start), np.diff(first_row)
     parent = owner[rows[first_row[:-2] + width[:-1]]]             # the owner of the first row below
     children = np.bincount(parent, minlength=len(width))
@@ -198,7 +195,8 @@ def _multifrontal_sizes(start: np.ndarray, first_row: np.ndarray, rows: np.ndarr
 
 def _ordered(pattern: sp.csc_array, n_ports: int, places: np.ndarray | None) -> np.ndarray:
     """Position of each unknown, the ports last."""
-    n, inner = pattern.shape[0], pattern[:-n_ports, :-n_ports]
+    n = pattern.shape[0]
+    inner = pattern[:-n_ports, :-n_ports]
     place = _minimum_degree(inner) if places is None else _nested_dissection(inner, places)
     return np.append(place, np.arange(n - n_ports, n))
 
@@ -241,17 +239,18 @@ def _nested_dissection(pattern: sp.csc_array, places: np.ndarray) -> np.ndarray:
 
 def _minimum_degree(pattern: sp.csc_array) -> np.ndarray:
     """Position of each unknown in a fill-reducing order."""
-    factors = splu(sp.csc_matrix(_diagonally_dominant(pattern)), permc_spec="MMD_AT_PLUS_A",
-                   diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    return factors.perm_c.astype(np.int64)
+    return eliminated(_diagonally_dominant(pattern), "MMD_AT_PLUS_A").perm_c.astype(np.int64)
 
 
 def _permuted(pattern: sp.csc_array, place: np.ndarray) -> sp.csc_array:
     coo = pattern.tocoo()
-    permuted = sp.csc_array((np.ones(coo.nnz), (place[coo.row], place[coo.col])),
-                            shape=pattern.shape)
-    permuted.sort_indices()
-    return permuted
+    return _sorted_pattern((place[coo.row], place[coo.col]), pattern.shape)
+
+
+def _sorted_pattern(places: tuple[np.ndarray, np.ndarray], shape: tuple[int, int]) -> sp.csc_array:
+    pattern = sp.csc_array((np.ones(len(places[0])), places), shape=shape)
+    pattern.sort_indices()
+    return pattern
 
 
 def _diagonally_dominant(pattern: sp.csc_array) -> sp.csc_array:

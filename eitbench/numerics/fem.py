@@ -28,21 +28,34 @@ def to_skfem(mesh: Mesh) -> skfem.Mesh:
     return kind(np.ascontiguousarray(mesh.points.T), np.ascontiguousarray(mesh.cells.T))
 
 
+def basis(mesh: Mesh, order: int, intorder: int) -> skfem.CellBasis:
+    """Of that order on a mesh, with integrals exact for polynomials of degree ``intorder``."""
+    return skfem.Basis(to_skfem(mesh), element(mesh.dim, order), intorder=intorder)
+
+
 @skfem.BilinearForm
-def _mass(u, v, _w):
+def product(u, v, _w):
+    """∫φᵢφⱼ."""
     return u * v
 
 
 @skfem.BilinearForm
-def _laplace(u, v, _w):
+def laplace(u, v, _w):
+    """∫∇φᵢ·∇φⱼ."""
     return dot(grad(u), grad(v))
+
+
+@skfem.LinearForm
+def integral(v, _w):
+    """∫φᵢ."""
+    return v
 
 
 def mass_matrix(mesh: Mesh) -> sp.csr_array:
     """(n, n) P1 mass matrix ∫φᵢφⱼ in m^d."""
-    return sp.csr_array(_mass.assemble(skfem.Basis(to_skfem(mesh), element(mesh.dim, 1), intorder=2)))
+    return sp.csr_array(product.assemble(basis(mesh, 1, intorder=2)))
 
 
 def stiffness_matrix(mesh: Mesh) -> sp.csr_array:
     """(n, n) P1 stiffness matrix ∫∇φᵢ·∇φⱼ in m^(d-2)."""
-    return sp.csr_array(_laplace.assemble(skfem.Basis(to_skfem(mesh), element(mesh.dim, 1), intorder=1)))
+    return sp.csr_array(laplace.assemble(basis(mesh, 1, intorder=1)))

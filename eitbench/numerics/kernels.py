@@ -34,7 +34,8 @@ class Lanes(types.Type):
     """<width x double>, held in registers."""
 
     def __init__(self, width: int) -> None:
-        self.width, self.vector = width, ir.VectorType(ir.DoubleType(), width)
+        self.width = width
+        self.vector = ir.VectorType(ir.DoubleType(), width)
         super().__init__(name=f"Lanes{width}")
 
 

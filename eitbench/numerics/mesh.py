@@ -1,5 +1,4 @@
-"""Simplex meshes from plain arrays: nodes, cells, boundary facets, and linear interpolation between
-meshes."""
+"""Simplex meshes from plain arrays: nodes, cells, boundary facets, and linear interpolation."""
 
 from __future__ import annotations
 
@@ -20,18 +19,15 @@ from eitbench import _check
 class Mesh:
     """A mesh of triangles (2D) or tetrahedra (3D).
 
+    ``ValueError`` if shapes are wrong, a coordinate is not finite, a node number is out of range, a
+    node belongs to no cell, or a cell has no volume.
+
     Parameters
     ----------
     points : (n_nodes, d) float
         Node coordinates in m, d = 2 or 3.
     cells : (n_cells, d + 1) int
         Node numbers of each simplex; the orientation does not matter.
-
-    Raises
-    ------
-    ValueError
-        If shapes are wrong, a coordinate is not finite, a node number is out of range, a node
-        belongs to no cell, or a cell has no volume.
     """
 
     points: np.ndarray
@@ -40,26 +36,29 @@ class Mesh:
     def __post_init__(self) -> None:
         points = _check.array("points", self.points, (None, None), units="m")
         cells = np.asarray(self.cells)
-        if points.shape[1] not in (2, 3):
-            raise ValueError(f"points must have shape (n_nodes, 2) or (n_nodes, 3), got {points.shape}")
         d = points.shape[1]
+        if d not in (2, 3):
+            raise ValueError("points must have shape (n_nodes, 2) or (n_nodes, 3), "
+                             f"got {points.shape}")
         if cells.ndim != 2 or cells.shape[1] != d + 1 or not np.issubdtype(cells.dtype, np.integer):
             raise ValueError(f"cells must be integers of shape (n_cells, {d + 1}) in {d}D, "
                              f"got {cells.dtype} of shape {cells.shape}")
         cells = cells.astype(np.int64)
         if cells.size == 0 or cells.min() < 0 or cells.max() >= len(points):
-            raise ValueError(f"cells must hold node numbers in [0, {len(points) - 1}], and at least one cell")
+            raise ValueError(f"cells must hold node numbers in [0, {len(points) - 1}], "
+                             "and at least one cell")
         unused = np.setdiff1d(np.arange(len(points)), cells)
         if unused.size:
-            raise ValueError(f"points must all belong to a cell; {unused.size} do not, the first is node {unused[0]}")
+            raise ValueError(f"points must all belong to a cell; {unused.size} do not, "
+                             f"the first is node {unused[0]}")
         for name, value in (("points", points.copy()), ("cells", cells)):
             value.setflags(write=False)  # meshes are shared, and much is derived from them
             object.__setattr__(self, name, value)
         size = np.ptp(points, axis=0).max()
         flat = np.flatnonzero(self.volumes <= 1e-14 * size**d)
         if flat.size:
-            raise ValueError(f"cells must have a positive volume; cell {flat[0]} has nodes {cells[flat[0]].tolist()} "
-                             "on one line or plane")
+            raise ValueError(f"cells must have a positive volume; cell {flat[0]} has nodes "
+                             f"{cells[flat[0]].tolist()} on one line or plane")
 
     @property
     def dim(self) -> int:
@@ -79,8 +78,7 @@ class Mesh:
 
     @cached_property
     def boundary_facets(self) -> np.ndarray:
-        """(n_facets, d) node numbers, sorted within each row, of the facets that belong to one cell
-        only."""
+        """(n_facets, d) node numbers, sorted in each row, of the facets of one cell only."""
         return self._boundary[0]
 
     @cached_property
@@ -88,34 +86,30 @@ class Mesh:
         """The boundary facets (n_facets, d) and the cell (n_facets,) that each belongs to."""
         d = self.dim
         facets = np.concatenate([np.delete(self.cells, i, axis=1) for i in range(d + 1)])
-        facets, first, count = np.unique(np.sort(facets, axis=1), axis=0, return_index=True, return_counts=True)
+        facets, first, count = np.unique(np.sort(facets, axis=1), axis=0, return_index=True,
+                                         return_counts=True)
         return facets[count == 1], first[count == 1] % len(self.cells)
 
     def facets_where(self, predicate: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-        """The boundary facets all of whose nodes satisfy ``predicate(points (k, d)) -> bool (k,)``;
-        (n_facets, d)."""
+        """(n_facets, d): boundary facets with all nodes in ``predicate(points) -> bool (k,)``."""
         inside = np.asarray(predicate(self.points), dtype=bool)
         return self.boundary_facets[inside[self.boundary_facets].all(axis=1)]
 
     @cached_property
-    def _centroid_tree(self) -> cKDTree:
-        return cKDTree(self.points[self.cells].mean(axis=1))
-
-    @cached_property
-    def _reach(self) -> float:
-        """How far from a cell's centroid its points may lie, m."""
-        corner = self.points[self.cells]
-        return (1.0 + 1e-9) * float(np.linalg.norm(corner - corner.mean(axis=1, keepdims=True), axis=2).max())
+    def _cell_tree(self) -> tuple[cKDTree, float]:
+        return _tree(self.points[self.cells])
 
     @cached_property
     def _wall_tree(self) -> tuple[cKDTree, float]:
-        """Centroids of the boundary facets, and how far from them their points may lie, m."""
-        corner = self.points[self.boundary_facets]
-        middle = corner.mean(axis=1)
-        return cKDTree(middle), float(np.linalg.norm(corner - middle[:, None], axis=2).max())
+        return _tree(self.points[self.boundary_facets])
 
     def locate(self, points: np.ndarray, candidates: int = 32) -> tuple[np.ndarray, np.ndarray]:
-        """The cell that holds each of ``points``, and the point's barycentric coordinates there.
+        """The cell (k,) int that holds each of ``points``, and its weights (k, d + 1) there.
+
+        Weights are barycentric coordinates, in the order of the cell's nodes: not negative, with
+        rows that sum to one.
+
+        ``ValueError`` if ``points`` has the wrong shape or is not finite.
 
         Parameters
         ----------
@@ -126,40 +120,28 @@ class Mesh:
         candidates : int
             How many cells, nearest by centroid, are searched first; points found in none are
             searched in all cells whose centroid is near enough.
-
-        Returns
-        -------
-        cells : (k,) int
-            Cell numbers; for a point outside, the cell that the nearest boundary facet belongs to.
-        barycentric : (k, d + 1) float
-            Weights of the cell's nodes, in the order of ``cells``: not negative, with rows that sum
-            to one.
-
-        Raises
-        ------
-        ValueError
-            If ``points`` has the wrong shape or is not finite.
         """
         points = _check.array("points", points, (None, self.dim), units="m")
         k = min(candidates, len(self.cells))
-        near = self._centroid_tree.query(points, k=k)[1].reshape(len(points), k)
+        tree, reach = self._cell_tree
+        near = tree.query(points, k=k)[1].reshape(len(points), k)
         best, weights = self._best_cell(points, near)
         lost = np.flatnonzero(weights.min(axis=1) < -1e-9)
         if lost.size and k < len(self.cells):
-            around = self._centroid_tree.query_ball_point(points[lost], self._reach, return_sorted=True)
+            around = tree.query_ball_point(points[lost], (1.0 + 1e-9) * reach, return_sorted=True)
             for i, cells in zip(lost, around, strict=True):
                 if cells:
-                    best[i:i + 1], weights[i:i + 1] = self._best_cell(points[i:i + 1], np.array([cells]))
+                    only = slice(i, i + 1)
+                    best[only], weights[only] = self._best_cell(points[only], np.array([cells]))
         for i in np.flatnonzero(weights.min(axis=1) < -1e-9):
-            # The cell with the least negative coordinate may be a large one far inside: take the
-            # nearest wall instead.
+            # The cell with the least negative coordinate may be a large one far inside.
             best[i], weights[i] = self._nearest_wall(points[i])
         weights = np.clip(weights, 0.0, None)
         weights /= weights.sum(axis=1, keepdims=True)
         return best, weights
 
     def interpolation_to(self, points: np.ndarray, candidates: int = 32) -> sp.csr_array:
-        """Matrix of linear interpolation from nodal values here to ``points``.
+        """(k, n_nodes) matrix of linear interpolation to ``points``, with rows that sum to one.
 
         Parameters
         ----------
@@ -168,37 +150,35 @@ class Mesh:
             point of the boundary.
         candidates : int
             See `locate`.
-
-        Returns
-        -------
-        (k, n_nodes) sparse array with rows that sum to one.
         """
         cells, weights = self.locate(points, candidates)
         rows = np.repeat(np.arange(len(cells)), self.dim + 1)
-        matrix = sp.csr_array((weights.ravel(), (rows, self.cells[cells].ravel())), shape=(len(cells), self.n_nodes))
+        matrix = sp.csr_array((weights.ravel(), (rows, self.cells[cells].ravel())),
+                              shape=(len(cells), self.n_nodes))
         matrix.eliminate_zeros()
         return matrix
 
     def _nearest_wall(self, point: np.ndarray) -> tuple[int, np.ndarray]:
-        """The cell of the boundary facet nearest to ``point``, and the barycentric coordinates of
-        its projection."""
+        """The cell at the nearest boundary facet, and the coordinates of the projection onto it."""
         tree, reach = self._wall_tree
-        distance = np.sqrt(((self.points[np.unique(self.boundary_facets)] - point)**2).sum(axis=1).min())
+        wall = self.points[np.unique(self.boundary_facets)]
+        distance = np.sqrt(((wall - point)**2).sum(axis=1).min())
         near = tree.query_ball_point(point, (1.0 + 1e-9) * (distance + reach), return_sorted=True)
         facets, cells = (array[near] for array in self._boundary)
         corner = self.points[facets]                                                   # (f, d, d)
         edges = corner[:, 1:] - corner[:, :1]
         gram = edges @ np.swapaxes(edges, 1, 2)
         local = np.linalg.solve(gram, edges @ (point - corner[:, 0])[:, :, None])[..., 0]
-        weights = np.clip(np.concatenate([1.0 - local.sum(axis=1, keepdims=True), local], axis=1), 0.0, None)
+        weights = np.concatenate([1.0 - local.sum(axis=1, keepdims=True), local], axis=1)
+        weights = np.clip(weights, 0.0, None)
         weights /= weights.sum(axis=1, keepdims=True)
         nearest = np.linalg.norm(np.einsum("fi,fid->fd", weights, corner) - point, axis=1).argmin()
         same_node = self.cells[cells[nearest]][:, None] == facets[nearest]              # (d + 1, d)
         return int(cells[nearest]), same_node @ weights[nearest]
 
-    def _best_cell(self, points: np.ndarray, candidates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Among each point's candidate cells the one that contains it best, with its barycentric
-        coordinates."""
+    def _best_cell(self, points: np.ndarray,
+                   candidates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Of each point's candidates the cell that holds it best, and its coordinates there."""
         corner = self.points[self.cells[candidates]]  # (k, c, d+1, d)
         edges = np.swapaxes(corner[:, :, 1:] - corner[:, :, :1], 2, 3)
         local = np.linalg.solve(edges, (points[:, None] - corner[:, :, 0])[..., None])[..., 0]
@@ -208,6 +188,35 @@ class Mesh:
         return candidates[row, which], barycentric[row, which]
 
 
+def _tree(corner: np.ndarray) -> tuple[cKDTree, float]:
+    """Middles of cells or facets (k, nodes, d), and how far from them their points may lie, m."""
+    middle = corner.mean(axis=1)
+    return cKDTree(middle), float(np.linalg.norm(corner - middle[:, None], axis=2).max())
+
+
+def checked_facets(name: str, facets: np.ndarray, mesh: Mesh) -> np.ndarray:
+    """``facets`` as an array of node numbers (k ≥ 1, d); else a ``ValueError`` with their name."""
+    facets = np.asarray(facets)
+    if (facets.ndim != 2 or facets.shape[1] != mesh.dim or len(facets) == 0
+            or not np.issubdtype(facets.dtype, np.integer)):
+        raise ValueError(f"{name} must be integers of shape (n_facets ≥ 1, {mesh.dim}), "
+                         f"got {facets.dtype} of shape {facets.shape}")
+    return facets
+
+
+def as_set(facets: np.ndarray) -> set[tuple[int, ...]]:
+    """Facets as tuples of node numbers."""
+    return set(map(tuple, facets.tolist()))
+
+
+def increasing(name: str, line: Sequence[float] | np.ndarray) -> np.ndarray:
+    """(k ≥ 2,) coordinates in m that increase; else a ``ValueError`` with their name."""
+    line = _check.array(name, line, (None,), units="m")
+    if len(line) < 2 or (np.diff(line) <= 0).any():
+        raise ValueError(f"{name} must hold at least two strictly increasing coordinates in m, "
+                         f"got {line!r}")
+    return line
+
 def rectangle_mesh(x: Sequence[float] | np.ndarray, y: Sequence[float] | np.ndarray) -> Mesh:
     """Structured triangles on the tensor grid of increasing coordinates ``x`` and ``y`` (m).
 
@@ -215,14 +224,12 @@ def rectangle_mesh(x: Sequence[float] | np.ndarray, y: Sequence[float] | np.ndar
     that matrices on this mesh are banded with half-bandwidth ``len(y) + 1``. Diagonals alternate,
     which keeps the mesh symmetric.
     """
-    x = _check.array("x", x, (None,), units="m")
-    y = _check.array("y", y, (None,), units="m")
-    for name, line in (("x", x), ("y", y)):
-        if len(line) < 2 or (np.diff(line) <= 0).any():
-            raise ValueError(f"{name} must hold at least two strictly increasing coordinates in m, got {line!r}")
+    x = increasing("x", x)
+    y = increasing("y", y)
     ny = len(y)
     points = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
-    i, j = (index.ravel() for index in np.meshgrid(np.arange(len(x) - 1), np.arange(ny - 1), indexing="ij"))
+    corners = np.meshgrid(np.arange(len(x) - 1), np.arange(ny - 1), indexing="ij")
+    i, j = (index.ravel() for index in corners)
     sw, nw = i * ny + j, i * ny + j + 1
     se, ne = sw + ny, nw + ny
     rising = ((i + j) % 2 == 0)[:, None]
@@ -231,9 +238,9 @@ def rectangle_mesh(x: Sequence[float] | np.ndarray, y: Sequence[float] | np.ndar
     return Mesh(points, np.concatenate([first, second], axis=1).reshape(-1, 3))
 
 
-def graded(start: float, stop: float, cells: int, grading: float, ends: str = "both") -> np.ndarray:
-    """``cells + 1`` coordinates from ``start`` to ``stop`` that crowd towards ``ends`` ("start",
-    "stop" or "both").
+def graded(start: float, stop: float, cells: int, grading: float,
+           ends: str = "both") -> np.ndarray:
+    """``cells + 1`` coordinates that crowd towards ``ends`` ("start", "stop" or "both").
 
     ``grading`` is the exponent of the clustering, ≥ 1; 1 is uniform.
     """
@@ -251,10 +258,28 @@ def graded(start: float, stop: float, cells: int, grading: float, ends: str = "b
     return start + (stop - start) * s
 
 
-def graded_pipe_mesh(length: float, half_width: float, electrode_spans: np.ndarray, cells_along: int,
-                     cells_across: int, grading: tuple[float, float] = (2.5, 1.75)) -> Mesh:
-    """EIT mesh of the pipe [0, length] × [-half_width, half_width], refined at the electrode edges
-    and the walls.
+def graded_line(length: float, name: str, spans: np.ndarray, cells: int,
+                grading: float) -> np.ndarray:
+    """Coordinates 0 … length (m) that crowd at both ends of each electrode's span along a pipe.
+
+    So many cells on each electrode and in each gap between two, half as many before the first and
+    after the last. ``ValueError`` with the name of ``spans`` if they do not fit.
+    """
+    edges = _check.array(name, spans, (None, 2), units="m").ravel()
+    if len(edges) == 0 or (np.diff([0.0, *edges, length]) <= 0).any():
+        raise ValueError(f"{name} must increase, keep a gap between electrodes and lie inside the "
+                         f"pipe, 0 … {length:g} m, got {spans!r}")
+    half = max(1, cells // 2)
+    lines = [graded(0.0, edges[0], half, grading, "stop")]
+    lines += [graded(a, b, cells, grading) for a, b in itertools.pairwise(edges)]
+    lines += [graded(edges[-1], length, half, grading, "start")]
+    return np.concatenate([line[:-1] for line in lines] + [[length]])
+
+
+def graded_pipe_mesh(length: float, half_width: float, electrode_spans: np.ndarray,
+                     cells_along: int, cells_across: int,
+                     grading: tuple[float, float] = (2.5, 1.75)) -> Mesh:
+    """EIT mesh of the pipe [0, length] × [-half_width, half_width], fine at electrodes and walls.
 
     Parameters
     ----------
@@ -273,13 +298,5 @@ def graded_pipe_mesh(length: float, half_width: float, electrode_spans: np.ndarr
         of unknowns.
     """
     along, across = grading
-    edges = _check.array("electrode_spans", electrode_spans, (None, 2), units="m").ravel()
-    if (np.diff([0.0, *edges, length]) <= 0).any():
-        raise ValueError("electrode_spans must increase, keep a gap between electrodes and lie inside the pipe, "
-                         f"0 … {length:g} m, got {electrode_spans!r}")
-    half = max(1, cells_along // 2)
-    lines = [graded(0.0, edges[0], half, along, "stop")]
-    lines += [graded(a, b, cells_along, along) for a, b in itertools.pairwise(edges)]
-    lines += [graded(edges[-1], length, half, along, "start")]
-    x = np.concatenate([line[:-1] for line in lines] + [[length]])
+    x = graded_line(length, "electrode_spans", electrode_spans, cells_along, along)
     return rectangle_mesh(x, graded(-half_width, half_width, cells_across, across))

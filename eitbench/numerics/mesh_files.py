@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from eitbench import _check
-from eitbench.numerics.mesh import Mesh
+from eitbench.numerics.mesh import Mesh, as_set, checked_facets
 
 _CELL = {2: "triangle", 3: "tetra"}
 _FACET = {2: "line", 3: "triangle"}
@@ -34,13 +34,20 @@ class MeshFile(NamedTuple):
 
     mesh: Mesh
     groups: dict[str, np.ndarray]
-    """Boundary facets by the name of their group: (k, d) node numbers, sorted in each row, each
-    facet once."""
+    """Boundary facets by their group's name: (k, d) node numbers, rows sorted, each facet once."""
 
 
 def read_mesh(path: str | PathLike[str], sha256: str | None = None, *,
               scale: float = 1.0) -> MeshFile:
     """A mesh of triangles or tetrahedra, and its named boundary facets.
+
+    It is 2D if there are no tetrahedra; the third coordinate must be zero then. Nodes stay in the
+    file's order; those of no cell are left out, such as the centres of circles. Groups of other
+    than boundary facets, such as the fluid, have no entry.
+
+    ``ValueError`` naming the file if it is not there, is not the one with this SHA-256, cannot be
+    read, holds no triangles or tetrahedra or other cells too, is of second order (curved), or if a
+    group of facets has no name, no facets, or one that is not on the boundary.
 
     Parameters
     ----------
@@ -52,20 +59,6 @@ def read_mesh(path: str | PathLike[str], sha256: str | None = None, *,
         What the SHA-256 of the file must be, in hexadecimal digits.
     scale : float
         Metres in a unit of the file, > 0: 1e-3 for one in mm.
-
-    Returns
-    -------
-    MeshFile
-        2D if there are no tetrahedra; the third coordinate must be zero then. Nodes stay in the
-        file's order; those of no cell are left out, such as the centres of circles. Groups of
-        other than boundary facets, such as the fluid, have no entry.
-
-    Raises
-    ------
-    ValueError
-        Naming the file, if it is not there, is not the one with this SHA-256, cannot be read, holds
-        no triangles or tetrahedra or other cells too, is of second order (curved), or if a group
-        of facets has no name, no facets, or one that is not on the boundary.
     """
     path = Path(path)
     scale = _check.number("scale", scale, low=0.0, open_low=True, units="m")
@@ -83,7 +76,7 @@ def read_mesh(path: str | PathLike[str], sha256: str | None = None, *,
         raise ValueError(f"{path}: {error}") from None
     number = np.full(len(points), -1)
     number[used] = np.arange(len(used))
-    boundary = _rows(mesh.boundary_facets)
+    boundary = as_set(mesh.boundary_facets)
     groups = {}
     for name, facets in _facet_groups(path, content, dim).items():
         numbered = np.sort(number[facets], axis=1)
@@ -100,6 +93,9 @@ def write_mesh(path: str | PathLike[str], mesh: Mesh,
                groups: Mapping[str, np.ndarray] | None = None) -> None:
     """Write a mesh and its groups as text, in gmsh's format 2.2; `read_mesh` finds the same bits.
 
+    ``ValueError`` if the file's name ends otherwise, a group's name cannot be written, or what it
+    holds are not boundary facets.
+
     Parameters
     ----------
     path : path of a file
@@ -107,12 +103,6 @@ def write_mesh(path: str | PathLike[str], mesh: Mesh,
     mesh : Mesh
     groups : mapping from str to (k ≥ 1, d) int, optional
         Boundary facets by name; a facet may be in several groups.
-
-    Raises
-    ------
-    ValueError
-        If the file's name ends otherwise, a group's name cannot be written, or what it holds are
-        not boundary facets.
     """
     import meshio
 
@@ -231,23 +221,12 @@ def _named_facets(path: Path, content: Any, dim: int, names: dict[int, str]
                 yield name, block.data[np.asarray(sets[number], dtype=int)]
 
 
-# -- facets ---------------------------------------------------------------------------------------
-
-
-def _rows(facets: np.ndarray) -> set[tuple[int, ...]]:
-    return set(map(tuple, facets.tolist()))
-
-
 def _checked_facets(name: object, facets: np.ndarray, mesh: Mesh) -> np.ndarray:
     if not isinstance(name, str) or not name.isprintable() or not name or set(name) & set('"\\'):
         raise ValueError("groups must have names of printable characters, without quotation marks "
                          f"and backslashes, got {name!r}")
-    facets = np.asarray(facets)
-    if (facets.ndim != 2 or facets.shape[1] != mesh.dim or len(facets) == 0
-            or not np.issubdtype(facets.dtype, np.integer)):
-        raise ValueError(f"group {name!r} must be integers of shape (n_facets ≥ 1, {mesh.dim}), "
-                         f"got {facets.dtype} of shape {facets.shape}")
-    strange = _rows(np.sort(facets, axis=1)) - _rows(mesh.boundary_facets)
+    facets = checked_facets(f"group {name!r}", facets, mesh)
+    strange = as_set(np.sort(facets, axis=1)) - as_set(mesh.boundary_facets)
     if strange:
         raise ValueError(f"group {name!r} must lie on the mesh's boundary, got facet "
                          f"{min(strange)}, which does not")

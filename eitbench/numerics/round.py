@@ -13,17 +13,18 @@ from collections.abc import Sequence
 import numpy as np
 
 from eitbench import _check
-from eitbench.numerics.mesh import Mesh, graded
+from eitbench.numerics.mesh import Mesh, graded, graded_line, increasing
 
 TURN = 2.0 * np.pi
 
 
 def disc_mesh(radii: Sequence[float] | np.ndarray, angles: Sequence[np.ndarray]) -> Mesh:
-    """Triangles of a disc, with nodes at its centre and on rings that need not hold equally many.
+    """Triangles of a disc with nodes at its centre (0), then on rings, outwards, by their angles.
 
-    Between two rings every edge of either is joined to that node of the other whose share of the
-    turn, from the middle of the edge before it to the middle of the edge behind it, holds the
-    middle of this edge.
+    Rings need not hold equally many. Every edge of either of two rings is joined to that node of
+    the other whose share of the turn, from the middle of the edge before it to the middle of the
+    edge behind it, holds the middle of this edge. ``ValueError`` naming the argument if a shape or
+    an order is wrong, or if the rings are so unlike that triangles overlap.
 
     Parameters
     ----------
@@ -31,29 +32,22 @@ def disc_mesh(radii: Sequence[float] | np.ndarray, angles: Sequence[np.ndarray])
         Radius of each ring in m, > 0 and increasing; the last one is the wall, a polygon.
     angles : K sequences of (n_k ≥ 3,) float
         Where each ring's nodes stand, in rad, increasing and within one turn.
-
-    Returns
-    -------
-    Mesh
-        Node 0 is the centre, then come the rings outwards, each in the order of its angles.
-
-    Raises
-    ------
-    ValueError
-        Naming the argument, if a shape or an order is wrong, or if the rings are so unlike that
-        triangles overlap.
     """
     radii = _check.array("radii", radii, (None,), units="m", positive=True)
     if len(radii) == 0 or (np.diff(radii) <= 0).any():
-        raise ValueError(f"radii must hold at least one radius in m, strictly increasing, got {radii!r}")
+        raise ValueError("radii must hold at least one radius in m, strictly increasing, "
+                         f"got {radii!r}")
     if len(angles) != len(radii):
-        raise ValueError(f"angles must hold one sequence for each of the {len(radii)} radii, got {len(angles)}")
-    rings = [_check.array(f"angles[{k}]", ring, (None,), units="rad") for k, ring in enumerate(angles)]
+        raise ValueError(f"angles must hold one sequence for each of the {len(radii)} radii, "
+                         f"got {len(angles)}")
+    rings = [_check.array(f"angles[{k}]", ring, (None,), units="rad")
+             for k, ring in enumerate(angles)]
     for k, ring in enumerate(rings):
         if len(ring) < 3 or (np.diff(ring) <= 0).any() or ring[-1] >= ring[0] + TURN:
-            raise ValueError(f"angles[{k}] must hold at least three angles in rad, strictly increasing and within one "
-                             f"turn, got {ring!r}")
-    polar = [r * np.stack([np.cos(ring), np.sin(ring)], axis=1) for r, ring in zip(radii, rings, strict=True)]
+            raise ValueError(f"angles[{k}] must hold at least three angles in rad, strictly "
+                             f"increasing and within one turn, got {ring!r}")
+    polar = [r * np.stack([np.cos(ring), np.sin(ring)], axis=1)
+             for r, ring in zip(radii, rings, strict=True)]
     points = np.concatenate([np.zeros((1, 2)), *polar])
     first = 1 + np.cumsum([0, *map(len, rings)])
     here = np.arange(len(rings[0]))
@@ -61,44 +55,44 @@ def disc_mesh(radii: Sequence[float] | np.ndarray, angles: Sequence[np.ndarray])
     cells += [_between(inner, outer, first[k], first[k + 1])
               for k, (inner, outer) in enumerate(itertools.pairwise(rings))]
     triangles = np.concatenate(cells)
-    # All run counter-clockwise, so that their areas add up to the polygon's, unless some lie on top
-    # of others.
+    # All run counter-clockwise, so that no area is negative unless some lie on top of others.
     a, b, c = np.moveaxis(points[triangles], 1, 0)
     area = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
     if area.min() <= 0:
-        raise ValueError("angles must be so dense, and those of neighbouring rings so alike, that no triangle is "
-                         f"turned over; one with node {triangles[area.argmin()].max()} is")
+        raise ValueError("angles must be so dense, and those of neighbouring rings so alike, that "
+                         "no triangle is turned over; one with node "
+                         f"{triangles[area.argmin()].max()} is")
     return Mesh(points, triangles)
 
 
-def _between(inner: np.ndarray, outer: np.ndarray, first_inner: int, first_outer: int) -> np.ndarray:
-    """Triangles (n_inner + n_outer, 3), counter-clockwise, between two rings of these angles and
-    first nodes."""
-    i, j = np.arange(len(inner)), np.arange(len(outer))
-    middle_i, middle_j = (np.mod(0.5 * (ring + np.append(ring[1:], ring[0] + TURN)), TURN) for ring in (inner, outer))
-    # Edges of both rings in one order around the turn; where two middles coincide the inner edge
-    # comes first.
-    on_outer, on_inner = _node_at(middle_j, middle_i, "left"), _node_at(middle_i, middle_j, "right")
-    inwards = np.stack([first_inner + i, first_outer + on_outer, first_inner + (i + 1) % len(i)], axis=1)
-    outwards = np.stack([first_outer + j, first_outer + (j + 1) % len(j), first_inner + on_inner], axis=1)
+def _between(inner: np.ndarray, outer: np.ndarray, first_inner: int,
+             first_outer: int) -> np.ndarray:
+    """Counter-clockwise triangles (n_inner + n_outer, 3) between two rings of these angles."""
+    i = np.arange(len(inner))
+    j = np.arange(len(outer))
+    middle_i, middle_j = (np.mod(0.5 * (ring + np.append(ring[1:], ring[0] + TURN)), TURN)
+                          for ring in (inner, outer))
+    # All edges have one order around the turn; where two middles coincide the inner comes first.
+    on_outer = first_outer + _node_at(middle_j, middle_i, "left")
+    on_inner = first_inner + _node_at(middle_i, middle_j, "right")
+    inwards = np.stack([first_inner + i, on_outer, first_inner + (i + 1) % len(i)], axis=1)
+    outwards = np.stack([first_outer + j, first_outer + (j + 1) % len(j), on_inner], axis=1)
     return np.concatenate([inwards, outwards])
 
 
 def _node_at(middles: np.ndarray, angle: np.ndarray, side: str) -> np.ndarray:
-    """The node that follows the last edge whose middle lies before ``angle`` ("left"), or there at
-    the latest."""
+    """The node after the last edge with its middle before ``angle`` ("left"), or not after it."""
     order = np.argsort(middles)
-    before = order[np.searchsorted(middles[order], angle, side) - 1]                   # type: ignore[call-overload]
+    before = order[np.searchsorted(middles[order], angle, side) - 1]  # type: ignore[call-overload]
     return (before + 1) % len(middles)
 
 
 def uniform_disc(radius: float, rings: int) -> Mesh:
-    """A disc of ``radius`` (m) in triangles of about one size: 6k nodes on ring k, 1 +
-    3·rings·(rings + 1) in all."""
+    """A disc of ``radius`` (m) in even triangles: 6k nodes on ring k, 1 + 3·rings·(rings + 1)."""
     _check.number("radius", radius, low=0.0, open_low=True, units="m")
     _check.integer("rings", rings, low=1)
-    counts = 6 * np.arange(1, rings + 1)
-    return disc_mesh(radius * np.arange(1, rings + 1) / rings, [TURN * np.arange(n) / n for n in counts])
+    number = np.arange(1, rings + 1)
+    return disc_mesh(radius * number / rings, [TURN * np.arange(n) / n for n in 6 * number])
 
 
 def electrode_disc(radius: float, spans: np.ndarray, cells_at_electrodes: int, rings: int,
@@ -106,7 +100,9 @@ def electrode_disc(radius: float, spans: np.ndarray, cells_at_electrodes: int, r
     """EIT mesh of a disc, refined at the electrode edges and the wall.
 
     Inwards the rings hold ever fewer nodes, about as far apart as the rings are, and stand ever
-    more evenly.
+    more evenly. ``ValueError`` naming the argument if it is out of range, of the wrong shape, or if
+    electrodes touch or overlap; also if the wall has cells so long that they cut through the rings
+    next to it.
 
     Parameters
     ----------
@@ -123,27 +119,23 @@ def electrode_disc(radius: float, spans: np.ndarray, cells_at_electrodes: int, r
         with 16 electrodes the default is within a few per cent of the smallest voltage error at
         equal numbers of unknowns. Angles stay above 15° where the wall's cells are about as long as
         the rings next to them are wide.
-
-    Raises
-    ------
-    ValueError
-        Naming the argument, if it is out of range, of the wrong shape, or if electrodes touch or
-        overlap; also if the wall has cells so long that they cut through the rings next to it.
     """
     _check.number("radius", radius, low=0.0, open_low=True, units="m")
     _check.integer("cells_at_electrodes", cells_at_electrodes, low=1)
     _check.integer("rings", rings, low=1)
     around, across = grading
     edges = _check.array("spans", spans, (None, 2), units="rad").ravel()
-    if len(edges) == 0 or (np.diff([*edges, edges[0] + TURN]) <= 0).any():
-        raise ValueError("spans must hold at least one electrode, increase, keep a gap between electrodes and lie "
-                         f"within one turn, got {spans!r}")
-    lines = [graded(a, b, cells_at_electrodes, around) for a, b in itertools.pairwise([*edges, edges[0] + TURN])]
+    closed = [*edges, *(edges[:1] + TURN)]
+    if len(edges) == 0 or (np.diff(closed) <= 0).any():
+        raise ValueError("spans must hold at least one electrode, increase, keep a gap between "
+                         f"electrodes and lie within one turn, got {spans!r}")
+    lines = [graded(a, b, cells_at_electrodes, around) for a, b in itertools.pairwise(closed)]
     wall = np.concatenate([line[:-1] for line in lines])
     radii = graded(0.0, radius, rings, across, "stop")
     angles = [wall]
     for r, step in zip(radii[-2:0:-1], np.diff(radii)[-2::-1], strict=True):
-        part = np.linspace(0.0, 1.0, min(len(angles[-1]), max(6, round(TURN * r / step))), endpoint=False)
+        count = min(len(angles[-1]), max(6, round(TURN * r / step)))
+        part = np.linspace(0.0, 1.0, count, endpoint=False)
         evenly = wall[0] + TURN * part
         crowded = np.interp(part * len(wall), np.arange(len(wall) + 1), [*wall, wall[0] + TURN])
         angles.append(evenly + (r / radius)**4 * (crowded - evenly))
@@ -151,27 +143,21 @@ def electrode_disc(radius: float, spans: np.ndarray, cells_at_electrodes: int, r
 
 
 def extrude(section: Mesh, z: Sequence[float] | np.ndarray) -> Mesh:
-    """Tetrahedra of the body that has this section in (x, y) at all coordinates ``z`` (m,
-    increasing).
+    """Tetrahedra of the body with this section in (x, y) at all ``z`` (m, increasing).
 
     Nodes are numbered by cross-section: all of the first ``z`` as in the section, then of the
     second, and so on. Every triangle and two neighbouring ``z`` bound a prism of three tetrahedra.
     On a prism's side the diagonal leads up from the lower node number to the higher one, so that
     neighbours agree about it; in every other layer it leads down, which makes the mesh its own
-    mirror image in z.
-
-    Raises
-    ------
-    ValueError
-        If ``section`` is not a mesh in 2D, or ``z`` does not increase.
+    mirror image in z. ``ValueError`` if ``section`` is not a mesh in 2D, or ``z`` does not
+    increase.
     """
-    z = _check.array("z", z, (None,), units="m")
+    z = increasing("z", z)
     if section.dim != 2:
         raise ValueError(f"section must be a mesh of triangles, got one in {section.dim}D")
-    if len(z) < 2 or (np.diff(z) <= 0).any():
-        raise ValueError(f"z must hold at least two strictly increasing coordinates in m, got {z!r}")
     n = section.n_nodes
-    points = np.concatenate([np.tile(section.points, (len(z), 1)), np.repeat(z, n)[:, None]], axis=1)
+    sections = np.tile(section.points, (len(z), 1))
+    points = np.concatenate([sections, np.repeat(z, n)[:, None]], axis=1)
     a, b, c = np.sort(section.cells, axis=1).T
     layer = np.arange(len(z) - 1)[:, None]
     # the end where diagonals begin
@@ -182,11 +168,13 @@ def extrude(section: Mesh, z: Sequence[float] | np.ndarray) -> Mesh:
     return Mesh(points, np.stack(cells, axis=1).reshape(-1, 4))
 
 
-def round_pipe_mesh(length: float, radius: float, spans_around: np.ndarray, spans_along: np.ndarray,
-                    cells_at_electrodes: tuple[int, int], rings: int,
+def round_pipe_mesh(length: float, radius: float, spans_around: np.ndarray,
+                    spans_along: np.ndarray, cells_at_electrodes: tuple[int, int], rings: int,
                     grading: tuple[float, float, float] = (2.0, 1.5, 2.0)) -> Mesh:
-    """EIT mesh of the round pipe 0 ≤ z ≤ length with electrodes at all pairs of spans around and
-    along it.
+    """EIT mesh of a round pipe 0 ≤ z ≤ length, electrodes at all pairs of spans around and along.
+
+    ``ValueError`` naming the argument if it is out of range, of the wrong shape, or if electrodes
+    touch or overlap.
 
     Parameters
     ----------
@@ -203,23 +191,9 @@ def round_pipe_mesh(length: float, radius: float, spans_around: np.ndarray, span
         Cells from the axis to the wall.
     grading : (float, float, float)
         Exponents of the clustering around, across and along the pipe, see `graded`.
-
-    Raises
-    ------
-    ValueError
-        Naming the argument, if it is out of range, of the wrong shape, or if electrodes touch or
-        overlap.
     """
     _check.number("length", length, low=0.0, open_low=True, units="m")
     around, along = cells_at_electrodes
     _check.integer("cells_at_electrodes[1]", along, low=1)
-    edges = _check.array("spans_along", spans_along, (None, 2), units="m").ravel()
-    if len(edges) == 0 or (np.diff([0.0, *edges, length]) <= 0).any():
-        raise ValueError("spans_along must increase, keep a gap between electrodes and lie inside the pipe, "
-                         f"0 … {length:g} m, got {spans_along!r}")
-    half = max(1, along // 2)
-    lines = [graded(0.0, edges[0], half, grading[2], "stop")]
-    lines += [graded(a, b, along, grading[2]) for a, b in itertools.pairwise(edges)]
-    lines += [graded(edges[-1], length, half, grading[2], "start")]
-    z = np.concatenate([line[:-1] for line in lines] + [[length]])
+    z = graded_line(length, "spans_along", spans_along, along, grading[2])
     return extrude(electrode_disc(radius, spans_around, around, rings, grading[:2]), z)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import SuperLU, splu
 
 from eitbench.numerics.compiled import compiled_kernels
 from eitbench.numerics.memory import scratch
@@ -48,8 +48,7 @@ class SparseLU:
     """
 
     def __init__(self, matrix: sp.csr_array) -> None:
-        factors = splu(sp.csc_matrix(matrix), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
-                       options={"SymmetricMode": True})
+        factors = eliminated(matrix, "MMD_AT_PLUS_A")
         L = sp.csr_array(sp.tril(factors.L, -1))
         U = sp.csr_array(sp.triu(factors.U, 1))
         self.factors = Factors(factors.perm_r.astype(np.int64), factors.perm_c.astype(np.int64),
@@ -68,3 +67,9 @@ class SparseLU:
             compiled_kernels().solve_lu(rows, columns, *lower, *upper, scale, eight, work, solution)
             result[:, first:first + 8] = solution.reshape(n, 8)[:, :block.shape[1]]
         return result
+
+
+def eliminated(matrix: sp.csr_array | sp.csc_array, order: str) -> SuperLU:
+    """L U without pivoting; ``order`` of the columns by SuperLU's name, the rows in the same."""
+    return splu(sp.csc_matrix(matrix), permc_spec=order, diag_pivot_thresh=0.0,
+                options={"SymmetricMode": True})

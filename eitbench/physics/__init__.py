@@ -1,2 +1,1 @@
-"""Floor 1: meshes, flow, transport (convection-diffusion), EIT (complete electrode model) and what
-is observed."""
+"""Floor 1: flow, transport (convection-diffusion), EIT (complete electrodes), observations."""

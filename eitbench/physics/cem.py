@@ -16,8 +16,9 @@ from skfem.helpers import dot, grad
 
 from eitbench import _check
 from eitbench.numerics.condensation import Condensation
-from eitbench.numerics.fem import element, to_skfem
-from eitbench.numerics.mesh import Mesh
+from eitbench.numerics.fem import basis as basis_on
+from eitbench.numerics.fem import element, integral, product
+from eitbench.numerics.mesh import Mesh, as_set, checked_facets
 from eitbench.physics.sensitivity import Sensitivity
 
 
@@ -25,7 +26,9 @@ class CompleteElectrodeModel:
     """Electrode voltages, and their derivatives, for a nodal conductivity.
 
     Voltages are linear in the currents, so for one conductivity everything is in one symmetric L×L
-    matrix, U = 𝓡 I with 𝓡1 = 0: one sparse factorisation serves every injection.
+    matrix, U = 𝓡 I with 𝓡1 = 0: one sparse factorisation serves every injection. ``ValueError`` if
+    the mesh falls apart, there are fewer than two electrodes, a facet is not on the boundary, two
+    electrodes share a facet, or a contact impedance is not positive.
 
     Parameters
     ----------
@@ -38,12 +41,6 @@ class CompleteElectrodeModel:
     order : int
         1 or 2: polynomial order of the potential. First order is wrong by several noise standard
         deviations on meshes of a few thousand unknowns.
-
-    Raises
-    ------
-    ValueError
-        If the mesh falls apart, there are fewer than two electrodes, a facet is not on the
-        boundary, two electrodes share a facet, or a contact impedance is not positive.
     """
 
     def __init__(self, mesh: Mesh, electrodes: Sequence[np.ndarray],
@@ -52,24 +49,27 @@ class CompleteElectrodeModel:
         self.order = order
         self.electrodes = _checked_electrodes(mesh, electrodes)
         self.n_electrodes = n_electrodes = len(self.electrodes)
-        z = np.full(n_electrodes, contact_impedance) if np.ndim(contact_impedance) == 0 else contact_impedance
+        z = contact_impedance
+        if np.ndim(z) == 0:
+            z = np.full(n_electrodes, z)
         z = _check.array("contact_impedance", z, (n_electrodes,), units="Ω·m²", positive=True)
         self.contact_impedance = z.copy()
         self.contact_impedance.setflags(write=False)
 
-        basis = skfem.Basis(to_skfem(mesh), element(mesh.dim, order), intorder=2 * order - 1)
-        contact, rows, columns, derivatives = self._contact_terms(basis), *_conduction(basis)
-        # The last electrode is grounded: without its row and column the system is symmetric
-        # positive definite.
+        basis = basis_on(mesh, order, intorder=2 * order - 1)
+        contact = self._contact_terms(basis)
+        rows, columns, derivatives = _conduction(basis)
         pattern = sp.coo_array((np.ones(len(rows)), (rows, columns)), shape=contact.shape).tocsc()
+        # The last electrode is grounded: without its row and column K is positive definite.
         system = Condensation((pattern + abs(contact))[:-1, :-1].tocsc(), n_electrodes - 1,
                               places=basis.doflocs.T if mesh.dim == 3 else None)
         self._system = system
         self.n_unknowns = system.n
         # K(σ) = constant + D σ, for the entries that the solver keeps, in its order
         n = system.n + 1
-        kept = sp.csr_array((np.arange(len(rows)) + 1, (rows, columns)), shape=(n, n))[system.rows, system.columns]
-        self._derivatives = sp.vstack([sp.csr_array((1, mesh.n_nodes)), derivatives], format="csr")[kept]
+        number = sp.csr_array((np.arange(len(rows)) + 1, (rows, columns)), shape=(n, n))
+        padded = sp.vstack([sp.csr_array((1, mesh.n_nodes)), derivatives], format="csr")
+        self._derivatives = padded[number[system.rows, system.columns]]
         self._constant = contact[system.rows, system.columns]
         # Mean-free currents and potentials: P = I − 11ᵀ/L on both sides of the grounded solution.
         self._centre = (np.eye(n_electrodes) - 1.0 / n_electrodes)[:, :-1]
@@ -78,17 +78,12 @@ class CompleteElectrodeModel:
     # -- public ------------------------------------------------------------------------------------
 
     def transfer_resistance(self, conductivity: np.ndarray) -> np.ndarray:
-        """𝓡 with U = 𝓡 I for every injection.
+        """(..., L, L) 𝓡 with U = 𝓡 I, in Ω (in 2D Ω·m); symmetric, rows sum to zero.
 
         Parameters
         ----------
         conductivity : (..., n_nodes) float
             σ at the mesh nodes in S/m, finite and > 0.
-
-        Returns
-        -------
-        (..., L, L) array in Ω (Ω·m in 2D, where currents are per metre of depth); symmetric, rows
-        sum to zero.
         """
         sigma = self._checked_conductivity(conductivity, batched=True)
         if sigma.ndim == 1:
@@ -101,8 +96,7 @@ class CompleteElectrodeModel:
         return result.reshape(*sigma.shape[:-1], self.n_electrodes, self.n_electrodes)
 
     def voltages(self, conductivity: np.ndarray, currents: np.ndarray) -> np.ndarray:
-        """Electrode potentials (K, L) in V for currents (K, L) in A (A/m in 2D) that sum to zero;
-        rows sum to zero."""
+        """Potentials (K, L) in V for currents (K, L) in A (A/m in 2D); rows of both sum to zero."""
         currents = self._checked_currents(currents)
         return currents @ self.transfer_resistance(self._checked_conductivity(conductivity))
 
@@ -110,32 +104,27 @@ class CompleteElectrodeModel:
         """dU/dσ, (K, L, n_nodes) in V·m/S, by adjoint fields: ∂U_m/∂σ_j = −∫ φ_j ∇u·∇w_m."""
         return self.linearise(conductivity, currents)[1]
 
-    def linearise(self, conductivity: np.ndarray, currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def linearise(self, conductivity: np.ndarray,
+                  currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """`voltages` and `jacobian` together, from one factorisation."""
         currents = self._checked_currents(currents)
         resistance, table = self.transfer_resistance_derivatives(conductivity)
         # (L, L·n_nodes): then one product gives every Jacobian in its final place
-        by_node = np.ascontiguousarray(table.reshape(len(table), -1).T).reshape(self.n_electrodes, -1)
+        by_node = np.ascontiguousarray(table.reshape(len(table), -1).T)
+        by_node = by_node.reshape(self.n_electrodes, -1)
         return currents @ resistance, (currents @ by_node).reshape(*currents.shape, -1)
 
-    def transfer_resistance_derivatives(self, conductivity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """𝓡 and its derivatives by the nodal conductivity, from one factorisation; they serve every
-        injection.
+    def transfer_resistance_derivatives(
+            self, conductivity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """𝓡 and its derivatives by nodal conductivity, from one factorisation for every injection.
 
+        They are (L, L) in Ω (Ω·m in 2D) and (n_nodes, L, L) in Ω·m/S (Ω·m²/S in 2D), for
+        ``conductivity`` (n_nodes,) in S/m, > 0.
         The field of any injection is a combination of the L fields w_m of unit currents, taken out
         evenly at all electrodes, so that ∂𝓡_ml/∂σ_j = −∫ φ_j ∇w_m·∇w_l.
-
-        Parameters
-        ----------
-        conductivity : (n_nodes,) float
-            In S/m, > 0.
-
-        Returns
-        -------
-        𝓡 : (L, L) in Ω (Ω·m in 2D)
-        table : (n_nodes, L, L) in Ω·m/S (Ω·m²/S in 2D)
         """
-        columns = self._system.port_columns(self._assemble(self._checked_conductivity(conductivity)))
+        values = self._assemble(self._checked_conductivity(conductivity))
+        columns = self._system.port_columns(values)
         fields, grounded = np.split(columns, [-self._system.n_ports])
         return self._centred(grounded), self._sensitivity(fields @ self._centre.T)
 
@@ -144,16 +133,19 @@ class CompleteElectrodeModel:
     def _contact_terms(self, basis: skfem.CellBasis) -> sp.csr_array:
         """Σ_l (1/z_l)∫_{e_l}(u − U_l)(φ − Φ_l) on all N + L unknowns."""
         mesh = basis.mesh
-        number = {tuple(facet): i for i, facet in enumerate(np.sort(mesh.facets, axis=0).T.tolist())}
+        sides = np.sort(mesh.facets, axis=0).T.tolist()
+        number = {tuple(side): i for i, side in enumerate(sides)}
         mass = sp.csr_array((basis.N, basis.N))
         loads = []
         for facets, z in zip(self.electrodes, self.contact_impedance, strict=True):
-            wall = skfem.FacetBasis(mesh, element(self.mesh.dim, self.order), intorder=2 * self.order,
-                                    facets=np.array([number[tuple(facet)] for facet in facets.tolist()]))
-            mass = mass + sp.csr_array(_wall_mass.assemble(wall)) / z
-            loads.append(_wall_load.assemble(wall) / z)
+            numbers = np.array([number[tuple(facet)] for facet in facets.tolist()])
+            wall = skfem.FacetBasis(mesh, element(self.mesh.dim, self.order),
+                                    intorder=2 * self.order, facets=numbers)
+            mass = mass + sp.csr_array(product.assemble(wall)) / z
+            loads.append(integral.assemble(wall) / z)
         load = sp.csr_array(np.stack(loads, axis=1))
-        return sp.block_array([[mass, -load], [-load.T, sp.diags_array(load.sum(axis=0))]], format="csr")
+        total = sp.diags_array(load.sum(axis=0))
+        return sp.block_array([[mass, -load], [-load.T, total]], format="csr")
 
     def _assemble(self, conductivity: np.ndarray) -> np.ndarray:
         """The solver's entries of K, (k,) or (k, b) for conductivity (n_nodes,) or (n_nodes, b)."""
@@ -181,24 +173,13 @@ class CompleteElectrodeModel:
         return currents
 
 
-@skfem.BilinearForm
-def _wall_mass(u, v, _w):
-    return u * v
-
-
-@skfem.LinearForm
-def _wall_load(v, _w):
-    return v
-
-
 @skfem.TrilinearForm
 def _conduction_form(s, u, v, _w):
     return s * dot(grad(u), grad(v))
 
 
 def _conduction(basis: skfem.CellBasis) -> tuple[np.ndarray, np.ndarray, sp.csr_array]:
-    """∫σ∇u·∇φ as local entries: their rows, columns, and their derivatives (entries, n_nodes) by
-    nodal σ."""
+    """∫σ∇u·∇φ as entries: rows, columns, and their derivatives (entries, n_nodes) by nodal σ."""
     sigma = basis.with_element(element(basis.mesh.dim(), 1))
     tensor = _conduction_form.coo_data(sigma, basis, basis)
     i, j, k = (np.asarray(index, dtype=np.int64) for index in tensor.indices)
@@ -209,28 +190,25 @@ def _conduction(basis: skfem.CellBasis) -> tuple[np.ndarray, np.ndarray, sp.csr_
 
 def _checked_electrodes(mesh: Mesh, electrodes: Sequence[np.ndarray]) -> list[np.ndarray]:
     edges = np.concatenate([mesh.cells[:, [0, i]] for i in range(1, mesh.dim + 1)])
-    pieces, _ = connected_components(sp.coo_array((np.ones(len(edges)), edges.T), shape=(mesh.n_nodes,) * 2))
+    graph = sp.coo_array((np.ones(len(edges)), edges.T), shape=(mesh.n_nodes,) * 2)
+    pieces, _ = connected_components(graph)
     if pieces > 1:
         raise ValueError(f"mesh must be connected, got {pieces} separate pieces")
     if len(electrodes) < 2:
         raise ValueError(f"electrodes must be at least two, got {len(electrodes)}")
-    boundary = {tuple(facet) for facet in mesh.boundary_facets.tolist()}
+    boundary = as_set(mesh.boundary_facets)
     owner: dict[tuple[int, ...], int] = {}
     checked = []
     for number, facets in enumerate(electrodes):
-        facets = np.asarray(facets)
-        if facets.ndim != 2 or facets.shape[1] != mesh.dim or len(facets) == 0 or not np.issubdtype(
-                facets.dtype, np.integer):
-            raise ValueError(f"electrodes[{number}] must be integers of shape (n_facets ≥ 1, {mesh.dim}), "
-                             f"got {facets.dtype} of shape {facets.shape}")
-        facets = np.sort(facets, axis=1)
+        name = f"electrodes[{number}]"
+        facets = np.sort(checked_facets(name, facets, mesh), axis=1)
         for facet in map(tuple, facets.tolist()):
             if facet not in boundary:
-                raise ValueError(f"electrodes[{number}] has facet {facet}, which is not on the mesh's boundary")
+                raise ValueError(f"{name} has facet {facet}, which is not on the mesh's boundary")
             if owner.get(facet) == number:
-                raise ValueError(f"electrodes[{number}] holds facet {facet} twice")
+                raise ValueError(f"{name} holds facet {facet} twice")
             if facet in owner:
-                raise ValueError(f"electrodes[{number}] and electrodes[{owner[facet]}] overlap in facet {facet}")
+                raise ValueError(f"{name} and electrodes[{owner[facet]}] overlap in facet {facet}")
             owner[facet] = number
         checked.append(facets)
     return checked

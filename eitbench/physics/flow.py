@@ -1,5 +1,4 @@
-"""Velocity fields: any callable ``points (k, d) in m -> velocity (k, d) in m/s`` without divergence
-will do."""
+"""Velocity fields: any callable points (k, d) in m -> velocity (k, d) in m/s without divergence."""
 
 from __future__ import annotations
 
@@ -10,103 +9,84 @@ import numpy as np
 from eitbench import _check
 
 
-@dataclass(frozen=True)
-class PlaneChannelFlow:
-    """Laminar flow between parallel walls y = ±half_width: v(y) = 1.5·v̄·(1 − (y/R)²) along x
-    (thesis 5.1.1).
+class AxialFlow:
+    """A velocity along x that depends on the height y only."""
 
-    Parameters
-    ----------
-    mean_velocity : float
-        v̄ in m/s, ≥ 0.
-    half_width : float
-        R in m, > 0.
-    """
+    def profile(self, y: np.ndarray) -> np.ndarray:
+        """Axial velocity in m/s at heights ``y`` in m."""
+        raise NotImplementedError
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        velocity = np.zeros_like(points, dtype=float)
+        velocity[:, 0] = self.profile(points[:, 1])
+        return velocity
+
+
+@dataclass(frozen=True)
+class PlugFlow(AxialFlow):
+    """The same velocity everywhere, v̄ along x: the limit of strong mixing, or without friction."""
 
     mean_velocity: float
+    """v̄ in m/s, ≥ 0"""
+
+    def __post_init__(self) -> None:
+        _check.number("mean_velocity", self.mean_velocity, low=0.0, units="m/s")
+
+    def profile(self, y: np.ndarray) -> np.ndarray:
+        return np.full(y.shape, self.mean_velocity)
+
+
+@dataclass(frozen=True)
+class ChannelFlow(AxialFlow):
+    """A flow between parallel walls y = ±R."""
+
+    mean_velocity: float
+    """v̄ in m/s, ≥ 0"""
     half_width: float
+    """R in m, > 0"""
 
     def __post_init__(self) -> None:
         _check.number("mean_velocity", self.mean_velocity, low=0.0, units="m/s")
         _check.number("half_width", self.half_width, low=0.0, open_low=True, units="m")
 
-    def __call__(self, points: np.ndarray) -> np.ndarray:
-        velocity = np.zeros_like(points, dtype=float)
-        velocity[:, 0] = 1.5 * self.mean_velocity * (1.0 - (points[:, 1] / self.half_width)**2)
-        return velocity
+
+@dataclass(frozen=True)
+class PlaneChannelFlow(ChannelFlow):
+    """Laminar flow between walls y = ±R: v(y) = 1.5·v̄·(1 − (y/R)²) along x (thesis 5.1.1)."""
+
+    def profile(self, y: np.ndarray) -> np.ndarray:
+        return 1.5 * self.mean_velocity * (1.0 - (y / self.half_width)**2)
 
 
 @dataclass(frozen=True)
-class PowerLawFlow:
+class PowerLawFlow(ChannelFlow):
     """Turbulent mean flow between parallel walls: v(y) = (1 + n)·v̄·(1 − |y|/R)ⁿ along x.
 
     With n = 1/7 this is the power law of Prandtl and von Kármán for moderate Reynolds numbers
     (Schlichting, *Boundary-Layer Theory*, ch. XX).
-
-    Parameters
-    ----------
-    mean_velocity : float
-        v̄ in m/s, ≥ 0.
-    half_width : float
-        R in m, > 0.
-    exponent : float
-        n, > 0; 1/7 by default.
     """
 
-    mean_velocity: float
-    half_width: float
     exponent: float = 1.0 / 7.0
+    """n, > 0"""
 
     def __post_init__(self) -> None:
-        _check.number("mean_velocity", self.mean_velocity, low=0.0, units="m/s")
-        _check.number("half_width", self.half_width, low=0.0, open_low=True, units="m")
+        super().__post_init__()
         _check.number("exponent", self.exponent, low=0.0, open_low=True)
 
-    def __call__(self, points: np.ndarray) -> np.ndarray:
-        velocity = np.zeros_like(points, dtype=float)
+    def profile(self, y: np.ndarray) -> np.ndarray:
         # a wall node may lie outside by rounding, where the power has no value
-        from_wall = np.maximum(1.0 - np.abs(points[:, 1]) / self.half_width, 0.0)
-        velocity[:, 0] = (1.0 + self.exponent) * self.mean_velocity * from_wall**self.exponent
-        return velocity
-
-
-@dataclass(frozen=True)
-class PlugFlow:
-    """The same velocity everywhere, v̄ along x: the limit of strong mixing, or of a fluid without
-    friction.
-
-    Parameters
-    ----------
-    mean_velocity : float
-        v̄ in m/s, ≥ 0.
-    """
-
-    mean_velocity: float
-
-    def __post_init__(self) -> None:
-        _check.number("mean_velocity", self.mean_velocity, low=0.0, units="m/s")
-
-    def __call__(self, points: np.ndarray) -> np.ndarray:
-        velocity = np.zeros_like(points, dtype=float)
-        velocity[:, 0] = self.mean_velocity
-        return velocity
+        from_wall = np.maximum(1.0 - np.abs(y) / self.half_width, 0.0)
+        return (1.0 + self.exponent) * self.mean_velocity * from_wall**self.exponent
 
 
 @dataclass(frozen=True)
 class RoundPipeFlow:
-    """Laminar flow in a round pipe, after Hagen and Poiseuille: v(r) = 2·v̄·(1 − (r/R)²) along z,
-    r² = x² + y².
-
-    Parameters
-    ----------
-    mean_velocity : float
-        v̄ in m/s, ≥ 0.
-    radius : float
-        R in m, > 0.
-    """
+    """Hagen–Poiseuille flow in a round pipe: v(r) = 2·v̄·(1 − (r/R)²) along z, r² = x² + y²."""
 
     mean_velocity: float
+    """v̄ in m/s, ≥ 0"""
     radius: float
+    """R in m, > 0"""
 
     def __post_init__(self) -> None:
         _check.number("mean_velocity", self.mean_velocity, low=0.0, units="m/s")

@@ -1,5 +1,4 @@
-"""What EIT sees of a concentration: σ(c), voltages and their derivatives by c, and measurement
-noise."""
+"""What EIT sees of a concentration: σ(c), voltages, their derivatives by c, and their noise."""
 
 from __future__ import annotations
 
@@ -26,18 +25,14 @@ class ConductivityLaw(Protocol):
 
 @dataclass(frozen=True)
 class LinearConductivity:
-    """σ = Λ c, as in the thesis' pipe example (5.1.1).
-
-    Parameters
-    ----------
-    molar_conductivity : float
-        Λ in S·m²/mol, > 0. Sodium chloride around 30 mol/m³: about 0.011.
-    """
+    """σ = Λ c, as in the thesis' pipe example (5.1.1)."""
 
     molar_conductivity: float
+    """Λ in S·m²/mol, > 0; sodium chloride around 30 mol/m³: about 0.011"""
 
     def __post_init__(self) -> None:
-        _check.number("molar_conductivity", self.molar_conductivity, low=0.0, open_low=True, units="S·m²/mol")
+        _check.number("molar_conductivity", self.molar_conductivity, low=0.0, open_low=True,
+                      units="S·m²/mol")
 
     def __call__(self, concentration: np.ndarray) -> np.ndarray:
         return self.molar_conductivity * concentration
@@ -48,58 +43,46 @@ class LinearConductivity:
 
 @dataclass(frozen=True)
 class KohlrauschConductivity:
-    """σ = (Λ₀ − K√c) c, Kohlrausch's square-root law of strong electrolytes; rises up to c =
-    (2Λ₀/3K)².
+    """σ = (Λ₀ − K√c) c, Kohlrausch's law of strong electrolytes; rises up to c = (2Λ₀/3K)².
 
-    The defaults are sodium chloride in water at 25 °C by Onsager's limiting law, Λ₀ = 126.45 and K
-    = 89.1 in S·cm²/mol with c in mol/l (Robinson & Stokes, *Electrolyte Solutions*, 1959), in SI
-    units.
-
-    Parameters
-    ----------
-    limiting_molar_conductivity : float
-        Λ₀ in S·m²/mol, > 0.
-    kohlrausch_coefficient : float
-        K in S·m²/mol per √(mol/m³), ≥ 0.
+    The defaults are sodium chloride in water at 25 °C by Onsager's limiting law, Λ₀ = 126.45 and
+    K = 89.1 in S·cm²/mol with c in mol/l (Robinson & Stokes, *Electrolyte Solutions*, 1959).
     """
 
     limiting_molar_conductivity: float = 0.012645
+    """Λ₀ in S·m²/mol, > 0"""
     kohlrausch_coefficient: float = 89.1e-4 / np.sqrt(1000.0)
+    """K in S·m²/mol per √(mol/m³), ≥ 0"""
 
     def __post_init__(self) -> None:
-        _check.number("limiting_molar_conductivity", self.limiting_molar_conductivity, low=0.0, open_low=True,
-                      units="S·m²/mol")
+        _check.number("limiting_molar_conductivity", self.limiting_molar_conductivity, low=0.0,
+                      open_low=True, units="S·m²/mol")
         _check.number("kohlrausch_coefficient", self.kohlrausch_coefficient, low=0.0,
                       units="S·m²/mol per √(mol/m³)")
 
     def __call__(self, concentration: np.ndarray) -> np.ndarray:
-        return (self.limiting_molar_conductivity - self.kohlrausch_coefficient * np.sqrt(concentration)) * concentration
+        lost = self.kohlrausch_coefficient * np.sqrt(concentration)
+        return (self.limiting_molar_conductivity - lost) * concentration
 
     def derivative(self, concentration: np.ndarray) -> np.ndarray:
-        return self.limiting_molar_conductivity - 1.5 * self.kohlrausch_coefficient * np.sqrt(concentration)
+        lost = 1.5 * self.kohlrausch_coefficient * np.sqrt(concentration)
+        return self.limiting_molar_conductivity - lost
 
 
 @dataclass(frozen=True)
 class VoltageNoise:
-    """Independent Gaussian noise, std² = (relative·reading)² + (of_largest·largest voltage)² +
-    floor² (thesis 5.1.1).
+    """Independent Gaussian noise (thesis 5.1.1), largest being that of the same injection.
 
-    The largest voltage is that of the same injection. Without ``floor`` the noise scales with the
-    current.
-
-    Parameters
-    ----------
-    relative : float
-        Part of the reading, ≥ 0; the thesis has 0.01.
-    of_largest : float
-        Part of the largest voltage of the injection, ≥ 0; the thesis has 0.001.
-    floor : float
-        Absolute std in V, ≥ 0; the thesis has none.
+    std² = (relative·reading)² + (of_largest·largest voltage)² + floor². Without ``floor`` the noise
+    scales with the current.
     """
 
     relative: float = 0.01
+    """part of the reading, ≥ 0; the thesis has 0.01"""
     of_largest: float = 0.001
+    """part of the largest voltage of the injection, ≥ 0; the thesis has 0.001"""
     floor: float = 0.0
+    """absolute std in V, ≥ 0; the thesis has none"""
 
     def __post_init__(self) -> None:
         for name in ("relative", "of_largest"):
@@ -109,7 +92,8 @@ class VoltageNoise:
     def std(self, voltages: np.ndarray) -> np.ndarray:
         """Standard deviation (V) of each reading for noise-free ``voltages`` (..., L)."""
         largest = np.abs(voltages).max(axis=-1, keepdims=True)
-        return np.sqrt((self.relative * voltages)**2 + (self.of_largest * largest)**2 + self.floor**2)
+        of_both = (self.relative * voltages)**2 + (self.of_largest * largest)**2
+        return np.sqrt(of_both + self.floor**2)
 
 
 class ObservationModel:
@@ -129,13 +113,14 @@ class ObservationModel:
         In mol/m³, > 0.
     """
 
-    def __init__(self, cem: CompleteElectrodeModel, interpolation: sp.csr_array, conductivity: ConductivityLaw,
-                 smallest_concentration: float) -> None:
+    def __init__(self, cem: CompleteElectrodeModel, interpolation: sp.csr_array,
+                 conductivity: ConductivityLaw, smallest_concentration: float) -> None:
         self.cem = cem
         self.interpolation = interpolation
         self.conductivity = conductivity
-        self.smallest_concentration = _check.number("smallest_concentration", smallest_concentration, low=0.0,
-                                                    open_low=True, units="mol/m³")
+        self.smallest_concentration = _check.number(
+            "smallest_concentration", smallest_concentration, low=0.0, open_low=True,
+            units="mol/m³")
 
     def transfer_resistance(self, concentration: np.ndarray) -> np.ndarray:
         """𝓡 (..., L, L) in Ω (Ω·m in 2D) for nodal ``concentration`` (..., n_cd) in mol/m³."""
@@ -146,27 +131,27 @@ class ObservationModel:
         return self.cem.voltages(self.conductivity(self._at_eit_nodes(concentration)), currents)
 
     def resistance_derivatives(self, concentration: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """𝓡 (L, L) in Ω (Ω·m in 2D) and its derivatives by the nodal concentration, (n_cd, L, L)
-        per mol/m³.
+        """𝓡 (L, L) in Ω (Ω·m in 2D) and its derivatives by nodal concentration, (n_cd, L, L).
 
-        They hold `linearise` for every injection: V = 𝓡 I, dV/dc_j = table[j] I.
+        They are per mol/m³ and hold `linearise` for every injection: V = 𝓡 I, dV/dc_j = table[j] I.
         """
-        c = self._at_eit_nodes(_check.array("concentration", concentration, (self.interpolation.shape[1],)))
+        n_nodes = self.interpolation.shape[1]
+        c = self._at_eit_nodes(_check.array("concentration", concentration, (n_nodes,)))
         resistance, table = self.cem.transfer_resistance_derivatives(self.conductivity(c))
         table *= self.conductivity.derivative(c)[:, None, None]
         by_node = self.interpolation.T @ table.reshape(len(c), -1)
         return resistance, by_node.reshape(-1, *resistance.shape)
 
-    def linearise(self, concentration: np.ndarray, currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Voltages (K, L) and their derivative by the nodal concentration, (K, L, n_cd) in V·m³/mol
-        (thesis 5.2)."""
+    def linearise(self, concentration: np.ndarray,
+                  currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Voltages (K, L) and their derivatives by c, (K, L, n_cd) in V·m³/mol (thesis 5.2)."""
         c = self._at_eit_nodes(concentration)
         voltages, by_conductivity = self.cem.linearise(self.conductivity(c), currents)
         by_node = (by_conductivity * self.conductivity.derivative(c)).reshape(-1, len(c))
         return voltages, (by_node @ self.interpolation).reshape(*voltages.shape, -1)
 
     def _at_eit_nodes(self, concentration: np.ndarray) -> np.ndarray:
-        c = _check.array("concentration", concentration, (*np.shape(concentration)[:-1], self.interpolation.shape[1]),
-                         units="mol/m³")
+        shape = (*np.shape(concentration)[:-1], self.interpolation.shape[1])
+        c = _check.array("concentration", concentration, shape, units="mol/m³")
         there = (self.interpolation @ c.reshape(-1, c.shape[-1]).T).T.reshape(*c.shape[:-1], -1)
         return np.maximum(there, self.smallest_concentration)

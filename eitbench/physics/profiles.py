@@ -1,5 +1,4 @@
-"""Axial flow in a plane channel by its profile across: one that is drawn, and a family whose
-members are estimated."""
+"""Axial flow in a plane channel by its profile: one that is drawn, and a family to be estimated."""
 
 from __future__ import annotations
 
@@ -7,44 +6,27 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.polynomial.polynomial import polyval
 
 from eitbench import _check
+from eitbench.physics.flow import AxialFlow, ChannelFlow
 
 _ETA, _WEIGHTS = np.polynomial.legendre.leggauss(24)
-"""Gauss–Legendre points and weights on [−1, 1]; integrals of products of profiles are exact to
-rounding."""
+"""Gauss–Legendre points and weights on [−1, 1]: exact to rounding for products of profiles."""
 
 
 @dataclass(frozen=True)
-class SkewedChannelFlow:
-    """v = C·(1 − η²)·exp(k·η) along x with η = y/R; C makes the mean v̄, and k = 0 is the parabola.
+class SkewedChannelFlow(ChannelFlow):
+    """v = C·(1 − η²)·exp(k·η) along x with η = y/R; C makes the mean v̄; k = 0: a parabola."""
 
-    Parameters
-    ----------
-    mean_velocity : float
-        v̄ in m/s, ≥ 0.
-    half_width : float
-        R in m, > 0.
-    skewness : float
-        k: how far the fastest fluid moves towards the upper wall (k > 0) or the lower one.
-    """
-
-    mean_velocity: float
-    half_width: float
     skewness: float = 0.0
+    """k: how far the fastest fluid moves towards the upper wall (k > 0) or the lower one"""
 
     def __post_init__(self) -> None:
-        _check.number("mean_velocity", self.mean_velocity, low=0.0, units="m/s")
-        _check.number("half_width", self.half_width, low=0.0, open_low=True, units="m")
+        super().__post_init__()
         _check.number("skewness", self.skewness, low=-5.0, high=5.0)
 
-    def __call__(self, points: np.ndarray) -> np.ndarray:
-        velocity = np.zeros_like(points, dtype=float)
-        velocity[:, 0] = self.profile(points[:, 1])
-        return velocity
-
     def profile(self, y: np.ndarray) -> np.ndarray:
-        """Axial velocity in m/s at heights ``y`` in m."""
         mean = 0.5 * _WEIGHTS @ self._shape(_ETA)
         return self.mean_velocity / mean * self._shape(y / self.half_width)
 
@@ -53,47 +35,38 @@ class SkewedChannelFlow:
 
 
 @dataclass(frozen=True)
-class PolynomialFlow:
-    """Axial flow v = Σ a_j (y/R)ʲ along x between walls y = ±R; ``coefficients`` a_j in m/s,
-    ``half_width`` R in m."""
+class PolynomialFlow(AxialFlow):
+    """v = Σ a_j (y/R)ʲ along x between walls y = ±R."""
 
     coefficients: tuple[float, ...]
+    """a_j in m/s"""
     half_width: float
+    """R in m"""
 
-    def __call__(self, points: np.ndarray) -> np.ndarray:
-        velocity = np.zeros_like(points, dtype=float)
-        velocity[:, 0] = np.polynomial.polynomial.polyval(points[:, 1] / self.half_width, self.coefficients)
-        return velocity
+    def profile(self, y: np.ndarray) -> np.ndarray:
+        return polyval(y / self.half_width, self.coefficients)
 
 
 @dataclass(frozen=True)
 class VelocityModel:
-    """An unknown flow written as v = Σ θ_k φ_k(y/R) along x, θ a random walk (thesis ch. 6).
-
-    Parameters
-    ----------
-    half_width : float
-        R in m.
-    basis : tuple of tuples
-        φ_k as polynomials in y/R: coefficients of 1, y/R, (y/R)², …; no unit.
-    nominal : (k,) tuple
-        θ_0 in m/s: what is believed at first.
-    initial_std : (k,) tuple
-        Its standard deviation in m/s.
-    walk_std : (k,) tuple
-        Standard deviation in m/s of the random walk's steps, one a time step.
-    """
+    """An unknown flow written as v = Σ θ_k φ_k(y/R) along x, θ a random walk (thesis ch. 6)."""
 
     half_width: float
+    """R in m"""
     basis: tuple[tuple[float, ...], ...]
+    """φ_k as polynomials in y/R: coefficients of 1, y/R, (y/R)², …; no unit"""
     nominal: tuple[float, ...]
+    """(k,) θ_0 in m/s: what is believed at first"""
     initial_std: tuple[float, ...]
+    """(k,) its standard deviation in m/s"""
     walk_std: tuple[float, ...]
+    """(k,) standard deviation in m/s of the random walk's steps, one a time step"""
 
     def __post_init__(self) -> None:
         _check.number("half_width", self.half_width, low=0.0, open_low=True, units="m")
         if not self.basis or not all(self.basis):
-            raise ValueError(f"basis must hold at least one profile, each with a coefficient, got {self.basis!r}")
+            raise ValueError("basis must hold at least one profile, each with a coefficient, "
+                             f"got {self.basis!r}")
         for name in ("nominal", "initial_std", "walk_std"):
             numbers = _check.array(name, getattr(self, name), (len(self.basis),), units="m/s")
             if name != "nominal" and (numbers < 0).any():
@@ -117,7 +90,7 @@ class VelocityModel:
     @property
     def profiles(self) -> np.ndarray:
         """(p, k) φ_k at `points`."""
-        return np.stack([np.polynomial.polynomial.polyval(_ETA, shape) for shape in self.basis], axis=1)
+        return np.stack([polyval(_ETA, shape) for shape in self.basis], axis=1)
 
     @property
     def directions(self) -> list[PolynomialFlow]:
@@ -132,6 +105,8 @@ class VelocityModel:
         return PolynomialFlow(tuple((theta @ shapes).tolist()), self.half_width)
 
 
-def parabola(half_width: float, mean_velocity: float, initial_std: float, walk_std: float) -> VelocityModel:
+def parabola(half_width: float, mean_velocity: float, initial_std: float,
+             walk_std: float) -> VelocityModel:
     """The parabolic profile with an unknown mean velocity, all in m/s: θ is that mean."""
-    return VelocityModel(half_width, ((1.5, 0.0, -1.5),), (mean_velocity,), (initial_std,), (walk_std,))
+    basis = ((1.5, 0.0, -1.5),)
+    return VelocityModel(half_width, basis, (mean_velocity,), (initial_std,), (walk_std,))

@@ -14,26 +14,20 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class AtRest:
-    """A `Transport` in which nothing flows, spreads or enters.
-
-    Parameters
-    ----------
-    mesh : Mesh
-        Where the concentration lives.
-    time_step : float
-        s between two injections.
-    """
+    """A `Transport` in which nothing flows, spreads or enters."""
 
     mesh: Mesh
+    """where the concentration lives"""
     time_step: float
+    """s between two injections"""
 
     @property
     def inlet(self) -> np.ndarray:
         """No node."""
         return np.empty(0, dtype=np.int64)
 
-    def step(self, c: np.ndarray, inflow_before: np.ndarray | float = 0.0, inflow_after: np.ndarray | float = 0.0,
-             ) -> np.ndarray:
+    def step(self, c: np.ndarray, inflow_before: np.ndarray | float = 0.0,
+             inflow_after: np.ndarray | float = 0.0) -> np.ndarray:
         """The same concentration; there is no inlet for an inflow to enter by."""
         return np.array(c, dtype=float)
 

@@ -47,7 +47,7 @@ class WideSubsteps:
 
     def advance(self, c: np.ndarray, before: np.ndarray, after: np.ndarray,
                 source: np.ndarray | None = None) -> np.ndarray:
-        """All sub-steps.
+        """(n, k) after all sub-steps.
 
         Parameters
         ----------
@@ -57,10 +57,6 @@ class WideSubsteps:
             c_in at the beginning and at the end; between them it moves linearly.
         source : (n_free, k), optional
             f, by default 0.
-
-        Returns
-        -------
-        (n, k) at the end.
         """
         from eitbench.numerics.wide_kernels import WIDE, advance_wide
         memory = scratch(sum(self._rows) * WIDE).reshape(-1, WIDE)

@@ -1,7 +1,6 @@
-"""Convection-diffusion (thesis ch. 3): ∂c/∂t = ∇·(κ∇c) − v·∇c, c given on the inlet, ∂c/∂n = 0
-elsewhere.
+"""Convection-diffusion (thesis ch. 3; ``docs/methods.md``, 1).
 
-The discretisation is that of ``docs/methods.md``, 1.
+∂c/∂t = ∇·(κ∇c) − v·∇c, c given on the inlet, ∂c/∂n = 0 elsewhere.
 """
 
 from __future__ import annotations
@@ -16,6 +15,7 @@ import skfem
 from skfem.helpers import dot, grad
 
 from eitbench import _check
+from eitbench.numerics.fem import basis as basis_on
 from eitbench.numerics.fem import element, to_skfem
 from eitbench.numerics.mesh import Mesh
 from eitbench.numerics.sparse_lu import SparseLU
@@ -27,55 +27,46 @@ MANY = 16
 
 
 class EvolutionModel(NamedTuple):
-    """c⁺ = F c + Y c_in⁺ + w, with w = Y η + H e (thesis 5.14–5.16); all matrices act on nodal
-    concentrations."""
+    """c⁺ = F c + Y c_in⁺ + w, w = Y η + H e (thesis 5.14–5.16), for nodal concentrations."""
 
     F: np.ndarray
     """(n, n) state transition over one time step; it carries the inlet's old value along."""
     Y: np.ndarray
     """(n, n_inlet) effect of the new inlet values."""
     H: np.ndarray
-    """(n, n) effect of nodal noise e, the concentration that an unknown source adds over the time
-    step."""
+    """(n, n) effect of nodal noise e, what an unknown source adds to c over the time step."""
 
     def state_noise_covariance(self, inflow_variance: float, nodal_variance: float) -> np.ndarray:
-        """Γ_w = Y Γ_η Yᵀ + H Γ_e Hᵀ (thesis 5.16) for Γ_η = inflow_variance·I and Γ_e =
-        nodal_variance·I; (n, n)."""
+        """(n, n) Γ_w = Y Γ_η Yᵀ + H Γ_e Hᵀ (thesis 5.16), with both variances times I for Γ."""
         return inflow_variance * (self.Y @ self.Y.T) + nodal_variance * (self.H @ self.H.T)
 
 
 class Transport(Protocol):
-    """How a concentration moves in a time step: `ConvectionDiffusion`, or
-    `eitbench.physics.rest.AtRest`."""
+    """How a concentration moves in a time step: `ConvectionDiffusion`, or `AtRest` in `rest`."""
 
     def __hash__(self) -> int: ...
 
     @property
     def mesh(self) -> Mesh:
         """Where the concentration lives."""
-        ...
 
     @property
     def time_step(self) -> float:
         """Time between two states in s."""
-        ...
 
     @property
     def inlet(self) -> np.ndarray:
         """(n_inlet,) int, nodes where the concentration is given."""
-        ...
 
-    def step(self, c: np.ndarray, inflow_before: np.ndarray | float, inflow_after: np.ndarray | float) -> np.ndarray:
+    def step(self, c: np.ndarray, inflow_before: np.ndarray | float,
+             inflow_after: np.ndarray | float) -> np.ndarray:
         """The concentration (n,) or (n, batch) one time step later."""
-        ...
 
     def evolution_model(self) -> EvolutionModel:
         """F, Y and H of (5.14–5.16) as dense matrices."""
-        ...
 
     def transition(self) -> tuple[np.ndarray, np.ndarray]:
         """F and Y of it."""
-        ...
 
 
 class ConvectionDiffusion:
@@ -88,7 +79,8 @@ class ConvectionDiffusion:
     from the old to the new one. Second order in space and in the sub-step; between those, at cell
     Péclet numbers of about 2–8, the order in space sinks to 1.5, as P1 has no ∇·(κ∇c) to weigh.
     Because every step starts anew with the two halves, shorter steps at equal ``substeps`` are
-    first order only.
+    first order only. ``ValueError`` naming the argument if it is out of range, of the wrong shape,
+    or not finite.
 
     Parameters
     ----------
@@ -103,35 +95,31 @@ class ConvectionDiffusion:
     substeps : int
         Crank–Nicolson steps per time step, ≥ 1.
     inlet : (n_inlet,) int, optional
-        Nodes where the concentration is given; default: nodes of the boundary facets through which
-        fluid enters.
-
-    Raises
-    ------
-    ValueError
-        Naming the argument, if it is out of range, of the wrong shape, or not finite.
+        Nodes where the concentration is given; default: those where fluid enters.
     """
 
     def __init__(self, mesh: Mesh, velocity: VelocityField, diffusivity: float, time_step: float, *,
                  substeps: int = 8, inlet: np.ndarray | None = None) -> None:
         self.mesh = mesh
-        self.diffusivity = _check.number("diffusivity", diffusivity, low=0.0, open_low=True, units="m²/s")
+        self.diffusivity = _check.number("diffusivity", diffusivity, low=0.0, open_low=True,
+                                         units="m²/s")
         self.time_step = _check.number("time_step", time_step, low=0.0, open_low=True, units="s")
         self.substeps = _check.integer("substeps", substeps, low=1)
-        self.inlet = inlet_nodes(mesh, velocity) if inlet is None else np.unique(inlet).astype(np.int64)
-        if inlet is not None and np.size(inlet) and not np.issubdtype(np.asarray(inlet).dtype, np.integer):
-            raise ValueError(f"inlet must hold integer node numbers, got {np.asarray(inlet).dtype}")
-        if self.inlet.size and (self.inlet[0] < 0 or self.inlet[-1] >= mesh.n_nodes):
-            raise ValueError(f"inlet must hold node numbers in [0, {mesh.n_nodes - 1}], got {self.inlet}")
+        nodes = np.unique(inlet_nodes(mesh, velocity) if inlet is None else inlet)
+        if nodes.size and not np.issubdtype(nodes.dtype, np.integer):
+            raise ValueError(f"inlet must hold integer node numbers, got {nodes.dtype}")
+        if nodes.size and (nodes[0] < 0 or nodes[-1] >= mesh.n_nodes):
+            raise ValueError(f"inlet must hold node numbers in [0, {mesh.n_nodes - 1}], "
+                             f"got {nodes}")
+        self.inlet = nodes.astype(np.int64)
         self._velocity = velocity
         mass, transport = _supg_matrices(mesh, velocity, self.diffusivity)
         dt = self.time_step / self.substeps
-        implicit, explicit = mass / dt + 0.5 * transport, mass / dt - 0.5 * transport
-        self._free = np.setdiff1d(np.arange(mesh.n_nodes), self.inlet)
-        free, inlet_ = self._free, self.inlet
-        self._solver = SparseLU(implicit[free][:, free])
-        self._explicit = sp.csr_matrix(explicit[free])
-        self._implicit_inlet = sp.csr_matrix(implicit[free][:, inlet_])
+        free = self._free = np.setdiff1d(np.arange(mesh.n_nodes), self.inlet)
+        implicit = (mass / dt + 0.5 * transport)[free]
+        self._solver = SparseLU(implicit[:, free])
+        self._explicit = sp.csr_matrix((mass / dt - 0.5 * transport)[free])
+        self._implicit_inlet = sp.csr_matrix(implicit[:, self.inlet])
         self._mass = sp.csr_matrix(mass[free])
 
     def with_velocity(self, velocity: VelocityField) -> ConvectionDiffusion:
@@ -139,8 +127,9 @@ class ConvectionDiffusion:
         return ConvectionDiffusion(self.mesh, velocity, self.diffusivity, self.time_step,
                                    substeps=self.substeps, inlet=self.inlet)
 
-    def step(self, c: np.ndarray, inflow_before: np.ndarray | float, inflow_after: np.ndarray | float) -> np.ndarray:
-        """The concentration one time step later.
+    def step(self, c: np.ndarray, inflow_before: np.ndarray | float,
+             inflow_after: np.ndarray | float) -> np.ndarray:
+        """The concentration one time step later, shaped like ``c``.
 
         Parameters
         ----------
@@ -148,22 +137,20 @@ class ConvectionDiffusion:
             Nodal concentration; its inlet entries are replaced by ``inflow_before``.
         inflow_before, inflow_after : float, (n_inlet,) or (n_inlet, batch)
             Inlet concentration at the beginning and at the end of the step, in the unit of ``c``.
-
-        Returns
-        -------
-        Array shaped like ``c``.
         """
         c = np.asarray(c, dtype=float)
         if c.ndim not in (1, 2) or len(c) != self.mesh.n_nodes:
-            raise ValueError(f"c must have shape ({self.mesh.n_nodes},) or ({self.mesh.n_nodes}, batch), got {c.shape}")
+            raise ValueError(f"c must have shape ({self.mesh.n_nodes},) or "
+                             f"({self.mesh.n_nodes}, batch), got {c.shape}")
         state = _check.array("c", c, c.shape).reshape(len(c), -1)
         before = self._inflow("inflow_before", inflow_before, state.shape[1])
         after = self._inflow("inflow_after", inflow_after, state.shape[1])
         return self._advance(state, before, after).reshape(c.shape)
 
-    def velocity_derivatives(self, c: np.ndarray, inflow_before: np.ndarray | float, inflow_after: np.ndarray | float,
+    def velocity_derivatives(self, c: np.ndarray, inflow_before: np.ndarray | float,
+                             inflow_after: np.ndarray | float,
                              directions: Sequence[VelocityField]) -> tuple[np.ndarray, np.ndarray]:
-        """The step and its derivatives by θ when the velocity is v + Σ θ_k v_k, at θ = 0.
+        """The step (n,) and its derivatives (n, K) by θ, at θ = 0, for the velocity v + Σ θ_k v_k.
 
         They are those of the discrete step, with the test functions, which depend on the velocity
         too, the Rannacher start and all sub-steps; the inlet nodes stay what they are. For k
@@ -173,26 +160,14 @@ class ConvectionDiffusion:
         The cell's length along the flow has a kink where the flow passes along the side of a cell;
         there the derivative is the mean of both one-sided ones. Where v = 0 it is exact along each
         direction, but the scheme is not linear in the direction there unless all directions are
-        parallel.
+        parallel. ``ValueError`` naming the argument if it is of the wrong shape or not finite.
 
         Parameters
         ----------
-        c : (n,) float
-            Nodal concentration; its inlet entries are replaced by ``inflow_before``.
-        inflow_before, inflow_after : float or (n_inlet,)
-            Inlet concentration at the beginning and at the end of the step, in the unit of ``c``.
+        c, inflow_before, inflow_after : (n,), float or (n_inlet,)
+            As in `step`.
         directions : K callables
             v_k, each points (k, d) in m -> velocity (k, d) in m/s for θ_k = 1, divergence-free.
-
-        Returns
-        -------
-        (n,) the concentration one time step later, and (n, K) its derivatives, in the unit of
-        ``c``.
-
-        Raises
-        ------
-        ValueError
-            Naming the argument, if it is of the wrong shape or not finite.
         """
         if not len(directions):
             raise ValueError("directions must hold at least one velocity field, got none")
@@ -200,17 +175,18 @@ class ConvectionDiffusion:
         before = self._inflow("inflow_before", inflow_before, 1)
         after = self._inflow("inflow_after", inflow_after, 1)
         changes = _supg_derivatives(self.mesh, self._velocity, self.diffusivity, directions)
-        states = np.hstack([state.copy() for state in self._substeps(c, before, after, self._no_loads())])
-        # A sub-step solves M (c⁺ − c)/Δt + K (c⁺ + c)/2 = 0, backward Euler the same with K c⁺/2;
-        # by the product rule
-        # what M and K change by is a load in the equation for the derivative.
+        substeps = self._substeps(c, before, after, self._no_loads())
+        states = np.hstack([state.copy() for state in substeps])
+        # A sub-step solves M (c⁺ − c)/Δt + K (c⁺ + c)/2 = 0, backward Euler the same with K c⁺/2.
+        # By the product rule what M and K change by is a load in the equation for the derivative.
         differences = (states[:, :-1] - states[:, 1:]) * (self.substeps / self.time_step)
         averages = 0.5 * (states[:, 1:] + states[:, :-1])
         averages[:, :2] = 0.5 * states[:, 1:3]
         loads = np.stack([mass[self._free] @ differences - transport[self._free] @ averages
                           for mass, transport in changes], axis=-1)  # (n_free, solves, K)
-        nothing = np.zeros((len(self.inlet), len(directions)))
-        *_, derivatives = self._substeps(np.zeros((len(c), len(directions))), nothing, nothing, loads.swapaxes(0, 1))
+        nothing = np.zeros((len(c), len(directions)))
+        none_in = nothing[self.inlet]
+        *_, derivatives = self._substeps(nothing, none_in, none_in, loads.swapaxes(0, 1))
         return states[:, -1].copy(), derivatives
 
     def evolution_model(self) -> EvolutionModel:
@@ -218,8 +194,7 @@ class ConvectionDiffusion:
         return self._evolution_model
 
     def transition(self) -> tuple[np.ndarray, np.ndarray]:
-        """F (n, n) and Y (n, n_inlet) of `evolution_model` without H, in half the time; computed
-        once and kept."""
+        """F (n, n) and Y (n, n_inlet) of `evolution_model`, in half the time; computed once."""
         return self._transition
 
     @cached_property
@@ -247,8 +222,7 @@ class ConvectionDiffusion:
 
     def _advance(self, c: np.ndarray, before: np.ndarray, after: np.ndarray,
                  source: np.ndarray | None = None) -> np.ndarray:
-        """All sub-steps on (n, batch) columns, perhaps with a nodal source of so much concentration
-        a second."""
+        """All sub-steps on (n, batch) columns, perhaps with a ``source`` added to c a second."""
         loads: Iterable[np.ndarray | float] = self._no_loads()
         load = None if source is None else self._mass @ source
         if c.shape[1] >= MANY:
@@ -274,9 +248,8 @@ class ConvectionDiffusion:
         slope = (after - before) / self.substeps
         rate = self.substeps / self.time_step
         for k, load in enumerate(loads):
-            # The first two are backward Euler, each half a sub-step: (2M/Δt + K) c⁺ = (2M/Δt) c +
-            # f, divided by two
-            # the Crank–Nicolson matrix again.
+            # The first two are backward Euler, each half a sub-step: (2M/Δt + K) c⁺ = (2M/Δt) c
+            # + f, whose matrix is twice that of Crank–Nicolson.
             inlet = before + (k or 0.5) * slope
             explicit = rate * (self._mass @ c) if k < 2 else self._explicit @ c
             c[self._free] = self._solver.solve(explicit - self._implicit_inlet @ inlet + load)
@@ -287,16 +260,16 @@ class ConvectionDiffusion:
         value = _check.array(name, value, np.shape(value))
         if value.ndim == 1:
             value = value[:, None]
+        n = len(self.inlet)
         try:
-            return np.broadcast_to(value, (len(self.inlet), batch))
+            return np.broadcast_to(value, (n, batch))
         except ValueError:
-            raise ValueError(f"{name} must be a number or have shape ({len(self.inlet)},) or ({len(self.inlet)}, "
-                             f"{batch}), got {value.shape}") from None
+            raise ValueError(f"{name} must be a number or have shape ({n},) or ({n}, {batch}), "
+                             f"got {value.shape}") from None
 
 
 def inlet_nodes(mesh: Mesh, velocity: VelocityField) -> np.ndarray:
-    """Nodes of the boundary facets through which fluid enters: ∫ v·n < 0 (midpoint rule);
-    (n_inlet,) int."""
+    """(n_inlet,) int, nodes of boundary facets where fluid enters: ∫ v·n < 0 by midpoint rule."""
     basis = skfem.FacetBasis(to_skfem(mesh), element(mesh.dim, 1), intorder=1)
     x = np.asarray(basis.global_coordinates())
     speed = (_velocity_at(velocity, x) * np.asarray(basis.normals)).sum(axis=0).mean(axis=1)
@@ -315,11 +288,12 @@ def _velocity_at(velocity: VelocityField, x: np.ndarray, name: str = "velocity")
 
 
 @lru_cache(maxsize=8)
-def _supg_basis(mesh: Mesh) -> skfem.Basis:
-    return skfem.Basis(to_skfem(mesh), element(mesh.dim, 1), intorder=4)
+def _supg_basis(mesh: Mesh) -> skfem.CellBasis:
+    return basis_on(mesh, 1, intorder=4)
 
 
-def _supg_matrices(mesh: Mesh, velocity: VelocityField, diffusivity: float) -> tuple[sp.csr_array, sp.csr_array]:
+def _supg_matrices(mesh: Mesh, velocity: VelocityField,
+                   diffusivity: float) -> tuple[sp.csr_array, sp.csr_array]:
     """SUPG mass matrix and transport matrix (n, n): M ċ + K c = 0."""
     basis = _supg_basis(mesh)
     v = _velocity_at(velocity, np.asarray(basis.global_coordinates()))
@@ -331,15 +305,16 @@ def _supg_matrices(mesh: Mesh, velocity: VelocityField, diffusivity: float) -> t
 
     @skfem.BilinearForm
     def transport(u, phi, w):
-        convection = dot(w["v"], grad(u))
-        return diffusivity * dot(grad(u), grad(phi)) + convection * (phi + w["tau"] * dot(w["v"], grad(phi)))
+        test = phi + w["tau"] * dot(w["v"], grad(phi))
+        return diffusivity * dot(grad(u), grad(phi)) + dot(w["v"], grad(u)) * test
 
     return (sp.csr_array(mass.assemble(basis, v=v, tau=tau)),
             sp.csr_array(transport.assemble(basis, v=v, tau=tau)))
 
 
 def _supg_derivatives(mesh: Mesh, velocity: VelocityField, diffusivity: float,
-                      directions: Sequence[VelocityField]) -> list[tuple[sp.csr_array, sp.csr_array]]:
+                      directions: Sequence[VelocityField],
+                      ) -> list[tuple[sp.csr_array, sp.csr_array]]:
     """∂M/∂θ_k and ∂K/∂θ_k, each (n, n), at θ = 0 for the velocity v + Σ θ_k v_k."""
     basis = _supg_basis(mesh)
     x = np.asarray(basis.global_coordinates())
@@ -360,16 +335,18 @@ def _supg_derivatives(mesh: Mesh, velocity: VelocityField, diffusivity: float,
         v_k = _velocity_at(direction, x, f"directions[{number}]")
         test = tau * v_k + (by_velocity * v_k).sum(axis=0) * v  # what τ v changes by
         along = sum(np.abs((v_k * phi[0].grad).sum(axis=0)) for phi in basis.basis)
-        # In slow flow τ = |v|²/(3κ(Σᵢ|v·∇φᵢ|)²) depends on the direction only: τ v leaves v = 0 as
-        # τ(v_k) v_k.
+        # In slow flow τ = |v|²/(3κ(Σᵢ|v·∇φᵢ|)²) depends on the direction only: from v = 0 τ v
+        # begins as τ(v_k) v_k.
         slow = (v_k**2).sum(axis=0) / np.maximum(3 * diffusivity * along**2, 1e-300)
         test = np.where(tau == 0.0, slow * v_k, test)
-        derivatives.append((sp.csr_array(mass.assemble(basis, test=test)),
-                            sp.csr_array(transport.assemble(basis, v=v, tau=tau, v_k=v_k, test=test))))
+        by_mass = mass.assemble(basis, test=test)
+        by_transport = transport.assemble(basis, v=v, tau=tau, v_k=v_k, test=test)
+        derivatives.append((sp.csr_array(by_mass), sp.csr_array(by_transport)))
     return derivatives
 
 
-def _upwinding(basis: skfem.Basis, v: np.ndarray, diffusivity: float) -> tuple[np.ndarray, np.ndarray]:
+def _upwinding(basis: skfem.Basis, v: np.ndarray,
+               diffusivity: float) -> tuple[np.ndarray, np.ndarray]:
     """τ (cells, points), and its derivative by the velocity (d, cells, points), zero where τ is.
 
     τ = h/(2|v|)·(coth Pe − 1/Pe) with Pe = |v|h/(2κ) and h the cell's length along the flow (Brooks

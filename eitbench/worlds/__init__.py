@@ -1,10 +1,9 @@
-"""Floor 2: what is simulated. A world is put together from parts, with the source of every number
-beside it."""
+"""Floor 2: what is simulated. A world is put together from parts, every number with its source."""
 
 from eitbench.worlds.parts import Discretisation, Flow, History, Prior, Target, Vessel
 from eitbench.worlds.registry import Entry, entries, entry, register
 from eitbench.worlds.streams import Randomness, randomness
 from eitbench.worlds.world import World
 
-__all__ = ["Discretisation", "Entry", "Flow", "History", "Prior", "Randomness", "Target", "Vessel", "World", "entries",
-           "entry", "randomness", "register"]
+__all__ = ["Discretisation", "Entry", "Flow", "History", "Prior", "Randomness", "Target", "Vessel",
+           "World", "entries", "entry", "randomness", "register"]

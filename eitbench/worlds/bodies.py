@@ -1,5 +1,4 @@
-"""Bodies in a round tank: a ball that the fluid carries round, and metal cylinders that stand
-still."""
+"""Bodies in a round tank: a ball that the fluid carries round, and metal cylinders at rest."""
 
 from __future__ import annotations
 
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from eitbench import _check
-from eitbench.worlds.parts import Discretisation, History, Target
+from eitbench.worlds.parts import Discretisation, History, Target, check_positive, check_range
 from eitbench.worlds.world import World
 
 if TYPE_CHECKING:
@@ -24,8 +23,7 @@ BALL_POINTS = np.concatenate([np.zeros((1, 2)), np.sqrt(2 / 3) * np.stack(
     [np.cos(np.arange(6) * np.pi / 3), np.sin(np.arange(6) * np.pi / 3)], axis=1)])
 """Where the flow is averaged over a disc of radius one, …"""
 BALL_WEIGHTS = np.array([1 / 4, *[1 / 8] * 6])
-"""… and with which weights: exact for polynomials of the fifth degree (Abramowitz & Stegun
-25.4.61)."""
+"""… and with which weights: exact for the fifth degree (Abramowitz & Stegun 25.4.61)."""
 
 
 @dataclass(frozen=True)
@@ -45,17 +43,14 @@ class Ball(Target):
     is_carried = False
 
     def __post_init__(self) -> None:
-        for name, units in (("background", "mol/m³"), ("radius", "m"), ("concentration", "mol/m³")):
-            _check.number(name, getattr(self, name), low=0.0, open_low=True, units=units)
-        low, high = _check.array("start_radius", self.start_radius, (2,))
-        if not 0 <= low <= high:
-            raise ValueError(f"start_radius must be a range 0 ≤ low ≤ high, got {self.start_radius!r}")
+        check_positive(self, background="mol/m³", radius="m", concentration="mol/m³")
+        check_range(self, "start_radius", open_low=False)
 
     def check(self, world: World) -> None:
         """``ValueError`` if it does not fit into the vessel."""
         if self.start_radius[1] * world.vessel.radius + self.radius > world.vessel.radius:
-            raise ValueError("target.start_radius must be a range 0 ≤ low ≤ high that keeps the ball inside the tank, "
-                             f"got {self.start_radius!r}")
+            raise ValueError("target.start_radius must be a range 0 ≤ low ≤ high that keeps the "
+                             f"ball inside the tank, got {self.start_radius!r}")
 
     def path(self, world: World, random: np.random.Generator) -> np.ndarray:
         """(T + 1, 2) centre of the ball in m, t = 0 … T."""
@@ -77,7 +72,8 @@ class Ball(Target):
             first = velocity(centre)
             second = velocity(centre + 0.5 * dt * first)
             third = velocity(centre + 0.5 * dt * second)
-            centre = centre + dt / 6.0 * (first + 2.0 * second + 2.0 * third + velocity(centre + dt * third))
+            last = velocity(centre + dt * third)
+            centre = centre + dt / 6.0 * (first + 2.0 * second + 2.0 * third + last)
             # it cannot enter the wall
             centre = centre * min(1.0, furthest / max(np.hypot(*centre), 1e-12))
         return np.array(path)
@@ -89,7 +85,8 @@ class Ball(Target):
             path = self.path(world, episode.flow)[:last + 1]
             ball = np.array([disc_indicator(points, centre, self.radius, EDGE) for centre in path])
             tick(world.n_steps)
-            yield History(self.background + (self.concentration - self.background) * ball, np.empty((last, 0)))
+            concentration = self.background + (self.concentration - self.background) * ball
+            yield History(concentration, np.empty((last, 0)))
 
 
 @dataclass(frozen=True)
@@ -106,7 +103,7 @@ class Cylinders(Target):
     small_radius: tuple[float, float] = (0.018, 0.022)
     """m; the smaller one [ours]"""
     furthest: float = 0.7
-    """how far from the middle a cylinder's centre may stand, in parts of the tank's radius [ours]"""
+    """how far from the middle a cylinder's centre may stand, in parts of the radius [ours]"""
     gap: float = 0.05
     """m at least between the cylinders' walls [ours]"""
     metal: float = 5.0
@@ -117,26 +114,29 @@ class Cylinders(Target):
     stands_still = True
 
     def __post_init__(self) -> None:
-        for name, units in (("background", "mol/m³"), ("metal", ""), ("gap", "m")):
-            _check.number(name, getattr(self, name), low=0.0, open_low=True, units=units)
+        check_positive(self, background="mol/m³", metal="", gap="m")
 
     def check(self, world: World) -> None:
         """``ValueError`` if they do not fit into the vessel."""
         tank = world.vessel.radius
         for name in ("large_radius", "small_radius"):
-            low, high = _check.array(f"target.{name}", getattr(self, name), (2,), units="m")
+            given = getattr(self, name)
+            low, high = _check.array(f"target.{name}", given, (2,), units="m")
             if not 0 < low <= high < 0.3 * tank:
-                raise ValueError(f"target.{name} must be a range 0 < low ≤ high < 0.3·radius in m, got "
-                                 f"{getattr(self, name)!r}")
+                raise ValueError(f"target.{name} must be a range 0 < low ≤ high < 0.3·radius in m, "
+                                 f"got {given!r}")
         if self.small_radius[1] > self.large_radius[1]:
             raise ValueError("target.small_radius must not reach beyond large_radius, got "
                              f"{self.small_radius!r} and {self.large_radius!r} m")
         _check.integer("vessel.n_electrodes", world.vessel.n_electrodes, low=8)
-        _check.number("target.furthest", self.furthest, low=0.5, high=1.0 - self.large_radius[1] / tank)
+        inside = 1.0 - self.large_radius[1] / tank
+        _check.number("target.furthest", self.furthest, low=0.5, high=inside)
         apart = self.large_radius[1] + self.small_radius[1] + self.gap
-        if apart > 1.6 * self.furthest * tank:  # else places would be drawn again and again
-            raise ValueError(f"target.gap must leave room for both cylinders: with it their centres are {apart:g} m "
-                             f"apart, of {1.6 * self.furthest * tank:g} m that furthest allows; got {self.gap!r} m")
+        most = 1.6 * self.furthest * tank
+        if apart > most:  # else places would be drawn again and again
+            raise ValueError("target.gap must leave room for both cylinders: with it their centres "
+                             f"are {apart:g} m apart, of {most:g} m that furthest allows; "
+                             f"got {self.gap!r} m")
 
     def draw(self, world: World, random: np.random.Generator) -> list[tuple[np.ndarray, float]]:
         """(centre (2,), radius) of both cylinders in m, the larger first."""
@@ -159,7 +159,8 @@ class Cylinders(Target):
             yield History(np.repeat(concentration[None], last + 1, axis=0), np.empty((last, 0)))
 
 
-def disc_indicator(points: np.ndarray, centre: np.ndarray, radius: float, edge: float) -> np.ndarray:
+def disc_indicator(points: np.ndarray, centre: np.ndarray, radius: float,
+                   edge: float) -> np.ndarray:
     """1 inside a disc, 0 outside, going over within about ``edge`` (m); (k,) for points (k, 2)."""
     distance = np.hypot(*(points - centre).T)
     return np.asarray(0.5 * (1.0 - np.tanh((distance - radius) / (0.5 * edge))))

@@ -1,5 +1,4 @@
-"""How the fluid moves: known, drawn for each episode, wandering, past a bulge, stirred, or not at
-all."""
+"""How the fluid moves: known, drawn for an episode, wandering, past a bulge, stirred, or not."""
 
 from __future__ import annotations
 
@@ -14,7 +13,13 @@ import numpy as np
 from eitbench import _check
 from eitbench.physics.flow import PlaneChannelFlow, PlugFlow, PowerLawFlow
 from eitbench.physics.profiles import SkewedChannelFlow, VelocityModel, parabola
-from eitbench.worlds.parts import Discretisation, Flow, refuse_assumptions
+from eitbench.worlds.parts import (
+    Discretisation,
+    Flow,
+    check_positive,
+    check_range,
+    refuse_assumptions,
+)
 from eitbench.worlds.vessels import Bulge, PlanePipe
 from eitbench.worlds.world import World
 
@@ -28,10 +33,21 @@ BELIEVED_PAST_A_BULGE = ("parabolic", "real")
 """What a model of the flow past a bulge may assume."""
 
 
+class PipeFlow(Flow):
+    """A flow through a pipe, by default believed to be laminar with this mean velocity."""
+
+    mean_velocity: float
+
+    def nominal(self, world: World, fine: bool) -> VelocityField:
+        return world.vessel.laminar(self.mean_velocity)
+
+    def flush_steps(self, world: World) -> int:
+        return steps_through(world, self.mean_velocity)
+
+
 @dataclass(frozen=True)
-class LaminarFlow(Flow):
-    """Laminar flow through a pipe with a known mean velocity; [T]: the thesis' number; [ours]: our
-    choice."""
+class LaminarFlow(PipeFlow):
+    """Laminar flow with a known mean velocity; [T]: the thesis' number; [ours]: our choice."""
 
     mean_velocity: float = 4.5
     """v̄ in m/s [T]"""
@@ -39,11 +55,7 @@ class LaminarFlow(Flow):
     """κ in m²/s [ours]: small, yet resolved by the model's mesh"""
 
     def __post_init__(self) -> None:
-        _check.number("mean_velocity", self.mean_velocity, low=0.0, open_low=True, units="m/s")
-        _check.number("diffusivity", self.diffusivity, low=0.0, open_low=True, units="m²/s")
-
-    def nominal(self, world: World, fine: bool) -> VelocityField:
-        return world.vessel.laminar(self.mean_velocity)
+        check_positive(self, mean_velocity="m/s", diffusivity="m²/s")
 
     def check_assumed(self, world: World, assumed: Mapping[str, Any]) -> None:
         """``mean_velocity`` in m/s, and in a plane pipe ``profile``, one of `PROFILES`."""
@@ -52,12 +64,8 @@ class LaminarFlow(Flow):
     def believed(self, world: World, **assumed: Any) -> VelocityField:
         return laminar_assumption(world, self.mean_velocity, assumed)
 
-    def flush_steps(self, world: World) -> int:
-        return steps_through(world, self.mean_velocity)
-
-
 @dataclass(frozen=True)
-class DrawnFlow(Flow):
+class DrawnFlow(LaminarFlow):
     """A flow through a plane pipe that is drawn for each episode (thesis 5.1.2 and ch. 6).
 
     v̄(t) = mean·(1 + swing·sin(2πt/period + phase)), its profile (1 − η²)·exp(kη).
@@ -68,8 +76,7 @@ class DrawnFlow(Flow):
     diffusivity: float = 5e-4
     """κ in m²/s [ours]"""
     velocity_range: tuple[float, float] = (2.5, 7.0)
-    """m/s; the true mean velocity is drawn evenly from it. The thesis assumes 2 and 7 for a true
-    4.5 [ours]"""
+    """m/s, of the true mean, drawn evenly; the thesis assumes 2 and 7 for a true 4.5 [ours]"""
     swing_range: tuple[float, float] = (0.0, 0.0)
     """amplitude of the mean velocity's sine in time, in parts of the mean"""
     period_range: tuple[float, float] = (0.4, 0.8)
@@ -77,22 +84,18 @@ class DrawnFlow(Flow):
     skewness_range: tuple[float, float] = (0.0, 0.0)
     """|k|, either sign; 0 is the parabola"""
     profiles: str | None = None
-    """what estimators are asked for: None, the ``mean`` velocity of a parabola, or ``three``
-    numbers of a profile"""
+    """what is asked for: None, the ``mean`` of a parabola, or ``three`` numbers of a profile"""
     velocity_std: float = 1.0
     """m/s, standard deviation of what is believed of it at first [ours]"""
     velocity_walk: float = 0.02
     """m/s a time step, standard deviation of the believed random walk [ours]"""
 
     def __post_init__(self) -> None:
-        _check.number("mean_velocity", self.mean_velocity, low=0.0, open_low=True, units="m/s")
-        _check.number("diffusivity", self.diffusivity, low=0.0, open_low=True, units="m²/s")
-        for name, units in (("velocity_range", "m/s"), ("swing_range", ""), ("period_range", "s"),
-                            ("skewness_range", "")):
-            low, high = _check.array(name, getattr(self, name), (2,), units=units)
-            if not 0 <= low <= high or (low == 0 and name in ("velocity_range", "period_range")):
-                raise ValueError(f"{name} must be a range low ≤ high of numbers ≥ 0 (velocity and period > 0), got "
-                                 f"{getattr(self, name)!r}")
+        super().__post_init__()
+        check_range(self, "velocity_range", "m/s")
+        check_range(self, "swing_range", open_low=False)
+        check_range(self, "period_range", "s")
+        check_range(self, "skewness_range", open_low=False)
         if self.swing_range[1] >= 1 or self.skewness_range[1] > 5:
             raise ValueError("swing_range must lie below 1 and skewness_range below 5, got "
                              f"{self.swing_range!r} and {self.skewness_range!r}")
@@ -100,19 +103,6 @@ class DrawnFlow(Flow):
             raise ValueError(f"profiles must be None, 'mean' or 'three', got {self.profiles!r}")
         _check.number("velocity_std", self.velocity_std, low=0.0, units="m/s")
         _check.number("velocity_walk", self.velocity_walk, low=0.0, units="m/s")
-
-    def nominal(self, world: World, fine: bool) -> VelocityField:
-        return world.vessel.laminar(self.mean_velocity)
-
-    def check_assumed(self, world: World, assumed: Mapping[str, Any]) -> None:
-        """As in `LaminarFlow`."""
-        laminar_assumption(world, self.mean_velocity, assumed)
-
-    def believed(self, world: World, **assumed: Any) -> VelocityField:
-        return laminar_assumption(world, self.mean_velocity, assumed)
-
-    def flush_steps(self, world: World) -> int:
-        return steps_through(world, self.mean_velocity)
 
     def lead_in(self, world: World) -> int:
         return steps_through(world, self.velocity_range[0] * (1.0 - self.swing_range[1]))
@@ -123,11 +113,11 @@ class DrawnFlow(Flow):
             return None
         if self.profiles == "mean":
             return parabola(half_width, self.mean_velocity, self.velocity_std, self.velocity_walk)
-        # the parabola, a skew cubic, and a quartic that flattens or sharpens the profile without a
-        # net flux
+        # the parabola, a skew cubic, and a quartic without a net flux that flattens or sharpens it
         basis = ((1.5, 0.0, -1.5), (0.0, 1.5, 0.0, -1.5), (-1.5, 0.0, 9.0, 0.0, -7.5))
+        nominal = (self.mean_velocity, 0.0, 0.0)
         std = (self.velocity_std, 3.0 * self.velocity_std, self.velocity_std)
-        return VelocityModel(half_width, basis, (self.mean_velocity, 0.0, 0.0), std, (self.velocity_walk,) * 3)
+        return VelocityModel(half_width, basis, nominal, std, (self.velocity_walk,) * 3)
 
     def draw(self, world: World, random: np.random.Generator) -> Callable[[int], SkewedChannelFlow]:
         mean = random.uniform(*self.velocity_range)
@@ -138,15 +128,15 @@ class DrawnFlow(Flow):
 
         def flow(t: int) -> SkewedChannelFlow:
             angle = 2.0 * math.pi * (t - 0.5) * world.time_step / period + phase
-            return SkewedChannelFlow(mean * (1.0 + swing * math.sin(angle)), world.vessel.half_width, skewness)
+            velocity = mean * (1.0 + swing * math.sin(angle))
+            return SkewedChannelFlow(velocity, world.vessel.half_width, skewness)
 
         return flow
 
 
 @dataclass(frozen=True)
-class WanderingFlow(Flow):
-    """A parabolic flow through a plane pipe whose mean velocity is a random walk; all numbers are
-    ours.
+class WanderingFlow(PipeFlow):
+    """A parabolic flow in a plane pipe whose mean velocity is a random walk; numbers are ours.
 
     At every time step it goes up or down by ``velocity_walk``, which is also the walk that
     estimators are told of; at the ends of ``velocity_range`` it turns back.
@@ -164,29 +154,19 @@ class WanderingFlow(Flow):
     """m/s a time step: 0.4 m/s (std) while the fluid passes through the pipe"""
 
     def __post_init__(self) -> None:
-        for name, units in (("mean_velocity", "m/s"), ("diffusivity", "m²/s"), ("velocity_walk", "m/s")):
-            _check.number(name, getattr(self, name), low=0.0, open_low=True, units=units)
+        check_positive(self, mean_velocity="m/s", diffusivity="m²/s", velocity_walk="m/s")
         _check.number("velocity_std", self.velocity_std, low=0.0, units="m/s")
-        low, high = _check.array("velocity_range", self.velocity_range, (2,), units="m/s")
-        if not 0 < low <= high:
-            raise ValueError(f"velocity_range must be a range 0 < low ≤ high in m/s, got {self.velocity_range!r}")
-
-    def nominal(self, world: World, fine: bool) -> VelocityField:
-        return world.vessel.laminar(self.mean_velocity)
-
-    def flush_steps(self, world: World) -> int:
-        return steps_through(world, self.mean_velocity)
-
+        check_range(self, "velocity_range", "m/s")
     def lead_in(self, world: World) -> int:
         return steps_through(world, self.velocity_range[0])
 
     def velocity_model(self, world: World) -> VelocityModel:
-        return parabola(world.vessel.half_width, self.mean_velocity, self.velocity_std, self.velocity_walk)
+        return parabola(world.vessel.half_width, self.mean_velocity, self.velocity_std,
+                        self.velocity_walk)
 
     def draw(self, world: World, random: np.random.Generator) -> Callable[[int], SkewedChannelFlow]:
         low, high = self.velocity_range
-        # from the lowest velocity to the highest
-        places = int((high - low) / self.velocity_walk + 1e-9)
+        places = int((high - low) / self.velocity_walk + 1e-9)  # from the lowest to the highest
         walk = random.integers(2 * places) if places else 0
         signs = random.choice([-1, 1], world.lead_in + world.n_steps)
         steps = walk + np.concatenate([[0], np.cumsum(signs)])[:-1]
@@ -195,15 +175,15 @@ class WanderingFlow(Flow):
         velocity = low + folded * self.velocity_walk
 
         def flow(t: int) -> SkewedChannelFlow:
-            return SkewedChannelFlow(float(velocity[t + world.lead_in - 1]), world.vessel.half_width)
+            mean = float(velocity[t + world.lead_in - 1])
+            return SkewedChannelFlow(mean, world.vessel.half_width)
 
         return flow
 
 
 @dataclass(frozen=True)
-class FlowPastBulge(Flow):
-    """The steady Navier–Stokes flow through a plane pipe with a bulge: the flow separates behind
-    it.
+class FlowPastBulge(PipeFlow):
+    """The steady Navier–Stokes flow through a plane pipe with a bulge, behind which it separates.
 
     Better fluid models are what the thesis names as its next step (5.1.1). Estimators know the
     walls, but of the flow only that it is parabolic between them at each x, unless they are given
@@ -215,22 +195,21 @@ class FlowPastBulge(Flow):
     diffusivity: float = 5e-4
     """κ in m²/s"""
     viscosity: float = 5e-4
-    """m²/s, the eddy viscosity; equal to κ, a turbulent Schmidt number of one. Re = v̄·2R/ν = 900"""
+    """m²/s, the eddy viscosity; as κ, a turbulent Schmidt number of one. Re = v̄·2R/ν = 900"""
 
     def __post_init__(self) -> None:
-        for name, units in (("mean_velocity", "m/s"), ("diffusivity", "m²/s"), ("viscosity", "m²/s")):
-            _check.number(name, getattr(self, name), low=0.0, open_low=True, units=units)
+        check_positive(self, mean_velocity="m/s", diffusivity="m²/s", viscosity="m²/s")
 
     def nominal(self, world: World, fine: bool) -> SteadyFlow:
-        """The real flow, on a mesh with so many cells along and across the pipe; computed once a
-        process."""
+        """The real flow, by so many cells along and across the pipe; computed once a process."""
         return _past_bulge(world.vessel, self, (96, 24) if fine else (64, 16))
 
     def check_assumed(self, world: World, assumed: Mapping[str, Any]) -> None:
         """``flow``, one of `BELIEVED_PAST_A_BULGE`."""
         refuse_assumptions(assumed, ("flow",))
         if (flow := assumed.get("flow", "parabolic")) not in BELIEVED_PAST_A_BULGE:
-            raise ValueError(f"assume.flow must be one of {', '.join(BELIEVED_PAST_A_BULGE)}, got {flow!r}")
+            known = ", ".join(BELIEVED_PAST_A_BULGE)
+            raise ValueError(f"assume.flow must be one of {known}, got {flow!r}")
 
     def believed(self, world: World, **assumed: Any) -> VelocityField:
         """By default what those believe who know the walls only."""
@@ -238,9 +217,6 @@ class FlowPastBulge(Flow):
         if assumed.get("flow") == "real":
             return self.nominal(world, fine=False)
         return LocalParabola(self.mean_velocity, world.vessel.half_width, world.vessel.bulge)
-
-    def flush_steps(self, world: World) -> int:
-        return steps_through(world, self.mean_velocity)
 
     def true_transport(self, world: World, model: Discretisation, random: np.random.Generator,
                        ) -> Callable[[int], Transport]:
@@ -250,11 +226,9 @@ class FlowPastBulge(Flow):
 
 @dataclass(frozen=True)
 class StirredFlow(Flow):
-    """A steady Navier–Stokes flow in a round tank, driven by a stirrer off the middle (thesis 7.1);
-    numbers are ours.
+    """A steady Navier–Stokes flow in a round tank with a stirrer (thesis 7.1); numbers are ours.
 
-    At rest on the wall, driven along the circle that the stirrer sweeps: force·exp(−((d −
-    swept)/width)²/2).
+    At rest on the wall, driven along the stirrer's circle: force·exp(−((d − swept)/width)²/2).
     """
 
     viscosity: float = 2e-4
@@ -271,9 +245,8 @@ class StirredFlow(Flow):
     """κ of the estimators' model in m²/s: as little as its mesh can do with"""
 
     def __post_init__(self) -> None:
-        for name, units in (("viscosity", "m²/s"), ("stirrer_radius", "m"), ("stirrer_width", "m"),
-                            ("stirrer_force", "m/s²"), ("diffusivity", "m²/s")):
-            _check.number(name, getattr(self, name), low=0.0, open_low=True, units=units)
+        check_positive(self, viscosity="m²/s", stirrer_radius="m", stirrer_width="m",
+                       stirrer_force="m/s²", diffusivity="m²/s")
         _check.array("stirrer_position", self.stirrer_position, (2,), units="m")
 
     def nominal(self, world: World, fine: bool) -> SteadyFlow:
@@ -293,22 +266,17 @@ class NoFlow(Flow):
 
 @dataclass(frozen=True)
 class LocalParabola:
-    """The flow with the stream function 1.5·v̄·R·(η − η³/3), η from −1 at the lower wall to 1 at
-    the upper one.
+    """The flow along a bent wall with the stream function 1.5·v̄·R·(η − η³/3), without divergence.
 
-    At each x a parabola along the pipe, with the fluid following the walls; without divergence.
-
-    Parameters
-    ----------
-    mean_velocity, half_width : float
-        v̄ in m/s and R in m.
-    bulge : Bulge or None
-        Of the lower wall. An estimator is given this, and through it nothing else of the world.
+    η goes from −1 at the lower wall to 1 at the upper one: a parabola at each x.
     """
 
     mean_velocity: float
+    """v̄ in m/s"""
     half_width: float
+    """R in m"""
     bulge: Bulge | None
+    """of the lower wall; an estimator is given this, and through it nothing else of the world"""
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
         if self.bulge is None:
@@ -318,7 +286,7 @@ class LocalParabola:
         slope = -2.0 * (x - self.bulge.position) / self.bulge.width**2 * bulge
         gap = 2.0 * self.half_width - bulge
         part = (y + self.half_width - bulge) / gap
-        by_eta = 1.5 * self.mean_velocity * self.half_width * (1.0 - (2.0 * part - 1.0)**2)  # ∂ψ/∂η
+        by_eta = 1.5 * self.mean_velocity * self.half_width * (1.0 - (2.0 * part - 1.0)**2)
         return np.stack([by_eta * 2.0 / gap, by_eta * 2.0 * slope / gap * (1.0 - part)], axis=1)
 
 
@@ -327,13 +295,15 @@ def steps_through(world: World, velocity: float) -> int:
     return math.ceil(world.vessel.length / (velocity * world.time_step))
 
 
-def laminar_assumption(world: World, mean_velocity: float, assumed: Mapping[str, Any]) -> VelocityField:
-    """What a model of a pipe is told to believe of its flow; ``ValueError`` if there is nothing of
-    this name."""
+def laminar_assumption(world: World, mean_velocity: float,
+                       assumed: Mapping[str, Any]) -> VelocityField:
+    """What a model of a pipe is told to believe; ``ValueError`` for another name or value."""
     plane = isinstance(world.vessel, PlanePipe)
     refuse_assumptions(assumed, ("mean_velocity", "profile") if plane else ("mean_velocity",))
     mean = assumed.get("mean_velocity")
-    mean = mean_velocity if mean is None else _check.number("assume.mean_velocity", mean, low=0.0, units="m/s")
+    if mean is None:
+        mean = mean_velocity
+    mean = _check.number("assume.mean_velocity", mean, low=0.0, units="m/s")
     profile = assumed.get("profile") or "parabolic"
     if profile not in PROFILES:
         raise ValueError(f"assume.profile must be one of {', '.join(PROFILES)}, got {profile!r}")
@@ -352,13 +322,13 @@ def _real_model(world: World) -> Discretisation:
 
 @lru_cache(maxsize=4)
 def _past_bulge(vessel: PlanePipe, flow: FlowPastBulge, cells: tuple[int, int]) -> SteadyFlow:
-    """On a pipe 1.75 times as long, so that the outlet, where the fluid leaves freely, does not
-    shorten the eddy."""
+    """On a pipe 1.75 times as long, so that the free outlet does not shorten the eddy."""
     from eitbench.numerics.mesh import rectangle_mesh
     from eitbench.physics.navier_stokes import steady_flow
     along = math.ceil(1.75 * cells[0])
     R = vessel.half_width
-    straight = rectangle_mesh(np.linspace(0.0, 1.75 * vessel.length, along + 1), np.linspace(-R, R, cells[1] + 1))
+    straight = rectangle_mesh(np.linspace(0.0, 1.75 * vessel.length, along + 1),
+                              np.linspace(-R, R, cells[1] + 1))
     inlet = straight.facets_where(lambda p: p[:, 0] == 0.0)
     walls = straight.facets_where(lambda p: np.abs(p[:, 1]) == R)
     return steady_flow(vessel.shaped(straight), flow.viscosity,
@@ -374,7 +344,9 @@ def _stirred(flow: StirredFlow, radius: float, rings: int) -> SteadyFlow:
     def stirrer(points: np.ndarray) -> np.ndarray:
         offset = points - np.array(flow.stirrer_position)
         distance = np.hypot(*offset.T)[:, None]
-        strength = flow.stirrer_force * np.exp(-0.5 * ((distance - flow.stirrer_radius) / flow.stirrer_width)**2)
-        return strength / np.maximum(distance, 1e-9) * np.stack([-offset[:, 1], offset[:, 0]], axis=1)
+        off = (distance - flow.stirrer_radius) / flow.stirrer_width
+        along = np.stack([-offset[:, 1], offset[:, 0]], axis=1)
+        strength = flow.stirrer_force * np.exp(-0.5 * off**2)
+        return strength / np.maximum(distance, 1e-9) * along
 
     return steady_flow(mesh, flow.viscosity, [(mesh.boundary_facets, np.zeros_like)], force=stirrer)

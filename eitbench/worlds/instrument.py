@@ -1,5 +1,4 @@
-"""The instrument between what is asked for and what is read: wires break, contacts come loose,
-amplifiers are noisy."""
+"""The instrument: wires break, contacts come loose, amplifiers are noisy."""
 
 from __future__ import annotations
 
@@ -10,6 +9,7 @@ import numpy as np
 
 from eitbench import _check
 from eitbench.physics.observation import VoltageNoise
+from eitbench.worlds.parts import check_positive, check_range
 
 LIMITS = ("L1", "L2", "Linf")
 """Norms that may bound the currents."""
@@ -34,8 +34,7 @@ class Faults(NamedTuple):
 
 @dataclass(frozen=True)
 class Instrument:
-    """Current sources and voltmeters; by default sound ones. [T]: the thesis' number; all others
-    are ours.
+    """Current sources and voltmeters, by default sound. [T]: the thesis' number; others are ours.
 
     A broken wire leaves the electrode in place, so the field is that of an electrode without net
     current: the transfer resistances of the episode stay exact. A current that would have to pass a
@@ -69,13 +68,12 @@ class Instrument:
     """V; std of what a broken wire reads"""
 
     def __post_init__(self) -> None:
-        _check.number("current", self.current, low=0.0, open_low=True, units="A")
-        for name in ("noise_relative", "noise_of_largest"):
-            _check.number(name, getattr(self, name), low=0.0)
+        check_positive(self, current="A")
+        for name, units in (("noise_relative", ""), ("noise_of_largest", ""), ("noise_floor", "V"),
+                            ("interference", "V")):
+            _check.number(name, getattr(self, name), low=0.0, units=units)
         if self.limit is not None and self.limit not in LIMITS:
             raise ValueError(f"limit must be one of {', '.join(LIMITS)}, got {self.limit!r}")
-        for name, units in (("noise_floor", "V"), ("interference", "V")):
-            _check.number(name, getattr(self, name), low=0.0, units=units)
         _check.number("loose_noise", self.loose_noise, low=1.0)
         for name in ("dead", "failing", "loose"):
             bounds = getattr(self, name)
@@ -84,9 +82,7 @@ class Instrument:
             low, high = (_check.integer(name, value, low=0) for value in bounds)
             if low > high:
                 raise ValueError(f"{name} must be a range least ≤ most, got {bounds!r}")
-        low, high = _check.array("loose_resistance", self.loose_resistance, (2,), units="Ω")
-        if not 0 <= low <= high:
-            raise ValueError(f"loose_resistance must be a range 0 ≤ low ≤ high, got {self.loose_resistance!r} Ω")
+        check_range(self, "loose_resistance", "Ω", open_low=False)
 
     @property
     def most(self) -> int:
@@ -118,10 +114,9 @@ class Instrument:
         factor[shaky] = self.loose_noise
         return Faults(broken, resistance, factor)
 
-    def measure(self, faults: Faults, t: np.ndarray | int, transfer_resistance: np.ndarray, currents: np.ndarray,
-                draws: np.ndarray) -> np.ndarray:
-        """Voltages (B, L) in V: 𝓡 I, and noise; of B episodes at step ``t``, or at steps t (B,) of
-        one.
+    def measure(self, faults: Faults, t: np.ndarray | int, transfer_resistance: np.ndarray,
+                currents: np.ndarray, draws: np.ndarray) -> np.ndarray:
+        """Voltages (B, L) in V, 𝓡 I and noise: B episodes at one step, or one at steps t (B,).
 
         Parameters
         ----------

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from eitbench import _check
+from eitbench.worlds.parts import check_positive
 
 if TYPE_CHECKING:
     from eitbench.numerics.mesh import Mesh
@@ -49,9 +50,7 @@ class MeshVessel:
     parts_of_a_step = 2
 
     def __post_init__(self) -> None:
-        for name, units in (("scale", "m"), ("contact_impedance", "Ω·m²"),
-                            ("molar_conductivity", "S·m²/mol")):
-            _check.number(name, getattr(self, name), low=0.0, open_low=True, units=units)
+        check_positive(self, scale="m", contact_impedance="Ω·m²", molar_conductivity="S·m²/mol")
         _check.integer("n_electrodes", self.n_electrodes, low=2)
         for count in self.patches:
             _check.integer("each entry of patches", count, low=1)

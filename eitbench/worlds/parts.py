@@ -1,5 +1,4 @@
-"""The parts of a world: what a vessel, a flow and a target can be asked, and what is believed
-beforehand."""
+"""The parts of a world: what vessel, flow and target can be asked, and what is believed before."""
 
 from __future__ import annotations
 
@@ -39,74 +38,58 @@ class History(NamedTuple):
 
 
 class Vessel(Protocol):
-    """What holds the liquid, with the electrodes on its wall. A frozen dataclass of plain numbers
-    in SI units."""
+    """What holds the liquid, with electrodes on its wall: a frozen dataclass of SI numbers."""
 
     @property
     def contact_impedance(self) -> float:
         """z in Ω·m²."""
-        ...
 
     @property
     def molar_conductivity(self) -> float:
         """Λ in S·m²/mol; σ = Λc."""
-        ...
 
     @property
     def n_electrodes(self) -> int:
         """L."""
-        ...
 
     @property
     def patches(self) -> tuple[int, int]:
         """Along x and y: the coarse grid on which an agent sees an estimate."""
-        ...
 
     @property
     def is_long(self) -> bool:
         """Whether pictures of it are laid one below the other."""
-        ...
 
     def carrier(self, fine: bool) -> tuple[Mesh, np.ndarray]:
-        """The mesh on which concentration moves, ``fine`` for the truth, and the numbers of its
-        inlet's nodes."""
-        ...
+        """The mesh on which concentration moves, ``fine`` for the truth, and its inlet's nodes."""
 
     @property
     def parts_of_a_step(self) -> int:
         """Steps of the truth's transport in a time step."""
-        ...
 
     def substeps(self, fine: bool) -> int:
         """Crank–Nicolson steps in each of them, or in a time step of the model."""
-        ...
 
     def electrode_model(self, fine: bool) -> CompleteElectrodeModel:
         """The complete electrode model, on a mesh of its own."""
-        ...
 
 
 class Flow(Protocol):
-    """How the fluid moves. A frozen dataclass of plain numbers in SI units; what is said here holds
-    where it says nothing else."""
+    """How the fluid moves: a frozen dataclass of SI numbers. What is said here is the default."""
 
     @property
     def diffusivity(self) -> float:
         """κ in m²/s; of the estimators' model where the truth is not carried."""
-        ...
 
     def nominal(self, world: World, fine: bool) -> VelocityField | None:
-        """The velocity with which the truth (``fine``) and the estimators' model are built; None:
-        nothing moves."""
-        ...
+        """The velocity of the truth (``fine``) or the estimators' model; None: nothing moves."""
 
     def check_assumed(self, world: World, assumed: Mapping[str, Any]) -> None:
         """``ValueError`` if `believed` knows nothing of what is assumed; at no cost."""
         refuse_assumptions(assumed, ())
 
     def believed(self, world: World, **assumed: Any) -> VelocityField | None:
-        """The velocity of the estimators' model; ``assumed`` is what they are told instead, by
-        name."""
+        """The velocity of the estimators' model; ``assumed``: what they are told instead."""
         self.check_assumed(world, assumed)
         return self.nominal(world, fine=False)
 
@@ -122,13 +105,13 @@ class Flow(Protocol):
         """How the flow may be written where it is to be estimated too."""
         return None
 
-    def draw(self, world: World, random: np.random.Generator) -> Callable[[int], SkewedChannelFlow] | None:
-        """t -> the flow from t − 1 to t in one episode; None where that is the nominal one in all
-        of them."""
+    def draw(self, world: World,
+             random: np.random.Generator) -> Callable[[int], SkewedChannelFlow] | None:
+        """t -> the flow from t − 1 to t in one episode; None: the nominal one in all of them."""
         return None
 
-    def true_transport(self, world: World, model: Discretisation, random: np.random.Generator,
-                       ) -> Callable[[int], Transport]:
+    def true_transport(self, world: World, model: Discretisation,
+                       random: np.random.Generator) -> Callable[[int], Transport]:
         """See `World.true_transport`."""
         drawn = self.draw(world, random)
         if drawn is None:
@@ -147,19 +130,31 @@ def refuse_assumptions(assumed: Mapping[str, Any], known: Sequence[str]) -> None
             raise ValueError(f"assume has no {name!r}; {there}")
 
 
+def check_positive(part: object, **units: str) -> None:
+    """``ValueError`` unless these numbers of a part, each with its unit, are above 0."""
+    for name, unit in units.items():
+        _check.number(name, getattr(part, name), low=0.0, open_low=True, units=unit)
+
+
+def check_range(part: object, name: str, units: str = "", open_low: bool = True) -> None:
+    """``ValueError`` unless this pair of a part's numbers is 0 < low ≤ high, or 0 ≤ low ≤ high."""
+    given = getattr(part, name)
+    low, high = _check.array(name, given, (2,), units=units)
+    if not 0 <= low <= high or (open_low and low == 0):
+        least = ("> 0" if open_low else "≥ 0") + (f" in {units}" if units else "")
+        raise ValueError(f"{name} must be a range low ≤ high of numbers {least}, got {given!r}")
+
+
 class Target(Protocol):
-    """What is to be seen. A frozen dataclass of plain numbers in SI units."""
+    """What is to be seen: a frozen dataclass of SI numbers."""
 
     @property
     def background(self) -> float:
         """Concentration (mol/m³) that fills the vessel at first."""
-        ...
 
     @property
     def is_carried(self) -> bool:
-        """Whether the truth is concentration that the fluid carries; else the target has a way of
-        its own."""
-        ...
+        """Whether the fluid carries the truth; else the target has a way of its own."""
 
     @property
     def stands_still(self) -> bool:
@@ -168,18 +163,15 @@ class Target(Protocol):
 
     def evolve(self, world: World, episodes: Sequence[Randomness], truth: Discretisation,
                tick: Callable[[int], object], last: int) -> Iterator[History]:
-        """What moves in each episode up to state ``last``. Its numbers do not depend on the others,
-        to the bit.
+        """What moves in each episode up to state ``last``; to the bit the same beside any others.
 
         ``tick(k)`` is called when k more steps of one episode are done.
         """
-        ...
 
 
 @dataclass(frozen=True)
 class Prior:
-    """What is believed before anything is measured; standard deviations in parts of ĉ_bh (thesis
-    Table 5.1)."""
+    """What is believed before any measurement; deviations in parts of ĉ_bh (thesis Table 5.1)."""
 
     expected_concentration: float = 25.0
     """mol/m³; a rough level, deliberately not the background [ours]"""
@@ -193,7 +185,7 @@ class Prior:
     """m over which the initial state is smooth; 0: nodes are independent"""
 
     def __post_init__(self) -> None:
-        _check.number("expected_concentration", self.expected_concentration, low=0.0, open_low=True, units="mol/m³")
+        check_positive(self, expected_concentration="mol/m³")
         for name in ("inflow_std", "nodal_std", "initial_std"):
             _check.number(name, getattr(self, name), low=0.0)
         _check.number("initial_length", self.initial_length, low=0.0, units="m")

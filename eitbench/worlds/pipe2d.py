@@ -14,13 +14,14 @@ the whole pipe.
 """
 
 ABOUT = """
-Fluid streams through a straight 2D pipe, 40 cm long and 10 cm wide, at 4.5 m/s on average; slugs of higher and lower
-concentration enter at random. Sixteen electrodes on the walls, one current injection every 5 ms: while a frame of 16
-injections is measured, the fluid moves on by 36 cm. From the voltages of each injection, and a model of flow, estimate
-the concentration everywhere (Seppänen 2005, ch. 5).
+Fluid streams through a straight 2D pipe, 40 cm long and 10 cm wide, at 4.5 m/s on average; slugs of
+higher and lower concentration enter at random. Sixteen electrodes on the walls, one current
+injection every 5 ms: while a frame of 16 injections is measured, the fluid moves on by 36 cm. From
+the voltages of each injection, and a model of flow, estimate the concentration everywhere (Seppänen
+2005, ch. 5).
 
-The homogeneous estimate scores about 0.02, a Kalman filter about 0.0045. `assume={"mean_velocity": 4.0}` tells
-estimators another velocity than the true one.
+The homogeneous estimate scores about 0.02, a Kalman filter about 0.0045.
+`assume={"mean_velocity": 4.0}` tells estimators another velocity than the true one.
 """
 LATER = "\nHere the state of four injections before is asked for.\n"
 WHOLE = "\nHere every state is asked for, once the whole record has been played.\n"

@@ -13,12 +13,15 @@ PIPE_2D_INTERMITTENT = World(
     schedule=Schedule(scored_steps=180, budget=30))
 """Strong slugs, about three in the injections that are scored; all numbers are ours."""
 
-register(PIPE_2D_INTERMITTENT, "eitbench/Pipe2DInjectionBudget-v0", track="injection", seeds="test:0-49", about="""
-The pipe of `eitbench/Pipe2D-v0` when slugs are rare: strong ones come one at a time, at times nobody foresees, about
-three in an episode. The agent may inject at one step in six only, so it has to notice that a slug has come and then
-look closely, and to keep something for the next one. Once the budget is spent every action is no injection
-(`action_masks`); within it injections cost nothing. Where nothing is injected `voltages` are the amplifiers' noise
-(here none) and `innovations` zero. The first frame does not count against the budget.
+register(PIPE_2D_INTERMITTENT, "eitbench/Pipe2DInjectionBudget-v0", track="injection",
+         seeds="test:0-49", about="""
+The pipe of `eitbench/Pipe2D-v0` when slugs are rare: strong ones come one at a time, at times
+nobody foresees, about three in an episode. The agent may inject at one step in six only, so it has
+to notice that a slug has come and then look closely, and to keep something for the next one. Once
+the budget is spent every action is no injection (`action_masks`); within it injections cost
+nothing. Where nothing is injected `voltages` are the amplifiers' noise (here none) and
+`innovations` zero. The first frame does not count against the budget.
 
-The adaptivity gap is 0.46, with a 95 % interval from 0.41 to 0.51 over 50 dev episodes (`docs/injection.md`).
+The adaptivity gap is 0.46, with a 95 % interval from 0.41 to 0.51 over 50 dev episodes
+(`docs/injection.md`).
 """)

@@ -1,5 +1,4 @@
-"""The worlds that can be played, by their ids: ours, those of installed packages, and those a
-script registers."""
+"""The worlds that can be played, by ids: ours, those of installed packages, those of a script."""
 
 from __future__ import annotations
 
@@ -18,8 +17,10 @@ from eitbench.worlds.world import World
 GROUP = "eitbench.worlds"
 """Entry points of installed packages: modules that call `register` when they are imported."""
 CLASSES = {
-    "estimation": ("eitbench.envs.estimation:EstimationEnv", "eitbench.envs.estimation_vector:EstimationVectorEnv"),
-    "injection": ("eitbench.envs.injection:InjectionEnv", "eitbench.envs.injection:InjectionVectorEnv")}
+    "estimation": ("eitbench.envs.estimation:EstimationEnv",
+                   "eitbench.envs.estimation_vector:EstimationVectorEnv"),
+    "injection": ("eitbench.envs.injection:InjectionEnv",
+                  "eitbench.envs.injection:InjectionVectorEnv")}
 """Track -> its environment, one at a time and vectorised."""
 SETTINGS = {"estimation": ("lag", "assume"), "injection": ("gate",)}
 """Track -> what an id may fix of its environment, beside the world."""
@@ -47,9 +48,11 @@ _by_hand: set[str] = set()
 """Ids that neither we nor an installed package registered: other processes must be told of them."""
 
 
-def register(world: World, id: str, *, track: str = "estimation", about: str = "", seeds: str = "test:0-9",
-             **settings: Any) -> None:
+def register(world: World, id: str, *, track: str = "estimation", about: str = "",
+             seeds: str = "test:0-9", **settings: Any) -> None:
     """Make a world playable under an id, for `gymnasium.make` and for everything here.
+
+    ``ValueError`` if the id has another form or belongs to another world, or a setting is unknown.
 
     Parameters
     ----------
@@ -63,20 +66,15 @@ def register(world: World, id: str, *, track: str = "estimation", about: str = "
     seeds : str
         The test episodes of its board.
     settings
-        Of the environment: ``lag`` and ``assume`` where estimates are asked for, ``gate`` where
-        injections are.
-
-    Raises
-    ------
-    ValueError
-        If the id has another form or belongs to another world, or a setting is unknown.
+        Of the environment: ``lag`` and ``assume`` for estimates, ``gate`` for injections.
     """
     if not re.fullmatch(r"[\w.-]+/[\w.-]+-v\d+", id):
         raise ValueError(f"id must look like 'namespace/Name-v0', got {id!r}")
     if track not in CLASSES:
         raise ValueError(f"track must be one of {', '.join(CLASSES)}, got {track!r}")
     if unknown := sorted(set(settings) - set(SETTINGS[track])):
-        raise ValueError(f"settings of the track {track} are {', '.join(SETTINGS[track])}; got {', '.join(unknown)}")
+        raise ValueError(f"settings of the track {track} are {', '.join(SETTINGS[track])}; "
+                         f"got {', '.join(unknown)}")
     try:
         json.dumps(settings, allow_nan=False)
     except (TypeError, ValueError) as error:
@@ -94,7 +92,8 @@ def _make_known(entry: Entry) -> None:
     """To `gymnasium.make`."""
     if entry.id not in gym.registry:
         single, many = CLASSES[entry.track]
-        gym.register(entry.id, entry_point=single, vector_entry_point=many, kwargs={"name": entry.id})
+        gym.register(entry.id, entry_point=single, vector_entry_point=many,
+                     kwargs={"name": entry.id})
 
 
 def entries() -> dict[str, Entry]:
@@ -129,5 +128,6 @@ def register_installed() -> None:
         try:
             point.load()
         except Exception as error:          # somebody else's package must not break ours
-            warnings.warn(f"worlds of {point.value} are left out: {type(error).__name__}: {error}", stacklevel=2)
+            warnings.warn(f"worlds of {point.value} are left out: {type(error).__name__}: {error}",
+                          stacklevel=2)
     _by_hand.clear()

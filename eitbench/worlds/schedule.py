@@ -8,18 +8,17 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from eitbench import _check
+from eitbench.worlds.parts import check_positive
 
 if TYPE_CHECKING:
     from eitbench.worlds.vessels import PlanePipe, RoundPipe, RoundTank
 
 
 class Pattern(Protocol):
-    """The cycle of injections, in parts of the instrument's current. A frozen dataclass of plain
-    numbers."""
+    """The cycle of injections, in parts of the current: a frozen dataclass of plain numbers."""
 
     def __call__(self, vessel: Any) -> np.ndarray:
         """(K, L), each row summing to zero."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -77,8 +76,7 @@ class RingsInTurn:
 
 @dataclass(frozen=True)
 class OnePair:
-    """The same pair of electrodes all the time: number 0, and the one opposite [T: one pair; ours:
-    which]."""
+    """The same pair all the time: electrode 0, and the one opposite [T: one pair; ours: which]."""
 
     def __call__(self, vessel: RoundTank) -> np.ndarray:
         return _pair(vessel, 0, vessel.n_electrodes // 2)[None]
@@ -86,8 +84,7 @@ class OnePair:
 
 @dataclass(frozen=True)
 class AroundTheTank:
-    """Eight injections straight across a tank, then eight aslant, each far from the one before
-    [ours]."""
+    """Eight injections straight across a tank, then eight aslant, far from the last ones [ours]."""
 
     def __call__(self, vessel: RoundTank) -> np.ndarray:
         half = vessel.n_electrodes // 2
@@ -115,16 +112,14 @@ class Schedule:
     pattern: Pattern = field(default_factory=AcrossAndAslant)
     """the cycle of injections"""
     warm_up: int | None = None
-    """injections not scored; None: the mean flow flushes the vessel once, and there is a whole
-    frame"""
+    """injections not scored; None: until the mean flow has flushed the vessel, and a whole frame"""
     calibration: int | None = None
     """first injections, from which ĉ_bh is found; None: a whole turn of the pattern"""
     budget: int | None = None
-    """injections that an agent may make, where it may also inject nothing; None: it injects at
-    every step"""
+    """injections that an agent may make, who may make none; None: it injects at every step"""
 
     def __post_init__(self) -> None:
-        _check.number("time_step", self.time_step, low=0.0, open_low=True, units="s")
+        check_positive(self, time_step="s")
         _check.integer("scored_steps", self.scored_steps, low=1)
         for name, low in (("warm_up", 0), ("calibration", 1), ("budget", 0)):
             if getattr(self, name) is not None:

@@ -1,5 +1,4 @@
-"""Slugs: liquid of higher or lower concentration that enters at random and is carried through a
-pipe."""
+"""Slugs: liquid of higher or lower concentration that enters a pipe at random and is carried on."""
 
 from __future__ import annotations
 
@@ -11,8 +10,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from eitbench import _check
-from eitbench.worlds.parts import Discretisation, History, Target
+from eitbench.worlds.parts import Discretisation, History, Target, check_positive, check_range
 from eitbench.worlds.world import World
 
 if TYPE_CHECKING:
@@ -22,8 +20,7 @@ if TYPE_CHECKING:
 Inflow = Callable[[np.ndarray, float], np.ndarray]
 """(points (k, d) in m, time in s) -> concentration (k,) in mol/m³"""
 KEPT = 48
-"""Transport models of a fine mesh that are kept: a wandering flow comes back to the same
-velocities."""
+"""Transport models of a fine mesh that are kept: a wandering flow comes back to its velocities."""
 
 
 class Arrivals(Protocol):
@@ -31,7 +28,6 @@ class Arrivals(Protocol):
 
     def draw(self, random: np.random.Generator, begin: float, end: float) -> np.ndarray:
         """Times in s at which slugs' centres pass the inlet."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -42,7 +38,7 @@ class OneInEach:
     """s [ours]"""
 
     def __post_init__(self) -> None:
-        _check.number("interval", self.interval, low=0.0, open_low=True, units="s")
+        check_positive(self, interval="s")
 
     def draw(self, random: np.random.Generator, begin: float, end: float) -> np.ndarray:
         n = math.ceil((end - begin) / self.interval)
@@ -63,8 +59,7 @@ class NowAndThen:
     """s; mean time beyond that"""
 
     def __post_init__(self) -> None:
-        _check.number("interval", self.interval, low=0.0, open_low=True, units="s")
-        _check.number("wait", self.wait, low=0.0, open_low=True, units="s")
+        check_positive(self, interval="s", wait="s")
 
     def draw(self, random: np.random.Generator, begin: float, end: float) -> np.ndarray:
         n = math.ceil((end - begin) / self.interval) + 1
@@ -77,8 +72,7 @@ class NowAndThen:
 
 @dataclass(frozen=True)
 class Slugs(Target):
-    """Slugs of both signs, Gaussian across the pipe and in time: c_in = background·exp(Σ
-    ±a·g(r)·g(t)) [ours]."""
+    """Slugs of both signs, Gaussian in r and t: c_in = background·exp(Σ ±a·g(r)·g(t)) [ours]."""
 
     background: float = 30.0
     """mol/m³, about 0.3 S/m: weak saline"""
@@ -94,11 +88,10 @@ class Slugs(Target):
     is_carried = True
 
     def __post_init__(self) -> None:
-        _check.number("background", self.background, low=0.0, open_low=True, units="mol/m³")
-        for name, units in (("strength", ""), ("duration", "s"), ("width", "m")):
-            low, high = _check.array(name, getattr(self, name), (2,), units=units)
-            if not 0 < low <= high:
-                raise ValueError(f"{name} must be a range 0 < low ≤ high, got {getattr(self, name)!r}")
+        check_positive(self, background="mol/m³")
+        check_range(self, "strength")
+        check_range(self, "duration", "s")
+        check_range(self, "width", "m")
 
     def draw_inflow(self, world: World, random: np.random.Generator) -> Inflow:
         """What enters in one episode."""
@@ -136,8 +129,10 @@ class Slugs(Target):
         points = np.empty(0) if model is None else model.points
         for flow, inflow in zip(flows, inflows, strict=True):
             assert flow is not None
-            (concentration,) = carry(world, lambda t: transport(flow(t)), [inflow], tick, last)  # noqa: B023
-            yield History(concentration, np.array([flow(t).profile(points) for t in range(1, last + 1)]))
+            (concentration,) = carry(world, lambda t: transport(flow(t)),  # noqa: B023
+                                     [inflow], tick, last)
+            velocity = np.array([flow(t).profile(points) for t in range(1, last + 1)])
+            yield History(concentration, velocity)
 
 
 def carry(world: World, transport_at: Callable[[int], Transport], inflows: Sequence[Inflow],

@@ -1,5 +1,4 @@
-"""The random streams of an episode: every draw comes from one of these, and its seed says all of
-them."""
+"""The random streams of an episode: every draw comes from one, and its seed says all of them."""
 
 from __future__ import annotations
 
@@ -7,20 +6,24 @@ from typing import NamedTuple
 
 import numpy as np
 
-STREAMS = ("inflow", "noise", "flow", "faults", "policy")
-"""In the order in which a seed gives them: what enters, what the voltmeters add, how the fluid
-moves (or where bodies stand), what is broken, and what a policy draws. New ones come last, so that
-the others stay as they are."""
-
 
 class Randomness(NamedTuple):
-    """The independent streams of one episode, from their beginning."""
+    """The independent streams of one episode; new ones come last, so that the others stay."""
 
     inflow: np.random.Generator
+    """what enters"""
     noise: np.random.Generator
+    """what the voltmeters add"""
     flow: np.random.Generator
+    """how the fluid moves, or where bodies stand"""
     faults: np.random.Generator
+    """what is broken"""
     policy: np.random.Generator
+    """what a policy draws"""
+
+
+STREAMS = Randomness._fields
+"""In the order in which a seed gives them."""
 
 
 def randomness(seed: int) -> Randomness:

@@ -1,4 +1,4 @@
-"""`Task`: all that an estimator may know about a world, and nothing of what happened in an episode."""
+"""`Task`: all that an estimator may know about a world, and nothing of what happened in it."""
 
 from __future__ import annotations
 
@@ -25,66 +25,44 @@ class Estimate(NamedTuple):
     mean: np.ndarray
     """(n,) concentration at the nodes of `Task.mesh`, mol/m³."""
     variance: np.ndarray | None = None
-    """(n,) its error variance, (mol/m³)²; None: the estimator makes no claim, and calibration is
-    not scored."""
+    """(n,) its error variance, (mol/m³)²; None: no claim, and calibration is not scored."""
     innovation: np.ndarray | None = None
     """(L,) measured minus predicted voltages, V, before this measurement was used; for NIS."""
     innovation_covariance: np.ndarray | None = None
     """(L, L) its covariance, V²."""
     velocity: np.ndarray | None = None
-    """(k,) parameters of the flow in m/s where `Task.velocity` asks for them; None: what is
-    believed at first."""
+    """(k,) the flow's parameters in m/s if `Task.velocity` asks; None: as believed at first."""
     velocity_variance: np.ndarray | None = None
     """(k,) their error variance, m²/s²."""
 
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """The estimator's side of a world.
-
-    Parameters
-    ----------
-    transport : Transport
-        The evolution model, on `mesh`.
-    observation : ObservationModel
-        Voltages for a concentration on `mesh`.
-    noise : VoltageNoise
-    currents : (K, L)
-        The injection cycle in A (A/m in 2D).
-    n_steps : int
-        Measurements in an episode, t = 1 … n_steps.
-    warm_up : int
-        States t ≤ warm_up are not scored.
-    lag : int
-        At measurement t the state t − lag is asked for: 0 filters, n_steps − 1 smooths over the
-        whole record.
-    expected_concentration : float
-        Rough level in mol/m³, where the search for the best homogeneous estimate begins.
-    calibration : int
-        First injections, all but always within the warm-up, from which the best homogeneous
-        estimate is found.
-    prior : Prior
-        What is believed of the target, in parts of the best homogeneous estimate (thesis Table
-        5.1).
-    velocity : VelocityModel or None
-        How the flow may be written where it is asked for too; ``transport`` then has the flow
-        believed at first.
-    vessel : Vessel
-        Its sizes and electrodes.
-    """
+    """The estimator's side of a world."""
 
     transport: Transport
+    """the evolution model, on `mesh`"""
     observation: ObservationModel
+    """voltages for a concentration on `mesh`"""
     noise: VoltageNoise
     currents: np.ndarray = field(repr=False)
+    """(K, L) the injection cycle in A (A/m in 2D)"""
     n_steps: int
+    """measurements in an episode, t = 1 … n_steps"""
     warm_up: int
+    """states t ≤ warm_up are not scored"""
     lag: int
+    """at measurement t the state t − lag is asked for: 0 filters, n_steps − 1 smooths it all"""
     expected_concentration: float
+    """rough level in mol/m³, where the search for the best homogeneous estimate begins"""
     calibration: int
+    """first injections, which that estimate is found from; all but always within the warm-up"""
     prior: Prior
+    """believed of the target, in parts of the best homogeneous estimate (thesis Table 5.1)"""
     velocity: VelocityModel | None = None
+    """how to write the flow if it is asked for too; ``transport`` has the one believed at first"""
     vessel: Vessel | None = None
+    """its sizes and electrodes"""
 
     @property
     def mesh(self) -> Mesh:
@@ -92,8 +70,7 @@ class Task:
         return self.transport.mesh
 
     def transport_at(self, parameters: np.ndarray) -> ConvectionDiffusion:
-        """The evolution model with the flow's ``parameters`` θ (k,) in m/s; ``ValueError`` where it
-        is not asked for."""
+        """The model with the flow's ``parameters`` θ (k,) in m/s; ``ValueError`` if it has none."""
         from eitbench.physics.transport import ConvectionDiffusion
         if self.velocity is None or not isinstance(self.transport, ConvectionDiffusion):
             raise ValueError("the flow has no parameters in this task")
@@ -101,8 +78,7 @@ class Task:
 
     @property
     def evolution(self) -> EvolutionModel:
-        """F, Y, H of the transport; computed on first use and shared by all tasks with the same
-        model."""
+        """F, Y, H of the transport; made on first use, shared by all tasks with the same model."""
         return self.transport.evolution_model()
 
 
@@ -115,16 +91,15 @@ def make_task(world: World, lag: int | str = 0, **assumed: Any) -> Task:
     lag : int or "all"
         See `Task`; "all" means the whole record.
     assumed
-        What the estimator wrongly believes of the flow, such as ``mean_velocity``; see
-        `World.model`.
+        What the estimator wrongly believes of the flow, as ``mean_velocity``; see `World.model`.
     """
     steps = lag_steps(world, lag)
     model = _model(world.fluid, tuple(sorted(assumed.items())))
     currents = world.currents
     currents.setflags(write=False)                                # shared by all who play this task
-    return Task(model.transport, model.observation, world.instrument.believed_noise, currents, world.n_steps,
-                world.warm_up, steps, world.expected_concentration, world.calibration, world.prior,
-                world.velocity_model, world.vessel)
+    return Task(model.transport, model.observation, world.instrument.believed_noise, currents,
+                world.n_steps, world.warm_up, steps, world.expected_concentration,
+                world.calibration, world.prior, world.velocity_model, world.vessel)
 
 
 def lag_steps(world: World, lag: int | str) -> int:

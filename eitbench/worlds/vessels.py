@@ -1,5 +1,4 @@
-"""What holds the liquid: plane and round pipes, and flat round tanks, with the electrodes on their
-walls."""
+"""What holds the liquid: plane and round pipes, and flat round tanks, with electrodes on walls."""
 
 from __future__ import annotations
 
@@ -10,6 +9,7 @@ import numpy as np
 
 from eitbench import _check
 from eitbench.physics.flow import PlaneChannelFlow, RoundPipeFlow
+from eitbench.worlds.parts import check_positive
 
 if TYPE_CHECKING:
     from eitbench.numerics.mesh import Mesh
@@ -18,8 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Bulge:
-    """A dent of a plane pipe's lower wall, electrodes and all: y = −R + h·exp(−((x − x₀)/w)²). All
-    numbers are ours."""
+    """A dent of the lower wall, electrodes and all: y = −R + h·exp(−((x − x₀)/w)²) [all ours]."""
 
     height: float = 0.02
     """h in m: a fifth of the pipe's width"""
@@ -29,11 +28,10 @@ class Bulge:
     """w in m"""
 
     def __post_init__(self) -> None:
-        for name in ("height", "position", "width"):
-            _check.number(name, getattr(self, name), low=0.0, open_low=True, units="m")
+        check_positive(self, height="m", position="m", width="m")
         if self.position < 3 * self.width:
-            raise ValueError("position must be at least three times width, so that the inlet is straight; got "
-                             f"{self.position!r} and {self.width!r} m")
+            raise ValueError("position must be at least three times width, so that the inlet is "
+                             f"straight; got {self.position!r} and {self.width!r} m")
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
         """m by which the wall is raised at ``x`` in m."""
@@ -68,9 +66,8 @@ class PlanePipe:
     lines = 40  # parts of its length whose ends are lines of both carriers' meshes
 
     def __post_init__(self) -> None:
-        for name, units in (("length", "m"), ("half_width", "m"), ("contact_impedance", "Ω·m²"),
-                            ("molar_conductivity", "S·m²/mol")):
-            _check.number(name, getattr(self, name), low=0.0, open_low=True, units=units)
+        check_positive(self, length="m", half_width="m", contact_impedance="Ω·m²",
+                       molar_conductivity="S·m²/mol")
         _check.number("electrode_cover", self.electrode_cover, low=0.0, high=0.95, open_low=True)
         _check.integer("electrodes_per_wall", self.electrodes_per_wall, low=2)
         if self.bulge is not None:
@@ -89,13 +86,12 @@ class PlanePipe:
         return centres[:, None] + 0.5 * self.electrode_cover * pitch * np.array([-1.0, 1.0])
 
     def electrodes(self, mesh: Mesh) -> list[np.ndarray]:
-        """Boundary facets of each electrode on an EIT mesh of the straight pipe with nodes at the
-        electrodes' edges."""
+        """Boundary facets of each electrode, on a mesh of the straight pipe with nodes at edges."""
         tiny = 1e-9 * self.length
         x, y = mesh.points.T
-        places = [(wall, *span) for wall in (-self.half_width, self.half_width) for span in self.electrode_spans]
-        inside = [(np.abs(y - wall) < tiny) & (x > begin - tiny) & (x < end + tiny) for wall, begin, end in places]
-        return [mesh.facets_where(lambda points, those=those: those) for those in inside]  # type: ignore[misc]
+        walls = [np.abs(y - wall) < tiny for wall in (-self.half_width, self.half_width)]
+        spans = [(x > begin - tiny) & (x < end + tiny) for begin, end in self.electrode_spans]
+        return [_facets(mesh, wall & span) for wall in walls for span in spans]
 
     def laminar(self, mean_velocity: float) -> PlaneChannelFlow:
         """Laminar flow through the straight pipe with this mean velocity in m/s."""
@@ -126,8 +122,10 @@ class PlanePipe:
         from eitbench.numerics.mesh import graded_pipe_mesh
         from eitbench.physics.cem import CompleteElectrodeModel
         at_electrodes, across = (10, 28) if fine else (5, 14)
-        straight = graded_pipe_mesh(self.length, self.half_width, self.electrode_spans, at_electrodes, across)
-        return CompleteElectrodeModel(self.shaped(straight), self.electrodes(straight), self.contact_impedance)
+        straight = graded_pipe_mesh(self.length, self.half_width, self.electrode_spans,
+                                    at_electrodes, across)
+        return CompleteElectrodeModel(self.shaped(straight), self.electrodes(straight),
+                                      self.contact_impedance)
 
     def lower_wall(self, x: np.ndarray) -> np.ndarray:
         """y of the lower wall in m at ``x`` in m."""
@@ -148,8 +146,7 @@ class PlanePipe:
 class RoundPipe:
     """A straight round pipe along z, with rings of electrodes on its wall (thesis 5.2, Fig. 5.10).
 
-    The page at hand shows the figure only: sizes and electrodes are ours. Contact impedance is per
-    area.
+    The page at hand shows the figure only: sizes and electrodes are ours.
     """
 
     length: float = 0.40
@@ -177,16 +174,15 @@ class RoundPipe:
     parts_of_a_step = 2
 
     def __post_init__(self) -> None:
-        for name, units in (("length", "m"), ("radius", "m"), ("electrode_length", "m"),
-                            ("contact_impedance", "Ω·m²"), ("molar_conductivity", "S·m²/mol")):
-            _check.number(name, getattr(self, name), low=0.0, open_low=True, units=units)
+        check_positive(self, length="m", radius="m", electrode_length="m", contact_impedance="Ω·m²",
+                       molar_conductivity="S·m²/mol")
         _check.number("electrode_cover", self.electrode_cover, low=0.0, high=0.95, open_low=True)
         _check.integer("electrode_rings", self.electrode_rings, low=1)
         _check.integer("electrodes_per_ring", self.electrodes_per_ring, low=4)
         _check.integer("potential_order", self.potential_order, low=1, high=2)
         if self.electrode_length * self.electrode_rings >= 0.95 * self.length:
-            raise ValueError(f"electrode_length must leave gaps between {self.electrode_rings} rings on {self.length} "
-                             f"m of pipe, got {self.electrode_length!r} m")
+            raise ValueError(f"electrode_length must leave gaps between {self.electrode_rings} "
+                             f"rings on {self.length} m of pipe, got {self.electrode_length!r} m")
 
     @property
     def n_electrodes(self) -> int:
@@ -205,8 +201,7 @@ class RoundPipe:
         return centres[:, None] + 0.5 * self.electrode_length * np.array([-1.0, 1.0])
 
     def electrodes(self, mesh: Mesh) -> list[np.ndarray]:
-        """Boundary facets of each electrode, ring by ring, on an EIT mesh whose nodes include the
-        electrodes' edges."""
+        """Boundary facets of each electrode, ring by ring, on an EIT mesh with nodes at edges."""
         z = mesh.points[:, 2]
         tiny = 1e-9 * self.length
         facets = []
@@ -238,16 +233,18 @@ class RoundPipe:
         from eitbench.numerics.round import extrude, uniform_disc
         rings, layers = (7, 80) if fine else (5, 32)
         section = uniform_disc(self.radius, rings)
-        return extrude(section, np.linspace(0.0, self.length, layers + 1)), np.arange(section.n_nodes)
+        mesh = extrude(section, np.linspace(0.0, self.length, layers + 1))
+        return mesh, np.arange(section.n_nodes)
 
     def electrode_model(self, fine: bool) -> CompleteElectrodeModel:
         """About 42,000 unknowns for the truth, 21,000 for the model."""
         from eitbench.numerics.round import round_pipe_mesh
         from eitbench.physics.cem import CompleteElectrodeModel
-        at_electrodes, rings, grading = ((4, 5), 5, (2.5, 1.75, 2.5)) if fine else ((3, 4), 4, (2.5, 1.5, 2.5))
-        mesh = round_pipe_mesh(self.length, self.radius, self.spans_around, self.spans_along, at_electrodes, rings,
-                               grading)
-        return CompleteElectrodeModel(mesh, self.electrodes(mesh), self.contact_impedance, self.potential_order)
+        at_electrodes, rings, across = ((4, 5), 5, 1.75) if fine else ((3, 4), 4, 1.5)
+        mesh = round_pipe_mesh(self.length, self.radius, self.spans_around, self.spans_along,
+                               at_electrodes, rings, (2.5, across, 2.5))
+        return CompleteElectrodeModel(mesh, self.electrodes(mesh), self.contact_impedance,
+                                      self.potential_order)
 
 
 @dataclass(frozen=True)
@@ -270,8 +267,7 @@ class RoundTank:
     parts_of_a_step = 1
 
     def __post_init__(self) -> None:
-        for name, units in (("radius", "m"), ("contact_impedance", "Ω·m²"), ("molar_conductivity", "S·m²/mol")):
-            _check.number(name, getattr(self, name), low=0.0, open_low=True, units=units)
+        check_positive(self, radius="m", contact_impedance="Ω·m²", molar_conductivity="S·m²/mol")
         _check.number("electrode_cover", self.electrode_cover, low=0.0, high=0.95, open_low=True)
         _check.integer("n_electrodes", self.n_electrodes, low=4)
 
@@ -281,8 +277,7 @@ class RoundTank:
         return _spans_around(self.n_electrodes, self.electrode_cover)
 
     def electrodes(self, mesh: Mesh) -> list[np.ndarray]:
-        """Boundary facets of each electrode on an EIT mesh whose nodes include the electrodes'
-        edges."""
+        """Boundary facets of each electrode, on an EIT mesh with nodes at their edges."""
         return _electrodes_around(mesh, self.radius, self.electrode_spans)
 
     def substeps(self, fine: bool) -> int:
@@ -308,8 +303,8 @@ def _spans_around(count: int, cover: float) -> np.ndarray:
     return pitch * (np.arange(count)[:, None] + 0.5 * cover * np.array([-1.0, 1.0]))
 
 
-def _electrodes_around(mesh: Mesh, radius: float, spans: np.ndarray, where: np.ndarray | bool = True,
-                       ) -> list[np.ndarray]:
+def _electrodes_around(mesh: Mesh, radius: float, spans: np.ndarray,
+                       where: np.ndarray | bool = True) -> list[np.ndarray]:
     """Boundary facets of electrodes at these angles of a round wall, at the nodes ``where``."""
     x, y = mesh.points[:, :2].T
     angle = np.arctan2(y, x)
@@ -317,6 +312,10 @@ def _electrodes_around(mesh: Mesh, radius: float, spans: np.ndarray, where: np.n
     facets = []
     for first, last in spans:
         off_centre = np.abs(np.mod(angle - 0.5 * (first + last) + np.pi, 2.0 * np.pi) - np.pi)
-        inside = wall & (off_centre < 0.5 * (last - first) + 1e-9)
-        facets.append(mesh.facets_where(lambda points, inside=inside: inside))  # type: ignore[misc]
+        facets.append(_facets(mesh, wall & (off_centre < 0.5 * (last - first) + 1e-9)))
     return facets
+
+
+def _facets(mesh: Mesh, inside: np.ndarray) -> np.ndarray:
+    """The boundary facets with all nodes ``inside`` (n_nodes,)."""
+    return mesh.facets_where(lambda points: inside)

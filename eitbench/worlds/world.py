@@ -1,4 +1,4 @@
-"""A world: vessel × flow × target × instrument × schedule, and what is believed of it beforehand."""
+"""A world: vessel × flow × target × instrument × schedule, and what is believed beforehand."""
 
 from __future__ import annotations
 
@@ -23,53 +23,48 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class World:
-    """What is simulated into episodes: parts that can be swapped, each a frozen dataclass of plain
-    numbers.
+    """What is simulated: parts that can be swapped, each a frozen dataclass of plain numbers.
 
-    Parameters
-    ----------
-    name : str
-        Under which its episodes are kept.
-    vessel, flow, target, instrument, schedule
-        A `Vessel`, `Flow`, `Target`, `Instrument` and `Schedule`. A part may ask more of another
-        than its protocol promises, as slugs ask for an inlet.
-    prior : Prior
-        What estimators are told to believe.
-    region : (float, float) or None
-        m along the vessel's first axis; only errors between these cross-sections count. None: the
-        whole vessel.
+    A part may ask more of another than its protocol promises, as slugs ask for an inlet.
     """
 
     name: str
+    """under which its episodes are kept"""
     vessel: Any
+    """a `Vessel`"""
     flow: Any
+    """a `Flow`"""
     target: Any
+    """a `Target`"""
     instrument: Instrument = field(default_factory=Instrument)
     schedule: Schedule = field(default_factory=Schedule)
     prior: Prior = field(default_factory=Prior)
+    """what estimators are told to believe"""
     region: tuple[float, float] | None = None
-    """m along the vessel; errors count between these cross-sections only. None: everywhere"""
+    """m along the vessel's axis; only errors between these cross-sections count. None: all"""
 
     def __post_init__(self) -> None:
         for part in (self.vessel, self.flow, self.target):
             if hasattr(part, "check"):
                 part.check(self)
         if self.instrument.most > self.vessel.n_electrodes - 2:
-            raise ValueError("instrument: dead, failing and loose must leave two electrodes sound, got up to "
-                             f"{self.instrument.most} of {self.vessel.n_electrodes}")
+            raise ValueError("instrument: dead, failing and loose must leave two electrodes sound, "
+                             f"got up to {self.instrument.most} of {self.vessel.n_electrodes}")
         if self.region is not None:
             self._check_region(self.region)
 
     def _check_region(self, region: tuple[float, float]) -> None:
         lines = getattr(self.vessel, "lines", None)
         if lines is None:
-            raise ValueError(f"region must be None in a {type(self.vessel).__name__}, got {region!r}")
+            kind = type(self.vessel).__name__
+            raise ValueError(f"region must be None in a {kind}, got {region!r}")
         length = self.vessel.length
         low, high = ends = _check.array("region", region, (2,), units="m")
         parts = lines * ends / length
         if not 0 <= low < high <= length or np.abs(parts - parts.round()).max() > 1e-6:
-            raise ValueError(f"region must be a range 0 ≤ begin < end ≤ {length:g} m with ends at multiples of "
-                             f"{length / lines:g} m, lines of both meshes, got {region!r}")
+            raise ValueError(f"region must be a range 0 ≤ begin < end ≤ {length:g} m with ends at "
+                             f"multiples of {length / lines:g} m, lines of both meshes, "
+                             f"got {region!r}")
 
     # -- time --
 
@@ -154,19 +149,20 @@ class World:
         """
         return self._discretise(self.flow.believed(self, **assumed), fine=False)
 
-    def true_transport(self, model: Discretisation, flow: np.random.Generator) -> Callable[[int], Transport]:
-        """t -> what moves an episode's concentration from t − 1 to t, on the estimators' mesh; for
-        references only.
+    def true_transport(self, model: Discretisation,
+                       flow: np.random.Generator) -> Callable[[int], Transport]:
+        """t -> what moves an episode's c from t − 1 to t, on the model's mesh; for references only.
 
         ``model`` is what estimators are given when they are told nothing wrong, ``flow`` the
         episode's fresh stream.
         """
         return self.flow.true_transport(self, model, flow)
 
-    def evolve(self, episodes: Sequence[Randomness], truth: Discretisation, tick: Callable[[int], object],
-               last: int | None = None) -> Iterator[History]:
+    def evolve(self, episodes: Sequence[Randomness], truth: Discretisation,
+               tick: Callable[[int], object], last: int | None = None) -> Iterator[History]:
         """What moves in each episode, up to state ``last`` (default: all); see `Target.evolve`."""
-        return self.target.evolve(self, episodes, truth, tick, self.n_steps if last is None else last)
+        until = self.n_steps if last is None else last
+        return self.target.evolve(self, episodes, truth, tick, until)
 
     def _discretise(self, velocity: VelocityField | None, fine: bool) -> Discretisation:
         from eitbench.physics.rest import AtRest  # finite elements: not needed to play recordings
@@ -177,8 +173,9 @@ class World:
             transport = AtRest(mesh, self.time_step)
         else:
             parts = self.vessel.parts_of_a_step if fine else 1
-            transport = ConvectionDiffusion(mesh, velocity, self.flow.diffusivity, self.time_step / parts,
-                                            substeps=self.vessel.substeps(fine), inlet=inlet)
+            transport = ConvectionDiffusion(
+                mesh, velocity, self.flow.diffusivity, self.time_step / parts,
+                substeps=self.vessel.substeps(fine), inlet=inlet)
         cem = self.vessel.electrode_model(fine)
         observation = ObservationModel(cem, mesh.interpolation_to(cem.mesh.points),
                                        LinearConductivity(self.vessel.molar_conductivity),
@@ -201,11 +198,8 @@ class World:
     def changed(self, changes: Mapping[str, Any] | None) -> World:
         """This world with some numbers changed, as in ``{"instrument": {"noise_relative": 0.02}}``.
 
-        Raises
-        ------
-        ValueError
-            Naming what there is, if a part or a number has another name, or what is allowed, if it
-            is out of range.
+        ``ValueError`` naming what there is, if a part or a number has another name, or what is
+        allowed, if it is out of range.
         """
         if changes is None:
             return self
@@ -217,22 +211,23 @@ class World:
 
     @cached_property
     def sound(self) -> World:
-        """What a filter depends on that believes in an instrument without faults and floor:
-        variants share theirs."""
-        instrument = Instrument(current=self.instrument.current, noise_relative=self.instrument.noise_relative,
-                                noise_of_largest=self.instrument.noise_of_largest)
+        """What a filter without faults and floor depends on: variants share theirs."""
+        given = self.instrument
+        instrument = Instrument(current=given.current, noise_relative=given.noise_relative,
+                                noise_of_largest=given.noise_of_largest)
         return replace(self, instrument=instrument, schedule=replace(self.schedule, budget=None))
 
     @cached_property
     def fluid(self) -> World:
-        """What the truth depends on: this world with a sound instrument, so that variants share
-        their episodes."""
-        return replace(self, instrument=Instrument(current=self.instrument.current),
-                       prior=Prior(self.expected_concentration), schedule=replace(self.schedule, budget=None))
+        """What the truth depends on, with a sound instrument: variants share their episodes."""
+        return replace(self.sound, instrument=Instrument(current=self.instrument.current),
+                       prior=Prior(self.expected_concentration))
 
 
 def _changed(part: Any, changes: Mapping[str, Any], where: str) -> Any:
-    known = [each.name for each in fields(part) if not (isinstance(part, World) and each.name == "name")]
+    known = [each.name for each in fields(part)]
+    if isinstance(part, World):
+        known.remove("name")
     made: dict[str, Any] = {}
     for name, value in changes.items():
         if name not in known:

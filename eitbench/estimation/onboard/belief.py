@@ -61,7 +61,8 @@ class Belief:
         return cls(rules, {"frame": frame, "doubt": np.zeros((2, frame.shape[1]))})
 
     @classmethod
-    def follow(cls, belief: Belief | None, rules: Rules, observation: dict[str, np.ndarray]) -> Belief:
+    def follow(cls, belief: Belief | None, rules: Rules,
+               observation: dict[str, np.ndarray]) -> Belief:
         """One more observation: the first of an episode makes a belief, which is then shown the
         others."""
         if belief is None:
@@ -115,7 +116,9 @@ class Belief:
     def _step(self, ahead: int) -> tuple[np.ndarray, np.ndarray]:
         """How deviations move in the step that begins so many steps from now, and their noise."""
         if ahead >= len(self._steps):
-            count = max(ahead + 1, 2 * len(self._steps)) if self._along is None else len(self._along)
+            count = max(ahead + 1, 2 * len(self._steps))
+            if self._along is not None:
+                count = len(self._along)
             self._steps = self._operator.steps(count, self._along)
         return self._steps[ahead]
 
@@ -138,7 +141,8 @@ class Belief:
             total = weight + transition.T @ total @ transition
         return total
 
-    def gains(self, covariance: np.ndarray, sound: np.ndarray | None = None, derivative: np.ndarray | None = None,
+    def gains(self, covariance: np.ndarray, sound: np.ndarray | None = None,
+              derivative: np.ndarray | None = None,
               weight: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """What each pair would teach about a state with this covariance: `pair_gains`, (pairs,)
         each.
@@ -155,13 +159,15 @@ class Belief:
             variance = np.where(sound, variance, np.inf)
         weight = self._operator.weight if weight is None else weight
         DPW = DP if weight is None else DP @ weight
-        gains = pair_gains((DP @ D.T).reshape(L, L, L, L), (DPW @ DP.T).reshape(L, L, L, L), self.rules.pairs, variance)
+        tables = ((DP @ D.T).reshape(L, L, L, L), (DPW @ DP.T).reshape(L, L, L, L))
+        gains = pair_gains(*tables, self.rules.pairs, variance)
         if sound is not None:
             usable = sound[self.rules.pairs].all(axis=1)
             gains = gains[0] * usable, gains[1] * usable
         return gains
 
-    def after(self, covariance: np.ndarray, pair: int, sound: np.ndarray | None = None) -> np.ndarray:
+    def after(self, covariance: np.ndarray, pair: int,
+              sound: np.ndarray | None = None) -> np.ndarray:
         """(s, s) covariance once this pair has been injected into a state with ``covariance``."""
         i, j = self.rules.pairs[pair]
         variance = self._noise_variance[pair]
@@ -190,10 +196,11 @@ class Belief:
                 gains = self.gains(predicted, sound)[0]
                 # A pair's cost is known before its covariance is computed.
                 before = cost + self.expected_error(predicted)
-                grown += [(before - gains[pair], int(pair) if first is None else first, predicted, int(pair))
-                          for pair in np.argsort(-gains)[:width]]
+                grown += [(before - gains[pair], pair if first is None else first, predicted, pair)
+                          for pair in np.argsort(-gains)[:width].tolist()]
+            best = sorted(grown, key=lambda leaf: leaf[0])[:width]
             beam = [(cost, first, self.after(predicted, pair, sound))
-                    for cost, first, predicted, pair in sorted(grown, key=lambda leaf: leaf[0])[:width]]
+                    for cost, first, predicted, pair in best]
         first = beam[0][1]
         assert first is not None
         return first
@@ -208,7 +215,8 @@ class Belief:
         levels = levels_of(self.rules.world)
         positive = np.maximum(self.mean, 0.1 * self._operator.concentration[0])  # a conductivity is
         _, table = levels.task.observation.resistance_derivatives(positive)
-        return self._with_flow(self._operator.concentration[0] * np.tensordot(table, self._operator.basis, axes=(0, 0)))
+        by_state = np.tensordot(table, self._operator.basis, axes=(0, 0))
+        return self._with_flow(self._operator.concentration[0] * by_state)
 
     def _with_flow(self, derivative: np.ndarray) -> np.ndarray:
         """Derivatives by the whole state: a velocity itself is not seen."""
@@ -227,5 +235,6 @@ def _noise_variance(rules: Rules, concentration: float, resistance: bytes) -> np
     i, j = rules.pairs.T
     R = np.frombuffer(resistance).reshape(rules.pairs.max() + 1, -1)
     levels = levels_of(rules.world)
-    std = [levels.noise_std(rules.amplitude * column, rules.instrument.noise_floor) for column in R[i] - R[j]]
+    std = [levels.noise_std(rules.amplitude * column, rules.instrument.noise_floor)
+           for column in R[i] - R[j]]
     return (np.array(std) / rules.amplitude)**2

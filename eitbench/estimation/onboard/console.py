@@ -27,7 +27,8 @@ class Console:
     """
 
     def __init__(self, kind: type[Operator], rules: Rules, frames: np.ndarray) -> None:
-        self.operator = kind(rules.world, frames, gate=rules.gate, noise_floor=rules.instrument.noise_floor)
+        self.operator = kind(rules.world, frames, gate=rules.gate,
+                             noise_floor=rules.instrument.noise_floor)
         B, _, L = frames.shape
         self._innovations, self._doubt = np.zeros((B, L)), np.zeros((B, 2, L))
 
@@ -47,7 +48,8 @@ class Console:
         """Arrays (B, …): innovations, mean, std, doubt, and where the flow is estimated its
         velocity and that's std."""
         mean, std = self.operator.grid()
-        seen = {"innovations": self._innovations.copy(), "mean": mean, "std": std, "doubt": self._doubt.copy()}
+        seen = {"innovations": self._innovations.copy(), "mean": mean, "std": std,
+                "doubt": self._doubt.copy()}
         if (flow := self.operator.flow()) is not None:
             seen |= {"velocity": flow[0], "velocity_std": flow[1]}
         return seen

@@ -16,10 +16,22 @@ import numpy as np
 
 from eitbench.estimation import FreeCovariance, JointFilter, KalmanFilter, initial_covariance
 from eitbench.estimation.onboard.operator import FullOperator
-from eitbench.estimation.onboard.reduced_operator import RANK, ReducedOperator, Shared, record_of_any, stored_model
+from eitbench.estimation.onboard.reduced_operator import (
+    RANK,
+    ReducedOperator,
+    Shared,
+    record_of_any,
+    stored_model,
+)
 from eitbench.estimation.parameters import RANK_TOLERANCE
 from eitbench.estimation.reduced import ReducedFilter, learnt_of, main_directions
-from eitbench.estimation.reduced_joint import JointModel, JointTables, ReducedJointFilter, joint_model, joint_step
+from eitbench.estimation.reduced_joint import (
+    JointModel,
+    JointTables,
+    ReducedJointFilter,
+    joint_model,
+    joint_step,
+)
 from eitbench.worlds.task import make_task
 
 if TYPE_CHECKING:
@@ -46,17 +58,20 @@ class JointFullOperator(FullOperator):
         return [JointFilter(
             task.transport_at, flow.directions,
             mean=np.ones(task.mesh.n_nodes), covariance=initial_covariance(task.mesh, prior),
-            parameters=np.array(flow.nominal), parameter_covariance=np.diag(np.square(flow.initial_std)),
-            walk_std=np.array(flow.walk_std), inflow=1.0, inflow_std=prior.inflow_std, nodal_noise=nodal,
-            profiles=flow.profiles, bounds=BOUNDS) for _ in range(episodes)]
+            parameters=np.array(flow.nominal),
+            parameter_covariance=np.diag(np.square(flow.initial_std)),
+            walk_std=np.array(flow.walk_std), inflow=1.0, inflow_std=prior.inflow_std,
+            nodal_noise=nodal, profiles=flow.profiles, bounds=BOUNDS) for _ in range(episodes)]
 
     def grid(self) -> tuple[np.ndarray, np.ndarray]:
         patches, n = self._patches, self._patches.shape[1]
-        variance = [((patches @ filter_.covariance[:n, :n]) * patches).sum(axis=1) for filter_ in self._filters]
+        variance = [((patches @ filter_.covariance[:n, :n]) * patches).sum(axis=1)
+                    for filter_ in self._filters]
         return self._patch_means(), self.concentration[:, None] * np.sqrt(variance)
 
     def means(self) -> np.ndarray:
-        return self.concentration[:, None] * np.array([filter_.concentration for filter_ in self._filters])
+        relative = np.array([filter_.concentration for filter_ in self._filters])
+        return self.concentration[:, None] * relative
 
     def spreads(self) -> np.ndarray:
         n = self._patches.shape[1]
@@ -86,7 +101,8 @@ class JointReducedOperator(ReducedOperator):
     def state_covariance(self) -> np.ndarray:
         return self._filter.covariance[:, :-1, :-1]
 
-    def steps(self, count: int, along: np.ndarray | None = None) -> list[tuple[np.ndarray, np.ndarray]]:
+    def steps(self, count: int,
+              along: np.ndarray | None = None) -> list[tuple[np.ndarray, np.ndarray]]:
         shared, made = self._shared, []
         assert isinstance(shared, JointShared)
         mean = self._filter.mean[:1].astype(float)
@@ -94,7 +110,8 @@ class JointReducedOperator(ReducedOperator):
             mean = mean if along is None else along[k:k + 1]
             transition, noise = joint_step(shared.tables, mean, shared.walk_std**2)
             made.append((transition[0], noise[0]))
-            mean = np.concatenate([(transition[:, :-1, :-1] @ mean[:, :-1, None])[..., 0], mean[:, -1:]], axis=1)
+            moved = (transition[:, :-1, :-1] @ mean[:, :-1, None])[..., 0]
+            mean = np.concatenate([moved, mean[:, -1:]], axis=1)
         return made
 
     @property
@@ -131,7 +148,8 @@ class JointShared(Shared):
         r = len(self.model.initial)
         mean, covariance = np.zeros((episodes, r + 1)), np.zeros((episodes, r + 1, r + 1))
         mean[:, r], covariance[:, :r, :r], covariance[:, r, r] = nominal, self.model.initial, std**2
-        return ReducedJointFilter(self._single, mean.astype(np.float32), covariance.astype(np.float32), self.walk_std,
+        return ReducedJointFilter(self._single, mean.astype(np.float32),
+                                  covariance.astype(np.float32), self.walk_std,
                                   (BOUNDS[0] * nominal, BOUNDS[1] * nominal))
 
 
@@ -141,8 +159,8 @@ _shared = lru_cache(maxsize=2)(JointShared)
 def one_velocity(task: Task) -> VelocityModel:
     """The flow that is asked for; ``ValueError`` unless it has one parameter."""
     if task.velocity is None or task.velocity.size != 1:
-        raise ValueError("world must have a flow with one unknown parameter, its mean velocity, got "
-                         f"{task.velocity!r}")
+        raise ValueError("world must have a flow with one unknown parameter, its mean velocity, "
+                         f"got {task.velocity!r}")
     return task.velocity
 
 
@@ -164,8 +182,10 @@ def _make_model(world: World) -> JointModel:
     learnt = np.zeros_like(mass)
     for part in LEARNING:
         F, Y, noise = step(part)
-        learnt += learnt_of(KalmanFilter(F, Y.sum(axis=1), np.ones(len(F)), FreeCovariance(F, noise),
-                                         rank_tolerance=RANK_TOLERANCE), record, 10)
+        filter_ = KalmanFilter(F, Y.sum(axis=1), np.ones(len(F)), FreeCovariance(F, noise),
+                               rank_tolerance=RANK_TOLERANCE)
+        learnt += learnt_of(filter_, record, 10)
     parts = np.linspace(*BOUNDS, TABLE)
-    return joint_model(main_directions(learnt, mass, min(RANK, len(mass))), mass, initial, parts * flow.nominal[0],
+    basis = main_directions(learnt, mass, min(RANK, len(mass)))
+    return joint_model(basis, mass, initial, parts * flow.nominal[0],
                        (step(part)[::2] for part in parts))

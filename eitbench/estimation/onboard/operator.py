@@ -54,11 +54,13 @@ class Operator(Protocol):
     concentration: np.ndarray
     """(B,) ĉ_bh in mol/m³"""
 
-    def __init__(self, world: World, frames: np.ndarray, *, gate: float, noise_floor: float) -> None:
+    def __init__(self, world: World, frames: np.ndarray, *, gate: float,
+                 noise_floor: float) -> None:
         """Take in the first frame, voltages (B, K, L) in V of the world's cycle."""
         ...
 
-    def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def assimilate(self, voltages: np.ndarray,
+                   currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """One time step on, with voltages (B, L) in V for currents (B, L), all zero where nothing
         was injected; returns the innovations in predicted standard deviations and which readings
         were believed, both (B, L)."""
@@ -68,7 +70,8 @@ class Operator(Protocol):
         """Mean and standard deviation (B, patches) in mol/m³ on the coarse grid."""
         ...
 
-    def errors(self, moments: np.ndarray, deviations: np.ndarray, squares: np.ndarray) -> np.ndarray:
+    def errors(self, moments: np.ndarray, deviations: np.ndarray,
+               squares: np.ndarray) -> np.ndarray:
         """Relative errors (5.12) of the present means, from what `project` makes of recorded
         moments (B, …)."""
         ...
@@ -103,7 +106,8 @@ class Linearisation(NamedTuple):
     derivative: np.ndarray
     """(L, L, k) of 𝓡 by the state"""
 
-    def observe(self, currents: np.ndarray, noise_std: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def observe(self, currents: np.ndarray,
+                noise_std: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Computed voltages (L,), their noise (L,) and their derivatives (L, k) in parts of the
         noise.
 
@@ -112,9 +116,10 @@ class Linearisation(NamedTuple):
         driven = np.flatnonzero(currents)
         computed = currents @ self.resistance
         if not len(driven):
-            return computed, np.ones_like(computed), np.zeros(self.derivative.shape[1:], self.derivative.dtype)
+            return computed, np.ones_like(computed), np.zeros_like(self.derivative[0])
         L, k = self.derivative.shape[1:]
-        matrix = (currents[driven].astype(self.derivative.dtype) @ self.derivative[driven].reshape(len(driven), -1))
+        by_driven = self.derivative[driven].reshape(len(driven), -1)
+        matrix = currents[driven].astype(self.derivative.dtype) @ by_driven
         return computed, noise_std, matrix.reshape(L, k) / noise_std[:, None].astype(matrix.dtype)
 
 
@@ -135,7 +140,8 @@ class Levels:
         """Number of the level that fits the voltages (K, L) best, weighted as in
         `best_homogeneous`; readings further than ``broken`` standard deviations away count as that
         far."""
-        off = (frame - self._homogeneous) / self.world.noise.std(frame if math.isinf(broken) else self._homogeneous)
+        of = frame if math.isinf(broken) else self._homogeneous
+        off = (frame - self._homogeneous) / self.world.noise.std(of)
         return int(LEVELS[np.argmin(np.minimum(off**2, broken**2).sum(axis=(1, 2)))])
 
     def noise_std(self, computed: np.ndarray, floor: float) -> np.ndarray:
@@ -144,11 +150,13 @@ class Levels:
         Readings near zero may have next to no noise; what the model leaves out would then count for
         knowledge.
         """
-        return np.hypot(np.maximum(self.world.noise.std(computed), 1e-3 * np.abs(computed).max()), floor)
+        least = 1e-3 * np.abs(computed).max()
+        return np.hypot(np.maximum(self.world.noise.std(computed), least), floor)
 
     def _linearised(self, number: int) -> Linearisation:
         c = self.world.expected_concentration * float(np.exp(LEVEL_STEP * number))
-        resistance, table = self.task.observation.resistance_derivatives(np.full(self.task.mesh.n_nodes, c))
+        level = np.full(self.task.mesh.n_nodes, c)
+        resistance, table = self.task.observation.resistance_derivatives(level)
         return Linearisation(c, resistance, c * np.ascontiguousarray(np.moveaxis(table, 0, 2)))
 
 
@@ -163,7 +171,8 @@ def levels_of(world: World) -> Levels:
 class FullOperator:
     """The Kalman filter of the baselines with its exact covariance: what scored runs use."""
 
-    def __init__(self, world: World, frames: np.ndarray, *, gate: float, noise_floor: float) -> None:
+    def __init__(self, world: World, frames: np.ndarray, *, gate: float,
+                 noise_floor: float) -> None:
         self._world, self._gate, self._floor = world, gate, noise_floor
         self._shared = levels = levels_of(world)
         broken = BROKEN if math.isfinite(gate) else math.inf
@@ -179,7 +188,8 @@ class FullOperator:
         task = self._shared.task
         return [starting_filter(task.transport, task.prior, 1.0) for _ in range(episodes)]
 
-    def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def assimilate(self, voltages: np.ndarray,
+                   currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         innovations, kept = np.zeros_like(voltages), np.ones(voltages.shape, dtype=bool)
         for b, (filter_, level) in enumerate(zip(self._filters, self._levels, strict=True)):
             filter_.predict()
@@ -189,11 +199,13 @@ class FullOperator:
             computed, std, matrix = level.observe(currents[b], std)
             # the state is 1 where nothing deviates
             value = (voltages[b] - computed) / std + matrix.sum(axis=1)
-            innovations[b], kept[b] = gated_update(filter_, Observation(matrix, value, np.ones(len(value))), self._gate)
+            observation = Observation(matrix, value, np.ones(len(value)))
+            innovations[b], kept[b] = gated_update(filter_, observation, self._gate)
         return innovations, kept
 
     def grid(self) -> tuple[np.ndarray, np.ndarray]:
-        spread = np.array([np.sqrt(filter_.variance_of(self._patches)) for filter_ in self._filters])
+        spread = np.array([np.sqrt(filter_.variance_of(self._patches))
+                           for filter_ in self._filters])
         return self._patch_means(), self.concentration[:, None] * spread
 
     def _patch_means(self) -> np.ndarray:
@@ -201,7 +213,8 @@ class FullOperator:
         # by side.
         return (self._patches @ self.means()[..., None])[..., 0]
 
-    def errors(self, moments: np.ndarray, deviations: np.ndarray, squares: np.ndarray) -> np.ndarray:
+    def errors(self, moments: np.ndarray, deviations: np.ndarray,
+               squares: np.ndarray) -> np.ndarray:
         estimate = self.means() - self._world.background
         return step_error(score_mass(self._world), estimate, moments, deviations, squares)
 
@@ -209,7 +222,8 @@ class FullOperator:
         return self.concentration[:, None] * np.array([filter_.mean for filter_ in self._filters])
 
     def spreads(self) -> np.ndarray:
-        return self.concentration[:, None] * np.sqrt([filter_.variances() for filter_ in self._filters])
+        variances = [filter_.variances() for filter_ in self._filters]
+        return self.concentration[:, None] * np.sqrt(variances)
 
     def flow(self) -> tuple[np.ndarray, np.ndarray] | None:
         return None
@@ -226,9 +240,11 @@ def patch_averages(mesh: Mesh, grid: tuple[int, int]) -> np.ndarray:
     points = mesh.points[:, :2]
     low = points.min(axis=0)
     high = points.max(axis=0)
-    column, row = np.minimum((points - low) / (high - low) * grid, np.array(grid) - 1).astype(int).T
+    place = (points - low) / (high - low) * grid
+    column, row = np.minimum(place, np.array(grid) - 1).astype(int).T
     averages = np.zeros((grid[0] * grid[1], len(points)))
     averages[row * grid[0] + column, np.arange(len(points))] = mass_matrix(mesh).sum(axis=0)
     if not averages.any(axis=1).all():
-        raise ValueError(f"the task's mesh must have a node in each of {grid[0]} × {grid[1]} patches of the vessel")
+        raise ValueError(f"the task's mesh must have a node in each of {grid[0]} × {grid[1]} "
+                         "patches of the vessel")
     return averages / averages.sum(axis=1, keepdims=True)

@@ -17,7 +17,13 @@ from eitbench.data import store
 from eitbench.data.recordings import outline
 from eitbench.data.regions import score_mass
 from eitbench.estimation import LinearisedObservations, Observation, starting_filter
-from eitbench.estimation.onboard.operator import BROKEN, Linearisation, levels_of, pair_currents, patch_averages
+from eitbench.estimation.onboard.operator import (
+    BROKEN,
+    Linearisation,
+    levels_of,
+    pair_currents,
+    patch_averages,
+)
 from eitbench.estimation.reduced import ReducedFilter, ReducedModel, reduced_model
 from eitbench.worlds.task import make_task
 
@@ -32,7 +38,8 @@ class ReducedOperator:
     """Kalman filters whose injections differ, in single precision, which halves the time; see
     `Operator`."""
 
-    def __init__(self, world: World, frames: np.ndarray, *, gate: float, noise_floor: float) -> None:
+    def __init__(self, world: World, frames: np.ndarray, *, gate: float,
+                 noise_floor: float) -> None:
         self._shared = shared = self._share(world)
         self._gate, self._floor = gate, noise_floor
         broken = BROKEN if math.isfinite(gate) else math.inf
@@ -47,14 +54,17 @@ class ReducedOperator:
         """What all episodes have in common; made once a process."""
         return _shared(world.sound)
 
-    def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def assimilate(self, voltages: np.ndarray,
+                   currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         noise_std = self._shared.levels.noise_std
         observed = [level.observe(current, noise_std(current @ level.resistance, self._floor))
                     for level, current in zip(self.levels, currents, strict=True)]
         computed, std, matrix = (np.array(part) for part in zip(*observed, strict=True))
-        residual = ((voltages - computed) / std).astype(np.float32) * currents.any(axis=1, keepdims=True)
+        residual = ((voltages - computed) / std).astype(np.float32)
+        residual = residual * currents.any(axis=1, keepdims=True)
         self._filter.predict()
-        innovation, variance, kept = self._filter.update(matrix, residual, np.ones_like(residual), gate=self._gate)
+        innovation, variance, kept = self._filter.update(matrix, residual, np.ones_like(residual),
+                                                         gate=self._gate)
         return (innovation / np.sqrt(variance)).astype(float), kept
 
     @property
@@ -77,7 +87,8 @@ class ReducedOperator:
         """(B, s, s) of all that is estimated, the reduced concentration first."""
         return self._filter.covariance
 
-    def steps(self, count: int, along: np.ndarray | None = None) -> list[tuple[np.ndarray, np.ndarray]]:
+    def steps(self, count: int,
+              along: np.ndarray | None = None) -> list[tuple[np.ndarray, np.ndarray]]:
         """How the first episode's deviations move in the next ``count`` steps, and their noise, (s,
         s) each; where that depends on the state itself, about what is predicted or ``along``
         (count, s), the states before each step."""
@@ -104,7 +115,8 @@ class ReducedOperator:
         variance = ((patches @ self.state_covariance) * patches).sum(axis=2, dtype=float)
         return self.concentration[:, None] * mean, self.concentration[:, None] * np.sqrt(variance)
 
-    def errors(self, moments: np.ndarray, deviations: np.ndarray, squares: np.ndarray) -> np.ndarray:
+    def errors(self, moments: np.ndarray, deviations: np.ndarray,
+               squares: np.ndarray) -> np.ndarray:
         shared = self._shared
         state = np.concatenate([self.concentration[:, None] - shared.background,
                                 self.concentration[:, None] * self.state], axis=1)
@@ -154,7 +166,8 @@ class Shared:
 
     def _level(self, number: int) -> Linearisation:
         concentration, resistance, derivative = self.levels.linearised(number)
-        return Linearisation(concentration, resistance, (derivative @ self.model.basis).astype(np.float32))
+        by_state = (derivative @ self.model.basis).astype(np.float32)
+        return Linearisation(concentration, resistance, by_state)
 
 
 _shared = lru_cache(maxsize=2)(Shared)
@@ -168,7 +181,8 @@ def _stored_model(world: World) -> ReducedModel:
 def stored_model(world: World, name: str, kind: type[Model], make: Callable[[], Model]) -> Model:
     """A model, a named tuple of arrays, from the cache if one of this name is there; else it is
     made and kept."""
-    code = code_digest(package_files("estimation/*.py", "estimation/onboard/*operator.py", "worlds/task.py"))
+    code = code_digest(package_files("estimation/*.py", "estimation/onboard/*operator.py",
+                                     "worlds/task.py"))
     whose = hashlib.sha256(f"{code} {store.described(world.sound)}".encode()).hexdigest()
     path = store.folder(world) / f"{name}-{whose[:16]}.npz"
 

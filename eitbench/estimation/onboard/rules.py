@@ -71,7 +71,9 @@ class Rules:
         """(actions, L) currents of each numbered action; the last is no current, where there is a
         budget."""
         pairs = pair_currents(self.world)
-        return pairs if self.budget is None else np.concatenate([pairs, np.zeros((1, pairs.shape[1]))])
+        if self.budget is None:
+            return pairs
+        return np.concatenate([pairs, np.zeros((1, pairs.shape[1]))])
 
     @property
     def action_space(self) -> spaces.Discrete | spaces.Box:
