@@ -27,7 +27,10 @@ from eitbench.bench.baselines import (
 )
 from eitbench.bench.scores import Outcome
 from eitbench.bench.tracks import Environment, check_track
+from eitbench.data.episodes import simulate, truth_discretisation
+from eitbench.data.regions import region_operators
 from eitbench.envs.injection import InjectionEnv
+from eitbench.estimation.onboard.operator import Innovation
 from eitbench.estimation.onboard.rules import Rules
 from eitbench.worlds.registry import entry
 from eitbench.worlds.streams import randomness
@@ -75,6 +78,18 @@ class Injected(NamedTuple):
     outcome: Outcome
     currents: np.ndarray
     """(steps, L) A (A/m in 2D) of each of its injections"""
+
+
+class _Claim(NamedTuple):
+    """What the filter inside says of a scored state."""
+
+    t: int
+    error: float
+    mean: np.ndarray
+    """(n,) mol/m³"""
+    std: np.ndarray
+    """(n,) mol/m³"""
+    innovation: Innovation | None
 
 
 def policy_folder() -> Path:
@@ -158,15 +173,26 @@ def play(env_id: str, kwargs: dict[str, Any], policy: str | PolicyFile, seed: in
     """
     env = environment(env_id, json.dumps(kwargs), estimator)
     loaded = policy if isinstance(policy, PolicyFile) else load_policy(policy)
-    seconds = 0.0
-    errors = list[float]()
-    currents = list[np.ndarray]()
-    for _, observation, elapsed in inject(env, loaded, seed):
+    world, seconds = env.core.world, 0.0
+    currents, claims = list[np.ndarray](), list[_Claim]()
+    # the clock of `inject` stands still while the filter is asked
+    for t, observation, elapsed in inject(env, loaded, seed):
         seconds += elapsed
         currents.append(observation["currents"])
-        errors += [] if env.error is None else [env.error]
+        if (error := env.error) is not None:
+            means, stds = env.core.estimate()
+            claims.append(_Claim(t, error, means[0], stds[0], env.core.innovations()[0]))
     spent = sum(bool(each.any()) for each in currents)
-    outcome = Outcome(env.core.world, seconds / env.core.length, np.array(errors), spent)
+    states, errors, means, stds, innovations = zip(*claims, strict=True)
+    interpolation, mass = region_operators(world)
+    truth = simulate(world, seed, progress=False).concentration[list(states)].astype(float)
+    used = [innovation for innovation in innovations if innovation is not None]
+    both = [each.value for each in used], [each.covariance for each in used]
+    outcome = Outcome(
+        world, seconds / env.core.length, np.array(errors), spent,
+        mean=(interpolation @ np.array(means).T).T, truth=truth, mass=mass,
+        points=truth_discretisation(world).transport.mesh.points,
+        innovations=both if used else None, std=(interpolation @ np.array(stds).T).T)
     return Injected(outcome, np.array(currents))
 
 

@@ -38,10 +38,11 @@ class _Filter(Protocol):
     def take_in(self, H: np.ndarray, cross: np.ndarray, innovation: np.ndarray, S: np.ndarray) -> object: ...
 
 
-def gated_update(filter_: _Filter, observation: Observation, gate: float) -> tuple[np.ndarray, np.ndarray]:
-    """Take in what is `believable` of a measurement; returns its innovations in predicted standard
-    deviations (m,) and which readings were taken in (m,)."""
+def gated_update(filter_: _Filter, observation: Observation,
+                 gate: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Take in what is `believable` of a measurement; returns its innovations (m,) and their
+    covariance (m, m), both before any was left out, and which readings were taken in (m,)."""
     cross, innovation, S = filter_.expect(observation)
     kept = believable(innovation, S.diagonal(), gate)
     filter_.take_in(observation.matrix[kept], cross[:, kept], innovation[kept], S[np.ix_(kept, kept)])
-    return innovation / np.sqrt(S.diagonal()), kept
+    return innovation, S, kept

@@ -105,6 +105,9 @@ class ReducedFilter:
         Of the present states; the filter works in the precision that these and the model have.
     """
 
+    innovation_covariance: np.ndarray
+    """(B, m, m) S of the last measurement; rows and columns of readings left out are those of 1"""
+
     def __init__(self, model: ReducedModel, mean: np.ndarray, covariance: np.ndarray) -> None:
         self.model, self.mean, self.covariance = model, mean, covariance.copy()
         self._half, self._next = np.empty_like(covariance), np.empty_like(covariance)
@@ -142,6 +145,7 @@ class ReducedFilter:
             cross, taken = cross * kept[..., None], innovation * kept
             S *= kept[:, :, None] & kept[:, None, :]
             S[:, np.arange(m), np.arange(m)] += ~kept
+        self.innovation_covariance = S
         inverse_root = np.linalg.inv(np.linalg.cholesky(S))
         W = inverse_root @ cross
         whitened = inverse_root @ taken[..., None]
