@@ -5,16 +5,19 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from eitbench import scoring
 from eitbench.bench.scores import Outcome
-from eitbench.data.episodes import truth_discretisation
+from eitbench.data.episodes import simulate, truth_discretisation
 from eitbench.data.regions import region_operators
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.estimation import best_homogeneous
+from eitbench.estimation.onboard.operator import Innovation
 from eitbench.worlds.task import Estimate, Task
+from eitbench.worlds.world import World
 
 
 @dataclass
@@ -109,3 +112,32 @@ def outcome_of(env: EstimationEnv, said: Said) -> Outcome:
         measured=said.voltages[states], computed=computed,
         innovations=(innovations[0], innovations[1]) if known else None, std=std,
         velocity=velocity)
+
+
+class Claim(NamedTuple):
+    """What the filter inside an environment says of a scored state."""
+
+    t: int
+    error: float
+    """ẽ_c"""
+    mean: np.ndarray
+    """(n,) mol/m³"""
+    std: np.ndarray
+    """(n,) mol/m³"""
+    innovation: Innovation | None
+    """Of the readings that were used for it; None where there were none."""
+
+
+def outcome_of_claims(world: World, seed: int, claims: list[Claim], seconds_per_step: float,
+                      spent: int) -> Outcome:
+    """What can be scored of an episode in which a policy made so many injections."""
+    states, errors, means, stds, innovations = zip(*claims, strict=True)
+    interpolation, mass = region_operators(world)
+    truth = simulate(world, seed, progress=False).concentration[list(states)].astype(float)
+    used = [innovation for innovation in innovations if innovation is not None]
+    both = [each.value for each in used], [each.covariance for each in used]
+    return Outcome(
+        world, seconds_per_step, np.array(errors), spent,
+        mean=(interpolation @ np.array(means).T).T, truth=truth, mass=mass,
+        points=truth_discretisation(world).transport.mesh.points,
+        innovations=both if used else None, std=(interpolation @ np.array(stds).T).T)

@@ -11,7 +11,7 @@ import numpy as np
 
 from eitbench import _check
 from eitbench.bench.methods import Method
-from eitbench.bench.outcomes import Said, outcome_of
+from eitbench.bench.outcomes import Claim, Said, outcome_of, outcome_of_claims
 from eitbench.bench.scores import Outcome
 from eitbench.bench.tracks import Environment, check_track
 from eitbench.envs.estimation import EstimationEnv
@@ -69,14 +69,17 @@ def estimated(env: EstimationEnv, estimator: Method, seed: int) -> Episode:
 
 def _injected(env: InjectionEnv, policy: Method, seed: int) -> Episode:
     seconds = 0.0
-    errors = list[float]()
     currents = list[np.ndarray]()
-    for _, observation, elapsed in injections(env, policy, seed):
+    claims = list[Claim]()
+    # the clock of `injections` stands still while the filter is asked
+    for t, observation, elapsed in injections(env, policy, seed):
         seconds += elapsed
         currents.append(observation["currents"])
-        errors += [] if env.error is None else [env.error]
+        if (error := env.error) is not None:
+            means, stds = env.core.estimate()
+            claims.append(Claim(t, error, means[0], stds[0], env.core.innovations()[0]))
     spent = sum(bool(each.any()) for each in currents)
-    outcome = Outcome(env.core.world, seconds / env.core.length, np.array(errors), spent)
+    outcome = outcome_of_claims(env.core.world, seed, claims, seconds / env.core.length, spent)
     return Episode(outcome, np.array(currents), {})
 
 

@@ -26,11 +26,9 @@ from eitbench.bench.sandbox.wall import landlock_version
 from eitbench.bench.scores import scored
 from eitbench.bench.store import EpisodeStore, machine, provenance, source_digest
 from eitbench.bench.tracks import Environment, board_of
-from eitbench.data.bank import fill
 from eitbench.data.episodes import simulate
 from eitbench.data.parallel import in_parallel
 from eitbench.data.seeds import name_seed
-from eitbench.envs.injection import InjectionEnv
 
 
 class Job(NamedTuple):
@@ -141,15 +139,8 @@ def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1, backend: 
     if not todo:
         return
     truths: dict[Any, Job] = {}  # each once, before several methods want it at once
-    recordings: dict[Any, list[int]] = {}
     for job in todo:
-        env = environment(job.environment)
-        if isinstance(env, InjectionEnv):
-            recordings.setdefault(env.world, []).append(job.seed)
-        else:
-            truths.setdefault((env.world, job.seed), job)
-    for world, seeds in recordings.items():
-        fill(world, seeds, n_jobs=n_jobs, backend=backend)
+        truths.setdefault((environment(job.environment).world, job.seed), job)
     run = {"command": command, **provenance(), "machine": machine()}
     home = platform.node()
     guests.close()                                  # that of `Job.load`; the workers have their own

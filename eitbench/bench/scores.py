@@ -50,8 +50,9 @@ class Outcome:
     """(S, L) V"""
     computed: np.ndarray | None = None
     """(S, L) V that the model computes of the estimates"""
-    innovations: tuple[np.ndarray, np.ndarray] | None = None
-    """(K, L) V and their covariances (K, L, L) V², where claimed"""
+    innovations: tuple[np.ndarray | list[np.ndarray], np.ndarray | list[np.ndarray]] | None = None
+    """(K, L) V and their covariances (K, L, L) V², where claimed; two lists of K where not every
+    reading is used: (m,) and (m, m) of the m that were"""
     std: np.ndarray | None = None
     """(S, m) mol/m³, where every scored state has a variance"""
     velocity: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
@@ -188,6 +189,16 @@ def _of_velocity(outcome: Any) -> float:
     return scoring.relative_error(estimated, true, np.diag(weights))
 
 
+def _nis(outcome: Any) -> float:
+    """The mean of νᵀS⁻¹ν/m, m being the readings that were used each time."""
+    innovations, covariances = outcome.innovations
+    if isinstance(innovations, np.ndarray):                     # all at once: the same bits as ever
+        return float(scoring.normalised_innovations(innovations, covariances).mean())
+    each = [scoring.normalised_innovations(innovation[None], covariance[None])[0]
+            for innovation, covariance in zip(innovations, covariances, strict=True)]
+    return float(np.mean(each))
+
+
 def _claimed(outcome: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """What `scoring` asks for of a claimed uncertainty."""
     return outcome.mean, outcome.std, outcome.truth, outcome.weights
@@ -201,23 +212,23 @@ for _score in (
           _contrast, needs=("mean", "truth"), everywhere=True),
     Score("nis", "NIS/m",
           "normalised innovation squared; 1 when the filter's own uncertainty fits",
-          lambda outcome: scoring.normalised_innovations(*outcome.innovations).mean(),
-          better="nominal", needs=("innovations",), everywhere=True),
+          _nis, better="nominal", needs=("innovations",), tracks=TRACKS, everywhere=True),
     Score("crps", "CRPS", "continuous ranked probability score, mol/m³",
-          lambda outcome: scoring.crps(*_claimed(outcome)), needs=("std",), everywhere=True),
+          lambda outcome: scoring.crps(*_claimed(outcome)), needs=("std",), tracks=TRACKS,
+          everywhere=True),
     Score("velocity_error", "ẽ_v",
           "relative error of the flow, ∫(v̂ − v)²/∫v² across the pipe, where it is asked for too",
           _of_velocity, needs=("velocity",)),
     Score("coverage_50", "50 %", "part of the truth inside the claimed 50 % interval",
           lambda outcome: scoring.coverage(*_claimed(outcome), 0.5),
-          better="nominal", needs=("std",), everywhere=True),
+          better="nominal", needs=("std",), tracks=TRACKS, everywhere=True),
     Score("coverage_90", "90 %", "part of the truth inside the claimed 90 % interval",
           lambda outcome: scoring.coverage(*_claimed(outcome), 0.9),
-          better="nominal", needs=("std",), everywhere=True),
+          better="nominal", needs=("std",), tracks=TRACKS, everywhere=True),
     Score("spread_ratio", "var/MSE",
           "claimed variance over squared error; 1 is honest, more is too modest",
           lambda outcome: scoring.spread_ratio(*_claimed(outcome)),
-          better="nominal", needs=("std",), everywhere=True),
+          better="nominal", needs=("std",), tracks=TRACKS, everywhere=True),
     Score("voltage_discrepancy", "ẽ_V", "voltage discrepancy (5.13), mV²; a diagnostic",
           lambda outcome: scoring.voltage_discrepancy(outcome.measured, outcome.computed),
           better="none", needs=("measured", "computed"), factor=1e6, everywhere=True),

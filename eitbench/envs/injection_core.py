@@ -12,7 +12,7 @@ from eitbench.data.recordings import faults_of, outline, recording
 from eitbench.data.regions import integrals, score_mass
 from eitbench.estimation.onboard.console import Console
 from eitbench.estimation.onboard.joint_operator import JointFullOperator, JointReducedOperator
-from eitbench.estimation.onboard.operator import FullOperator, Operator
+from eitbench.estimation.onboard.operator import FullOperator, Innovation, Operator
 from eitbench.estimation.onboard.reduced_operator import ReducedOperator
 from eitbench.estimation.onboard.rules import Rules
 from eitbench.worlds.instrument import Faults
@@ -190,6 +190,15 @@ class InjectionCore:
             shape = (len(self._spent), outline(self.world).mass.shape[0])
             return np.full(shape, self.world.expected_concentration), np.zeros(shape)
         return self._operator.means(), self._operator.spreads()
+
+    def innovations(self) -> list[Innovation | None]:
+        """Of each episode how the readings that the estimator used last differ from its
+        predictions.
+
+        None where nothing was injected, every reading was left out, or nothing estimates. The
+        update computed them anyway; for scores, never for agents.
+        """
+        return self._operator.innovations() if self._operator_type else [None] * len(self._spent)
 
     @property
     def t(self) -> int:

@@ -35,11 +35,11 @@ class Filter(Protocol):
 
 
 def gated_update(filter_: Filter, observation: Observation,
-                 gate: float) -> tuple[np.ndarray, np.ndarray]:
-    """Take in what is `believable` of a measurement; returns its innovations in predicted standard
-    deviations (m,) and which readings were taken in (m,)."""
+                 gate: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Take in what is `believable` of a measurement; returns its innovations (m,) and their
+    covariance (m, m), both before any was left out, and which readings were taken in (m,)."""
     cross, innovation, S = filter_.expect(observation)
     kept = believable(innovation, S.diagonal(), gate)
     both = np.ix_(kept, kept)
     filter_.take_in(observation.matrix[kept], cross[:, kept], innovation[kept], S[both])
-    return innovation / np.sqrt(S.diagonal()), kept
+    return innovation, S, kept

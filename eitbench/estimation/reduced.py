@@ -107,6 +107,9 @@ class ReducedFilter:
         Of the present states; the filter works in the precision that these and the model have.
     """
 
+    innovation_covariance: np.ndarray
+    """(B, m, m) S of the last measurement; rows and columns of readings left out are those of 1"""
+
     def __init__(self, model: ReducedModel, mean: np.ndarray, covariance: np.ndarray) -> None:
         self.model = model
         self.mean = mean
@@ -152,6 +155,7 @@ class ReducedFilter:
             taken = innovation * kept
             S *= kept[:, :, None] & kept[:, None, :]
             S[:, np.arange(m), np.arange(m)] += ~kept
+        self.innovation_covariance = S
         inverse_root = np.linalg.inv(np.linalg.cholesky(S))
         W = inverse_root @ cross
         gained = np.swapaxes(W, -1, -2)

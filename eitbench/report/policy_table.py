@@ -53,7 +53,7 @@ def policy_table(rows: pd.DataFrame, privileged: Sequence[str]) -> str:
 
     Agents that differ in the seed of their training only are one policy: an episode's error is the
     mean of theirs. Policies that did not finish every episode are below all that did, with the
-    number of those they did.
+    number of those they did. What the filter says of itself has columns where an episode has it.
     """
     if rows.empty:
         return "no episode was finished"

@@ -51,9 +51,10 @@ def test_innovations_and_velocity_where_they_are_claimed():
 
 
 def test_policies_have_theirs():
-    """Error, injections, time, and nothing else."""
+    """Error, injections, time, and of what the filter claims nothing where nobody asked it."""
     said = scored("injection", Outcome(WORLD, 0.5, np.array([0.1, 0.3]), spent=7))
-    assert said == {"error": pytest.approx(0.2), "spent": 7.0, "seconds_per_step": 0.5}
+    claims = dict.fromkeys(("nis", "crps", "coverage_50", "coverage_90", "spread_ratio"))
+    assert said == claims | {"error": pytest.approx(0.2), "spent": 7.0, "seconds_per_step": 0.5}
 
 
 def worst(better="lower"):

@@ -109,6 +109,28 @@ def test_ours_are_known_by_name(tmp_path):
     assert code == 1 and "fails is none of ours: its file must be given" in complaint
 
 
+def test_a_record_from_before_a_score_is_verified(tmp_path):
+    """Without what the filter claims it is compared by the rest; with it, a wrong one is found."""
+    claims = ("nis", "crps", "coverage_50", "coverage_90", "spread_ratio")
+    assert eitbench("policies", "--env", INJECTION, "--policy", "random_pair", "--seeds", "dev:0",
+                    "--estimator", "reduced", "-j", 1)[0] == 0
+    (path,) = tmp_path.glob("results/records/*--random_pair--*")
+    now = read_record(path)["episodes"][0]["scores"]
+    assert all(now[name] is not None for name in claims)
+
+    def older(record):
+        for name in claims:
+            del record["episodes"][0]["scores"][name]
+
+    def wrong(record):
+        record["episodes"][0]["scores"]["nis"] *= 1.01
+
+    code, said, complaint = eitbench("verify", forged(path, older, "older"))
+    assert code == 0 and "as it says" in said, complaint
+    code, _, complaint = eitbench("verify", forged(path, wrong, "wrong"))
+    assert code == 1 and "nis is" in complaint
+
+
 @walled
 def test_a_stranger_s_policy_is_submitted_and_verified(tmp_path):
     """In guests both times, by the same random numbers; the record says so."""

@@ -76,7 +76,7 @@ class JointFullOperator(FullOperator):
     def spreads(self) -> np.ndarray:
         n = self._patches.shape[1]
         variance = np.array([filter_.covariance.diagonal()[:n] for filter_ in self._filters])
-        return self.concentration[:, None] * np.sqrt(variance)
+        return self.concentration[:, None] * np.sqrt(np.maximum(variance, 0.0))
 
     def flow(self) -> tuple[np.ndarray, np.ndarray] | None:
         n = self._patches.shape[1]

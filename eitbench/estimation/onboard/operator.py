@@ -47,6 +47,26 @@ def pair_currents(world: World) -> np.ndarray:
     return currents
 
 
+class Innovation(NamedTuple):
+    """How the m readings that a filter took in differ from what it predicted."""
+
+    value: np.ndarray
+    """(m,) ν in V, measured less predicted"""
+    covariance: np.ndarray
+    """(m, m) S in V², as predicted"""
+
+    @classmethod
+    def of(cls, innovation: np.ndarray, covariance: np.ndarray, std: np.ndarray,
+           used: np.ndarray) -> Innovation | None:
+        """From ν (L,) and S (L, L) in parts of ``std`` (L,) V, and which were used (L,); None where
+        none was."""
+        if not used.any():
+            return None
+        scale = std[used]
+        chosen = covariance[np.ix_(used, used)].astype(float)
+        return cls(innovation[used].astype(float) * scale, chosen * np.outer(scale, scale))
+
+
 class Operator(Protocol):
     """Estimators of B episodes. The parameters are those of Table 5.1, as in the Kalman filter
     baseline, with the ĉ_bh of the first frame, in which they start from t = 0."""
@@ -64,6 +84,11 @@ class Operator(Protocol):
         """One time step on, with voltages (B, L) in V for currents (B, L), all zero where nothing
         was injected; returns the innovations in predicted standard deviations and which readings
         were believed, both (B, L)."""
+        ...
+
+    def innovations(self) -> list[Innovation | None]:
+        """Of each episode what it took in last, for scores; None where nothing was injected, or no
+        reading was believed."""
         ...
 
     def grid(self) -> tuple[np.ndarray, np.ndarray]:
@@ -179,6 +204,7 @@ class FullOperator:
         self._levels = [levels.linearised(levels.best(frame, broken)) for frame in frames]
         self.concentration = np.array([level.concentration for level in self._levels])
         self._filters = self._start(len(frames))
+        self._last = list[tuple[np.ndarray, ...] | None]()
         self._patches = patch_averages(levels.task.mesh, world.vessel.patches)
         for k, currents in enumerate(world.currents):
             self.assimilate(frames[:, k], np.repeat(currents[None], len(frames), axis=0))
@@ -191,6 +217,7 @@ class FullOperator:
     def assimilate(self, voltages: np.ndarray,
                    currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         innovations, kept = np.zeros_like(voltages), np.ones(voltages.shape, dtype=bool)
+        self._last = [None] * len(voltages)
         for b, (filter_, level) in enumerate(zip(self._filters, self._levels, strict=True)):
             filter_.predict()
             if not currents[b].any():
@@ -200,8 +227,13 @@ class FullOperator:
             # the state is 1 where nothing deviates
             value = (voltages[b] - computed) / std + matrix.sum(axis=1)
             observation = Observation(matrix, value, np.ones(len(value)))
-            innovations[b], kept[b] = gated_update(filter_, observation, self._gate)
+            innovation, covariance, kept[b] = gated_update(filter_, observation, self._gate)
+            innovations[b] = innovation / np.sqrt(covariance.diagonal())
+            self._last[b] = innovation, covariance, std, kept[b]
         return innovations, kept
+
+    def innovations(self) -> list[Innovation | None]:
+        return [None if last is None else Innovation.of(*last) for last in self._last]
 
     def grid(self) -> tuple[np.ndarray, np.ndarray]:
         spread = np.array([np.sqrt(filter_.variance_of(self._patches))
@@ -222,8 +254,9 @@ class FullOperator:
         return self.concentration[:, None] * np.array([filter_.mean for filter_ in self._filters])
 
     def spreads(self) -> np.ndarray:
-        variances = [filter_.variances() for filter_ in self._filters]
-        return self.concentration[:, None] * np.sqrt(variances)
+        # a difference of two: rounding may leave less than none
+        variance = np.maximum([filter_.variances() for filter_ in self._filters], 0.0)
+        return self.concentration[:, None] * np.sqrt(variance)
 
     def flow(self) -> tuple[np.ndarray, np.ndarray] | None:
         return None

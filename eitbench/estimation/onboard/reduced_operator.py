@@ -19,6 +19,7 @@ from eitbench.data.regions import score_mass
 from eitbench.estimation import LinearisedObservations, Observation, starting_filter
 from eitbench.estimation.onboard.operator import (
     BROKEN,
+    Innovation,
     Linearisation,
     levels_of,
     pair_currents,
@@ -65,7 +66,14 @@ class ReducedOperator:
         self._filter.predict()
         innovation, variance, kept = self._filter.update(matrix, residual, np.ones_like(residual),
                                                          gate=self._gate)
+        self._last = innovation, std, kept, currents
         return (innovation / np.sqrt(variance)).astype(float), kept
+
+    def innovations(self) -> list[Innovation | None]:
+        innovation, std, kept, currents = self._last
+        used = kept & currents.any(axis=1, keepdims=True)
+        S = self._filter.innovation_covariance
+        return [Innovation.of(*each) for each in zip(innovation, S, std, used, strict=True)]
 
     @property
     def basis(self) -> np.ndarray:
@@ -128,7 +136,7 @@ class ReducedOperator:
 
     def spreads(self) -> np.ndarray:
         basis = self._shared.model.basis
-        variance = ((basis @ self.state_covariance) * basis).sum(axis=2)
+        variance = np.maximum(((basis @ self.state_covariance) * basis).sum(axis=2), 0.0)
         return self.concentration[:, None] * np.sqrt(variance)
 
     def flow(self) -> tuple[np.ndarray, np.ndarray] | None:

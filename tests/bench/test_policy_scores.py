@@ -1,0 +1,152 @@
+"""What the filter inside claims is scored as estimators' claims are, and old records stay true."""
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+from choosing import BUDGET, FAULTS, FLOW, NAME, make, world
+from tiny import record
+
+import eitbench
+from eitbench import scoring
+from eitbench.bench import playing
+from eitbench.bench.methods import load_method
+from eitbench.bench.scores import Outcome, scored, scores
+from eitbench.bench.tracks import TRACKS, Environment
+from eitbench.bench.verify import differences_of
+from eitbench.data.regions import mass_between
+from eitbench.numerics.fem import mass_matrix
+from eitbench.report import boards, policy_table, summary
+from eitbench.worlds import entry
+
+SEED = 5
+CLAIMS = ("nis", "crps", "coverage_50", "coverage_90", "spread_ratio")
+
+
+def again(name: str, currents: np.ndarray) -> dict[str, list]:
+    """What an environment of its own says at each scored step, of the same injections."""
+    env = make("reduced", name).unwrapped
+    env.reset(seed=SEED)
+    pairs = env.rules.pairs.tolist()
+    truth = eitbench.simulate(env.world, SEED).concentration.astype(float)
+    seen: dict[str, list] = {key: [] for key in ("error", "mean", "std", "truth", "nis")}
+    for k, each in enumerate(currents):
+        pair = pairs.index([int(each.argmax()), int(each.argmin())]) if each.any() else None
+        env.step(env.rules.action(pair))
+        if env.error is None:
+            continue
+        mean, std = (part[0] for part in env.core.estimate())
+        for key, value in (("error", env.error), ("mean", mean), ("std", std),
+                           ("truth", truth[len(env.world.currents) + k + 1])):
+            seen[key].append(value)
+        if (innovation := env.core.innovations()[0]) is not None:
+            value, covariance = innovation
+            seen["nis"].append(value @ np.linalg.inv(covariance) @ value / len(value))
+    return seen
+
+
+@pytest.mark.parametrize("name", [NAME, FAULTS, BUDGET, FLOW])
+def test_claims_are_those_of_the_filter_inside(name):
+    """CRPS, coverage and var/MSE are the formulas' of mean, spread and truth on the truth's nodes
+    within what counts; NIS/m is the mean over the injections of which a reading was used."""
+    played = playing.play(
+        Environment(name, json.dumps({"world": world(name), "estimator": "reduced"})),
+        load_method("random_pair", "injection"), SEED)
+    seen = again(name, played.currents)
+    env = make("reduced", name).unwrapped
+    mesh = env.world.truth().transport.mesh
+    onto = env.task.mesh.interpolation_to(mesh.points)
+    mass = mass_between(mesh, *env.world.region) if env.world.region else mass_matrix(mesh)
+    weights = np.asarray(mass.sum(axis=0)).ravel()
+    claim = [np.array([onto @ state for state in seen[key]]) for key in ("mean", "std")]
+    claim = [*claim, np.array(seen["truth"]), weights]
+    said = scored("injection", played.outcome)
+    assert played.outcome.errors.tolist() == seen["error"]
+    assert 0 < len(seen["nis"]) <= len(seen["error"]) == env.world.schedule.scored_steps
+    expected = {"nis": np.mean(seen["nis"]), "crps": scoring.crps(*claim),
+                "coverage_50": scoring.coverage(*claim, 0.5),
+                "coverage_90": scoring.coverage(*claim, 0.9),
+                "spread_ratio": scoring.spread_ratio(*claim)}
+    assert {key: said[key] for key in expected} == pytest.approx(expected, rel=1e-9)
+    assert 0.0 < said["crps"] < env.world.expected_concentration
+
+
+def test_the_same_scores_on_both_tracks():
+    """Whatever is claimed is scored, whoever claims it."""
+    both = [name for name, score in scores().items() if tuple(score.tracks) == TRACKS]
+    assert both == ["error", *CLAIMS, "seconds_per_step"]
+
+
+def test_only_used_readings_count():
+    """Two readings and then one: (4/1 + 4/4)/2 = 2.5 and 9/1 = 9 have a mean of 5.75."""
+    innovations = ([np.array([2.0, 2.0]), np.array([3.0])], [np.diag([1.0, 4.0]), np.eye(1)])
+    outcome = Outcome(entry(NAME).world, 0.0, np.ones(2), innovations=innovations)
+    assert scored("injection", outcome)["nis"] == pytest.approx(5.75)
+    silent = Outcome(entry(NAME).world, 0.0, np.ones(2))
+    assert [scored("injection", silent)[name] for name in CLAIMS] == [None] * 5
+
+
+def test_a_policy_sees_nothing_of_it():
+    """What is scored is in no observation and no info."""
+    env = make("reduced")
+    observation, info = env.reset(seed=SEED)
+    known = set(observation)
+    observation, *_, later = env.step(7)
+    assert set(observation) == known == set(env.observation_space.spaces)
+    assert set(info) == set(later) == {"step"}
+
+
+# -- records of before ---------------------------------------------------------------------------
+
+
+def test_a_record_from_before_is_the_same():
+    """Only what a record says is compared: with nothing of it said there is no difference, and a
+    wrong number is one."""
+    said = {"status": "ok", "step_errors": [0.1], "scores": {"error": 0.1, "spent": 3}}
+    now = said | {"scores": said["scores"] | {"nis": 1.2, "crps": 0.4}}
+    assert set(differences_of(said, now)) == {"error", "spent", "step_errors"}
+    assert not any(differences_of(said, now).values())
+    wrong = now | {"scores": now["scores"] | {"nis": 1.3}}
+    assert differences_of(wrong, now)["nis"] == pytest.approx(0.1 / 1.3)
+    assert differences_of(now, said)["nis"] == np.inf
+
+
+def injection(method: str, factor: float, **changes) -> dict:
+    errors = [factor * error for error in (0.2, 0.24, 0.22)]
+    return record(method, errors, board="injection", **changes)
+
+
+def rows_of(text: str, beginning: str) -> list[list[str]]:
+    """Cells of the lines of Markdown that have this in them."""
+    lines = [line for line in text.splitlines() if beginning in line]
+    return [[cell.strip() for cell in line.split("|")] for line in lines]
+
+
+def test_boards_show_it_where_it_is_known():
+    """A board of old records has no column of it; beside a new one the old ones have a dash."""
+    old = [injection("random_pair", 1.0, role="floor", scores={"spent": 40}),
+           injection("opposite", 0.9, scores={"spent": 40})]
+    new = injection("greedy_a", 0.5, scores={"spent": 40, "nis": 1.2, "crps": 0.44})
+    (heading,) = rows_of(boards.render(old)["leaderboard.md"], "| rank")
+    assert "NIS/m" not in heading and "CRPS" not in heading
+    text = boards.render([*old, new])["leaderboard.md"]
+    (heading,) = rows_of(text, "| rank")
+    place = heading.index("NIS/m")
+    assert rows_of(text, "(greedy_a ")[0][place] == "1.2"
+    assert rows_of(text, "(opposite ")[0][place] == "–"
+    shown = summary.cells(summary.summary([*old, new]))
+    assert sorted(shown["CRPS"]) == ["0.44", "–", "–"]
+
+
+def test_the_table_of_policies_shows_it_where_it_is_known():
+    """Means over the episodes that have it; no column if nobody has."""
+    rows = pd.DataFrame([
+        {"policy": name, "seed": f"dev:{k}", "error": error + k, "spent": 5, "nis": nis,
+         "seconds_per_step": 0.001}
+        for name, error, claimed in (("old", 1.0, [None, None]), ("new", 2.0, [1.0, 2.0]))
+        for k, nis in enumerate(claimed)])
+    lines = policy_table.policy_table(rows, []).splitlines()
+    assert lines[0] == "| policy | ẽ_c | worse than old by | NIS/m | injections | ms/step |"
+    assert [line.split("|")[4].strip() for line in lines[2:]] == ["–", "1.5"]
+    assert "NIS/m" not in policy_table.policy_table(rows.drop(columns="nis"), [])

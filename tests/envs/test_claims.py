@@ -1,0 +1,144 @@
+"""What the filter inside says of itself, for scores: how far readings are from its predictions."""
+
+import copy
+
+import numpy as np
+import pytest
+from choosing import BUDGET, FAULTS, FLOW, NAME, TANK, make, some_pairs
+
+from eitbench.bench.scores import Outcome, scored
+from eitbench.envs.injection import InjectionVectorEnv
+from eitbench.estimation import KalmanFilter
+from eitbench.estimation.onboard.operator import FullOperator, Levels
+from eitbench.estimation.onboard.reduced_operator import ReducedOperator
+
+
+def predicted(filter_, estimator: str, n: int):
+    """(mean, X -> Γ X) of the concentration's next state, in the filter's own coordinates."""
+    moved = copy.deepcopy(filter_)
+    moved.predict()
+    if estimator == "reduced":
+        r = moved.mean.shape[1] - (not hasattr(moved, "model"))     # behind it the velocity
+        covariance = moved.covariance[0, :r, :r].astype(float)
+        return moved.mean[0, :r].astype(float), lambda X: covariance @ X
+    if isinstance(moved, KalmanFilter):
+        return moved.mean, moved.apply_covariance
+    mean = moved.concentration if hasattr(moved, "concentration") else moved.mean
+    return mean, lambda X: moved.covariance[:n, :n] @ X
+
+
+@pytest.mark.parametrize(("name", "estimator"), [
+    (NAME, "reduced"), (FAULTS, "reduced"), (FAULTS, "full"), (BUDGET, "reduced"), (FLOW, "reduced"),
+    (FLOW, "full"), (TANK, "reduced"), (TANK, "full")])
+def test_innovations_are_those_of_the_tasks_matrices(name, estimator):
+    """ν = V − R(c*) − J (ĉ − c*) and S = J Γ Jᵀ + noise in volts, from the measured voltages, of
+    the readings within the gate; none of an injection of which more than a third is beyond."""
+    env = make(estimator, name).unwrapped
+    env.reset(seed=5)
+    core, task, rules = env.core, env.task, env.rules
+    operator = core._operator
+    n = task.mesh.n_nodes
+    level = operator.concentration[0]
+    basis = operator.basis if estimator == "reduced" else np.eye(n)
+    sizes = []
+    for k, pair in enumerate(some_pairs()[:core.length]):
+        before = operator._filter if estimator == "reduced" else operator._filters[0]
+        mean, times = predicted(before, estimator, n)
+        resting = name == BUDGET and k == 1
+        observation = env.step(rules.action(None if resting else int(pair)))[0]
+        said = core.innovations()[0]
+        if resting:
+            assert said is None
+            continue
+        volts, jacobian = (part[0] for part in task.observation.linearise(
+            np.full(n, level), observation["currents"][None]))
+        H = level * jacobian @ basis
+        away = mean if estimator == "reduced" else mean - 1.0
+        instrument = rules.instrument
+        std = np.maximum(instrument.noise.std(volts), 1e-3 * np.abs(volts).max())
+        std = np.hypot(std, instrument.noise_floor)
+        innovation = observation["voltages"] - volts - H @ away
+        S = H @ times(H.T) + np.diag(std**2)
+        beyond = np.abs(innovation) > rules.gate * np.sqrt(S.diagonal())
+        used = ~beyond & (beyond.mean() <= 1 / 3)
+        sizes.append(int(used.sum()))
+        if not used.any():
+            assert said is None
+            continue
+        close = 1e-7 if estimator == "full" else 1e-4
+        scale = np.sqrt(S.diagonal())[used]
+        np.testing.assert_allclose(said.value / scale, innovation[used] / scale, atol=close)
+        np.testing.assert_allclose(said.covariance / np.outer(scale, scale),
+                                   S[np.ix_(used, used)] / np.outer(scale, scale), atol=close)
+    if name == FAULTS:
+        assert 0 in sizes and 0 < max(sizes) < len(std)
+    else:
+        assert set(sizes) == {len(std)}
+
+
+def nis_of(random, noise: float) -> float:
+    """NIS/m of reduced filters of 32 episodes over 40 injections, whose voltages are drawn from
+    their own model, with the noise so many times as large."""
+    env = make("reduced").unwrapped
+    world, rules, B = env.world, env.rules, 32
+    shared = ReducedOperator._share(world)
+    model, level = shared.model, shared.level(0)
+    root, initial = (vectors * np.sqrt(np.maximum(values, 0.0)) for values, vectors in (
+        np.linalg.eigh(model.noise), np.linalg.eigh(model.initial)))
+    state = random.standard_normal((B, len(root))) @ initial.T
+
+    def measured(state, currents):
+        volts = currents @ level.resistance
+        computed, std, H = level.observe(currents, shared.levels.noise_std(volts, 0.0))
+        draws = noise * random.standard_normal((B, len(std)))
+        return computed + std * (state @ H.T.astype(float) + draws)
+
+    pairs = rules.table[some_pairs(40)]
+    record = []
+    for currents in [*world.currents, *pairs]:
+        state = state @ model.transition.T + random.standard_normal(state.shape) @ root.T
+        record.append(measured(state, currents))
+    K = len(world.currents)
+    operator = ReducedOperator(world, np.stack(record[:K], axis=1), gate=np.inf, noise_floor=0.0)
+    seen = []
+    for currents, voltages in zip(pairs, record[K:], strict=True):
+        operator.assimilate(voltages, np.repeat(currents[None], B, axis=0))
+        seen += operator.innovations()
+    innovations = [each.value for each in seen], [each.covariance for each in seen]
+    return scored("injection", Outcome(world, 0.0, np.zeros(1), innovations=innovations))["nis"]
+
+
+def test_nis_of_a_consistent_filter_averages_one(monkeypatch):
+    """Innovations of a filter that knows its model are independent: the mean of 20,480 squares is
+    within four of its standard deviations of 1, and is not where the noise is twice as large."""
+    monkeypatch.setattr(Levels, "best", lambda self, frame, broken: 0)
+    random = np.random.default_rng(0)
+    spread = np.sqrt(2 / (32 * 40 * 16))
+    assert abs(nis_of(random, 1.0) - 1.0) < 4 * spread
+    assert nis_of(random, 2.0) > 1.0 + 40 * spread
+
+
+def test_nobody_asks_in_training(monkeypatch):
+    """A step of training computes no spread on the nodes and gathers no innovations."""
+    def refuse(self):
+        raise AssertionError("only scores ask for this")
+
+    for kind in (FullOperator, ReducedOperator):
+        for asked in ("spreads", "innovations", "means"):
+            monkeypatch.setattr(kind, asked, refuse)
+    world = make("reduced").unwrapped.world
+    envs = InjectionVectorEnv(NAME, num_envs=2, world={"flow": {"mean_velocity": 16.0},
+                                                       "schedule": {"scored_steps": 4}})
+    envs.reset(seed=[3, 4])
+    for actions in some_pairs(world.n_steps - 16, 2):
+        envs.step(actions)
+    with pytest.raises(AssertionError, match="only scores"):
+        envs._cores[0].innovations()
+
+
+def test_without_an_estimator_there_is_none():
+    """Nobody predicts, so that nothing can differ."""
+    env = make("none").unwrapped
+    env.reset(seed=3)
+    env.step(7)
+    assert env.core.innovations() == [None]
