@@ -23,9 +23,9 @@ from eitbench.worlds.task import Estimate, Task
 
 
 @pytest.fixture(autouse=True)
-def cache(tmp_path_factory, monkeypatch):
+def cache(run_cache, monkeypatch):
     """One cache of episodes for all tests of this session."""
-    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path_factory.getbasetemp() / "episodes"))
+    monkeypatch.setenv(CACHE_VARIABLE, run_cache)
 
 
 @pytest.fixture

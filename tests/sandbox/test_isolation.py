@@ -42,9 +42,9 @@ BY_LOT = "return int(self.random.integers(self.rules.action_space.n))"
 
 
 @pytest.fixture(autouse=True)
-def cache(tmp_path_factory, monkeypatch):
+def cache(run_cache, monkeypatch):
     """One cache of episodes for all tests of this session, and no guest left behind."""
-    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path_factory.getbasetemp() / "episodes"))
+    monkeypatch.setenv(CACHE_VARIABLE, run_cache)
     yield
     guests.close()
 
