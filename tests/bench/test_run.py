@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from recorded import forget_made
 from scipy.optimize import minimize_scalar
 from short import merged
 from tiny import FILTER, FIXED_LAG, SCENARIO, SMOOTHING, count, counting, write_baseline
@@ -169,7 +170,7 @@ def test_estimators_cannot_spoil_the_task_for_others(tmp_path):
     try:
         assert scores_of(run_episode(Job(FILTER, good, 1))[0]) == before
     finally:
-        run._made.cache_clear()                                 # what a vandal broke is no other test's affair
+        forget_made(run)                                        # what a vandal broke is no other test's affair
 
 
 @pytest.mark.parametrize(("environment", "board"), [(FILTER, "filter"), (FIXED_LAG, "fixed-lag"),

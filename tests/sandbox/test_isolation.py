@@ -12,6 +12,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from recorded import forget_made
 from short import PIPE
 from tiny import FILTER, FIXED_LAG, SMOOTHING, write_baseline
 
@@ -224,12 +225,12 @@ def test_a_guest_does_not_choose_its_name(tmp_path, monkeypatch):
     monkeypatch.setattr(guests, "own_agents", lambda id: [str(ours)])
     about = {"title": "Mine", "parameters": {}, "role": None, "suits": True}
     for name, refused in (("ppo_seed3", True), ("random_pair", True), ("ppo_seed4", False)):
-        guests._load.cache_clear()
+        forget_made(guests)
         monkeypatch.setattr(guests, "_enter", lambda *_, name=name: SimpleNamespace(about=about | {"name": name}))
         with pytest.raises(ValueError, match=f"model.zip has the name of one of ours, {name}") if refused else (
                 nullcontext()):
             assert Job(INJECTION, str(agent), 1, True).load().name == name
-    guests._load.cache_clear()
+    forget_made(guests)
 
 
 def test_ours_are_ours_by_path_too(tmp_path):
