@@ -32,6 +32,11 @@ def world(name: str) -> dict:
     return {"schedule": {"warm_up": 2, "scored_steps": 3}} if name == TANK else SHORT
 
 
+def filter_of(whose):
+    """The filters inside an environment that asks for injections, or those a policy's belief follows."""
+    return (whose.unwrapped.core if isinstance(whose, gym.Env) else whose)._operator
+
+
 def play(env: gym.Env, seed: int, actions: np.ndarray) -> list[tuple]:
     """(observation, reward, terminated, truncated, info) of the whole episode under the given actions."""
     observation, info = env.reset(seed=seed)

@@ -16,6 +16,13 @@ def forget():
     recordings._outline.cache_clear()
 
 
+def forget_made(module):
+    """What a process has made and keeps for later in a module."""
+    for value in vars(module).values():
+        if hasattr(value, "cache_clear"):
+            value.cache_clear()
+
+
 def bits(entries):
     """All that makes two recordings the same."""
     return entries.dtype, entries.shape, entries.tobytes()

@@ -137,7 +137,15 @@ def references():
 def reference_model(*arguments, **options) -> cem.CompleteElectrodeModel:
     """A `CompleteElectrodeModel` without compiled kernels."""
     with references():
-        return cem.CompleteElectrodeModel(*arguments, **options)
+        model = cem.CompleteElectrodeModel(*arguments, **options)
+    assert isinstance(model._system, SuperLUCondensation)
+    assert isinstance(model._sensitivity, NumpySensitivity)
+    return model
+
+
+def unsymmetrised(model: cem.CompleteElectrodeModel, conductivity: np.ndarray) -> np.ndarray:
+    """𝓡 with the last electrode grounded, (L − 1, L − 1), as the factorisation gives it."""
+    return model._system.port_inverse(model._assemble(conductivity))
 
 
 def reference_flow(*arguments, **options) -> transport.ConvectionDiffusion:

@@ -56,9 +56,15 @@ def short(name: str) -> dict:
     return world(name) | {"episodes": 2}
 
 
+def register_apart(monkeypatch) -> None:
+    """What is registered from now on is forgotten after the test."""
+    hands = {each.id for each in registry.registered_by_hand()}
+    monkeypatch.setattr(registry, "_entries", registry.entries())
+    monkeypatch.setattr(registry, "_by_hand", hands)
+
+
 def shorten(monkeypatch, changes: dict[str, dict]) -> None:
     """Let registered ids play other worlds, in other processes too: id -> changes of the world."""
-    for name, each in changes.items():
-        made = replace(entry(name), world=entry(name).world.changed(each))
-        monkeypatch.setitem(registry._entries, name, made)
-    monkeypatch.setattr(registry, "_by_hand", registry._by_hand | set(changes))
+    register_apart(monkeypatch)
+    registry.take_over([replace(entry(name), world=entry(name).world.changed(each))
+                        for name, each in changes.items()])

@@ -4,6 +4,7 @@ import hashlib
 import json
 from pathlib import Path
 
+from eitbench.bench import store
 from eitbench.bench.records import SCHEMA, sealed, split_of
 from eitbench.bench.tracks import Environment
 
@@ -53,6 +54,14 @@ def write_baseline(folder: Path, name: str = "mine", *, doc: str = "Mine: the sa
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(SOURCE.format(doc=doc, init=init, update=update, parameters=parameters))
     return str(path)
+
+
+def git_says(monkeypatch, commit: str | None = None, status: str | None = "") -> None:
+    """Records name this commit wherever the tests run; None: outside a checkout."""
+    def said(*words: str) -> str | None:
+        return commit if commit is None or "rev-parse" in words else status
+
+    monkeypatch.setattr(store, "_git", said)
 
 
 def counting(log: Path) -> str:

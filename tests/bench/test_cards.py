@@ -10,19 +10,12 @@ from typer.testing import CliRunner
 from eitbench.bench import cards, methods
 from eitbench.bench.methods import baseline_folder, load_method, own_agents
 from eitbench.cli import app
-from eitbench.data.store import CACHE_VARIABLE
 
 SLOW = ("filter_bank", "eitbench-Pipe2DInjectionFlow-v0--ppo")
 """Half a minute and more, whatever the episode."""
 METHODS = cards.official_methods()
 IN_ORDER = sorted(METHODS, key=lambda name: str((cards.read_card(name) or {}).get("kwargs")))
 """World by world: a process keeps a few."""
-
-
-@pytest.fixture(autouse=True)
-def one_cache(tmp_path_factory, monkeypatch):
-    """Episodes are simulated once for all cards."""
-    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path_factory.getbasetemp() / "episodes"))
 
 
 def test_every_method_of_ours_has_a_card():

@@ -23,8 +23,8 @@ KILL = ("open({log!r}, 'a').write('made\\n'); "
 
 
 @pytest.fixture(autouse=True)
-def cache(tmp_path_factory, monkeypatch):
-    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path_factory.getbasetemp() / "episodes"))
+def cache(run_cache, monkeypatch):
+    monkeypatch.setenv(CACHE_VARIABLE, run_cache)
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
 
 

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pandas as pd
 import pytest
-from choosing import injected
+from choosing import filter_of, injected
 from scipy.stats import t as student
 from short import merged
 
@@ -74,9 +74,9 @@ def test_belief_is_the_filter_inside(name):
         predicted = belief.predicted()
         observation, *_ = env.step(env.rules.action(pair))
         belief.see(observation)
-        inside = env.core._operator
+        inside = filter_of(env)
         np.testing.assert_array_equal(belief.mean, inside.means()[0])
-        np.testing.assert_array_equal(belief._operator.covariance, inside.covariance)
+        np.testing.assert_array_equal(filter_of(belief).covariance, inside.covariance)
         if name == NAME:                         # what it foretells: nothing was left out
             expected = inside.covariance[0].astype(float)
             np.testing.assert_allclose(belief.after(predicted, pair), expected, atol=2e-5 * np.abs(expected).max())
@@ -129,8 +129,8 @@ def test_beforehand_is_the_expected_liquid():
     """A belief without data is linear about the expected level, and at the level both derivatives agree."""
     env = environment(NAME)
     belief = Belief.beforehand(env.rules)
-    assert belief._operator.concentration[0] == pytest.approx(env.world.expected_concentration, rel=1e-12)
-    level = belief._operator.concentration[0]
+    assert filter_of(belief).concentration[0] == pytest.approx(env.world.expected_concentration, rel=1e-12)
+    level = filter_of(belief).concentration[0]
     assert np.abs(belief.mean / level - 1.0).max() < 0.01
     np.testing.assert_allclose(belief.relinearised(), belief.derivative, rtol=0.1,
                                atol=0.02 * np.abs(belief.derivative).max())

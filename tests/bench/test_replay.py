@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from short import PIPE, shorten
-from tiny import FILTER, SCENARIO
+from tiny import FILTER, SCENARIO, git_says
 from typer.testing import CliRunner
 
 from eitbench.bench import replay
@@ -20,10 +20,10 @@ INJECTION = "eitbench/Pipe2DInjection-v0"
 
 
 @pytest.fixture(autouse=True)
-def tiny_world(monkeypatch, tmp_path, tmp_path_factory):
+def tiny_world(monkeypatch, tmp_path, run_cache):
     """The registered environments play tiny worlds, in an empty folder."""
-    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path_factory.getbasetemp() / "episodes"))
-    monkeypatch.setattr(store_module, "_git", lambda *words: None)
+    monkeypatch.setenv(CACHE_VARIABLE, run_cache)
+    git_says(monkeypatch)
     shorten(monkeypatch, {FILTER.id: SCENARIO, INJECTION: PIPE})
     monkeypatch.chdir(tmp_path)
     store_module.provenance.cache_clear()

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from recorded import forget_made
 from scipy.optimize import minimize_scalar
 from short import merged
 from tiny import FILTER, FIXED_LAG, SCENARIO, SMOOTHING, count, counting, write_baseline
@@ -26,9 +27,9 @@ from eitbench.worlds.task import Estimate, Task
 
 
 @pytest.fixture(autouse=True)
-def cache(tmp_path_factory, monkeypatch):
+def cache(run_cache, monkeypatch):
     """One cache of episodes for all tests of this session."""
-    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path_factory.getbasetemp() / "episodes"))
+    monkeypatch.setenv(CACHE_VARIABLE, run_cache)
 
 
 @pytest.fixture
@@ -172,7 +173,7 @@ def test_estimators_cannot_spoil_the_task_for_others(tmp_path):
     try:
         assert scores_of(run_episode(Job(FILTER, good, 1))[0]) == before
     finally:
-        playing._made.cache_clear()                                 # what a vandal broke is no other test's affair
+        forget_made(playing)                                    # what a vandal broke is no other test's affair
 
 
 @pytest.mark.parametrize(("environment", "board"), [(FILTER, "filter"), (FIXED_LAG, "fixed-lag"),

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny import FILTER, FIXED_LAG, RUN, SCENARIO, sha, strict, write_baseline
+from tiny import FILTER, FIXED_LAG, RUN, SCENARIO, git_says, sha, strict, write_baseline
 
 from eitbench._files import PACKAGE
 from eitbench.bench import store as store_module
@@ -23,10 +23,10 @@ ENV, COMMAND = "eitbench/Pipe2D-v0", "eitbench run --seeds train:1-2"
 
 
 @pytest.fixture(autouse=True)
-def surroundings(tmp_path_factory, monkeypatch):
+def surroundings(run_cache, monkeypatch):
     """One cache of episodes for the session, and a commit that doesn't depend on where the tests run."""
-    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path_factory.getbasetemp() / "episodes"))
-    monkeypatch.setattr(store_module, "_git", lambda *words: "c0ffee" if "rev-parse" in words else "")
+    monkeypatch.setenv(CACHE_VARIABLE, run_cache)
+    git_says(monkeypatch, "c0ffee")
     provenance.cache_clear()
     yield
     provenance.cache_clear()
@@ -136,7 +136,7 @@ def played(tmp_path_factory):
     update = "assert voltages[0] != 0 or Path('x').exists(), 'silent'\n        return Estimate(self.level)"
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(CACHE_VARIABLE, str(folder / "cache"))
-        patch.setattr(store_module, "_git", lambda *words: "c0ffee" if "rev-parse" in words else "")
+        git_says(patch, "c0ffee")
         mine = write_baseline(folder, update=update, parameters="{'alpha': 0.5, 'order': [1, 2]}")
         bad = write_baseline(folder, "bad", update="raise RuntimeError('no')")
         run_jobs([Job(FILTER, path, seed) for path in (mine, bad) for seed in (1, 2)], EpisodeStore(folder),

@@ -5,7 +5,7 @@ import re
 
 import pytest
 from short import PIPE, shorten
-from tiny import FILTER, SCENARIO, SMOOTHING, count, counting, write_baseline
+from tiny import FILTER, SCENARIO, SMOOTHING, count, counting, git_says, write_baseline
 from typer.testing import CliRunner
 
 from eitbench.bench import baselines, load, run, suites
@@ -23,10 +23,10 @@ TEST = parse_seeds("test:0-1")
 
 
 @pytest.fixture(autouse=True)
-def tiny_world(monkeypatch, tmp_path, tmp_path_factory):
+def tiny_world(monkeypatch, tmp_path, run_cache):
     """The registered environments play tiny worlds, in an empty folder, from a clean commit."""
-    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path_factory.getbasetemp() / "episodes"))
-    monkeypatch.setattr(store_module, "_git", lambda *words: "c0ffee" if "rev-parse" in words else "")
+    monkeypatch.setenv(CACHE_VARIABLE, run_cache)
+    git_says(monkeypatch, "c0ffee")
     for name in (FILTER.id, SMOOTHING.id):
         shorten(monkeypatch, {name: SCENARIO})
     shorten(monkeypatch, {INJECTION: PIPE})
@@ -146,7 +146,7 @@ def test_official_needs_a_clean_commit(tmp_path, monkeypatch):
 
     for commit, message in (("c0ffee", "and changes to c0ffee"), (None, "outside a checkout")):
         with monkeypatch.context() as patch, pytest.raises(ValueError, match=f"official must be False .*{message}"):
-            patch.setattr(store_module, "_git", lambda *words, commit=commit: commit)
+            git_says(patch, commit, "M README.md")
             official()
         assert not (tmp_path / "r").exists() and not to.exists()
     (path,) = official()

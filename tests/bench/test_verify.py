@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from short import PIPE, merged, shorten
-from tiny import FILTER, SCENARIO, write_baseline
+from tiny import FILTER, SCENARIO, git_says, write_baseline
 from typer.testing import CliRunner
 
 from eitbench.bench import baselines, held_out, run
@@ -32,10 +32,10 @@ walled = pytest.mark.skipif(not landlock_version(), reason="this kernel has no L
 
 
 @pytest.fixture(autouse=True)
-def tiny_world(monkeypatch, tmp_path, tmp_path_factory):
+def tiny_world(monkeypatch, tmp_path, run_cache):
     """The registered environments play tiny worlds, in an empty folder."""
-    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path_factory.getbasetemp() / "episodes"))
-    monkeypatch.setattr(store_module, "_git", lambda *words: None)
+    monkeypatch.setenv(CACHE_VARIABLE, run_cache)
+    git_says(monkeypatch)
     shorten(monkeypatch, {FILTER.id: SCENARIO, INJECTION: PIPE})
     monkeypatch.setattr(held_out, "PUBLISHED", tmp_path / "leaderboards" / "held_out.json")
     monkeypatch.chdir(tmp_path)

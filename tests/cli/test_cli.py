@@ -9,9 +9,10 @@ from pathlib import Path
 
 import pytest
 from short import PLAIN, shorten, world
+from tiny import git_says
 from typer.testing import CliRunner
 
-from eitbench.bench import store, suites, tracks
+from eitbench.bench import suites, tracks
 from eitbench.bench.methods import own_methods
 from eitbench.bench.tracks import ids
 from eitbench.cli import app
@@ -41,13 +42,13 @@ class Estimator:
 
 
 @pytest.fixture(autouse=True)
-def tiny_world(monkeypatch, tmp_path, tmp_path_factory):
+def tiny_world(monkeypatch, tmp_path, run_cache):
     """The registered environments play tiny worlds, in an empty folder; git is left alone."""
-    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path_factory.getbasetemp() / "episodes"))
-    monkeypatch.setattr(store, "_git", lambda *words: None)
+    monkeypatch.setenv(CACHE_VARIABLE, run_cache)
+    git_says(monkeypatch)
     shorten(monkeypatch, {name: TINY if name in PLAIN else world(name)["world"] for name in ids()})
     lagged = replace(entry("eitbench/Pipe2DFixedLag-v0"), settings={"lag": 2})
-    monkeypatch.setitem(registry._entries, lagged.id, lagged)
+    registry.take_over([lagged])
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.py").write_text(MINE)
 

@@ -3,12 +3,12 @@ done is lost."""
 
 import re
 import shutil
-from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
 from joblib.externals.loky import get_reusable_executor
-from short import merged
+from recorded import forget
+from short import PLAIN, merged, shorten
 from tiny_worlds import CHANGES, TINY
 from typer.testing import CliRunner
 
@@ -20,7 +20,6 @@ from eitbench.data.episodes import simulate, simulate_together
 from eitbench.data.recordings import is_recorded, make_recording, recording, recording_path
 from eitbench.data.regions import are_kept, integrals_path
 from eitbench.data.store import CACHE_VARIABLE, folder
-from eitbench.worlds import registry
 from eitbench.worlds.pipe2d import PIPE_2D
 from eitbench.worlds.pipe2d_drifting import PIPE_2D_DRIFTING
 
@@ -33,18 +32,10 @@ def place(tmp_path, monkeypatch):
     """The ids of the plain pipe play the tiny world; recordings lie in a folder of this test's
     own."""
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
-    for name, each in registry.entries().items():
-        if each.world == PIPE_2D:
-            monkeypatch.setitem(registry._entries, name, replace(each, world=TINY))
+    shorten(monkeypatch, dict.fromkeys(PLAIN, CHANGES))
     forget()
     yield folder(TINY)
     forget()
-
-
-def forget():
-    """What a new process does not know: files found in order, and outlines."""
-    recordings._sound.clear()
-    recordings._outline.cache_clear()
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from recorded import forget_made
 from scipy.stats import kstest
 from short import merged
 from tiny_worlds import CHANGES, TINY
@@ -182,10 +183,10 @@ def test_file_of_something_else_is_rebuilt(other, counted, cache, monkeypatch):
     with monkeypatch.context() as patch:
         if other == "version":
             patch.setattr(store, "_code", lambda: "older code")
-            store._digest.cache_clear()
+            forget_made(store)
         world = TINY.changed({"instrument": {"current": 0.2}}) if other == "world" else TINY
         simulate(world, 8 if other == "seed" else 7)
-    store._digest.cache_clear()
+    forget_made(store)
     (stranger,) = files(cache)
     stranger.rename(path)
     assert_rebuilt(path, counted)

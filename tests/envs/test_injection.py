@@ -13,6 +13,7 @@ from choosing import (
     NAME,
     SHORT,
     arrays_of,
+    filter_of,
     make,
     play,
     some_actions,
@@ -129,7 +130,7 @@ def test_reward_is_the_decrease_of_the_error(estimator):
     played = base.world
     interpolation, mass = score_operators(played)
     truth = eitbench.simulate(played, 3).concentration.astype(float)
-    level = np.full(interpolation.shape[1], base.core._operator.concentration[0])
+    level = np.full(interpolation.shape[1], filter_of(base).concentration[0])
     paid = 0
     for k in range(played.n_steps - 16):
         reward = env.step(int(actions[k]))[1]

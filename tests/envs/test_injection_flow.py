@@ -7,7 +7,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
-from choosing import FLOW, NAME, make, some_pairs
+from choosing import FLOW, NAME, filter_of, make, some_pairs
 from short import WANDERING
 
 import eitbench
@@ -72,7 +72,7 @@ def test_errors_are_those_in_the_region(estimator):
     truth = eitbench.simulate(world, 3).concentration.astype(float)
     mesh = world.truth().transport.mesh
     onto = base.task.mesh.interpolation_to(mesh.points)
-    level = np.full(onto.shape[1], base.core._operator.concentration[0])
+    level = np.full(onto.shape[1], filter_of(base).concentration[0])
     paid = 0
     for k, action in enumerate(some_pairs()[:world.n_steps - 16]):
         reward = env.step(int(action))[1]
@@ -215,7 +215,7 @@ def test_single_precision_is_enough(env, shared):
     """Over an episode the operator's means differ from those of the same filter in double precision
     by 1e-4 at most."""
     observation, _ = env.reset(seed=5)
-    operator = env.core._operator
+    operator = filter_of(env)
     world = env.world
     r = len(shared.model.initial)
     mean = np.zeros((1, r + 1))
@@ -259,7 +259,7 @@ def test_full_operator_is_the_joint_filter_of_the_baselines():
     spec.loader.exec_module(baseline)
     baseline.BOUNDS = joint_operator.BOUNDS
     estimator = baseline.Estimator(task)
-    estimator.first.c_bh = level = env.core._operator.concentration[0]
+    estimator.first.c_bh = level = filter_of(env).concentration[0]
     filter_ = estimator.start(level)
     nodes = np.full(task.mesh.n_nodes, level)
     linear = LinearisedObservations(task.observation, task.noise, nodes)
@@ -286,7 +286,7 @@ def test_observation_shows_the_velocity(env):
     for action in some_pairs()[:3]:
         observation = env.step(int(action))[0]
     (velocity,), (std,) = observation["velocity"], observation["velocity_std"]
-    estimated, spread = env.core._operator.flow()
+    estimated, spread = filter_of(env).flow()
     assert velocity == estimated[0, 0] > 0.0
     assert 0.0 < std == spread[0, 0] < 1.0
     flat = scaled(env.rules, observation)
@@ -327,7 +327,7 @@ def test_told_the_truth_the_belief_moves_along_it(env, shared):
     """The true states are those of the recording, projected, and the true velocity; steps are
     linear about them."""
     belief = Belief(env.rules, env.reset(seed=3)[0])
-    operator = belief._operator
+    operator = filter_of(belief)
     entries = recording(env.world, 3)
     told = operator.truth(entries)
     truth = eitbench.simulate(env.world, 3)

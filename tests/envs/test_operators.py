@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from choosing import NAME, make, some_pairs
+from choosing import NAME, filter_of, make, some_pairs
 
 from eitbench import make_task
 from eitbench.data.recordings import cycle_voltages, recording
@@ -58,7 +58,7 @@ def test_reduced_one_is_close_to_the_baselines():
     full = kalman_filter(start, [linear(v, world.currents[t % 16]) for t, v in enumerate(voltages)])
     env.reset(seed=5)
     core = env.unwrapped.core
-    assert core._operator.concentration[0] == pytest.approx(first.c_bh, rel=0.011)
+    assert filter_of(env).concentration[0] == pytest.approx(first.c_bh, rel=0.011)
     for t in range(16, world.n_steps):
         env.step(number(world.currents[t % 16]))
         difference = core.estimate()[0][0] - full[t].mean
@@ -75,7 +75,7 @@ def test_full_one_is_that_of_the_baselines():
     core = env.unwrapped.core
     voltages = cycle_voltages(world, 5, recording(world, 5))
     env.reset(seed=5)
-    start = table_5_1(task.transport, task.prior, core._operator.concentration[0])
+    start = table_5_1(task.transport, task.prior, filter_of(env).concentration[0])
     linear = LinearisedObservations(task.observation, task.noise, start.mean)
     steps = kalman_filter(start, [linear(v, world.currents[t % 16])
                                   for t, v in enumerate(voltages)])
@@ -93,7 +93,7 @@ def test_grid_of_the_full_one_is_that_of_its_covariance():
     env = make("full")
     env.reset(seed=5)
     shown = env.step(7)[0]["std"]
-    operator = env.unwrapped.core._operator
+    operator = filter_of(env)
     filter_, averages = operator._filters[0], operator._patches
     unit = np.eye(averages.shape[1])
     covariance = filter_.covariance.apply(filter_.time, unit) - filter_.known @ filter_.known.T

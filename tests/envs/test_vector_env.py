@@ -15,7 +15,6 @@ from short import PIPE as CHANGES
 from short import PLAIN, short
 
 from eitbench.data.episodes import simulate
-from eitbench.data.store import CACHE_VARIABLE
 from eitbench.envs import estimation, estimation_vector
 from eitbench.worlds import entry
 from eitbench.worlds.pipe2d import PIPE_2D
@@ -25,14 +24,6 @@ LAGS = [name for name in PLAIN if name in ESTIMATION]
 """The plain pipe with its three lags; what does not depend on the world is tested on these."""
 TINY = PIPE_2D.changed(CHANGES)
 """Seven measurements, of which five are scored."""
-
-
-@pytest.fixture(autouse=True, scope="module")
-def cache(tmp_path_factory):
-    """One cache folder for all tests of this file."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv(CACHE_VARIABLE, str(tmp_path_factory.mktemp("episodes")))
-        yield
 
 
 def make(name=PIPE, num_envs=3, mode="vector_entry_point", **kwargs):

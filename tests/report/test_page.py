@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 from PIL import Image
 from short import short, shorten
-from tiny import FILTER, SCENARIO, SMOOTHING, write_baseline
+from tiny import FILTER, SCENARIO, SMOOTHING, git_says, write_baseline
 
-from eitbench.bench import store as store_module
 from eitbench.bench.run import Job, run_jobs
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.tracks import Environment
@@ -68,7 +67,7 @@ def two_worlds(tmp_path_factory):
     folder = tmp_path_factory.mktemp("worlds")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(CACHE_VARIABLE, str(folder / "cache"))
-        patch.setattr(store_module, "_git", lambda *words: None)
+        git_says(patch)
         store = EpisodeStore(folder)
         run_jobs([Job(environment, "homogeneous", 1) for environment in (TANK, FILTER)], store)
         records = store.write_records()
@@ -82,7 +81,7 @@ def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("page")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(CACHE_VARIABLE, str(folder / "cache"))
-        patch.setattr(store_module, "_git", lambda *words: None)
+        git_says(patch)
         for name in (FILTER.id, SMOOTHING.id):
             shorten(patch, {name: SCENARIO})
         evil = write_baseline(folder, "evil", doc=EVIL + ": bad.", update="return Estimate(self.level + self.calls)")

@@ -17,6 +17,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from short import register_apart
 from tiny import FILTER, SCENARIO, write_baseline
 
 from eitbench.bench.methods import load_method
@@ -145,8 +146,7 @@ def test_a_guest_is_told_a_script_s_world(tmp_path, monkeypatch):
     for name, text in SCRIPT.items():
         (tmp_path / f"{name}.py").write_text(text)
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(registry, "_entries", registry.entries())
-    monkeypatch.setattr(registry, "_by_hand", set(registry._by_hand))
+    register_apart(monkeypatch)
     target = replace(PIPE_2D.target, arrivals=import_module("arrivals_of_mine").Mine())
     world = replace(PIPE_2D.changed(SCENARIO), name="Told", target=target)
     try:

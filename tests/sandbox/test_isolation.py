@@ -12,6 +12,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from recorded import forget_made
 from short import PIPE
 from tiny import FILTER, FIXED_LAG, SMOOTHING, write_baseline
 
@@ -42,9 +43,9 @@ BY_LOT = "return int(self.random.integers(self.rules.action_space.n))"
 
 
 @pytest.fixture(autouse=True)
-def cache(tmp_path_factory, monkeypatch):
+def cache(run_cache, monkeypatch):
     """One cache of episodes for all tests of this session, and no guest left behind."""
-    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path_factory.getbasetemp() / "episodes"))
+    monkeypatch.setenv(CACHE_VARIABLE, run_cache)
     yield
     guests.close()
 
@@ -226,12 +227,12 @@ def test_a_guest_does_not_choose_its_name(tmp_path, monkeypatch):
     monkeypatch.setattr(guests, "own_files", lambda id: own(id) | {"ppo_seed3": ours})
     about = {"title": "Mine", "boards": ["injection"], "parameters": {}, "role": None, "suits": True}
     for name, refused in (("ppo_seed3", True), ("random_pair", True), ("ppo_seed4", False)):
-        guests._load.cache_clear()
+        forget_made(guests)
         monkeypatch.setattr(guests, "_enter", lambda *_, name=name: SimpleNamespace(about=about | {"name": name}))
         with pytest.raises(ValueError, match=f"model.zip has the name of one of ours, {name}") if refused else (
                 nullcontext()):
             assert Job(INJECTION, str(agent), 1, True).load().name == name
-    guests._load.cache_clear()
+    forget_made(guests)
 
 
 def test_ours_are_ours_by_path_too(tmp_path):

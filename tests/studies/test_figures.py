@@ -19,7 +19,7 @@ from eitbench.bench.methods import load_method
 from eitbench.bench.text import seed_ranges
 from eitbench.cli.studies import NAME, thesis
 from eitbench.data.seeds import name_seed
-from eitbench.data.store import CACHE_VARIABLE
+from eitbench.data.store import CACHE_VARIABLE, cache_folder
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.estimation import FirstFrame, initial_covariance
 from eitbench.physics.rest import AtRest
@@ -33,6 +33,7 @@ common, injection, obstacle, parameters, pipe2d, profiles, tanks, velocity = (
     ("common", "injection", "obstacle", "parameters", "pipe2d", "profiles", "tanks", "velocity"))
 error_of, estimates_of = common.error_of, common.estimates_of
 SEED = 100_000
+ORDINARY = str(cache_folder())
 PIPE = merged(CHANGES, {"schedule": {"scored_steps": 32}})
 """A fast fluid flushes the pipe in two steps; pictures of the pipe show states up to the 28th."""
 FLOW = merged(PIPE, {"flow": {"velocity_range": [55.0, 60.0], "velocity_std": 10.0}})
@@ -78,9 +79,10 @@ def constant(env, name, seed):
 
 
 @pytest.fixture(autouse=True)
-def tiny_worlds(monkeypatch, tmp_path_factory):
-    """Each figure's environment, small; episodes are shared by the tests."""
-    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path_factory.getbasetemp() / "figure-episodes"))
+def tiny_worlds(monkeypatch, run_cache):
+    """Each figure's environment, small; episodes are shared by the tests, and kept from all others,
+    since the flow past the bulge is another's here."""
+    monkeypatch.setenv(CACHE_VARIABLE, f"{run_cache}-of-figures")
     monkeypatch.setattr(pipe2d, "_env", lambda lag=0, mean_velocity=None: played_in(
         "Pipe2D", PIPE, lag=lag))
     monkeypatch.setattr(velocity, "_env", lambda flow: played_in(
@@ -155,14 +157,15 @@ def test_injection_is_drawn(monkeypatch, tmp_path):
                                                             for job in jobs)))}))
     monkeypatch.setattr(injection, "policy_rows", rows)
     monkeypatch.setattr(injection, "results_in", lambda folder: [])
-    shorten(monkeypatch, {injection.AT_WORK[0]: merged(SHORT, {"schedule": {"scored_steps": 3}})})
+    shorten(monkeypatch, {injection.AT_WORK[0]: SHORT})
+    monkeypatch.setenv(CACHE_VARIABLE, ORDINARY)            # where other tests' reduced model lies
     path, remark = FIGURES["injection"](None, 1, tmp_path / "new")
     picture = imread(path)
     assert min(picture.shape[:2]) > 250 and picture[..., :3].std() > 0.05
     assert list(played.items()) == [((env, "{}"), entry(env).seeds) for env in injection.WORLDS]
     assert remark.count("| best_pair |") == 6
     with Image.open(tmp_path / "new" / "injection.gif") as moving:
-        assert moving.n_frames == 3                        # the first frame of 16, then three steps
+        assert moving.n_frames == 4                        # the first frame of 16, then four steps
 
 
 def test_thesis_figures_show_dev_episodes_when_not_told(monkeypatch, tmp_path):

@@ -5,11 +5,12 @@ import hashlib
 import gymnasium as gym
 import numpy as np
 import pytest
+from short import register_apart
 
 from eitbench.numerics.mesh_files import write_mesh
 from eitbench.numerics.round import electrode_disc
 from eitbench.physics.cem import CompleteElectrodeModel
-from eitbench.worlds import World, register, registry
+from eitbench.worlds import World, register
 from eitbench.worlds.bodies import Cylinders
 from eitbench.worlds.flows import NoFlow
 from eitbench.worlds.mesh_vessel import MeshVessel
@@ -58,8 +59,7 @@ def test_electrodes_are_those_of_the_groups(files, vessel):
 
 def test_a_world_of_it_is_played(vessel, monkeypatch):
     """Registered by a script it plays as any other; no inlet, so that nothing flows in."""
-    monkeypatch.setattr(registry, "_entries", dict(registry._entries))
-    monkeypatch.setattr(registry, "_by_hand", set())
+    register_apart(monkeypatch)
     world = World("Meshed", vessel, NoFlow(), Cylinders(), schedule=Schedule(
         time_step=0.02, scored_steps=4, pattern=AroundTheTank(), warm_up=0, calibration=1))
     register(world, "test/Meshed-v0")

@@ -10,7 +10,7 @@ from importlib.metadata import EntryPoint
 import gymnasium as gym
 import numpy as np
 import pytest
-from short import PIPE
+from short import PIPE, register_apart
 
 import eitbench
 from eitbench.data import store
@@ -45,8 +45,7 @@ register(World("Theirs", PlanePipe(length=0.3), LaminarFlow(), Slugs()), "theirs
 @pytest.fixture(autouse=True)
 def restored(monkeypatch):
     """What is registered by a test is forgotten after it."""
-    monkeypatch.setattr(registry, "_entries", entries())
-    monkeypatch.setattr(registry, "_by_hand", set())
+    register_apart(monkeypatch)
     before = set(gym.registry)
     yield
     for id in set(gym.registry) - before:
