@@ -18,11 +18,12 @@ if TYPE_CHECKING:
     from eitbench.worlds.world import World
 
 __version__ = "0.1.0"
-__all__ = ["Episode", "Estimate", "Rules", "Task", "World", "make_task", "page", "register", "simulate"]
+__all__ = ["Episode", "Estimate", "Rules", "Task", "World",
+           "make_task", "page", "register", "simulate"]
 
-_LATER = {"Estimate": "worlds.task", "Task": "worlds.task", "make_task": "worlds.task", "World": "worlds.world",
-          "Episode": "data.episodes", "simulate": "data.episodes", "Rules": "estimation.onboard.rules",
-          "page": "envs.pages"}
+_LATER = {"Estimate": "worlds.task", "Task": "worlds.task", "make_task": "worlds.task",
+          "World": "worlds.world", "Episode": "data.episodes", "simulate": "data.episodes",
+          "Rules": "estimation.onboard.rules", "page": "envs.pages"}
 """Where the public names lie that are loaded on first use."""
 
 

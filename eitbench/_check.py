@@ -8,8 +8,8 @@ from collections.abc import Iterable
 import numpy as np
 
 
-def number(name: str, value: object, *, low: float = -math.inf, high: float = math.inf, open_low: bool = False,
-           units: str = "") -> float:
+def number(name: str, value: object, *, low: float = -math.inf, high: float = math.inf,
+           open_low: bool = False, units: str = "") -> float:
     """``value`` as a finite float within [low, high] (``open_low``: within (low, high]); else a
     ``ValueError``."""
     try:
@@ -20,7 +20,8 @@ def number(name: str, value: object, *, low: float = -math.inf, high: float = ma
         raise ValueError(f"{name} must be a number{_in(units)}, got {value!r}") from None
     if not math.isfinite(result) or result > high or result < low or (open_low and result == low):
         bracket = "(" if open_low else "["
-        raise ValueError(f"{name} must be a finite number in {bracket}{low:g}, {high:g}]{_in(units)}, got {value!r}")
+        raise ValueError(f"{name} must be a finite number in {bracket}{low:g}, {high:g}]"
+                         f"{_in(units)}, got {value!r}")
     return result
 
 
@@ -49,19 +50,23 @@ def array(name: str, value: object, shape: Iterable[int | None], *, units: str =
     try:
         result = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
-        raise ValueError(f"{name} must be an array of numbers{_in(units)}, got {type(value).__name__}") from None
+        raise ValueError(f"{name} must be an array of numbers{_in(units)}, got "
+                         f"{type(value).__name__}") from None
     trailing = result.shape[result.ndim - len(core):] if result.ndim >= len(core) else ()
     fits = (result.ndim >= len(core) if batched else result.ndim == len(core)) and all(
         want is None or want == have for want, have in zip(core, trailing, strict=True))
     if not fits:
-        text = ", ".join((["..."] if batched else []) + ["any" if w is None else str(w) for w in core])
+        lengths = ["any" if want is None else str(want) for want in core]
+        text = ", ".join(["..."] * batched + lengths)
         text += "," if len(wanted) == 1 else ""
         raise ValueError(f"{name} must have shape ({text}), got {result.shape}")
     if not np.isfinite(result).all():
-        raise ValueError(f"{name} must be finite{_in(units)}, got {np.count_nonzero(~np.isfinite(result))} "
-                         f"entries that are not, the first at index {_first(~np.isfinite(result))}")
+        wrong = ~np.isfinite(result)
+        raise ValueError(f"{name} must be finite{_in(units)}, got {np.count_nonzero(wrong)} "
+                         f"entries that are not, the first at index {_first(wrong)}")
     if positive and not (result > 0).all():
-        raise ValueError(f"{name} must be positive{_in(units)}, got {result.min():g} at index {_first(result <= 0)}")
+        raise ValueError(f"{name} must be positive{_in(units)}, got {result.min():g} at index "
+                         f"{_first(result <= 0)}")
     return result
 
 

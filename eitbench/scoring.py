@@ -10,7 +10,8 @@ import numpy as np
 from scipy.special import ndtr, ndtri
 
 
-def step_errors(estimate: np.ndarray, truth: np.ndarray, mass: Any, reference: float = 0.0) -> np.ndarray:
+def step_errors(estimate: np.ndarray, truth: np.ndarray, mass: Any,
+                reference: float = 0.0) -> np.ndarray:
     """∫(ĉ_t − c_t)² / ∫(c_t − reference)² for each t.
 
     Parameters
@@ -30,7 +31,8 @@ def step_errors(estimate: np.ndarray, truth: np.ndarray, mass: Any, reference: f
     return _squares(estimate - truth, mass) / _squares(truth - reference, mass)
 
 
-def relative_error(estimate: np.ndarray, truth: np.ndarray, mass: Any, reference: float = 0.0) -> float:
+def relative_error(estimate: np.ndarray, truth: np.ndarray, mass: Any,
+                   reference: float = 0.0) -> float:
     """ẽ_c = (1/T) Σ_t ∫(ĉ_t − c_t)² / ∫c_t² (thesis 5.12: squared, no root); arguments as in
     `step_errors`."""
     return float(step_errors(estimate, truth, mass, reference).mean())
@@ -61,11 +63,13 @@ def crps(mean: np.ndarray, std: np.ndarray, truth: np.ndarray, weights: np.ndarr
     spread = np.maximum(std, 1e-12 * np.maximum(error, 1e-300))
     z = error / spread
     density = np.exp(-0.5 * np.minimum(z, 40.0)**2) / math.sqrt(2 * math.pi)
-    score = np.where(std > 0, error * (2 * ndtr(z) - 1) + spread * (2 * density - 1 / math.sqrt(math.pi)), error)
+    gaussian = error * (2 * ndtr(z) - 1) + spread * (2 * density - 1 / math.sqrt(math.pi))
+    score = np.where(std > 0, gaussian, error)
     return float(np.average(score.mean(axis=0), weights=weights))
 
 
-def coverage(mean: np.ndarray, std: np.ndarray, truth: np.ndarray, weights: np.ndarray, level: float) -> float:
+def coverage(mean: np.ndarray, std: np.ndarray, truth: np.ndarray, weights: np.ndarray,
+             level: float) -> float:
     """Part of space and time where the truth lies in the central ``level`` interval of the Gaussian
     marginal."""
     mean, truth = _pair(mean, truth)
@@ -73,7 +77,8 @@ def coverage(mean: np.ndarray, std: np.ndarray, truth: np.ndarray, weights: np.n
                             weights=weights))
 
 
-def spread_ratio(mean: np.ndarray, std: np.ndarray, truth: np.ndarray, weights: np.ndarray) -> float:
+def spread_ratio(mean: np.ndarray, std: np.ndarray, truth: np.ndarray,
+                 weights: np.ndarray) -> float:
     """Mean variance over mean squared error; 1 when the claimed uncertainty is honest, above when
     too modest."""
     mean, truth = _pair(mean, truth)
@@ -108,9 +113,11 @@ def deficit_centre(values: np.ndarray, points: np.ndarray, weights: np.ndarray) 
 
 
 def _pair(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
+    a = np.asarray(a, dtype=float)
+    b = np.asarray(b, dtype=float)
     if a.shape != b.shape or a.ndim != 2:
-        raise ValueError(f"both arrays must have the same shape (T, n), got {a.shape} and {b.shape}")
+        raise ValueError("both arrays must have the same shape (T, n), got "
+                         f"{a.shape} and {b.shape}")
     return a, b
 
 

@@ -4,12 +4,12 @@ import json
 
 import gymnasium as gym
 import numpy as np
-from short import merged
-
 from eitbench.bench import playing
 from eitbench.bench.methods import load_method
 from eitbench.bench.scores import Outcome
 from eitbench.bench.tracks import Environment
+
+from short import merged
 
 NAME = "eitbench/Pipe2DInjection-v0"
 CURRENTS, FAULTS, BUDGET = (f"eitbench/Pipe2DInjection{kind}-v0" for kind in ("Currents", "Faults", "Budget"))

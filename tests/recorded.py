@@ -3,7 +3,6 @@
 import hashlib
 
 import numpy as np
-
 from eitbench.data import recordings
 
 HEADER = 256

@@ -11,9 +11,8 @@ from unittest import mock
 import numpy as np
 import scipy.sparse as sp
 import skfem
-from scipy.sparse.linalg import SuperLU, splu
-
 from eitbench.physics import cem, transport
+from scipy.sparse.linalg import SuperLU, splu
 
 SYMMETRIC = {"diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
 

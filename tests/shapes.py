@@ -8,10 +8,9 @@ from math import factorial
 from typing import NamedTuple
 
 import numpy as np
+from eitbench.numerics.mesh import Mesh, graded, rectangle_mesh
 from scipy.integrate import solve_ivp
 from scipy.special import roots_jacobi, spherical_jn
-
-from eitbench.numerics.mesh import Mesh, graded, rectangle_mesh
 
 # -- meshes -----------------------------------------------------------------------------------------------------------
 

@@ -1,7 +1,6 @@
 """What a table says, for tests that look up its cells."""
 
 import pandas as pd
-
 from eitbench.bench.table import Table
 
 

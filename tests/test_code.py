@@ -1,7 +1,6 @@
 """Digests of code: words do not count, all else does."""
 
 import pytest
-
 from eitbench._code import code_digest
 
 CODE = '''"""A module."""

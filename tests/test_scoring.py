@@ -3,8 +3,6 @@
 import numpy as np
 import pytest
 import scipy.integrate
-from scipy.stats import norm
-
 from eitbench.numerics.fem import mass_matrix
 from eitbench.numerics.mesh import rectangle_mesh
 from eitbench.scoring import (
@@ -18,6 +16,7 @@ from eitbench.scoring import (
     step_errors,
     voltage_discrepancy,
 )
+from scipy.stats import norm
 
 
 @pytest.fixture(scope="module")

@@ -1,8 +1,8 @@
 """Worlds whose episodes take a third of a second, made from ours."""
 
-from short import merged
-
 from eitbench.worlds.pipe2d import PIPE_2D
+
+from short import merged
 
 CHANGES = {"flow": {"mean_velocity": 45.0}, "vessel": {"electrodes_per_wall": 2},
            "schedule": {"scored_steps": 3, "pattern": {"frame": 2}}}

@@ -235,8 +235,8 @@ for _score in (
     Score("spent", "injections", "how many the policy made, where it is asked for them",
           lambda outcome: outcome.spent, better="none", needs=("spent",), tracks=("injection",)),
     Score("seconds_per_step", "ms/step",
-          "time per injection on one core, in the fastest episode: what is done once for a model is "
-          "left apart",
+          "time per injection on one core, in the fastest episode: what is done once for a model "
+          "is left apart",
           lambda outcome: outcome.seconds_per_step, tracks=TRACKS, factor=1e3, everywhere=True,
           repeats=False),
 ):

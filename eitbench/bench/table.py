@@ -1,5 +1,5 @@
-"""One model of a table: cells of text with the number to sort by. It becomes Markdown here, which is
-also what a terminal shows, and HTML in the pages of `eitbench.report`."""
+"""One model of a table: cells of text with the number to sort by. It becomes Markdown here, which
+is also what a terminal shows, and HTML in the pages of `eitbench.report`."""
 
 from __future__ import annotations
 

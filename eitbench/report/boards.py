@@ -1,4 +1,4 @@
-"""Leaderboards from records: ranks and intervals board by board, and an aggregate for each class."""
+"""Leaderboards from records: ranks and intervals board by board, an aggregate for each class."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ _BEFORE = ("class", "environment", "method", "version", "title", "rank", "note",
 _NUMBERS = ("error", "error_low", "error_high", "gain", "gain_low", "gain_high")
 _AFTER = {
     "matmuls_per_step": (
-        "products/step", "time per step in units of a 1000 × 1000 × 1000 matrix product on one thread "
-        "of that processor, the median of all that were timed on it"),
+        "products/step", "time per step in units of a 1000 × 1000 × 1000 matrix product on one "
+        "thread of that processor, the median of all that were timed on it"),
     "peak_memory": ("MB", "memory that the method's own process held at most"),
 }
 _FIRST = {
-    "rank": "one more than the number of methods that are significantly better; shared where none is. "
-            "Floors, references, privileged methods and those that have not finished every episode "
-            "have none",
+    "rank": "one more than the number of methods that are significantly better; shared where none "
+            "is. Floors, references, privileged methods and those that have not finished every "
+            "episode have none",
     "by": "who ran it: the maintainers (official), or its author (self-reported)",
     "ẽ_c": "relative estimation error (5.12), mean over episodes with its 95 % bootstrap interval; "
            "lower is better",
-    "gain": "1 − ẽ_c over that of the floor (homogeneous; random_pair) in the same episode: 0 as the "
-            "floor, 1 perfect. Interquartile mean with its 95 % bootstrap interval",
+    "gain": "1 − ẽ_c over that of the floor (homogeneous; random_pair) in the same episode: 0 as "
+            "the floor, 1 perfect. Interquartile mean with its 95 % bootstrap interval",
 }
 
 

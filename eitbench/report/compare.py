@@ -103,7 +103,8 @@ def _row(label: str, pairs: dict[str, tuple[dict[str, float], dict[str, float]]]
     means = [float(mean_over_environments(*[list(own.values()) for own in side.values()]))
              for side in (ours, theirs)]
     better = paired_probability_of_improvement(ours, theirs, higher_is_better=higher)
-    values = (label, sum(map(len, ours.values())), *means, *paired_difference(ours, theirs), *better)
+    values = (label, sum(map(len, ours.values())), *means, *paired_difference(ours, theirs),
+              *better)
     return dict(zip(FIELDS, values, strict=True))
 
 

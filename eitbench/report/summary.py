@@ -51,7 +51,8 @@ def summary(records: list[dict[str, Any]]) -> pd.DataFrame:
     worlds = sorted(set(table["world"]), key=place_of_world)
     keys = {"_split": table["split"].map(SPLITS.index), "_world": table["world"].map(worlds.index),
             "_board": table["board"].map(BOARDS.index), "_error": order}
-    ordered = table.assign(**keys).sort_values(["_split", "_world", "_board", "environment", "_error"])
+    by = ["_split", "_world", "_board", "environment", "_error"]
+    ordered = table.assign(**keys).sort_values(by)
     return ordered.drop(columns=list(keys)).reset_index(drop=True)
 
 
@@ -66,7 +67,8 @@ def summary_row(record: dict[str, Any], records: list[dict[str, Any]]) -> dict[s
         "episodes": len(status), "failed": sum(s != "ok" for s in status)}
     for name in columns():
         skills = name == "skill"
-        values = list((_skills(record, records) if skills else scores_by_seed(record, name)).values())
+        found = _skills(record, records) if skills else scores_by_seed(record, name)
+        values = list(found.values())
         row[name] = mean_and_interval(values) if values else None
         if name == "seconds_per_step" and values:
             row[name] = (min(values), math.inf)

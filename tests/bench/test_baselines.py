@@ -3,9 +3,9 @@
 import json
 
 import pytest
-from tiny import strict
-
 from eitbench.bench.methods import load_method, own_methods
+
+from tiny import strict
 
 
 def test_our_baselines_load():

@@ -5,11 +5,10 @@ import re
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
-
 from eitbench.bench import cards, methods
 from eitbench.bench.methods import baseline_folder, load_method, own_agents
 from eitbench.cli import app
+from typer.testing import CliRunner
 
 SLOW = ("filter_bank", "eitbench-Pipe2DInjectionFlow-v0--ppo")
 """Half a minute and more, whatever the episode."""

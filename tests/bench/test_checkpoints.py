@@ -5,12 +5,12 @@ import shutil
 
 import numpy as np
 import pytest
-from choosing import injected
-
 from eitbench.bench.methods import baseline_folder, load_method, own_agents
 from eitbench.bench.run import Job, run_episode
 from eitbench.bench.sandbox import guests
 from eitbench.bench.tracks import Environment, ids
+
+from choosing import injected
 
 FOLDER = baseline_folder() / "checkpoints"
 AGENTS = [path for env in ids("injection") for path in own_agents(env)]

@@ -8,13 +8,13 @@ import importlib
 import importlib.util
 
 import pytest
-from tiny import FILTER, count, write_baseline
-
 from eitbench.bench.run import Job, run_episode, run_jobs
 from eitbench.bench.store import EpisodeStore
 from eitbench.data import parallel
 from eitbench.data.parallel import BACKENDS, WorkerLost, in_parallel
 from eitbench.data.store import CACHE_VARIABLE
+
+from tiny import FILTER, count, write_baseline
 
 CLUSTERS = {"ray": "ray", "dask": "distributed"}
 KILL = ("open({log!r}, 'a').write('made\\n'); "

@@ -5,10 +5,6 @@ import json
 import numpy as np
 import pandas as pd
 import pytest
-from choosing import filter_of, injected
-from scipy.stats import t as student
-from short import merged
-
 from eitbench.bench import playing, run
 from eitbench.bench.methods import load_method, own_methods
 from eitbench.bench.run import Job, run_jobs
@@ -21,6 +17,10 @@ from eitbench.estimation.onboard.rules import Rules
 from eitbench.report import policy_table
 from eitbench.report.policy_table import adaptivity_gap, policy_rows
 from eitbench.worlds.pipe2d import PIPE_2D
+from scipy.stats import t as student
+
+from choosing import filter_of, injected
+from short import merged
 
 NAME = "eitbench/Pipe2DInjection-v0"
 CURRENTS, FAULTS, BUDGET = (f"eitbench/Pipe2DInjection{kind}-v0" for kind in ("Currents", "Faults", "Budget"))

@@ -2,13 +2,10 @@
 
 import json
 
+import eitbench
 import numpy as np
 import pandas as pd
 import pytest
-from choosing import BUDGET, FAULTS, FLOW, NAME, make, world
-from tiny import record
-
-import eitbench
 from eitbench import scoring
 from eitbench.bench import playing
 from eitbench.bench.methods import load_method
@@ -19,6 +16,9 @@ from eitbench.data.regions import mass_between
 from eitbench.numerics.fem import mass_matrix
 from eitbench.report import boards, policy_table, summary
 from eitbench.worlds import entry
+
+from choosing import BUDGET, FAULTS, FLOW, NAME, make, world
+from tiny import record
 
 SEED = 5
 CLAIMS = ("nis", "crps", "coverage_50", "coverage_90", "spread_ratio")

@@ -5,8 +5,6 @@ import json
 import warnings
 
 import pytest
-from tiny import RUN, episode, record, sha, strict
-
 from eitbench._files import shipped
 from eitbench.bench.migrate import migrate
 from eitbench.bench.records import (
@@ -20,6 +18,8 @@ from eitbench.bench.records import (
     write_record,
 )
 from eitbench.bench.tracks import named
+
+from tiny import RUN, episode, record, sha, strict
 
 MINE = record("mine", [0.1, 0.25, None], parameters={"alpha": 0.1, "order": [1, 2], "β": 1e-22})
 

@@ -5,16 +5,16 @@ import re
 from pathlib import Path
 
 import pytest
-from short import PIPE, shorten
-from tiny import FILTER, SCENARIO, git_says
-from typer.testing import CliRunner
-
 from eitbench.bench import replay
 from eitbench.bench import store as store_module
 from eitbench.bench.records import write_record
 from eitbench.bench.replay import by_environment, differing, official_records, verify_all
 from eitbench.cli import app
 from eitbench.data.store import CACHE_VARIABLE, cache_folder
+from typer.testing import CliRunner
+
+from short import PIPE, shorten
+from tiny import FILTER, SCENARIO, git_says
 
 INJECTION = "eitbench/Pipe2DInjection-v0"
 

@@ -8,11 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from recorded import forget_made
-from scipy.optimize import minimize_scalar
-from short import merged
-from tiny import FILTER, FIXED_LAG, SCENARIO, SMOOTHING, count, counting, write_baseline
-
 from eitbench.bench import playing, run
 from eitbench.bench.methods import Method
 from eitbench.bench.outcomes import Said
@@ -24,6 +19,11 @@ from eitbench.data.episodes import simulate, truth_discretisation
 from eitbench.data.store import CACHE_VARIABLE
 from eitbench.worlds.pipe2d import PIPE_2D
 from eitbench.worlds.task import Estimate, Task
+from scipy.optimize import minimize_scalar
+
+from recorded import forget_made
+from short import merged
+from tiny import FILTER, FIXED_LAG, SCENARIO, SMOOTHING, count, counting, write_baseline
 
 
 @pytest.fixture(autouse=True)

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tables import said
-
 from eitbench.bench import scores
 from eitbench.bench.records import read_records
 from eitbench.bench.scores import Outcome, Score, register_score, scored
 from eitbench.report import boards, compare, summary
 from eitbench.report.site import render, render_site
 from eitbench.worlds import entry
+
+from tables import said
 
 PUBLISHED = Path(__file__).parents[2] / "leaderboards" / "results"
 WORLD = entry("eitbench/Pipe2D-v0").world

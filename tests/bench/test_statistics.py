@@ -10,8 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy import stats
-
 from eitbench.bench.statistics import (
     interquartile_mean,
     mean_over_environments,
@@ -22,6 +20,7 @@ from eitbench.bench.statistics import (
     stratified_bootstrap,
     tail,
 )
+from scipy import stats
 
 
 def seeded(values, split="test"):

@@ -9,8 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny import FILTER, FIXED_LAG, RUN, SCENARIO, git_says, sha, strict, write_baseline
-
 from eitbench._files import PACKAGE
 from eitbench.bench import store as store_module
 from eitbench.bench.run import Job, run_jobs
@@ -18,6 +16,8 @@ from eitbench.bench.store import EpisodeStore, machine, provenance, results_of, 
 from eitbench.bench.tracks import Environment
 from eitbench.data.seeds import name_seed
 from eitbench.data.store import CACHE_VARIABLE
+
+from tiny import FILTER, FIXED_LAG, RUN, SCENARIO, git_says, sha, strict, write_baseline
 
 ENV, COMMAND = "eitbench/Pipe2D-v0", "eitbench run --seeds train:1-2"
 

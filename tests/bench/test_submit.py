@@ -4,10 +4,6 @@ import json
 import re
 
 import pytest
-from short import PIPE, shorten
-from tiny import FILTER, SCENARIO, SMOOTHING, count, counting, git_says, write_baseline
-from typer.testing import CliRunner
-
 from eitbench.bench import baselines, load, run, suites
 from eitbench.bench import store as store_module
 from eitbench.bench.records import newest, read_record, read_records, sealed, write_record
@@ -17,6 +13,10 @@ from eitbench.cli import app
 from eitbench.data import bank
 from eitbench.data.seeds import parse_seeds
 from eitbench.data.store import CACHE_VARIABLE
+from typer.testing import CliRunner
+
+from short import PIPE, shorten
+from tiny import FILTER, SCENARIO, SMOOTHING, count, counting, git_says, write_baseline
 
 INJECTION = "eitbench/Pipe2DInjection-v0"
 TEST = parse_seeds("test:0-1")

@@ -9,10 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from short import PIPE, merged, shorten
-from tiny import FILTER, SCENARIO, git_says, write_baseline
-from typer.testing import CliRunner
-
 from eitbench.bench import baselines, held_out, run
 from eitbench.bench import store as store_module
 from eitbench.bench import verify as verification
@@ -25,6 +21,10 @@ from eitbench.data.episodes import simulate
 from eitbench.data.seeds import SPLITS, parse_seeds
 from eitbench.data.store import CACHE_VARIABLE, cache_folder, folder
 from eitbench.worlds.pipe2d import PIPE_2D
+from typer.testing import CliRunner
+
+from short import PIPE, merged, shorten
+from tiny import FILTER, SCENARIO, git_says, write_baseline
 
 INJECTION = "eitbench/Pipe2DInjection-v0"
 SALT = bytes(range(32))

@@ -9,7 +9,6 @@ import copy
 import json
 
 import pytest
-
 from eitbench.bench import world_cards as cards
 from eitbench.bench.world_cards import (
     CARDS,

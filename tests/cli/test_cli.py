@@ -8,10 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from short import PLAIN, shorten, world
-from tiny import git_says
-from typer.testing import CliRunner
-
 from eitbench.bench import suites, tracks
 from eitbench.bench.methods import own_methods
 from eitbench.bench.tracks import ids
@@ -19,6 +15,10 @@ from eitbench.cli import app
 from eitbench.data.seeds import parse_seeds
 from eitbench.data.store import CACHE_VARIABLE
 from eitbench.worlds import entry, registry
+from typer.testing import CliRunner
+
+from short import PLAIN, shorten, world
+from tiny import git_says
 
 ROOT = Path(__file__).parents[2]
 PIPE, INJECTION = "eitbench/Pipe2D-v0", "eitbench/Pipe2DInjection-v0"

@@ -3,12 +3,12 @@
 from types import SimpleNamespace
 
 import pytest
-from recorded import bits, forget
-from tiny_worlds import TINY
-
 from eitbench.data import recordings
 from eitbench.data.episodes import simulate
 from eitbench.data.store import CACHE_VARIABLE
+
+from recorded import bits, forget
+from tiny_worlds import TINY
 
 
 @pytest.fixture

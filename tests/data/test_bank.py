@@ -5,14 +5,8 @@ import re
 import shutil
 from types import SimpleNamespace
 
-import pytest
-from joblib.externals.loky import get_reusable_executor
-from recorded import forget
-from short import PLAIN, merged, shorten
-from tiny_worlds import CHANGES, TINY
-from typer.testing import CliRunner
-
 import eitbench  # noqa: F401 (registers)
+import pytest
 from eitbench.cli import app
 from eitbench.data import bank, recordings
 from eitbench.data.bank import fill, recording_bytes
@@ -22,6 +16,12 @@ from eitbench.data.regions import are_kept, integrals_path
 from eitbench.data.store import CACHE_VARIABLE, folder
 from eitbench.worlds.pipe2d import PIPE_2D
 from eitbench.worlds.pipe2d_drifting import PIPE_2D_DRIFTING
+from joblib.externals.loky import get_reusable_executor
+from typer.testing import CliRunner
+
+from recorded import forget
+from short import PLAIN, merged, shorten
+from tiny_worlds import CHANGES, TINY
 
 SEEDS = range(10)
 """A full batch of eight and a remainder."""

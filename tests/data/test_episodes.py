@@ -9,16 +9,16 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from recorded import forget_made
-from scipy.stats import kstest
-from short import merged
-from tiny_worlds import CHANGES, TINY
-
 from eitbench.data import episodes, store
 from eitbench.data.episodes import Episode, simulate, truth_discretisation
 from eitbench.data.store import CACHE_VARIABLE
 from eitbench.worlds.parts import Discretisation
 from eitbench.worlds.pipe2d import PIPE_2D
+from scipy.stats import kstest
+
+from recorded import forget_made
+from short import merged
+from tiny_worlds import CHANGES, TINY
 
 
 @pytest.fixture(autouse=True)

@@ -12,14 +12,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny_worlds import TINY
-
 from eitbench._files import write_atomically
 from eitbench.data import store
 from eitbench.data.store import CACHE_VARIABLE, cache_folder, folder, kept, load, save
 from eitbench.worlds.flows import LaminarFlow
 from eitbench.worlds.instrument import Instrument
 from eitbench.worlds.parts import Prior
+
+from tiny_worlds import TINY
 
 NAMES = ("small", "large", "empty")
 RNG = np.random.default_rng(3)

@@ -4,13 +4,10 @@ import os
 import subprocess
 import sys
 
+import eitbench  # noqa: F401 (registers)
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from recorded import bits, digest, forget, outline_bits
-from tiny_worlds import CHANGES, TINY
-
-import eitbench  # noqa: F401 (registers)
 from eitbench.data import episodes, recordings
 from eitbench.data.episodes import truth_discretisation
 from eitbench.data.recordings import (
@@ -22,6 +19,9 @@ from eitbench.data.recordings import (
     step_error,
 )
 from eitbench.data.store import CACHE_VARIABLE
+
+from recorded import bits, digest, forget, outline_bits
+from tiny_worlds import CHANGES, TINY
 
 pytestmark = pytest.mark.usefixtures("cache")
 

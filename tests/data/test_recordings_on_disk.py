@@ -2,13 +2,10 @@
 
 import os
 
+import eitbench  # noqa: F401 (registers)
 import gymnasium as gym
 import numpy as np
 import pytest
-from recorded import HEADER, bits, forget, outline_bits
-from tiny_worlds import CHANGES, TINY
-
-import eitbench  # noqa: F401 (registers)
 from eitbench.data import recordings, store
 from eitbench.data.recordings import (
     SPARSE,
@@ -21,6 +18,9 @@ from eitbench.data.recordings import (
 )
 from eitbench.data.store import CACHE_VARIABLE, folder
 from eitbench.worlds.pipe2d import PIPE_2D
+
+from recorded import HEADER, bits, forget, outline_bits
+from tiny_worlds import CHANGES, TINY
 
 pytestmark = pytest.mark.usefixtures("cache")
 

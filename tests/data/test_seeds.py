@@ -3,10 +3,9 @@
 from itertools import combinations
 
 import pytest
+from eitbench.data.seeds import SPLITS, name_seed, parse_seeds
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
-from eitbench.data.seeds import SPLITS, name_seed, parse_seeds
 
 numbers = st.integers(0, 99_999)
 unhurried = settings(deadline=None)                                   # a busy machine is no failure

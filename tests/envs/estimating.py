@@ -2,9 +2,9 @@
 
 import gymnasium as gym
 import numpy as np
-from short import short
-
 from eitbench.worlds import entries, entry
+
+from short import short
 
 ESTIMATION = [id for id, each in entries().items() if each.track == "estimation"]
 PIPE, BIASED = "eitbench/Pipe2D-v0", "eitbench/Pipe2DBiasedVelocity-v0"

@@ -4,13 +4,13 @@ import copy
 
 import numpy as np
 import pytest
-from choosing import BUDGET, FAULTS, FLOW, NAME, TANK, make, some_pairs
-
 from eitbench.bench.scores import Outcome, scored
 from eitbench.envs.injection import InjectionVectorEnv
 from eitbench.estimation import KalmanFilter
 from eitbench.estimation.onboard.operator import FullOperator, Levels
 from eitbench.estimation.onboard.reduced_operator import ReducedOperator
+
+from choosing import BUDGET, FAULTS, FLOW, NAME, TANK, make, some_pairs
 
 
 def predicted(filter_, estimator: str, n: int):

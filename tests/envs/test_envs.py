@@ -10,15 +10,15 @@ import sys
 import gymnasium as gym
 import numpy as np
 import pytest
-from estimating import ESTIMATION, PIPE, make, noise_actions, play
-from gymnasium.utils.env_checker import check_env
-from short import SHORT, short
-from stable_baselines3.common.env_checker import check_env as check_env_sb3
-
 from eitbench.data.episodes import Episode
 from eitbench.data.store import CACHE_VARIABLE
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.worlds import Flow, Target, World, entries
+from estimating import ESTIMATION, PIPE, make, noise_actions, play
+from gymnasium.utils.env_checker import check_env
+from stable_baselines3.common.env_checker import check_env as check_env_sb3
+
+from short import SHORT, short
 
 
 @pytest.fixture(scope="module", params=ESTIMATION)

@@ -4,11 +4,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from estimating import PIPE, SKEWED, VELOCITY, make
-
 from eitbench import Estimate
 from eitbench.bench.playing import estimated
 from eitbench.bench.scores import scored
+from estimating import PIPE, SKEWED, VELOCITY, make
 
 
 @pytest.mark.parametrize("name", VELOCITY)

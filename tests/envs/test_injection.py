@@ -3,9 +3,17 @@ side."""
 
 import pickle
 
+import eitbench
 import gymnasium as gym
 import numpy as np
 import pytest
+from eitbench.data.recordings import cycle_voltages, recording, score_operators
+from eitbench.estimation.onboard.operator import electrode_pairs
+from eitbench.estimation.onboard.reduced_operator import ReducedOperator
+from eitbench.worlds import entries
+from gymnasium.utils.env_checker import check_env
+from stable_baselines3.common.env_checker import check_env as check_env_sb3
+
 from choosing import (
     CURRENTS,
     FAULTS,
@@ -20,14 +28,6 @@ from choosing import (
     some_pairs,
     world,
 )
-from gymnasium.utils.env_checker import check_env
-from stable_baselines3.common.env_checker import check_env as check_env_sb3
-
-import eitbench
-from eitbench.data.recordings import cycle_voltages, recording, score_operators
-from eitbench.estimation.onboard.operator import electrode_pairs
-from eitbench.estimation.onboard.reduced_operator import ReducedOperator
-from eitbench.worlds import entries
 
 INJECTION = [id for id, each in entries().items() if each.track == "injection"]
 every = pytest.mark.parametrize("name", INJECTION)

@@ -4,13 +4,10 @@ import dataclasses
 import importlib.util
 from pathlib import Path
 
+import eitbench
 import gymnasium as gym
 import numpy as np
 import pytest
-from choosing import FLOW, NAME, filter_of, make, some_pairs
-from short import WANDERING
-
-import eitbench
 from eitbench.data import regions
 from eitbench.data.bank import fill, missing_seeds, recording_bytes
 from eitbench.data.recordings import cycle_voltages, outline, recording, recording_path
@@ -31,6 +28,9 @@ from eitbench.estimation.reduced_joint import JointTables, joint_step
 from eitbench.numerics.fem import mass_matrix
 from eitbench.worlds.pipe2d_drifting import PIPE_2D_DRIFTING
 from eitbench.worlds.task import make_task
+
+from choosing import FLOW, NAME, filter_of, make, some_pairs
+from short import WANDERING
 
 ROOT = Path(__file__).parents[2]
 BASELINE = ROOT / "baselines" / "joint_extended_kalman_filter.py"

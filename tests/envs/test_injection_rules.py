@@ -3,13 +3,13 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from choosing import BUDGET, CURRENTS, FAULTS, NAME, make, play, some_pairs
-
 from eitbench.estimation.onboard.operator import electrode_pairs
 from eitbench.estimation.onboard.rules import Rules
 from eitbench.worlds import entry
 from eitbench.worlds.instrument import Faults, Instrument
 from eitbench.worlds.pipe2d import PIPE_2D
+
+from choosing import BUDGET, CURRENTS, FAULTS, NAME, make, play, some_pairs
 
 
 @pytest.mark.parametrize(("limit", "order"), [("L1", 1), ("L2", 2), ("Linf", np.inf)])

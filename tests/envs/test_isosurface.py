@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-
 from eitbench.envs.isosurface import isosurface
 from eitbench.numerics.round import extrude, uniform_disc
 

@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-from choosing import NAME, filter_of, make, some_pairs
-
 from eitbench import make_task
 from eitbench.data.recordings import cycle_voltages, recording
 from eitbench.data.store import CACHE_VARIABLE
@@ -12,6 +10,8 @@ from eitbench.estimation.onboard import reduced_operator
 from eitbench.estimation.onboard.operator import electrode_pairs
 from eitbench.estimation.reduced import ReducedModel
 from eitbench.worlds import entry
+
+from choosing import NAME, filter_of, make, some_pairs
 
 PAIRS = electrode_pairs(16).tolist()
 

@@ -5,10 +5,9 @@ import re
 
 import gymnasium as gym
 import pytest
-from gymnasium import spaces
-
 from eitbench import page
 from eitbench.worlds import entries
+from gymnasium import spaces
 
 
 @pytest.fixture(scope="module", params=list(entries()))

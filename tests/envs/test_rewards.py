@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-from estimating import ESTIMATION, VELOCITY, best_velocity, make
-
 from eitbench import scoring
 from eitbench.data.recordings import score_operators
 from eitbench.worlds import entry
+from estimating import ESTIMATION, VELOCITY, best_velocity, make
 
 PARAMETERS = {"Pipe2DUnknownVelocity": 1, "Pipe2DTimeVaryingVelocity": 1, "Pipe2DSkewedVelocity": 3}
 """Of the flow, by the name of the world."""

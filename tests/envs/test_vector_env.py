@@ -8,17 +8,17 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
-from estimating import ESTIMATION, PIPE
-from gymnasium.envs.registration import EnvSpec
-from gymnasium.vector import AutoresetMode
-from short import PIPE as CHANGES
-from short import PLAIN, short
-
 from eitbench.data.episodes import simulate
 from eitbench.envs import estimation, estimation_vector
 from eitbench.worlds import entry
 from eitbench.worlds.pipe2d import PIPE_2D
 from eitbench.worlds.task import lag_steps
+from estimating import ESTIMATION, PIPE
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.vector import AutoresetMode
+
+from short import PIPE as CHANGES
+from short import PLAIN, short
 
 LAGS = [name for name in PLAIN if name in ESTIMATION]
 """The plain pipe with its three lags; what does not depend on the world is tested on these."""

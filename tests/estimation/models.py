@@ -5,7 +5,6 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-
 from eitbench.estimation import (
     FreeCovariance,
     KalmanFilter,

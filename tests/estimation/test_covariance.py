@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 import scipy.linalg
-from models import pipe, random_model
-
 from eitbench.estimation import FreeCovariance
+from models import pipe, random_model
 
 TIMES = [0, 1, 2, 3, 7, 8, 20, 60, 200]
 

@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-from models import dense_filter, draw, random_design, random_model
-
 from eitbench.estimation.dense import DenseKalmanFilter
 from eitbench.estimation.kalman import Observation
+from models import dense_filter, draw, random_design, random_model
 
 
 def run(model, observations):

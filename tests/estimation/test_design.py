@@ -4,10 +4,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from models import LinearGaussian, dense_filter
-
 from eitbench.estimation import LinearisedObservations, kalman_filter, table_5_1
 from eitbench.estimation.design import independent_rows, pair_gains, pair_tables
 from eitbench.estimation.onboard.operator import electrode_pairs
@@ -15,6 +11,9 @@ from eitbench.numerics.fem import mass_matrix
 from eitbench.numerics.mesh import rectangle_mesh
 from eitbench.worlds.pipe2d import PIPE_2D
 from eitbench.worlds.vessels import PlanePipe
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from models import LinearGaussian, dense_filter
 
 L, N = 5, 9
 PAIRS = electrode_pairs(L)

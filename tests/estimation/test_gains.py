@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
-from models import dense_filter, draw, joint_posterior, pipe, random_design, random_model, rauch_tung_striebel
-
 from eitbench.estimation import fixed_interval_smoother, gain_sequence, kalman_filter
+from models import dense_filter, draw, joint_posterior, pipe, random_design, random_model, rauch_tung_striebel
 
 
 @pytest.fixture

@@ -4,12 +4,11 @@ import numpy as np
 import pytest
 import scipy.optimize
 import scipy.sparse as sp
-from models import QuadraticModel
-
 from eitbench.estimation import best_homogeneous, gauss_newton
 from eitbench.numerics.mesh import rectangle_mesh
 from eitbench.physics.cem import CompleteElectrodeModel
 from eitbench.physics.observation import KohlrauschConductivity, ObservationModel, VoltageNoise
+from models import QuadraticModel
 
 
 class Linear:

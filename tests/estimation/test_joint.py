@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
-from models import LinearGaussian, dense_filter
-
 from eitbench.estimation.joint import JointFilter
 from eitbench.estimation.kalman import Observation
 from eitbench.numerics.mesh import rectangle_mesh
 from eitbench.physics.transport import ConvectionDiffusion
+from models import LinearGaussian, dense_filter
 
 # -- a coarse pipe of 147 nodes, seen by local averages ---------------------------------------------------------------
 

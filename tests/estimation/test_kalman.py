@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
-from models import QuadraticModel, dense_filter, draw, pipe, random_design, random_model
-from scipy.stats import chi2
-
 from eitbench.estimation import KalmanFilter, LinearisedObservations, Observation, kalman_filter, linearised
 from eitbench.physics.observation import VoltageNoise
 from eitbench.scoring import normalised_innovations
+from models import QuadraticModel, dense_filter, draw, pipe, random_design, random_model
+from scipy.stats import chi2
 
 
 def assert_same(steps, reference, tolerance):

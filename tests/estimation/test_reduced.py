@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 import scipy.linalg
-from models import LinearGaussian, dense_filter, draw, random_design, random_model
-
 from eitbench.estimation import Observation, kalman_filter
 from eitbench.estimation.reduced import ReducedFilter, ReducedModel, reduced_model
+from models import LinearGaussian, dense_filter, draw, random_design, random_model
 
 
 @pytest.fixture

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-
 from eitbench.estimation.reduced_joint import JointTables, ReducedJointFilter, joint_model
 
 

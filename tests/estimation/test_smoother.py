@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-from models import dense_filter, draw, joint_posterior, pipe, random_design, random_model, rauch_tung_striebel
-
 from eitbench.estimation import (
     DenseKalmanFilter,
     Observation,
@@ -12,6 +10,7 @@ from eitbench.estimation import (
     smoothed_means,
     smoothed_state,
 )
+from models import dense_filter, draw, joint_posterior, pipe, random_design, random_model, rauch_tung_striebel
 
 
 @pytest.fixture

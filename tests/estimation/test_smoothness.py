@@ -6,9 +6,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.linalg import cho_factor, cho_solve, eigvalsh
-from scipy.special import kv
-
 from eitbench.estimation import (
     LinearisedObservations,
     gauss_newton,
@@ -21,6 +18,8 @@ from eitbench.numerics.round import uniform_disc
 from eitbench.worlds.bodies import disc_indicator
 from eitbench.worlds.stationary_tank import STATIONARY_TANK_2D
 from eitbench.worlds.task import make_task
+from scipy.linalg import cho_factor, cho_solve, eigvalsh
+from scipy.special import kv
 
 LENGTH, STD = 0.1, 2.0
 

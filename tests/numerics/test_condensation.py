@@ -10,11 +10,11 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from numpy.testing import assert_allclose, assert_array_equal
-from references import SuperLUCondensation
-
 from eitbench.numerics import condensation
 from eitbench.numerics.condensation import Condensation
+from numpy.testing import assert_allclose, assert_array_equal
+
+from references import SuperLUCondensation
 
 both = pytest.mark.parametrize("kind", [Condensation, SuperLUCondensation])
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from eitbench.numerics.fem import mass_matrix, stiffness_matrix
+from eitbench.numerics.mesh import Mesh, graded, graded_pipe_mesh, rectangle_mesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
-from shapes import disc_mesh, shaken_box, shaken_rectangle
 
-from eitbench.numerics.fem import mass_matrix, stiffness_matrix
-from eitbench.numerics.mesh import Mesh, graded, graded_pipe_mesh, rectangle_mesh
+from shapes import disc_mesh, shaken_box, shaken_rectangle
 
 RNG = np.random.default_rng(11)
 SIZE = np.array([1.0, 0.8, 0.6])

@@ -7,13 +7,13 @@ from pathlib import Path
 import meshio
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose, assert_array_equal
-from shapes import end_facets, shaken_box, shaken_rectangle
-
 from eitbench.numerics.mesh import Mesh
 from eitbench.numerics.mesh_files import read_mesh, write_mesh
 from eitbench.physics.cem import CompleteElectrodeModel
 from eitbench.physics.transport import inlet_nodes
+from numpy.testing import assert_allclose, assert_array_equal
+
+from shapes import end_facets, shaken_box, shaken_rectangle
 
 SIZE = np.array([1.0, 0.8, 0.6])
 MESHES = {2: shaken_rectangle(*SIZE[:2], (6, 5), np.random.default_rng(11)),

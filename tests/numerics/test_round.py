@@ -6,11 +6,10 @@ import re
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose, assert_array_equal
-
 from eitbench.numerics.fem import mass_matrix
 from eitbench.numerics.mesh import Mesh, graded, rectangle_mesh
 from eitbench.numerics.round import disc_mesh, electrode_disc, extrude, round_pipe_mesh, uniform_disc
+from numpy.testing import assert_allclose, assert_array_equal
 
 R = 0.05
 CENTRES = 2 * np.pi * np.arange(8) / 8

@@ -6,13 +6,13 @@ What holds for the compiled substitution holds for the tests' own reference too.
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from numpy.testing import assert_allclose, assert_array_equal
-from references import SuperLUSolver, reference_flow
-
 from eitbench.numerics.mesh import rectangle_mesh
 from eitbench.numerics.sparse_lu import SparseLU
 from eitbench.physics.flow import PlaneChannelFlow
 from eitbench.physics.transport import ConvectionDiffusion
+from numpy.testing import assert_allclose, assert_array_equal
+
+from references import SuperLUSolver, reference_flow
 
 both = pytest.mark.parametrize("kind", [SparseLU, SuperLUSolver])
 WIDTHS = (1, 7, 8, 9, 20)

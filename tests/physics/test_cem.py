@@ -6,7 +6,11 @@ from functools import cache
 
 import numpy as np
 import pytest
+from eitbench.numerics.mesh import Mesh, graded_pipe_mesh
+from eitbench.physics.cem import CompleteElectrodeModel
+from eitbench.worlds.pipe2d import PIPE_2D
 from numpy.testing import assert_allclose
+
 from references import reference_model, unsymmetrised
 from shapes import (
     annulus_resistance,
@@ -21,10 +25,6 @@ from shapes import (
     shaken_rectangle,
     slab_resistance,
 )
-
-from eitbench.numerics.mesh import Mesh, graded_pipe_mesh
-from eitbench.physics.cem import CompleteElectrodeModel
-from eitbench.worlds.pipe2d import PIPE_2D
 
 # -- a small problem in each dimension, with nothing symmetric about it -----------------------------------------------
 

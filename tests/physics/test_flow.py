@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-
 from eitbench.numerics.fem import mass_matrix
 from eitbench.numerics.mesh import rectangle_mesh
 from eitbench.numerics.round import uniform_disc

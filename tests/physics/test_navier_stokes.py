@@ -7,13 +7,13 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose, assert_array_equal
-from shapes import polar_mesh, shaken_box, shaken_rectangle
-
 from eitbench.numerics.fem import mass_matrix
 from eitbench.numerics.mesh import Mesh, graded, rectangle_mesh
 from eitbench.physics.flow import PlaneChannelFlow
 from eitbench.physics.navier_stokes import SteadyFlow, steady_flow
+from numpy.testing import assert_allclose, assert_array_equal
+
+from shapes import polar_mesh, shaken_box, shaken_rectangle
 
 # -- helpers ----------------------------------------------------------------------------------------------------------
 

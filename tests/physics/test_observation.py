@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose, assert_array_equal
-
 from eitbench.numerics.mesh import rectangle_mesh
 from eitbench.physics.cem import CompleteElectrodeModel
 from eitbench.physics.observation import KohlrauschConductivity, LinearConductivity, ObservationModel, VoltageNoise
+from numpy.testing import assert_allclose, assert_array_equal
 
 LAWS = [LinearConductivity(0.011), KohlrauschConductivity()]
 PATTERNS = np.array([[1.0, -1.0, 0.0, 0.0], [0.0, 0.5, -1.5, 1.0], [0.3, 0.3, 0.3, -0.9]])

@@ -5,7 +5,6 @@ import math
 
 import numpy as np
 import pytest
-
 from eitbench.physics.flow import PlaneChannelFlow
 from eitbench.physics.profiles import SkewedChannelFlow, VelocityModel, parabola
 from eitbench.worlds.pipe2d_skewed import PIPE_2D_SKEWED

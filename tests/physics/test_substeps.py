@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose, assert_array_equal
-
 from eitbench.numerics.memory import scratch
 from eitbench.numerics.mesh import rectangle_mesh
 from eitbench.physics.flow import PlaneChannelFlow
 from eitbench.physics.transport import MANY, ConvectionDiffusion, _supg_matrices
+from numpy.testing import assert_allclose, assert_array_equal
 
 MESH = rectangle_mesh(np.linspace(0.0, 1.0, 13), np.linspace(-0.25, 0.25, 7))
 FLOW = PlaneChannelFlow(1.0, 0.25)

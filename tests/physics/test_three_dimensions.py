@@ -6,16 +6,16 @@ from functools import cache
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose, assert_array_equal
-from references import reference_model, unsymmetrised
-from shapes import annulus_resistance, polar_mesh, ring_facets, slab_resistance
-
 from eitbench.numerics.fem import mass_matrix
 from eitbench.numerics.mesh import Mesh
 from eitbench.numerics.round import electrode_disc, extrude, round_pipe_mesh, uniform_disc
 from eitbench.physics.cem import CompleteElectrodeModel
 from eitbench.physics.flow import RoundPipeFlow
 from eitbench.physics.transport import ConvectionDiffusion, _supg_matrices
+from numpy.testing import assert_allclose, assert_array_equal
+
+from references import reference_model, unsymmetrised
+from shapes import annulus_resistance, polar_mesh, ring_facets, slab_resistance
 
 R = 0.05
 CENTRES = 2 * np.pi * np.arange(4) / 4

@@ -5,7 +5,6 @@ from itertools import pairwise, permutations
 import numpy as np
 import pytest
 import scipy.linalg
-
 from eitbench.numerics.fem import mass_matrix
 from eitbench.numerics.mesh import Mesh, rectangle_mesh
 from eitbench.physics.flow import PlaneChannelFlow

@@ -8,17 +8,17 @@ import sys
 from itertools import pairwise
 from pathlib import Path
 
+import eitbench
 import numpy as np
 import pandas as pd
 import pytest
-from tiny import BOARD_IDS, RUN, record, sha
-
-import eitbench
 from eitbench.bench import load
 from eitbench.bench.records import read_records, write_record
 from eitbench.bench.statistics import interquartile_mean, stratified_bootstrap
 from eitbench.report.boards import ALL, boards, class_of, fields
 from eitbench.report.site import render
+
+from tiny import BOARD_IDS, RUN, record, sha
 
 ROOT = Path(__file__).parents[2]
 FLOOR = [0.20, 0.24, 0.22, 0.26, 0.18, 0.30, 0.25, 0.21]

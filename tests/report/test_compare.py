@@ -6,13 +6,13 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from tables import said
-from tiny import record, sha
-
 from eitbench.bench.records import write_record
 from eitbench.bench.statistics import paired_difference, paired_probability_of_improvement
 from eitbench.bench.text import scores_by_seed
 from eitbench.report.compare import compare, find, html, names, shown
+
+from tables import said
+from tiny import record, sha
 
 TANK = "eitbench/RotatingTank2D-v0"
 PIPE_NAME, TANK_NAME = "eitbench-Pipe2D-v0", "eitbench-RotatingTank2D-v0"

@@ -10,10 +10,6 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from PIL import Image
-from short import short, shorten
-from tiny import FILTER, SCENARIO, SMOOTHING, git_says, write_baseline
-
 from eitbench.bench.run import Job, run_jobs
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.tracks import Environment
@@ -22,6 +18,10 @@ from eitbench.numerics.round import extrude, uniform_disc
 from eitbench.report import charts, page
 from eitbench.report.summary import explanations, shown, summary
 from eitbench.worlds.pipe3d import PIPE_3D
+from PIL import Image
+
+from short import short, shorten
+from tiny import FILTER, SCENARIO, SMOOTHING, git_says, write_baseline
 
 EVIL = "Evil <script>alert('x')</script> & \\\"co\\\""
 """A title as it stands in a docstring; the page must show it and not run it."""

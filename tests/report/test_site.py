@@ -14,10 +14,6 @@ from xml.etree import ElementTree
 import numpy as np
 import pandas as pd
 import pytest
-from PIL import Image
-from test_page import Page, svgs
-from tiny import RUN, record, several_boards
-
 from eitbench.bench.records import read_records, write_record
 from eitbench.bench.text import number, with_interval
 from eitbench.bench.tracks import ids
@@ -27,6 +23,10 @@ from eitbench.report.site import read_media, render_site, write_site
 from eitbench.report.site.collect import Row, collect
 from eitbench.report.site.environment import _told, documentation, learning_curves, markdown
 from eitbench.report.site.method import command
+from PIL import Image
+from test_page import Page, svgs
+
+from tiny import RUN, record, several_boards
 
 ROOT = Path(__file__).parents[2]
 BUDGET = "eitbench-Pipe2DInjectionBudget-v0"

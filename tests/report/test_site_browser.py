@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 from browser import Browser, executable
-from tiny import several_boards
-
 from eitbench.report.boards import boards
 from eitbench.report.site import render_site, write_site
+
+from tiny import several_boards
 
 pytestmark = pytest.mark.skipif(executable() is None, reason="there is no Chromium or Chrome on the PATH")
 STYLE = Path(__file__).parents[2] / "eitbench" / "report" / "style.css"

@@ -5,14 +5,14 @@ import re
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from scipy import stats
-from tables import said
-
 from eitbench.bench.scores import scores as registered
 from eitbench.bench.text import mean_and_interval, number, rounded, scores_by_seed, seed_ranges
 from eitbench.report.summary import explanations, shown, summary
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from tables import said
 
 unhurried = settings(deadline=None)                                                     # a busy machine is no failure
 BOARD_IDS = {"filter": "eitbench/Pipe2D-v0", "fixed-lag": "eitbench/Pipe2DFixedLag-v0",

@@ -7,10 +7,6 @@ from zipfile import ZIP_DEFLATED, ZipFile
 import gymnasium as gym
 import numpy as np
 import pytest
-from choosing import injected
-from short import merged
-from threadpoolctl import threadpool_limits
-
 from eitbench.bench.methods import load_method
 from eitbench.envs.injection import InjectionVectorEnv
 from eitbench.estimation.onboard.rules import Rules
@@ -19,6 +15,10 @@ from eitbench.rl.agents import _mark, load_agent
 from eitbench.rl.training import Config, read_config, train
 from eitbench.rl.vec_env import InjectionVecEnv
 from eitbench.worlds.pipe2d import PIPE_2D
+from threadpoolctl import threadpool_limits
+
+from choosing import injected
+from short import merged
 
 NAME = "eitbench/Pipe2DInjection-v0"
 CURRENTS, BUDGET = "eitbench/Pipe2DInjectionCurrents-v0", "eitbench/Pipe2DInjectionBudget-v0"

@@ -14,12 +14,6 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
-from short import register_apart
-from tiny import FILTER, SCENARIO, write_baseline
-
 from eitbench.bench.methods import load_method
 from eitbench.bench.sandbox import wall, wire
 from eitbench.bench.sandbox.host import Guest, GuestError
@@ -29,6 +23,12 @@ from eitbench.data.recordings import cycle_voltages, recording
 from eitbench.data.store import CACHE_VARIABLE
 from eitbench.worlds import registry
 from eitbench.worlds.pipe2d import PIPE_2D
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from short import register_apart
+from tiny import FILTER, SCENARIO, write_baseline
 
 KWARGS = json.loads(FILTER.kwargs)
 walled = pytest.mark.skipif(not landlock_version(), reason="this kernel has no Landlock")

@@ -12,10 +12,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from recorded import forget_made
-from short import PIPE
-from tiny import FILTER, FIXED_LAG, SMOOTHING, write_baseline
-
 from eitbench.bench import suites
 from eitbench.bench.methods import own_methods
 from eitbench.bench.run import Job, run_episode, run_jobs
@@ -24,6 +20,10 @@ from eitbench.bench.sandbox.wall import landlock_version
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.tracks import Environment
 from eitbench.data.store import CACHE_VARIABLE
+
+from recorded import forget_made
+from short import PIPE
+from tiny import FILTER, FIXED_LAG, SMOOTHING, write_baseline
 
 INJECTION = Environment("eitbench/Pipe2DInjection-v0", json.dumps({"world": PIPE, "estimator": "reduced"}))
 WALL = "landlock" if landlock_version() else "process"

@@ -9,12 +9,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from choosing import SHORT
-from matplotlib.image import imread
-from PIL import Image
-from short import merged, shorten
-from tiny_worlds import CHANGES
-
 from eitbench.bench.methods import load_method
 from eitbench.bench.text import seed_ranges
 from eitbench.cli.studies import NAME, thesis
@@ -26,6 +20,12 @@ from eitbench.physics.rest import AtRest
 from eitbench.worlds import entry
 from eitbench.worlds.flows import FlowPastBulge, _past_bulge
 from eitbench.worlds.task import Estimate
+from matplotlib.image import imread
+from PIL import Image
+
+from choosing import SHORT
+from short import merged, shorten
+from tiny_worlds import CHANGES
 
 FIGURES = thesis().FIGURES
 common, injection, obstacle, parameters, pipe2d, profiles, tanks, velocity = (

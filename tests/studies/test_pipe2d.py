@@ -8,7 +8,6 @@ import importlib
 
 import numpy as np
 import pytest
-
 from eitbench import make_task, simulate
 from eitbench.bench.methods import load_method
 from eitbench.bench.run import Job, run_episode

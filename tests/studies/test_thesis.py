@@ -10,7 +10,6 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-
 from eitbench.bench.run import Job, run_episode
 from eitbench.bench.tracks import Environment
 from eitbench.data.seeds import parse_seeds

@@ -4,7 +4,6 @@ import dataclasses
 import pickle
 
 import pytest
-
 from eitbench.data import store
 from eitbench.worlds import entries
 from eitbench.worlds.pipe2d import PIPE_2D

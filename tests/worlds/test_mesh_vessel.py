@@ -5,8 +5,6 @@ import hashlib
 import gymnasium as gym
 import numpy as np
 import pytest
-from short import register_apart
-
 from eitbench.numerics.mesh_files import write_mesh
 from eitbench.numerics.round import electrode_disc
 from eitbench.physics.cem import CompleteElectrodeModel
@@ -16,6 +14,8 @@ from eitbench.worlds.flows import NoFlow
 from eitbench.worlds.mesh_vessel import MeshVessel
 from eitbench.worlds.schedule import AroundTheTank, Schedule
 from eitbench.worlds.vessels import RoundTank
+
+from short import register_apart
 
 TANK = RoundTank(n_electrodes=8)
 

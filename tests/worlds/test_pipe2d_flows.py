@@ -3,10 +3,6 @@ carry."""
 
 import numpy as np
 import pytest
-from scipy.stats import kstest
-from short import merged
-from tiny_worlds import CHANGES, FAST, TINY
-
 from eitbench.data import episodes
 from eitbench.data.episodes import simulate, truth_discretisation
 from eitbench.physics.flow import PlaneChannelFlow
@@ -16,6 +12,10 @@ from eitbench.worlds.pipe2d_skewed import PIPE_2D_SKEWED
 from eitbench.worlds.pipe2d_time_varying import PIPE_2D_TIME_VARYING
 from eitbench.worlds.pipe2d_unknown import PIPE_2D_UNKNOWN
 from eitbench.worlds.streams import randomness
+from scipy.stats import kstest
+
+from short import merged
+from tiny_worlds import CHANGES, FAST, TINY
 
 WORLDS = (PIPE_2D_BIASED, PIPE_2D_UNKNOWN, PIPE_2D_TIME_VARYING, PIPE_2D_SKEWED)
 each_world = pytest.mark.parametrize("world", WORLDS, ids=lambda world: world.name)

@@ -3,7 +3,6 @@ the model."""
 
 import numpy as np
 import pytest
-
 from eitbench.worlds.pipe3d import PIPE_3D
 
 SMALL = PIPE_3D.changed({

@@ -7,16 +7,16 @@ import sys
 from dataclasses import dataclass, replace
 from importlib.metadata import EntryPoint
 
+import eitbench
 import gymnasium as gym
 import numpy as np
 import pytest
-from short import PIPE, register_apart
-
-import eitbench
 from eitbench.data import store
 from eitbench.worlds import entries, entry, register, registry
 from eitbench.worlds.pipe2d import PIPE_2D
 from eitbench.worlds.slugs import Slugs
+
+from short import PIPE, register_apart
 
 ID = "mine/Quiet-v0"
 

@@ -9,9 +9,6 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
-from scipy.stats import kstest
-
 from eitbench.data.episodes import simulate, simulate_together, truth_discretisation
 from eitbench.numerics.fem import mass_matrix
 from eitbench.numerics.round import electrode_disc
@@ -22,6 +19,8 @@ from eitbench.worlds.stationary_tank import STATIONARY_TANK_2D as STATIONARY
 from eitbench.worlds.streams import randomness
 from eitbench.worlds.task import make_task
 from eitbench.worlds.vessels import RoundTank
+from scipy.integrate import solve_ivp
+from scipy.stats import kstest
 
 SHORT = ROTATING.changed({"schedule": {"warm_up": 1, "scored_steps": 3},
                           "vessel": {"n_electrodes": 8}})

@@ -4,18 +4,18 @@ import functools
 import types
 from dataclasses import FrozenInstanceError, replace
 
+import eitbench  # noqa: F401 (registers)
 import numpy as np
 import pytest
-from short import merged
-from tiny_worlds import CHANGES, TINY
-
-import eitbench  # noqa: F401 (registers)
 from eitbench.data.episodes import Episode, simulate, truth_discretisation
 from eitbench.data.store import CACHE_VARIABLE
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.worlds.pipe2d import PIPE_2D
 from eitbench.worlds.task import make_task
 from eitbench.worlds.world import World
+
+from short import merged
+from tiny_worlds import CHANGES, TINY
 
 
 def environment(**kwargs):

@@ -68,7 +68,8 @@ def _nothing(words: dict[str, Any], arrays: dict[str, np.ndarray]) -> Reply:
     raise ValueError("the first message must be 'play'")
 
 
-def _player(words: dict[str, Any], arrays: dict[str, np.ndarray]) -> tuple[Callable[..., Reply], dict[str, Any]]:
+def _player(words: dict[str, Any], arrays: dict[str, np.ndarray],
+            ) -> tuple[Callable[..., Reply], dict[str, Any]]:
     """What answers from now on, and what the method says of itself."""
     import gymnasium as gym
 
@@ -102,7 +103,8 @@ def _estimator(task: Any, method: Any) -> Callable[..., Reply]:
             return {"estimate": None}, {}
         if not hasattr(estimate, "_asdict"):
             return {"estimate": type(estimate).__name__}, {}
-        said = {key: np.asarray(value) for key, value in estimate._asdict().items() if value is not None}
+        said = {key: np.asarray(value) for key, value in estimate._asdict().items()
+                if value is not None}
         return {"estimate": "Estimate"}, said
 
     return answer

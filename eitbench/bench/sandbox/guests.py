@@ -65,7 +65,8 @@ class _Elsewhere:
 
     def __call__(self, world: Any, random: np.random.Generator | None = None) -> Guest:
         guest = self._enter()
-        guest.begin(0 if random is None else random.bit_generator.seed_seq.entropy)  # type: ignore[attr-defined]
+        origin: Any = None if random is None else random.bit_generator
+        guest.begin(0 if origin is None else origin.seed_seq.entropy)
         return guest
 
 
@@ -100,8 +101,8 @@ def _load(track: str, id: str, kwargs: str, method: str, path: Path, sha256: str
         raise ValueError(f"{path} says nonsense of its {', '.join(wrong)}")
     ours = own_files(id).get(about["name"])
     if ours is not None and hashlib.sha256(ours.read_bytes()).hexdigest() != sha256:
-        raise ValueError(f"{path} has the name of one of ours, {about['name']}, under which results "
-                         "are kept")
+        raise ValueError(f"{path} has the name of one of ours, {about['name']}, under which "
+                         "results are kept")
     # in the one that its guest knows
     there = _Elsewhere(enter, lambda world: bool(about.get("suits")))
     return Method(track, about["name"], about["title"], path, sha256, tuple(about["boards"]),

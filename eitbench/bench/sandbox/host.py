@@ -136,7 +136,8 @@ class Guest:
             status = Path(f"/proc/{self._process.pid}/status").read_text()
         except OSError:
             return None
-        return next((1024 * int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM")), None)
+        return next((1024 * int(line.split()[1]) for line in status.splitlines()
+                     if line.startswith("VmHWM")), None)
 
     def close(self) -> None:
         """End it and its children, and remove its folder."""
@@ -163,10 +164,15 @@ class Guest:
             shutil.copy(model, cache / there.name)
         _copy_kernels(kernels)
         package = PACKAGE.parent
-        arithmetic = {name: value for name, value in os.environ.items() if name.startswith(ARITHMETIC)}
+        arithmetic = {name: value for name, value in os.environ.items()
+                      if name.startswith(ARITHMETIC)}
         return arithmetic | {
-            "PATH": os.environ.get("PATH", ""), "HOME": str(self._private), "TMPDIR": str(self._private),
-            "PYTHONPATH": str(package), "PYTHONDONTWRITEBYTECODE": "1", "NUMBA_CACHE_DIR": str(kernels),
+            "PATH": os.environ.get("PATH", ""),
+            "HOME": str(self._private),
+            "TMPDIR": str(self._private),
+            "PYTHONPATH": str(package),
+            "PYTHONDONTWRITEBYTECODE": "1",
+            "NUMBA_CACHE_DIR": str(kernels),
             CACHE_VARIABLE: str(cache),
         } | dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
@@ -193,17 +199,21 @@ class Guest:
             self._end()
             raise
         if "error" in answer[0]:
-            error = GuestError(_plain(answer[0]["error"]).replace(f"{self._private}{os.sep}own{os.sep}", ""))
+            own = f"{self._private}{os.sep}own{os.sep}"
+            error = GuestError(_plain(answer[0]["error"]).replace(own, ""))
             error.where = _plain(answer[0].get("where"))
             raise error
         return answer
 
     def _send(self, message: bytes) -> None:
         assert self._process.stdin is not None
-        pipe, deadline, left = self._process.stdin.fileno(), time.monotonic() + self._patience, memoryview(message)
+        pipe = self._process.stdin.fileno()
+        deadline = time.monotonic() + self._patience
+        left = memoryview(message)
         while left:                                    # a pipe that nobody reads is full some time
             if not select.select([], [pipe], [], max(0.0, deadline - time.monotonic()))[1]:
-                raise GuestError(f"TimeoutError: a question was not read within {self._patience:g} s")
+                raise GuestError("TimeoutError: a question was not read within "
+                                 f"{self._patience:g} s")
             try:
                 left = left[os.write(pipe, left):]
             except BrokenPipeError:
@@ -211,10 +221,12 @@ class Guest:
 
     def _receive(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         assert self._process.stdout is not None
-        pipe, deadline = self._process.stdout.fileno(), time.monotonic() + self._patience
+        pipe = self._process.stdout.fileno()
+        deadline = time.monotonic() + self._patience
 
         def read(n: int) -> bytes:
-            parts, left = [], n
+            parts = []
+            left = n
             while left:
                 if not select.select([pipe], [], [], max(0.0, deadline - time.monotonic()))[0]:
                     raise GuestError(f"TimeoutError: no answer within {self._patience:g} s")
@@ -231,8 +243,8 @@ class Guest:
             raise GuestError(f"ValueError: {error}") from None
 
     def _ended(self) -> GuestError:
-        return GuestError(f"ChildProcessError: its process ended with status {self._end()}, which is what a crash "
-                          "does, or a limit of memory")
+        return GuestError(f"ChildProcessError: its process ended with status {self._end()}, which "
+                          "is what a crash does, or a limit of memory")
 
     def _end(self) -> int:
         """Kill it and all processes of its session; its status."""
@@ -268,9 +280,10 @@ def _told(id: str) -> np.ndarray:
 def _refuse_open_cache(readable: list[str]) -> None:
     """``ValueError`` if the truths of episodes are kept in one of these places or beneath."""
     cache = cache_folder().resolve()
-    if place := next((place for place in readable if cache.is_relative_to(Path(place).resolve())), None):
-        raise ValueError(f"the cache folder {cache} lies in {place}, which guests may read; let $EITBENCH_CACHE name "
-                         "another")
+    for place in readable:
+        if cache.is_relative_to(Path(place).resolve()):
+            raise ValueError(f"the cache folder {cache} lies in {place}, which guests may read; "
+                             "let $EITBENCH_CACHE name another")
 
 
 def _plain(said: Any) -> str:

@@ -37,8 +37,8 @@ _REFUSED_CALLS = {
         101, 310, 311, 298, 321,  # ptrace, others' memory, perf events, bpf
         141, 142, 144, 314, 251, 203)),  # priorities and processors, of others too
     "aarch64": (0xC00000B7, 261, (
-        198, 199, 425, 154, 157, 26, 27, 262, 263, 264, 265, 52, 53, 452, 54, 55, 88, 5, 6, 7, 463, 14, 15, 16, 466,
-        117, 270, 271, 241, 280, 140, 118, 119, 274, 30, 122)),
+        198, 199, 425, 154, 157, 26, 27, 262, 263, 264, 265, 52, 53, 452, 54, 55,
+        88, 5, 6, 7, 463, 14, 15, 16, 466, 117, 270, 271, 241, 280, 140, 118, 119, 274, 30, 122)),
 }
 """Architecture as the kernel names it, the number of its call prlimit64, which may ask about the
 process itself, and those of the calls that are refused; the second in the order of the first, which
@@ -52,13 +52,14 @@ _FOREIGN = 0x40000000
 """From here on calls have x86_64's other numbers, for 32-bit pointers."""
 
 
-_SETTINGS = ("ld.so.cache", "localtime", "timezone", "passwd", "group", "nsswitch.conf", "mime.types", "os-release",
-             "fonts", "alternatives")
+_SETTINGS = ("ld.so.cache", "localtime", "timezone", "passwd", "group", "nsswitch.conf",
+             "mime.types", "os-release", "fonts", "alternatives")
 """What programs look up in /etc; much else there is not for everybody."""
 
 
 class _Ruleset(ctypes.Structure):
-    _fields_ = (("files", ctypes.c_uint64), ("network", ctypes.c_uint64), ("scoped", ctypes.c_uint64))
+    _fields_ = (("files", ctypes.c_uint64), ("network", ctypes.c_uint64),
+                ("scoped", ctypes.c_uint64))
 
 
 class _Beneath(ctypes.Structure):
@@ -68,8 +69,8 @@ class _Beneath(ctypes.Structure):
 
 
 class _Step(ctypes.Structure):
-    _fields_ = (("deed", ctypes.c_uint16), ("skip_if", ctypes.c_uint8), ("skip_else", ctypes.c_uint8),
-                ("value", ctypes.c_uint32))
+    _fields_ = (("deed", ctypes.c_uint16), ("skip_if", ctypes.c_uint8),
+                ("skip_else", ctypes.c_uint8), ("value", ctypes.c_uint32))
 
 
 class _Filter(ctypes.Structure):
@@ -93,7 +94,8 @@ def close_files(readable: Iterable[Path], writable: Iterable[Path]) -> bool:
     version = landlock_version()
     if not version:
         return False
-    libc, everything = _libc(), _ALL[max(known for known in _ALL if known <= version)]
+    libc = _libc()
+    everything = _ALL[max(known for known in _ALL if known <= version)]
     asked = _Ruleset(everything, 0b11 if version >= 4 else 0, 0b11 if version >= 6 else 0)
     size = 24 if version >= 6 else 16 if version >= 4 else 8
     ruleset = _checked(libc.syscall(_CREATE, ctypes.byref(asked), size, 0))
@@ -130,8 +132,10 @@ def refuse_calls() -> bool:
             (_RETURN, 0, 0, _ALLOWED), (_RETURN, 0, 0, _REFUSED)]
     steps = [(_LOAD, 0, 0, _ARCHITECTURE), (_EQUAL, 1, 0, architecture), (_RETURN, 0, 0, _REFUSED),
              (_LOAD, 0, 0, _CALL),
-             *((deed, len(asked) - i + len(last) - 2, 0, value) for i, (deed, value) in enumerate(asked)), *last]
-    libc, content = _libc(), (_Step * len(steps))(*(_Step(*step) for step in steps))
+             *((deed, len(asked) - i + len(last) - 2, 0, value)
+               for i, (deed, value) in enumerate(asked)), *last]
+    libc = _libc()
+    content = (_Step * len(steps))(*(_Step(*step) for step in steps))
     _checked(libc.prctl(_NO_NEW_PRIVILEGES, 1, 0, 0, 0))
     return bool(libc.prctl(*_FILTER_CALLS, ctypes.byref(_Filter(len(steps), content)), 0, 0) == 0)
 
@@ -156,10 +160,12 @@ def python_files() -> list[Path]:
     package = PACKAGE
     # else others lie beside
     checkout = package.parent if (package.parent / "pyproject.toml").exists() else None
-    places = [sys.prefix, sys.base_prefix, sys.exec_prefix, str(package), str(package.parent / "baselines"), "/usr",
-              "/lib", "/lib64", "/bin", *(f"/etc/{name}" for name in _SETTINGS), "/dev/null", "/dev/urandom",
-              "/dev/zero", f"/proc/{os.getpid()}", "/proc/cpuinfo", "/proc/meminfo", "/proc/stat",
-              "/sys/devices/system/cpu", *(place for place in sys.path if place and Path(place) != checkout)]
+    places = [sys.prefix, sys.base_prefix, sys.exec_prefix,
+              str(package), str(package.parent / "baselines"), "/usr", "/lib", "/lib64", "/bin",
+              *(f"/etc/{name}" for name in _SETTINGS), "/dev/null", "/dev/urandom", "/dev/zero",
+              f"/proc/{os.getpid()}", "/proc/cpuinfo", "/proc/meminfo", "/proc/stat",
+              "/sys/devices/system/cpu",
+              *(place for place in sys.path if place and Path(place) != checkout)]
     return [Path(place) for place in places]
 
 
@@ -169,5 +175,6 @@ def _libc() -> ctypes.CDLL:
 
 def _checked(result: int) -> int:
     if result < 0:
-        raise OSError(ctypes.get_errno(), f"a limit of this process: {os.strerror(ctypes.get_errno())}")
+        code = ctypes.get_errno()
+        raise OSError(code, f"a limit of this process: {os.strerror(code)}")
     return result

@@ -48,13 +48,17 @@ def render_site(records: list[dict[str, Any]], table: pd.DataFrame,
     media = media or {}
     site = collect(records, table)
     pages = {"index.html": index_page(site)}
-    pages |= {f"environments/{board.environment}.html": environment_page(site, board, media.get(board.environment))
-              for board in site.boards if not board.is_aggregate}
+    for board in site.boards:
+        if not board.is_aggregate:
+            name = board.environment
+            pages[f"environments/{name}.html"] = environment_page(site, board, media.get(name))
     pages |= {f"methods/{name}.html": method_page(site, name) for name in site.methods}
     files = {path: html.encode() for path, html in pages.items()}
-    files |= {name: b"".join((HERE / part).read_bytes() for part in parts) for name, parts in ASSETS.items()}
+    files |= {name: b"".join((HERE / part).read_bytes() for part in parts)
+              for name, parts in ASSETS.items()}
     shown = {board.environment for board in site.boards}
-    return files | {f"media/{name}.webp": content for name, content in media.items() if name in shown}
+    return files | {f"media/{name}.webp": content for name, content in media.items()
+                    if name in shown}
 
 
 def render(records: list[dict[str, Any]], table: pd.DataFrame | None = None) -> dict[str, str]:
@@ -97,9 +101,10 @@ def write_site(folder: Path, files: Mapping[str, bytes]) -> None:
         If the folder is neither empty nor such a site: then nothing of it is touched.
     """
     index = folder / "index.html"
-    if folder.exists() and any(folder.iterdir()) and not (index.is_file() and MARK in index.read_bytes()):
-        raise ValueError(f"folder must be empty or hold a site of the leaderboards, since other files in it are "
-                         f"deleted; {folder} holds something else")
+    ours = index.is_file() and MARK in index.read_bytes()
+    if folder.exists() and any(folder.iterdir()) and not ours:
+        raise ValueError("folder must be empty or hold a site of the leaderboards, since other "
+                         f"files in it are deleted; {folder} holds something else")
     for path in [path for path in folder.rglob("*") if path.is_file()]:
         if path.relative_to(folder).as_posix() not in files:
             path.unlink()

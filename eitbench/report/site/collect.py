@@ -101,7 +101,8 @@ class Site(NamedTuple):
 
 def collect(records: list[dict[str, Any]], table: pd.DataFrame) -> Site:
     """Boards of all records, the outdated ones among them, from the table of those that are not."""
-    by_key = {(record["environment"]["name"], record["method"], record["version"]): record for record in records}
+    by_key = {(record["environment"]["name"], record["method"], record["version"]): record
+              for record in records}
     found: dict[tuple[str, str], list[Row]] = {}
     for generation, rows in enumerate(_generations(records, table)):
         for cells in rows.astype(object).where(rows.notna(), None).to_dict("records"):
@@ -111,13 +112,15 @@ def collect(records: list[dict[str, Any]], table: pd.DataFrame) -> Site:
             board = found.setdefault((cells["class"], cells["environment"]), [])
             record = by_key.get((cells["environment"], cells["method"], cells["version"]))
             changes = {"rank": None} if generation else {}
-            board.append(Row({str(key): value for key, value in cells.items()} | changes, record, generation > 0,
-                             len(board)))
-    titles = {record["environment"]["name"]: title_of(record) for record in records} | {ALL: "All environments"}
+            shown = {str(key): value for key, value in cells.items()} | changes
+            board.append(Row(shown, record, generation > 0, len(board)))
+    titles = {record["environment"]["name"]: title_of(record) for record in records}
+    titles[ALL] = "All environments"
     made = [Board(*key, titles[key[1]], rows) for key, rows in found.items()]
     classes = list(dict.fromkeys(board.of_class for board in made))
     made.sort(key=lambda board: (classes.index(board.of_class), not board.is_aggregate))
-    return Site(made, sorted(records, key=lambda r: (r["environment"]["name"], r["method"], r["version"])))
+    return Site(made, sorted(records, key=lambda record: (
+        record["environment"]["name"], record["method"], record["version"])))
 
 
 def title_of(record: dict[str, Any]) -> str:

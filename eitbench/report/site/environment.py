@@ -29,11 +29,14 @@ def environment_page(site: Site, board: Board, animation: bytes | None) -> str:
     made = table(board, "../", compact=False)
     description, details = documentation(id)
     return template("site/environment.html.j2").render(
-        root="../", board=board, id=id, table=made, explanations=explanations([made]), description=description,
-        details=details, front=_front(board), intervals=_intervals(board), curves=_curves(board), duels=_duels(board),
-        calibration=_calibration(board), spread=_spread(board), learning=learning_curves(board.environment),
+        root="../", board=board, id=id, table=made, explanations=explanations([made]),
+        description=description, details=details,
+        front=_front(board), intervals=_intervals(board), curves=_curves(board),
+        duels=_duels(board), calibration=_calibration(board), spread=_spread(board),
+        learning=learning_curves(board.environment),
         media_mb=f"{1e-6 * len(animation):.1f} MB" if animation else "",
-        siblings=[other for other in site.boards if other.of_class == board.of_class and not other.is_aggregate])
+        siblings=[other for other in site.boards
+                  if other.of_class == board.of_class and not other.is_aggregate])
 
 
 def documentation(id: str) -> tuple[Markup, Markup]:
@@ -46,19 +49,25 @@ def documentation(id: str) -> tuple[Markup, Markup]:
 def markdown(text: str) -> Markup:
     """HTML of a text with tables, whose headings come below those of the page; HTML and links in it
     are mere text."""
-    reader = MarkdownIt("commonmark", {"html": False}).enable("table").disable(["link", "image", "autolink"])
+    reader = MarkdownIt("commonmark", {"html": False}).enable("table")
+    reader.disable(["link", "image", "autolink"])
     tokens = reader.parse(text)
     for token in tokens:
         if token.type in ("heading_open", "heading_close"):
             token.tag = f"h{min(int(token.tag[1]) + 1, 6)}"
     html = reader.renderer.render(tokens, reader.options, {})
-    return Markup(html.replace("<table>", '<div class="card" tabindex="0" role="region" aria-label="table"><table>')
-                  .replace("</table>", "</table></div>"))
+    begin = '<div class="card" tabindex="0" role="region" aria-label="table"><table>'
+    return Markup(html.replace("<table>", begin).replace("</table>", "</table></div>"))
 
 
 def _legend(rows: list[Row]) -> list[tuple[int, bool, str]]:
     """Colour, whether its line is dashed, and name."""
-    return [(row.colour % charts.COLOURS, row.colour >= charts.COLOURS, row.cells["title"]) for row in rows]
+    return [(row.colour % charts.COLOURS, row.colour >= charts.COLOURS, row.cells["title"])
+            for row in rows]
+
+
+def _series(row: Row, values: Any, *, faint: bool = False) -> charts.Series:
+    return charts.Series(row.cells["title"], row.colour, np.asarray(values), faint=faint)
 
 
 def _chart(svg: str, rows: list[Row]) -> dict[str, Any] | None:
@@ -67,17 +76,19 @@ def _chart(svg: str, rows: list[Row]) -> dict[str, Any] | None:
 
 def _front(board: Board) -> dict[str, Any] | None:
     """Error over time per step."""
-    rows = [row for row in board.current if row.cells["error"] is not None and row.cells["seconds_per_step"]]
-    points = [charts.Point(row.cells["title"], row.colour, row.cells["seconds_per_step"], row.cells["error"],
-                           row.competes) for row in rows]
+    rows = [row for row in board.current
+            if row.cells["error"] is not None and row.cells["seconds_per_step"]]
+    points = [charts.Point(row.cells["title"], row.colour, row.cells["seconds_per_step"],
+                           row.cells["error"], row.competes) for row in rows]
     best = ", ".join(point.name for point in charts.optimal(points))
-    made = _chart(charts.front(points, "time per step on one core, ms", "relative error ẽ_c") if rows else "", rows)
+    axes = "time per step on one core, ms", "relative error ẽ_c"
+    made = _chart(charts.front(points, *axes) if rows else "", rows)
     return made and made | {"best": best}
 
 
 def _intervals(board: Board) -> dict[str, Any] | None:
     rows = [row for row in board.current if row.cells["error"] is not None]
-    series = [charts.Series(row.cells["title"], row.colour, np.array(three(row, "error"))) for row in rows]
+    series = [_series(row, three(row, "error")) for row in rows]
     return _chart(charts.intervals(series, "relative error ẽ_c") if rows else "", rows)
 
 
@@ -86,10 +97,11 @@ def _curves(board: Board) -> dict[str, Any] | None:
     found = [(row, [episode["step_errors"] for episode in row.episodes()]) for row in board.current]
     found = [(row, errors) for row, errors in found if errors and len(errors[0]) > 1]
     told = _told([row for row, _ in found])
-    series = [charts.Series(row.cells["title"], row.colour, np.mean(errors, axis=0), faint=row not in told)
+    series = [_series(row, np.mean(errors, axis=0), faint=row not in told)
               for row, errors in found]
     longest = max((len(s.values) for s in series), default=0)
-    made = _chart(charts.lines(np.arange(1, longest + 1), series, "scored state", "relative error") if series else "",
+    steps = np.arange(1, longest + 1)
+    made = _chart(charts.lines(steps, series, "scored state", "relative error") if series else "",
                   told)
     return made and made | {"faint": len(told) < len(found)}
 
@@ -115,8 +127,9 @@ def _duels(board: Board) -> list[tuple[str, list[dict[str, Any] | None]]]:
     ``share`` in %, ``low`` and ``high`` the ends of its 95 % interval, and whether it ``tells``: 50
     % is outside.
     """
-    scores = [(row.cells["title"], {board.environment: {e["seed"]: e["scores"]["error"] for e in row.episodes()}})
-              for row in board.current]
+    scores = [(row.cells["title"], {board.environment: {
+        episode["seed"]: episode["scores"]["error"] for episode in row.episodes()}})
+        for row in board.current]
     scores = [(name, own) for name, own in scores if own[board.environment]]
     cells: dict[tuple[int, int], dict[str, Any]] = {}
     for (i, (_, ours)), (j, (_, theirs)) in combinations(enumerate(scores), 2):
@@ -124,46 +137,53 @@ def _duels(board: Board) -> list[tuple[str, list[dict[str, Any] | None]]]:
             won = [100 * each for each in paired_probability_of_improvement(ours, theirs)]
             lost = [100 - won[0], 100 - won[2], 100 - won[1]]
             for place, (share, low, high) in (((i, j), won), ((j, i), lost)):
-                cells[place] = {"share": share, "low": low, "high": high, "tells": not low <= 50 <= high}
-    return [(name, [cells.get((i, j)) for j in range(len(scores))]) for i, (name, _) in enumerate(scores)]
+                cells[place] = {"share": share, "low": low, "high": high,
+                                "tells": not low <= 50 <= high}
+    return [(name, [cells.get((i, j)) for j in range(len(scores))])
+            for i, (name, _) in enumerate(scores)]
 
 
 def _calibration(board: Board) -> dict[str, Any] | None:
     """Observed coverage of the claimed 50 % and 90 % intervals."""
     rows = [row for row in board.current if all(row.cells[name] is not None for name in NOMINAL)]
-    series = [charts.Series(row.cells["title"], row.colour, 100 * np.array([row.cells[name] for name in NOMINAL]))
+    series = [_series(row, 100 * np.array([row.cells[name] for name in NOMINAL]))
               for row in rows]
-    return _chart(charts.calibration(series, (50.0, 90.0), "claimed, % of the truth within the interval",
-                                     "observed, %") if rows else "", rows)
+    axes = "claimed, % of the truth within the interval", "observed, %"
+    return _chart(charts.calibration(series, (50.0, 90.0), *axes) if rows else "", rows)
 
 
 def _spread(board: Board) -> dict[str, Any] | None:
     """Claimed variance over squared error."""
     rows = [row for row in board.current if row.cells["spread_ratio"]]
     unknown = (-np.inf, np.inf)
-    series = [charts.Series(row.cells["title"], row.colour, np.array([row.cells["spread_ratio"], *unknown]))
+    series = [_series(row, [row.cells["spread_ratio"], *unknown])
               for row in rows]
-    return _chart(charts.intervals(series, "claimed variance / squared error", mark=1.0) if rows else "", rows)
+    said = "claimed variance / squared error"
+    return _chart(charts.intervals(series, said, mark=1.0) if rows else "", rows)
 
 
 def learning_curves(environment: str) -> dict[str, Any] | None:
     """Errors on dev episodes while our agents were trained: each training, and their mean."""
     folder = shipped("baselines") / "checkpoints" / environment
-    series, legend = [], []
+    series = []
+    legend = []
     for colour, algorithm in enumerate(sorted(path for path in folder.glob("*") if path.is_dir())):
         trainings = []
         for path in sorted(algorithm.glob("seed*/evaluations.npz")):
             with np.load(path, allow_pickle=False) as stored:
-                trainings.append((stored["steps"], stored["errors"].mean(axis=1)))
-            series.append(charts.Series(f"{algorithm.name}, {path.parent.name}", colour, trainings[-1][1],
-                                        trainings[-1][0], faint=True))
+                steps = stored["steps"]
+                errors = stored["errors"].mean(axis=1)
+            trainings.append((steps, errors))
+            series.append(charts.Series(f"{algorithm.name}, {path.parent.name}", colour, errors,
+                                        steps, faint=True))
         if trainings:
             shared = sorted(set.intersection(*(set(steps.tolist()) for steps, _ in trainings)))
-            mean = np.mean([errors[np.searchsorted(steps, shared)] for steps, errors in trainings], axis=0)
+            mean = np.mean([errors[np.searchsorted(steps, shared)]
+                            for steps, errors in trainings], axis=0)
             series.append(charts.Series(f"{algorithm.name}, mean", colour, mean, np.array(shared)))
             legend.append((colour % charts.COLOURS, colour >= charts.COLOURS,
                            f"{algorithm.name}, mean of {len(trainings)}"))
     if not series:
         return None
-    return {"svg": Markup(charts.lines(np.zeros(1), series, "steps of training", "relative error ẽ_c")),
-            "legend": legend}
+    drawn = charts.lines(np.zeros(1), series, "steps of training", "relative error ẽ_c")
+    return {"svg": Markup(drawn), "legend": legend}

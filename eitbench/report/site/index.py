@@ -28,4 +28,5 @@ def index_page(site: Site) -> str:
     } for name in site.classes]
     return template("site/index.html.j2").render(
         root="", classes=classes, n_records=len(site.records), n_methods=len(site.methods),
-        last=max(map(finished, site.records), default="")[:10], explanations=explanations(list(made.values())))
+        last=max(map(finished, site.records), default="")[:10],
+        explanations=explanations(list(made.values())))

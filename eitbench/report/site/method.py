@@ -14,7 +14,7 @@ import numpy as np
 from markupsafe import Markup
 
 from eitbench._files import shipped
-from eitbench.bench.methods import version_of
+from eitbench.bench.methods import baseline_folder, own_files, version_of
 from eitbench.bench.records import alike, finished
 from eitbench.bench.table import NOTHING, Cell, Table, number_cell
 from eitbench.bench.text import scores_by_seed, seed_ranges
@@ -28,13 +28,16 @@ from eitbench.report.templates import template
 
 def method_page(site: Site, name: str) -> str:
     """The HTML of the page of all versions of a method."""
-    standings = [(board, row) for board in site.boards for row in board.rows if row.cells["method"] == name]
-    records = sorted((record for record in site.records if record["method"] == name), key=finished, reverse=True)
+    standings = [(board, row) for board in site.boards for row in board.rows
+                 if row.cells["method"] == name]
+    records = sorted((record for record in site.records if record["method"] == name),
+                     key=finished, reverse=True)
     versions = list(dict.fromkeys(record["version"] for record in records))
     return template("site/method.html.j2").render(
         root="../", name=name, title=records[0]["title"], standings=_standings(standings),
-        intervals=_intervals(standings), versions=[_version([r for r in records if r["version"] == each], site)
-                                                   for each in versions])
+        intervals=_intervals(standings),
+        versions=[_version([record for record in records if record["version"] == each], site)
+                  for each in versions])
 
 
 def _standings(standings: list[tuple[Board, Row]]) -> Table:
@@ -63,28 +66,37 @@ def _standings(standings: list[tuple[Board, Row]]) -> Table:
 def _intervals(standings: list[tuple[Board, Row]]) -> Markup:
     """Gains on all boards, which are on one scale."""
     colours: dict[str, int] = {}
-    series = [charts.Series(f"{board.title} · {board.of_class}" if board.is_aggregate else board.title,
-                            colours.setdefault(board.of_class, len(colours)), np.array(three(row, "gain")))
+    series = [charts.Series(f"{board.title} · {board.of_class}" if board.is_aggregate
+                            else board.title,
+                            colours.setdefault(board.of_class, len(colours)),
+                            np.array(three(row, "gain")))
               for board, row in standings if row.cells["gain"] is not None and not row.outdated]
-    return Markup(charts.intervals(series, "gain: 0 as the floor, 1 perfect", log=False, mark=0.0) if series else "")
+    if not series:
+        return Markup()
+    return Markup(charts.intervals(series, "gain: 0 as the floor, 1 perfect", log=False, mark=0.0))
 
 
 def _version(records: list[dict[str, Any]], site: Site) -> dict[str, Any]:
     """What is said of one version: its file as far as it is ours and the same, and its records."""
     record = records[0]
     file = source_file(record)
-    return {"name": record["version"], "sha256": record["method_sha256"], "checkpoint": record["checkpoint_sha256"],
+    return {"name": record["version"], "sha256": record["method_sha256"],
+            "checkpoint": record["checkpoint_sha256"],
             "parameters": {key: json.dumps(value, ensure_ascii=False)
                            for key, value in sorted(record["parameters"].items())},
             "file": file, "docstring": docstring(record, file),
-            "records": [_record(each, site) for each in sorted(records, key=lambda r: r["environment"]["name"])]}
+            "records": [_record(each, site) for each in sorted(
+                records, key=lambda record: record["environment"]["name"])]}
 
 
 def _record(record: dict[str, Any], site: Site) -> dict[str, Any]:
-    board, row = next(((board, row) for board in site.boards for row in board.rows if row.record is record),
+    board, row = next(((board, row) for board in site.boards for row in board.rows
+                       if row.record is record),
                       (None, None))  # it played none of the board's episodes
-    return {"title": title_of(record), "address": board and board.address, "official": record["official"],
-            "outdated": row is not None and row.outdated, "runs": _runs(record), "command": command(record),
+    return {"title": title_of(record), "address": board and board.address,
+            "official": record["official"],
+            "outdated": row is not None and row.outdated,
+            "runs": _runs(record), "command": command(record),
             "typed": sorted({run["command"] for run in record["runs"]}),
             "episodes": _episodes(record),
             "failures": [episode for episode in record["episodes"] if episode["status"] != "ok"]}
@@ -93,7 +105,8 @@ def _record(record: dict[str, Any], site: Site) -> dict[str, Any]:
 def _runs(record: dict[str, Any]) -> list[dict[str, Any]]:
     """Runs of one code on one machine as one, with ``products``, the times in ms that its processes
     took for theirs."""
-    return [group[0] | {"products": sorted(1000 * run["machine"]["matmul_seconds"] for run in group)}
+    return [group[0] | {"products": sorted(1000 * run["machine"]["matmul_seconds"]
+                                           for run in group)}
             for group in alike(record["runs"])]
 
 
@@ -104,7 +117,8 @@ def _episodes(record: dict[str, Any]) -> Table:
     rows = [{
         "seed": Cell(episode["seed"], float(i)),
         "status": episode["status"],
-        **{shown[name]: number_cell(values.get(episode["seed"])) for name, values in scores.items()},
+        **{shown[name]: number_cell(values.get(episode["seed"]))
+           for name, values in scores.items()},
         "played on": Cell(episode["finished"][:10], episode["finished"]),
     } for i, episode in enumerate(record["episodes"])]
     return Table.of(rows, label=f"Episodes of {title_of(record)}")
@@ -119,7 +133,8 @@ def command(record: dict[str, Any]) -> str:
     if record["environment"]["kwargs"]:
         return ""
     kind = "--policy" if record["board"] == "injection" else "--baseline"
-    return shlex.join(["eitbench", "submit", kind, _argument(record), "--env", record["environment"]["id"],
+    return shlex.join(["eitbench", "submit", kind, _argument(record),
+                       "--env", record["environment"]["id"],
                        "--seeds", seed_ranges(record["seeds"]), "--to", "again"])
 
 
@@ -150,13 +165,10 @@ def source_file(record: dict[str, Any]) -> str:
 
     Of agents, whose names others may give to theirs, the very version only.
     """
-    folder = shipped("baselines")
-    for path in (*folder.glob("*.py"), *folder.glob("injection/*.py"), *folder.glob("checkpoints/*/*/*/model.zip")):
-        name = path.stem if path.suffix == ".py" else f"{path.parent.parent.name}_{path.parent.name}"
-        same_world = path.suffix == ".py" or path.parents[2].name == record["environment"]["id"].replace("/", "-")
-        if name == record["method"] and same_world and (path.suffix == ".py" or _is_version(path, record)):
-            return f"baselines/{path.relative_to(folder).as_posix()}"
-    return ""
+    path = own_files(record["environment"]["id"]).get(record["method"])
+    if path is None or not (path.suffix == ".py" or _is_version(path, record)):
+        return ""
+    return f"baselines/{path.relative_to(baseline_folder()).as_posix()}"
 
 
 def docstring(record: dict[str, Any], file: str) -> Markup:

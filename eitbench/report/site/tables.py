@@ -35,7 +35,8 @@ def table(board: Board, root: str, *, compact: bool) -> Table:
         "by": "official" if row.cells["official"] else "self-reported",
         **{headings()[name]: number_cell(row.cells[name]) for name in scores},
     } for row in board.rows]
-    return Table.of(rows, label=board.title, keep=["rank"], flags=[_flags(row) for row in board.rows])
+    flags = [_flags(row) for row in board.rows]
+    return Table.of(rows, label=board.title, keep=["rank"], flags=flags)
 
 
 def explanations(tables: list[Table]) -> dict[str, str]:
@@ -66,7 +67,8 @@ def interval_cell(row: Row, name: str, ends: tuple[float, float]) -> Cell:
     if math.isnan(value):
         return Cell(NOTHING)
     text, _, interval = with_interval(value, low, high).partition(" ")
-    return Cell(text, value, Markup(charts.cell((value, low, high), *ends, log=SCALES[name][1])), small=interval)
+    drawn = charts.cell((value, low, high), *ends, log=SCALES[name][1])
+    return Cell(text, value, Markup(drawn), small=interval)
 
 
 def _rank(row: Row, shared: Counter[Any]) -> Cell:
@@ -79,10 +81,11 @@ def _rank(row: Row, shared: Counter[Any]) -> Cell:
 def _method(row: Row, root: str) -> Cell:
     cells = row.cells
     badges = (*filter(None, cells["note"].split(", ")), *["outdated"] * row.outdated)
-    return Cell(cells["title"], cells["title"].casefold(), link=root + method_address(cells["method"]),
-                small=row.label, badges=badges)
+    return Cell(cells["title"], cells["title"].casefold(), small=row.label, badges=badges,
+                link=root + method_address(cells["method"]))
 
 
 def _flags(row: Row) -> str:
-    flags = {"self-reported": not row.cells["official"], "unranked": row.unranked, "outdated": row.outdated}
+    flags = {"self-reported": not row.cells["official"], "unranked": row.unranked,
+             "outdated": row.outdated}
     return " ".join(name for name, holds in flags.items() if holds)
