@@ -47,7 +47,8 @@ def scaled(rules: Rules, observation: Observation) -> np.ndarray:
     left, and where the flow is estimated its velocity and that one's std; all as in the raw
     observation but for the scale, the first frame left out.
     """
-    world, level = rules.world, rules.world.expected_concentration
+    world = rules.world
+    level = rules.world.expected_concentration
     left = np.array([world.n_steps, rules.budget or 1][:observation["left"].shape[-1]])
     parts = [observation["voltages"] / outline(world).largest_voltage,
              observation["recent"] / rules.amplitude,
@@ -75,7 +76,8 @@ class InjectionCore:
     """
 
     def __init__(self, rules: Rules, estimator: str) -> None:
-        self.rules, self.world = rules, rules.world
+        self.rules = rules
+        self.world = rules.world
         self._operator_type = operator_type(rules.world, estimator)
         self._table = rules.table if rules.limit is None else None
         self.first = len(self.world.currents) if self._operator_type else 0
@@ -84,10 +86,13 @@ class InjectionCore:
 
     def space(self) -> spaces.Dict:
         """What one environment shows, in SI units."""
-        world, rules = self.world, self.rules
-        L, level = world.currents.shape[1], world.expected_concentration
+        world = self.world
+        rules = self.rules
+        L = world.currents.shape[1]
+        level = world.expected_concentration
         # "L2" goes up to √2
-        largest, current = 1e3 * outline(world).largest_voltage, 1.5 * rules.amplitude
+        largest = 1e3 * outline(world).largest_voltage
+        current = 1.5 * rules.amplitude
         shown: dict[str, spaces.Space] = {
             "voltages": spaces.Box(-largest, largest, (L,), np.float64),
             "currents": spaces.Box(-current, current, (L,), np.float64)}
@@ -112,14 +117,21 @@ class InjectionCore:
 
     def begin(self, seeds: Sequence[int]) -> None:
         """Play these episodes up to the agent's first injection."""
-        world, rules, B, L = self.world, self.rules, len(seeds), self.world.currents.shape[1]
+        world = self.world
+        rules = self.rules
+        B = len(seeds)
+        L = self.world.currents.shape[1]
         T = world.n_steps
-        self.seeds, self._t, self._spent = tuple(seeds), self.first, np.zeros(B, dtype=int)
-        self._resistance, self._draws = np.empty((T, B, L, L)), np.empty((T, B, L))
+        self.seeds = tuple(seeds)
+        self._t = self.first
+        self._spent = np.zeros(B, dtype=int)
+        self._resistance = np.empty((T, B, L, L))
+        self._draws = np.empty((T, B, L))
         self._deviations, self._squares, totals = np.empty((3, B, T))
         self._voltages, self._currents = np.zeros((2, B, L))
         self._recent = np.zeros((B, RECENT, L))
-        moments, faults = [], []
+        moments = []
+        faults = []
         # all is copied: a mapped file is open, and there may be more than may be
         for k, seed in enumerate(seeds):
             entries = recording(world, seed)
@@ -158,7 +170,8 @@ class InjectionCore:
         if self.rules.budget is not None:
             currents = currents * (self._spent < self.rules.budget)[:, None]
             self._spent += currents.any(axis=1)
-        self._currents, self._voltages = currents, self._measure(self._t, currents)
+        self._currents = currents
+        self._voltages = self._measure(self._t, currents)
         self._recent = np.concatenate([currents[:, None], self._recent[:, :-1]], axis=1)
         self._t += 1
         if not self._operator_type:

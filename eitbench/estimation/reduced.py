@@ -125,14 +125,18 @@ class ReducedFilter:
 
     def predict(self) -> None:
         """One time step on."""
-        A, P, AP, APA = self.model.transition, self.covariance, self._half, self._next
+        A = self.model.transition
+        P = self.covariance
+        AP = self._half
+        APA = self._next
         self.mean = (A @ self.mean[..., None])[..., 0]
         for begin, end in pairwise(self._edges):                     # below its blocks A is zero
             np.matmul(A[begin:end, begin:], P[:, begin:], out=AP[:, begin:end])
         for begin, end in pairwise(self._edges):
             np.matmul(AP[:, :, begin:], A[begin:end, begin:].T, out=APA[:, :, begin:end])
         APA += self.model.noise
-        self.covariance, self._next = APA, P
+        self.covariance = APA
+        self._next = P
 
     def update(self, matrix: np.ndarray, residual: np.ndarray, noise_variance: np.ndarray, *,
                gate: float = math.inf) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -65,7 +65,8 @@ class Condensation:
         self._slot = slot[by_slot]
         self._first_entry = np.searchsorted(self._slot, panel)
         order = np.argsort(place)
-        self.rows, self.columns = order[lower.row[by_slot]], order[lower.col[by_slot]]
+        self.rows = order[lower.row[by_slot]]
+        self.columns = order[lower.col[by_slot]]
         self._children, self._front_size, self._stack_size = _multifrontal_sizes(*self._symbolic)
         self.batch = 8 if self._front_size <= _WIDEST**2 else 1
 

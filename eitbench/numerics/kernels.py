@@ -136,11 +136,17 @@ def _function(builder, name, lanes, count):
 def factorise(start, first_row, rows, panel, owner, first_entry, slot, values, factor):
     """Left-looking supernodal Cholesky; lower entries ``values`` go to ``factor``'s ``slot``."""
     n_super = len(start) - 1
-    head, after, done = np.full(n_super, -1), np.full(n_super, -1), np.zeros(n_super, np.int64)
-    place, target = np.empty(len(owner), np.int64), np.empty(len(owner), np.int64)
-    column, second = np.empty(len(owner) + WIDTH), np.empty(len(owner) + WIDTH)
+    head = np.full(n_super, -1)
+    after = np.full(n_super, -1)
+    done = np.zeros(n_super, np.int64)
+    place = np.empty(len(owner), np.int64)
+    target = np.empty(len(owner), np.int64)
+    column = np.empty(len(owner) + WIDTH)
+    second = np.empty(len(owner) + WIDTH)
     for s in range(n_super):
-        width, height, here = start[s + 1] - start[s], first_row[s + 1] - first_row[s], panel[s]
+        width = start[s + 1] - start[s]
+        height = first_row[s + 1] - first_row[s]
+        here = panel[s]
         for i in range(height):
             place[rows[first_row[s] + i]] = i
         for i in range(here, here + height * width):
@@ -150,7 +156,9 @@ def factorise(start, first_row, rows, panel, owner, first_entry, slot, values, f
         d = head[s]                              # earlier supernodes with rows among these columns
         while d >= 0:
             following = after[d]
-            rows_d, height_d, there = first_row[d], first_row[d + 1] - first_row[d], panel[d]
+            rows_d = first_row[d]
+            height_d = first_row[d + 1] - first_row[d]
+            there = panel[d]
             begin = end = done[d]
             for a in range(begin, height_d):
                 target[a] = place[rows[rows_d + a]]
@@ -222,8 +230,10 @@ def condense_lanes(start, first_row, rows, panel, children, first_entry, slot, v
     all work is done in memory that the caches hold.
     """
     n_super = len(start) - 1
-    place, target = np.empty(start[-1], np.int64), np.empty(start[-1], np.int64)
-    begins, waiting = np.zeros(n_super + 1, np.int64), np.zeros(n_super, np.int64)
+    place = np.empty(start[-1], np.int64)
+    target = np.empty(start[-1], np.int64)
+    begins = np.zeros(n_super + 1, np.int64)
+    waiting = np.zeros(n_super, np.int64)
     depth = 0
     for s in range(n_super):
         width, height = start[s + 1] - start[s], first_row[s + 1] - first_row[s]
@@ -236,7 +246,8 @@ def condense_lanes(start, first_row, rows, panel, children, first_entry, slot, v
             store(front, (slot[e] - panel[s]) * WIDTH, load(values, e * WIDTH))
         for _ in range(children[s]):
             depth -= 1
-            d, at = waiting[depth], begins[depth]
+            d = waiting[depth]
+            at = begins[depth]
             left = first_row[d] + start[d + 1] - start[d]
             size = first_row[d + 1] - left
             for i in range(size):
@@ -289,7 +300,8 @@ def substitute_back(start, first_row, rows, panel, factor, solution):
     width = solution.shape[1]
     flat = solution.reshape(-1)
     for s in range(n_super - 2, -1, -1):
-        height, first = first_row[s + 1] - first_row[s], first_row[s]
+        height = first_row[s + 1] - first_row[s]
+        first = first_row[s]
         for p in range(start[s + 1] - start[s] - 1, -1, -1):
             column = panel[s] + p * height
             scale = splat(1.0 / factor[column + p])
@@ -311,8 +323,10 @@ def subtract_gradient_products(cells, unknowns, gradient, fields, table, G):
     """
     n_cells, n_vertices = cells.shape
     n_rows, n_local = gradient.shape[1:]
-    dim, width = n_rows // n_vertices, fields.shape[1]
-    u, out = fields.reshape(-1), table.reshape(-1)
+    dim = n_rows // n_vertices
+    width = fields.shape[1]
+    u = fields.reshape(-1)
+    out = table.reshape(-1)
     size = dim * width                                   # numbers a vertex
     shifted = n_vertices * size                          # where S + G_j begins, behind the G_j
     for c in range(n_cells):
@@ -333,7 +347,8 @@ def subtract_gradient_products(cells, unknowns, gradient, fields, table, G):
         for m in range(width):
             for l in range(0, width, 2 * WIDTH):         # sixteen at a time, if there are so many
                 twin = min(l + WIDTH, width - WIDTH)
-                everywhere, everywhere_twin = splat(0.0), splat(0.0)
+                everywhere = splat(0.0)
+                everywhere_twin = splat(0.0)
                 i = 0
                 for _ in range(n_rows):
                     left = splat(G[i + m])

@@ -76,7 +76,8 @@ def steady_flow(mesh: Mesh, viscosity: float, walls: Sequence[tuple[np.ndarray, 
     viscosity = _check.number("viscosity", viscosity, low=0.0, open_low=True, units="m²/s")
     equations = _discretise(mesh, walls, force)
     found = _continuation(equations, viscosity)
-    velocity, pressure = found[:-mesh.n_nodes].reshape(2, -1).T, found[-mesh.n_nodes:]
+    velocity = found[:-mesh.n_nodes].reshape(2, -1).T
+    pressure = found[-mesh.n_nodes:]
     if equations.closed:
         pressure = pressure - equations.weights @ pressure / equations.weights.sum()
     return SteadyFlow(mesh, velocity[equations.cell_dofs], pressure)
@@ -226,7 +227,8 @@ def _continuation(equations: _Equations, viscosity: float) -> np.ndarray:
         lower = max(viscosity, at / ratio)
         result = _newton(equations, lower, found)
         if result is not None:
-            found, at = result, lower
+            found = result
+            at = lower
         elif ratio > 1.02:
             ratio = math.sqrt(ratio)
         else:
@@ -244,7 +246,8 @@ def _newton(equations: _Equations, viscosity: float,
     for k in range(_NEWTON_STEPS):
         if x is None:
             return None
-        before, x = x, _linear_solution(equations, viscosity, x)
+        before = x
+        x = _linear_solution(equations, viscosity, x)
         if x is not None:
             velocity, pressure = np.split(x, [len(equations.load)])
             step = np.abs(velocity - before[:len(velocity)]).max()

@@ -48,7 +48,11 @@ class Axis:
     """From values to px: logarithmic or linear, with ticks at round numbers."""
 
     def __init__(self, low: float, high: float, begin: float, end: float, *, log: bool) -> None:
-        self.low, self.high, self.begin, self.end, self.log = low, high, begin, end, log
+        self.low = low
+        self.high = high
+        self.begin = begin
+        self.end = end
+        self.log = log
 
     def __call__(self, value: float) -> float:
         value = max(value, self.low)
@@ -241,7 +245,9 @@ def _room(x: float, y: float, width: float, taken: list[tuple[float, float, floa
     for dx, dy, anchor in ((10, 4, "start"), (-10, 4, "end"), (6, -9, "start"), (6, 18, "start"),
                            (-6, -9, "end"), (-6, 18, "end")):
         left = x + dx - width * (anchor == "end")
-        right, top, bottom = left + width, y + dy - 11, y + dy + 3
+        right = left + width
+        top = y + dy - 11
+        bottom = y + dy + 3
         inside = left > LEFT and right < WIDTH - 2 * LETTER and top > 0 and bottom < HEIGHT - BOTTOM
         if inside and not any(left < b[2] and b[0] < right and top < b[3] and b[1] < bottom
                               for b in taken):

@@ -79,7 +79,8 @@ def compare(a: list[dict[str, Any]], b: list[dict[str, Any]], score: str = "erro
     pairs: dict[str, tuple[dict[str, float], dict[str, float]]] = {}
     others = {(record["environment"]["name"], record["split"]): record for record in b}
     for record in a:
-        name, split = record["environment"]["name"], record["split"]
+        name = record["environment"]["name"]
+        split = record["split"]
         if (other := others.get((name, split))) is None:
             continue
         own, theirs = (scores_by_seed(each, score) for each in (record, other))

@@ -82,7 +82,8 @@ def load_agent(path: Path, content: bytes) -> tuple[str, str, type[Agent], dict[
     from eitbench.rl.training import algorithm_of
     # as older models name their networks' module
     sys.modules.setdefault("eitbench.pair_policy", networks)
-    algo, seed = asked["algo"], asked["seed"]
+    algo = asked["algo"]
+    seed = asked["seed"]
     model = algorithm_of(algo).load(io.BytesIO(content), device="cpu")
     policy = type("Policy", (Agent,), {"model": model, "masked": algo.startswith("maskable")})
     mark = "" if _is_shipped(asked, found) else f"_{_mark(asked)}"

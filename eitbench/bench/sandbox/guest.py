@@ -26,7 +26,8 @@ Reply = tuple[dict[str, Any], dict[str, np.ndarray]]
 
 def main() -> None:
     """Answer one message after another until the other side hangs up."""
-    private, memory = Path(sys.argv[1]), int(sys.argv[2])
+    private = Path(sys.argv[1])
+    memory = int(sys.argv[2])
     incoming, outgoing = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     silent = os.open(os.devnull, os.O_RDWR)
     for stream in range(3):  # what the guest prints is no answer

@@ -157,7 +157,8 @@ class Guest:
     def _surroundings(self, id: str, kwargs: dict[str, Any]) -> dict[str, str]:
         """Environment variables; models that are kept in the cache, without a truth, are copied for
         the guest."""
-        cache, kernels = self._private / "cache", self._private / "kernels"
+        cache = self._private / "cache"
+        kernels = self._private / "kernels"
         there = folder(entry(id).world.changed(kwargs.get("world")))
         (cache / there.name).mkdir(parents=True)
         for model in (path for pattern in MODELS for path in there.glob(pattern)):
@@ -181,7 +182,8 @@ class Guest:
             return name
         if is_ours(name):  # a copy would pass for a stranger's that has taken our name
             return str(Path(name).resolve())
-        path, place = Path(name), self._private / "own"
+        path = Path(name)
+        place = self._private / "own"
         place.mkdir()
         beside: Sequence[str] = ("config.json", "sha256") if path.suffix == ".zip" else ()
         for each in (path, *(path.with_name(other) for other in beside)):

@@ -78,7 +78,8 @@ class Belief:
         broken one reads interference.
         """
         self._operator.assimilate(observation["voltages"][None], observation["currents"][None])
-        self._along, self._steps = None, []
+        self._along = None
+        self._steps = []
         reading, driving = observation["doubt"]
         self._driving = np.where(observation["currents"] == 0.0, FORGIVEN * self._driving, driving)
         self.doubt = reading + self._driving
@@ -86,7 +87,8 @@ class Belief:
     def told(self, entries: np.ndarray) -> None:
         """Be shown the truth, by the rest of an episode's recording from the present t on: for
         bounds only."""
-        self._along, self._steps = self._operator.truth(entries), []
+        self._along = self._operator.truth(entries)
+        self._steps = []
 
     @property
     def mean(self) -> np.ndarray:

@@ -30,15 +30,18 @@ class Console:
         self.operator = kind(rules.world, frames, gate=rules.gate,
                              noise_floor=rules.instrument.noise_floor)
         B, _, L = frames.shape
-        self._innovations, self._doubt = np.zeros((B, L)), np.zeros((B, 2, L))
+        self._innovations = np.zeros((B, L))
+        self._doubt = np.zeros((B, 2, L))
 
     def take_in(self, voltages: np.ndarray, currents: np.ndarray) -> None:
         """One time step on, with voltages (B, L) in V for currents (B, L) in A (A/m in 2D)."""
         self._innovations, believed = self.operator.assimilate(voltages, currents)
         # Of each electrode: how often lately its own reading was not believed, and the injections
         # that it drove.
-        reading, driving = self._doubt[:, 0], self._doubt[:, 1]
-        injected, drives = currents.any(axis=1, keepdims=True), currents != 0.0
+        reading = self._doubt[:, 0]
+        driving = self._doubt[:, 1]
+        injected = currents.any(axis=1, keepdims=True)
+        drives = currents != 0.0
         failed = ~believed.any(axis=1, keepdims=True)
         # A failed injection says nothing of the electrodes that only listened.
         reading += DOUBT * (injected & ~failed) * (~believed - reading)

@@ -53,7 +53,8 @@ class JointFullOperator(FullOperator):
 
     def _start(self, episodes: int) -> list[Any]:
         task = self._shared.task
-        flow, prior = one_velocity(task), task.prior
+        flow = one_velocity(task)
+        prior = task.prior
         nodal = task.evolution.state_noise_covariance(0.0, prior.nodal_std**2)
         return [JointFilter(
             task.transport_at, flow.directions,
@@ -64,7 +65,8 @@ class JointFullOperator(FullOperator):
             nodal_noise=nodal, profiles=flow.profiles, bounds=BOUNDS) for _ in range(episodes)]
 
     def grid(self) -> tuple[np.ndarray, np.ndarray]:
-        patches, n = self._patches, self._patches.shape[1]
+        patches = self._patches
+        n = self._patches.shape[1]
         variance = [((patches @ filter_.covariance[:n, :n]) * patches).sum(axis=1)
                     for filter_ in self._filters]
         return self._patch_means(), self.concentration[:, None] * np.sqrt(variance)
@@ -103,7 +105,8 @@ class JointReducedOperator(ReducedOperator):
 
     def steps(self, count: int,
               along: np.ndarray | None = None) -> list[tuple[np.ndarray, np.ndarray]]:
-        shared, made = self._shared, []
+        shared = self._shared
+        made = []
         assert isinstance(shared, JointShared)
         mean = self._filter.mean[:1].astype(float)
         for k in range(count):
@@ -137,7 +140,8 @@ class JointShared(Shared):
         super().__init__(world)
         self.flow = one_velocity(self.levels.task)
         self.walk_std = self.flow.walk_std[0]
-        self.tables, self._single = JointTables(self.model), JointTables(self.model, np.float32)
+        self.tables = JointTables(self.model)
+        self._single = JointTables(self.model, np.float32)
 
     @staticmethod
     def _make(world: World) -> Any:
@@ -146,8 +150,11 @@ class JointShared(Shared):
     def start(self, episodes: int) -> ReducedFilter:
         (nominal,), (std,) = self.flow.nominal, self.flow.initial_std
         r = len(self.model.initial)
-        mean, covariance = np.zeros((episodes, r + 1)), np.zeros((episodes, r + 1, r + 1))
-        mean[:, r], covariance[:, :r, :r], covariance[:, r, r] = nominal, self.model.initial, std**2
+        mean = np.zeros((episodes, r + 1))
+        covariance = np.zeros((episodes, r + 1, r + 1))
+        mean[:, r] = nominal
+        covariance[:, :r, :r] = self.model.initial
+        covariance[:, r, r] = std**2
         return ReducedJointFilter(self._single, mean.astype(np.float32),
                                   covariance.astype(np.float32), self.walk_std,
                                   (BOUNDS[0] * nominal, BOUNDS[1] * nominal))
@@ -168,8 +175,10 @@ def _make_model(world: World) -> JointModel:
     """Some 45 s."""
     from eitbench.numerics.fem import mass_matrix
     task = make_task(world)
-    flow, prior = one_velocity(task), task.prior
-    mass, record = mass_matrix(task.mesh).toarray(), record_of_any(world, 45)
+    flow = one_velocity(task)
+    prior = task.prior
+    mass = mass_matrix(task.mesh).toarray()
+    record = record_of_any(world, 45)
     initial = initial_covariance(task.mesh, prior)
     nodal = task.evolution.state_noise_covariance(0.0, prior.nodal_std**2)
 

@@ -198,7 +198,9 @@ class FullOperator:
 
     def __init__(self, world: World, frames: np.ndarray, *, gate: float,
                  noise_floor: float) -> None:
-        self._world, self._gate, self._floor = world, gate, noise_floor
+        self._world = world
+        self._gate = gate
+        self._floor = noise_floor
         self._shared = levels = levels_of(world)
         broken = BROKEN if math.isfinite(gate) else math.inf
         self._levels = [levels.linearised(levels.best(frame, broken)) for frame in frames]
@@ -216,7 +218,8 @@ class FullOperator:
 
     def assimilate(self, voltages: np.ndarray,
                    currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        innovations, kept = np.zeros_like(voltages), np.ones(voltages.shape, dtype=bool)
+        innovations = np.zeros_like(voltages)
+        kept = np.ones(voltages.shape, dtype=bool)
         self._last = [None] * len(voltages)
         for b, (filter_, level) in enumerate(zip(self._filters, self._levels, strict=True)):
             filter_.predict()

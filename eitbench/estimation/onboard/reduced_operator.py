@@ -42,7 +42,8 @@ class ReducedOperator:
     def __init__(self, world: World, frames: np.ndarray, *, gate: float,
                  noise_floor: float) -> None:
         self._shared = shared = self._share(world)
-        self._gate, self._floor = gate, noise_floor
+        self._gate = gate
+        self._floor = noise_floor
         broken = BROKEN if math.isfinite(gate) else math.inf
         self.levels = [shared.level(shared.levels.best(frame, broken)) for frame in frames]
         self.concentration = np.array([level.concentration for level in self.levels])
@@ -111,7 +112,8 @@ class ReducedOperator:
 
     def truth(self, entries: np.ndarray) -> np.ndarray:
         """(T, s) what is estimated in the first episode, from its recording: for bounds only."""
-        shared, level = self._shared, self.concentration[0]
+        shared = self._shared
+        level = self.concentration[0]
         mass = outline(shared.world).mass
         whole = 0.5 * (mass.sum(axis=0) + mass.sum(axis=1))  # ∫ of each node's function
         beyond = (shared.background - level) * whole + entries["moment"]
@@ -151,7 +153,9 @@ class Shared:
     """What all episodes of a world share."""
 
     def __init__(self, world: World) -> None:
-        self.world, self.background, self.levels = world, world.background, levels_of(world)
+        self.world = world
+        self.background = world.background
+        self.levels = levels_of(world)
         self.model = self._make(world)
         basis = np.column_stack([np.ones(len(self.model.basis)), self.model.basis])
         half = score_mass(world)
@@ -211,7 +215,9 @@ def _make_model(world: World) -> ReducedModel:
 
 def record_of_any(world: World, length: int) -> list[Observation]:
     """A record of pairs at random, about the expected level and in parts of it."""
-    task, every, level = make_task(world), pair_currents(world), world.expected_concentration
+    task = make_task(world)
+    every = pair_currents(world)
+    level = world.expected_concentration
     currents = every[np.random.default_rng(0).integers(len(every), size=length)]
     linear = LinearisedObservations(task.observation, task.noise, np.full(task.mesh.n_nodes, level))
     record = []

@@ -141,7 +141,8 @@ def method_address(name: str) -> str:
 def _generations(records: list[dict[str, Any]], table: pd.DataFrame) -> list[pd.DataFrame]:
     """The table, then one of what is outdated, one of what is older still, and so on: each method
     in one version."""
-    tables, left = [table], newest(records)[1]
+    tables = [table]
+    left = newest(records)[1]
     while left:
         current, older = newest(left)
         tables.append(boards(current))
