@@ -9,9 +9,17 @@ from typing import TYPE_CHECKING
 from tqdm import tqdm
 
 from eitbench import _check
-from eitbench.data import recordings, regions
 from eitbench.data.episodes import simulate_together
 from eitbench.data.parallel import in_parallel
+from eitbench.data.recordings import (
+    is_recorded,
+    make_recording,
+    outline,
+    recording_path,
+    recording_type,
+    store_recording,
+)
+from eitbench.data.regions import are_kept, integrals_path, make_integrals, store_integrals
 
 if TYPE_CHECKING:
     from eitbench.worlds.world import World
@@ -22,9 +30,9 @@ TOGETHER = 8
 
 def recording_bytes(world: World) -> int:
     """Of one recording on disk, with what lies beside it, but for headers of some hundred bytes."""
-    n = recordings.outline(world).mass.shape[0]
+    n = outline(world).mass.shape[0]
     beside = 0 if world.region is None else 4 * n + 16  # see `Integrals`
-    return world.n_steps * (recordings.recording_type(world, n).itemsize + beside)
+    return world.n_steps * (recording_type(world, n).itemsize + beside)
 
 
 def fill(world: World, seeds: Sequence[int], *, n_jobs: int = 1, backend: str = "loky") -> int:
@@ -41,8 +49,7 @@ def fill(world: World, seeds: Sequence[int], *, n_jobs: int = 1, backend: str = 
     missing = missing_seeds(world, seeds)
     together = max(1, min(TOGETHER, -(-len(missing) // n_jobs)))
     # Paths are found out here: by now a worker may live in another environment than its parent.
-    todo = [(seed, recordings.recording_path(world, seed), regions.integrals_path(world, seed))
-            for seed in missing]
+    todo = [(seed, recording_path(world, seed), integrals_path(world, seed)) for seed in missing]
     groups = [(world, todo[k:k + together]) for k in range(0, len(todo), together)]
     with tqdm(total=len(missing), desc="recording", unit="episode", disable=None) as bar:
         for done in in_parallel(_record, groups, n_jobs, backend):
@@ -53,14 +60,14 @@ def fill(world: World, seeds: Sequence[int], *, n_jobs: int = 1, backend: str = 
 def missing_seeds(world: World, seeds: Sequence[int]) -> list[int]:
     """Those of ``seeds`` without a sound recording."""
     checked = dict.fromkeys(_check.integer("seeds", seed, low=0) for seed in seeds)
-    return [seed for seed in checked if not (recordings.is_recorded(world, seed)
-                                             and regions.are_kept(world, seed))]
+    return [seed for seed in checked
+            if not (is_recorded(world, seed) and are_kept(world, seed))]
 
 
 def _record(world: World, todo: Sequence[tuple[int, Path, Path]]) -> int:
     episodes = simulate_together(world, [seed for seed, *_ in todo], progress=False)
     for (seed, path, beside), episode in zip(todo, episodes, strict=True):
         if world.region is not None:
-            regions.store_integrals(beside, seed, regions.make_integrals(world, episode))
-        recordings.store_recording(path, recordings.make_recording(world, seed, episode))
+            store_integrals(beside, seed, make_integrals(world, episode))
+        store_recording(path, make_recording(world, seed, episode))
     return len(todo)
