@@ -1,4 +1,4 @@
-"""Extended Kalman filter: the observation is linearised anew about each prediction; else as the \
+"""Extended Kalman filter: the observation is linearised anew about each prediction; else as the
 Kalman filter."""
 
 import numpy as np

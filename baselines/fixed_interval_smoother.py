@@ -1,4 +1,4 @@
-"""Fixed-interval Kalman smoother (thesis 5.1.2): the Kalman filter, and then back over the whole \
+"""Fixed-interval Kalman smoother (thesis 5.1.2): the Kalman filter, and then back over the whole
 record."""
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""Best homogeneous estimate: one constant, fitted to all complete frames so far. The floor on \
+"""Best homogeneous estimate: one constant, fitted to all complete frames so far. The floor on
 every board."""
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""Linearised Kalman filter (thesis 5.1.2): linear about the first frame's ĉ_bh, parameters of \
+"""Linearised Kalman filter (thesis 5.1.2): linear about the first frame's ĉ_bh, parameters of
 Table 5.1."""
 
 import numpy as np

@@ -1,7 +1,7 @@
-"""Maximum a posteriori: nonlinear Gauss–Newton over all injections so far, with the Kalman \
+"""Maximum a posteriori: nonlinear Gauss–Newton over all injections so far, with the Kalman
 filter's own prior.
 
-For targets that stand still: what the linearised filter approximates, and is to be compared with \
+For targets that stand still: what the linearised filter approximates, and is to be compared with
 (thesis 7.2).
 """
 

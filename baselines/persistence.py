@@ -1,7 +1,7 @@
-"""Persistence: the stationary image of the last complete frame, held until the next frame is \
+"""Persistence: the stationary image of the last complete frame, held until the next frame is
 complete.
 
-Where estimates are asked for later it says what it would have said at the time: the floor for \
+Where estimates are asked for later it says what it would have said at the time: the floor for
 those who look back.
 """
 

@@ -1,4 +1,4 @@
-"""Best cycle: up to four pairs in turn, the best of a search on training episodes; a budget is \
+"""Best cycle: up to four pairs in turn, the best of a search on training episodes; a budget is
 spread evenly."""
 
 from itertools import cycle

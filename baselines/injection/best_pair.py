@@ -1,4 +1,4 @@
-"""Best fixed pair: the same one at every step, the best of all on training episodes; a budget is \
+"""Best fixed pair: the same one at every step, the best of all on training episodes; a budget is
 spread evenly."""
 
 from typing import Any

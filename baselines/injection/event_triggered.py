@@ -1,7 +1,7 @@
-"""Event-triggered: probes now and then, and looks closely while what it reads is not what was \
+"""Event-triggered: probes now and then, and looks closely while what it reads is not what was
 predicted.
 
-What is left of the budget is spread over what is left of the episode; a part is kept back for \
+What is left of the budget is spread over what is left of the episode; a part is kept back for
 surprises.
 """
 

@@ -1,4 +1,4 @@
-"""Fault-aware greedy: A-optimal among the electrodes that recent readings give no reason to \
+"""Fault-aware greedy: A-optimal among the electrodes that recent readings give no reason to
 doubt."""
 
 from typing import Any

@@ -1,4 +1,4 @@
-"""Fault-aware look-ahead: beam search over the next three injections, among the electrodes that \
+"""Fault-aware look-ahead: beam search over the next three injections, among the electrodes that
 are not in doubt."""
 
 from typing import Any

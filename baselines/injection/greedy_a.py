@@ -1,4 +1,4 @@
-"""Greedy, A-optimal: the pair that leaves the least variance, linear about the estimate; a budget \
+"""Greedy, A-optimal: the pair that leaves the least variance, linear about the estimate; a budget
 is spread evenly."""
 
 from typing import Any

@@ -1,4 +1,4 @@
-"""Greedy, D-optimal: the pair that tells most bits, linear about the estimate; a budget is spread \
+"""Greedy, D-optimal: the pair that tells most bits, linear about the estimate; a budget is spread
 evenly."""
 
 from typing import Any

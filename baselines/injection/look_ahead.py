@@ -1,4 +1,4 @@
-"""Look-ahead: beam search over the next three injections for the least sum of variances; a budget \
+"""Look-ahead: beam search over the next three injections for the least sum of variances; a budget
 is spread evenly."""
 
 from typing import Any
