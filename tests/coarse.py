@@ -1,4 +1,4 @@
-"""Worlds of ours on coarser meshes: the same physics and the same estimators at a tenth of the price."""
+"""Worlds of ours on coarser meshes: the same physics and estimators at a fraction of the price."""
 
 from dataclasses import dataclass, replace
 
@@ -24,14 +24,15 @@ class CoarsePlanePipe(PlanePipe):
         """3,751 nodes for the truth, 915 for the model."""
         along, across = (120, 30) if fine else (60, 14)
         R = self.half_width
-        mesh = rectangle_mesh(np.linspace(0.0, self.length, along + 1), np.linspace(-R, R, across + 1))
+        mesh = rectangle_mesh(np.linspace(0.0, self.length, along + 1),
+                              np.linspace(-R, R, across + 1))
         return self.shaped(mesh), np.arange(across + 1)
 
     def electrode_model(self, fine):
         """As in `PlanePipe`, with fewer cells at each electrode and across."""
         at_electrodes, across = (7, 20) if fine else (4, 12)
-        straight = graded_pipe_mesh(self.length, self.half_width, self.electrode_spans, at_electrodes,
-                                    across)
+        straight = graded_pipe_mesh(self.length, self.half_width, self.electrode_spans,
+                                    at_electrodes, across)
         return CompleteElectrodeModel(self.shaped(straight), self.electrodes(straight),
                                       self.contact_impedance)
 
