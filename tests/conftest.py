@@ -41,7 +41,7 @@ def pytest_collection_modifyitems(items):
 
 
 @pytest.fixture(scope="session")
-def run_cache(tmp_path_factory):
-    """A cache folder that all processes of this run share, and no other run."""
-    own = tmp_path_factory.getbasetemp()
-    return str((own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / "episodes")
+def run_cache(pytestconfig):
+    """A cache folder that all processes share, and the next run too: what lies there names the code
+    it was computed with, so that other code never finds it. `pytest --cache-clear` empties it."""
+    return str(pytestconfig.cache.mkdir("episodes"))

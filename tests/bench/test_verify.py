@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from eitbench.bench import baselines, held_out, run
+from eitbench.bench import held_out, methods, run
 from eitbench.bench import store as store_module
 from eitbench.bench import verify as verification
 from eitbench.bench.records import read_record, write_record
@@ -215,7 +215,7 @@ def test_numbers_decide_and_not_the_text(tmp_path, monkeypatch):
     assert (code, complaint) == (0, "") and "as it says" in said and "now v" not in said
     code, _, complaint = eitbench("verify", forged(path, lambda record: record.update(role=None)))
     assert code == 1 and "role is 'floor', the record says None" in complaint
-    monkeypatch.setattr(baselines, "version_of", lambda path, sha256: "v2")
+    monkeypatch.setattr(methods, "version_of", lambda path, sha256: "v2")
     code, said, _ = eitbench("verify", path)
     assert code == 0 and "the record is of v1, and homogeneous is now v2" in said
     code, said, complaint = eitbench("verify", forged(path, better))
