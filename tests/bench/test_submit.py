@@ -294,7 +294,7 @@ def test_from_a_file_to_the_boards_by_command(tmp_path):
     assert "Mine" in (tmp_path / "leaderboards" / "site" / "methods" / "mine.html").read_text(encoding="utf-8")
     text = (tmp_path / "leaderboards" / "leaderboard.md").read_text(encoding="utf-8")
     assert re.search(r"\| +1 +\| Mine mine@\w{8} +\|.*\| self-reported \|", text)
-    assert "## injection" in text and "| floor |" in text
+    assert "## injection" in text and "(floor)" in text
 
     code, said, _ = eitbench("compare", "mine", "homogeneous", "--html", "pair.html")
     assert code == 0 and "eitbench-Pipe2D-v0" in said and "wrote pair.html" in said
