@@ -273,16 +273,16 @@ def test_an_agent_plays_as_it_was_evaluated(env, algo, tmp_path):
               for seed in (100_000, 100_001)]
     np.testing.assert_allclose(errors, expected, rtol=1e-5)
     agent = load_method(str(path), "injection")
-    injected = []
+    chosen = []
     for estimator in ("reduced", "full"):
         world = gym.make(env, estimator=estimator, observation="raw", **kwargs).unwrapped
-        player, ended = agent.policy(world.rules, np.random.default_rng(0)), False
+        player, ended = agent.make(world.rules, np.random.default_rng(0)), False
         observation, _ = world.reset(seed=7)
-        injected.append([])
+        chosen.append([])
         while not ended:
             observation, _, ended, _, _ = world.step(player.act(observation))
-            injected[-1].append(observation["currents"])
-    np.testing.assert_array_equal(*injected)                # whichever filter is inside
+            chosen[-1].append(observation["currents"])
+    np.testing.assert_array_equal(*chosen)                # whichever filter is inside
     asked = json.loads((tmp_path / "config.json").read_text())
     assert asked["config"] == json.loads(json.dumps(asdict(config)))
     assert agent.name == f"{algo}_{_mark(asked)}_seed1" and _mark(asked) == _mark(asked | {"seed": 2})
