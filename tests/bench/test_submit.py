@@ -4,7 +4,7 @@ import json
 import re
 
 import pytest
-from eitbench.bench import baselines, load, run, suites
+from eitbench.bench import load, methods, run, suites
 from eitbench.bench import store as store_module
 from eitbench.bench.records import newest, read_record, read_records, sealed, write_record
 from eitbench.bench.store import EpisodeStore, provenance
@@ -175,7 +175,7 @@ def test_what_says_more_is_not_replaced(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="would lose its being official"):
         submitted("b", TEST[:1])
     with monkeypatch.context() as patch:
-        patch.setattr(baselines, "version_of", lambda path, sha256: "v2")
+        patch.setattr(methods, "version_of", lambda path, sha256: "v2")
         assert submitted("b", TEST[:1])["seeds"] == ["test:0"]
     assert path.exists() and newest(read_records(to))[0] == [read_record(path.with_name(path.name.replace("v1", "v2")))]
 
