@@ -23,7 +23,7 @@ def verify(
     isolate: options.Isolate = options.Isolation.always,
     held_out: Annotated[int, typer.Option(
         "--held-out", min=0, help="For maintainers: play so many held-out episodes too, and "
-                                  "compare the gains.")] = 0,
+                                  "ask whether the record is too good.")] = 0,
     salt_file: Annotated[Path | None, typer.Option(
         help="From which they follow; see `eitbench held-out`.")] = None,
     every: Annotated[bool, typer.Option(
@@ -79,7 +79,7 @@ def verify(
                 typer.echo(f"episodes drawn with --seed {seed}, isolation {job.isolation}\n\n"
                            f"{table}\n")
             if held_out:
-                table, more = beyond.held_out(claimed, job, salt, held_out, record.parent)
+                table, more = beyond.held_out(claimed, job, salt, held_out)
                 differences += more
                 typer.echo("held-out episodes of the salt with sha256 "
                            f"{beyond.hash_of(salt)}\n\n{table}\n")
