@@ -16,7 +16,8 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import re
+import os
+import stat
 import warnings
 from collections.abc import Iterable
 from functools import lru_cache
@@ -27,15 +28,18 @@ import jsonschema
 
 from eitbench._files import shipped, write_atomically
 from eitbench.bench import schema2, tracks
-from eitbench.data.seeds import name_seed, parse_seeds
+from eitbench.bench.contradictions import contradictions, version_number
+from eitbench.bench.text import cleaned
 
 SCHEMA = 3
 BOARDS = tracks.ALL_BOARDS
 SHARED = ("board", "title", "parameters", "role", "privileged", "version", "method_sha256",
           "checkpoint_sha256")
 """What all episodes of a record have in common, beside environment and method."""
-OURS = re.compile(r"v([1-9][0-9]*)")
-"""Versions of our own methods; of all others a version is eight digits of their file's sha256."""
+MOST_BYTES = 2**25
+"""of a file"""
+DEEPEST = 32
+"""levels of lists and objects within each other"""
 
 
 def write_record(folder: Path, record: dict[str, Any]) -> Path:
@@ -43,7 +47,10 @@ def write_record(folder: Path, record: dict[str, Any]) -> Path:
     is replaced. ``ValueError``, naming file and fields, if it is not what the schema asks for."""
     record = sealed(record)
     path = Path(folder) / _named_by_content(record)
-    _check(path, record)
+    try:
+        _check(record)
+    except ValueError as error:
+        raise ValueError(f"record {cleaned(str(path))} {cleaned(str(error))}") from None
     write_atomically(path, _text(record).encode())
     return path
 
@@ -55,22 +62,65 @@ def read_record(path: Path) -> dict[str, Any]:
     was changed since it was written, or has another name than its content asks for.
     """
     try:
-        record = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse)
+        return _read(path)
     except (OSError, ValueError) as error:
-        raise ValueError(f"record {path} cannot be read: {error}") from None
+        raise ValueError(f"record {cleaned(str(path))} {cleaned(str(error))}") from None
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """As `read_record`; what is wrong, without the file's name."""
+    record = _parsed(path)
     written = record
     name = None
     if isinstance(record, dict) and record.get("schema") == schema2.NUMBER:
-        content, name = schema2.upgraded(path, record)
+        content, name = schema2.upgraded(record)
         record = sealed(content)
-    _check(path, record)
+    _check(record)
     if written.get("sha256") != sealed(written)["sha256"]:
-        raise ValueError(f"record {path} was changed since it was written: its sha256 is no longer "
-                         "that of its content")
+        raise ValueError("was changed since it was written: its sha256 is no longer that of its "
+                         "content")
     name = name or file_name(record)
     if path.name != name:
-        raise ValueError(f"record {path} must have the name {name}, as its content asks for")
+        raise ValueError(f"must have the name {name}, as its content asks for")
     return record
+
+
+def _parsed(path: Path) -> Any:
+    """The JSON of a file, in which nothing is larger or deeper than a record can be."""
+    try:
+        size = os.stat(path)
+        if not stat.S_ISREG(size.st_mode) or size.st_size > MOST_BYTES:
+            raise ValueError(f"it is no file of at most {MOST_BYTES >> 20} MiB")
+        content = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse,
+                             parse_int=_integer, parse_float=_real)
+        _check_depth(content)
+        _json(content).encode()                                  # halves of letters are no text
+    except (OSError, ValueError, RecursionError) as error:
+        raise ValueError(f"cannot be read: {error}") from None
+    return content
+
+
+def _check_depth(content: Any) -> None:
+    """``ValueError`` if lists and objects lie deeper within each other than `DEEPEST`."""
+    level = [content]
+    for _ in range(DEEPEST):
+        level = [inner for each in level if isinstance(each, dict | list)
+                 for inner in (each.values() if isinstance(each, dict) else each)]
+        if not level:
+            return
+    raise ValueError(f"lists and objects must lie at most {DEEPEST} deep within each other")
+
+
+def _integer(text: str) -> int:
+    if len(text) > 20 or abs(number := int(text)) >= 2**63:
+        raise ValueError(f"integers must have 64 bits at most, got one of {len(text)} digits")
+    return number
+
+
+def _real(text: str) -> float:
+    if not math.isfinite(number := float(text)):
+        raise ValueError(f"numbers must be finite, got {text[:40]}")
+    return number
 
 
 def read_records(folder: Path) -> list[dict[str, Any]]:
@@ -94,20 +144,16 @@ def sealed(record: dict[str, Any]) -> dict[str, Any]:
     content = {key: value for key, value in record.items() if key != "sha256"}
     try:
         content = json.loads(_json(content))
-    except (TypeError, ValueError) as error:  # NaN, or something that is no JSON at all
+        text = _json(content, separators=(",", ":")).encode()
+    # NaN, or something that is no JSON at all, or too deep
+    except (TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"record cannot be written as JSON: {error}") from None
-    text = _json(content, separators=(",", ":"))
-    return content | {"sha256": hashlib.sha256(text.encode()).hexdigest()}
+    return content | {"sha256": hashlib.sha256(text).hexdigest()}
 
 
 def file_name(record: dict[str, Any]) -> str:
     """``ENV--METHOD--VERSION.json``; of other seeds than test with their split in it too."""
     return schema2.file_name(record, record["version"])
-
-
-def split_of(seed: str) -> str:
-    """``test`` of ``test:4``; ``own`` of a plain number."""
-    return seed.split(":")[0] if ":" in seed else "own"
 
 
 def alike(runs: Iterable[dict[str, Any]], *keys: str) -> list[list[dict[str, Any]]]:
@@ -145,58 +191,17 @@ def newest(records: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], list[di
     return current, outdated
 
 
-def version_number(version: str) -> int | None:
-    """3 of ``v3``, a version of a method of ours; None for the digits of somebody else's file."""
-    return int(version[1:]) if OURS.fullmatch(version) else None
-
-
 def _lineage(record: dict[str, Any]) -> tuple[str, ...]:
     """What the versions of one method have in common."""
     return record["environment"]["name"], record["method"], record["split"]
 
 
-def _check(path: Path, record: Any) -> None:
-    """``ValueError`` naming file and fields if a record breaks the schema or contradicts itself."""
+def _check(record: Any) -> None:
+    """``ValueError`` naming fields if a record breaks the schema or contradicts itself."""
     errors = sorted(_validator().iter_errors(record), key=lambda error: error.json_path)
     wrong = [f"{error.json_path}: {_shortened(error.message)}" for error in errors]
-    if wrong := wrong or _contradictions(record):
-        raise ValueError(f"record {path} is not valid: " + "; ".join(wrong[:5]))
-
-
-def _contradictions(record: dict[str, Any]) -> list[str]:
-    """What the schema cannot say: fields of a valid record that do not fit each other."""
-    wrong = []
-    environment = record["environment"]
-    version = record["version"]
-    name = tracks.named(environment["id"], environment["kwargs"])
-    if environment["name"] != name:
-        wrong.append(f"$.environment.name: must be {name}, as id and kwargs ask for")
-    if version != record["method_sha256"][:8] and version_number(version) is None:
-        wrong.append("$.version: must be v1, v2, … of ours, or begin as method_sha256 does")
-    if record["seeds"] != [episode["seed"] for episode in record["episodes"]]:
-        wrong.append("$.seeds: must be those of the episodes, in their order")
-    wrong += [f"$.seeds: {seed!r} names no episode"
-              for seed in record["seeds"] if not _names_an_episode(seed)]
-    if {split_of(seed) for seed in record["seeds"]} != {record["split"]}:
-        wrong.append(f"$.seeds: must all be of the split {record['split']}")
-    if record["official"] and any(run["commit"] is None or run["dirty"] for run in record["runs"]):
-        wrong.append("$.official: must be false where a run was not of a commit without changes")
-    for i, episode in enumerate(record["episodes"]):
-        if episode["run"] >= len(record["runs"]):
-            wrong.append(f"$.episodes[{i}].run: there are only {len(record['runs'])} runs")
-        if steps := episode.get("step_errors"):
-            mean = sum(steps) / len(steps)
-            if not math.isclose(episode["scores"]["error"], mean, rel_tol=1e-9):
-                wrong.append(f"$.episodes[{i}].scores.error: must be the mean of step_errors")
-    return wrong
-
-
-def _names_an_episode(seed: str) -> bool:
-    """Whether it lies within its split, written as `name_seed` does: an episode has one name."""
-    try:
-        return name_seed(parse_seeds(seed)[0]) == seed
-    except ValueError:
-        return False
+    if wrong := wrong or contradictions(record):
+        raise ValueError("is not valid: " + "; ".join(wrong[:5]))
 
 
 @lru_cache(maxsize=1)

@@ -21,7 +21,8 @@ from threadpoolctl import threadpool_limits
 
 from eitbench._code import code_digest, package_files
 from eitbench._files import PACKAGE, write_atomically
-from eitbench.bench.records import SCHEMA, SHARED, read_records, sealed, split_of, write_record
+from eitbench.bench.contradictions import split_of
+from eitbench.bench.records import SCHEMA, SHARED, read_records, sealed, write_record
 from eitbench.data.seeds import name_seed
 
 PACKAGES = ("eitbench", "numpy", "scipy", "gymnasium", "scikit-fem", "numba", "stable-baselines3",

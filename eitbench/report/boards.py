@@ -94,10 +94,11 @@ def boards(records: list[dict[str, Any]]) -> pd.DataFrame:
 
     A board is an environment. Its episodes are those that its floor has played (without one, those
     that anybody has); others are not looked at. After the boards of a class comes its aggregate,
-    with ``environment`` `ALL`, if there are several registered environments with a floor: of
-    methods that have finished every episode of every one of them. Environments with arguments of
-    somebody's own have boards, and no part in it. ``seconds_per_step`` is in ms of the fastest
-    episode, ``voltage_discrepancy`` in mV², ``peak_memory`` in 10⁶ bytes.
+    with ``environment`` `ALL`, if there are several registered environments with a floor (an
+    official one, where any is): of methods that have finished every episode of every one of them.
+    Environments with arguments of somebody's own have boards, and no part in it.
+    ``seconds_per_step`` is in ms of the fastest episode, ``voltage_discrepancy`` in mV²,
+    ``peak_memory`` in 10⁶ bytes.
 
     Raises
     ------
@@ -121,8 +122,8 @@ def boards(records: list[dict[str, Any]]) -> pd.DataFrame:
                   for _, environment in environments}
         for environment, entries in played.items():
             rows += _board(environment, entries, current, products)
-        rows += _aggregate({environment: entries for environment, entries in played.items()
-                            if environment in registered and any(entry.gains for entry in entries)})
+        rows += _aggregate(_counted({environment: entries for environment, entries in played.items()
+                                     if environment in registered}))
     types: dict[str, Any] = dict.fromkeys([*_NUMBERS, *others(), *_AFTER], float)
     return pd.DataFrame(rows, columns=fields()).astype(types | {"rank": "Int64"})
 
@@ -134,8 +135,7 @@ def class_of(record: dict[str, Any]) -> str:
 
 def _entries(records: list[dict[str, Any]]) -> list[Entry]:
     """The records of one environment on the board's episodes."""
-    floors = [record for record in records
-              if record["method"] == FLOORS[track_of_board(record["board"])]]
+    floors = [record for record in records if _is_floor(record)]
     floor = max(floors, key=lambda record: (record["official"], finished(record)), default=None)
     seeds = {seed for record in ([floor] if floor else records) for seed in record["seeds"]}
     zero = scores_by_seed(floor, "error") if floor else {}
@@ -180,6 +180,20 @@ def _board(environment: str, entries: list[Entry], current: list[dict[str, Any]]
 def _place(entry: Entry) -> tuple[bool, float, str]:
     errors = list(entry.errors.values())
     return not entry.complete, mean_over_environments(errors) if errors else math.inf, entry.label
+
+
+def _counted(played: dict[str, list[Entry]]) -> dict[str, list[Entry]]:
+    """The environments of an aggregate: those with a floor; where there are official floors, those
+    with an official one, or else a stranger with a floor of his own could shut all others out."""
+    own = {environment: entries for environment, entries in played.items()
+           if any(entry.gains for entry in entries)}
+    official = {environment: entries for environment, entries in own.items()
+                if any(_is_floor(entry.record) and entry.record["official"] for entry in entries)}
+    return official or own
+
+
+def _is_floor(record: dict[str, Any]) -> bool:
+    return bool(record["method"] == FLOORS[track_of_board(record["board"])])
 
 
 def _aggregate(played: dict[str, list[Entry]]) -> list[dict[str, Any]]:

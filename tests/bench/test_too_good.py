@@ -54,7 +54,8 @@ def test_by_hand():
     record, new = np.array([[1.0, 10.0], [3.0, 10.0]]), np.array([[4.0, 10.0], [6.0, 20.0]])
     a, b, c = judged(record, new, 20_000)
     assert [a.name, b.name, c.name] == NAMES
-    assert (a.record, a.held_out) == pytest.approx((0.2, 1 / 3)) and (b.record, b.held_out) == pytest.approx((0.8, 0.65))
+    assert (a.record, a.held_out) == pytest.approx((0.2, 1 / 3))
+    assert (b.record, b.held_out) == pytest.approx((0.8, 0.65))
     assert (c.record, c.held_out) == pytest.approx((0.1, 0.3))
     # Were 1 and 4 the record, its gains would be as good, 0.8 and 0.65; its means less so, 7/30 and 7/20.
     assert a.p == pytest.approx(1 / 6, abs=0.01) and b.p == pytest.approx(2 / 6, abs=0.01)
