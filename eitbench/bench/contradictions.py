@@ -8,8 +8,8 @@ import re
 from collections.abc import Iterator
 from typing import Any
 
+from eitbench._foreign import cleaned
 from eitbench.bench import tracks
-from eitbench.bench.text import cleaned
 from eitbench.data.seeds import name_seed, parse_seeds
 
 OURS = re.compile(r"v([1-9][0-9]*)")

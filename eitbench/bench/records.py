@@ -21,15 +21,16 @@ import stat
 import warnings
 from collections.abc import Iterable
 from functools import lru_cache
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import jsonschema
 
 from eitbench._files import shipped, write_atomically
+from eitbench._foreign import cleaned
 from eitbench.bench import schema2, tracks
 from eitbench.bench.contradictions import contradictions, version_number
-from eitbench.bench.text import cleaned
 
 SCHEMA = 3
 BOARDS = tracks.ALL_BOARDS
@@ -38,6 +39,8 @@ SHARED = ("board", "title", "parameters", "role", "privileged", "version", "meth
 """What all episodes of a record have in common, beside environment and method."""
 MOST_BYTES = 2**25
 """of a file"""
+MOST_EPISODES = 10_000
+"""of a record"""
 DEEPEST = 32
 """levels of lists and objects within each other"""
 
@@ -124,19 +127,36 @@ def _real(text: str) -> float:
 
 
 def read_records(folder: Path) -> list[dict[str, Any]]:
-    """All records of a folder, by file name; none if there is no such folder. Errors as
-    `read_record`. Records of an environment that is not registered, or no longer in that version,
-    are left out with a warning."""
+    """All records of a folder, by file name; none if there is no such folder. Records of an
+    environment that is not registered, or no longer in that version, are left out with a warning.
+
+    ``ValueError``, naming all of them, if some are not as `read_record` asks for.
+    """
+    records, complaints = read_sound_records(folder)
+    if complaints:
+        raise ValueError("; ".join(complaints))
+    return records
+
+
+def read_sound_records(folder: Path) -> tuple[list[dict[str, Any]], list[str]]:
+    """As `read_records`, but those that are not valid are left out, with a sentence for each that
+    names the file."""
     records = []
+    complaints = []
     known = set(tracks.ids())
     for path in sorted(Path(folder).glob("*.json")):
-        record = read_record(path)
+        try:
+            record = read_record(path)
+        except ValueError as error:
+            complaints.append(str(error))
+            continue
         id = record["environment"]["id"]
         if id in known:
             records.append(record)
         else:
-            warnings.warn(f"record {path} is left out: there is no environment {id}", stacklevel=2)
-    return records
+            warnings.warn(f"record {cleaned(str(path))} is left out: there is no environment "
+                          f"{cleaned(id)}", stacklevel=3)
+    return records, complaints
 
 
 def sealed(record: dict[str, Any]) -> dict[str, Any]:
@@ -198,10 +218,24 @@ def _lineage(record: dict[str, Any]) -> tuple[str, ...]:
 
 def _check(record: Any) -> None:
     """``ValueError`` naming fields if a record breaks the schema or contradicts itself."""
-    errors = sorted(_validator().iter_errors(record), key=lambda error: error.json_path)
-    wrong = [f"{error.json_path}: {_shortened(error.message)}" for error in errors]
-    if wrong := wrong or contradictions(record):
-        raise ValueError("is not valid: " + "; ".join(wrong[:5]))
+    wrong = _too_many(record) or _against_the_schema(record) or contradictions(record)
+    if wrong:
+        raise ValueError("is not valid: " + "; ".join(map(_shortened, wrong[:5])))
+
+
+def _too_many(record: Any) -> list[str]:
+    """What to compare with each other would take for ever."""
+    seeds = record.get("seeds") if isinstance(record, dict) else None
+    if isinstance(seeds, list) and (len(seeds) > MOST_EPISODES
+                                    or not all(isinstance(seed, str) for seed in seeds)):
+        return [f"$.seeds: must be at most {MOST_EPISODES} texts"]
+    return []
+
+
+def _against_the_schema(record: Any) -> list[str]:
+    errors = list(islice(_validator().iter_errors(record), 20))
+    return [f"{error.json_path}: {_shortened(error.message)}"
+            for error in sorted(errors, key=lambda error: error.json_path)]
 
 
 @lru_cache(maxsize=1)
@@ -237,4 +271,4 @@ def _refuse(constant: str) -> None:
 
 
 def _shortened(message: str) -> str:
-    return message if len(message) < 200 else f"{message[:90]} … {message[-90:]}"
+    return message if len(message) < 300 else f"{message[:140]} … {message[-140:]}"

@@ -8,7 +8,8 @@ from typing import NamedTuple
 
 from markupsafe import Markup
 
-from eitbench.bench.text import as_markdown, number
+from eitbench._foreign import as_markdown
+from eitbench.bench.text import number
 
 NOTHING = "–"
 

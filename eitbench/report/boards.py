@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple
 
 import pandas as pd
 
-from eitbench.bench.records import file_name, finished, newest
+from eitbench.bench.records import file_name, finished, newest, read_sound_records
 from eitbench.bench.statistics import (
     interquartile_mean,
     mean_over_environments,
@@ -126,6 +127,28 @@ def boards(records: list[dict[str, Any]]) -> pd.DataFrame:
                                      if environment in registered}))
     types: dict[str, Any] = dict.fromkeys([*_NUMBERS, *others(), *_AFTER], float)
     return pd.DataFrame(rows, columns=fields()).astype(types | {"rank": "Int64"})
+
+
+def read_for_boards(folder: Path) -> tuple[list[dict[str, Any]], list[str]]:
+    """The records of a folder that can stand on boards, and a sentence for each of the others.
+
+    Raises
+    ------
+    ValueError
+        If there is no such folder, or none of it can.
+    """
+    if not folder.is_dir():
+        raise ValueError(f"records must be a folder that exists, got {folder}")
+    read, complaints = read_sound_records(folder)
+    found = [record for record in read if record["split"] == "test"]
+    complaints += [f"record {folder / file_name(record)} has {record['split']} seeds, and "
+                   "leaderboards are made of test seeds"
+                   for record in read if record["split"] != "test"]
+    if not found:
+        named = "".join(f"; {complaint}" for complaint in complaints)
+        raise ValueError(f"records must be a folder with records, got {folder}, where there are "
+                         f"none that can be shown{named}")
+    return found, complaints
 
 
 def class_of(record: dict[str, Any]) -> str:

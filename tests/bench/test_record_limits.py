@@ -5,8 +5,8 @@ import os
 from inspect import signature
 
 import pytest
+from eitbench._foreign import as_markdown, cleaned
 from eitbench.bench.records import BOARDS, DEEPEST, MOST_BYTES, file_name, read_record, sealed, write_record
-from eitbench.bench.text import as_markdown, cleaned
 from eitbench.bench.tracks import ARGUMENTS, boards_of, named
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.injection import InjectionEnv

@@ -16,7 +16,7 @@ from eitbench.data.store import CACHE_VARIABLE
 from typer.testing import CliRunner
 
 from short import PIPE, shorten
-from tiny import FILTER, SCENARIO, SMOOTHING, count, counting, git_says, write_baseline
+from tiny import FILTER, SCENARIO, SMOOTHING, count, counting, git_says, record, write_baseline
 
 INJECTION = "eitbench/Pipe2DInjection-v0"
 TEST = parse_seeds("test:0-1")
@@ -257,12 +257,14 @@ def test_mistyped_records_delete_nothing(tmp_path):
     kept = tmp_path / "site" / "index.html"
     kept.parent.mkdir()
     kept.write_text("mine")
-    (tmp_path / "results").mkdir()
+    (tmp_path / "none").mkdir()
+    write_record(tmp_path / "results", record("homogeneous", [0.2, 0.3]))
     for records, message in (("result", "records must be a folder that exists, got result"),
+                             ("none", "records must be a folder with records, got none, where there are none"),
                              ("results", "folder must be empty or hold a site of the leaderboards")):
         code, _, complaint = eitbench("leaderboard", "--records", records)
         assert code == 2 and message in complaint
-        assert {path.name for path in tmp_path.iterdir()} == {"site", "results"} and kept.read_text() == "mine"
+        assert {path.name for path in tmp_path.iterdir()} == {"site", "results", "none"} and kept.read_text() == "mine"
 
 
 @pytest.mark.parametrize("arguments", [
