@@ -15,9 +15,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
-import os
-import stat
 import warnings
 from collections.abc import Iterable
 from functools import lru_cache
@@ -31,18 +28,15 @@ from eitbench._files import shipped, write_atomically
 from eitbench._foreign import cleaned
 from eitbench.bench import schema2, tracks
 from eitbench.bench.contradictions import contradictions, version_number
+from eitbench.bench.strict_json import parsed
 
 SCHEMA = 3
 BOARDS = tracks.ALL_BOARDS
 SHARED = ("board", "title", "parameters", "role", "privileged", "version", "method_sha256",
           "checkpoint_sha256")
 """What all episodes of a record have in common, beside environment and method."""
-MOST_BYTES = 2**25
-"""of a file"""
 MOST_EPISODES = 10_000
 """of a record"""
-DEEPEST = 32
-"""levels of lists and objects within each other"""
 
 
 def write_record(folder: Path, record: dict[str, Any]) -> Path:
@@ -72,7 +66,7 @@ def read_record(path: Path) -> dict[str, Any]:
 
 def _read(path: Path) -> dict[str, Any]:
     """As `read_record`; what is wrong, without the file's name."""
-    record = _parsed(path)
+    record = parsed(path)
     written = record
     name = None
     if isinstance(record, dict) and record.get("schema") == schema2.NUMBER:
@@ -86,44 +80,6 @@ def _read(path: Path) -> dict[str, Any]:
     if path.name != name:
         raise ValueError(f"must have the name {name}, as its content asks for")
     return record
-
-
-def _parsed(path: Path) -> Any:
-    """The JSON of a file, in which nothing is larger or deeper than a record can be."""
-    try:
-        size = os.stat(path)
-        if not stat.S_ISREG(size.st_mode) or size.st_size > MOST_BYTES:
-            raise ValueError(f"it is no file of at most {MOST_BYTES >> 20} MiB")
-        content = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse,
-                             parse_int=_integer, parse_float=_real)
-        _check_depth(content)
-        _json(content).encode()                                  # halves of letters are no text
-    except (OSError, ValueError, RecursionError) as error:
-        raise ValueError(f"cannot be read: {error}") from None
-    return content
-
-
-def _check_depth(content: Any) -> None:
-    """``ValueError`` if lists and objects lie deeper within each other than `DEEPEST`."""
-    level = [content]
-    for _ in range(DEEPEST):
-        level = [inner for each in level if isinstance(each, dict | list)
-                 for inner in (each.values() if isinstance(each, dict) else each)]
-        if not level:
-            return
-    raise ValueError(f"lists and objects must lie at most {DEEPEST} deep within each other")
-
-
-def _integer(text: str) -> int:
-    if len(text) > 20 or abs(number := int(text)) >= 2**63:
-        raise ValueError(f"integers must have 64 bits at most, got one of {len(text)} digits")
-    return number
-
-
-def _real(text: str) -> float:
-    if not math.isfinite(number := float(text)):
-        raise ValueError(f"numbers must be finite, got {text[:40]}")
-    return number
 
 
 def read_records(folder: Path) -> list[dict[str, Any]]:
@@ -264,10 +220,6 @@ def _text(record: dict[str, Any]) -> str:
 
 def _json(value: Any, **how: Any) -> str:
     return json.dumps(value, sort_keys=True, ensure_ascii=False, allow_nan=False, **how)
-
-
-def _refuse(constant: str) -> None:
-    raise ValueError(f"{constant} is not JSON")
 
 
 def _shortened(message: str) -> str:

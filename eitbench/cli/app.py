@@ -12,6 +12,7 @@ from typing import Annotated, Any
 
 import typer
 
+from eitbench._foreign import cleaned
 from eitbench.cli import options
 from eitbench.cli.maintain import cards, held_out, migrate
 from eitbench.cli.studies import thesis
@@ -372,7 +373,7 @@ def _say_failures(records: list[dict[str, Any]]) -> None:
         for episode in record["episodes"]:
             if episode["status"] != "ok":
                 options.say(f"failed: {record['method']} on {episode['seed']}: "
-                            f"{episode['message']}", err=True)
+                            f"{cleaned(episode['message'])}", err=True)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,8 @@ from inspect import signature
 
 import pytest
 from eitbench._foreign import as_markdown, cleaned
-from eitbench.bench.records import BOARDS, DEEPEST, MOST_BYTES, file_name, read_record, sealed, write_record
+from eitbench.bench.records import BOARDS, file_name, read_record, sealed, write_record
+from eitbench.bench.strict_json import DEEPEST, MOST_BYTES
 from eitbench.bench.tracks import ARGUMENTS, boards_of, named
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.injection import InjectionEnv

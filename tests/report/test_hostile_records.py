@@ -45,6 +45,7 @@ def rendered(folder, count, seed):
         assert not re.search(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2066-\u2069]", text)
     assert not re.search(r"(?<!\\)<(script|b|i)\b", markdown) and not re.search(r"(?<!\\)\]\(http://x", markdown)
     pages = [path.read_text() for path in (folder.parent / "site").rglob("*.html")]
+    assert not any(re.search(r"[\u200b-\u200f\u2028-\u202e\u2066-\u2069\x1b]", page) for page in pages)
     assert len(pages) > 10 and not any(re.search(r"<script>|<b>\s*$|<i>odd|{{", page.replace("{{ 7*7 }}", ""))
                                        for page in pages)
     return shown
