@@ -6,7 +6,7 @@ record are called the record and the others held-out, as they are; or both are d
 population like it (episodes drawn again, logarithms of the ratio to the floor moved by a kernel);
 or, for the single-episode test, each episode of every record is compared with the others of it.
 Cheats are a Kalman filter in Pipe2D-v0 with a record of ten episodes, of which some are better than
-it can do.
+it can do; and methods whose record is that of a better one.
 """
 
 from __future__ import annotations
@@ -32,6 +32,11 @@ CHEATS: tuple[tuple[str, int, float], ...] = (
     ("30 % less in the two hardest", 2, 0.7), ("30 % less in five", 5, 0.7),
     ("30 % less in all", 10, 0.7), ("20 % less in all", 10, 0.8), ("10 % less in all", 10, 0.9))
 """What is known, of how many of the ten episodes, and what is left of their error."""
+PRETENDERS = (("Pipe2D", "extended_kalman_filter", "kalman_filter", 20),
+              ("Pipe2DInjectionFaults", "fault_aware", "best_cycle", 50),
+              ("Pipe2DInjectionBudget", "event_triggered", "best_cycle", 20),
+              ("Pipe2DInjectionBudget", "event_triggered", "best_cycle", 100))
+"""World, what the record says, what the method is, held-out episodes."""
 
 
 def main() -> None:
@@ -68,6 +73,11 @@ def main() -> None:
                       for (a, _), (b, _) in zip(made, prepared, strict=True)]
         found = " | ".join(f"{100 * each:.0f}" for each in rates)
         print(f"| {what} | {100 * float(np.mean(falls)):.0f} % | {found} |")
+    print("\n| record of | method | held-out episodes | found, of 100 |\n|---|---|---:|---:|")
+    for world, said, true, number in PRETENDERS:
+        a, b = (populations[f"eitbench-{world}-v0", name] for name in (said, true))
+        cases = [(like(random, a, len(a)), like(random, b, number)) for _ in range(REPEATS)]
+        print(f"| {world}, {said} | {true} | {number} | {100 * rate(cases):.0f} |")
 
 
 def published() -> Iterator[tuple[tuple[str, str], np.ndarray]]:

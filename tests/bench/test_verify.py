@@ -329,8 +329,8 @@ def test_no_record_of_the_floor_is_believed(mine, tmp_path, monkeypatch):
     honest = submitted(mine, "--seeds", "test:0-7")
     floor = submitted("homogeneous", "--seeds", "test:0-7")
 
-    def with_the_truth(record):
-        for episode in record["episodes"]:
+    def with_the_truth(record, of=8):
+        for episode in sorted(record["episodes"], key=lambda episode: episode["scores"]["error"])[-of:]:
             episode["step_errors"] = [1.2e-5 for _ in episode["step_errors"]]
             episode["scores"]["error"] = float(np.mean(episode["step_errors"]))
 
@@ -341,10 +341,12 @@ def test_no_record_of_the_floor_is_believed(mine, tmp_path, monkeypatch):
             episode["step_errors"] = [1.2e-5 * error for error in true["step_errors"]]
             episode["scores"]["error"] = float(np.mean(episode["step_errors"]))
 
-    prepared = forged(honest, with_the_truth)
-    assert forged(floor, in_front).name < floor.name
-    code, _, complaint = eitbench("verify", prepared, *held_out_claim(tmp_path, monkeypatch, mine))
-    assert code == 1 and "smallest ratio: " in complaint
+    claim = held_out_claim(tmp_path, monkeypatch, mine)
+    for of in (8, 2):                                       # all, or the hardest two
+        prepared = forged(honest, lambda record, of=of: with_the_truth(record, of))
+        assert forged(floor, in_front).name < floor.name
+        code, _, complaint = eitbench("verify", prepared, *claim)
+        assert code == 1 and "smallest ratio: " in complaint
 
 
 @walled
