@@ -3,6 +3,7 @@ environment, and numbers and names beyond what anybody needs."""
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from collections.abc import Iterator
@@ -19,6 +20,8 @@ LARGEST, SMALLEST = 1e50, 1e-100
 squares of those, are finite then."""
 LONGEST_NAME = 100
 """letters of a method's name, which becomes that of a file"""
+LONGEST_ARGUMENTS = 10_000
+"""letters of an environment's arguments as JSON, which become headings"""
 DIGITS = 9
 """of a version v1, v2, …"""
 
@@ -46,6 +49,8 @@ def _of_the_environment(record: dict[str, Any]) -> Iterator[str]:
     name = tracks.named(id, kwargs)
     if environment["name"] != name:
         yield f"$.environment.name: must be {name}, as id and kwargs ask for"
+    if len(json.dumps(kwargs)) > LONGEST_ARGUMENTS:
+        yield f"$.environment.kwargs: must be of {LONGEST_ARGUMENTS} letters at most"
     if id not in tracks.ids():                        # nothing is known of it: nobody shows it
         return
     try:

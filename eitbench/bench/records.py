@@ -152,17 +152,22 @@ def newest(records: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], list[di
     """Records that may stand on a board together, and the outdated ones, each in the given order.
 
     Among those of one environment, one split and one method of ours only the highest version is
-    current; versions of somebody else's method, whose names do not say which came first, stand side
-    by side.
+    current, and an official one whatever the others call themselves: only a higher official one
+    makes it outdated. Versions of somebody else's method, whose names do not say which came first,
+    stand side by side.
     """
-    highest: dict[tuple[str, ...], int] = {}
+    highest: dict[tuple[Any, ...], int] = {}
     for record in records:
-        key = _lineage(record)
-        highest[key] = max(highest.get(key, 0), version_number(record["version"]) or 0)
+        number = version_number(record["version"]) or 0
+        # an official version counts for all, another for those that are not official
+        for official in {False, record["official"]}:
+            key = (*_lineage(record), official)
+            highest[key] = max(highest.get(key, 0), number)
     current: list[dict[str, Any]] = []
     outdated: list[dict[str, Any]] = []
     for record in records:
-        is_current = version_number(record["version"]) in (None, highest[_lineage(record)])
+        latest = highest[(*_lineage(record), record["official"])]
+        is_current = version_number(record["version"]) in (None, latest)
         (current if is_current else outdated).append(record)
     return current, outdated
 

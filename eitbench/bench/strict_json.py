@@ -9,7 +9,7 @@ import stat
 from pathlib import Path
 from typing import Any
 
-MOST_BYTES = 2**25
+MOST_BYTES = 2**23
 """of a file"""
 DEEPEST = 32
 """levels of lists and objects within each other"""

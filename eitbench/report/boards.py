@@ -262,13 +262,14 @@ def _three(name: str, scores: dict[str, dict[str, float]],
 
 def _matrix_products(records: list[dict[str, Any]]) -> dict[str, float]:
     """Processor -> time of a matrix product in s, the median of the runs: a single one depends on
-    what runs beside."""
-    timed: dict[str, list[float]] = {}
+    what runs beside. Of official runs, where any was on that processor."""
+    timed: dict[str, dict[bool, list[float]]] = {}
     for record in records:
         for run in record["runs"]:
             machine = run["machine"]
-            timed.setdefault(machine["processor"], []).append(machine["matmul_seconds"])
-    return {processor: median(seconds) for processor, seconds in timed.items()}
+            by = timed.setdefault(machine["processor"], {True: [], False: []})
+            by[record["official"]].append(machine["matmul_seconds"])
+    return {processor: median(by[True] or by[False]) for processor, by in timed.items()}
 
 
 def _in_products(record: dict[str, Any], products: dict[str, float]) -> float | None:

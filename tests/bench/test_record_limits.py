@@ -104,7 +104,7 @@ def test_what_is_too_deep_or_too_large_is_named(tmp_path):
         with pytest.raises(ValueError, match=f"record .*{path.name}.*{message}"):
             read_record(path)
     path.write_bytes(b" " * (MOST_BYTES + 1))
-    with pytest.raises(ValueError, match=rf"{path.name} cannot be read: it is no file of at most 32 MiB"):
+    with pytest.raises(ValueError, match=rf"{path.name} cannot be read: it is no file of at most 8 MiB"):
         read_record(path)
     path.unlink()
     os.mkfifo(path)                                                  # reading it would wait for ever
