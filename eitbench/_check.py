@@ -7,6 +7,9 @@ from collections.abc import Iterable
 
 import numpy as np
 
+NUMBERS = "biufO"
+"""Kinds of arrays that may stand for real numbers; not complex ones, dates or text."""
+
 
 def number(name: str, value: object, *, low: float = -math.inf, high: float = math.inf,
            open_low: bool = False, units: str = "") -> float:
@@ -28,7 +31,7 @@ def number(name: str, value: object, *, low: float = -math.inf, high: float = ma
 def integer(name: str, value: object, *, low: int, high: int | None = None) -> int:
     """``value`` as an int within [low, high]; else a ``ValueError``."""
     # as stable-baselines3 gives a single action
-    if isinstance(value, np.ndarray) and value.ndim == 0:
+    if isinstance(value, np.ndarray) and value.ndim == 0 and value.dtype.kind in "iu":
         value = value.item()
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < low or (
             high is not None and value > high):
@@ -48,7 +51,10 @@ def array(name: str, value: object, shape: Iterable[int | None], *, units: str =
     batched = bool(wanted) and wanted[0] == -1
     core = wanted[1:] if batched else wanted
     try:
-        result = np.asarray(value, dtype=np.float64)
+        given = np.asarray(value)
+        if given.dtype.kind not in NUMBERS or isinstance(value, np.ma.MaskedArray):
+            raise TypeError
+        result = given.astype(np.float64, copy=False)
     except (TypeError, ValueError):
         raise ValueError(f"{name} must be an array of numbers{_in(units)}, got "
                          f"{type(value).__name__}") from None

@@ -16,10 +16,15 @@ PLACES = {
     "examples": "study",                       # installs two packages and plays with them
     "bench/test_cards.py": "study",            # plays every method of ours
     "bench/test_checkpoints.py": "study",      # plays every trained agent
+    "bench/test_replay.py": "study",           # plays records again
+    "bench/test_verify.py": "study",           # plays records again, and false ones
     "bench/test_world_cards.py": "study",      # simulates every world of ours
+    "report/test_boards.py::test_published_files_are_rendered_from_the_records": "study",
+    "report/test_site.py::test_the_published_site_is_rendered_from_the_records": "study",
     "report/test_site_browser.py": "browser",
 }
-"""What is not the core, by folder or file: `pytest -m "not browser and not study"` leaves it out."""
+"""What is not the core, by folder, file or test: `pytest -m "not browser and not study"` leaves it
+out."""
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -27,15 +32,16 @@ def pytest_collection_modifyitems(items):
     """Mark what is not the core, and begin with it: what takes long is not to be what is left at
     the end, when the other processes have nothing to do any more."""
     for item in items:
-        place = item.path.relative_to(TESTS)
-        for above in (place, *place.parents):
-            if mark := PLACES.get(above.as_posix()):
+        file = item.path.relative_to(TESTS)
+        test = f"{file.as_posix()}::{item.originalname}"
+        for place in (test, file.as_posix(), *map(Path.as_posix, file.parents)):
+            if mark := PLACES.get(place):
                 item.add_marker(mark)
     items.sort(key=lambda item: item.get_closest_marker("study") is None)
 
 
 @pytest.fixture(scope="session")
-def run_cache(tmp_path_factory):
-    """A cache folder that all processes of this run share, and no other run."""
-    own = tmp_path_factory.getbasetemp()
-    return str((own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / "episodes")
+def run_cache(pytestconfig):
+    """A cache folder that all processes share, and the next run too: what lies there names the code
+    it was computed with, so that other code never finds it. `pytest --cache-clear` empties it."""
+    return str(pytestconfig.cache.mkdir("episodes"))

@@ -14,6 +14,7 @@ from eitbench.bench.methods import Method
 from eitbench.bench.outcomes import Claim, Said, outcome_of, outcome_of_claims
 from eitbench.bench.scores import Outcome
 from eitbench.bench.tracks import Environment, check_track
+from eitbench.data.seeds import for_scores
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.injection import InjectionEnv
 from eitbench.worlds.registry import entry
@@ -89,7 +90,8 @@ def injections(env: InjectionEnv, policy: Method, seed: int,
     in one episode, the first with what it took to prepare; errors as `play`."""
     if not policy.suits(env.rules):
         raise ValueError(f"policy {policy.name} does not suit {env.spec.id if env.spec else env}")
-    observation, _ = env.reset(seed=seed)
+    with for_scores():
+        observation, _ = env.reset(seed=seed)
     t = env.core.first
     # A generator knows what it was seeded with, so the policy's is seeded with a number that says
     # nothing of the episode.
@@ -117,7 +119,8 @@ def estimates(env: EstimationEnv, estimator: Method, seed: int) -> Iterator[tupl
 def _estimates(env: EstimationEnv, estimator: Method, seed: int,
                ) -> Iterator[tuple[int, Estimate | None, dict[str, np.ndarray], float]]:
     """(t = i − lag, estimate, measurement i, seconds the estimator took) at each step i."""
-    observation, _ = env.reset(seed=seed)
+    with for_scores():
+        observation, _ = env.reset(seed=seed)
     shown = (env.task, env.reveal()) if estimator.privileged else (env.task,)
     begin = time.perf_counter()
     player = estimator.make(*shown)

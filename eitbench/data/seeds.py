@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import re
+import warnings
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 SPLITS = {"train": range(0, 100_000), "dev": range(100_000, 200_000),
           "test": range(200_000, 300_000)}
@@ -37,3 +40,26 @@ def name_seed(seed: int) -> str:
         if seed in seeds:
             return f"{split}:{seed - seeds.start}"
     return str(seed)
+
+
+class ReservedSeedWarning(UserWarning):
+    """Somebody plays an episode of which scores are reported."""
+
+
+def warn_of_reserved(seeds: Iterable[int]) -> None:
+    """A `ReservedSeedWarning`, which Python shows once, if one of these episodes is of the test
+    split and nobody said that it is played `for_scores`."""
+    if any(seed in SPLITS["test"] for seed in seeds):
+        first, last = SPLITS["test"][0], SPLITS["test"][-1]
+        warnings.warn(f"reset(seed=…) began a test episode, one of the seeds {first} to {last} on "
+                      "which methods are scored: what was trained or chosen on it has no fair "
+                      f"score; choose on dev seeds, from {SPLITS['dev'][0]}",
+                      ReservedSeedWarning, stacklevel=3)
+
+
+@contextmanager
+def for_scores() -> Iterator[None]:
+    """Within, test episodes are played as they are meant to be."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ReservedSeedWarning)
+        yield

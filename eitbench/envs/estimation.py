@@ -14,6 +14,7 @@ from gymnasium.utils import EzPickle
 from eitbench import _check
 from eitbench.data.recordings import cycle_voltages, outline, recording, step_error, velocity_error
 from eitbench.data.regions import integrals, score_mass
+from eitbench.data.seeds import warn_of_reserved
 from eitbench.worlds.parts import Discretisation
 from eitbench.worlds.registry import entry
 from eitbench.worlds.streams import randomness
@@ -103,6 +104,7 @@ class EstimationEnv(gym.Env[Observation, np.ndarray], EzPickle):
         """Begin the episode with this seed (`eitbench.data.seeds`), or a random training one."""
         super().reset(seed=seed)
         self._seed = int(self.np_random.integers(self.episodes)) if seed is None else seed
+        warn_of_reserved([self._seed])
         self._entries = recording(self.world, self._seed)
         self._integrals = integrals(self.world, self._seed, self._entries)
         self._voltages = np.zeros_like(self._currents)

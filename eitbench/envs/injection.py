@@ -12,6 +12,7 @@ from gymnasium import spaces
 from gymnasium.utils import EzPickle
 
 from eitbench import _check
+from eitbench.data.seeds import warn_of_reserved
 from eitbench.envs.estimation import RESET_NEEDED
 from eitbench.envs.injection_core import FURTHEST, InjectionCore, scaled
 from eitbench.envs.lockstep import LockstepVectorEnv
@@ -79,6 +80,7 @@ class InjectionEnv(gym.Env[Any, Any], EzPickle):
         """Begin the episode with this seed (`eitbench.data.seeds`), or a random training one."""
         super().reset(seed=seed)
         self._seed = int(self.np_random.integers(self.episodes)) if seed is None else seed
+        warn_of_reserved([self._seed])
         self._core.begin([self._seed])
         self._step = 1
         return self._observe(), {"step": 1}

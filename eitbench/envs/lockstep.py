@@ -11,6 +11,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from eitbench import _check
+from eitbench.data.seeds import warn_of_reserved
 from eitbench.envs.estimation import Observation
 
 
@@ -57,6 +58,7 @@ class LockstepVectorEnv(gym.vector.VectorEnv[Observation, np.ndarray, np.ndarray
             random = self._randoms[k]
             assert random is not None
             chosen.append(int(random.integers(self.episodes)) if one is None else one)
+        warn_of_reserved(chosen)
         self._begin(chosen)
         self._step = 1
         self._ended = False

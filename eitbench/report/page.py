@@ -21,7 +21,7 @@ from eitbench._foreign import cleaned
 from eitbench.bench.records import alike
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.tracks import Environment
-from eitbench.data.seeds import parse_seeds
+from eitbench.data.seeds import for_scores, parse_seeds
 from eitbench.envs.rendering import FIELD_MAP, colour_range, draw_field
 from eitbench.numerics.mesh import Mesh
 from eitbench.report import charts
@@ -130,7 +130,8 @@ def _snapshots(store: EpisodeStore, records: list[dict[str, Any]]) -> dict[str, 
         return None
     world = chosen[0]["environment"]
     env: Any = Environment(world["id"], json.dumps(world["kwargs"])).make()
-    env.reset(seed=parse_seeds(seed)[0])
+    with for_scores():
+        env.reset(seed=parse_seeds(seed)[0])
     task = env.task
     if any(field.shape != (task.n_steps, task.mesh.n_nodes) for field in fields):
         warnings.warn(f"no pictures of {seed}: estimates of {cleaned(world['name'])} have another "

@@ -18,7 +18,9 @@ if TYPE_CHECKING:
     from eitbench.physics.profiles import SkewedChannelFlow, VelocityModel
     from eitbench.physics.transport import Transport, VelocityField
     from eitbench.worlds.streams import Randomness
-    from eitbench.worlds.world import World
+
+World = Any
+"""The `eitbench.worlds.world.World` that is made of parts: one floor up, so not to be imported."""
 
 
 class Discretisation(NamedTuple):

@@ -18,13 +18,13 @@ agent, so that agents differ only in what they inject.
 register(PIPE_2D, "eitbench/Pipe2DInjection-v0", track="injection", about=f"""{ABOUT}
 This is the reference case, not a competition: one pair near the inlet, injected for ever, is as
 good as anything (what is known at the inlet the flow carries through the whole pipe), and what to
-inject does not depend on what is measured. The adaptivity gap is 0.01 (`docs/injection.md`).
+inject does not depend on what is measured. The adaptivity gap is none (`docs/injection.md`).
 """)
 register(PIPE_2D_CURRENTS, "eitbench/Pipe2DInjectionCurrents-v0", track="injection",
          about=f"""{ABOUT}
 This is the same world with a current of its own for each electrode, and as much a reference: the
 best currents, the same at every step, take a tenth off the ẽ_c of any pairs, and the clairvoyant 2
-% more. The adaptivity gap is 0.02.
+% more. The adaptivity gap is none.
 
 Actions are in parts of the instrument's 0.1 A/m. Their mean is taken away (Σ I = 0); if they then
 exceed the limit, they are scaled down to it. The limit is the norm of a pair: Σ|I| ≤ 2 ("L1", a

@@ -10,6 +10,6 @@ filter inside knows the liquid's flow and of no ball. The first frame is one inj
 
 This is a reference case, not a competition: the liquid carries the ball past every pair, between
 random pairs and the clairvoyant there are 8 % of ẽ_c, and no policy that looks at the data has
-beaten the best pair. The adaptivity gap is 0.32, with a 95 % interval from 0.21 to 0.50 over 50 dev
-episodes, a quotient of small numbers (`docs/injection.md`).
+beaten the best pair. The adaptivity gap is 0.25, with a 95 % interval from 0.05 to 0.40 over the
+board's 10 episodes, a quotient of small numbers (`docs/injection.md`).
 """)

@@ -1,9 +1,10 @@
 """Loading baselines: what a file must hold, and what is said of those that do not."""
 
 import json
+import re
 
 import pytest
-from eitbench.bench.methods import load_method, own_methods
+from eitbench.bench.methods import is_ours, load_method, own_methods
 
 from tiny import strict
 
@@ -67,3 +68,24 @@ def test_baselines_may_use_dataclasses(tmp_path):
     path.write_text("from __future__ import annotations\nfrom dataclasses import dataclass\n@dataclass\n"
                     "class Estimator:\n    task: object\n    def update(self, V, I): pass\n")
     assert load_method(str(path), "estimation").make(task=3).task == 3
+
+
+@pytest.mark.parametrize("track", ["estimation", "injection"])
+def test_only_registered_names_are_ours(track, tmp_path, monkeypatch):
+    """A path without .py leads nowhere, be there a file of that name with it; a link is what it
+    leads to; a name of ours in another folder is refused."""
+    ours = own_methods(track)[0]
+    path = tmp_path / "insider.py"
+    path.write_text("raise SystemExit('executed')")
+    monkeypatch.chdir(tmp_path)
+    for name in (str(tmp_path / "insider"), "insider", "./insider", f"../{tmp_path.name}/insider",
+                 f"{ours}/../../insider", "", "."):
+        assert not is_ours(name)
+        with pytest.raises(ValueError, match=f"or one of .*; got {re.escape(repr(name))}"):
+            load_method(name, track)
+    assert is_ours(ours) and not is_ours(str(path))
+    link = tmp_path / f"{ours}.py"
+    link.symlink_to(path)
+    assert not is_ours(str(link))
+    with pytest.raises(ValueError, match="has the name of one of ours"):
+        load_method(str(link), track)

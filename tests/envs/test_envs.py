@@ -6,11 +6,13 @@ import os
 import pickle
 import subprocess
 import sys
+import warnings
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from eitbench.data.episodes import Episode
+from eitbench.data.seeds import ReservedSeedWarning, for_scores
 from eitbench.data.store import CACHE_VARIABLE
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.worlds import Flow, Target, World, entries
@@ -172,3 +174,16 @@ def test_frames_show_truth_estimate_and_spread(name):
     base.spread = np.full(base.n_nodes, 4.0)
     spread = env.render()
     assert len({picture.tobytes() for picture in (first, flat, spread, bright)}) == 4
+
+
+def test_a_test_episode_is_said_to_be_one():
+    """Once, to whoever resets to it; not to who plays for scores, nor of train and dev seeds."""
+    env = make(PIPE).unwrapped
+    with pytest.warns(ReservedSeedWarning, match="began a test episode, one of the seeds 200000"):
+        env.reset(seed=200_000)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env.reset(seed=1)
+        env.reset(seed=100_000)
+        with for_scores():
+            env.reset(seed=200_000)

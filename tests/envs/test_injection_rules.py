@@ -213,3 +213,41 @@ def test_wrong_rules_are_named(name, change, message):
     """Of faults and budgets too."""
     with pytest.raises(ValueError, match=message):
         gym.make(name, world=change)
+
+
+@pytest.mark.parametrize("kind", [np.float16, np.float32, np.float64])
+@pytest.mark.parametrize("limit", ["L1", "L2", "Linf"])
+def test_the_largest_currents_are_those_at_the_bounds(kind, limit):
+    """Whatever is finite is injected within the instrument's limit; nothing overflows."""
+    largest = np.finfo(kind).max
+    longer = {"instrument": {"limit": limit}}
+    env, other = (make("reduced", CURRENTS, longer=longer).unwrapped for _ in range(2))
+    signs = np.random.default_rng(3).choice([-1.0, 1.0], (env.core.length, 16))
+    env.reset(seed=1)
+    other.reset(seed=1)
+    for sign in signs:
+        seen, reward, *_ = env.step((largest * sign).astype(kind))
+        assert env.observation_space.contains(seen) and np.isfinite(reward)
+        expected, paid, *_ = other.step(sign)
+        for name, values in expected.items():
+            np.testing.assert_array_equal(seen[name], values)
+        assert reward == paid
+
+
+@pytest.mark.parametrize("action", [
+    np.full(16, 1.0 + 1.0j), np.ma.masked_all(16), np.full(16, np.timedelta64(1, "s"))])
+def test_currents_are_real_numbers(action):
+    """Complex ones, masked ones and times are none."""
+    env = make("reduced", CURRENTS).unwrapped
+    env.reset(seed=1)
+    with pytest.raises(ValueError, match="action must be an array of numbers"):
+        env.step(action)
+
+
+@pytest.mark.parametrize("action", [np.array(np.timedelta64(3, "ns")), np.array(3.0 + 0.0j), 3.0])
+def test_the_number_of_a_pair_is_an_integer(action):
+    """A time in nanoseconds is none, though it is kept as one."""
+    env = make("reduced", NAME).unwrapped
+    env.reset(seed=1)
+    with pytest.raises(ValueError, match="action must be an integer"):
+        env.step(action)

@@ -36,7 +36,7 @@ GOLDEN = {"homogeneous": 0.020354, "filter": 0.0046947, "smoother": 0.0019687,
 """ẽ_c on dev:0 in version 0.1.0; a change of physics or of an estimator shows here."""
 
 
-@pytest.mark.parametrize("seeds", [SEEDS[:4], pytest.param(SEEDS, marks=pytest.mark.slow)], ids=len)
+@pytest.mark.parametrize("seeds", [SEEDS[:2], pytest.param(SEEDS, marks=pytest.mark.slow)], ids=len)
 def test_order_of_the_methods(seeds):
     """Smoother < Kalman filter < 0.6 × homogeneous < stationary on average, the first two on every
     seed."""
@@ -64,9 +64,9 @@ def test_stationary_method_works_on_a_stationary_target():
     interpolation, mass = score_operators(PIPE_2D)
     penalty = load_method("gauss_newton", "estimation").parameters["alpha"]**2 * stiffness_matrix(task.mesh)
     images, constants, truths = [], [], []
-    for seed in SEEDS[:3]:
+    for seed in SEEDS[:2]:
         episode = simulate(PIPE_2D, seed)
-        for state in (30, 70):
+        for state in (30, 50, 70):
             clean = task.currents @ episode.transfer_resistance[state - 1]
             rng = np.random.default_rng([seed, state])
             voltages = clean + PIPE_2D.noise.std(clean) * rng.standard_normal(clean.shape)

@@ -1,13 +1,14 @@
 """The other examples of the thesis, each as a whole on one dev episode: what it shows, and golden
 scores.
 
-These take minutes; with pytest-xdist they run side by side. Dev seeds are for choosing and testing,
-never reported.
+What takes minutes is tested on coarser meshes each time, and by `pytest -m slow` on our own. Dev
+seeds are for choosing and testing, never reported.
 """
 
 import json
 from functools import lru_cache
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from eitbench.bench.run import Job, run_episode
@@ -15,6 +16,9 @@ from eitbench.bench.tracks import Environment
 from eitbench.data.seeds import parse_seeds
 from eitbench.scoring import deficit_centre
 from eitbench.worlds.streams import randomness
+
+from coarse import register_coarse
+from short import register_apart
 
 SEED = parse_seeds("dev:0")[0]
 GOLDEN = {
@@ -33,14 +37,38 @@ GOLDEN = {
     ("StationaryTank2D", "homogeneous"): 0.40068,
     ("StationaryTank2D", "kalman_filter"): 0.21733,
     ("StationaryTank2D", "map_estimate"): 0.16581,
+    ("coarse/Pipe2DBiasedVelocity", "kalman_filter"): 0.0079171,
+    ("coarse/Pipe2DObstacle", "homogeneous"): 0.019282,
+    ("coarse/Pipe2DObstacle", "kalman_filter"): 0.0059374,
+    ("coarse/Pipe3D", "homogeneous"): 0.0066450,
+    ("coarse/Pipe3D", "kalman_filter"): 0.0030697,
+    ("coarse/Pipe3DSmoothing", "fixed_interval_smoother"): 0.0021479,
 }
 """ẽ_c on dev:0 in version 0.1.0; a change of physics or of an estimator shows here."""
+coarse_and_ours = pytest.mark.parametrize(
+    "whose", ["coarse/", pytest.param("", marks=pytest.mark.slow)], ids=["coarse", "ours"])
+
+
+@pytest.fixture(scope="module", autouse=True)
+def coarse_worlds():
+    """They are registered for the tests of this file."""
+    with pytest.MonkeyPatch.context() as patch:
+        register_apart(patch)
+        ids = register_coarse()
+        yield
+    for id in ids:
+        del gym.registry[id]
+
+
+def id_of(name):
+    """``name`` is that of an id of ours, or coarse/ and that."""
+    return f"{name}-v0" if name.startswith("coarse/") else f"eitbench/{name}-v0"
 
 
 @lru_cache(maxsize=32)
 def played(name, baseline, kwargs="{}"):
     """(scores, fields) of the episode."""
-    result, fields = run_episode(Job(Environment(f"eitbench/{name}-v0", kwargs), baseline, SEED))
+    result, fields = run_episode(Job(Environment(id_of(name), kwargs), baseline, SEED))
     assert result["status"] == "ok", result
     return result["scores"], fields
 
@@ -110,36 +138,36 @@ def test_skewed_profile_comes_close_though_it_is_not_in_the_basis():
     error("Pipe2DSkewedVelocity", "joint_extended_kalman_filter")
 
 
-def test_wrong_mean_velocity_costs_and_the_estimate_is_still_of_use():
+@coarse_and_ours
+def test_wrong_mean_velocity_costs_and_the_estimate_is_still_of_use(whose):
     """Thesis 5.1.2: filters that assume 2 or 7 m/s instead of 4.5 are worse than the right one,
     better than nothing."""
+    name = f"{whose}Pipe2DBiasedVelocity"
     known = {"flow": {"velocity_range": [4.5, 4.5]}}
     right, slow, fast = (
-        error("Pipe2DBiasedVelocity", "kalman_filter", world=known, assume={"mean_velocity": mean})
+        error(name, "kalman_filter", world=known, assume={"mean_velocity": mean})
         for mean in (4.5, 2.0, 7.0))
-    nothing = error("Pipe2DBiasedVelocity", "homogeneous", world=known)
+    nothing = error(name, "homogeneous", world=known)
     assert right < min(slow, fast) < nothing and fast < nothing
-    error("Pipe2DBiasedVelocity", "kalman_filter")
+    error(name, "kalman_filter")
 
 
-def test_real_flow_past_the_obstacle_helps():
+@coarse_and_ours
+def test_real_flow_past_the_obstacle_helps(whose):
     """A filter that knows the recirculation is better than one that believes in parabolas, which is
     of use still."""
-    simple = error("Pipe2DObstacle", "kalman_filter")
-    real = error("Pipe2DObstacle", "kalman_filter", assume={"flow": "real"})
-    assert real < simple < 0.6 * error("Pipe2DObstacle", "homogeneous")
+    name = f"{whose}Pipe2DObstacle"
+    simple = error(name, "kalman_filter")
+    real = error(name, "kalman_filter", assume={"flow": "real"})
+    assert real < simple < 0.6 * error(name, "homogeneous")
 
 
-def test_three_dimensions():
-    """Thesis 5.2: filter < 0.6 × homogeneous, as in 2D."""
-    assert error("Pipe3D", "kalman_filter") < 0.6 * error("Pipe3D", "homogeneous")
-
-
-@pytest.mark.slow
-def test_three_dimensions_looking_back():
-    """Thesis 5.2: smoother < filter, as in 2D."""
-    assert error("Pipe3DSmoothing", "fixed_interval_smoother") < 0.8 * error("Pipe3D",
-                                                                             "kalman_filter")
+@coarse_and_ours
+def test_three_dimensions(whose):
+    """Thesis 5.2: filter < 0.6 × homogeneous and smoother < 0.8 × filter, as in 2D."""
+    filtered = error(f"{whose}Pipe3D", "kalman_filter")
+    assert filtered < 0.6 * error(f"{whose}Pipe3D", "homogeneous")
+    assert error(f"{whose}Pipe3DSmoothing", "fixed_interval_smoother") < 0.8 * filtered
 
 
 def test_ball_is_followed_from_one_pair_of_electrodes():

@@ -114,10 +114,11 @@ class Rules:
         return (k + 1) * self.budget // steps > k * self.budget // steps
 
     def currents(self, actions: np.ndarray) -> np.ndarray:
-        """(B, L) currents in A (A/m in 2D) of actions (B,) or (B, L)."""
+        """(B, L) currents in A (A/m in 2D) of actions (B,) or (B, L); what lies outside of the
+        action space is taken for its bound."""
         if self.limit is None:
             return self.table[actions]
-        free = np.asarray(actions, dtype=float)
+        free = np.clip(np.asarray(actions, dtype=float), -1.0, 1.0)
         free = free - free.mean(axis=1, keepdims=True)
         order = {"L1": 1, "L2": 2, "Linf": np.inf}[self.limit]
         pair = np.linalg.norm([1.0, -1.0], order)
