@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import shutil
 import uuid
+from collections.abc import Mapping
 from pathlib import Path
 
 
@@ -18,6 +20,29 @@ def write_atomically(path: Path, data: bytes) -> None:
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+
+
+def replace_folder(folder: Path, files: Mapping[str, bytes]) -> None:
+    """Let the folder hold these files and no others: a new one is written beside it and takes its
+    place when it is whole, so that whoever is interrupted leaves what was there before."""
+    folder = folder.resolve()
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    mark = uuid.uuid4().hex
+    new, old = (folder.with_name(f".{folder.name}.{mark}.{which}") for which in ("new", "old"))
+    try:
+        new.mkdir()
+        for name, data in files.items():
+            path = new / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(data)
+        if folder.exists():
+            os.rename(folder, old)
+        os.rename(new, folder)
+    finally:
+        if old.exists() and not folder.exists():
+            os.rename(old, folder)
+        for left in (new, old):
+            shutil.rmtree(left, ignore_errors=True)
 
 
 PACKAGE = Path(__file__).parent

@@ -5,7 +5,8 @@ import json
 from pathlib import Path
 
 from eitbench.bench import store
-from eitbench.bench.records import SCHEMA, sealed, split_of
+from eitbench.bench.contradictions import split_of
+from eitbench.bench.records import SCHEMA, sealed
 from eitbench.bench.tracks import Environment
 
 SCENARIO = {"flow": {"mean_velocity": 45.0}, "schedule": {"scored_steps": 3, "pattern": {"frame": 2}},

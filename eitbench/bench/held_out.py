@@ -9,27 +9,23 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import os
 import secrets
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from eitbench._files import shipped, write_atomically
 from eitbench.bench.methods import is_ours
-from eitbench.bench.records import newest, read_records
 from eitbench.bench.run import Job, run_episode
 from eitbench.bench.sandbox.wall import python_files
-from eitbench.bench.statistics import (
-    FEWEST,
-    interquartile_mean,
-    mean_over_environments,
-    stratified_bootstrap,
-)
+from eitbench.bench.statistics import FEWEST
 from eitbench.bench.table import Cell, Table
-from eitbench.bench.text import scores_by_seed, with_interval
+from eitbench.bench.text import scores_by_seed
+from eitbench.bench.too_good import judged, too_good
 from eitbench.bench.tracks import FLOORS
-from eitbench.data.seeds import SPLITS
+from eitbench.data.seeds import SPLITS, parse_seeds
 
 PUBLISHED = shipped("leaderboards") / "held_out.json"
 """Where the hash of the salt is."""
@@ -103,12 +99,12 @@ def held_out_seeds(salt: bytes, count: int) -> list[int]:
     return [seed if seed >= public else seed + public for seed in drawn]
 
 
-def held_out(record: dict[str, Any], job: Job, salt: bytes, episodes: int,
-             folder: Path) -> tuple[str, list[str]]:
-    """Whether what a record gains over the board's floor, its method gains held-out too.
+def held_out(record: dict[str, Any], job: Job, salt: bytes,
+             episodes: int) -> tuple[str, list[str]]:
+    """Whether what a record says is better than what its method does in held-out episodes.
 
-    The interquartile mean gains of both are compared; where the floor's record is not there, the
-    mean errors.
+    The floor of the board plays the record's episodes and the held-out ones, here and now: no
+    record of it is believed. `too_good.judged` says how the two are compared.
 
     Parameters
     ----------
@@ -118,8 +114,6 @@ def held_out(record: dict[str, Any], job: Job, salt: bytes, episodes: int,
         As read by `read_salt`.
     episodes : int
         How many held-out episodes the method and the board's floor play.
-    folder : path
-        Of records, where that of the floor may lie.
 
     Returns
     -------
@@ -129,8 +123,8 @@ def held_out(record: dict[str, Any], job: Job, salt: bytes, episodes: int,
     Raises
     ------
     ValueError
-        If the episodes are too few for an interval, or the method is a stranger's and could reach
-        their seeds.
+        If the episodes are too few to judge, or the method is a stranger's and could reach their
+        seeds.
     """
     if not is_ours(job.method) and job.isolation != "landlock":
         raise ValueError(f"{job.method} is not ours and can play held-out episodes behind a wall "
@@ -138,51 +132,35 @@ def held_out(record: dict[str, Any], job: Job, salt: bytes, episodes: int,
     errors = scores_by_seed(record, "error")
     if min(episodes, len(errors)) < 2 or episodes + len(errors) < FEWEST:
         raise ValueError(f"held-out episodes and those of the record must be {FEWEST} together, "
-                         f"and two each, for an interval; got {episodes} and {len(errors)}")
-    floor = FLOORS[job.environment.track]
+                         f"and two each, to be compared; got {episodes} and {len(errors)}")
+    zero = Job(job.environment, FLOORS[job.environment.track], 0)
     seeds = held_out_seeds(salt, episodes)
-    own, zero = ([run_episode(each._replace(seed=seed))[0] for seed in seeds]
-                 for each in (job, Job(job.environment, floor, 0)))
-    pairs = [(a["scores"]["error"], b["scores"]["error"]) for a, b in zip(own, zero, strict=True)
-             if a["status"] == b["status"] == "ok"]
+    own = [run_episode(job._replace(seed=seed))[0] for seed in seeds]
+    beside = [run_episode(zero._replace(seed=seed))[0] for seed in seeds]
+    there = [run_episode(zero._replace(seed=parse_seeds(name)[0]))[0] for name in errors]
+    said = [{"status": "ok", "scores": {"error": error}} for error in errors.values()]
     differences = [f"failed in a held-out episode: {result['message']}"
-                   for result in (*own, *zero) if result["status"] == "failed"]
-    if len(pairs) < 2:
+                   for result in (*own, *beside) if result["status"] == "failed"]
+    differences += [f"the floor failed in {result['seed']}: {result['message']}"
+                    for result in there if result["status"] == "failed"]
+    record_pairs = _pairs(said, there)
+    new_pairs = _pairs(own, beside)
+    if min(len(record_pairs), len(new_pairs)) < 2:
         return "", differences
-    compared = {"ẽ_c": (mean_over_environments, list(errors.values()), [a for a, _ in pairs])}
-    if gains := _gains(record, floor, errors, folder):
-        # How hard an episode is cancels in its gain, so that far smaller differences are seen.
-        compared[f"gain over {floor}"] = interquartile_mean, gains, [1.0 - a / b for a, b in pairs]
+    found = judged(record_pairs, new_pairs)
     rows: list[dict[str, Cell | str]] = [
-        {"episodes": "record", "number": Cell(str(len(errors)))},
-        {"episodes": "held-out", "number": Cell(str(len(pairs)))},
-        {"episodes": "difference", "number": Cell("")},
-    ]
-    for name, (statistic, theirs, new) in compared.items():
-        step = stratified_bootstrap({"a": new, "b": theirs}, lambda a, b, statistic=statistic:
-                                    statistic(a) - statistic(b))
-        said = [_said(stratified_bootstrap({"": each}, statistic)) for each in (theirs, new)]
-        for row, text in zip(rows, (*said, with_interval(*step)), strict=True):
-            row[name] = Cell(text)
-    if not step[1] <= 0.0 <= step[2]:
-        differences.append(f"{name} of held-out episodes differs from the record's by "
-                           f"{with_interval(*step)}")
+        {"compared with the floor": finding.name,
+         f"record, {len(record_pairs)} episodes": Cell(f"{finding.record:.3g}"),
+         f"held-out, {len(new_pairs)}": Cell(f"{finding.held_out:.3g}"),
+         "p": Cell(f"{finding.p:.2g}")} for finding in found]
+    differences += [f"{finding.name}: {finding.record:.3g} in the record, {finding.held_out:.3g} "
+                    f"held-out; so much better is an honest record with p = {finding.p:.2g}"
+                    for finding in too_good(found)]
     return Table.of(rows).markdown(), differences
 
 
-def _gains(record: dict[str, Any], floor: str, errors: dict[str, float],
-           folder: Path) -> list[float]:
-    """Of the record's own episodes, if the floor's record lies in the folder."""
-    asked = floor, record["environment"], record["split"]
-    for other in newest(read_records(folder))[0]:
-        if (other["method"], other["environment"], other["split"]) == asked:
-            zero = scores_by_seed(other, "error")
-            gains = [1.0 - error / zero[seed] for seed, error in errors.items() if zero.get(seed)]
-            return gains if len(gains) > 1 else []
-    return []
-
-
-def _said(three: tuple[float, float, float]) -> str:
-    """A value with its interval, if it has one."""
-    value, low, high = three
-    return with_interval(value, low, high) if math.isfinite(low) else f"{value:.3g}"
+def _pairs(own: list[dict[str, Any]], floor: list[dict[str, Any]]) -> np.ndarray:
+    """(n, 2) ẽ_c of a method and of the floor, of the episodes that both finished."""
+    pairs = [(a["scores"]["error"], b["scores"]["error"]) for a, b in zip(own, floor, strict=True)
+             if a["status"] == b["status"] == "ok"]
+    return np.array([pair for pair in pairs if pair[1] > 0.0]).reshape(-1, 2)

@@ -15,27 +15,28 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
-import re
 import warnings
 from collections.abc import Iterable
 from functools import lru_cache
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import jsonschema
 
 from eitbench._files import shipped, write_atomically
+from eitbench._foreign import cleaned
 from eitbench.bench import schema2, tracks
-from eitbench.data.seeds import name_seed, parse_seeds
+from eitbench.bench.contradictions import contradictions, version_number
+from eitbench.bench.strict_json import parsed
 
 SCHEMA = 3
 BOARDS = tracks.ALL_BOARDS
 SHARED = ("board", "title", "parameters", "role", "privileged", "version", "method_sha256",
           "checkpoint_sha256")
 """What all episodes of a record have in common, beside environment and method."""
-OURS = re.compile(r"v([1-9][0-9]*)")
-"""Versions of our own methods; of all others a version is eight digits of their file's sha256."""
+MOST_EPISODES = 10_000
+"""of a record"""
 
 
 def write_record(folder: Path, record: dict[str, Any]) -> Path:
@@ -43,7 +44,10 @@ def write_record(folder: Path, record: dict[str, Any]) -> Path:
     is replaced. ``ValueError``, naming file and fields, if it is not what the schema asks for."""
     record = sealed(record)
     path = Path(folder) / _named_by_content(record)
-    _check(path, record)
+    try:
+        _check(record)
+    except ValueError as error:
+        raise ValueError(f"record {cleaned(str(path))} {cleaned(str(error))}") from None
     write_atomically(path, _text(record).encode())
     return path
 
@@ -55,38 +59,60 @@ def read_record(path: Path) -> dict[str, Any]:
     was changed since it was written, or has another name than its content asks for.
     """
     try:
-        record = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse)
+        return _read(path)
     except (OSError, ValueError) as error:
-        raise ValueError(f"record {path} cannot be read: {error}") from None
+        raise ValueError(f"record {cleaned(str(path))} {cleaned(str(error))}") from None
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """As `read_record`; what is wrong, without the file's name."""
+    record = parsed(path)
     written = record
     name = None
     if isinstance(record, dict) and record.get("schema") == schema2.NUMBER:
-        content, name = schema2.upgraded(path, record)
+        content, name = schema2.upgraded(record)
         record = sealed(content)
-    _check(path, record)
+    _check(record)
     if written.get("sha256") != sealed(written)["sha256"]:
-        raise ValueError(f"record {path} was changed since it was written: its sha256 is no longer "
-                         "that of its content")
+        raise ValueError("was changed since it was written: its sha256 is no longer that of its "
+                         "content")
     name = name or file_name(record)
     if path.name != name:
-        raise ValueError(f"record {path} must have the name {name}, as its content asks for")
+        raise ValueError(f"must have the name {name}, as its content asks for")
     return record
 
 
 def read_records(folder: Path) -> list[dict[str, Any]]:
-    """All records of a folder, by file name; none if there is no such folder. Errors as
-    `read_record`. Records of an environment that is not registered, or no longer in that version,
-    are left out with a warning."""
+    """All records of a folder, by file name; none if there is no such folder. Records of an
+    environment that is not registered, or no longer in that version, are left out with a warning.
+
+    ``ValueError``, naming all of them, if some are not as `read_record` asks for.
+    """
+    records, complaints = read_sound_records(folder)
+    if complaints:
+        raise ValueError("; ".join(complaints))
+    return records
+
+
+def read_sound_records(folder: Path) -> tuple[list[dict[str, Any]], list[str]]:
+    """As `read_records`, but those that are not valid are left out, with a sentence for each that
+    names the file."""
     records = []
+    complaints = []
     known = set(tracks.ids())
     for path in sorted(Path(folder).glob("*.json")):
-        record = read_record(path)
+        try:
+            record = read_record(path)
+        except ValueError as error:
+            complaints.append(str(error))
+            continue
         id = record["environment"]["id"]
         if id in known:
             records.append(record)
         else:
-            warnings.warn(f"record {path} is left out: there is no environment {id}", stacklevel=2)
-    return records
+            warnings.warn(f"record {cleaned(str(path))} is left out: there is no environment "
+                          f"{cleaned(id)}", stacklevel=3)
+    return records, complaints
 
 
 def sealed(record: dict[str, Any]) -> dict[str, Any]:
@@ -94,20 +120,16 @@ def sealed(record: dict[str, Any]) -> dict[str, Any]:
     content = {key: value for key, value in record.items() if key != "sha256"}
     try:
         content = json.loads(_json(content))
-    except (TypeError, ValueError) as error:  # NaN, or something that is no JSON at all
+        text = _json(content, separators=(",", ":")).encode()
+    # NaN, or something that is no JSON at all, or too deep
+    except (TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"record cannot be written as JSON: {error}") from None
-    text = _json(content, separators=(",", ":"))
-    return content | {"sha256": hashlib.sha256(text.encode()).hexdigest()}
+    return content | {"sha256": hashlib.sha256(text).hexdigest()}
 
 
 def file_name(record: dict[str, Any]) -> str:
     """``ENV--METHOD--VERSION.json``; of other seeds than test with their split in it too."""
     return schema2.file_name(record, record["version"])
-
-
-def split_of(seed: str) -> str:
-    """``test`` of ``test:4``; ``own`` of a plain number."""
-    return seed.split(":")[0] if ":" in seed else "own"
 
 
 def alike(runs: Iterable[dict[str, Any]], *keys: str) -> list[list[dict[str, Any]]]:
@@ -130,24 +152,24 @@ def newest(records: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], list[di
     """Records that may stand on a board together, and the outdated ones, each in the given order.
 
     Among those of one environment, one split and one method of ours only the highest version is
-    current; versions of somebody else's method, whose names do not say which came first, stand side
-    by side.
+    current, and an official one whatever the others call themselves: only a higher official one
+    makes it outdated. Versions of somebody else's method, whose names do not say which came first,
+    stand side by side.
     """
-    highest: dict[tuple[str, ...], int] = {}
+    highest: dict[tuple[Any, ...], int] = {}
     for record in records:
-        key = _lineage(record)
-        highest[key] = max(highest.get(key, 0), version_number(record["version"]) or 0)
+        number = version_number(record["version"]) or 0
+        # an official version counts for all, another for those that are not official
+        for official in {False, record["official"]}:
+            key = (*_lineage(record), official)
+            highest[key] = max(highest.get(key, 0), number)
     current: list[dict[str, Any]] = []
     outdated: list[dict[str, Any]] = []
     for record in records:
-        is_current = version_number(record["version"]) in (None, highest[_lineage(record)])
+        latest = highest[(*_lineage(record), record["official"])]
+        is_current = version_number(record["version"]) in (None, latest)
         (current if is_current else outdated).append(record)
     return current, outdated
-
-
-def version_number(version: str) -> int | None:
-    """3 of ``v3``, a version of a method of ours; None for the digits of somebody else's file."""
-    return int(version[1:]) if OURS.fullmatch(version) else None
 
 
 def _lineage(record: dict[str, Any]) -> tuple[str, ...]:
@@ -155,48 +177,26 @@ def _lineage(record: dict[str, Any]) -> tuple[str, ...]:
     return record["environment"]["name"], record["method"], record["split"]
 
 
-def _check(path: Path, record: Any) -> None:
-    """``ValueError`` naming file and fields if a record breaks the schema or contradicts itself."""
-    errors = sorted(_validator().iter_errors(record), key=lambda error: error.json_path)
-    wrong = [f"{error.json_path}: {_shortened(error.message)}" for error in errors]
-    if wrong := wrong or _contradictions(record):
-        raise ValueError(f"record {path} is not valid: " + "; ".join(wrong[:5]))
+def _check(record: Any) -> None:
+    """``ValueError`` naming fields if a record breaks the schema or contradicts itself."""
+    wrong = _too_many(record) or _against_the_schema(record) or contradictions(record)
+    if wrong:
+        raise ValueError("is not valid: " + "; ".join(map(_shortened, wrong[:5])))
 
 
-def _contradictions(record: dict[str, Any]) -> list[str]:
-    """What the schema cannot say: fields of a valid record that do not fit each other."""
-    wrong = []
-    environment = record["environment"]
-    version = record["version"]
-    name = tracks.named(environment["id"], environment["kwargs"])
-    if environment["name"] != name:
-        wrong.append(f"$.environment.name: must be {name}, as id and kwargs ask for")
-    if version != record["method_sha256"][:8] and version_number(version) is None:
-        wrong.append("$.version: must be v1, v2, … of ours, or begin as method_sha256 does")
-    if record["seeds"] != [episode["seed"] for episode in record["episodes"]]:
-        wrong.append("$.seeds: must be those of the episodes, in their order")
-    wrong += [f"$.seeds: {seed!r} names no episode"
-              for seed in record["seeds"] if not _names_an_episode(seed)]
-    if {split_of(seed) for seed in record["seeds"]} != {record["split"]}:
-        wrong.append(f"$.seeds: must all be of the split {record['split']}")
-    if record["official"] and any(run["commit"] is None or run["dirty"] for run in record["runs"]):
-        wrong.append("$.official: must be false where a run was not of a commit without changes")
-    for i, episode in enumerate(record["episodes"]):
-        if episode["run"] >= len(record["runs"]):
-            wrong.append(f"$.episodes[{i}].run: there are only {len(record['runs'])} runs")
-        if steps := episode.get("step_errors"):
-            mean = sum(steps) / len(steps)
-            if not math.isclose(episode["scores"]["error"], mean, rel_tol=1e-9):
-                wrong.append(f"$.episodes[{i}].scores.error: must be the mean of step_errors")
-    return wrong
+def _too_many(record: Any) -> list[str]:
+    """What to compare with each other would take for ever."""
+    seeds = record.get("seeds") if isinstance(record, dict) else None
+    if isinstance(seeds, list) and (len(seeds) > MOST_EPISODES
+                                    or not all(isinstance(seed, str) for seed in seeds)):
+        return [f"$.seeds: must be at most {MOST_EPISODES} texts"]
+    return []
 
 
-def _names_an_episode(seed: str) -> bool:
-    """Whether it lies within its split, written as `name_seed` does: an episode has one name."""
-    try:
-        return name_seed(parse_seeds(seed)[0]) == seed
-    except ValueError:
-        return False
+def _against_the_schema(record: Any) -> list[str]:
+    errors = list(islice(_validator().iter_errors(record), 20))
+    return [f"{error.json_path}: {_shortened(error.message)}"
+            for error in sorted(errors, key=lambda error: error.json_path)]
 
 
 @lru_cache(maxsize=1)
@@ -227,9 +227,5 @@ def _json(value: Any, **how: Any) -> str:
     return json.dumps(value, sort_keys=True, ensure_ascii=False, allow_nan=False, **how)
 
 
-def _refuse(constant: str) -> None:
-    raise ValueError(f"{constant} is not JSON")
-
-
 def _shortened(message: str) -> str:
-    return message if len(message) < 200 else f"{message[:90]} … {message[-90:]}"
+    return message if len(message) < 300 else f"{message[:140]} … {message[-140:]}"

@@ -7,7 +7,6 @@ environment was registered with too.
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 from eitbench.bench import tracks
@@ -16,14 +15,14 @@ from eitbench.bench.methods import own_files
 NUMBER = 2
 
 
-def upgraded(path: Path, record: dict[str, Any]) -> tuple[dict[str, Any], str]:
+def upgraded(record: dict[str, Any]) -> tuple[dict[str, Any], str]:
     """A record of schema 2 as one of schema 3, not sealed, and the name its file had to have.
-    ``ValueError``, naming the file, if something is missing that the new record is made from."""
+    ``ValueError`` if something is missing that the new record is made from."""
     try:
         return _upgraded(record), file_name(record, record["method_sha256"][:8])
     except (AttributeError, KeyError, TypeError) as error:
-        raise ValueError(f"record {path} is not valid as one of schema {NUMBER}: "
-                         f"{type(error).__name__}: {error}") from None
+        raise ValueError(f"is not valid as one of schema {NUMBER}: {type(error).__name__}: "
+                         f"{error}") from None
 
 
 def _upgraded(record: dict[str, Any]) -> dict[str, Any]:

@@ -10,6 +10,8 @@ import re
 import subprocess
 import timeit
 import warnings
+import zipfile
+import zlib
 from collections.abc import Iterable, Iterator
 from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
@@ -21,7 +23,10 @@ from threadpoolctl import threadpool_limits
 
 from eitbench._code import code_digest, package_files
 from eitbench._files import PACKAGE, write_atomically
-from eitbench.bench.records import SCHEMA, SHARED, read_records, sealed, split_of, write_record
+from eitbench._foreign import cleaned
+from eitbench.bench.contradictions import split_of
+from eitbench.bench.records import SCHEMA, SHARED, read_records, sealed, write_record
+from eitbench.bench.strict_json import parsed
 from eitbench.data.seeds import name_seed
 
 PACKAGES = ("eitbench", "numpy", "scipy", "gymnasium", "scikit-fem", "numba", "stable-baselines3",
@@ -30,6 +35,8 @@ PACKAGES = ("eitbench", "numpy", "scipy", "gymnasium", "scikit-fem", "numba", "s
 _OF_ALL = ("environment", "method", *SHARED)
 """What the results that make one record have in common."""
 _NEEDED = {"identity", "seed", "finished", "status", "run", *_OF_ALL}
+_TEXTS = ("identity", "seed", "finished", "status", "method", "title", "board", "version",
+          "method_sha256")
 
 
 class EpisodeStore:
@@ -59,16 +66,34 @@ class EpisodeStore:
         return result is not None and result["identity"] == identity and result["status"] == "ok"
 
     def results(self) -> Iterator[dict[str, Any]]:
-        """All stored results; files that cannot be read are passed over."""
+        """All stored results; a file that is none is passed over with a warning that names it."""
         for path in sorted(self.folder.glob("episodes/*/*/*.json")):
             if result := _read(path):
                 yield result
+            else:
+                warnings.warn(f"{cleaned(str(path))} is left out: it is no result of an episode",
+                              stacklevel=2)
 
     def fields(self, result: dict[str, Any]) -> dict[str, np.ndarray]:
-        """The estimates that belong to a result: ``mean`` and perhaps ``std``, (T, n) in mol/m³."""
+        """The estimates that belong to a result: ``mean`` and perhaps ``std``, (T, n) in mol/m³.
+
+        ``FileNotFoundError`` if there are none; ``ValueError``, naming the file, if it is damaged.
+        """
         path = self._path(result["environment"]["name"], result["method"], result["seed"])
-        with np.load(path.with_suffix(".npz"), allow_pickle=False) as stored:
-            return dict(stored)
+        path = path.with_suffix(".npz")
+        try:
+            with np.load(path, allow_pickle=False) as stored:
+                fields = dict(stored)
+        except FileNotFoundError:
+            raise
+        except (OSError, ValueError, EOFError, TypeError, AttributeError, NotImplementedError,
+                zipfile.BadZipFile, zlib.error) as error:
+            raise ValueError(f"estimates {path} cannot be read: {error}") from None
+        if "mean" not in fields or not all(
+                each.ndim == 2 and each.dtype.kind == "f" and np.isfinite(each).all()
+                for each in fields.values()):
+            raise ValueError(f"estimates {path} must hold finite numbers (T, n) named mean")
+        return fields
 
     def records(self, also: Iterable[dict[str, Any]] = ()) -> list[dict[str, Any]]:
         """The episodes, gathered into one record per environment, method and split of the seeds;
@@ -170,14 +195,34 @@ def results_in(folder: Path) -> list[dict[str, Any]]:
 def _read(path: Path) -> dict[str, Any] | None:
     """A result, if it is there and whole."""
     result = read_json(path)
-    return result if result is not None and result.keys() >= _NEEDED else None
+    return result if result is not None and _is_whole(result) else None
+
+
+def _is_whole(result: dict[str, Any]) -> bool:
+    """Whether a record can be gathered from it and others; the record is checked in full then."""
+    if not result.keys() >= _NEEDED or not all(isinstance(result[name], str) for name in _TEXTS):
+        return False
+    environment = result["environment"]
+    run = result["run"]
+    return (isinstance(environment, dict) and isinstance(environment.get("kwargs"), dict)
+            and all(isinstance(environment.get(name), str) for name in ("id", "name"))
+            and isinstance(run, dict) and isinstance(run.get("source"), str)
+            and (result["status"] != "ok" or _is_scored(result)))
+
+
+def _is_scored(result: dict[str, Any]) -> bool:
+    scores = result.get("scores")
+    steps = result.get("step_errors")
+    return (isinstance(scores, dict) and isinstance(scores.get("error"), int | float)
+            and all(isinstance(score, int | float | None) for score in scores.values())
+            and isinstance(steps, list) and all(isinstance(step, int | float) for step in steps))
 
 
 def read_json(path: Path) -> dict[str, Any] | None:
     """What a file says, if it can be read and says a dict."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        content = parsed(path)
+    except ValueError:
         return None
     return content if isinstance(content, dict) else None
 

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from eitbench.bench import suites, tracks
-from eitbench.bench.records import read_record, split_of, write_record
+from eitbench.bench.contradictions import split_of
+from eitbench.bench.records import read_record, write_record
 from eitbench.bench.run import Job, run_jobs, unplayed
 from eitbench.bench.store import EpisodeStore, provenance, results_of
 from eitbench.bench.text import seed_ranges

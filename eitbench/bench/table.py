@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from markupsafe import Markup
 
+from eitbench._foreign import as_markdown
 from eitbench.bench.text import number
 
 NOTHING = "–"
@@ -73,7 +74,7 @@ class Table(NamedTuple):
     def markdown(self) -> str:
         """Also pleasant to read in a terminal."""
         said = [self.headings, *([cell.plain for cell in row.cells] for row in self.rows)]
-        lines = [[text.replace("|", "\\|") for text in line] for line in said]
+        lines = [[as_markdown(text) for text in line] for line in said]
         widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
         words = [kind == "words" for kind in self.kinds]
 

@@ -28,6 +28,10 @@ CLASSES = ("filter", "fixed-lag", "smoothing", "stationary", "injection")
 """What is ranked together: the boards, and targets that stand still apart."""
 FLOORS = {"estimation": "homogeneous", "injection": "random_pair"}
 """Whose episodes are the board's, and from whose error the gain is counted."""
+ARGUMENTS = {
+    "estimation": ("world", "lag", "assume", "episodes", "render_mode"),
+    "injection": ("world", "estimator", "observation", "gate", "episodes", "render_mode")}
+"""What may be given to an environment of each track, beside its name."""
 ESTIMATORS = ("full", "reduced")
 """What may stand inside an injection environment: the exact filter, for scores, or that of
 training."""
@@ -136,6 +140,39 @@ def board_of(env: EstimationEnv | InjectionEnv) -> str:
     if lag == 0:
         return "filter"
     return "smoothing" if lag == env.world.n_steps - 1 else "fixed-lag"
+
+
+def boards_of(id: str, kwargs: dict[str, Any]) -> tuple[str, ...]:
+    """The boards that a registered id with these arguments may belong to, without making it: one,
+    or two where only a world of somebody's own would say which.
+
+    Raises
+    ------
+    ValueError
+        If the arguments are not such as it takes.
+    """
+    track = track_of(id)
+    for name, value in kwargs.items():
+        if name not in ARGUMENTS[track]:
+            raise ValueError(f"{name} is no argument of {id}; there are "
+                             f"{', '.join(ARGUMENTS[track])}")
+        if name in ("world", "assume") and not isinstance(value, dict | None):
+            raise ValueError(f"{name} must be an object, got {type(value).__name__}")
+    if track == "injection":
+        return BOARDS[track]
+    each = entry(id)
+    lag = kwargs.get("lag")
+    if lag is None:
+        lag = each.settings.get("lag", 0)
+    if lag == "all":
+        return ("smoothing",)
+    if type(lag) is not int or lag < 0:
+        raise ValueError(f"lag must be 'all' or an integer of at least 0, got {lag!r}")
+    if lag == 0:
+        return ("filter",)
+    if kwargs.get("world"):                                 # whose length is not computed here
+        return ("fixed-lag", "smoothing")
+    return ("smoothing",) if lag == each.world.n_steps - 1 else ("fixed-lag",)
 
 
 def track_of_board(board: str) -> str:

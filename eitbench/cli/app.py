@@ -12,6 +12,7 @@ from typing import Annotated, Any
 
 import typer
 
+from eitbench._foreign import cleaned
 from eitbench.cli import options
 from eitbench.cli.maintain import cards, held_out, migrate
 from eitbench.cli.studies import thesis
@@ -38,22 +39,22 @@ def list_() -> None:
 
     from eitbench.bench.methods import load_method, own_methods
     from eitbench.bench.tracks import Environment, board_of, ids
-    typer.echo("environments")
+    options.say("environments")
     for name in ids("estimation"):
         env: Any = Environment(name).make()
         steps = env.world.n_steps
-        typer.echo(f"  {name:40} {board_of(env):10}  lag {env.lag}, {steps - env.world.warm_up} "
-                   f"scored of {steps} states, {env.action_space.shape[0]} numbers each")
+        options.say(f"  {name:40} {board_of(env):10}  lag {env.lag}, {steps - env.world.warm_up} "
+                    f"scored of {steps} states, {env.action_space.shape[0]} numbers each")
     for name in ids("injection"):
         core = gym.make(name).unwrapped.core  # type: ignore[attr-defined]
         rules = core.rules
         what = f"{rules.limit} currents" if rules.limit else f"{len(rules.pairs)} electrode pairs"
         allowed = "" if rules.budget is None else f", {rules.budget} of them allowed"
-        typer.echo(f"  {name:40} injection   {what}, {core.length} injections{allowed}")
-    typer.echo("baselines")
+        options.say(f"  {name:40} injection   {what}, {core.length} injections{allowed}")
+    options.say("baselines")
     for name in own_methods("estimation"):
         baseline = load_method(name, "estimation")
-        typer.echo(f"  {name:40} {', '.join(baseline.boards):30}  {baseline.title}")
+        options.say(f"  {name:40} {', '.join(baseline.boards):30}  {baseline.title}")
 
 
 @app.command()
@@ -115,15 +116,15 @@ def bank(
     except OSError as error:
         raise typer.BadParameter(f"recordings cannot be kept in {place}: {error}") from error
     missing = len(missing_seeds(world, numbers))
-    typer.echo(f"{len(numbers)} episodes, {len(numbers) * each / 1e6:.0f} MB in {place}; "
-               f"{missing} to simulate")
+    options.say(f"{len(numbers)} episodes, {len(numbers) * each / 1e6:.0f} MB in {place}; "
+                f"{missing} to simulate")
     free = shutil.disk_usage(place).free
     if missing * each > free:
         raise typer.BadParameter(f"seeds need {missing * each / 1e9:.1f} GB more, and "
                                  f"{free / 1e9:.1f} GB are free")
     with options.clear_errors():
         made = fill(world, numbers, n_jobs=jobs, backend=backend)
-    typer.echo(f"{made} simulated, {len(numbers) - made} were there")
+    options.say(f"{made} simulated, {len(numbers) - made} were there")
 
 
 @app.command()
@@ -153,7 +154,7 @@ def train(
             asked = replace(asked, total_steps=steps)
         folder = out or Path("results/training") / env.replace("/", "-") / algo / f"seed{seed}"
         model = training.train(env, algo.value, asked, seed, folder)
-    typer.echo(f"wrote {model}")
+    options.say(f"wrote {model}")
 
 
 @app.command()
@@ -191,7 +192,7 @@ def policies(
         run_jobs(unplayed(todo, before), store, n_jobs=jobs, backend=backend, command=_command())
     asked = {job.load().name: job.load().privileged for job in todo}
     rows = policy_rows(todo, [*before, *store.results()])
-    typer.echo(policy_table(rows, [name for name, privileged in asked.items() if privileged]))
+    options.say(policy_table(rows, [name for name, privileged in asked.items() if privileged]))
     _say_failures([record for record in store.write_records()
                    if record["method"] in asked and record["environment"]["id"] == env])
 
@@ -230,8 +231,8 @@ def submit(
                            n_jobs=jobs, backend=backend, command=_command()):
             episodes = read_record(path)["episodes"]
             failed = sum(episode["status"] != "ok" for episode in episodes)
-            typer.echo(f"wrote {path}: {len(episodes)} episodes"
-                       + (f", {failed} failed" if failed else ""))
+            options.say(f"wrote {path}: {len(episodes)} episodes"
+                        + (f", {failed} failed" if failed else ""))
 
 
 app.command()(verify)
@@ -247,25 +248,32 @@ def leaderboard(
         help="Folder of the leaderboards' records, such as leaderboards/results: render "
              "leaderboard.csv, leaderboard.md and the pages site/ beside it instead.")] = None,
 ) -> None:
-    """Print the table and write the page again from the results stored in a folder."""
+    """Print the table and write the page again from the results stored in a folder.
+
+    Of --records, those that are not valid are left out and named: exit status 1. Without any that
+    is valid nothing is written.
+    """
     if records is None:
         with options.clear_errors():
             return _report(out)
     from eitbench._files import write_atomically
-    from eitbench.bench.records import read_records
-    from eitbench.report.boards import boards
+    from eitbench.report.boards import boards, read_for_boards
     from eitbench.report.site import read_media, render, render_site, write_site
     beside = records.parent
     with options.clear_errors():
-        if not records.is_dir():
-            raise ValueError(f"records must be a folder that exists, got {records}")
-        found = read_records(records)
+        found, complaints = read_for_boards(records)
         table = boards(found)
-        write_site(beside / "site", render_site(found, table, read_media(beside / "media")))
-    for name, text in render(found, table).items():
+        pages = render_site(found, table, read_media(beside / "media"))
+        texts = render(found, table)
+        write_site(beside / "site", pages)
+    for name, text in texts.items():
         write_atomically(beside / name, text.encode())
-        typer.echo(f"wrote {beside / name}")
-    typer.echo(f"wrote {beside / 'site' / 'index.html'}")
+        options.say(f"wrote {beside / name}")
+    options.say(f"wrote {beside / 'site' / 'index.html'}")
+    for complaint in complaints:
+        options.say(f"left out: {complaint}", err=True)
+    if complaints:
+        raise typer.Exit(1)
 
 
 @app.command()
@@ -285,10 +293,10 @@ def compare(
         ours, theirs = (comparison.find(name, records) for name in (a, b))
         table = comparison.compare(ours, theirs, score)
     names = comparison.names(ours[0], theirs[0])
-    typer.echo(comparison.shown(table, *names, score).markdown())
+    options.say(comparison.shown(table, *names, score).markdown())
     if html is not None:
         write_atomically(html, comparison.html(table, *names, score).encode())
-        typer.echo(f"\nwrote {html}")
+        options.say(f"\nwrote {html}")
 
 
 @app.command()
@@ -312,7 +320,7 @@ def render(
     with options.clear_errors():
         if track_of(env) == "injection" and policy is None:
             raise ValueError(f"policy must be given for {env}, which asks for injections")
-        typer.echo(f"wrote {animate(env, policy or baseline, seed, step, out, every=every)}")
+        options.say(f"wrote {animate(env, policy or baseline, seed, step, out, every=every)}")
 
 
 @app.command()
@@ -328,7 +336,7 @@ def reproduce(
     """Draw a figure of the thesis from our data, and say what agrees and what differs."""
     with options.clear_errors():
         path, remark = thesis().FIGURES[name.value](_numbers(seeds), jobs, out)
-    typer.echo(f"wrote {path}\n{remark}")
+    options.say(f"wrote {path}\n{remark}")
 
 
 def _numbers(seeds: str | None) -> list[int] | None:
@@ -349,10 +357,10 @@ def _report(out: Path) -> None:
     table = summary(records)
     text = shown(table).markdown()
     write_atomically(out / "leaderboard.md", f"{text}\n".encode())
-    typer.echo(text)
+    options.say(text)
     _say_failures(records)
     write_page(store, records, table)
-    typer.echo(f"\nwrote {out / 'index.html'}")
+    options.say(f"\nwrote {out / 'index.html'}")
 
 
 def _command() -> str:
@@ -364,8 +372,8 @@ def _say_failures(records: list[dict[str, Any]]) -> None:
     for record in records:
         for episode in record["episodes"]:
             if episode["status"] != "ok":
-                typer.echo(f"failed: {record['method']} on {episode['seed']}: "
-                           f"{episode['message']}", err=True)
+                options.say(f"failed: {record['method']} on {episode['seed']}: "
+                            f"{cleaned(episode['message'])}", err=True)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from eitbench.cli.options import clear_errors
+from eitbench.cli import options
 
 
 def cards(
@@ -29,18 +29,18 @@ def cards(
     worlds = [name for name in names or own_ids() if name in own_ids()]
     methods = [name for name in names or [] if name not in worlds]
     anything_moved = False
-    with clear_errors():
+    with options.clear_errors():
         compared = chain(
             world_cards.update(worlds),
             method_cards.update(methods, new_version=new_version) if methods or not names else ())
         for name, what, differences in compared:
             anything_moved |= what == "moved"
-            typer.echo(f"{name}: {what}")
+            options.say(f"{name}: {what}")
             for difference in differences:
-                typer.echo(f"  {difference}", err=what == "moved")
+                options.say(f"  {difference}", err=what == "moved")
     if anything_moved:
-        typer.echo("numbers have moved: find out why; or give the world the next -vN, or write a "
-                   "method's new version with --new-version and play its records again", err=True)
+        options.say("numbers have moved: find out why; or give the world the next -vN, or write a "
+                    "method's new version with --new-version and play its records again", err=True)
         raise typer.Exit(1)
 
 
@@ -51,9 +51,9 @@ def migrate(
     """For maintainers: rewrite records of an older format in that of today; no episode, score or
     run is lost."""
     from eitbench.bench.migrate import migrate as rewritten
-    with clear_errors():
+    with options.clear_errors():
         for old, new in rewritten(folder):
-            typer.echo(f"{old.name} -> {new.name}")
+            options.say(f"{old.name} -> {new.name}")
 
 
 def held_out(
@@ -63,6 +63,6 @@ def held_out(
     """For maintainers: draw the salt of held-out episodes, and publish its hash in
     leaderboards/held_out.json, once."""
     from eitbench.bench import held_out as beyond
-    with clear_errors():
+    with options.clear_errors():
         digest = beyond.publish_new_salt(new)
-    typer.echo(f"wrote {new}, sha256 {digest}, and {beyond.PUBLISHED}")
+    options.say(f"wrote {new}, sha256 {digest}, and {beyond.PUBLISHED}")

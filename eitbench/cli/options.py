@@ -11,6 +11,7 @@ from typing import Annotated
 
 import typer
 
+from eitbench._foreign import cleaned
 from eitbench.data.parallel import WorkerLost
 
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -34,6 +35,11 @@ RL = ("torch", "stable_baselines3", "sb3_contrib", "yaml")
 """What the extra rl installs for training and for trained agents."""
 
 
+def say(text: object, *, err: bool = False) -> None:
+    """Print what may hold a stranger's words: nothing in them moves the cursor."""
+    typer.echo(cleaned(str(text), lines=True), err=err)
+
+
 @contextmanager
 def clear_errors() -> Iterator[None]:
     """Turn a ValueError about an argument, the loss of a process, or the want of an extra into a
@@ -41,22 +47,22 @@ def clear_errors() -> Iterator[None]:
     try:
         yield
     except WorkerLost as error:
-        typer.echo(error, err=True)
+        say(error, err=True)
         raise typer.Exit(1) from error
     except ModuleNotFoundError as error:
         if (error.name or "").split(".")[0] not in RL:
             raise
-        typer.echo("training and trained agents need the extra rl, pip install -e '.[rl]': "
-                   f"{error}", err=True)
+        say("training and trained agents need the extra rl, pip install -e '.[rl]': "
+            f"{error}", err=True)
         raise typer.Exit(1) from error
     except ValueError as error:
-        raise typer.BadParameter(str(error)) from error
+        raise typer.BadParameter(cleaned(str(error), lines=True)) from error
 
 
 def say_differences(sentences: Iterable[str]) -> None:
     """What differs, one a line; then, if anything does, exit status 1."""
     wrong = list(sentences)
     for sentence in wrong:
-        typer.echo(f"differs: {sentence}", err=True)
+        say(f"differs: {cleaned(sentence)}", err=True)
     if wrong:
         raise typer.Exit(1)

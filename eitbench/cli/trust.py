@@ -23,7 +23,7 @@ def verify(
     isolate: options.Isolate = options.Isolation.always,
     held_out: Annotated[int, typer.Option(
         "--held-out", min=0, help="For maintainers: play so many held-out episodes too, and "
-                                  "compare the gains.")] = 0,
+                                  "ask whether the record is too good.")] = 0,
     salt_file: Annotated[Path | None, typer.Option(
         help="From which they follow; see `eitbench held-out`.")] = None,
     every: Annotated[bool, typer.Option(
@@ -72,21 +72,21 @@ def verify(
             claimed = read_record(record)
             job = again.job_of(claimed, baseline or policy, isolate)
             if remark := again.outdated(claimed, job):
-                typer.echo(f"{remark}\n")
+                options.say(f"{remark}\n")
             if episodes:
                 table, differences = again.verify(claimed, job, episodes=episodes, seed=seed,
                                                   tolerance=tolerance)
-                typer.echo(f"episodes drawn with --seed {seed}, isolation {job.isolation}\n\n"
-                           f"{table}\n")
+                options.say(f"episodes drawn with --seed {seed}, isolation {job.isolation}\n\n"
+                            f"{table}\n")
             if held_out:
-                table, more = beyond.held_out(claimed, job, salt, held_out, record.parent)
+                table, more = beyond.held_out(claimed, job, salt, held_out)
                 differences += more
-                typer.echo("held-out episodes of the salt with sha256 "
-                           f"{beyond.hash_of(salt)}\n\n{table}\n")
+                options.say("held-out episodes of the salt with sha256 "
+                            f"{beyond.hash_of(salt)}\n\n{table}\n")
     except ValueError as error:
         differences = [str(error)]
     options.say_differences(differences)
-    typer.echo(f"{record.name}: what was played again is as it says")
+    options.say(f"{record.name}: what was played again is as it says")
 
 
 def _verify_all(folder: Path, environments: list[str], out: Path, tolerance: float,
@@ -94,5 +94,5 @@ def _verify_all(folder: Path, environments: list[str], out: Path, tolerance: flo
     from eitbench.bench.replay import by_environment, differing, official_records, verify_all
     with options.clear_errors():
         rows = verify_all(official_records(folder, environments), out, **how)
-    typer.echo(by_environment(rows, tolerance))
+    options.say(by_environment(rows, tolerance))
     options.say_differences(differing(rows, tolerance))

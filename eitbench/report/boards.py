@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple
 
 import pandas as pd
 
-from eitbench.bench.records import file_name, finished, newest
+from eitbench.bench.records import file_name, finished, newest, read_sound_records
 from eitbench.bench.statistics import (
     interquartile_mean,
     mean_over_environments,
@@ -94,10 +95,11 @@ def boards(records: list[dict[str, Any]]) -> pd.DataFrame:
 
     A board is an environment. Its episodes are those that its floor has played (without one, those
     that anybody has); others are not looked at. After the boards of a class comes its aggregate,
-    with ``environment`` `ALL`, if there are several registered environments with a floor: of
-    methods that have finished every episode of every one of them. Environments with arguments of
-    somebody's own have boards, and no part in it. ``seconds_per_step`` is in ms of the fastest
-    episode, ``voltage_discrepancy`` in mV², ``peak_memory`` in 10⁶ bytes.
+    with ``environment`` `ALL`, if there are several registered environments with a floor (an
+    official one, where any is): of methods that have finished every episode of every one of them.
+    Environments with arguments of somebody's own have boards, and no part in it.
+    ``seconds_per_step`` is in ms of the fastest episode, ``voltage_discrepancy`` in mV²,
+    ``peak_memory`` in 10⁶ bytes.
 
     Raises
     ------
@@ -121,10 +123,32 @@ def boards(records: list[dict[str, Any]]) -> pd.DataFrame:
                   for _, environment in environments}
         for environment, entries in played.items():
             rows += _board(environment, entries, current, products)
-        rows += _aggregate({environment: entries for environment, entries in played.items()
-                            if environment in registered and any(entry.gains for entry in entries)})
+        rows += _aggregate(_counted({environment: entries for environment, entries in played.items()
+                                     if environment in registered}))
     types: dict[str, Any] = dict.fromkeys([*_NUMBERS, *others(), *_AFTER], float)
     return pd.DataFrame(rows, columns=fields()).astype(types | {"rank": "Int64"})
+
+
+def read_for_boards(folder: Path) -> tuple[list[dict[str, Any]], list[str]]:
+    """The records of a folder that can stand on boards, and a sentence for each of the others.
+
+    Raises
+    ------
+    ValueError
+        If there is no such folder, or none of it can.
+    """
+    if not folder.is_dir():
+        raise ValueError(f"records must be a folder that exists, got {folder}")
+    read, complaints = read_sound_records(folder)
+    found = [record for record in read if record["split"] == "test"]
+    complaints += [f"record {folder / file_name(record)} has {record['split']} seeds, and "
+                   "leaderboards are made of test seeds"
+                   for record in read if record["split"] != "test"]
+    if not found:
+        named = "".join(f"; {complaint}" for complaint in complaints)
+        raise ValueError(f"records must be a folder with records, got {folder}, where there are "
+                         f"none that can be shown{named}")
+    return found, complaints
 
 
 def class_of(record: dict[str, Any]) -> str:
@@ -134,8 +158,7 @@ def class_of(record: dict[str, Any]) -> str:
 
 def _entries(records: list[dict[str, Any]]) -> list[Entry]:
     """The records of one environment on the board's episodes."""
-    floors = [record for record in records
-              if record["method"] == FLOORS[track_of_board(record["board"])]]
+    floors = [record for record in records if _is_floor(record)]
     floor = max(floors, key=lambda record: (record["official"], finished(record)), default=None)
     seeds = {seed for record in ([floor] if floor else records) for seed in record["seeds"]}
     zero = scores_by_seed(floor, "error") if floor else {}
@@ -182,6 +205,20 @@ def _place(entry: Entry) -> tuple[bool, float, str]:
     return not entry.complete, mean_over_environments(errors) if errors else math.inf, entry.label
 
 
+def _counted(played: dict[str, list[Entry]]) -> dict[str, list[Entry]]:
+    """The environments of an aggregate: those with a floor; where there are official floors, those
+    with an official one, or else a stranger with a floor of his own could shut all others out."""
+    own = {environment: entries for environment, entries in played.items()
+           if any(entry.gains for entry in entries)}
+    official = {environment: entries for environment, entries in own.items()
+                if any(_is_floor(entry.record) and entry.record["official"] for entry in entries)}
+    return official or own
+
+
+def _is_floor(record: dict[str, Any]) -> bool:
+    return bool(record["method"] == FLOORS[track_of_board(record["board"])])
+
+
 def _aggregate(played: dict[str, list[Entry]]) -> list[dict[str, Any]]:
     """Rows of the methods that have finished all of several environments, ordered and ranked by the
     interquartile mean of their gains."""
@@ -225,13 +262,14 @@ def _three(name: str, scores: dict[str, dict[str, float]],
 
 def _matrix_products(records: list[dict[str, Any]]) -> dict[str, float]:
     """Processor -> time of a matrix product in s, the median of the runs: a single one depends on
-    what runs beside."""
-    timed: dict[str, list[float]] = {}
+    what runs beside. Of official runs, where any was on that processor."""
+    timed: dict[str, dict[bool, list[float]]] = {}
     for record in records:
         for run in record["runs"]:
             machine = run["machine"]
-            timed.setdefault(machine["processor"], []).append(machine["matmul_seconds"])
-    return {processor: median(seconds) for processor, seconds in timed.items()}
+            by = timed.setdefault(machine["processor"], {True: [], False: []})
+            by[record["official"]].append(machine["matmul_seconds"])
+    return {processor: median(by[True] or by[False]) for processor, by in timed.items()}
 
 
 def _in_products(record: dict[str, Any], products: dict[str, float]) -> float | None:

@@ -48,8 +48,9 @@ class Axis:
     """From values to px: logarithmic or linear, with ticks at round numbers."""
 
     def __init__(self, low: float, high: float, begin: float, end: float, *, log: bool) -> None:
+        wide = high - low > 1e-12 * max(abs(low), abs(high))
         self.low = low
-        self.high = high
+        self.high = high if wide else low + max(1.0, abs(low))
         self.begin = begin
         self.end = end
         self.log = log
@@ -174,7 +175,7 @@ def cell(three: tuple[float, float, float], low: float, high: float, *, log: boo
     """A dot and its interval within a table's cell, on the scale of its column from ``low`` to
     ``high``, perhaps with a line at a ``mark``; the number beside it says the same, so that it is
     hidden from those who listen."""
-    px = Axis(low, high if high > low else low + 1.0, 4, 76, log=log)
+    px = Axis(low, high, 4, 76, log=log)
     value, a, b = (min(end if math.isfinite(end) else three[0], px.high) for end in three)
     line = "" if mark is None else f'<path class="grid" d="M{px(mark):.1f} 0V14"/>'
     return (f'<svg class="cell" viewBox="0 0 80 14" aria-hidden="true">{line}'
@@ -263,7 +264,8 @@ def _log_ticks(low: float, high: float) -> list[float]:
     ticks = [m * 10.0**e for e in decades for m in (1, 2, 5) if low <= m * 10.0**e <= high]
     if len(ticks) < 2:
         return _linear_ticks(low, high)
-    return ticks if len(ticks) < 12 else [10.0**e for e in decades if low <= 10.0**e <= high]
+    powers = [10.0**e for e in decades if low <= 10.0**e <= high]
+    return ticks if len(ticks) < 12 else powers[::math.ceil(len(powers) / 12)]
 
 
 def _linear_ticks(low: float, high: float) -> list[float]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import json
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from eitbench._files import write_atomically
+from eitbench._foreign import cleaned
 from eitbench.bench.records import alike
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.tracks import Environment
@@ -123,11 +125,18 @@ def _snapshots(store: EpisodeStore, records: list[dict[str, Any]]) -> dict[str, 
         fields = [store.fields(record | {"seed": seed})["mean"] for record in chosen]
     except FileNotFoundError:                                      # only the records were kept
         return None
+    except ValueError as error:
+        warnings.warn(f"no pictures of {seed}: {error}", stacklevel=2)
+        return None
     world = chosen[0]["environment"]
     env: Any = Environment(world["id"], json.dumps(world["kwargs"])).make()
     with for_scores():
         env.reset(seed=parse_seeds(seed)[0])
     task = env.task
+    if any(field.shape != (task.n_steps, task.mesh.n_nodes) for field in fields):
+        warnings.warn(f"no pictures of {seed}: estimates of {cleaned(world['name'])} have another "
+                      "shape than its states", stacklevel=2)
+        return None
     truth = env.truth()
     times = task.warm_up + np.linspace(0.12, 0.88, 4) * (task.n_steps - task.warm_up)
     rows = []

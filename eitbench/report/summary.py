@@ -130,13 +130,14 @@ def _skills(record: dict[str, Any], records: list[dict[str, Any]]) -> dict[str, 
     """(E_bh − E)/(E_bh − E_ref) with the means over the seeds that all three have; one number, or
     none.
 
-    The anchors are those of the world's board with the longest record to look back on.
+    The anchors are those of the world's board with the longest record to look back on; official
+    ones, where there are any.
     """
     def of(baseline: str) -> dict[str, float]:
         found = [other for other in records if other["method"] == baseline
                  and world(other) == world(record) and other["split"] == record["split"]]
         anchor = max(found, default=None, key=lambda other: (
-            BOARDS.index(other["board"]), other["official"], finished(other)))
+            other["official"], BOARDS.index(other["board"]), finished(other)))
         return scores_by_seed(anchor, "error") if anchor else {}
 
     own = scores_by_seed(record, "error")

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import Any
 
 import jinja2
+
+from eitbench._foreign import cleaned
 
 
 def template(name: str) -> jinja2.Template:
@@ -16,4 +19,9 @@ def template(name: str) -> jinja2.Template:
 def _environment() -> jinja2.Environment:
     return jinja2.Environment(loader=jinja2.PackageLoader("eitbench.report", "."), autoescape=True,
                               trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
-                              undefined=jinja2.StrictUndefined)
+                              undefined=jinja2.StrictUndefined, finalize=_seen)
+
+
+def _seen(value: Any) -> Any:
+    """A stranger's text with all its characters to be seen; what is HTML already as it is."""
+    return cleaned(value, lines=True) if type(value) is str else value

@@ -87,9 +87,11 @@ def test_damaged_results_are_passed_over(content, store):
     put(store, result(2))
     damaged = store.folder / "episodes" / "eitbench-Pipe2D-v0" / "mine" / "train-1.json"
     damaged.write_bytes(content)
-    assert [r["seed"] for r in store.results()] == ["train:2"]
+    with pytest.warns(UserWarning, match=r"train-1\.json is left out: it is no result"):
+        assert [r["seed"] for r in store.results()] == ["train:2"]
     assert not store.holds(ENV, "mine", 1, "abc")
-    assert [record["seeds"] for record in store.write_records()] == [["train:2"]]
+    with pytest.warns(UserWarning, match="is left out"):
+        assert [record["seeds"] for record in store.write_records()] == [["train:2"]]
 
 
 @pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])

@@ -16,7 +16,7 @@ from eitbench.data.store import CACHE_VARIABLE
 from typer.testing import CliRunner
 
 from short import PIPE, shorten
-from tiny import FILTER, SCENARIO, SMOOTHING, count, counting, git_says, write_baseline
+from tiny import FILTER, SCENARIO, SMOOTHING, count, counting, git_says, record, write_baseline
 
 INJECTION = "eitbench/Pipe2DInjection-v0"
 TEST = parse_seeds("test:0-1")
@@ -177,7 +177,8 @@ def test_what_says_more_is_not_replaced(tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(methods, "version_of", lambda path, sha256: "v2")
         assert submitted("b", TEST[:1])["seeds"] == ["test:0"]
-    assert path.exists() and newest(read_records(to))[0] == [read_record(path.with_name(path.name.replace("v1", "v2")))]
+    newer = read_record(path.with_name(path.name.replace("v1", "v2")))
+    assert newest(read_records(to)) == ([read_record(path), newer], [])         # only an official one makes it outdated
 
 
 def test_a_record_of_other_code_is_extended(tmp_path, monkeypatch):
@@ -252,12 +253,14 @@ def test_mistyped_records_delete_nothing(tmp_path):
     kept = tmp_path / "site" / "index.html"
     kept.parent.mkdir()
     kept.write_text("mine")
-    (tmp_path / "results").mkdir()
+    (tmp_path / "none").mkdir()
+    write_record(tmp_path / "results", record("homogeneous", [0.2, 0.3]))
     for records, message in (("result", "records must be a folder that exists, got result"),
+                             ("none", "records must be a folder with records, got none, where there are none"),
                              ("results", "folder must be empty or hold a site of the leaderboards")):
         code, _, complaint = eitbench("leaderboard", "--records", records)
         assert code == 2 and message in complaint
-        assert {path.name for path in tmp_path.iterdir()} == {"site", "results"} and kept.read_text() == "mine"
+        assert {path.name for path in tmp_path.iterdir()} == {"site", "results", "none"} and kept.read_text() == "mine"
 
 
 @pytest.mark.parametrize("arguments", [
@@ -304,7 +307,7 @@ def test_from_a_file_to_the_boards_by_command(tmp_path):
 
     record.write_text(record.read_text().replace('"official": false', '"official": true'))
     code, _, complaint = eitbench("leaderboard", "--records", "leaderboards/results")
-    assert code == 2 and "was changed since it was written" in complaint
+    assert code == 1 and "was changed since it was written" in complaint
 
 
 @pytest.mark.parametrize(("arguments", "message"), [

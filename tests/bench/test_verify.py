@@ -288,29 +288,32 @@ def test_the_published_hash_is_found_from_everywhere(tmp_path):
     assert Path(said.stdout.strip()) == Path(run.__file__).parents[2] / "leaderboards" / "held_out.json"
 
 
+def held_out_claim(tmp_path, monkeypatch, mine, episodes=6):
+    """Arguments of `verify` for held-out episodes alone, of a salt of zeros: one in twenty is bad luck."""
+    monkeypatch.setattr(held_out.secrets, "token_bytes", bytes)
+    held_out.new_salt(tmp_path / "salt")
+    return "--episodes", 0, "--held-out", episodes, "--salt-file", "salt", "--baseline", mine
+
+
 @walled
 def test_held_out_episodes_tell_the_honest_from_the_prepared(mine, tmp_path, monkeypatch):
-    """The record's own error again; that of a record which holds on public episodes only is another."""
+    """What the record says is no better than held-out; one that holds on public episodes only is."""
     public = submitted(mine, "--seeds", "test:0-7")
-    submitted("homogeneous", "--seeds", "test:0-7")
-    monkeypatch.setattr(held_out.secrets, "token_bytes", bytes)      # zeros: one salt in twenty is bad luck
-    digest = held_out.new_salt(tmp_path / "salt")
-    claim = ("--episodes", 0, "--held-out", 6, "--salt-file", "salt", "--baseline", mine)
+    claim = held_out_claim(tmp_path, monkeypatch, mine)
     code, said, complaint = eitbench("verify", public, *claim)
-    assert code == 0 and digest in said, complaint
-    lines = {line.split("|")[1].strip(): line for line in said.splitlines() if line.startswith("| ")}
-    assert re.search(r"\| +8 \|.*\(.* to .*\).*\(.* to .*\)", lines["record"]) and "| 6 |" in re.sub(" +", " ", said)
+    assert code == 0 and held_out.hash_of(bytes(32)) in said, complaint
+    assert "record, 8 episodes" in said and "held-out, 6" in said
+    assert all(re.search(rf"{name} *\|( +[\d.-]+ \|){{3}}", said)
+               for name in ("ẽ_c over the floor's", "gain over the floor", "smallest ratio"))
 
     def much_better(record):
-        for _ in range(10):
+        for _ in range(20):
             better(record)
 
     code, said, complaint = eitbench("verify", forged(public, much_better), *claim)
-    assert code == 1 and re.search(r"ẽ_c of held-out episodes differs from the record's by 0\.\d+ \(0", complaint)
-
-    code, said, complaint = eitbench("verify", forged(public, much_better, to="records"), *claim)
-    assert code == 1 and "| gain over homogeneous |" in re.sub(" +", " ", said)
-    assert re.search(r"gain over homogeneous of held-out episodes differs from the record's by -0\.\d+ \(-", complaint)
+    assert code == 1
+    for name in ("ẽ_c over the floor's", "gain over the floor"):
+        assert re.search(name + r": [\d.-]+ in the record, [\d.-]+ held-out; so much better is an honest", complaint)
 
     with monkeypatch.context() as patch:
         patch.setattr(run, "landlock_version", lambda: 0)
@@ -318,6 +321,32 @@ def test_held_out_episodes_tell_the_honest_from_the_prepared(mine, tmp_path, mon
         assert code == 1 and "behind a wall only" in complaint
     code, _, complaint = eitbench("verify", public, *claim, "--isolate", "never")
     assert code == 1 and "behind a wall only" in complaint
+
+
+@walled
+def test_no_record_of_the_floor_is_believed(mine, tmp_path, monkeypatch):
+    """A file with the truth of its test episodes; beside it a floor that is as good, first by file name."""
+    honest = submitted(mine, "--seeds", "test:0-7")
+    floor = submitted("homogeneous", "--seeds", "test:0-7")
+
+    def with_the_truth(record, of=8):
+        for episode in sorted(record["episodes"], key=lambda episode: episode["scores"]["error"])[-of:]:
+            episode["step_errors"] = [1.2e-5 for _ in episode["step_errors"]]
+            episode["scores"]["error"] = float(np.mean(episode["step_errors"]))
+
+    def in_front(record):
+        with_the_truth(record)
+        record.update(version="00000000", method_sha256="0" * 64, official=False)
+        for episode, true in zip(record["episodes"], read_record(floor)["episodes"], strict=True):
+            episode["step_errors"] = [1.2e-5 * error for error in true["step_errors"]]
+            episode["scores"]["error"] = float(np.mean(episode["step_errors"]))
+
+    claim = held_out_claim(tmp_path, monkeypatch, mine)
+    for of in (8, 2):                                       # all, or the hardest two
+        prepared = forged(honest, lambda record, of=of: with_the_truth(record, of))
+        assert forged(floor, in_front).name < floor.name
+        code, _, complaint = eitbench("verify", prepared, *claim)
+        assert code == 1 and "smallest ratio: " in complaint
 
 
 @walled
@@ -344,7 +373,8 @@ def test_held_out_seeds_stay_here(mine, tmp_path, monkeypatch):
     code, said, complaint = eitbench("verify", path, "--episodes", 0, "--held-out", 2, "--salt-file", "salt",
                                      "--baseline", mine)
     assert code == 0, complaint
-    assert played == 2 * seeds and sum(b'"update"' in message for message in passed) == 2 * 5
+    assert played == [*seeds, *seeds, *parse_seeds("test:0-3")]
+    assert sum(b'"update"' in message for message in passed) == 2 * 5
     for secret in (*(str(seed) for seed in seeds), *(f"{seed:x}" for seed in seeds), salt.hex()):
         assert secret not in said + complaint and not any(secret.encode() in message for message in passed)
     for secret in (salt, *(seed.to_bytes(8, order) for seed in seeds for order in ("little", "big"))):

@@ -168,6 +168,16 @@ def test_an_environment_with_arguments_has_no_part_in_an_aggregate():
     assert set(table[table["environment"] == name]["method"]) == {"b", "homogeneous"}
 
 
+def test_nobody_s_own_floor_empties_an_aggregate():
+    """Of an environment that no official floor has played: its two records would shut out all who did not play it."""
+    honest = [floor(official=True), floor(id=TANK, official=True),
+              *(record(name, times(0.5), id=id) for name in "ab" for id in (BOARD_IDS["filter"], TANK))]
+    id = "eitbench/Pipe3D-v0"
+    table = boards([*honest, floor(id=id), record("stranger", times(0.9), id=id)])
+    assert set(table[table["environment"] == ALL]["method"]) == {"a", "b", "homogeneous"}
+    assert set(table[table["environment"] == id.replace("/", "-")]["method"]) == {"stranger", "homogeneous"}
+
+
 def test_an_aggregate_is_ranked_by_what_orders_it():
     """By the interquartile mean of gains, which a disaster leaves as it is; a board of one environment by the mean."""
     def made(gains):
@@ -245,8 +255,9 @@ def folder(tmp_path):
     """A folder of records on three boards."""
     random = np.random.default_rng(7)
     three = random.uniform(0.1, 0.2, (3, 8)).tolist()
-    for each in (floor(official=True), floor(id=TANK), record("a", three[0], version="v2", scores={"nis": 1.5}),
-                 record("b", [*three[1][:7], None]), record("a", three[2], id=TANK, version="v2"),
+    for each in (floor(official=True), floor(id=TANK, official=True),
+                 record("a", three[0], version="v2", scores={"nis": 1.5}), record("b", [*three[1][:7], None]),
+                 record("a", three[2], id=TANK, version="v2"),
                  record("random_pair", FLOOR, board="injection", role="floor", scores={"spent": 3}),
                  record("a", times(0.1), finished="2020-01-01", version="v1")):
         write_record(tmp_path, each)
@@ -301,7 +312,7 @@ def test_load_is_tidy(folder):
     failed = frame[frame["status"] == "failed"]
     assert list(failed["method"]) == ["b"] and failed["value"].isna().all() and list(failed["seed"]) == ["test:7"]
     assert set(frame[frame["outdated"]]["version"]) == {"v1"}
-    ours = frame[(frame["method"] == "homogeneous") & (frame["metric"] == "error") & frame["official"]]
+    ours = errors[(errors["method"] == "homogeneous") & errors["official"]]
     assert list(ours["value"]) == FLOOR and set(ours["role"]) == {"floor"}
     mine = record("isolated", [0.1, None])
     mine["episodes"] = [episode | {"peak_memory": 10**8} for episode in mine["episodes"]]

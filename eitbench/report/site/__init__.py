@@ -13,7 +13,8 @@ from typing import Any
 
 import pandas as pd
 
-from eitbench._files import write_atomically
+from eitbench._files import replace_folder
+from eitbench._foreign import as_markdown
 from eitbench.bench.records import file_name, newest
 from eitbench.report.boards import boards, meanings
 from eitbench.report.site.collect import collect
@@ -76,13 +77,14 @@ def render(records: list[dict[str, Any]], table: pd.DataFrame | None = None) -> 
             if board.of_class == name and board.current:
                 seeds = "" if board.is_aggregate else f", {board.seeds}"
                 current = board._replace(rows=board.current)
-                parts += [f"### {board.title}{seeds}", shown(current, "", compact=False).markdown()]
+                parts += [f"### {as_markdown(board.title)}{seeds}",
+                          shown(current, "", compact=False).markdown()]
     if site.boards:
         said = [f"- **{heading}**: {text}" for heading, text in meanings().items()]
         parts += ["## What the columns say", "\n".join(said)]
     if outdated := newest(records)[1]:
         parts += ["## Outdated records", "Made by an earlier version of the method.\n\n"
-                  + "\n".join(f"- {file_name(record)}" for record in outdated)]
+                  + "\n".join(f"- {as_markdown(file_name(record))}" for record in outdated)]
     return {"leaderboard.csv": found.to_csv(index=False, float_format="%.6g", lineterminator="\n"),
             "leaderboard.md": "\n\n".join(parts) + "\n"}
 
@@ -93,7 +95,8 @@ def read_media(folder: Path) -> dict[str, bytes]:
 
 
 def write_site(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Make the folder hold these files and no others: a page whose records are gone goes too.
+    """Make the folder hold these files and no others: a page whose records are gone goes too. All
+    at once: an interruption leaves the site that was there.
 
     Raises
     ------
@@ -105,8 +108,4 @@ def write_site(folder: Path, files: Mapping[str, bytes]) -> None:
     if folder.exists() and any(folder.iterdir()) and not ours:
         raise ValueError("folder must be empty or hold a site of the leaderboards, since other "
                          f"files in it are deleted; {folder} holds something else")
-    for path in [path for path in folder.rglob("*") if path.is_file()]:
-        if path.relative_to(folder).as_posix() not in files:
-            path.unlink()
-    for name, content in files.items():
-        write_atomically(folder / name, content)
+    replace_folder(folder, files)

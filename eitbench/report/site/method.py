@@ -31,7 +31,7 @@ def method_page(site: Site, name: str) -> str:
     standings = [(board, row) for board in site.boards for row in board.rows
                  if row.cells["method"] == name]
     records = sorted((record for record in site.records if record["method"] == name),
-                     key=finished, reverse=True)
+                     key=lambda record: (record["official"], finished(record)), reverse=True)
     versions = list(dict.fromkeys(record["version"] for record in records))
     return template("site/method.html.j2").render(
         root="../", name=name, title=records[0]["title"], standings=_standings(standings),
