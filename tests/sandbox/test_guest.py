@@ -326,6 +326,27 @@ def test_nonsense_is_refused(head, body):
         wire.unpack(lambda n: endless)
 
 
+@pytest.mark.parametrize("head", [
+    b'[{"a": [' + b"[]," * (1 << 24), b"[{}, [" + b"[]," * 300_000, b'[{"a": ' + b"[" * 30 + b"]" * 30 + b"}, []]",
+    b'[{"a": 1e999}, []]', b'[{"a": -1e400}, []]', b'[{"a": ' + b"9" * 400 + b"}, []]",
+    b'[{"a": 1.' + b"0" * 400 + b"}, []]",
+    b'[{}, [["a", "<f8", [0, 18446744073709551616]]]]', b'[{}, [["a", "<f8", [0, true]]]]',
+    b'[{}, [["a", "<f8", ' + b"[0" + b", 1" * 60 + b"]]]]", b'[{}, [["a", {"a": 1}, [1]]]]', b'[{}, [7]]', b'[{}, 7]',
+])
+def test_what_costs_the_host_much_is_refused(head):
+    """64 MiB of empty lists took 1.7 GB and 21 s; what is too long is not even read."""
+    asked, began = [], time.process_time()
+    stream = iter(((len(head).to_bytes(8, "little") + bytes(8)), head, b""))
+
+    def read(n):
+        asked.append(n)
+        return next(stream)
+
+    with pytest.raises(ValueError, match="message must"):
+        wire.unpack(read)
+    assert time.process_time() - began < 0.5 and sum(asked) <= 16 + wire.HEAD
+
+
 def test_the_variables_of_this_process_stay_here():
     """A guest sees none of them but those it needs."""
     os.environ["EITBENCH_TEST_SECRET"] = "salt"

@@ -42,6 +42,14 @@ class Policy:
 BY_LOT = "return int(self.random.integers(self.rules.action_space.n))"
 
 
+ABOUT = """import os
+from eitbench.bench.sandbox import wire
+sound = {{"title": "Mine", "boards": ["filter"], "role": None, "parameters": {{}}, "suits": True}}
+os.write(4, wire.pack(sound | {{{}}}))
+"""
+"""A file that answers for the process before it is loaded."""
+
+
 @pytest.fixture(autouse=True)
 def cache(run_cache, monkeypatch):
     """One cache of episodes for all tests of this session, and no guest left behind."""
@@ -202,6 +210,16 @@ def test_a_file_that_changes_meanwhile_is_not_played(tmp_path):
      "b.BOARDS = {'estimation': [[1]]}\nEstimator.boards = [[1]]\n"
      "b.set = lambda _: type('S', (), {'__le__': lambda *_: True})()",
      "says nonsense of its boards"),
+    *((f"class Estimator:\n    def update(self, v, i): pass\nimport eitbench.bench.methods as b\n"
+       f"b._parameters = lambda *_: {said}", "mine.py.*(parameters|JSON)")
+      for said in ("{'a': 'b' * 10_000}", "{'a': float('inf')}", "{'a': [[]] * 900_000}")),
+    ("class Estimator:\n    def update(self, v, i): pass\nimport eitbench.bench.methods as b\n"
+     "b.title_of = lambda *_: 'a' * 121", "says nonsense of its title"),
+    (ABOUT.format("'boards': 7"), "says nonsense of its boards"),
+    (ABOUT.format("'boards': [{}]"), "says nonsense of its boards"),
+    (ABOUT.format("'role': [], 'name': None, 'title': 7"), "says nonsense of its title, role"),
+    ("import os\nhead = b'[{\"parameters\": 1e999}, []]'\n"
+     "os.write(4, len(head).to_bytes(8, 'little') + bytes(8) + head)", "1e999"),
 ])
 def test_files_that_cannot_be_played(said, message, tmp_path):
     """A ``ValueError`` that names the file, also if the file makes the process lie."""

@@ -17,7 +17,17 @@ from typing import Any
 
 import numpy as np
 
-from eitbench.bench.methods import ROLES, Method, find_method, is_ours, load_method, own_files
+from eitbench import _check
+from eitbench.bench.methods import (
+    PARAMETERS,
+    ROLES,
+    TITLE,
+    Method,
+    find_method,
+    is_ours,
+    load_method,
+    own_files,
+)
 from eitbench.bench.sandbox.host import Guest, GuestError
 from eitbench.bench.tracks import BOARDS
 
@@ -90,15 +100,7 @@ def _load(track: str, id: str, kwargs: str, method: str, path: Path, sha256: str
         raise ValueError(PRIVILEGED.format(path))
     if path.suffix == ".py":
         about = about | {"name": path.stem}  # a guest may call itself anything
-    sound = {
-        "name": isinstance(about.get("name"), str) and NAME.fullmatch(about["name"]),
-        "title": isinstance(about.get("title"), str) and about["title"],
-        "parameters": isinstance(about.get("parameters"), dict),
-        "role": about.get("role") in ROLES,
-        "boards": all(board in BOARDS[track] for board in about.get("boards") or [None]),
-    }
-    if wrong := [name for name, is_sound in sound.items() if not is_sound]:
-        raise ValueError(f"{path} says nonsense of its {', '.join(wrong)}")
+    _check_about(path, about, track)
     ours = own_files(id).get(about["name"])
     if ours is not None and hashlib.sha256(ours.read_bytes()).hexdigest() != sha256:
         raise ValueError(f"{path} has the name of one of ours, {about['name']}, under which "
@@ -107,6 +109,21 @@ def _load(track: str, id: str, kwargs: str, method: str, path: Path, sha256: str
     there = _Elsewhere(enter, lambda world: bool(about.get("suits")))
     return Method(track, about["name"], about["title"], path, sha256, tuple(about["boards"]),
                   about["parameters"], there, about["role"])
+
+
+def _check_about(path: Path, about: dict[str, Any], track: str) -> None:
+    """``ValueError``, naming the file, if a guest says of it what no method can be."""
+    boards = about.get("boards")
+    sound = {
+        "name": isinstance(about.get("name"), str) and NAME.fullmatch(about["name"]),
+        "title": isinstance(about.get("title"), str) and 0 < len(about["title"]) <= TITLE,
+        "role": about.get("role") in ROLES,
+        "boards": isinstance(boards, list) and boards and all(
+            board in BOARDS[track] for board in boards),
+    }
+    if wrong := [name for name, is_sound in sound.items() if not is_sound]:
+        raise ValueError(f"{path} says nonsense of its {', '.join(wrong)}")
+    _check.document(f"{path}: parameters", about.get("parameters"), PARAMETERS)
 
 
 def _enter(track: str, id: str, kwargs: str, method: str, sha256: str) -> Guest:
