@@ -45,8 +45,8 @@ def attempt(what, deed):
         pass
 def not_negative(result):
     return result >= 0
-parent, libc = f"/proc/{os.getppid()}", ctypes.CDLL(None)
-other = os.PRIO_PROCESS, os.getppid()
+parent, libc = f"/proc/{HOST}", ctypes.CDLL(None)
+other = os.PRIO_PROCESS, HOST
 attempt("the cache", lambda: os.listdir(SECRETS))
 attempt("a truth", lambda: Path(SECRETS, "secret.txt").read_text())
 attempt("the checkout", lambda: Path(ROOT, "README.md").read_text())
@@ -55,7 +55,7 @@ attempt("the other's surroundings", lambda: Path(parent, "environ").read_bytes()
 attempt("the other's command", lambda: Path(parent, "cmdline").read_bytes())
 attempt("the other's memory", lambda: open(parent + "/mem", "rb"))
 attempt("the other's files", lambda: os.listdir(parent + "/fd"))
-attempt("the other process", lambda: os.kill(os.getppid(), 0))
+attempt("the other process", lambda: os.kill(HOST, 0))
 attempt("the network", lambda: socket.create_connection(("127.0.0.1", PORT), timeout=5))
 attempt("UDP", lambda: socket.socket(type=socket.SOCK_DGRAM).sendto(b"the truth", ("127.0.0.1", PORT)))
 attempt("a service", lambda: socket.socket(socket.AF_UNIX).connect(SECRETS + "/service"))
@@ -67,7 +67,7 @@ attempt("names everywhere", lambda: not_negative(libc.fanotify_init(0x600, 0)))
 attempt("who may read", lambda: os.chmod(SECRETS + "/secret.txt", 0o644))
 attempt("when it was written", lambda: os.utime(SECRETS + "/secret.txt"))
 attempt("the other's haste", lambda: os.setpriority(*other, os.getpriority(*other)))
-attempt("the other's limits", lambda: resource.prlimit(os.getppid(), resource.RLIMIT_NOFILE))
+attempt("the other's limits", lambda: resource.prlimit(HOST, resource.RLIMIT_NOFILE))
 attempt("the machine's secrets", lambda: open("/etc/shadow"))
 attempt("another folder", lambda: Path(SECRETS, "mine.txt").write_text("mine"))
 attempt("the name of the cache", lambda: os.environ["EITBENCH_CACHE"] == CACHE)
@@ -190,7 +190,8 @@ def test_it_reaches_nothing(tmp_path, monkeypatch):
         service.bind(str(tmp_path / "service"))
         service.listen()
         log.bind(str(tmp_path / "log"))
-        known = {"SECRETS": str(tmp_path), "PORT": server.getsockname()[1], "CACHE": str(tmp_path / "cache"),
+        known = {"SECRETS": str(tmp_path), "HOST": os.getpid(), "PORT": server.getsockname()[1],
+                 "CACHE": str(tmp_path / "cache"),
                  "ROOT": str(Path(__file__).parents[2]), "SHAPE": list(here["truth"].shape)}
         source = "\n".join(f"{name} = {value!r}" for name, value in known.items()) + ATTACKS
         within: dict = {}
@@ -216,9 +217,11 @@ CHILD = """child = os.fork()
                     leave()
                 except OSError:
                     pass
+            Path.home().joinpath("number").write_text(os.readlink("/proc/self"))
             time.sleep(60)
             os._exit(0)
-        Path.home().joinpath("child").write_text(str(child))
+        while not Path.home().joinpath("number").exists():
+            pass
         """
 
 
@@ -231,7 +234,7 @@ def test_its_children_end_with_it(end, tmp_path):
         guest._patience = 5.0
         with suppress(GuestError):
             guest.update(np.zeros(4), np.zeros(4))
-        child = Path("/proc", (guest._private / "child").read_text(), "status")
+        child = Path("/proc", (guest._private / "number").read_text(), "status")
     until = time.monotonic() + 5.0
     while child.exists() and "State:\tZ" not in child.read_text():
         assert time.monotonic() < until
@@ -352,7 +355,7 @@ def test_the_variables_of_this_process_stay_here():
     os.environ["EITBENCH_TEST_SECRET"] = "salt"
     try:
         with Guest("estimation", FILTER.id, KWARGS, "homogeneous") as guest:
-            seen = Path(f"/proc/{guest._process.pid}/environ").read_text()
+            seen = Path(f"/proc/{guest.process}/environ").read_text()
     finally:
         del os.environ["EITBENCH_TEST_SECRET"]
     assert "SECRET" not in seen and "NUMBA_CACHE_DIR" in seen

@@ -15,7 +15,7 @@ import pytest
 from eitbench.bench import suites
 from eitbench.bench.methods import own_methods
 from eitbench.bench.run import Job, run_episode, run_jobs
-from eitbench.bench.sandbox import guests, host
+from eitbench.bench.sandbox import guests, host, keeper
 from eitbench.bench.sandbox.wall import landlock_version
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.tracks import Environment
@@ -168,6 +168,96 @@ def test_workers_leave_nothing_behind(tmp_path):
     subprocess.run([sys.executable, "-c", program], check=True, env=os.environ | {"TMPDIR": str(folder)})
     assert {r["status"] for r in EpisodeStore(tmp_path / "results").results()} == {"ok"}
     assert not list(folder.glob("eitbench-guest-*"))
+
+
+STUBBORN = """import ctypes
+        ctypes.CDLL(None).prctl(1, 0, 0, 0, 0)
+        for role in ("guest", "child"):
+            Path.home().joinpath(f"{role}-{os.readlink('/proc/self')}").touch()
+            if role == "guest" and os.fork():
+                break
+            for leave in (os.setsid, os.setpgrp):
+                try:
+                    leave()
+                except OSError:
+                    pass
+        while True: pass"""
+"""It will not hear of the death of its parents, has a child that neither does, and never answers."""
+SUBMIT = """import json, sys
+from eitbench.bench.submit import submit
+from eitbench.bench.store import EpisodeStore
+from eitbench.bench import suites, tracks
+from eitbench.bench.tracks import Environment
+id, kwargs, path, folder, n_jobs = sys.argv[1:]
+before = suites.Environment
+suites.Environment = lambda id, given: before(id, kwargs)
+from pathlib import Path
+list(submit(path, [id], [200_000, 200_001, 200_002], EpisodeStore(Path(folder)), Path(folder), n_jobs=int(n_jobs)))
+"""
+"""As `eitbench submit`, in a world whose episodes take a moment."""
+
+
+def without_namespaces(folder):
+    """The keeper of a system that grants none."""
+    path = folder / "keeper.py"
+    path.write_text(Path(keeper.__file__).read_text().replace("NAMESPACES[name] for", "1 for"))
+    return str(path)
+
+
+def alive(number):
+    """Whether there is such a process, other than one whose parent has not asked how it ended."""
+    status = Path("/proc", str(number), "status")
+    try:
+        return "State:\tZ" not in status.read_text()
+    except OSError:
+        return False
+
+
+def waited(found, seconds):
+    """What ``found`` finds, as soon as it is something."""
+    until = time.monotonic() + seconds
+    while not (there := found()):
+        assert time.monotonic() < until
+        time.sleep(0.05)
+    return there
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="nobody ends a child elsewhere")
+@pytest.mark.parametrize("victim", ["host", "host without namespaces", "worker", "host of workers"])
+def test_nobody_outlives_a_killed_host(victim, tmp_path):
+    """Neither guests that do all they can, nor their children, nor workers; their folders are gone too."""
+    folder = tmp_path / "temporary"
+    folder.mkdir()
+    path = write_baseline(tmp_path, update=STUBBORN)
+    n_jobs = 2 if "worker" in victim else 1
+    program = SUBMIT if "without" not in victim else (
+        f"from eitbench.bench.sandbox import keeper\nkeeper.__file__ = {without_namespaces(tmp_path)!r}\n{SUBMIT}")
+    arguments = [FILTER.id, FILTER.kwargs, path, str(tmp_path / "results"), str(n_jobs)]
+    with subprocess.Popen([sys.executable, "-c", program, *arguments], stderr=subprocess.DEVNULL,
+                          env=os.environ | {"TMPDIR": str(folder)}) as submitting:
+        def family():
+            there = [int(each.name.split("-")[1]) for each in folder.glob("eitbench-guest-*/*-*")]
+            return there if len(there) == 2 * n_jobs else []
+
+        try:
+            players = waited(family, 90.0)
+            workers = [int(each.name) for each in Path("/proc").glob("[0-9]*")
+                       if started_by(each) == submitting.pid and "popen_loky" in (each / "cmdline").read_text()]
+            assert len(workers) >= (2 if n_jobs == 2 else 0)
+            os.kill(workers[0] if victim == "worker" else submitting.pid, 9)
+            waited(lambda: not any(map(alive, (*players, *workers))), 5.0)
+            if victim != "worker":                        # joblib then kills whoever descends from the others
+                waited(lambda: not list(folder.glob("eitbench-guest-*")), 5.0)
+        finally:
+            submitting.kill()
+
+
+def started_by(process):
+    """The parent of a process in /proc."""
+    try:
+        return int(re.search(r"PPid:\t(\d+)", (process / "status").read_text())[1])
+    except OSError:
+        return None
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="nobody ends a child elsewhere")

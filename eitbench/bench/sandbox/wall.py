@@ -11,7 +11,6 @@ from __future__ import annotations
 import ctypes
 import errno
 import os
-import signal
 import sys
 from collections.abc import Iterable
 from pathlib import Path
@@ -26,7 +25,7 @@ _FILE = 1 << 0 | 1 << 1 | 1 << 2 | 1 << 14
 """What rules on a single file may allow."""
 _ALL = {1: (1 << 13) - 1, 2: (1 << 14) - 1, 3: (1 << 15) - 1, 5: (1 << 16) - 1}
 """What a version of the interface can refuse: all that came with it or earlier."""
-_NO_NEW_PRIVILEGES, _END_WITH_PARENT, _FILTER_CALLS = 38, 1, (22, 2)
+_NO_NEW_PRIVILEGES, _FILTER_CALLS = 38, (22, 2)
 _REFUSED_CALLS = {
     "x86_64": (0xC000003E, 302, (
         41, 53, 425,  # socket, socketpair, io_uring_setup
@@ -114,7 +113,7 @@ def close_files(readable: Iterable[Path], writable: Iterable[Path]) -> bool:
     return True
 
 
-def refuse_calls() -> bool:
+def refuse_calls(signals: bool = True) -> bool:
     """From now on this process and its children make no socket of any kind, leave neither session
     nor group, and are not told which files others open; owners, modes, times and attributes of
     files stay what they are, and so do priorities and limits of other processes.
@@ -148,10 +147,18 @@ def limit_memory(size: int) -> None:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
-def end_with_parent() -> None:
-    """Be killed when whoever started this process is, also in the midst of an endless loop."""
-    if sys.platform.startswith("linux"):
-        _checked(_libc().prctl(_END_WITH_PARENT, signal.SIGKILL, 0, 0, 0))
+def drop_capabilities() -> bool:
+    """From now on root may do no more than others, nor who has namespaces; whether it is so."""
+    if not sys.platform.startswith("linux"):
+        return False
+    asked = (ctypes.c_uint32 * 2)(0x20080522, 0)
+    none = (ctypes.c_uint32 * 6)()
+    return bool(_libc().capset(asked, none) == 0)
+
+
+def own_number() -> int:
+    """Of this process, as those outside count it."""
+    return int(os.readlink("/proc/self")) if Path("/proc/self").exists() else os.getpid()
 
 
 def python_files() -> list[Path]:
@@ -163,7 +170,7 @@ def python_files() -> list[Path]:
     places = [sys.prefix, sys.base_prefix, sys.exec_prefix,
               str(package), str(package.parent / "baselines"), "/usr", "/lib", "/lib64", "/bin",
               *(f"/etc/{name}" for name in _SETTINGS), "/dev/null", "/dev/urandom", "/dev/zero",
-              f"/proc/{os.getpid()}", "/proc/cpuinfo", "/proc/meminfo", "/proc/stat",
+              f"/proc/{own_number()}", "/proc/cpuinfo", "/proc/meminfo", "/proc/stat",
               "/sys/devices/system/cpu",
               *(place for place in sys.path if place and Path(place) != checkout)]
     return [Path(place) for place in places]

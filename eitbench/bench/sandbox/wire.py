@@ -67,7 +67,7 @@ def _parsed(head: bytes) -> tuple[Any, list[Any]]:
     be kept."""
     if sum(head.count(sign) for sign in (b",", b"[", b"{")) > VALUES:
         raise ValueError(f"more than {VALUES} values")
-    said = json.loads(head, parse_constant=_refuse, parse_float=_real, parse_int=_whole)
+    said = _DECODER.decode(head.decode())
     _check.nesting("the JSON", said)
     json.dumps(said, ensure_ascii=False).encode()  # half a character cannot be kept
     words, layout = said
@@ -101,3 +101,6 @@ def _real(text: str) -> float:
 
 def _refuse(constant: str) -> None:
     raise ValueError(f"{constant} is not JSON")
+
+
+_DECODER = json.JSONDecoder(parse_constant=_refuse, parse_float=_real, parse_int=_whole)
