@@ -190,5 +190,6 @@ def _run_job(job: Job, store: EpisodeStore, run: dict[str, Any], home: str) -> N
     result, fields = run_episode(job)
     # whose times these are, not who asked
     elsewhere = {} if platform.node() == home else {"machine": machine()}
-    store.put(job.environment.name, result["method"], job.seed,
-              result | {"run": run | elsewhere | {"isolation": job.isolation}}, fields)
+    walls = {"walls": guests.walls()} if job.isolated else {}
+    result["run"] = run | elsewhere | {"isolation": job.isolation} | walls
+    store.put(job.environment.name, result["method"], job.seed, result, fields)

@@ -36,6 +36,7 @@ NAME = re.compile(r"[^./\\][^/\\]*")
 PRIVILEGED = "{} is privileged: it asks for the truth, which a process of its own has not"
 _present: list[tuple[tuple[str, ...], Guest]] = []
 """The guest of this process, and whom it plays."""
+_walls: list[str] = []
 
 
 def load(track: str, id: str, kwargs: str, method: str) -> Method:
@@ -56,6 +57,11 @@ def load(track: str, id: str, kwargs: str, method: str) -> Method:
 def peak_memory() -> int | None:
     """Bytes that the present guest has held at most."""
     return _present[0][1].peak_memory if _present else None
+
+
+def walls() -> list[str]:
+    """What keeps the guests of this process where they are, as the last of them has said."""
+    return list(_walls)
 
 
 def close() -> None:
@@ -134,6 +140,7 @@ def _enter(track: str, id: str, kwargs: str, method: str, sha256: str) -> Guest:
         atexit.register(close)
         _present.append((key, Guest(track, id, json.loads(kwargs), method)))
     guest = _present[0][1]
+    _walls[:] = guest.walls
     if guest.sha256 not in ("", sha256):
         close()
         raise GuestError(f"ValueError: {method} was changed while it was being played")
