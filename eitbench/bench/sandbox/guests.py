@@ -11,7 +11,7 @@ import hashlib
 import json
 import re
 from collections.abc import Callable
-from functools import lru_cache, partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -95,7 +95,7 @@ def _ours(track: str, id: str, kwargs: str, method: str, path: Path) -> Method:
     return loaded._replace(make=_Elsewhere(enter, loaded.suits))
 
 
-@lru_cache(maxsize=64)
+@cache
 def _load(track: str, id: str, kwargs: str, method: str, path: Path, sha256: str) -> Method:
     enter = partial(_enter, track, id, kwargs, method, sha256)
     try:

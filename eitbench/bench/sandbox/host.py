@@ -165,7 +165,8 @@ class Guest:
         there = folder(entry(id).world.changed(kwargs.get("world")))
         (cache / there.name).mkdir(parents=True)
         for model in (path for pattern in MODELS for path in there.glob(pattern)):
-            shutil.copy(model, cache / there.name)
+            if model.is_file():
+                shutil.copy(model, cache / there.name)
         _copy_kernels(kernels)
         package = PACKAGE.parent
         arithmetic = {name: value for name, value in os.environ.items()

@@ -64,42 +64,53 @@ def main() -> None:
 
 def remove(folder: str) -> None:
     """Remove a folder that a stranger has filled, as far as that is possible: however deep it is,
-    whatever its modes are; links are not followed.
-
-    What lies in an inner folder is moved to the top, so that no path becomes long.
-    """
+    whatever its modes are; links are not followed."""
     with suppress(OSError):
-        top = _open(folder)
-        try:
-            _empty(top)
-        finally:
-            os.close(top)
+        _empty(_open(folder))
         os.rmdir(folder)
 
 
-def _empty(top: int) -> None:
-    names = os.listdir(top)
-    mark = os.urandom(8).hex()  # no name that can be guessed and taken
-    moved = 0
-    while names:
-        name = names.pop()
-        if not stat.S_ISDIR(os.stat(name, dir_fd=top, follow_symlinks=False).st_mode):
-            os.unlink(name, dir_fd=top)
-            continue
-        inner = _open(name, top)
-        try:
-            for each in os.listdir(inner):
-                if stat.S_ISDIR(os.stat(each, dir_fd=inner, follow_symlinks=False).st_mode):
-                    os.close(_open(each, inner))  # a folder can be moved by whoever may write it
-                    moved += 1
-                    aside = f"{mark}-{moved}"
-                    os.rename(each, aside, src_dir_fd=inner, dst_dir_fd=top)
-                    names.append(aside)
-                else:
-                    os.unlink(each, dir_fd=inner)
-        finally:
-            os.close(inner)
-        os.rmdir(name, dir_fd=top)
+def _empty(here: int) -> None:
+    """Remove all that is in an open folder, and close it; no path is longer than a name, and few
+    folders are open at once."""
+    above: list[tuple[str, tuple[int, int], list[str]]] = []  # what to remove there, and after that
+    try:
+        folders = _cleared(here)
+        while folders or above:
+            if folders:
+                above.append((folders.pop(), _identity(here), folders))
+                here = _instead(here, _open(above[-1][0], here))
+                folders = _cleared(here)
+            else:
+                name, expected, folders = above.pop()
+                here = _instead(here, os.open("..", os.O_RDONLY | os.O_DIRECTORY, dir_fd=here))
+                if _identity(here) != expected:  # somebody has moved it, who should be dead
+                    raise OSError(f"{name!r} is elsewhere")
+                os.rmdir(name, dir_fd=here)
+    finally:
+        os.close(here)
+
+
+def _cleared(place: int) -> list[str]:
+    """The folders in an open folder, from which all else is removed."""
+    folders = []
+    for name in os.listdir(place):
+        if stat.S_ISDIR(os.stat(name, dir_fd=place, follow_symlinks=False).st_mode):
+            folders.append(name)
+        else:
+            os.unlink(name, dir_fd=place)
+    return folders
+
+
+def _identity(place: int) -> tuple[int, int]:
+    status = os.fstat(place)
+    return status.st_dev, status.st_ino
+
+
+def _instead(before: int, after: int) -> int:
+    """The second of two open folders; the first is closed."""
+    os.close(before)
+    return after
 
 
 def _open(name: str, place: int | None = None) -> int:
