@@ -117,7 +117,7 @@ def test_a_policy_plays_as_it_would_here():
     observation, _ = env.reset(seed=1)
     here = load_method("random_pair", "injection").make(env.rules, np.random.default_rng(12))
     with Guest("injection", name, kwargs, "random_pair") as guest:
-        guest.begin(random=12)
+        guest.begin(np.random.default_rng(12))
         said = [guest.act(observation) for _ in range(4)]
         assert said == [here.act(observation) for _ in range(4)] and {type(action) for action in said} == {int}
 

@@ -20,6 +20,7 @@ from eitbench.bench.sandbox.wall import landlock_version
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.tracks import Environment
 from eitbench.data.store import CACHE_VARIABLE
+from eitbench.worlds.streams import randomness
 
 from recorded import forget_made
 from short import PIPE
@@ -86,6 +87,17 @@ def test_scores_are_the_same_to_the_bit(environment, tmp_path):
         assert set(fields) == set(others) and all((fields[name] == others[name]).all() for name in fields)
         assert here["peak_memory"] is None and 50e6 < there["peak_memory"] < 8e9
         assert there["scores"]["seconds_per_step"] > 0
+
+
+@pytest.mark.parametrize("isolated", [False, True])
+def test_a_policy_is_not_told_what_its_numbers_were_drawn_from(isolated, tmp_path):
+    """Its generator knows the same of all episodes, though it draws other numbers in each; no seed is among them."""
+    init = "seeds = self.random.bit_generator.seed_seq\n        self.known = repr((seeds, seeds.entropy, seeds.state))"
+    path = write_policy(tmp_path, init, "raise RuntimeError(f'{self.known} draws {self.random.integers(2**63)}')")
+    said = [run_episode(Job(INJECTION, path, seed, isolated))[0]["message"].split(" draws ") for seed in (1, 2)]
+    assert said[0][0] == said[1][0] and "entropy=0" in said[0][0] and said[0][1] != said[1][1]
+    expected = np.random.default_rng(int(randomness(1).policy.integers(2**63))).integers(2**63)
+    assert said[0][1] == str(expected)                                  # records of before stay what they are
 
 
 def test_ours_play_there_too(tmp_path):

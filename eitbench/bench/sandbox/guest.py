@@ -18,6 +18,7 @@ import cloudpickle
 import numpy as np
 
 from eitbench.bench.sandbox import wall, wire
+from eitbench.worlds import streams
 from eitbench.worlds.registry import take_over
 
 Reply = tuple[dict[str, Any], dict[str, np.ndarray]]
@@ -124,7 +125,7 @@ def _policy(rules: Any, method: Any) -> Callable[..., Reply]:
     def answer(words: dict[str, Any], arrays: dict[str, np.ndarray]) -> Reply:
         nonlocal player
         if words["do"] == "begin":
-            player = method.make(rules, np.random.default_rng(words["random"]))
+            player = method.make(rules, streams.in_state(words["random"]))
             return {}, {}
         assert player is not None
         return {}, {"action": np.asarray(player.act(arrays))}

@@ -81,8 +81,7 @@ class _Elsewhere:
 
     def __call__(self, world: Any, random: np.random.Generator | None = None) -> Guest:
         guest = self._enter()
-        origin: Any = None if random is None else random.bit_generator
-        guest.begin(0 if origin is None else origin.seed_seq.entropy)
+        guest.begin(random)
         return guest
 
 

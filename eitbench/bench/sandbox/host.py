@@ -102,10 +102,11 @@ class Guest:
             self.close()
             raise
 
-    def begin(self, random: int = 0) -> None:
-        """A new episode: another estimator or policy, of the same class; a policy's generator is
-        seeded with this."""
-        self._ask({"do": "begin", "random": random})
+    def begin(self, random: np.random.Generator | None = None) -> None:
+        """A new episode: another estimator or policy, of the same class; a policy's generator
+        draws what this one would."""
+        state = None if random is None else random.bit_generator.state
+        self._ask({"do": "begin", "random": state})
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Any:
         """What the estimator makes of a measurement: an `Estimate` or None."""
