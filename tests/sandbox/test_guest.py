@@ -266,10 +266,24 @@ def test_no_guest_where_the_cache_can_be_read(monkeypatch):
 def test_what_lies_beside_the_package_is_read_unless_it_is_a_checkout(tmp_path, monkeypatch):
     """Dependencies, as `pip install --target` puts them; not records, tests and whatever else a checkout holds."""
     monkeypatch.setattr(wall, "PACKAGE", tmp_path / "eitbench")
-    monkeypatch.syspath_prepend(tmp_path)
     assert tmp_path in wall.python_files()
     (tmp_path / "pyproject.toml").touch()
     assert tmp_path not in wall.python_files() and tmp_path / "eitbench" in wall.python_files()
+
+
+def test_checkouts_of_others_are_not_read(tmp_path, monkeypatch):
+    """What is installed for editing lies on `sys.path`: only what offers something to this package is read."""
+    offers, other = tmp_path / "offers", tmp_path / "other"
+    for place, name in ((offers, "bench_of_mine"), (other, "secrets_of_mine")):
+        (place / "src" / name).mkdir(parents=True)
+        (place / "src" / name / "__init__.py").touch()
+        monkeypatch.syspath_prepend(place / "src")
+    information = offers / "src" / "bench_of_mine-1.dist-info"
+    information.mkdir()
+    (information / "METADATA").write_text("Metadata-Version: 2.1\nName: bench-of-mine\nVersion: 1\n")
+    (information / "entry_points.txt").write_text("[eitbench.methods]\nmine = bench_of_mine.mine\n")
+    mine = {place for place in wall.python_files() if place.is_relative_to(tmp_path)}
+    assert mine == {offers / "src" / "bench_of_mine"}
 
 
 @pytest.mark.parametrize(("statement", "message"), [

@@ -9,8 +9,11 @@ from __future__ import annotations
 
 import ctypes
 import os
+import site
 import sys
 from collections.abc import Iterable
+from importlib.metadata import entry_points
+from importlib.util import find_spec
 from pathlib import Path
 
 from eitbench._files import PACKAGE
@@ -28,6 +31,9 @@ _NO_NEW_PRIVILEGES, _FILTER_CALLS = 38, (22, 2)
 _SETTINGS = ("ld.so.cache", "localtime", "timezone", "passwd", "group", "nsswitch.conf",
              "mime.types", "os-release", "fonts", "alternatives")
 """What programs look up in /etc; much else there is not for everybody."""
+
+_OFFERS = ("eitbench.worlds", "eitbench.methods", "eitbench.scores", "eitbench.loaders")
+"""Groups of entry points by which installed packages offer something to this one."""
 
 
 class _Ruleset(ctypes.Structure):
@@ -131,14 +137,26 @@ def python_files() -> list[Path]:
     the processor's."""
     package = PACKAGE
     # else others lie beside
-    checkout = package.parent if (package.parent / "pyproject.toml").exists() else None
+    is_checkout = (package.parent / "pyproject.toml").exists()
     places = [sys.prefix, sys.base_prefix, sys.exec_prefix,
               str(package), str(package.parent / "baselines"), "/usr", "/lib", "/lib64", "/bin",
               *(f"/etc/{name}" for name in _SETTINGS), "/dev/null", "/dev/urandom", "/dev/zero",
               f"/proc/{own_number()}", "/proc/cpuinfo", "/proc/meminfo", "/proc/stat",
               "/sys/devices/system/cpu",
-              *(place for place in sys.path if place and Path(place) != checkout)]
+              *([] if is_checkout else [str(package.parent)]), *_installed()]
     return [Path(place) for place in places]
+
+
+def _installed() -> list[str]:
+    """Where packages are installed for this Python, and the packages that offer something to this
+    one; not whatever else lies on `sys.path`, as checkouts installed for editing."""
+    places = [*site.getsitepackages(), site.getusersitepackages()]
+    offers = [point for group in _OFFERS for point in entry_points(group=group)]
+    for package in {point.module.partition(".")[0] for point in offers}:
+        found = find_spec(package)
+        if found is not None:
+            places += found.submodule_search_locations or [found.origin or ""]
+    return [place for place in places if place]
 
 
 def _libc() -> ctypes.CDLL:
