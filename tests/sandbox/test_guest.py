@@ -98,7 +98,7 @@ def test_a_guest_answers_as_it_would_here(name, measured, tmp_path):
     with Guest("estimation", FILTER.id, KWARGS, name) as guest:
         for _ in range(2):
             guest.begin()
-            estimator = here.estimator(FILTER.make().task)
+            estimator = here.make(FILTER.make().task)
             for voltages, currents in zip(*measured, strict=True):
                 said, expected = guest.update(voltages, currents), estimator.update(voltages, currents)
                 assert (said is None) == (expected is None)

@@ -147,7 +147,7 @@ def test_what_goes_wrong_is_the_episode_s(statement, message, lives, tmp_path):
         here = run_episode(job._replace(isolated=False))[0]
         assert lasting(result) | {"where": ""} == lasting(here) | {"where": ""}
         assert result["where"] == here["where"] or statement == "return 7"
-    job.load().estimator(None).update(np.zeros(4), np.zeros(4))
+    job.load().make(None).update(np.zeros(4), np.zeros(4))
     assert guests._present[0][1].alive and (guests._present[0][1] is first) == lives
 
 
