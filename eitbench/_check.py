@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 
@@ -74,6 +76,36 @@ def array(name: str, value: object, shape: Iterable[int | None], *, units: str =
         raise ValueError(f"{name} must be positive{_in(units)}, got {result.min():g} at index "
                          f"{_first(result <= 0)}")
     return result
+
+
+DEEPEST = 20
+"""How deep lists and dicts from elsewhere may be nested."""
+
+
+def nesting(name: str, value: Any) -> None:
+    """``ValueError`` if lists and dicts are nested too deep for what goes through them."""
+    level = [value]
+    for _ in range(DEEPEST):
+        level = [inner for each in level if isinstance(each, (list, tuple, dict))
+                 for inner in (each.values() if isinstance(each, dict) else each)]
+        if not level:
+            return
+    raise ValueError(f"{name} must not be nested deeper than {DEEPEST} levels")
+
+
+def document(name: str, value: object, size: int) -> None:
+    """``ValueError`` unless ``value`` is a dict that JSON can hold in so many bytes, its numbers
+    finite, also as floats, and not nested too deep."""
+    try:
+        if not isinstance(value, dict):
+            raise TypeError(f"got {type(value).__name__}")
+        text = json.dumps(value, allow_nan=False)
+        json.loads(text, parse_int=lambda digits: math.trunc(float(digits)))
+        nesting(name, value)
+    except (TypeError, ValueError, OverflowError, RecursionError) as error:
+        raise ValueError(f"{name} must be a dict fit for JSON: {error}") from None
+    if len(text) > size:
+        raise ValueError(f"{name} must have at most {size} bytes as JSON, got {len(text)}")
 
 
 def _first(mask: np.ndarray) -> tuple[int, ...]:

@@ -8,13 +8,14 @@ import json
 import re
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
+from eitbench import _check
 from eitbench._files import shipped
 from eitbench.bench.tracks import BOARDS, TRACKS
 
@@ -25,6 +26,11 @@ LOADERS = "eitbench.loaders"
 and content."""
 ROLES = (None, "floor", "reference")
 """What a method is on a board: ranked, or a mark from which the others are judged."""
+
+TITLE = 120
+"""letters of a title"""
+PARAMETERS = 10_000
+"""bytes of JSON that the parameters of a method may take in a record"""
 
 
 class Form(NamedTuple):
@@ -221,10 +227,11 @@ def load_method(name: str, track: str) -> Method:
 def _load(path: Path, source: bytes, track: str) -> Method:
     """The file with this content, executed once a process."""
     sha256 = hashlib.sha256(source).hexdigest()
+    form = FORMS[track]
     if track == "injection" and path.suffix in _loaders():
         name, title, agent, parameters = _loaders()[path.suffix].load()(path, source)
+        _check.document(f"{form.kind} {path}: parameters", parameters, PARAMETERS)
         return Method(track, name, title, path, sha256, BOARDS[track], parameters, agent)
-    form = FORMS[track]
     module = load_module(form.kind, path, source)
     method = getattr(module, form.type, None)
     function = form.answers.partition("(")[0]
@@ -266,15 +273,13 @@ def title_of(module: ModuleType, path: Path) -> str:
     """First line of the docstring, up to a colon, bracket or full stop, 120 letters at most;
     without one, the file's name."""
     line = f"{(module.__doc__ or '').strip()}\n".splitlines()[0]
-    return re.split(r"[:(.]", line)[0].strip()[:120] or path.stem
+    return re.split(r"[:(.]", line)[0].strip()[:TITLE] or path.stem
 
 
 def _parameters(who: str, method: type[Any]) -> dict[str, Any]:
-    """The class attribute ``parameters``; ``ValueError``, naming ``who``, if JSON cannot hold
+    """The class attribute ``parameters``; ``ValueError``, naming ``who``, if a record cannot hold
     them."""
-    try:
-        parameters = dict(getattr(method, "parameters", {}))
-        json.dumps(parameters, allow_nan=False)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{who}.parameters must be a dict fit for JSON: {error}") from None
+    given = getattr(method, "parameters", {})
+    parameters = dict(given) if isinstance(given, Mapping) else given
+    _check.document(f"{who}.parameters", parameters, PARAMETERS)
     return parameters

@@ -18,7 +18,7 @@ from eitbench.data.seeds import for_scores
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.injection import InjectionEnv
 from eitbench.worlds.registry import entry
-from eitbench.worlds.streams import randomness
+from eitbench.worlds.streams import in_state, randomness
 from eitbench.worlds.task import Estimate, Task
 from eitbench.worlds.world import World
 
@@ -93,9 +93,9 @@ def injections(env: InjectionEnv, policy: Method, seed: int,
     with for_scores():
         observation, _ = env.reset(seed=seed)
     t = env.core.first
-    # A generator knows what it was seeded with, so the policy's is seeded with a number that says
-    # nothing of the episode.
-    random = np.random.default_rng(int(randomness(seed).policy.integers(2**63)))
+    # A generator knows what it was seeded with, so the policy's is given its state only.
+    drawn = np.random.default_rng(int(randomness(seed).policy.integers(2**63)))
+    random = in_state(drawn.bit_generator.state)
     begin = time.perf_counter()
     player = policy.make(env.rules, random, *[env.core] * policy.privileged)
     done = False

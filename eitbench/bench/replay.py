@@ -16,6 +16,7 @@ from eitbench import _check
 from eitbench._files import write_atomically
 from eitbench.bench.records import newest, read_record
 from eitbench.bench.run import run_episode
+from eitbench.bench.sandbox.host import GuestError
 from eitbench.bench.store import read_json, source_digest
 from eitbench.bench.table import Cell, Table
 from eitbench.bench.verify import TOLERANCE, differences_of, drawn_of, job_of, outdated
@@ -101,10 +102,11 @@ def _replay(replay: Replay, isolate: str) -> None:
         "said": said.get("scores", {}).get("error"), "again": None, "problem": "", "remark": ""}
     try:
         job = job_of(record, None, isolate)._replace(seed=parse_seeds(said["seed"])[0])
-    except ValueError as error:
+        played = run_episode(job)[0]
+    except (ValueError, GuestError) as error:
         outcome["problem"] = str(error)
     else:
-        again = json.loads(json.dumps(run_episode(job)[0]))
+        again = json.loads(json.dumps(played))
         off = differences_of(said, again)
         worst = max(off, key=lambda name: off[name], default="")
         outcome |= {

@@ -76,8 +76,31 @@ def run_episode(job: Job) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         failure.
     """
     method = job.load()
+    result = _beginning(job, method)
+    fields: dict[str, np.ndarray] = {}
+    begin = time.perf_counter()
+    try:
+        with threadpool_limits(1):
+            played = play(job.environment, method, job.seed)
+            numbers = scored(method.track, played.outcome)
+        said = {"scores": numbers, "step_errors": played.outcome.errors.tolist()}
+        json.dumps(said, allow_nan=False)  # what cannot be kept is the method's failure too
+        result |= {"status": "ok"} | said
+        fields = played.fields
+    # whatever a method does wrong is its result, not our crash
+    except (Exception, SystemExit) as error:
+        result |= _failure(error)
+    if job.isolated:
+        result["peak_memory"] = guests.peak_memory()
+    result["finished"] = datetime.now(UTC).isoformat(timespec="microseconds")
+    result["seconds"] = time.perf_counter() - begin
+    return result, fields
+
+
+def _beginning(job: Job, method: Method) -> dict[str, Any]:
+    """What is known of a result before anything is played."""
     env = environment(job.environment)
-    result: dict[str, Any] = {
+    return {
         "identity": job.identity(),
         "seed": name_seed(job.seed),
         "method": method.name,
@@ -91,29 +114,18 @@ def run_episode(job: Job) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         "board": board_of(env),
         "environment": {"id": job.environment.id, "name": job.environment.name,
                         "kwargs": job.environment.given},
-        "finished": None,
+        "finished": datetime.now(UTC).isoformat(timespec="microseconds"),
         "peak_memory": None,
+        "seconds": 0.0,
     }
-    fields: dict[str, np.ndarray] = {}
-    begin = time.perf_counter()
-    try:
-        with threadpool_limits(1):
-            played = play(job.environment, method, job.seed)
-            numbers = scored(method.track, played.outcome)
-        result |= {"status": "ok", "scores": numbers,
-                   "step_errors": played.outcome.errors.tolist()}
-        fields = played.fields
-    except GuestError as error:
-        result |= {"status": "failed", "message": str(error), "where": error.where}
-    # whatever a method does wrong is its result, not our crash
-    except (Exception, SystemExit) as error:
-        result |= {"status": "failed", "message": f"{type(error).__name__}: {error}",
-                   "where": _where(error)}
-    if job.isolated:
-        result["peak_memory"] = guests.peak_memory()
-    result["finished"] = datetime.now(UTC).isoformat(timespec="microseconds")
-    result["seconds"] = time.perf_counter() - begin
-    return result, fields
+
+
+def _failure(error: BaseException) -> dict[str, Any]:
+    """What a result says of it."""
+    if isinstance(error, GuestError):
+        return {"status": "failed", "message": str(error), "where": error.where}
+    return {"status": "failed", "message": f"{type(error).__name__}: {error}",
+            "where": _where(error)}
 
 
 def _where(error: BaseException) -> str:
@@ -147,7 +159,8 @@ def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1, backend: 
     try:
         for function, work, label in (
             (_simulate_job, [(job,) for job in truths.values()], "simulating truths"),
-            (_run_job, [(job, store, run, home) for job in todo], "running methods"),
+            (_run_job, [(job, store, run, home, _beginning(job, job.load())) for job in todo],
+             "running methods"),
         ):
             done = in_parallel(function, work, n_jobs, backend)
             for _ in tqdm(done, total=len(work), desc=label, unit="episode", disable=None):
@@ -186,9 +199,19 @@ def _simulate_job(job: Job) -> None:
     simulate(environment(job.environment).world, job.seed, progress=False)
 
 
-def _run_job(job: Job, store: EpisodeStore, run: dict[str, Any], home: str) -> None:
-    result, fields = run_episode(job)
+def _run_job(job: Job, store: EpisodeStore, run: dict[str, Any], home: str,
+             beginning: dict[str, Any]) -> None:
+    try:
+        result, fields = run_episode(job)
+    # what could be loaded in the beginning and cannot any more: that, too, is only its own result
+    except Exception as error:
+        result, fields = beginning | _failure(error), {}
     # whose times these are, not who asked
     elsewhere = {} if platform.node() == home else {"machine": machine()}
-    store.put(job.environment.name, result["method"], job.seed,
-              result | {"run": run | elsewhere | {"isolation": job.isolation}}, fields)
+    walls = {"walls": guests.walls()} if job.isolated else {}
+    result["run"] = run | elsewhere | {"isolation": job.isolation} | walls
+    try:
+        store.put(job.environment.name, result["method"], job.seed, result, fields)
+    except OSError:
+        guests.close()  # its folder may be what fills the disk
+        store.put(job.environment.name, result["method"], job.seed, result, fields)

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import nullcontext
+from functools import lru_cache
+from threading import Thread
 from typing import Any, TypeVar
 
 from eitbench.worlds.registry import Entry, registered_by_hand, take_over
@@ -50,7 +53,9 @@ def _with_joblib(function: Callable[..., Result], arguments: Sequence[tuple], n_
     try:
         with config or nullcontext(), Parallel(n_jobs=n_jobs, **how) as parallel:
             told = registered_by_hand()
-            yield from parallel(delayed(_pinned)(told, function, *each) for each in arguments)
+            here = os.getpid()
+            yield from parallel(delayed(_watched)(here, told, function, *each)
+                                for each in arguments)
     except lost as error:
         raise _explained(error) from error
 
@@ -91,6 +96,28 @@ def _explained(error: BaseException) -> WorkerLost:
     return WorkerLost("a process was lost, killed perhaps for want of memory "
                       f"({type(error).__name__}); what was finished is kept, and the same command "
                       "goes on from there")
+
+
+def _watched(host: int, told: list[Entry], function: Callable[..., Result], *arguments: Any,
+             ) -> Result:
+    """The same in a process that ends soon when ``host``, who has started it, does."""
+    if os.getppid() == host:
+        _end_with(host)
+    return _pinned(told, function, *arguments)
+
+
+@lru_cache(maxsize=1)
+def _end_with(host: int) -> None:
+    """Look from now on, each second, whether this process has become an orphan.
+
+    (Linux would tell it, but as soon as the thread ends that has started it.)
+    """
+    def look() -> None:
+        while os.getppid() == host:
+            time.sleep(1.0)
+        os._exit(1)
+
+    Thread(target=look, daemon=True, name="end with the host").start()
 
 
 def _pinned(told: list[Entry], function: Callable[..., Result], *arguments: Any) -> Result:

@@ -214,7 +214,7 @@ def _load(world: World, seed: int) -> np.ndarray | None:
                 return None
             _sound[path] = status.st_size, status.st_mtime_ns
         return entries
-    except (FileNotFoundError, ValueError):        # missing, cut short
+    except (FileNotFoundError, IsADirectoryError, ValueError):  # missing, no file, cut short
         return None
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -30,3 +31,11 @@ def randomness(seed: int) -> Randomness:
     """The streams of the episode with this seed."""
     children = np.random.SeedSequence(seed).spawn(len(STREAMS))
     return Randomness(*map(np.random.default_rng, children))
+
+
+def in_state(state: Mapping[str, Any]) -> np.random.Generator:
+    """A generator that goes on from this state of another one, and knows nothing of the seed that
+    led to it."""
+    generator = np.random.default_rng(0)
+    generator.bit_generator.state = state
+    return generator

@@ -45,8 +45,8 @@ def attempt(what, deed):
         pass
 def not_negative(result):
     return result >= 0
-parent, libc = f"/proc/{os.getppid()}", ctypes.CDLL(None)
-other = os.PRIO_PROCESS, os.getppid()
+parent, libc = f"/proc/{HOST}", ctypes.CDLL(None)
+other = os.PRIO_PROCESS, HOST
 attempt("the cache", lambda: os.listdir(SECRETS))
 attempt("a truth", lambda: Path(SECRETS, "secret.txt").read_text())
 attempt("the checkout", lambda: Path(ROOT, "README.md").read_text())
@@ -55,7 +55,7 @@ attempt("the other's surroundings", lambda: Path(parent, "environ").read_bytes()
 attempt("the other's command", lambda: Path(parent, "cmdline").read_bytes())
 attempt("the other's memory", lambda: open(parent + "/mem", "rb"))
 attempt("the other's files", lambda: os.listdir(parent + "/fd"))
-attempt("the other process", lambda: os.kill(os.getppid(), 0))
+attempt("the other process", lambda: os.kill(HOST, 0))
 attempt("the network", lambda: socket.create_connection(("127.0.0.1", PORT), timeout=5))
 attempt("UDP", lambda: socket.socket(type=socket.SOCK_DGRAM).sendto(b"the truth", ("127.0.0.1", PORT)))
 attempt("a service", lambda: socket.socket(socket.AF_UNIX).connect(SECRETS + "/service"))
@@ -67,7 +67,7 @@ attempt("names everywhere", lambda: not_negative(libc.fanotify_init(0x600, 0)))
 attempt("who may read", lambda: os.chmod(SECRETS + "/secret.txt", 0o644))
 attempt("when it was written", lambda: os.utime(SECRETS + "/secret.txt"))
 attempt("the other's haste", lambda: os.setpriority(*other, os.getpriority(*other)))
-attempt("the other's limits", lambda: resource.prlimit(os.getppid(), resource.RLIMIT_NOFILE))
+attempt("the other's limits", lambda: resource.prlimit(HOST, resource.RLIMIT_NOFILE))
 attempt("the machine's secrets", lambda: open("/etc/shadow"))
 attempt("another folder", lambda: Path(SECRETS, "mine.txt").write_text("mine"))
 attempt("the name of the cache", lambda: os.environ["EITBENCH_CACHE"] == CACHE)
@@ -117,7 +117,7 @@ def test_a_policy_plays_as_it_would_here():
     observation, _ = env.reset(seed=1)
     here = load_method("random_pair", "injection").make(env.rules, np.random.default_rng(12))
     with Guest("injection", name, kwargs, "random_pair") as guest:
-        guest.begin(random=12)
+        guest.begin(np.random.default_rng(12))
         said = [guest.act(observation) for _ in range(4)]
         assert said == [here.act(observation) for _ in range(4)] and {type(action) for action in said} == {int}
 
@@ -190,7 +190,8 @@ def test_it_reaches_nothing(tmp_path, monkeypatch):
         service.bind(str(tmp_path / "service"))
         service.listen()
         log.bind(str(tmp_path / "log"))
-        known = {"SECRETS": str(tmp_path), "PORT": server.getsockname()[1], "CACHE": str(tmp_path / "cache"),
+        known = {"SECRETS": str(tmp_path), "HOST": os.getpid(), "PORT": server.getsockname()[1],
+                 "CACHE": str(tmp_path / "cache"),
                  "ROOT": str(Path(__file__).parents[2]), "SHAPE": list(here["truth"].shape)}
         source = "\n".join(f"{name} = {value!r}" for name, value in known.items()) + ATTACKS
         within: dict = {}
@@ -216,9 +217,11 @@ CHILD = """child = os.fork()
                     leave()
                 except OSError:
                     pass
+            Path.home().joinpath("number").write_text(os.readlink("/proc/self"))
             time.sleep(60)
             os._exit(0)
-        Path.home().joinpath("child").write_text(str(child))
+        while not Path.home().joinpath("number").exists():
+            pass
         """
 
 
@@ -231,7 +234,7 @@ def test_its_children_end_with_it(end, tmp_path):
         guest._patience = 5.0
         with suppress(GuestError):
             guest.update(np.zeros(4), np.zeros(4))
-        child = Path("/proc", (guest._private / "child").read_text(), "status")
+        child = Path("/proc", (guest._private / "number").read_text(), "status")
     until = time.monotonic() + 5.0
     while child.exists() and "State:\tZ" not in child.read_text():
         assert time.monotonic() < until
@@ -263,10 +266,24 @@ def test_no_guest_where_the_cache_can_be_read(monkeypatch):
 def test_what_lies_beside_the_package_is_read_unless_it_is_a_checkout(tmp_path, monkeypatch):
     """Dependencies, as `pip install --target` puts them; not records, tests and whatever else a checkout holds."""
     monkeypatch.setattr(wall, "PACKAGE", tmp_path / "eitbench")
-    monkeypatch.syspath_prepend(tmp_path)
     assert tmp_path in wall.python_files()
     (tmp_path / "pyproject.toml").touch()
     assert tmp_path not in wall.python_files() and tmp_path / "eitbench" in wall.python_files()
+
+
+def test_checkouts_of_others_are_not_read(tmp_path, monkeypatch):
+    """What is installed for editing lies on `sys.path`: only what offers something to this package is read."""
+    offers, other = tmp_path / "offers", tmp_path / "other"
+    for place, name in ((offers, "bench_of_mine"), (other, "secrets_of_mine")):
+        (place / "src" / name).mkdir(parents=True)
+        (place / "src" / name / "__init__.py").touch()
+        monkeypatch.syspath_prepend(place / "src")
+    information = offers / "src" / "bench_of_mine-1.dist-info"
+    information.mkdir()
+    (information / "METADATA").write_text("Metadata-Version: 2.1\nName: bench-of-mine\nVersion: 1\n")
+    (information / "entry_points.txt").write_text("[eitbench.methods]\nmine = bench_of_mine.mine\n")
+    mine = {place for place in wall.python_files() if place.is_relative_to(tmp_path)}
+    assert mine == {offers / "src" / "bench_of_mine"}
 
 
 @pytest.mark.parametrize(("statement", "message"), [
@@ -326,12 +343,33 @@ def test_nonsense_is_refused(head, body):
         wire.unpack(lambda n: endless)
 
 
+@pytest.mark.parametrize("head", [
+    b'[{"a": [' + b"[]," * (1 << 24), b"[{}, [" + b"[]," * 300_000, b'[{"a": ' + b"[" * 30 + b"]" * 30 + b"}, []]",
+    b'[{"a": 1e999}, []]', b'[{"a": -1e400}, []]', b'[{"a": ' + b"9" * 400 + b"}, []]",
+    b'[{"a": 1.' + b"0" * 400 + b"}, []]",
+    b'[{}, [["a", "<f8", [0, 18446744073709551616]]]]', b'[{}, [["a", "<f8", [0, true]]]]',
+    b'[{}, [["a", "<f8", ' + b"[0" + b", 1" * 60 + b"]]]]", b'[{}, [["a", {"a": 1}, [1]]]]', b'[{}, [7]]', b'[{}, 7]',
+])
+def test_what_costs_the_host_much_is_refused(head):
+    """64 MiB of empty lists took 1.7 GB and 21 s; what is too long is not even read."""
+    asked, began = [], time.process_time()
+    stream = iter(((len(head).to_bytes(8, "little") + bytes(8)), head, b""))
+
+    def read(n):
+        asked.append(n)
+        return next(stream)
+
+    with pytest.raises(ValueError, match="message must"):
+        wire.unpack(read)
+    assert time.process_time() - began < 0.5 and sum(asked) <= 16 + wire.HEAD
+
+
 def test_the_variables_of_this_process_stay_here():
     """A guest sees none of them but those it needs."""
     os.environ["EITBENCH_TEST_SECRET"] = "salt"
     try:
         with Guest("estimation", FILTER.id, KWARGS, "homogeneous") as guest:
-            seen = Path(f"/proc/{guest._process.pid}/environ").read_text()
+            seen = Path(f"/proc/{guest.process}/environ").read_text()
     finally:
         del os.environ["EITBENCH_TEST_SECRET"]
     assert "SECRET" not in seen and "NUMBA_CACHE_DIR" in seen

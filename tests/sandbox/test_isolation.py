@@ -15,11 +15,12 @@ import pytest
 from eitbench.bench import suites
 from eitbench.bench.methods import own_methods
 from eitbench.bench.run import Job, run_episode, run_jobs
-from eitbench.bench.sandbox import guests, host
+from eitbench.bench.sandbox import guests, host, keeper
 from eitbench.bench.sandbox.wall import landlock_version
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.tracks import Environment
 from eitbench.data.store import CACHE_VARIABLE
+from eitbench.worlds.streams import randomness
 
 from recorded import forget_made
 from short import PIPE
@@ -40,6 +41,14 @@ class Policy:
         {act}
 '''
 BY_LOT = "return int(self.random.integers(self.rules.action_space.n))"
+
+
+ABOUT = """import os
+from eitbench.bench.sandbox import wire
+sound = {{"title": "Mine", "boards": ["filter"], "role": None, "parameters": {{}}, "suits": True}}
+os.write(4, wire.pack(sound | {{{}}}))
+"""
+"""A file that answers for the process before it is loaded."""
 
 
 @pytest.fixture(autouse=True)
@@ -78,6 +87,17 @@ def test_scores_are_the_same_to_the_bit(environment, tmp_path):
         assert set(fields) == set(others) and all((fields[name] == others[name]).all() for name in fields)
         assert here["peak_memory"] is None and 50e6 < there["peak_memory"] < 8e9
         assert there["scores"]["seconds_per_step"] > 0
+
+
+@pytest.mark.parametrize("isolated", [False, True])
+def test_a_policy_is_not_told_what_its_numbers_were_drawn_from(isolated, tmp_path):
+    """Its generator knows the same of all episodes, though it draws other numbers in each; no seed is among them."""
+    init = "seeds = self.random.bit_generator.seed_seq\n        self.known = repr((seeds, seeds.entropy, seeds.state))"
+    path = write_policy(tmp_path, init, "raise RuntimeError(f'{self.known} draws {self.random.integers(2**63)}')")
+    said = [run_episode(Job(INJECTION, path, seed, isolated))[0]["message"].split(" draws ") for seed in (1, 2)]
+    assert said[0][0] == said[1][0] and "entropy=0" in said[0][0] and said[0][1] != said[1][1]
+    expected = np.random.default_rng(int(randomness(1).policy.integers(2**63))).integers(2**63)
+    assert said[0][1] == str(expected)                                  # records of before stay what they are
 
 
 def test_ours_play_there_too(tmp_path):
@@ -162,6 +182,96 @@ def test_workers_leave_nothing_behind(tmp_path):
     assert not list(folder.glob("eitbench-guest-*"))
 
 
+STUBBORN = """import ctypes
+        ctypes.CDLL(None).prctl(1, 0, 0, 0, 0)
+        for role in ("guest", "child"):
+            Path.home().joinpath(f"{role}-{os.readlink('/proc/self')}").touch()
+            if role == "guest" and os.fork():
+                break
+            for leave in (os.setsid, os.setpgrp):
+                try:
+                    leave()
+                except OSError:
+                    pass
+        while True: pass"""
+"""It will not hear of the death of its parents, has a child that neither does, and never answers."""
+SUBMIT = """import json, sys
+from eitbench.bench.submit import submit
+from eitbench.bench.store import EpisodeStore
+from eitbench.bench import suites, tracks
+from eitbench.bench.tracks import Environment
+id, kwargs, path, folder, n_jobs = sys.argv[1:]
+before = suites.Environment
+suites.Environment = lambda id, given: before(id, kwargs)
+from pathlib import Path
+list(submit(path, [id], [200_000, 200_001, 200_002], EpisodeStore(Path(folder)), Path(folder), n_jobs=int(n_jobs)))
+"""
+"""As `eitbench submit`, in a world whose episodes take a moment."""
+
+
+def without_namespaces(folder):
+    """The keeper of a system that grants none."""
+    path = folder / "keeper.py"
+    path.write_text(Path(keeper.__file__).read_text().replace("NAMESPACES[name] for", "1 for"))
+    return str(path)
+
+
+def alive(number):
+    """Whether there is such a process, other than one whose parent has not asked how it ended."""
+    status = Path("/proc", str(number), "status")
+    try:
+        return "State:\tZ" not in status.read_text()
+    except OSError:
+        return False
+
+
+def waited(found, seconds):
+    """What ``found`` finds, as soon as it is something."""
+    until = time.monotonic() + seconds
+    while not (there := found()):
+        assert time.monotonic() < until
+        time.sleep(0.05)
+    return there
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="nobody ends a child elsewhere")
+@pytest.mark.parametrize("victim", ["host", "host without namespaces", "worker", "host of workers"])
+def test_nobody_outlives_a_killed_host(victim, tmp_path):
+    """Neither guests that do all they can, nor their children, nor workers; their folders are gone too."""
+    folder = tmp_path / "temporary"
+    folder.mkdir()
+    path = write_baseline(tmp_path, update=STUBBORN)
+    n_jobs = 2 if "worker" in victim else 1
+    program = SUBMIT if "without" not in victim else (
+        f"from eitbench.bench.sandbox import keeper\nkeeper.__file__ = {without_namespaces(tmp_path)!r}\n{SUBMIT}")
+    arguments = [FILTER.id, FILTER.kwargs, path, str(tmp_path / "results"), str(n_jobs)]
+    with subprocess.Popen([sys.executable, "-c", program, *arguments], stderr=subprocess.DEVNULL,
+                          env=os.environ | {"TMPDIR": str(folder)}) as submitting:
+        def family():
+            there = [int(each.name.split("-")[1]) for each in folder.glob("eitbench-guest-*/*-*")]
+            return there if len(there) == 2 * n_jobs else []
+
+        try:
+            players = waited(family, 90.0)
+            workers = [int(each.name) for each in Path("/proc").glob("[0-9]*")
+                       if started_by(each) == submitting.pid and "popen_loky" in (each / "cmdline").read_text()]
+            assert len(workers) >= (2 if n_jobs == 2 else 0)
+            os.kill(workers[0] if victim == "worker" else submitting.pid, 9)
+            waited(lambda: not any(map(alive, (*players, *workers))), 5.0)
+            if victim != "worker":                        # joblib then kills whoever descends from the others
+                waited(lambda: not list(folder.glob("eitbench-guest-*")), 5.0)
+        finally:
+            submitting.kill()
+
+
+def started_by(process):
+    """The parent of a process in /proc."""
+    try:
+        return int(re.search(r"PPid:\t(\d+)", (process / "status").read_text())[1])
+    except OSError:
+        return None
+
+
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="nobody ends a child elsewhere")
 def test_a_guest_ends_with_who_started_it(tmp_path):
     """Even if a killed worker leaves it in an endless loop."""
@@ -202,6 +312,16 @@ def test_a_file_that_changes_meanwhile_is_not_played(tmp_path):
      "b.BOARDS = {'estimation': [[1]]}\nEstimator.boards = [[1]]\n"
      "b.set = lambda _: type('S', (), {'__le__': lambda *_: True})()",
      "says nonsense of its boards"),
+    *((f"class Estimator:\n    def update(self, v, i): pass\nimport eitbench.bench.methods as b\n"
+       f"b._parameters = lambda *_: {said}", "mine.py.*(parameters|JSON)")
+      for said in ("{'a': 'b' * 10_000}", "{'a': float('inf')}", "{'a': [[]] * 900_000}")),
+    ("class Estimator:\n    def update(self, v, i): pass\nimport eitbench.bench.methods as b\n"
+     "b.title_of = lambda *_: 'a' * 121", "says nonsense of its title"),
+    (ABOUT.format("'boards': 7"), "says nonsense of its boards"),
+    (ABOUT.format("'boards': [{}]"), "says nonsense of its boards"),
+    (ABOUT.format("'role': [], 'name': None, 'title': 7"), "says nonsense of its title, role"),
+    ("import os\nhead = b'[{\"parameters\": 1e999}, []]'\n"
+     "os.write(4, len(head).to_bytes(8, 'little') + bytes(8) + head)", "1e999"),
 ])
 def test_files_that_cannot_be_played(said, message, tmp_path):
     """A ``ValueError`` that names the file, also if the file makes the process lie."""

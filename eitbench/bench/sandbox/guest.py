@@ -1,4 +1,4 @@
-"""The process in which somebody else's estimator or policy runs; `eitbench.bench.sandbox.host`
+"""The process in which somebody else's estimator or policy runs; `eitbench.bench.sandbox.keeper`
 starts it.
 
 It is told the environment's id and arguments, and then, step by step, what was measured. There is
@@ -9,7 +9,6 @@ be kept can be opened.
 from __future__ import annotations
 
 import os
-import sys
 import traceback
 from collections.abc import Callable
 from pathlib import Path
@@ -19,24 +18,32 @@ import cloudpickle
 import numpy as np
 
 from eitbench.bench.sandbox import wall, wire
+from eitbench.worlds import streams
 from eitbench.worlds.registry import take_over
 
 Reply = tuple[dict[str, Any], dict[str, np.ndarray]]
 
 
-def main() -> None:
-    """Answer one message after another until the other side hangs up."""
-    private = Path(sys.argv[1])
-    memory = int(sys.argv[2])
+def main(folder: str, memory: int, separate: list[str]) -> None:
+    """Answer one message after another until the other side hangs up.
+
+    ``folder`` is the only one where the guest can write, ``memory`` the bytes of address space that
+    it may take, ``separate`` the namespaces that it has to itself.
+    """
+    private = Path(folder)
     incoming, outgoing = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     silent = os.open(os.devnull, os.O_RDWR)
     for stream in range(3):  # what the guest prints is no answer
         os.dup2(silent, stream)
     readable = wall.python_files()
-    wall.end_with_parent()
+    walls = list(separate)
     wall.limit_memory(memory)
-    closed = wall.close_files(readable, [private, Path(os.devnull)])
-    wall.refuse_calls()
+    if wall.drop_capabilities():
+        walls.append("capabilities")
+    if wall.close_files(readable, [private, Path(os.devnull)]):
+        walls.append("landlock")
+    if wall.refuse_calls(signals="pid" in walls or wall.landlock_version() >= 6):
+        walls.append("seccomp")
 
     def read(n: int) -> bytes:
         content = incoming.read(n)
@@ -48,7 +55,8 @@ def main() -> None:
         outgoing.write(wire.pack(words, arrays))
         outgoing.flush()
 
-    say({"closed": closed, "readable": [str(place) for place in readable]})
+    say({"walls": sorted(walls), "readable": [str(place) for place in readable],
+         "process": wall.own_number()})
     answer: Callable[..., Reply] = _nothing
     while True:
         try:
@@ -117,7 +125,7 @@ def _policy(rules: Any, method: Any) -> Callable[..., Reply]:
     def answer(words: dict[str, Any], arrays: dict[str, np.ndarray]) -> Reply:
         nonlocal player
         if words["do"] == "begin":
-            player = method.make(rules, np.random.default_rng(words["random"]))
+            player = method.make(rules, streams.in_state(words["random"]))
             return {}, {}
         assert player is not None
         return {}, {"action": np.asarray(player.act(arrays))}
@@ -130,6 +138,3 @@ def _where(error: BaseException) -> str:
     last = traceback.extract_tb(error.__traceback__)[-1]
     return f"{Path(last.filename).name}:{last.lineno}"
 
-
-if __name__ == "__main__":
-    main()

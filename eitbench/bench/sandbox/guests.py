@@ -11,13 +11,23 @@ import hashlib
 import json
 import re
 from collections.abc import Callable
-from functools import lru_cache, partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from eitbench.bench.methods import ROLES, Method, find_method, is_ours, load_method, own_files
+from eitbench import _check
+from eitbench.bench.methods import (
+    PARAMETERS,
+    ROLES,
+    TITLE,
+    Method,
+    find_method,
+    is_ours,
+    load_method,
+    own_files,
+)
 from eitbench.bench.sandbox.host import Guest, GuestError
 from eitbench.bench.tracks import BOARDS
 
@@ -26,6 +36,7 @@ NAME = re.compile(r"[^./\\][^/\\]*")
 PRIVILEGED = "{} is privileged: it asks for the truth, which a process of its own has not"
 _present: list[tuple[tuple[str, ...], Guest]] = []
 """The guest of this process, and whom it plays."""
+_walls: list[str] = []
 
 
 def load(track: str, id: str, kwargs: str, method: str) -> Method:
@@ -48,6 +59,11 @@ def peak_memory() -> int | None:
     return _present[0][1].peak_memory if _present else None
 
 
+def walls() -> list[str]:
+    """What keeps the guests of this process where they are, as the last of them has said."""
+    return list(_walls)
+
+
 def close() -> None:
     """End the present guest."""
     while _present:
@@ -65,8 +81,7 @@ class _Elsewhere:
 
     def __call__(self, world: Any, random: np.random.Generator | None = None) -> Guest:
         guest = self._enter()
-        origin: Any = None if random is None else random.bit_generator
-        guest.begin(0 if origin is None else origin.seed_seq.entropy)
+        guest.begin(random)
         return guest
 
 
@@ -79,7 +94,7 @@ def _ours(track: str, id: str, kwargs: str, method: str, path: Path) -> Method:
     return loaded._replace(make=_Elsewhere(enter, loaded.suits))
 
 
-@lru_cache(maxsize=64)
+@cache
 def _load(track: str, id: str, kwargs: str, method: str, path: Path, sha256: str) -> Method:
     enter = partial(_enter, track, id, kwargs, method, sha256)
     try:
@@ -90,15 +105,7 @@ def _load(track: str, id: str, kwargs: str, method: str, path: Path, sha256: str
         raise ValueError(PRIVILEGED.format(path))
     if path.suffix == ".py":
         about = about | {"name": path.stem}  # a guest may call itself anything
-    sound = {
-        "name": isinstance(about.get("name"), str) and NAME.fullmatch(about["name"]),
-        "title": isinstance(about.get("title"), str) and about["title"],
-        "parameters": isinstance(about.get("parameters"), dict),
-        "role": about.get("role") in ROLES,
-        "boards": all(board in BOARDS[track] for board in about.get("boards") or [None]),
-    }
-    if wrong := [name for name, is_sound in sound.items() if not is_sound]:
-        raise ValueError(f"{path} says nonsense of its {', '.join(wrong)}")
+    _check_about(path, about, track)
     ours = own_files(id).get(about["name"])
     if ours is not None and hashlib.sha256(ours.read_bytes()).hexdigest() != sha256:
         raise ValueError(f"{path} has the name of one of ours, {about['name']}, under which "
@@ -109,6 +116,21 @@ def _load(track: str, id: str, kwargs: str, method: str, path: Path, sha256: str
                   about["parameters"], there, about["role"])
 
 
+def _check_about(path: Path, about: dict[str, Any], track: str) -> None:
+    """``ValueError``, naming the file, if a guest says of it what no method can be."""
+    boards = about.get("boards")
+    sound = {
+        "name": isinstance(about.get("name"), str) and NAME.fullmatch(about["name"]),
+        "title": isinstance(about.get("title"), str) and 0 < len(about["title"]) <= TITLE,
+        "role": about.get("role") in ROLES,
+        "boards": isinstance(boards, list) and boards and all(
+            board in BOARDS[track] for board in boards),
+    }
+    if wrong := [name for name, is_sound in sound.items() if not is_sound]:
+        raise ValueError(f"{path} says nonsense of its {', '.join(wrong)}")
+    _check.document(f"{path}: parameters", about.get("parameters"), PARAMETERS)
+
+
 def _enter(track: str, id: str, kwargs: str, method: str, sha256: str) -> Guest:
     """The present guest if it plays this and can be asked; else a fresh one takes its place."""
     key = (track, id, kwargs, method, sha256)
@@ -117,6 +139,7 @@ def _enter(track: str, id: str, kwargs: str, method: str, sha256: str) -> Guest:
         atexit.register(close)
         _present.append((key, Guest(track, id, json.loads(kwargs), method)))
     guest = _present[0][1]
+    _walls[:] = guest.walls
     if guest.sha256 not in ("", sha256):
         close()
         raise GuestError(f"ValueError: {method} was changed while it was being played")

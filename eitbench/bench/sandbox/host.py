@@ -10,13 +10,11 @@ import hashlib
 import os
 import select
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -26,7 +24,7 @@ import numpy as np
 
 from eitbench._files import PACKAGE
 from eitbench.bench.methods import is_ours, is_path
-from eitbench.bench.sandbox import wire
+from eitbench.bench.sandbox import keeper, wire
 from eitbench.data.store import CACHE_VARIABLE, cache_folder, folder, kinds
 from eitbench.worlds.registry import entry, registered_by_hand
 
@@ -34,6 +32,8 @@ MEMORY = 8 << 30
 """bytes of address space that a guest may take"""
 PATIENCE = 600.0
 """s that an answer may take; the first after an episode began may hold all preparations"""
+END = 10.0
+"""s that its keeper may take to end it"""
 MODELS = ("outline.npz", "region.npz", "reduced-*.npz", "joint-*.npz")
 """What the cache holds of a world, made without any episode; the files of an episode begin with its
 seed."""
@@ -75,12 +75,11 @@ class Guest:
     def __init__(self, track: str, id: str, kwargs: dict[str, Any], name: str, *,
                  memory: int = MEMORY, patience: float = PATIENCE) -> None:
         self._patience = patience
-        self._over = False
         self.sha256 = ""
         """Of the file that was copied; empty for one of ours."""
         self._private = Path(tempfile.mkdtemp(prefix="eitbench-guest-"))
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "eitbench.bench.sandbox.guest", str(self._private), str(memory)],
+            [sys.executable, "-P", keeper.__file__, str(self._private), str(memory)],
             # a terminal can be typed into
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
             start_new_session=True, env=self._surroundings(id, kwargs), cwd=self._private)
@@ -88,7 +87,11 @@ class Guest:
             assert self._process.stdin is not None
             os.set_blocking(self._process.stdin.fileno(), False)
             wall = self._receive()[0]  # no stranger's word yet
-            self.closed = bool(wall["closed"])
+            self.walls: list[str] = wall["walls"]
+            """What keeps it where it is: its own namespaces, Landlock, seccomp, no capabilities."""
+            self.process = int(wall["process"])
+            """The number of the process that plays."""
+            self.closed = "landlock" in self.walls
             """Whether files are out of its reach."""
             if self.closed:
                 _refuse_open_cache(wall["readable"])
@@ -99,10 +102,11 @@ class Guest:
             self.close()
             raise
 
-    def begin(self, random: int = 0) -> None:
-        """A new episode: another estimator or policy, of the same class; a policy's generator is
-        seeded with this."""
-        self._ask({"do": "begin", "random": random})
+    def begin(self, random: np.random.Generator | None = None) -> None:
+        """A new episode: another estimator or policy, of the same class; a policy's generator
+        draws what this one would."""
+        state = None if random is None else random.bit_generator.state
+        self._ask({"do": "begin", "random": state})
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Any:
         """What the estimator makes of a measurement: an `Estimate` or None."""
@@ -133,7 +137,7 @@ class Guest:
     def peak_memory(self) -> int | None:
         """bytes that it has held at most; None where that is not told."""
         try:
-            status = Path(f"/proc/{self._process.pid}/status").read_text()
+            status = Path(f"/proc/{self.process}/status").read_text(errors="replace")
         except OSError:
             return None
         return next((1024 * int(line.split()[1]) for line in status.splitlines()
@@ -145,7 +149,7 @@ class Guest:
         for pipe in (self._process.stdin, self._process.stdout):
             if pipe:
                 pipe.close()
-        shutil.rmtree(self._private, ignore_errors=True)
+        keeper.remove(str(self._private))
 
     def __enter__(self) -> Guest:
         return self
@@ -162,7 +166,8 @@ class Guest:
         there = folder(entry(id).world.changed(kwargs.get("world")))
         (cache / there.name).mkdir(parents=True)
         for model in (path for pattern in MODELS for path in there.glob(pattern)):
-            shutil.copy(model, cache / there.name)
+            if model.is_file():
+                shutil.copy(model, cache / there.name)
         _copy_kernels(kernels)
         package = PACKAGE.parent
         arithmetic = {name: value for name, value in os.environ.items()
@@ -249,12 +254,13 @@ class Guest:
                           "is what a crash does, or a limit of memory")
 
     def _end(self) -> int:
-        """Kill it and all processes of its session; its status."""
-        if not self._over:  # only once: later the number may be another's
-            self._over = True
-            with suppress(ProcessLookupError, PermissionError):            # it has ended by itself
-                os.killpg(self._process.pid, signal.SIGKILL)
-        return self._process.wait()
+        """Have it and all its descendants killed; its status."""
+        self._process.send_signal(keeper.ASKED)
+        try:
+            return self._process.wait(END)
+        except subprocess.TimeoutExpired:
+            self._process.kill()  # the guest ends with it
+            return self._process.wait()
 
 
 def _told(id: str) -> np.ndarray:

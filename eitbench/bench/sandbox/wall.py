@@ -1,22 +1,23 @@
 """Limits that a process puts on itself before it runs somebody else's code, and cannot lift again.
 
 Files: Linux' Landlock (kernel 5.13 and later). Whatever is not named is out of reach, other
-processes' memory too, and TCP where the kernel knows how to refuse it. Linux' seccomp: sockets of
-all kinds, and what Landlock lets pass, such as being told the names of files that others open.
-Memory: a limit of the address space.
+processes' memory too, and TCP where the kernel knows how to refuse it. Linux' seccomp: all system
+calls but those that estimators need. Memory: a limit of the address space.
 """
 
 from __future__ import annotations
 
 import ctypes
-import errno
 import os
-import signal
+import site
 import sys
 from collections.abc import Iterable
+from importlib.metadata import entry_points
+from importlib.util import find_spec
 from pathlib import Path
 
 from eitbench._files import PACKAGE
+from eitbench.bench.sandbox import calls
 
 _CREATE, _ADD, _RESTRICT = 444, 445, 446
 """System calls of Landlock, the same on every architecture that Python is at home on."""
@@ -26,35 +27,13 @@ _FILE = 1 << 0 | 1 << 1 | 1 << 2 | 1 << 14
 """What rules on a single file may allow."""
 _ALL = {1: (1 << 13) - 1, 2: (1 << 14) - 1, 3: (1 << 15) - 1, 5: (1 << 16) - 1}
 """What a version of the interface can refuse: all that came with it or earlier."""
-_NO_NEW_PRIVILEGES, _END_WITH_PARENT, _FILTER_CALLS = 38, 1, (22, 2)
-_REFUSED_CALLS = {
-    "x86_64": (0xC000003E, 302, (
-        41, 53, 425,  # socket, socketpair, io_uring_setup
-        109, 112,                                                     # setpgid, setsid
-        253, 294, 254, 300, 301, 303, 304,  # inotify, fanotify, files by their handles
-        90, 91, 268, 452, 92, 93, 94, 260,                            # chmod and chown
-        132, 235, 261, 280, 188, 189, 190, 463, 197, 198, 199, 466,  # utime and extended attributes
-        101, 310, 311, 298, 321,  # ptrace, others' memory, perf events, bpf
-        141, 142, 144, 314, 251, 203)),  # priorities and processors, of others too
-    "aarch64": (0xC00000B7, 261, (
-        198, 199, 425, 154, 157, 26, 27, 262, 263, 264, 265, 52, 53, 452, 54, 55,
-        88, 5, 6, 7, 463, 14, 15, 16, 466, 117, 270, 271, 241, 280, 140, 118, 119, 274, 30, 122)),
-}
-"""Architecture as the kernel names it, the number of its call prlimit64, which may ask about the
-process itself, and those of the calls that are refused; the second in the order of the first, which
-has more of its own."""
-_LOAD, _EQUAL, _AT_LEAST, _RETURN = 0x20, 0x15, 0x35, 0x06
-"""What a step of a filter of system calls does."""
-_ALLOWED, _REFUSED = 0x7FFF0000, 0x00050000 | errno.EACCES
-_CALL, _ARCHITECTURE, _ARGUMENT = 0, 4, 16
-"""Where a filter finds them, and the lower half of the first argument."""
-_FOREIGN = 0x40000000
-"""From here on calls have x86_64's other numbers, for 32-bit pointers."""
-
-
+_NO_NEW_PRIVILEGES, _FILTER_CALLS = 38, (22, 2)
 _SETTINGS = ("ld.so.cache", "localtime", "timezone", "passwd", "group", "nsswitch.conf",
              "mime.types", "os-release", "fonts", "alternatives")
 """What programs look up in /etc; much else there is not for everybody."""
+
+_OFFERS = ("eitbench.worlds", "eitbench.methods", "eitbench.scores", "eitbench.loaders")
+"""Groups of entry points by which installed packages offer something to this one."""
 
 
 class _Ruleset(ctypes.Structure):
@@ -114,26 +93,17 @@ def close_files(readable: Iterable[Path], writable: Iterable[Path]) -> bool:
     return True
 
 
-def refuse_calls() -> bool:
-    """From now on this process and its children make no socket of any kind, leave neither session
-    nor group, and are not told which files others open; owners, modes, times and attributes of
-    files stay what they are, and so do priorities and limits of other processes.
+def refuse_calls(signals: bool) -> bool:
+    """From now on this process and its children make only the system calls that
+    `eitbench.bench.sandbox.calls` names.
 
-    Pairs of sockets are refused too, as one of datagrams can be turned to any address. Returns
-    whether that is so; False where the kernel cannot filter system calls or this does not know
-    their numbers.
+    ``signals``: whether those they send reach their own kin only. Returns whether that is so; False
+    where the kernel cannot filter system calls or their numbers are not known.
     """
-    if not sys.platform.startswith("linux") or os.uname().machine not in _REFUSED_CALLS:
+    machine = os.uname().machine if sys.platform.startswith("linux") else ""
+    if machine not in calls.MACHINES:
         return False
-    architecture, limits, calls = _REFUSED_CALLS[os.uname().machine]
-    asked = [(_AT_LEAST, _FOREIGN), *((_EQUAL, call) for call in calls)]
-    # limits of process 0: its own
-    last = [(_EQUAL, 0, 2, limits), (_LOAD, 0, 0, _ARGUMENT), (_EQUAL, 0, 1, 0),
-            (_RETURN, 0, 0, _ALLOWED), (_RETURN, 0, 0, _REFUSED)]
-    steps = [(_LOAD, 0, 0, _ARCHITECTURE), (_EQUAL, 1, 0, architecture), (_RETURN, 0, 0, _REFUSED),
-             (_LOAD, 0, 0, _CALL),
-             *((deed, len(asked) - i + len(last) - 2, 0, value)
-               for i, (deed, value) in enumerate(asked)), *last]
+    steps = calls.steps(machine, os.getpid(), signals)
     libc = _libc()
     content = (_Step * len(steps))(*(_Step(*step) for step in steps))
     _checked(libc.prctl(_NO_NEW_PRIVILEGES, 1, 0, 0, 0))
@@ -148,10 +118,18 @@ def limit_memory(size: int) -> None:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
-def end_with_parent() -> None:
-    """Be killed when whoever started this process is, also in the midst of an endless loop."""
-    if sys.platform.startswith("linux"):
-        _checked(_libc().prctl(_END_WITH_PARENT, signal.SIGKILL, 0, 0, 0))
+def drop_capabilities() -> bool:
+    """From now on root may do no more than others, nor who has namespaces; whether it is so."""
+    if not sys.platform.startswith("linux"):
+        return False
+    asked = (ctypes.c_uint32 * 2)(0x20080522, 0)
+    none = (ctypes.c_uint32 * 6)()
+    return bool(_libc().capset(asked, none) == 0)
+
+
+def own_number() -> int:
+    """Of this process, as those outside count it."""
+    return int(os.readlink("/proc/self")) if Path("/proc/self").exists() else os.getpid()
 
 
 def python_files() -> list[Path]:
@@ -159,14 +137,26 @@ def python_files() -> list[Path]:
     the processor's."""
     package = PACKAGE
     # else others lie beside
-    checkout = package.parent if (package.parent / "pyproject.toml").exists() else None
+    is_checkout = (package.parent / "pyproject.toml").exists()
     places = [sys.prefix, sys.base_prefix, sys.exec_prefix,
               str(package), str(package.parent / "baselines"), "/usr", "/lib", "/lib64", "/bin",
               *(f"/etc/{name}" for name in _SETTINGS), "/dev/null", "/dev/urandom", "/dev/zero",
-              f"/proc/{os.getpid()}", "/proc/cpuinfo", "/proc/meminfo", "/proc/stat",
+              f"/proc/{own_number()}", "/proc/cpuinfo", "/proc/meminfo", "/proc/stat",
               "/sys/devices/system/cpu",
-              *(place for place in sys.path if place and Path(place) != checkout)]
+              *([] if is_checkout else [str(package.parent)]), *_installed()]
     return [Path(place) for place in places]
+
+
+def _installed() -> list[str]:
+    """Where packages are installed for this Python, and the packages that offer something to this
+    one; not whatever else lies on `sys.path`, as checkouts installed for editing."""
+    places = [*site.getsitepackages(), site.getusersitepackages()]
+    offers = [point for group in _OFFERS for point in entry_points(group=group)]
+    for package in {point.module.partition(".")[0] for point in offers}:
+        found = find_spec(package)
+        if found is not None:
+            places += found.submodule_search_locations or [found.origin or ""]
+    return [place for place in places if place]
 
 
 def _libc() -> ctypes.CDLL:

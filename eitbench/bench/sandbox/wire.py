@@ -11,10 +11,20 @@ from typing import Any
 
 import numpy as np
 
+from eitbench import _check
+
 LARGEST = 1 << 28
 """bytes; no message is longer"""
+HEAD = 1 << 20
+"""bytes of a message's JSON"""
+VALUES = 50_000
+"""How many commas and opening brackets the JSON may have, which bounds what it costs to parse."""
 KINDS = "biuf"
 """Of numbers in arrays."""
+DIGITS = 40
+"""Of a number; the state of a generator has 39."""
+ARRAYS, AXES = 64, 32
+"""How many arrays a message may have, and each of them axes."""
 
 
 def pack(words: dict[str, Any], arrays: dict[str, np.ndarray] | None = None) -> bytes:
@@ -29,13 +39,12 @@ def pack(words: dict[str, Any], arrays: dict[str, np.ndarray] | None = None) -> 
 def unpack(read: Callable[[int], bytes]) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """The next message; ``read(n)`` gives exactly n bytes. ``ValueError`` if it is none."""
     head, body = struct.unpack("<QQ", read(16))
-    if head + body > LARGEST:
-        raise ValueError(f"a message must have at most {LARGEST} bytes, got {head + body}")
+    if head > HEAD or head + body > LARGEST:
+        raise ValueError(f"a message must have at most {LARGEST} bytes, {HEAD} of them JSON; got "
+                         f"{head + body} and {head}")
     try:
-        words, layout = json.loads(read(head), parse_constant=_refuse)
-        json.dumps(words, ensure_ascii=False).encode()  # half a character cannot be kept
-        kinds = [(str(name), np.dtype(kind), tuple(int(n) for n in shape))
-                 for name, kind, shape in layout]
+        words, layout = _parsed(read(head))
+        kinds = [_described(*each) for each in layout]
     except (TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"a message must begin with JSON that names its arrays: {error}") from None
     content = read(body)
@@ -43,7 +52,7 @@ def unpack(read: Callable[[int], bytes]) -> tuple[dict[str, Any], dict[str, np.n
     arrays = {}
     for name, kind, shape in kinds:
         size = math.prod(shape) * kind.itemsize
-        if kind.kind not in KINDS or min(shape, default=0) < 0 or at + size > body:
+        if kind.kind not in KINDS or at + size > body:
             raise ValueError(f"array {name!r} of a message must hold numbers that are there; got "
                              f"{kind}, {shape}")
         arrays[name] = np.frombuffer(content, kind, math.prod(shape), at).reshape(shape).copy()
@@ -53,5 +62,45 @@ def unpack(read: Callable[[int], bytes]) -> tuple[dict[str, Any], dict[str, np.n
     return words, arrays
 
 
+def _parsed(head: bytes) -> tuple[Any, list[Any]]:
+    """Words and layout of a message; an error if they are too many, nested too deep or not fit to
+    be kept."""
+    if sum(head.count(sign) for sign in (b",", b"[", b"{")) > VALUES:
+        raise ValueError(f"more than {VALUES} values")
+    said = _DECODER.decode(head.decode())
+    _check.nesting("the JSON", said)
+    json.dumps(said, ensure_ascii=False).encode()  # half a character cannot be kept
+    words, layout = said
+    if len(layout) > ARRAYS:
+        raise ValueError(f"more than {ARRAYS} arrays")
+    return words, layout
+
+
+def _described(name: str, kind: str, shape: list[int]) -> tuple[str, np.dtype, tuple[int, ...]]:
+    """An entry of the layout."""
+    is_one = isinstance(name, str) and isinstance(kind, str) and len(kind) < 8
+    if not is_one or len(shape) > AXES:
+        raise ValueError("an array must have a name, a type and a shape")
+    for n in shape:
+        _check.integer("length of an axis", n, low=0, high=LARGEST)
+    return name, np.dtype(kind), tuple(shape)
+
+
+def _whole(text: str) -> int:
+    if len(text) > DIGITS:
+        raise ValueError(f"an integer of {len(text)} digits")
+    return int(text)
+
+
+def _real(text: str) -> float:
+    number = float(text[:DIGITS])
+    if len(text) > DIGITS or not math.isfinite(number):
+        raise ValueError(f"the number {text[:DIGITS]} is too great or too long")
+    return number
+
+
 def _refuse(constant: str) -> None:
     raise ValueError(f"{constant} is not JSON")
+
+
+_DECODER = json.JSONDecoder(parse_constant=_refuse, parse_float=_real, parse_int=_whole)
