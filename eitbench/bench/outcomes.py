@@ -102,16 +102,18 @@ def outcome_of(env: EstimationEnv, said: Said) -> Outcome:
     if task.velocity is not None:
         velocity = (said.velocities[states] @ task.velocity.profiles.T,
                     env.true_velocity()[states], task.velocity.weights)
-    known = [said.innovations[i] for i in range(task.warm_up + 1, task.n_steps + 1)
-             if i in said.innovations]
-    innovations = [np.array(part) for part in zip(*known, strict=True)]
+    # all of them or none: one step that fits can be chosen
+    steps = range(task.warm_up + 1, task.n_steps + 1)
+    innovations = None
+    if all(i in said.innovations for i in steps):
+        innovations = (np.array([said.innovations[i][0] for i in steps]),
+                       np.array([said.innovations[i][1] for i in steps]))
     return Outcome(
         env.world, float(said.seconds.sum() / task.n_steps),
         scoring.step_errors(mean, truth, mass), mean=mean, truth=truth, mass=mass,
         points=truth_discretisation(env.world).transport.mesh.points, homogeneous=homogeneous,
         measured=said.voltages[states], computed=computed,
-        innovations=(innovations[0], innovations[1]) if known else None, std=std,
-        velocity=velocity)
+        innovations=innovations, std=std, velocity=velocity)
 
 
 class Claim(NamedTuple):

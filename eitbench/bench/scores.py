@@ -211,7 +211,8 @@ for _score in (
           "error relative to the deviation from the homogeneous estimate; 1 is no better than that",
           _contrast, needs=("mean", "truth"), everywhere=True),
     Score("nis", "NIS/m",
-          "normalised innovation squared; 1 when the filter's own uncertainty fits",
+          "normalised innovation squared, of all scored measurements; 1 when the filter's own "
+          "uncertainty fits",
           _nis, better="nominal", needs=("innovations",), tracks=TRACKS, everywhere=True),
     Score("crps", "CRPS", "continuous ranked probability score, mol/m³",
           lambda outcome: scoring.crps(*_claimed(outcome)), needs=("std",), tracks=TRACKS,

@@ -104,6 +104,18 @@ def test_nothing_but_the_scored_states_must_be_claimed(tmp_path):
     assert claimed["nis"] is None and unclaimed["error"] == claimed["error"]
 
 
+def test_calibration_cannot_be_bought_by_one_step(tmp_path):
+    """NIS is of every scored measurement: whoever keeps silent about one of them has none, so that
+    1 is not for sale by a single innovation of which one knows that it fits."""
+    fits = "Estimate(self.level, None, np.ones(4), np.eye(4))"
+    often, once = (run_episode(Job(FILTER, write_baseline(tmp_path, name, update=update), 1))[0]
+                   for name, update in (("often", f"return {fits}"),
+                                        ("once", f"return {fits} if self.calls == 4 else "
+                                                 "Estimate(self.level)")))
+    assert often["scores"]["nis"] == 1.0 and once["scores"]["nis"] is None
+    assert often["scores"]["error"] == once["scores"]["error"]
+
+
 # -- what estimators are shown ----------------------------------------------------------------------------------------
 
 
