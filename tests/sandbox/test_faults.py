@@ -9,7 +9,7 @@ import pytest
 from eitbench.bench import run
 from eitbench.bench.run import Job, run_episode, run_jobs
 from eitbench.bench.sandbox import guests, keeper
-from eitbench.bench.store import EpisodeStore
+from eitbench.bench.store import EpisodeStore, machine, provenance
 from eitbench.data.store import CACHE_VARIABLE, folder
 from eitbench.worlds.pipe2d import PIPE_2D
 
@@ -102,7 +102,8 @@ def test_a_file_that_can_no_longer_be_loaded_fails_alone(tmp_path):
     beginning = run._beginning(job, job.load())
     Path(path).write_text("import os; os._exit(4)")
     store = EpisodeStore(tmp_path / "results")
-    run._run_job(job, store, {}, "", beginning)
+    how = {"command": "", **provenance(), "machine": machine()}
+    run._run_job(job, store, how, "", beginning)
     (result,) = store.results()
     assert result["status"] == "failed" and "ended with status 4" in result["message"] and result["method"] == "mine"
 

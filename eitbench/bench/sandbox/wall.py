@@ -148,9 +148,11 @@ def python_files() -> list[Path]:
 
 
 def _installed() -> list[str]:
-    """Where packages are installed for this Python, and the packages that offer something to this
-    one; not whatever else lies on `sys.path`, as checkouts installed for editing."""
-    places = [*site.getsitepackages(), site.getusersitepackages()]
+    """Where packages are installed for this Python, other environments' folders on `sys.path` among
+    them, and the packages that offer something to this one; not whatever else lies on `sys.path`,
+    as checkouts installed for editing."""
+    others = [place for place in sys.path if Path(place).name in ("site-packages", "dist-packages")]
+    places = [*site.getsitepackages(), site.getusersitepackages(), *others]
     offers = [point for group in _OFFERS for point in entry_points(group=group)]
     for package in {point.module.partition(".")[0] for point in offers}:
         found = find_spec(package)
