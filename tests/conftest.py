@@ -37,6 +37,8 @@ def pytest_collection_modifyitems(items):
         for place in (test, file.as_posix(), *map(Path.as_posix, file.parents)):
             if mark := PLACES.get(place):
                 item.add_marker(mark)
+        if item.get_closest_marker("slow"):
+            item.add_marker("study")
     items.sort(key=lambda item: item.get_closest_marker("study") is None)
 
 
