@@ -77,7 +77,7 @@ class EpisodeStore:
     def fields(self, result: dict[str, Any]) -> dict[str, np.ndarray]:
         """The estimates that belong to a result: ``mean`` and perhaps ``std``, (T, n) in mol/m³.
 
-        ``FileNotFoundError`` if there are none; ``ValueError``, naming the file, if it is damaged.
+        ``std`` is NaN in states of which the method claims none. ``FileNotFoundError`` if there are none; ``ValueError``, naming the file, if it is damaged.
         """
         path = self._path(result["environment"]["name"], result["method"], result["seed"])
         path = path.with_suffix(".npz")
@@ -89,9 +89,10 @@ class EpisodeStore:
         except (OSError, ValueError, EOFError, TypeError, AttributeError, NotImplementedError,
                 zipfile.BadZipFile, zlib.error) as error:
             raise ValueError(f"estimates {path} cannot be read: {error}") from None
+        # no std before a method's first claim: NaN is allowed there
         if "mean" not in fields or not all(
-                each.ndim == 2 and each.dtype.kind == "f" and np.isfinite(each).all()
-                for each in fields.values()):
+                each.ndim == 2 and each.dtype.kind == "f" and not np.isinf(each).any()
+                for each in fields.values()) or np.isnan(fields["mean"]).any():
             raise ValueError(f"estimates {path} must hold finite numbers (T, n) named mean")
         return fields
 

@@ -360,6 +360,19 @@ def test_two_runs_into_one_folder_lose_nothing(store, tmp_path):
     assert all(store.fields(result)["mean"].shape == (5, 1701) for result in store.results())
 
 
+def test_a_method_need_not_claim_a_variance_before_the_first_scored_state(store, tmp_path):
+    """Its estimates are stored, read and drawn; where it claimed none its std is NaN."""
+    path = write_baseline(tmp_path, init="self.variance = np.full(task.mesh.n_nodes, 4.0)", update=(
+        "return Estimate(self.level, self.variance if self.calls > self.task.warm_up else None)"))
+    run_jobs([Job(FILTER, path, 4)], store)
+    (result,) = store.results()
+    fields = store.fields(result)
+    assert result["status"] == "ok" and result["scores"]["crps"] > 0
+    assert np.isfinite(fields["mean"]).all()
+    warm_up = PIPE_2D.changed(SCENARIO).warm_up
+    assert warm_up > 0 and np.isnan(fields["std"][:warm_up]).all() and (fields["std"][warm_up:] == 2).all()
+
+
 def test_processes_change_nothing_but_the_time(store, tmp_path):
     """Two workers and one give the same scores."""
     path = write_baseline(tmp_path, update="return Estimate(self.level + voltages.sum() + voltages[0])")
