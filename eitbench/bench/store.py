@@ -77,7 +77,8 @@ class EpisodeStore:
     def fields(self, result: dict[str, Any]) -> dict[str, np.ndarray]:
         """The estimates that belong to a result: ``mean`` and perhaps ``std``, (T, n) in mol/m³.
 
-        ``std`` is NaN in states of which the method claims none. ``FileNotFoundError`` if there are none; ``ValueError``, naming the file, if it is damaged.
+        ``std`` is NaN in states of which the method claims none. ``FileNotFoundError`` if there are
+        no estimates; ``ValueError``, naming the file, if it is damaged.
         """
         path = self._path(result["environment"]["name"], result["method"], result["seed"])
         path = path.with_suffix(".npz")
