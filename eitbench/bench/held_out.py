@@ -2,123 +2,49 @@
 know.
 
 Held-out episode k = 0, 1, … has the seed SHA-256(salt ‖ k) mod 2⁶³, k as eight bytes, the first the
-highest. The salt's own SHA-256 is published, so that it cannot be chosen after a method was seen.
+highest. The salt's own SHA-256 is published, so that it cannot be chosen after a method was seen
+(`eitbench.bench.salts`).
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
-import os
-import secrets
-from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from eitbench._files import shipped, write_atomically
 from eitbench.bench.methods import is_ours
 from eitbench.bench.run import Job, run_episode
-from eitbench.bench.sandbox.wall import python_files
 from eitbench.bench.statistics import FEWEST
 from eitbench.bench.table import Cell, Table
 from eitbench.bench.text import scores_by_seed
 from eitbench.bench.too_good import judged, too_good
 from eitbench.bench.tracks import FLOORS
-from eitbench.data.seeds import SPLITS, parse_seeds
-
-PUBLISHED = shipped("leaderboards") / "held_out.json"
-"""Where the hash of the salt is."""
-LENGTH = 32
-"""bytes"""
+from eitbench.data.seasons import drawn_seeds
+from eitbench.data.seeds import parse_seeds
 
 
-def new_salt(path: Path) -> str:
-    """Write a new salt for its owner only, return its hash; ``ValueError`` if there is a file."""
-    salt = secrets.token_bytes(LENGTH)
-    try:
-        file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-    except OSError as error:
-        raise ValueError(f"salt {path} cannot be written: {error}") from None
-    with os.fdopen(file, "w") as stream:
-        stream.write(salt.hex() + "\n")
-    return hash_of(salt)
+class Plays(NamedTuple):
+    """What is played to judge a record: no record of the floor is believed."""
+
+    own: list[Job]
+    """The method in held-out episodes."""
+    beside: list[Job]
+    """The board's floor in the same."""
+    there: list[Job]
+    """The floor in the record's episodes that the method has finished."""
 
 
-def publish_new_salt(path: Path) -> str:
-    """Write a new salt, and its hash, which is returned, where everybody can see it.
-
-    ``ValueError`` if a hash is published already: who could replace it unseen could choose a salt.
-    """
-    if PUBLISHED.exists():
-        raise ValueError(f"the hash of a salt is published in {PUBLISHED} already; to begin a new "
-                         "season, remove that file in a commit of its own first, for everybody to "
-                         "see")
-    digest = new_salt(path)
-    write_atomically(PUBLISHED, (json.dumps({"salt_sha256": digest}, indent=1) + "\n").encode())
-    return digest
-
-
-def read_salt(path: Path) -> bytes:
-    """The salt in a file; ``ValueError`` if there is none, others may read it, guests even, or
-    another's hash is published."""
-    if any(path.resolve().is_relative_to(place.resolve()) for place in python_files()):
-        raise ValueError(
-            f"salt {path} lies among Python's files, which guests may read; move it elsewhere")
-    try:
-        shared = os.name == "posix" and path.stat().st_mode & 0o077
-        text = path.read_text()
-    except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"salt {path} cannot be read: {error}") from None
-    if shared:
-        raise ValueError(
-            f"salt {path} must be readable by its owner only, which `chmod 600` makes it")
-    try:
-        salt = bytes.fromhex(text)
-    except ValueError as error:
-        raise ValueError(f"salt {path} must hold hexadecimal digits: {error}") from None
-    if len(salt) != LENGTH:
-        raise ValueError(f"salt {path} must hold {LENGTH} bytes, got {len(salt)}")
-    digest = hash_of(salt)
-    told = json.loads(PUBLISHED.read_text())["salt_sha256"] if PUBLISHED.exists() else digest
-    if told != digest:
-        raise ValueError(f"salt {path} has the hash {digest}, but {PUBLISHED} says {told}")
-    return salt
-
-
-def hash_of(salt: bytes) -> str:
-    """What is published of it."""
-    return hashlib.sha256(salt).hexdigest()
-
-
-def held_out_seeds(salt: bytes, count: int) -> list[int]:
-    """The first ``count`` seeds."""
-    public = max(split.stop for split in SPLITS.values())
-    digests = [hashlib.sha256(salt + k.to_bytes(8, "big")).digest() for k in range(count)]
-    drawn = [int.from_bytes(digest, "big") % 2**63 for digest in digests]
-    return [seed if seed >= public else seed + public for seed in drawn]
-
-
-def held_out(record: dict[str, Any], job: Job, salt: bytes,
-             episodes: int) -> tuple[str, list[str]]:
-    """Whether what a record says is better than what its method does in held-out episodes.
-
-    The floor of the board plays the record's episodes and the held-out ones, here and now: no
-    record of it is believed. `too_good.judged` says how the two are compared.
+def plays(record: dict[str, Any], job: Job, salt: bytes, episodes: int) -> Plays:
+    """What is to be played to judge a record by so many held-out episodes.
 
     Parameters
     ----------
     record, job
         As read, and what `verify.job_of` makes of it.
     salt : bytes
-        As read by `read_salt`.
+        As read by `salts.read_published_salt`.
     episodes : int
         How many held-out episodes the method and the board's floor play.
-
-    Returns
-    -------
-    table, differences
-        Markdown, and a sentence for each thing that is not as the record says.
 
     Raises
     ------
@@ -133,16 +59,37 @@ def held_out(record: dict[str, Any], job: Job, salt: bytes,
     if min(episodes, len(errors)) < 2 or episodes + len(errors) < FEWEST:
         raise ValueError(f"held-out episodes and those of the record must be {FEWEST} together, "
                          f"and two each, to be compared; got {episodes} and {len(errors)}")
-    zero = Job(job.environment, FLOORS[job.environment.track], 0)
-    seeds = held_out_seeds(salt, episodes)
-    own = [run_episode(job._replace(seed=seed))[0] for seed in seeds]
-    beside = [run_episode(zero._replace(seed=seed))[0] for seed in seeds]
-    there = [run_episode(zero._replace(seed=parse_seeds(name)[0]))[0] for name in errors]
+    floor = Job(job.environment, FLOORS[job.environment.track], 0)
+    seeds = drawn_seeds(salt, episodes)
+    return Plays([job._replace(seed=seed) for seed in seeds],
+                 [floor._replace(seed=seed) for seed in seeds],
+                 [floor._replace(seed=parse_seeds(name)[0]) for name in errors])
+
+
+def verdict(record: dict[str, Any], own: list[dict[str, Any]], beside: list[dict[str, Any]],
+            there: list[dict[str, Any]]) -> tuple[str, list[str]]:
+    """Whether what a record says is better than what its method does in held-out episodes.
+
+    Parameters
+    ----------
+    record
+        As read.
+    own, beside, there
+        The results of its `plays`, in their order.
+
+    Returns
+    -------
+    table, differences
+        Markdown, and a sentence for each thing that is not as the record says;
+        `too_good.judged` says how the two are compared.
+    """
+    errors = scores_by_seed(record, "error")
     said = [{"status": "ok", "scores": {"error": error}} for error in errors.values()]
     differences = [f"failed in a held-out episode: {result['message']}"
                    for result in (*own, *beside) if result["status"] == "failed"]
-    differences += [f"the floor failed in {result['seed']}: {result['message']}"
-                    for result in there if result["status"] == "failed"]
+    differences += [f"the floor failed in {name}: {result['message']}"
+                    for name, result in zip(errors, there, strict=True)
+                    if result["status"] == "failed"]
     record_pairs = _pairs(said, there)
     new_pairs = _pairs(own, beside)
     if min(len(record_pairs), len(new_pairs)) < 2:
@@ -157,6 +104,11 @@ def held_out(record: dict[str, Any], job: Job, salt: bytes,
                     f"held-out; so much better is an honest record with p = {finding.p:.2g}"
                     for finding in too_good(found)]
     return Table.of(rows).markdown(), differences
+
+
+def held_out(record: dict[str, Any], todo: Plays) -> tuple[str, list[str]]:
+    """Play all that is to be played here and now, one after the other; the `verdict`."""
+    return verdict(record, *([run_episode(job)[0] for job in jobs] for jobs in todo))
 
 
 def _pairs(own: list[dict[str, Any]], floor: list[dict[str, Any]]) -> np.ndarray:

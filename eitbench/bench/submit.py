@@ -13,6 +13,7 @@ from eitbench.bench.records import read_record, write_record
 from eitbench.bench.run import Job, run_jobs, unplayed
 from eitbench.bench.store import EpisodeStore, provenance, results_of
 from eitbench.bench.text import seed_ranges
+from eitbench.data.seasons import current_season
 from eitbench.data.seeds import name_seed
 
 
@@ -31,7 +32,7 @@ def submit(method: str | None, environments: list[str], seeds: list[int] | None,
         With a method at least one, and all of them must be such that it plays them; without, by
         default all.
     seeds : list of int
-        Of the test split; default: those of the full suite.
+        Of the season's test split; default: those of the full suite.
     official : bool
         Whether a maintainer runs it; else the records say that they are self-reported.
     isolate : str
@@ -57,10 +58,11 @@ def submit(method: str | None, environments: list[str], seeds: list[int] | None,
         where = f"and changes to {code['commit'][:8]}" if code["commit"] else "outside a checkout"
         raise ValueError("official must be False unless this is a commit without changes, got "
                          f"official=True {where}")
-    outside = [name_seed(seed) for seed in seeds or [] if split_of(name_seed(seed)) != "test"]
+    split = current_season().split
+    outside = [name_seed(seed) for seed in seeds or [] if split_of(name_seed(seed)) != split]
     if outside:
-        raise ValueError(
-            f"seeds of a submission must be of the test split, got {', '.join(outside)}")
+        raise ValueError(f"seeds of a submission must be of the season's split {split}, got "
+                         f"{', '.join(outside)}")
     if method is not None and not environments:
         raise ValueError("env must name at least one environment to submit for")
     asked = (_jobs(method, id, policy, seeds, isolate) for id in environments or tracks.ids())
@@ -69,15 +71,15 @@ def submit(method: str | None, environments: list[str], seeds: list[int] | None,
         before = list[dict[str, Any]]()
         played = {(job.environment.name, job.load().name): job.load().version for job in jobs}
         for (environment, name), version in played.items():
-            for path, earlier in _earlier(Path(to), environment, name, version):
+            for path, earlier in _earlier(Path(to), environment, name, version, split):
                 _check_nothing_is_lost(path, earlier, official)
                 before += results_of(earlier) if earlier["official"] == official else []
         run_jobs(unplayed(jobs, before), store, n_jobs=n_jobs, backend=backend, command=command)
         made = []
         for record in store.records(also=before):
             key = record["environment"]["name"], record["method"]
-            if key in played and record["split"] == "test":
-                there = _earlier(Path(to), *key, record["version"])
+            if key in played and record["split"] == split:
+                there = _earlier(Path(to), *key, record["version"], split)
                 made.append((record | {"official": official}, there))
         for record, there in made:
             for path, earlier in there:
@@ -99,12 +101,13 @@ def _jobs(method: str | None, id: str, policy: bool, seeds: list[int] | None,
     return suites.jobs(track, [id], methods, seeds, isolate=isolate)
 
 
-def _earlier(to: Path, environment: str, method: str,
-             version: str) -> list[tuple[Path, dict[str, Any]]]:
-    """Records there of this version's test episodes; at most one, unless of several formats."""
+def _earlier(to: Path, environment: str, method: str, version: str,
+             split: str) -> list[tuple[Path, dict[str, Any]]]:
+    """Records there of this version's episodes of a split; at most one, unless of several
+    formats."""
     paths = sorted(to.glob(f"{environment}--{glob.escape(method)}--*.json"))
     return [(path, record) for path, record in zip(paths, map(read_record, paths), strict=True)
-            if (record["method"], record["version"], record["split"]) == (method, version, "test")]
+            if (record["method"], record["version"], record["split"]) == (method, version, split)]
 
 
 def _check_nothing_is_lost(path: Path, earlier: dict[str, Any], official: bool,

@@ -76,7 +76,7 @@ def jobs(track: str, environments: list[str], methods: list[str], seeds: list[in
         asked = Environment(id, json.dumps(given))
         env = _to_look_at(asked)
         board = board_of(env)
-        numbers = default_seeds(env, id, suite) if seeds is None else seeds
+        numbers = default_seeds(id, suite) if seeds is None else seeds
         # Environment by environment, since models are kept for a few only, and a guest for one
         # method.
         for method in methods or [*own_methods(track), *own_agents(id)]:

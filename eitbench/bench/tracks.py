@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium as gym
 
+from eitbench.data.seasons import in_season
 from eitbench.data.seeds import parse_seeds
 from eitbench.worlds.registry import entries, entry
 
@@ -187,6 +188,7 @@ def class_of(id: str, board: str) -> str:
     return "stationary" if at_rest else board
 
 
-def default_seeds(env: EstimationEnv | InjectionEnv, id: str, suite: str = "full") -> list[int]:
-    """Seeds that are played in an environment when nobody says which."""
-    return parse_seeds(QUICK_SEEDS if suite == "quick" else entry(id).seeds)
+def default_seeds(id: str, suite: str = "full") -> list[int]:
+    """Seeds that are played in an environment when nobody says which: of the season's test
+    episodes."""
+    return parse_seeds(in_season(QUICK_SEEDS if suite == "quick" else entry(id).seeds))

@@ -25,7 +25,7 @@ from eitbench.bench.tracks import Environment
 from eitbench.data.seeds import parse_seeds
 from eitbench.data.store import cache_in
 
-OF_OURS = ("board", "role", "privileged")
+OF_OURS = ("method", "board", "role", "privileged")
 """What must be as a record says of a method of ours, beside numbers: its words may be mended."""
 TOLERANCE = 1e-6
 """Relative difference of a score that is none; another machine sums in another order."""
@@ -58,6 +58,14 @@ def outdated(record: dict[str, Any], job: Job) -> str:
             "other numbers are no wonder")
 
 
+def unknown_version(record: dict[str, Any], job: Job) -> list[str]:
+    """A sentence if the record is of a version that the method of ours has not reached."""
+    now, then = version_number(job.load().version), version_number(record["version"])
+    if now is None or then is None or then <= now:
+        return []
+    return [f"the record is of {record['version']}, and {record['method']} has only come to v{now}"]
+
+
 def drawn_of(record: dict[str, Any], episodes: int, seed: int) -> list[int]:
     """The places of so many of a record's episodes, drawn with this ``seed``; in order."""
     drawn = np.random.default_rng(seed).permutation(len(record["episodes"]))[:episodes]
@@ -85,7 +93,7 @@ def verify(record: dict[str, Any], job: Job, *, episodes: int = 3, seed: int = 0
     _check.integer("episodes", episodes, low=1)
     stated = OF_OURS if is_ours(job.method) else (*SHARED, "method")
     rows = []
-    differences = list[str]()
+    differences = unknown_version(record, job)
     for said in (record["episodes"][i] for i in drawn_of(record, episodes, seed)):
         (number,) = parse_seeds(said["seed"])
         again = json.loads(json.dumps(run_episode(job._replace(seed=number))[0]))

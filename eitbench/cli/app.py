@@ -1,5 +1,5 @@
-"""The command line: `eitbench list | run | bank | train | policies | submit | verify | held-out |
-migrate | cards | leaderboard | compare | render | reproduce`."""
+"""The command line: `eitbench list | run | bank | train | policies | submit | verify | check |
+season | held-out | migrate | cards | leaderboard | compare | render | reproduce`."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ import typer
 from eitbench._foreign import cleaned
 from eitbench.cli import options
 from eitbench.cli.maintain import cards, held_out, migrate
+from eitbench.cli.season import app as season_commands
 from eitbench.cli.studies import thesis
-from eitbench.cli.trust import verify
+from eitbench.cli.trust import check, verify
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
                   context_settings={"help_option_names": ["-h", "--help"]}, help="""
@@ -236,6 +237,8 @@ def submit(
 
 
 app.command()(verify)
+app.command()(check)
+app.add_typer(season_commands, name="season")
 app.command("held-out")(held_out)
 app.command()(migrate)
 app.command()(cards)
@@ -247,6 +250,9 @@ def leaderboard(
     records: Annotated[Path | None, typer.Option(
         help="Folder of the leaderboards' records, such as leaderboards/results: render "
              "leaderboard.csv, leaderboard.md and the pages site/ beside it instead.")] = None,
+    season: Annotated[int | None, typer.Option(
+        min=1, help="With --records: the boards of an earlier season, in a folder season-N/ beside "
+                    "them. Default: the current one.")] = None,
 ) -> None:
     """Print the table and write the page again from the results stored in a folder.
 
@@ -257,13 +263,14 @@ def leaderboard(
         with options.clear_errors():
             return _report(out)
     from eitbench._files import write_atomically
+    from eitbench.data.seasons import season_numbered
     from eitbench.report.boards import boards, read_for_boards
     from eitbench.report.site import read_media, render, render_site, write_site
-    beside = records.parent
     with options.clear_errors():
-        found, complaints = read_for_boards(records)
+        found, complaints = read_for_boards(records, season_numbered(season))
         table = boards(found)
-        pages = render_site(found, table, read_media(beside / "media"))
+        pages = render_site(found, table, read_media(records.parent / "media"))
+        beside = records.parent if season is None else records.parent / f"season-{season}"
         texts = render(found, table)
         write_site(beside / "site", pages)
     for name, text in texts.items():

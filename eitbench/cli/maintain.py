@@ -62,7 +62,7 @@ def held_out(
 ) -> None:
     """For maintainers: draw the salt of held-out episodes, and publish its hash in
     leaderboards/held_out.json, once."""
-    from eitbench.bench import held_out as beyond
+    from eitbench.bench import salts
     with options.clear_errors():
-        digest = beyond.publish_new_salt(new)
-    options.say(f"wrote {new}, sha256 {digest}, and {beyond.PUBLISHED}")
+        digest = salts.publish_new_salt(new)
+    options.say(f"wrote {new}, sha256 {digest}, and {salts.PUBLISHED}")

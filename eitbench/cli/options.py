@@ -30,6 +30,8 @@ Isolate = Annotated[Isolation, typer.Option(
 Environments = Annotated[list[str] | None, typer.Option(help="Environment id; may be repeated.")]
 InjectionId = Annotated[str, typer.Option(help="Id of an injection environment.")]
 RECORDS = Path("leaderboards/results")
+METHODS = Path("leaderboards/methods")
+"""Where pull requests put the files of methods."""
 
 RL = ("torch", "stable_baselines3", "sb3_contrib", "yaml")
 """What the extra rl installs for training and for trained agents."""

@@ -1,11 +1,14 @@
-"""Public episode seeds in disjoint ranges: learn on `train`, choose on `dev`, report on `test`."""
+"""Public episode seeds in disjoint splits: learn on `train`, choose on `dev`, report on `test`, or
+on the test split of the season (`eitbench.data.seasons`)."""
 
 from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+
+from eitbench.data.seasons import drawn_names, season_of
 
 SPLITS = {"train": range(0, 100_000), "dev": range(100_000, 200_000),
           "test": range(200_000, 300_000)}
@@ -18,9 +21,9 @@ def parse_seeds(text: str) -> list[int]:
     ``ValueError`` if the text has another form, names an unknown split, or leaves its range.
     """
     split, colon, numbers = text.rpartition(":")
-    if colon and split not in SPLITS:
+    allowed = _seeds_of(split) if colon else range(0, 2**31)
+    if not allowed:
         raise ValueError(f"seeds must name one of the splits {', '.join(SPLITS)}, got {text!r}")
-    allowed = SPLITS[split] if colon else range(0, 2**31)
     seeds: list[int] = []
     for part in numbers.split(","):
         match = re.fullmatch(r"(\d+)(?:-(\d+))?", part.strip())
@@ -39,7 +42,20 @@ def name_seed(seed: int) -> str:
     for split, seeds in SPLITS.items():
         if seed in seeds:
             return f"{split}:{seed - seeds.start}"
-    return str(seed)
+    return drawn_names().get(seed, str(seed))
+
+
+def is_test(seed: int) -> bool:
+    """Whether scores are reported of this episode, in whatever season."""
+    return seed in SPLITS["test"] or seed in drawn_names()
+
+
+def _seeds_of(split: str) -> Sequence[int]:
+    """Empty if there is no such split, or its season has not begun."""
+    if split in SPLITS:
+        return SPLITS[split]
+    season = season_of(split)
+    return season.seeds if season else ()
 
 
 class ReservedSeedWarning(UserWarning):
@@ -49,10 +65,9 @@ class ReservedSeedWarning(UserWarning):
 def warn_of_reserved(seeds: Iterable[int]) -> None:
     """A `ReservedSeedWarning`, which Python shows once, if one of these episodes is of the test
     split and nobody said that it is played `for_scores`."""
-    if any(seed in SPLITS["test"] for seed in seeds):
-        first, last = SPLITS["test"][0], SPLITS["test"][-1]
-        warnings.warn(f"reset(seed=…) began a test episode, one of the seeds {first} to {last} on "
-                      "which methods are scored: what was trained or chosen on it has no fair "
+    if reserved := [seed for seed in seeds if is_test(seed)]:
+        warnings.warn(f"reset(seed={reserved[0]}) began a test episode, {name_seed(reserved[0])}, "
+                      "on which methods are scored: what was trained or chosen on it has no fair "
                       f"score; choose on dev seeds, from {SPLITS['dev'][0]}",
                       ReservedSeedWarning, stacklevel=3)
 

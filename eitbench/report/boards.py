@@ -19,6 +19,7 @@ from eitbench.bench.statistics import (
 from eitbench.bench.text import scores_by_seed, seed_ranges
 from eitbench.bench.tracks import CLASSES, FLOORS, ids, named, track_of_board
 from eitbench.bench.tracks import class_of as class_of_board
+from eitbench.data.seasons import Season, current_season, season_of
 from eitbench.report.summary import columns, explanations, place_of_world, summary_row, world
 
 ALL = "all"
@@ -104,12 +105,12 @@ def boards(records: list[dict[str, Any]]) -> pd.DataFrame:
     Raises
     ------
     ValueError
-        If a record is of other seeds than test.
+        If a record is of other seeds than test, or they are of several seasons.
     """
     for record in records:
-        if record["split"] != "test":
-            raise ValueError(f"leaderboards are made of test seeds; {file_name(record)} has "
-                             f"{record['split']} seeds")
+        if season_of(record["split"]) is None or record["split"] != records[0]["split"]:
+            raise ValueError("leaderboards are made of the test seeds of one season; "
+                             f"{file_name(record)} has {record['split']} seeds")
     current, _ = newest(records)
     registered = {named(id, {}) for id in ids()}
     products = _matrix_products(current)
@@ -129,25 +130,28 @@ def boards(records: list[dict[str, Any]]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=fields()).astype(types | {"rank": "Int64"})
 
 
-def read_for_boards(folder: Path) -> tuple[list[dict[str, Any]], list[str]]:
-    """The records of a folder that can stand on boards, and a sentence for each of the others.
+def read_for_boards(folder: Path, season: Season | None = None,
+                    ) -> tuple[list[dict[str, Any]], list[str]]:
+    """The records of a folder that can stand on the boards of a season (default: the current one),
+    and a sentence for each that can stand on none.
 
     Raises
     ------
     ValueError
         If there is no such folder, or none of it can.
     """
+    split = (season or current_season()).split
     if not folder.is_dir():
         raise ValueError(f"records must be a folder that exists, got {folder}")
     read, complaints = read_sound_records(folder)
-    found = [record for record in read if record["split"] == "test"]
+    found = [record for record in read if record["split"] == split]
     complaints += [f"record {folder / file_name(record)} has {record['split']} seeds, and "
                    "leaderboards are made of test seeds"
-                   for record in read if record["split"] != "test"]
+                   for record in read if season_of(record["split"]) is None]
     if not found:
         named = "".join(f"; {complaint}" for complaint in complaints)
-        raise ValueError(f"records must be a folder with records, got {folder}, where there are "
-                         f"none that can be shown{named}")
+        raise ValueError(f"records must be a folder with records of {split} seeds, got {folder}, "
+                         f"where there are none that can be shown{named}")
     return found, complaints
 
 

@@ -19,6 +19,7 @@ from eitbench.bench.statistics import (
 )
 from eitbench.bench.table import NOTHING, Cell, Table, number_cell
 from eitbench.bench.text import scores_by_seed, with_interval
+from eitbench.data.seasons import current_season
 from eitbench.report import charts
 from eitbench.report.templates import template
 
@@ -78,6 +79,7 @@ def compare(a: list[dict[str, Any]], b: list[dict[str, Any]], score: str = "erro
     higher = comparable(score).better == "higher"
     pairs: dict[str, tuple[dict[str, float], dict[str, float]]] = {}
     others = {(record["environment"]["name"], record["split"]): record for record in b}
+    ours = current_season().split
     for record in a:
         name = record["environment"]["name"]
         split = record["split"]
@@ -85,7 +87,7 @@ def compare(a: list[dict[str, Any]], b: list[dict[str, Any]], score: str = "erro
             continue
         own, theirs = (scores_by_seed(each, score) for each in (record, other))
         if shared := own.keys() & theirs.keys():
-            label = name if split == "test" else f"{name} ({split} seeds)"
+            label = name if split == ours else f"{name} ({split} seeds)"
             pairs[label] = ({seed: own[seed] for seed in shared},
                             {seed: theirs[seed] for seed in shared})
     if not pairs:

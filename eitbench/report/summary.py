@@ -16,6 +16,7 @@ from eitbench.bench.scores import scores
 from eitbench.bench.table import NOTHING, Cell, Table
 from eitbench.bench.text import mean_and_interval, number, rounded, scores_by_seed, seed_ranges
 from eitbench.bench.tracks import ids
+from eitbench.data.seasons import current_season, season_of
 from eitbench.scoring import skill
 
 SKILL = ("skill", "0 for the homogeneous estimate, 1 for the fixed-interval smoother that is told "
@@ -23,8 +24,8 @@ SKILL = ("skill", "0 for the homogeneous estimate, 1 for the fixed-interval smoo
          "that filters may fall below 0")
 """Heading and explanation of the one number that follows from several records, not from an
 episode."""
-SPLITS = ["test", "dev", "train", "own"]
-"""In the order in which boards are shown; the reported seeds first."""
+SPLITS = ["dev", "train", "own"]
+"""In the order in which boards are shown, after the reported seeds."""
 _NOT_THE_WORLD = ("lag", "assume", "gate", "episodes", "render_mode", "observation", "estimator")
 """Arguments of an environment that its episodes do not depend on."""
 
@@ -49,7 +50,8 @@ def summary(records: list[dict[str, Any]]) -> pd.DataFrame:
     table = pd.DataFrame([summary_row(record, records) for record in records])
     order = table["error"].map(lambda cell: math.inf if cell is None else cell[0])
     worlds = sorted(set(table["world"]), key=place_of_world)
-    keys = {"_split": table["split"].map(SPLITS.index), "_world": table["world"].map(worlds.index),
+    keys = {"_split": table["split"].map(_place_of_split),
+            "_world": table["world"].map(worlds.index),
             "_board": table["board"].map(BOARDS.index), "_error": order}
     by = ["_split", "_world", "_board", "environment", "_error"]
     ordered = table.assign(**keys).sort_values(by)
@@ -173,8 +175,15 @@ def shown(table: pd.DataFrame, *, grouped: bool = False) -> Table:
 
 
 def board_label(row: Any) -> str:
-    """Name of the board; scores of other seeds than the reported ones say so."""
-    return row["board"] if row["split"] == "test" else f"{row['board']} ({row['split']} seeds)"
+    """Name of the board; scores of other seeds than those of the season say so."""
+    ours = row["split"] == current_season().split
+    return row["board"] if ours else f"{row['board']} ({row['split']} seeds)"
+
+
+def _place_of_split(split: str) -> int:
+    """The latest season first."""
+    season = season_of(split)
+    return -season.number if season else SPLITS.index(split)
 
 
 def _cell(name: str, value: tuple[float, float] | None) -> Cell:

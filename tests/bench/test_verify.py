@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from eitbench.bench import held_out, methods, run
+from eitbench.bench import held_out, methods, run, salts
 from eitbench.bench import store as store_module
 from eitbench.bench import verify as verification
 from eitbench.bench.records import read_record, write_record
@@ -18,6 +18,7 @@ from eitbench.bench.sandbox.wall import landlock_version
 from eitbench.bench.tracks import named
 from eitbench.cli import app
 from eitbench.data.episodes import simulate
+from eitbench.data.seasons import drawn_seeds
 from eitbench.data.seeds import SPLITS, parse_seeds
 from eitbench.data.store import CACHE_VARIABLE, cache_folder, folder
 from eitbench.worlds.pipe2d import PIPE_2D
@@ -37,7 +38,7 @@ def tiny_world(monkeypatch, tmp_path, run_cache):
     monkeypatch.setenv(CACHE_VARIABLE, run_cache)
     git_says(monkeypatch)
     shorten(monkeypatch, {FILTER.id: SCENARIO, INJECTION: PIPE})
-    monkeypatch.setattr(held_out, "PUBLISHED", tmp_path / "leaderboards" / "held_out.json")
+    monkeypatch.setattr(salts, "PUBLISHED", tmp_path / "leaderboards" / "held_out.json")
     monkeypatch.chdir(tmp_path)
     store_module.provenance.cache_clear()
     yield
@@ -245,31 +246,31 @@ def test_the_cache_is_not_believed(mine, tmp_path, monkeypatch):
 def test_held_out_seeds_are_the_formula():
     """SHA-256 of salt and number, outside the public ranges; by coreutils: the first of bytes 0 … 31 is e0bc…"""
     import hashlib
-    seeds = held_out.held_out_seeds(SALT, 50)
+    seeds = drawn_seeds(SALT, 50)
     assert seeds[1] == int(hashlib.sha256(SALT + bytes(7) + b"\1").hexdigest(), 16) % 2**63
     assert len(set(seeds)) == 50 and max(split.stop for split in SPLITS.values()) <= min(seeds) < max(seeds) < 2**63
-    assert held_out.held_out_seeds(SALT, 3) == seeds[:3] and held_out.held_out_seeds(SALT[::-1], 3) != seeds[:3]
+    assert drawn_seeds(SALT, 3) == seeds[:3] and drawn_seeds(SALT[::-1], 3) != seeds[:3]
 
 
 def test_a_salt_is_its_owner_s_and_its_hash_everybody_s(tmp_path):
     """A file that others cannot read, and never overwrites another; the published hash decides which salt counts."""
     code, said, _ = eitbench("held-out", "--new", "salt")
     assert code == 0 and (tmp_path / "salt").stat().st_mode & 0o777 == 0o600
-    salt = held_out.read_salt(tmp_path / "salt")
+    salt = salts.read_salt(tmp_path / "salt")
     told = json.loads((tmp_path / "leaderboards" / "held_out.json").read_text())
-    assert told == {"salt_sha256": held_out.hash_of(salt)} and told["salt_sha256"] in said and salt.hex() not in said
+    assert told == {"salt_sha256": salts.hash_of(salt)} and told["salt_sha256"] in said and salt.hex() not in said
     code, _, complaint = eitbench("held-out", "--new", "next")
-    assert code == 2 and "to begin a new season, remove that file in a commit" in complaint
+    assert code == 2 and "to draw another one, remove that file in a commit" in complaint
     assert not (tmp_path / "next").exists()
     with pytest.raises(ValueError, match="cannot be written"):
-        held_out.new_salt(tmp_path / "salt")
-    assert held_out.read_salt(tmp_path / "salt") == salt
+        salts.new_salt(tmp_path / "salt")
+    assert salts.read_salt(tmp_path / "salt") == salt
     (tmp_path / "words").write_text("hello")
-    held_out.new_salt(tmp_path / "other")
-    held_out.new_salt(package := Path(run.__file__).parent / "test_salt.tmp")
+    salts.new_salt(tmp_path / "other")
+    salts.new_salt(package := Path(run.__file__).parent / "test_salt.tmp")
     try:
         with pytest.raises(ValueError, match="which guests may read"):
-            held_out.read_salt(package)
+            salts.read_salt(package)
     finally:
         package.unlink()
     for name, change, message in (("other", 0o600, "has the hash"), ("salt", 0o640, "readable by its owner only"),
@@ -278,20 +279,20 @@ def test_a_salt_is_its_owner_s_and_its_hash_everybody_s(tmp_path):
         if change:
             (tmp_path / name).chmod(change)
         with pytest.raises(ValueError, match=message):
-            held_out.read_salt(tmp_path / name)
+            salts.read_published_salt(tmp_path / name)
 
 
 def test_the_published_hash_is_found_from_everywhere(tmp_path):
     """It is that of the checkout or the installed package, not of the working folder."""
-    program = "from eitbench.bench.held_out import PUBLISHED; print(PUBLISHED)"
+    program = "from eitbench.bench.salts import PUBLISHED; print(PUBLISHED)"
     said = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, text=True, capture_output=True, check=True)
     assert Path(said.stdout.strip()) == Path(run.__file__).parents[2] / "leaderboards" / "held_out.json"
 
 
 def held_out_claim(tmp_path, monkeypatch, mine, episodes=6):
     """Arguments of `verify` for held-out episodes alone, of a salt of zeros: one in twenty is bad luck."""
-    monkeypatch.setattr(held_out.secrets, "token_bytes", bytes)
-    held_out.new_salt(tmp_path / "salt")
+    monkeypatch.setattr(salts.secrets, "token_bytes", bytes)
+    salts.new_salt(tmp_path / "salt")
     return "--episodes", 0, "--held-out", episodes, "--salt-file", "salt", "--baseline", mine
 
 
@@ -301,7 +302,7 @@ def test_held_out_episodes_tell_the_honest_from_the_prepared(mine, tmp_path, mon
     public = submitted(mine, "--seeds", "test:0-7")
     claim = held_out_claim(tmp_path, monkeypatch, mine)
     code, said, complaint = eitbench("verify", public, *claim)
-    assert code == 0 and held_out.hash_of(bytes(32)) in said, complaint
+    assert code == 0 and salts.hash_of(bytes(32)) in said, complaint
     assert "record, 8 episodes" in said and "held-out, 6" in said
     assert all(re.search(rf"{name} *\|( +[\d.-]+ \|){{3}}", said)
                for name in ("ẽ_c over the floor's", "gain over the floor", "smallest ratio"))
@@ -353,9 +354,9 @@ def test_no_record_of_the_floor_is_believed(mine, tmp_path, monkeypatch):
 def test_held_out_seeds_stay_here(mine, tmp_path, monkeypatch):
     """Neither a message to a guest, nor its command line or surroundings, nor what is printed has one, or the salt."""
     path = submitted(mine, "--seeds", "test:0-3")
-    monkeypatch.setattr(held_out.secrets, "token_bytes", bytes)      # zeros: one salt in twenty is bad luck
-    held_out.new_salt(tmp_path / "salt")
-    seeds = held_out.held_out_seeds(salt := held_out.read_salt(tmp_path / "salt"), 2)
+    monkeypatch.setattr(salts.secrets, "token_bytes", bytes)      # zeros: one salt in twenty is bad luck
+    salts.new_salt(tmp_path / "salt")
+    seeds = drawn_seeds(salt := salts.read_salt(tmp_path / "salt"), 2)
     passed, popen, pack = [], host.subprocess.Popen, wire.pack
 
     def started(command, **rest):

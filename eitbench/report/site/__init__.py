@@ -17,7 +17,7 @@ from eitbench._files import replace_folder
 from eitbench._foreign import as_markdown
 from eitbench.bench.records import file_name, newest
 from eitbench.report.boards import boards, meanings
-from eitbench.report.site.collect import collect
+from eitbench.report.site.collect import about_season, collect
 from eitbench.report.site.environment import environment_page
 from eitbench.report.site.index import index_page
 from eitbench.report.site.method import method_page
@@ -71,6 +71,8 @@ def render(records: list[dict[str, Any]], table: pd.DataFrame | None = None) -> 
              "leaderboards/results`; [README.md](README.md) says how to add one.*"]
     if not site.boards:
         parts.append("There are no records yet.")
+    else:
+        parts.append(f"**{about_season(site.season)}**")
     for name in site.classes:
         parts.append(f"## {name}")
         for board in site.boards:

@@ -9,6 +9,7 @@ from urllib.parse import quote
 import pandas as pd
 
 from eitbench.bench.records import newest
+from eitbench.data.seasons import Season, current_season, season_of
 from eitbench.data.seeds import name_seed, parse_seeds
 from eitbench.report.boards import ALL, boards
 
@@ -89,6 +90,12 @@ class Site(NamedTuple):
     records: list[dict[str, Any]]
 
     @property
+    def season(self) -> Season:
+        """Whose test episodes were played; the current one where nothing was."""
+        split = self.records[0]["split"] if self.records else ""
+        return season_of(split) or current_season()
+
+    @property
     def classes(self) -> list[str]:
         """Those that have boards, in order."""
         return list(dict.fromkeys(board.of_class for board in self.boards))
@@ -131,6 +138,14 @@ def title_of(record: dict[str, Any]) -> str:
         return environment["id"].removeprefix("eitbench/")
     given = [f"{key}={value}" for key, value in environment["kwargs"].items() if value is not None]
     return f"{environment['id'].removeprefix('eitbench/')} ({', '.join(given)})"
+
+
+def about_season(season: Season) -> str:
+    """Which one, and who could know its episodes."""
+    if season.number == 1:
+        return "Season 1: anybody could simulate its test episodes from the beginning."
+    return (f"Season {season.number}, begun on {season.begun}: before that day nobody but the "
+            "maintainers could simulate its test episodes.")
 
 
 def method_address(name: str) -> str:

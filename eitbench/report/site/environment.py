@@ -29,7 +29,8 @@ def environment_page(site: Site, board: Board, animation: bytes | None) -> str:
     made = table(board, "../", compact=False)
     description, details = documentation(id)
     return template("site/environment.html.j2").render(
-        root="../", board=board, id=id, table=made, explanations=explanations([made]),
+        root="../", season=site.season.number, board=board, id=id, table=made,
+        explanations=explanations([made]),
         description=description, details=details,
         front=_front(board), intervals=_intervals(board), curves=_curves(board),
         duels=_duels(board), calibration=_calibration(board), spread=_spread(board),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from eitbench.bench.records import finished
-from eitbench.report.site.collect import Site
+from eitbench.report.site.collect import Site, about_season
 from eitbench.report.site.tables import explanations, table
 from eitbench.report.templates import template
 
@@ -28,5 +28,6 @@ def index_page(site: Site) -> str:
     } for name in site.classes]
     return template("site/index.html.j2").render(
         root="", classes=classes, n_records=len(site.records), n_methods=len(site.methods),
+        season=about_season(site.season),
         last=max(map(finished, site.records), default="")[:10],
         explanations=explanations(list(made.values())))
