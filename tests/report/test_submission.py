@@ -203,3 +203,15 @@ def test_held_out_episodes_are_played_too(theirs, monkeypatch, tmp_path):
 def test_mistakes_are_explained(arguments, message, theirs):
     code, _, complaint = eitbench("check", "--against", "ours", *arguments)
     assert code == 2 and message in complaint
+
+
+def test_the_workflow_asks_for_what_there_is():
+    """Its command is understood, its code and itself are those of the base branch, and it may only read."""
+    text = (Path(__file__).parents[2] / ".github/workflows/submission.yml").read_text()
+    (words,) = re.findall(r"run: \.\./venv/bin/eitbench (check .*)", text)
+    command, folder, *rest = words.split()
+    code, _, complaint = eitbench(command, "nowhere", *rest[:-1], "report.md")
+    assert code == 2 and "submitted must be a folder leaderboards" in complaint and folder == "../submitted/leaderboards"
+    assert "pull_request_target:" in text and "permissions:\n  contents: read\n" in text and "secrets" not in (
+        re.sub("#.*", "", text))
+    assert re.findall(r"working-directory: (\w+)", text) == ["ours", "ours"]
