@@ -234,11 +234,21 @@ def _load(path: Path, source: bytes, track: str) -> Method:
         return Method(track, name, title, path, sha256, BOARDS[track], parameters, agent)
     module = load_module(form.kind, path, source)
     method = getattr(module, form.type, None)
-    function = form.answers.partition("(")[0]
-    if not isinstance(method, type) or not callable(getattr(method, function, None)):
+    if not isinstance(method, type):
         raise ValueError(f"{form.kind} {path} must define a class {form.type} with a method "
                          f"{form.answers}")
-    who = f"{form.kind} {path}: {form.type}"
+    return method_of(method, track, path.stem)._replace(
+        title=title_of(module, path), path=path, sha256=sha256)
+
+
+def method_of(method: type[Any], track: str, name: str) -> Method:
+    """A class as a method of a track, without a file. ``ValueError`` if it is not as that asks
+    for."""
+    form = FORMS[track]
+    who = f"{form.kind} {name}: {method.__name__}"
+    function = form.answers.partition("(")[0]
+    if not callable(getattr(method, function, None)):
+        raise ValueError(f"{who} must have a method {form.answers}")
     boards = tuple(getattr(method, "boards", BOARDS[track][:1]))
     if not boards or not set(boards) <= set(BOARDS[track]):
         raise ValueError(f"{who}.boards must be some of {', '.join(BOARDS[track])}, got {boards!r}")
@@ -248,8 +258,8 @@ def _load(path: Path, source: bytes, track: str) -> Method:
     privileged = getattr(method, "privileged", False)
     if not isinstance(privileged, bool):
         raise ValueError(f"{who}.privileged must be True or False, got {privileged!r}")
-    return Method(track, path.stem, title_of(module, path), path, sha256, boards,
-                  _parameters(who, method), method, role, privileged)
+    return Method(track, name, name, Path(), "", boards, _parameters(who, method), method, role,
+                  privileged)
 
 
 def load_module(kind: str, path: Path, source: bytes) -> ModuleType:
