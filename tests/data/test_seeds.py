@@ -1,9 +1,10 @@
 """Public seeds: disjoint ranges, and text that names them."""
 
+import warnings
 from itertools import combinations
 
 import pytest
-from eitbench.data.seeds import SPLITS, name_seed, parse_seeds
+from eitbench.data.seeds import SPLITS, for_scores, name_seed, parse_seeds, warn_of_reserved
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -71,3 +72,14 @@ def test_errors_say_what_was_expected(text, message):
     with pytest.raises(ValueError, match=message) as caught:
         parse_seeds(text)
     assert repr(text) in str(caught.value)
+
+
+def test_playing_for_scores_leaves_other_warnings_alone():
+    """What Python shows once is not shown again after each episode, and nothing is said within."""
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("default")
+        for _ in range(2):
+            with for_scores():
+                warn_of_reserved([200_000])
+            warnings.warn("the cache is full", stacklevel=1)
+    assert [str(warning.message) for warning in said] == ["the cache is full"]
