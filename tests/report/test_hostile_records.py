@@ -141,6 +141,16 @@ def test_an_interrupted_render_leaves_the_old_site(broken, error, site, monkeypa
     assert {path.name for path in site.iterdir()} == {"site", "results", "leaderboard.md", "leaderboard.csv"}
 
 
+def test_the_next_call_puts_back_what_a_killed_one_has_left(site):
+    """It was killed when the old folder was out of the way and the new one not yet in its place."""
+    before = content(site / "site")
+    os.rename(site / "site", site / ".site.0123.old")
+    with pytest.raises(TypeError):
+        _files.replace_folder(site / "site", {"a.html": None})
+    assert content(site / "site") == before
+    assert not list(site.glob(".site.*"))
+
+
 def test_a_site_is_replaced_as_a_whole(site):
     """Pages whose records are gone go too; the folder is another one."""
     before = (site / "site").stat().st_ino
