@@ -107,7 +107,8 @@ class Mesh:
         """The cell (k,) int that holds each of ``points``, and its weights (k, d + 1) there.
 
         Weights are barycentric coordinates, in the order of the cell's nodes: not negative, with
-        rows that sum to one.
+        rows that sum to one. For a point outside the mesh it is the cell that the nearest boundary
+        facet belongs to.
 
         ``ValueError`` if ``points`` has the wrong shape or is not finite.
 
