@@ -218,6 +218,7 @@ def increasing(name: str, line: Sequence[float] | np.ndarray) -> np.ndarray:
                          f"got {line!r}")
     return line
 
+
 def rectangle_mesh(x: Sequence[float] | np.ndarray, y: Sequence[float] | np.ndarray) -> Mesh:
     """Structured triangles on the tensor grid of increasing coordinates ``x`` and ``y`` (m).
 

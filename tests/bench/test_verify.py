@@ -203,6 +203,7 @@ def test_another_file_of_a_stranger_is_named_and_not_played(mine, tmp_path):
     code, said, complaint = eitbench("verify", path, "--baseline", changed)
     assert code == 1 and said == "" and "the sha256 of mine.py is" in complaint
 
+
 def test_numbers_decide_and_not_the_text(tmp_path, monkeypatch):
     """A record of ours is played whatever its words and digests are; of an older version it is said to be one."""
     path = submitted("homogeneous", "--seeds", "test:0")
