@@ -25,9 +25,8 @@ ENV, COMMAND = "eitbench/Pipe2D-v0", "eitbench run --seeds train:1-2"
 
 
 @pytest.fixture(autouse=True)
-def surroundings(run_cache, monkeypatch):
-    """One cache of episodes for the session, and a commit that doesn't depend on where the tests run."""
-    monkeypatch.setenv(CACHE_VARIABLE, run_cache)
+def surroundings(monkeypatch):
+    """A commit that doesn't depend on where the tests run."""
     git_says(monkeypatch, "c0ffee")
     provenance.cache_clear()
     yield

@@ -13,7 +13,6 @@ from eitbench.bench.methods import own_methods
 from eitbench.bench.tracks import ids
 from eitbench.cli import app
 from eitbench.data.seeds import parse_seeds
-from eitbench.data.store import CACHE_VARIABLE
 from eitbench.worlds import entry, registry
 from typer.testing import CliRunner
 
@@ -42,9 +41,8 @@ class Estimator:
 
 
 @pytest.fixture(autouse=True)
-def tiny_world(monkeypatch, tmp_path, run_cache):
+def tiny_world(monkeypatch, tmp_path):
     """The registered environments play tiny worlds, in an empty folder; git is left alone."""
-    monkeypatch.setenv(CACHE_VARIABLE, run_cache)
     git_says(monkeypatch)
     shorten(monkeypatch, {name: TINY if name in PLAIN else world(name)["world"] for name in ids()})
     lagged = replace(entry("eitbench/Pipe2DFixedLag-v0"), settings={"lag": 2})
