@@ -56,7 +56,7 @@ def check_boards(folder, records):
     assert shown <= set(map(place, records)) and len(shown) > len(records) / 3
     current, _ = newest(records)
     for each in current:
-        floors = [set(other["seeds"]) for other in current if other["role"] == "floor"
+        floors = [set(other["seeds"]) for other in current if other["method"] in ("homogeneous", "random_pair")
                   and other["environment"]["name"] == each["environment"]["name"]]
         assert place(each) in shown or any(floor.isdisjoint(each["seeds"]) for floor in floors), place(each)
 
