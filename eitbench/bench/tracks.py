@@ -41,6 +41,7 @@ QUICK = ("eitbench/Pipe2D-v0", "eitbench/Pipe2DFixedLag-v0", "eitbench/Pipe2DSmo
 """What the quick suite runs; the full one runs all that ask for estimates."""
 QUICK_SEEDS = "test:0-3"
 
+
 class Environment(NamedTuple):
     """A registered id with keyword arguments: what is made, and what a record names."""
 

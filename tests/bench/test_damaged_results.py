@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from eitbench.bench.store import EpisodeStore
 from eitbench.cli import app
-from eitbench.data.store import CACHE_VARIABLE
 from typer.testing import CliRunner
 
 from short import shorten
@@ -15,9 +14,8 @@ from tiny import FILTER, SCENARIO, write_baseline
 
 
 @pytest.fixture(autouse=True)
-def tiny_world(monkeypatch, tmp_path, run_cache):
+def tiny_world(monkeypatch, tmp_path):
     """The registered environment plays a tiny world, in an empty folder."""
-    monkeypatch.setenv(CACHE_VARIABLE, run_cache)
     shorten(monkeypatch, {FILTER.id: SCENARIO})
     monkeypatch.chdir(tmp_path)
 

@@ -7,7 +7,6 @@ import pytest
 from eitbench import Estimate
 from eitbench.bench.run import Job, run_episode
 from eitbench.bench.tracks import Environment
-from eitbench.data.store import CACHE_VARIABLE
 
 from short import PIPE, shorten
 from tiny import FILTER, SCENARIO, write_baseline
@@ -16,8 +15,7 @@ INJECTION = "eitbench/Pipe2DInjection-v0"
 
 
 @pytest.fixture(autouse=True)
-def tiny_world(monkeypatch, run_cache):
-    monkeypatch.setenv(CACHE_VARIABLE, run_cache)
+def tiny_world(monkeypatch):
     shorten(monkeypatch, {INJECTION: PIPE})
 
 

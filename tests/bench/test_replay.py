@@ -10,7 +10,7 @@ from eitbench.bench import store as store_module
 from eitbench.bench.records import write_record
 from eitbench.bench.replay import by_environment, differing, official_records, verify_all
 from eitbench.cli import app
-from eitbench.data.store import CACHE_VARIABLE, cache_folder
+from eitbench.data.store import cache_folder
 from typer.testing import CliRunner
 
 from short import PIPE, shorten
@@ -20,9 +20,8 @@ INJECTION = "eitbench/Pipe2DInjection-v0"
 
 
 @pytest.fixture(autouse=True)
-def tiny_world(monkeypatch, tmp_path, run_cache):
+def tiny_world(monkeypatch, tmp_path):
     """The registered environments play tiny worlds, in an empty folder."""
-    monkeypatch.setenv(CACHE_VARIABLE, run_cache)
     git_says(monkeypatch)
     shorten(monkeypatch, {FILTER.id: SCENARIO, INJECTION: PIPE})
     monkeypatch.chdir(tmp_path)

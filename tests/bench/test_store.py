@@ -5,6 +5,8 @@ import math
 import platform
 import re
 import threading
+import warnings
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -23,9 +25,8 @@ ENV, COMMAND = "eitbench/Pipe2D-v0", "eitbench run --seeds train:1-2"
 
 
 @pytest.fixture(autouse=True)
-def surroundings(run_cache, monkeypatch):
-    """One cache of episodes for the session, and a commit that doesn't depend on where the tests run."""
-    monkeypatch.setenv(CACHE_VARIABLE, run_cache)
+def surroundings(monkeypatch):
+    """A commit that doesn't depend on where the tests run."""
     git_says(monkeypatch, "c0ffee")
     provenance.cache_clear()
     yield
@@ -105,7 +106,8 @@ def test_no_number_that_json_lacks_is_written(number, store):
 
 def test_writers_at_once_lose_nothing(store):
     """Eight threads, sixty-four episodes and a reader that never meets half a file."""
-    together, seen = threading.Barrier(9), []
+    together = threading.Barrier(9)
+    over = threading.Event()
 
     def write(worker):
         together.wait()
@@ -113,16 +115,25 @@ def test_writers_at_once_lose_nothing(store):
             put(store, result(8 * worker + seed, f"baseline{worker % 2}"), {"mean": np.ones((2, 2))})
 
     def read():
+        """Episodes of each record at each look, the last when nobody writes any more."""
         together.wait()
-        for _ in range(20):
-            seen.extend(len(record["episodes"]) for record in store.write_records())
+        is_last = False
+        while not is_last:
+            is_last = over.is_set()
+            yield [len(record["episodes"]) for record in store.write_records()]
 
-    threads = [threading.Thread(target=write, args=(worker,)) for worker in range(8)] + [threading.Thread(target=read)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert len(list(store.results())) == 64 and max(seen, default=0) <= 32
+    with warnings.catch_warnings(), ThreadPoolExecutor(9) as pool:
+        warnings.simplefilter("error")                                       # "… is left out: it is no result"
+        reader = pool.submit(lambda: list(read()))
+        try:
+            for writer in [pool.submit(write, worker) for worker in range(8)]:
+                writer.result()
+        finally:
+            over.set()
+        looks = reader.result()
+    seen = [sum(look) for look in looks]
+    assert len(seen) > 1 and seen == sorted(seen) and looks[-1] == [32, 32]
+    assert len(list(store.results())) == 64
     assert [len(record["episodes"]) for record in store.write_records()] == [32, 32]
     assert not [path for path in store.folder.rglob(".*") if path.is_file()]
 

@@ -23,9 +23,8 @@ TEST = parse_seeds("test:0-1")
 
 
 @pytest.fixture(autouse=True)
-def tiny_world(monkeypatch, tmp_path, run_cache):
+def tiny_world(monkeypatch, tmp_path):
     """The registered environments play tiny worlds, in an empty folder, from a clean commit."""
-    monkeypatch.setenv(CACHE_VARIABLE, run_cache)
     git_says(monkeypatch, "c0ffee")
     for name in (FILTER.id, SMOOTHING.id):
         shorten(monkeypatch, {name: SCENARIO})
