@@ -234,7 +234,8 @@ def source_digest() -> str:
     """Hash of the code that scores depend on: stored results of other code are played again, and a
     record says of each run which it was."""
     rooms = ("numerics/*", "physics/*", "worlds/*", "data/*", "estimation/**/*", "scoring",
-             "envs/*", "rl/networks", "rl/agents", "bench/run", "bench/score", "bench/policies")
+             "envs/*", "rl/networks", "rl/agents", "bench/outcomes", "bench/playing", "bench/run",
+             "bench/scores")
     return code_digest(package_files(*(f"{room}.py" for room in rooms)))
 
 

@@ -267,7 +267,8 @@ def test_a_record_names_the_machine_that_played(store, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["data/bank.py", "data/seeds.py", "rl/networks.py", "rl/agents.py",
-                                  "envs/estimation.py"])
+                                  "envs/estimation.py", "bench/scores.py", "bench/outcomes.py", "bench/playing.py",
+                                  "bench/run.py"])
 def test_the_source_is_all_that_scores_depend_on(name, monkeypatch):
     """A change in any of these files makes another digest."""
     changed, read, before = PACKAGE / name, Path.read_bytes, source_digest()
