@@ -29,6 +29,8 @@ from eitbench.bench.tracks import Environment, board_of
 from eitbench.data.episodes import simulate
 from eitbench.data.parallel import in_parallel
 from eitbench.data.seeds import name_seed
+from eitbench.data.store import world_digest
+from eitbench.worlds.registry import entry
 
 
 class Job(NamedTuple):
@@ -58,8 +60,11 @@ class Job(NamedTuple):
     def identity(self) -> str:
         """What the outcome depends on; a stored result counts only for the very same."""
         method = self.load()
-        parts = [*self.environment, method.sha256, method.version, str(self.seed), source_digest(),
-                 np.__version__, scipy.__version__]
+        asked = entry(self.environment.id)
+        world = asked.world.changed(json.loads(self.environment.kwargs).get("world"))
+        parts = [*self.environment, json.dumps(dict(asked.settings), sort_keys=True),
+                 world_digest(world), method.sha256, method.version, str(self.seed),
+                 source_digest(), np.__version__, scipy.__version__]
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
 
 
@@ -203,6 +208,9 @@ def _run_job(job: Job, store: EpisodeStore, run: dict[str, Any], home: str,
              beginning: dict[str, Any]) -> None:
     try:
         result, fields = run_episode(job)
+        if result["method_sha256"] == beginning["method_sha256"]:
+            # a world of a script is told apart by the script's file, which this process has not
+            result["identity"] = beginning["identity"]
     # what could be loaded in the beginning and cannot any more: that, too, is only its own result
     except Exception as error:
         result, fields = beginning | _failure(error), {}
