@@ -97,7 +97,13 @@ def read_records(folder: Path) -> list[dict[str, Any]]:
 def read_sound_records(folder: Path) -> tuple[list[dict[str, Any]], list[str]]:
     """As `read_records`, but those that are not valid are left out, with a sentence for each that
     names the file."""
-    records = []
+    sound, complaints = read_sound_files(folder)
+    return list(sound.values()), complaints
+
+
+def read_sound_files(folder: Path) -> tuple[dict[Path, dict[str, Any]], list[str]]:
+    """As `read_sound_records`, with the path of each record."""
+    records = {}
     complaints = []
     known = set(tracks.ids())
     for path in sorted(Path(folder).glob("*.json")):
@@ -108,10 +114,10 @@ def read_sound_records(folder: Path) -> tuple[list[dict[str, Any]], list[str]]:
             continue
         id = record["environment"]["id"]
         if id in known:
-            records.append(record)
+            records[path] = record
         else:
             warnings.warn(f"record {cleaned(str(path))} is left out: there is no environment "
-                          f"{cleaned(id)}", stacklevel=3)
+                          f"{cleaned(id)}", stacklevel=4)
     return records, complaints
 
 

@@ -18,7 +18,7 @@ import scipy
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
-from eitbench.bench.methods import Method, load_method
+from eitbench.bench.methods import Method, find_method, load_method, version_of
 from eitbench.bench.playing import environment, play
 from eitbench.bench.sandbox import guests
 from eitbench.bench.sandbox.host import GuestError
@@ -58,12 +58,14 @@ class Job(NamedTuple):
         return "none" if not self.isolated else "landlock" if landlock_version() else "process"
 
     def identity(self) -> str:
-        """What the outcome depends on; a stored result counts only for the very same."""
-        method = self.load()
+        """What the outcome depends on; a stored result counts only for the very same. Nothing is
+        loaded. ``ValueError`` if there is no such method or environment."""
+        path = find_method(self.method, self.environment.track)
+        sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
         asked = entry(self.environment.id)
         world = asked.world.changed(json.loads(self.environment.kwargs).get("world"))
         parts = [*self.environment, json.dumps(dict(asked.settings), sort_keys=True),
-                 world_digest(world), method.sha256, method.version, str(self.seed),
+                 world_digest(world), sha256, version_of(path, sha256), str(self.seed),
                  source_digest(), np.__version__, scipy.__version__]
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
 
