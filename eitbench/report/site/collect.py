@@ -66,8 +66,9 @@ class Board(NamedTuple):
 
     @property
     def seeds(self) -> str:
-        """Its episodes, as whoever has played most of them has them."""
-        return str(max((row.cells["seeds"] for row in self.rows),
+        """Its episodes, as whoever has played most of them has them; those of outdated rows only
+        where there are no others."""
+        return str(max((row.cells["seeds"] for row in self.current or self.rows),
                        key=lambda seeds: len(parse_seeds(seeds))))
 
     @property
