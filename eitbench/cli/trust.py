@@ -1,4 +1,4 @@
-"""The commands `verify` and `held-out`: whether a record is true."""
+"""The command `verify`: whether a record is true."""
 
 from __future__ import annotations
 
