@@ -138,8 +138,9 @@ def sealed(record: dict[str, Any]) -> dict[str, Any]:
 
 
 def file_name(record: dict[str, Any]) -> str:
-    """``ENV--METHOD--VERSION.json``; of other seeds than test with their split in it too."""
-    return schema2.file_name(record, record["version"])
+    """Of the file that a record has; see `tracks.record_name`."""
+    return tracks.record_name(record["environment"]["name"], record["method"], record["version"],
+                              record["split"])
 
 
 def alike(runs: Iterable[dict[str, Any]], *keys: str) -> list[list[dict[str, Any]]]:

@@ -7,10 +7,8 @@ import hashlib
 import json
 import platform
 import time
-import traceback
 from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +16,7 @@ import scipy
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
+from eitbench._foreign import where_of
 from eitbench.bench.methods import Method, find_method, load_method, version_of
 from eitbench.bench.playing import environment, play
 from eitbench.bench.sandbox import guests
@@ -132,13 +131,7 @@ def _failure(error: BaseException) -> dict[str, Any]:
     if isinstance(error, GuestError):
         return {"status": "failed", "message": str(error), "where": error.where}
     return {"status": "failed", "message": f"{type(error).__name__}: {error}",
-            "where": _where(error)}
-
-
-def _where(error: BaseException) -> str:
-    """File and line where it was raised, without the folders of this machine."""
-    last = traceback.extract_tb(error.__traceback__)[-1]
-    return f"{Path(last.filename).name}:{last.lineno}"
+            "where": where_of(error)}
 
 
 def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1, backend: str = "loky",

@@ -132,6 +132,13 @@ def named(id: str, given: dict[str, Any]) -> str:
     return id.replace("/", "-") + (f"-{digest}" if given else "")
 
 
+def record_name(environment: str, method: str, version: str, split: str) -> str:
+    """Of a record's file: ``ENV--METHOD--VERSION.json``; of other seeds than test with their split
+    in it too."""
+    parts = [environment, method, version, *[split] * (split != "test")]
+    return "--".join(parts) + ".json"
+
+
 def board_of(env: EstimationEnv | InjectionEnv) -> str:
     """Which of its track's `BOARDS` an environment belongs to."""
     lag = getattr(env, "lag", None)
@@ -187,6 +194,6 @@ def class_of(id: str, board: str) -> str:
     return "stationary" if at_rest else board
 
 
-def default_seeds(env: EstimationEnv | InjectionEnv, id: str, suite: str = "full") -> list[int]:
+def default_seeds(id: str, suite: str = "full") -> list[int]:
     """Seeds that are played in an environment when nobody says which."""
     return parse_seeds(QUICK_SEEDS if suite == "quick" else entry(id).seeds)

@@ -98,7 +98,7 @@ def test_numbers_out_of_bounds_are_named_with_the_file(number, place, tmp_path):
 
 def test_what_is_too_deep_or_too_large_is_named(tmp_path):
     """Before anything is made of it."""
-    for depth, message in ((DEEPEST, "deep within each other"), (50_000, "cannot be read")):
+    for depth, message in ((DEEPEST, "nested deeper than 32 levels"), (50_000, "cannot be read")):
         path = left(tmp_path, record("mine", [0.1], parameters={"a": 7}), old='{"a": 7}',
                     new='{"a": ' + "[" * depth + "]" * depth + "}")
         with pytest.raises(ValueError, match=f"record .*{path.name}.*{message}"):

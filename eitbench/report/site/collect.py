@@ -39,6 +39,11 @@ class Row(NamedTuple):
         """A floor, a reference, or shown the truth; not one that merely failed."""
         return any(word in self.cells["note"] for word in ("floor", "reference", "privileged"))
 
+    @property
+    def badges(self) -> tuple[str, ...]:
+        """Words that mark it: why it has no rank, and that it is outdated."""
+        return (*filter(None, self.cells["note"].split(", ")), *["outdated"] * self.outdated)
+
     def episodes(self) -> list[dict[str, Any]]:
         """Those finished, of the board's seeds."""
         seeds = {name_seed(seed) for seed in parse_seeds(self.cells["seeds"])}
