@@ -88,15 +88,15 @@ DEEPEST = 20
 """How deep lists and dicts from elsewhere may be nested."""
 
 
-def nesting(name: str, value: Any) -> None:
+def nesting(name: str, value: Any, deepest: int = DEEPEST) -> None:
     """``ValueError`` if lists and dicts are nested too deep for what goes through them."""
     level = [value]
-    for _ in range(DEEPEST):
+    for _ in range(deepest):
         level = [inner for each in level if isinstance(each, (list, tuple, dict))
                  for inner in (each.values() if isinstance(each, dict) else each)]
         if not level:
             return
-    raise ValueError(f"{name} must not be nested deeper than {DEEPEST} levels")
+    raise ValueError(f"{name} must not be nested deeper than {deepest} levels")
 
 
 def document(name: str, value: object, size: int) -> None:

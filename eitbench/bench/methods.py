@@ -203,7 +203,7 @@ def find_method(name: str, track: str) -> Path:
     if not path.is_file():
         raise ValueError(f"{form.kind} must be the path of {form.files}, or one of "
                          f"{', '.join([*own, *installed_methods()])}; got {name!r}")
-    if path.stem in own and not path.samefile(folder / path.name):
+    if path.stem in own and not path.samefile(folder / f"{path.stem}.py"):
         raise ValueError(f"{form.kind} {path} has the name of one of ours, under which results are "
                          "kept; rename it")
     return path

@@ -36,7 +36,11 @@ SHARED = ("board", "title", "parameters", "role", "privileged", "version", "meth
           "checkpoint_sha256")
 """What all episodes of a record have in common, beside environment and method."""
 MOST_EPISODES = 10_000
-"""of a record"""
+"""of a record; nor has it more runs"""
+MOST_WALLS = 20
+"""of a run"""
+MOST_STEPS = 100_000
+"""errors of an episode"""
 
 
 def write_record(folder: Path, record: dict[str, Any]) -> Path:
@@ -97,7 +101,13 @@ def read_records(folder: Path) -> list[dict[str, Any]]:
 def read_sound_records(folder: Path) -> tuple[list[dict[str, Any]], list[str]]:
     """As `read_records`, but those that are not valid are left out, with a sentence for each that
     names the file."""
-    records = []
+    sound, complaints = read_sound_files(folder)
+    return list(sound.values()), complaints
+
+
+def read_sound_files(folder: Path) -> tuple[dict[Path, dict[str, Any]], list[str]]:
+    """As `read_sound_records`, with the path of each record."""
+    records = {}
     complaints = []
     known = set(tracks.ids())
     for path in sorted(Path(folder).glob("*.json")):
@@ -108,10 +118,10 @@ def read_sound_records(folder: Path) -> tuple[list[dict[str, Any]], list[str]]:
             continue
         id = record["environment"]["id"]
         if id in known:
-            records.append(record)
+            records[path] = record
         else:
             warnings.warn(f"record {cleaned(str(path))} is left out: there is no environment "
-                          f"{cleaned(id)}", stacklevel=3)
+                          f"{cleaned(id)}", stacklevel=4)
     return records, complaints
 
 
@@ -128,8 +138,9 @@ def sealed(record: dict[str, Any]) -> dict[str, Any]:
 
 
 def file_name(record: dict[str, Any]) -> str:
-    """``ENV--METHOD--VERSION.json``; of other seeds than test with their split in it too."""
-    return schema2.file_name(record, record["version"])
+    """Of the file that a record has; see `tracks.record_name`."""
+    return tracks.record_name(record["environment"]["name"], record["method"], record["version"],
+                              record["split"])
 
 
 def alike(runs: Iterable[dict[str, Any]], *keys: str) -> list[list[dict[str, Any]]]:
@@ -185,12 +196,36 @@ def _check(record: Any) -> None:
 
 
 def _too_many(record: Any) -> list[str]:
-    """What to compare with each other would take for ever."""
-    seeds = record.get("seeds") if isinstance(record, dict) else None
-    if isinstance(seeds, list) and (len(seeds) > MOST_EPISODES
-                                    or not all(isinstance(seed, str) for seed in seeds)):
-        return [f"$.seeds: must be at most {MOST_EPISODES} texts"]
-    return []
+    """A sentence for each list that is too long to be looked at: to compare the items of one with
+    each other would take for ever."""
+    if not isinstance(record, dict):
+        return []
+    seeds, runs, episodes = (record.get(name) for name in ("seeds", "runs", "episodes"))
+    wrong = []
+    if not _are_texts(seeds, MOST_EPISODES):
+        wrong.append(f"$.seeds: must be at most {MOST_EPISODES} texts")
+    for name, items in (("runs", runs), ("episodes", episodes)):
+        if isinstance(items, list) and len(items) > MOST_EPISODES:
+            wrong.append(f"$.{name}: must be at most {MOST_EPISODES}")
+    if wrong:
+        return wrong
+    wrong += [f"$.runs[{i}].walls: must be at most {MOST_WALLS} texts"
+              for i, walls in _inner(runs, "walls") if not _are_texts(walls, MOST_WALLS)]
+    return wrong + [f"$.episodes[{i}].step_errors: must be at most {MOST_STEPS}"
+                    for i, steps in _inner(episodes, "step_errors")
+                    if isinstance(steps, list) and len(steps) > MOST_STEPS]
+
+
+def _are_texts(items: Any, most: int) -> bool:
+    """False of a list that is longer, or has others in it; what is no list the schema will name."""
+    return not isinstance(items, list) or (
+        len(items) <= most and all(isinstance(item, str) for item in items))
+
+
+def _inner(items: Any, name: str) -> list[tuple[int, Any]]:
+    """What stands under a name in each object of a list, with its place."""
+    return [(i, each.get(name)) for i, each in enumerate(items if isinstance(items, list) else [])
+            if isinstance(each, dict)]
 
 
 def _against_the_schema(record: Any) -> list[str]:

@@ -134,6 +134,13 @@ def named(id: str, given: dict[str, Any]) -> str:
     return id.replace("/", "-") + (f"-{digest}" if given else "")
 
 
+def record_name(environment: str, method: str, version: str, split: str) -> str:
+    """Of a record's file: ``ENV--METHOD--VERSION.json``; of other seeds than test with their split
+    in it too."""
+    parts = [environment, method, version, *[split] * (split != "test")]
+    return "--".join(parts) + ".json"
+
+
 def board_of(env: EstimationEnv | InjectionEnv) -> str:
     """Which of its track's `BOARDS` an environment belongs to."""
     lag = getattr(env, "lag", None)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -100,8 +100,7 @@ def verify(record: dict[str, Any], job: Job, *, episodes: int = 3, seed: int = 0
         wrong = differences_of(said, again)
         differences += [f"{said['seed']}: {_difference(name, said, again)}"
                         for name, off in wrong.items() if off > tolerance]
-        differences += [f"{name} is {again[name]!r}, the record says {record[name]!r}"
-                        for name in (*stated, "environment") if again[name] != record[name]]
+        differences += stated_differently(record, again, (*stated, "environment"))
         worst = max(wrong, key=lambda name: wrong[name], default="")
         rows.append({"episode": said["seed"],
                      "greatest difference in": worst if wrong.get(worst) else "none",
@@ -128,6 +127,14 @@ def _own(record: dict[str, Any]) -> str | None:
     if path is None:
         return None
     return name if path.suffix == ".py" and name not in installed_methods() else str(path)
+
+
+def stated_differently(record: dict[str, Any], again: dict[str, Any],
+                       names: Iterable[str]) -> list[str]:
+    """A sentence for each of these fields that is another in an episode's result than in the
+    record."""
+    return [f"{name} is {again[name]!r}, the record says {record[name]!r}"
+            for name in names if again[name] != record[name]]
 
 
 def differences_of(said: dict[str, Any], again: dict[str, Any]) -> dict[str, float]:

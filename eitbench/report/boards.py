@@ -234,14 +234,18 @@ def _aggregate(played: dict[str, list[Entry]]) -> list[dict[str, Any]]:
     gains = {label: {environment: entries[label].gains
                      for environment, entries in zip(played, found, strict=True)}
              for label in labels}
-    competing = {label: own for label, own in gains.items() if not found[0][label].note}
+    notes = {label: list(dict.fromkeys(word for entries in found
+                                       for word in filter(None, entries[label].note.split(", "))))
+             for label in labels}
+    competing = {label: own for label, own in gains.items() if not notes[label]}
     ranks = shared_ranks(competing, statistic=interquartile_mean,
                          higher_is_better=True) if competing else {}
     rows = []
     for label in labels:
         row = _row(found[0][label], ALL, ranks.get(label))
         row |= _three("gain", gains[label], interquartile_mean)
-        rows.append(row | {"official": all(entries[label].record["official"] for entries in found)})
+        rows.append(row | {"note": ", ".join(notes[label]),
+                           "official": all(entries[label].record["official"] for entries in found)})
     return sorted(rows, key=lambda row: (-row["gain"], row["method"], row["version"]))
 
 

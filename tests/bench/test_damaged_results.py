@@ -63,7 +63,9 @@ def test_arguments_that_there_are_not_are_named(played):
 
 @pytest.mark.parametrize("damage", [
     lambda data: data[:len(data) // 2], lambda data: b"", lambda data: b"PK", lambda data: data[:200] + data[300:],
-    lambda data: b"\x93NUMPY", lambda data: data.replace(b"mean.npy", b"main.npy")])
+    lambda data: b"\x93NUMPY", lambda data: data.replace(b"mean.npy", b"main.npy"),
+    # marked as encrypted
+    lambda data: re.sub(rb"(PK\x01\x02.{4}).", lambda found: found[1] + b"\x01", data, flags=re.DOTALL)])
 def test_damaged_estimates_are_named_and_the_table_is_shown(damage, played):
     """The page is made without pictures."""
     for path in played.glob("*.npz"):

@@ -5,6 +5,7 @@ import math
 import platform
 import re
 import threading
+import time
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -209,6 +210,17 @@ def test_each_episode_keeps_the_run_that_made_it(store):
     assert [episode["run"] for episode in record["episodes"]] == [0, 1, 0]
 
 
+def test_many_runs_are_gathered_at_once(store):
+    """A run of its own for each of many episodes: each is looked up, not compared with all others."""
+    others = [result(seed, run=RUN | {"machine": RUN["machine"] | {"matmul_seconds": 1.0 + seed}})
+              for seed in range(5000)]
+    begin = time.process_time()
+    (record,) = store.records(also=others)
+    assert time.process_time() - begin < 2.0                                    # 0.5 s; with comparisons 15 s
+    assert [record["runs"][each["run"]]["machine"]["matmul_seconds"] for each in record["episodes"]] == [
+        1.0 + seed for seed in range(5000)]
+
+
 def test_splits_are_not_mixed(store):
     """Development and training seeds never enter the record of another split."""
     put(store, result(1))
@@ -278,7 +290,8 @@ def test_a_record_names_the_machine_that_played(store, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["data/bank.py", "data/seeds.py", "rl/networks.py", "rl/agents.py",
-                                  "envs/estimation.py"])
+                                  "envs/estimation.py", "bench/scores.py", "bench/outcomes.py", "bench/playing.py",
+                                  "bench/run.py"])
 def test_the_source_is_all_that_scores_depend_on(name, monkeypatch):
     """A change in any of these files makes another digest."""
     changed, read, before = PACKAGE / name, Path.read_bytes, source_digest()

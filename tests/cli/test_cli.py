@@ -13,6 +13,7 @@ from eitbench.bench.methods import own_methods
 from eitbench.bench.tracks import ids
 from eitbench.cli import app
 from eitbench.data.seeds import parse_seeds
+from eitbench.report import animate
 from eitbench.worlds import entry, registry
 from typer.main import get_command
 from typer.testing import CliRunner
@@ -141,11 +142,12 @@ def test_suites():
 
 
 def test_list():
-    """Every environment with its board, every baseline with its boards and title."""
+    """Every environment with its board, every baseline and policy with its boards and title."""
     code, said, _ = eitbench("list")
     assert code == 0
     lines = {line.split()[0]: line for line in said.splitlines()}
-    assert lines.keys() >= {*ids(), *own_methods("estimation")}
+    assert lines.keys() >= {*ids(), *own_methods("estimation"), *own_methods("injection")}
+    assert "injection" in lines["random_pair"] and "Random pair" in lines["random_pair"]
     assert "smoothing" in lines["eitbench/Pipe2DSmoothing-v0"] and "3 scored of 5" in lines[PIPE]
     assert "filter, smoothing" in lines["gauss_newton"] and "Stationary Gauss–Newton" in lines["gauss_newton"]
 
@@ -237,6 +239,15 @@ def test_mistakes_are_explained(arguments, message, tmp_path):
     assert code == 2 and said == ""
     assert message in complaint and "Traceback" not in complaint
     assert not (tmp_path / "results").exists() and not (tmp_path / "nothing").exists()
+
+
+@pytest.mark.parametrize(("given", "isolate"), [([], "others"), (["--isolate", "always"], "always")])
+def test_an_episode_is_drawn_as_isolated_as_asked(given, isolate, monkeypatch):
+    """As by all other commands that play."""
+    asked = []
+    monkeypatch.setattr(animate, "animate", lambda *_, **how: asked.append(how["isolate"]))
+    code, _, complaint = eitbench("render", *given)
+    assert code == 0 and asked == [isolate], complaint
 
 
 def test_a_missing_extra_is_named(monkeypatch, tmp_path):

@@ -178,6 +178,21 @@ def test_nobody_s_own_floor_empties_an_aggregate():
     assert set(table[table["environment"] == id.replace("/", "-")]["method"]) == {"stranger", "homogeneous"}
 
 
+def test_who_is_marked_anywhere_has_no_rank_in_an_aggregate():
+    """Whichever environment comes first: what each record says of itself is said once."""
+    pipe = BOARD_IDS["filter"]
+    for first, second in ((pipe, TANK), (TANK, pipe)):
+        seer = [record("seer", times(0.1), id=first), record("seer", times(0.1), id=second, privileged=True)]
+        shown = [record("shown", times(0.2), id=first, privileged=True, role="reference"),
+                 record("shown", times(0.2), id=second, privileged=True)]
+        honest = [record("a", times(0.5), id=id) for id in (pipe, TANK)]
+        table = boards([floor(), floor(id=TANK), *seer, *shown, *honest])
+        total = table[table["environment"] == ALL].set_index("method")
+        assert dict(total["rank"].dropna()) == {"a": 1}
+        assert total["note"]["seer"] == "privileged"
+        assert sorted(total["note"]["shown"].split(", ")) == ["privileged", "reference"]
+
+
 def test_an_aggregate_is_ranked_by_what_orders_it():
     """By the interquartile mean of gains, which a disaster leaves as it is; a board of one environment by the mean."""
     def made(gains):

@@ -172,6 +172,14 @@ def test_shared_ranks_say_so(pages):
     assert [cells[0] for cells in rows if cells[0].startswith("1")] == ["1 shared", "1 shared"]
 
 
+def test_a_heading_names_the_episodes_of_current_rows():
+    """An outdated record may have played more."""
+    records = [record("a", [0.1] * 2, version="v2"), record("a", [0.2] * 9, version="v1")]
+    (board,) = collect(records, boards(records)).boards
+    assert [row.outdated for row in board.rows] == [False, True] and board.seeds == "test:0-1"
+    assert board._replace(rows=board.rows[1:]).seeds == "test:0-8"
+
+
 def test_outdated_ones_are_last_and_of_their_own(pages):
     """Listed with their own means, without rank, and not in the charts."""
     site = collect(several_boards(), boards(several_boards()))

@@ -9,7 +9,6 @@ be kept can be opened.
 from __future__ import annotations
 
 import os
-import traceback
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from typing import Any
 import cloudpickle
 import numpy as np
 
+from eitbench._foreign import where_of
 from eitbench.bench.sandbox import wall, wire
 from eitbench.worlds import streams
 from eitbench.worlds.registry import take_over
@@ -70,7 +70,7 @@ def main(folder: str, memory: int, separate: list[str]) -> None:
             else:
                 say(*answer(words, arrays))
         except (Exception, SystemExit) as error:
-            say({"error": f"{type(error).__name__}: {error}", "where": _where(error)})
+            say({"error": f"{type(error).__name__}: {error}", "where": where_of(error)})
 
 
 def _nothing(words: dict[str, Any], arrays: dict[str, np.ndarray]) -> Reply:
@@ -131,10 +131,3 @@ def _policy(rules: Any, method: Any) -> Callable[..., Reply]:
         return {}, {"action": np.asarray(player.act(arrays))}
 
     return answer
-
-
-def _where(error: BaseException) -> str:
-    """File and line where it was raised, without the folders of this machine."""
-    last = traceback.extract_tb(error.__traceback__)[-1]
-    return f"{Path(last.filename).name}:{last.lineno}"
-

@@ -78,11 +78,15 @@ class Guest:
         self.sha256 = ""
         """Of the file that was copied; empty for one of ours."""
         self._private = Path(tempfile.mkdtemp(prefix="eitbench-guest-"))
-        self._process = subprocess.Popen(
-            [sys.executable, "-P", keeper.__file__, str(self._private), str(memory)],
-            # a terminal can be typed into
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
-            start_new_session=True, env=self._surroundings(id, kwargs), cwd=self._private)
+        try:
+            self._process = subprocess.Popen(
+                [sys.executable, "-P", keeper.__file__, str(self._private), str(memory)],
+                # a terminal can be typed into
+                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+                start_new_session=True, env=self._surroundings(id, kwargs), cwd=self._private)
+        except BaseException:
+            keeper.remove(str(self._private))
+            raise
         try:
             assert self._process.stdin is not None
             os.set_blocking(self._process.stdin.fileno(), False)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from eitbench import _check
+from eitbench.bench.strict_json import decoder
 
 LARGEST = 1 << 28
 """bytes; no message is longer"""
@@ -21,8 +22,8 @@ VALUES = 50_000
 """How many commas and opening brackets the JSON may have, which bounds what it costs to parse."""
 KINDS = "biuf"
 """Of numbers in arrays."""
-DIGITS = 40
-"""Of a number; the state of a generator has 39."""
+BITS = 132
+"""Of an integer with its sign; the state of a generator has 128."""
 ARRAYS, AXES = 64, 32
 """How many arrays a message may have, and each of them axes."""
 
@@ -86,21 +87,4 @@ def _described(name: str, kind: str, shape: list[int]) -> tuple[str, np.dtype, t
     return name, np.dtype(kind), tuple(shape)
 
 
-def _whole(text: str) -> int:
-    if len(text) > DIGITS:
-        raise ValueError(f"an integer of {len(text)} digits")
-    return int(text)
-
-
-def _real(text: str) -> float:
-    number = float(text[:DIGITS])
-    if len(text) > DIGITS or not math.isfinite(number):
-        raise ValueError(f"the number {text[:DIGITS]} is too great or too long")
-    return number
-
-
-def _refuse(constant: str) -> None:
-    raise ValueError(f"{constant} is not JSON")
-
-
-_DECODER = json.JSONDecoder(parse_constant=_refuse, parse_float=_real, parse_int=_whole)
+_DECODER = decoder(BITS)

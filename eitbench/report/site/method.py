@@ -48,10 +48,9 @@ def _standings(standings: list[tuple[Board, Row]]) -> Table:
         competing = sum(other.competes for other in board.rows)
         rank = row.cells["rank"]
         link = f"../index.html#{board.anchor}" if board.is_aggregate else f"../{board.address}"
-        badges = (*filter(None, row.cells["note"].split(", ")), *["outdated"] * row.outdated)
         cells: dict[str, Cell | str] = {
             "board": Cell(board.title, board.title.casefold(), link=link, small=board.of_class,
-                          badges=badges)}
+                          badges=row.badges)}
         if several:
             cells["version"] = row.cells["version"]
         rows.append(cells | {

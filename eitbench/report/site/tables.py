@@ -80,8 +80,7 @@ def _rank(row: Row, shared: Counter[Any]) -> Cell:
 
 def _method(row: Row, root: str) -> Cell:
     cells = row.cells
-    badges = (*filter(None, cells["note"].split(", ")), *["outdated"] * row.outdated)
-    return Cell(cells["title"], cells["title"].casefold(), small=row.label, badges=badges,
+    return Cell(cells["title"], cells["title"].casefold(), small=row.label, badges=row.badges,
                 link=root + method_address(cells["method"]))
 
 
