@@ -25,11 +25,10 @@ import numpy as np
 from eitbench._files import PACKAGE
 from eitbench.bench.methods import is_ours, is_path
 from eitbench.bench.sandbox import keeper, wire
+from eitbench.bench.sandbox.keeper import Limits
 from eitbench.data.store import CACHE_VARIABLE, cache_folder, folder, kinds
 from eitbench.worlds.registry import entry, registered_by_hand
 
-MEMORY = 8 << 30
-"""bytes of address space that a guest may take"""
 PATIENCE = 600.0
 """s that an answer may take; the first after an episode began may hold all preparations"""
 END = 10.0
@@ -37,6 +36,9 @@ END = 10.0
 MODELS = ("outline.npz", "region.npz", "reduced-*.npz", "joint-*.npz")
 """What the cache holds of a world, made without any episode; the files of an episode begin with its
 seed."""
+_LIMITS = Limits()
+_LONGEST_WORD = 1000
+"""bytes that a keeper says at most"""
 ARITHMETIC = ("OPENBLAS_", "MKL_", "OMP_", "NPY_", "NUMBA_CPU")
 """Variables on which the last bits of numbers depend begin so."""
 
@@ -59,8 +61,8 @@ class Guest:
     name : str
         One of ours, or the path of a .py file or an agent's model.zip. A file that is not ours is
         copied into a folder of the guest's own, which is the only place where it can write.
-    memory : int
-        bytes
+    limits : Limits
+        What it may take, together with all that it starts.
     patience : float
         s
 
@@ -73,15 +75,15 @@ class Guest:
     """
 
     def __init__(self, track: str, id: str, kwargs: dict[str, Any], name: str, *,
-                 memory: int = MEMORY, patience: float = PATIENCE) -> None:
+                 limits: Limits = _LIMITS, patience: float = PATIENCE) -> None:
         self._patience = patience
         self.sha256 = ""
         """Of the file that was copied; empty for one of ours."""
         self._private = Path(tempfile.mkdtemp(prefix="eitbench-guest-"))
         self._process = subprocess.Popen(
-            [sys.executable, "-P", keeper.__file__, str(self._private), str(memory)],
-            # a terminal can be typed into
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+            [sys.executable, "-P", keeper.__file__, str(self._private), *map(str, limits)],
+            # a terminal can be typed into; at the end the keeper says what was too much
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
             start_new_session=True, env=self._surroundings(id, kwargs), cwd=self._private)
         try:
             assert self._process.stdin is not None
@@ -146,7 +148,7 @@ class Guest:
     def close(self) -> None:
         """End it and its children, and remove its folder."""
         self._end()
-        for pipe in (self._process.stdin, self._process.stdout):
+        for pipe in (self._process.stdin, self._process.stdout, self._process.stderr):
             if pipe:
                 pipe.close()
         keeper.remove(str(self._private))
@@ -250,7 +252,12 @@ class Guest:
             raise GuestError(f"ValueError: {error}") from None
 
     def _ended(self) -> GuestError:
-        return GuestError(f"ChildProcessError: its process ended with status {self._end()}, which "
+        status = self._end()
+        assert self._process.stderr is not None
+        os.set_blocking(self._process.stderr.fileno(), False)
+        if said := self._process.stderr.read(_LONGEST_WORD):
+            return GuestError(f"ResourceLimitError: it took {said.decode(errors='replace')}")
+        return GuestError(f"ChildProcessError: its process ended with status {status}, which "
                           "is what a crash does, or a limit of memory")
 
     def _end(self) -> int:
