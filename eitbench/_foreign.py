@@ -24,3 +24,8 @@ def cleaned(text: str, *, lines: bool = False) -> str:
 def as_markdown(text: str) -> str:
     """`cleaned`, and nothing but text in a line of Markdown either."""
     return _OF_MARKDOWN.sub(r"\\\g<0>", cleaned(text))
+
+
+def as_cell(text: str) -> str:
+    """The same in a CSV: a program that opens one takes what begins like this for a formula."""
+    return f"'{text}" if text.startswith(("=", "+", "-", "@")) else text

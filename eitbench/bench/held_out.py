@@ -141,6 +141,9 @@ def held_out(record: dict[str, Any], job: Job, salt: bytes,
     said = [{"status": "ok", "scores": {"error": error}} for error in errors.values()]
     differences = [f"failed in a held-out episode: {result['message']}"
                    for result in (*own, *beside) if result["status"] == "failed"]
+    differences += [f"played with {name} {result[name]}, the record says {record[name]}"
+                    for result in own[:1] + own[-1:] for name in ("method", "method_sha256")
+                    if not is_ours(job.method) and result[name] != record[name]]
     differences += [f"the floor failed in {result['seed']}: {result['message']}"
                     for result in there if result["status"] == "failed"]
     record_pairs = _pairs(said, there)

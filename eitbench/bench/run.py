@@ -20,6 +20,7 @@ from tqdm import tqdm
 
 from eitbench.bench.methods import Method, load_method
 from eitbench.bench.playing import environment, play
+from eitbench.bench.records import SHARED
 from eitbench.bench.sandbox import guests
 from eitbench.bench.sandbox.host import GuestError
 from eitbench.bench.sandbox.wall import landlock_version
@@ -29,6 +30,9 @@ from eitbench.bench.tracks import Environment, board_of
 from eitbench.data.episodes import simulate
 from eitbench.data.parallel import in_parallel
 from eitbench.data.seeds import name_seed
+
+_LASTING = ("environment", "method", *SHARED)
+"""What a method may not change while it is played: its results are kept by it."""
 
 
 class Job(NamedTuple):
@@ -203,6 +207,8 @@ def _run_job(job: Job, store: EpisodeStore, run: dict[str, Any], home: str,
              beginning: dict[str, Any]) -> None:
     try:
         result, fields = run_episode(job)
+        if any(result[name] != beginning[name] for name in _LASTING):
+            raise ValueError(f"{job.method} says other things of itself than before")
     # what could be loaded in the beginning and cannot any more: that, too, is only its own result
     except Exception as error:
         result, fields = beginning | _failure(error), {}

@@ -23,7 +23,8 @@ def parsed(path: Path) -> Any:
         if not stat.S_ISREG(size.st_mode) or size.st_size > MOST_BYTES:
             raise ValueError(f"it is no file of at most {MOST_BYTES >> 20} MiB")
         content = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse,
-                             parse_int=_integer, parse_float=_real)
+                             parse_int=_integer, parse_float=_real,
+                             object_pairs_hook=_object)
         _check_depth(content)
         json.dumps(content, ensure_ascii=False).encode()         # halves of letters are no text
     except (OSError, ValueError, RecursionError) as error:
@@ -40,6 +41,13 @@ def _check_depth(content: Any) -> None:
         if not level:
             return
     raise ValueError(f"lists and objects must lie at most {DEEPEST} deep within each other")
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):  # readers would believe one of them, this program another
+        raise ValueError("an object must have no name twice")
+    return found
 
 
 def _integer(text: str) -> int:

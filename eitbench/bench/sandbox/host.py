@@ -31,6 +31,9 @@ from eitbench.worlds.registry import entry, registered_by_hand
 
 PATIENCE = 600.0
 """s that an answer may take; the first after an episode began may hold all preparations"""
+ENDURANCE = 6 * 3600.0
+"""s that all answers of an episode may take together; else one answer after the other could take
+nearly `PATIENCE`"""
 END = 10.0
 """s that its keeper may take to end it"""
 MODELS = ("outline.npz", "region.npz", "reduced-*.npz", "joint-*.npz")
@@ -77,6 +80,8 @@ class Guest:
     def __init__(self, track: str, id: str, kwargs: dict[str, Any], name: str, *,
                  limits: Limits = _LIMITS, patience: float = PATIENCE) -> None:
         self._patience = patience
+        self._left = ENDURANCE
+        """s that answers may still take in this episode"""
         self.sha256 = ""
         """Of the file that was copied; empty for one of ours."""
         self._private = Path(tempfile.mkdtemp(prefix="eitbench-guest-"))
@@ -107,6 +112,7 @@ class Guest:
     def begin(self, random: np.random.Generator | None = None) -> None:
         """A new episode: another estimator or policy, of the same class; a policy's generator
         draws what this one would."""
+        self._left = ENDURANCE
         state = None if random is None else random.bit_generator.state
         self._ask({"do": "begin", "random": state})
 
@@ -201,9 +207,14 @@ class Guest:
 
     def _ask(self, words: dict[str, Any], arrays: dict[str, np.ndarray] | None = None,
              ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        begin = time.monotonic()
         try:
             self._send(wire.pack(words, arrays))
             answer = self._receive()
+            self._left -= time.monotonic() - begin
+            if self._left < 0.0:
+                raise GuestError("TimeoutError: its answers in one episode took more than "
+                                 f"{ENDURANCE:g} s")
         except BaseException:  # whatever it says from now on would answer another question
             self._end()
             raise
