@@ -32,3 +32,8 @@ def where_of(error: BaseException) -> str:
     """File and line where it was raised, without the folders of this machine."""
     last = traceback.extract_tb(error.__traceback__)[-1]
     return f"{Path(last.filename).name}:{last.lineno}"
+
+
+def as_cell(text: str) -> str:
+    """The same in a CSV: a program that opens one takes what begins like this for a formula."""
+    return f"'{text}" if text.startswith(("=", "+", "-", "@")) else text

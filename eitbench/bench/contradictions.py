@@ -11,6 +11,7 @@ from typing import Any
 
 from eitbench._foreign import cleaned
 from eitbench.bench import tracks
+from eitbench.bench.names import faults
 from eitbench.data.seeds import name_seed, parse_seeds
 
 OURS = re.compile(r"v([1-9][0-9]*)")
@@ -18,8 +19,6 @@ OURS = re.compile(r"v([1-9][0-9]*)")
 LARGEST, SMALLEST = 1e50, 1e-100
 """Between which the sizes of scores and times lie, if they are not zero: their ratios, and the
 squares of those, are finite then."""
-LONGEST_NAME = 100
-"""letters of a method's name, which becomes that of a file"""
 LONGEST_ARGUMENTS = 10_000
 """letters of an environment's arguments as JSON, which become headings"""
 DIGITS = 9
@@ -68,11 +67,7 @@ def _of_the_method(record: dict[str, Any]) -> Iterator[str]:
         yield f"$.version: must have {DIGITS} digits at most"
     elif version != record["method_sha256"][:8] and version_number(version) is None:
         yield "$.version: must be v1, v2, … of ours, or begin as method_sha256 does"
-    for field in ("method", "title"):
-        if cleaned(record[field]) != record[field]:
-            yield f"$.{field}: must have no control characters, and none that turn the text round"
-    if len(record["method"]) > LONGEST_NAME:
-        yield f"$.method: must have {LONGEST_NAME} letters at most"
+    yield from faults(record["method"], record["title"], record["environment"]["id"])
     if record["official"] and any(run["commit"] is None or run["dirty"] for run in record["runs"]):
         yield "$.official: must be false where a run was not of a commit without changes"
 

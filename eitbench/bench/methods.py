@@ -27,6 +27,8 @@ and content."""
 ROLES = (None, "floor", "reference")
 """What a method is on a board: ranked, or a mark from which the others are judged."""
 
+MOST_BYTES = 1 << 28
+"""of a method's file, which is read whole"""
 TITLE = 120
 """letters of a title"""
 PARAMETERS = 10_000
@@ -203,6 +205,8 @@ def find_method(name: str, track: str) -> Path:
     if not path.is_file():
         raise ValueError(f"{form.kind} must be the path of {form.files}, or one of "
                          f"{', '.join([*own, *installed_methods()])}; got {name!r}")
+    if path.stat().st_size > MOST_BYTES:
+        raise ValueError(f"{form.kind} {path} must have {MOST_BYTES >> 20} MiB at most")
     if path.stem in own and not path.samefile(folder / f"{path.stem}.py"):
         raise ValueError(f"{form.kind} {path} has the name of one of ours, under which results are "
                          "kept; rename it")
@@ -283,7 +287,7 @@ def title_of(module: ModuleType, path: Path) -> str:
     """First line of the docstring, up to a colon, bracket or full stop, 120 letters at most;
     without one, the file's name."""
     line = f"{(module.__doc__ or '').strip()}\n".splitlines()[0]
-    return re.split(r"[:(.]", line)[0].strip()[:TITLE] or path.stem
+    return re.split(r"[:(.]", line)[0].strip()[:TITLE].strip() or path.stem
 
 
 def _parameters(who: str, method: type[Any]) -> dict[str, Any]:

@@ -15,8 +15,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from functools import lru_cache
 from itertools import islice
 from pathlib import Path
@@ -28,6 +29,7 @@ from eitbench._files import shipped, write_atomically
 from eitbench._foreign import cleaned
 from eitbench.bench import schema2, tracks
 from eitbench.bench.contradictions import contradictions, version_number
+from eitbench.bench.names import folded
 from eitbench.bench.strict_json import parsed
 
 SCHEMA = 3
@@ -122,7 +124,37 @@ def read_sound_files(folder: Path) -> tuple[dict[Path, dict[str, Any]], list[str
         else:
             warnings.warn(f"record {cleaned(str(path))} is left out: there is no environment "
                           f"{cleaned(id)}", stacklevel=4)
-    return records, complaints
+    clashing = _clashing(records)
+    complaints += [f"record {cleaned(str(path))} {what}" for path, what in clashing.items()]
+    return {path: each for path, each in records.items() if path not in clashing}, complaints
+
+
+def _clashing(records: dict[Path, dict[str, Any]]) -> dict[Path, str]:
+    """Path -> what is wrong, of records that cannot stand beside others of the same folder: they
+    are of the same episodes of one method, of another environment under the same name, or of a
+    method whose name differs from another's for some systems only. Official ones stay, then those
+    of the present format, then older ones."""
+    versions = set[tuple[str, ...]]()
+    given: dict[str, Any] = {}
+    methods: dict[str, str] = {}
+    wrong = {}
+    first = sorted(records.items(), key=lambda pair: (
+        not pair[1]["official"], pair[0].name != file_name(pair[1]), finished(pair[1]),
+        pair[0].name))
+    for path, record in first:
+        environment = record["environment"]
+        key = (*_lineage(record), record["version"])
+        if key in versions:
+            wrong[path] = "is of the same version and the same split as another record"
+        elif given.setdefault(environment["name"], environment["kwargs"]) != environment["kwargs"]:
+            wrong[path] = f"gives other arguments to {environment['name']} than another record"
+        elif (other := methods.setdefault(folded(record["method"]), record["method"])
+              ) != record["method"]:
+            wrong[path] = ("is of a method whose name differs from that of another only as some "
+                           f"systems do not see: {cleaned(record['method'])}, {cleaned(other)}")
+        else:
+            versions.add(key)
+    return wrong
 
 
 def sealed(record: dict[str, Any]) -> dict[str, Any]:
@@ -237,7 +269,15 @@ def _against_the_schema(record: Any) -> list[str]:
 @lru_cache(maxsize=1)
 def _validator() -> Any:
     schema = json.loads((shipped("leaderboards") / "schema.json").read_text(encoding="utf-8"))
-    return jsonschema.Draft202012Validator(schema)
+    strict = jsonschema.validators.extend(jsonschema.Draft202012Validator, {"pattern": _pattern})
+    return strict(schema)
+
+
+def _pattern(_validator: Any, pattern: str, text: Any, _schema: Any) -> Iterator[Exception]:
+    """As the standard has it, where $ is the end; Python's also stands before a last newline."""
+    ending = re.sub(r"\$(?=\)?$)", r"\\Z", pattern)
+    if isinstance(text, str) and not re.search(ending, text):
+        yield jsonschema.ValidationError(f"{text!r} does not match {pattern!r}")
 
 
 def _named_by_content(record: dict[str, Any]) -> str:

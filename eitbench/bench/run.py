@@ -19,6 +19,7 @@ from tqdm import tqdm
 from eitbench._foreign import where_of
 from eitbench.bench.methods import Method, find_method, load_method, version_of
 from eitbench.bench.playing import environment, play
+from eitbench.bench.records import SHARED
 from eitbench.bench.sandbox import guests
 from eitbench.bench.sandbox.host import GuestError
 from eitbench.bench.sandbox.wall import landlock_version
@@ -30,6 +31,9 @@ from eitbench.data.parallel import in_parallel
 from eitbench.data.seeds import name_seed
 from eitbench.data.store import world_digest
 from eitbench.worlds.registry import entry
+
+_LASTING = ("environment", "method", *SHARED)
+"""What a method may not change while it is played: its results are kept by it."""
 
 
 class Job(NamedTuple):
@@ -203,9 +207,10 @@ def _run_job(job: Job, store: EpisodeStore, run: dict[str, Any], home: str,
              beginning: dict[str, Any]) -> None:
     try:
         result, fields = run_episode(job)
-        if result["method_sha256"] == beginning["method_sha256"]:
-            # a world of a script is told apart by the script's file, which this process has not
-            result["identity"] = beginning["identity"]
+        if any(result[name] != beginning[name] for name in _LASTING):
+            raise ValueError(f"{job.method} says other things of itself than before")
+        # a world of a script is told apart by the script's file, which this process has not
+        result["identity"] = beginning["identity"]
     # what could be loaded in the beginning and cannot any more: that, too, is only its own result
     except Exception as error:
         result, fields = beginning | _failure(error), {}

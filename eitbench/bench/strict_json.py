@@ -39,7 +39,14 @@ def decoder(bits: int) -> json.JSONDecoder:
     """Of JSON whose integers have so many bits at most, their sign among them, and whose numbers
     are finite; else it raises a ``ValueError``."""
     return json.JSONDecoder(parse_constant=_refuse, parse_int=partial(_integer, bits),
-                            parse_float=_real)
+                            parse_float=_real, object_pairs_hook=_object)
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):  # readers would believe one of them, this program another
+        raise ValueError("an object must have no name twice")
+    return found
 
 
 def _integer(bits: int, text: str) -> int:

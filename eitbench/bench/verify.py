@@ -42,6 +42,10 @@ def job_of(record: dict[str, Any], file: str | None = None, isolate: str = "alwa
         raise ValueError(f"{record['method']} is none of ours: its file must be given, as "
                          "--baseline or --policy")
     path = find_method(method, environment.track)
+    named = own_files(environment.id).get(record["method"])
+    if is_ours(method) and not (named and path.samefile(named)):
+        raise ValueError(f"{path} is one of ours, and not {record['method']}, of which the record "
+                         "is")
     found = hashlib.sha256(path.read_bytes()).hexdigest()
     if found != record["method_sha256"] and not is_ours(method):
         raise ValueError(f"what the record says cannot be played here: the sha256 of {path.name} "

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
+from eitbench.bench.contradictions import version_number
 from eitbench.bench.records import file_name, finished, newest, read_sound_records
 from eitbench.bench.statistics import (
     interquartile_mean,
@@ -220,7 +221,9 @@ def _counted(played: dict[str, list[Entry]]) -> dict[str, list[Entry]]:
 
 
 def _is_floor(record: dict[str, Any]) -> bool:
-    return bool(record["method"] == FLOORS[track_of_board(record["board"])])
+    """Whether it is of the floor itself: a stranger's file may have its name, not its version."""
+    return (record["method"] == FLOORS[track_of_board(record["board"])]
+            and version_number(record["version"]) is not None)
 
 
 def _aggregate(played: dict[str, list[Entry]]) -> list[dict[str, Any]]:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from eitbench.bench.contradictions import version_number
 from eitbench.bench.records import BOARDS, finished
 from eitbench.bench.scores import scores
 from eitbench.bench.table import NOTHING, Cell, Table
@@ -137,6 +138,7 @@ def _skills(record: dict[str, Any], records: list[dict[str, Any]]) -> dict[str, 
     """
     def of(baseline: str) -> dict[str, float]:
         found = [other for other in records if other["method"] == baseline
+                 and version_number(other.get("version", "v1"))  # not a stranger's of its name
                  and world(other) == world(record) and other["split"] == record["split"]]
         anchor = max(found, default=None, key=lambda other: (
             other["official"], BOARDS.index(other["board"]), finished(other)))

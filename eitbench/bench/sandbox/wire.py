@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import struct
 from collections.abc import Callable
 from typing import Any
@@ -20,8 +21,8 @@ HEAD = 1 << 20
 """bytes of a message's JSON"""
 VALUES = 50_000
 """How many commas and opening brackets the JSON may have, which bounds what it costs to parse."""
-KINDS = "biuf"
-"""Of numbers in arrays."""
+KIND = re.compile(r"[<>|][biuf](1|2|4|8|12|16)")
+"""Of numbers in arrays; numpy would take other words for programs."""
 BITS = 132
 """Of an integer with its sign; the state of a generator has 128."""
 ARRAYS, AXES = 64, 32
@@ -53,10 +54,13 @@ def unpack(read: Callable[[int], bytes]) -> tuple[dict[str, Any], dict[str, np.n
     arrays = {}
     for name, kind, shape in kinds:
         size = math.prod(shape) * kind.itemsize
-        if kind.kind not in KINDS or at + size > body:
+        if at + size > body:
             raise ValueError(f"array {name!r} of a message must hold numbers that are there; got "
                              f"{kind}, {shape}")
-        arrays[name] = np.frombuffer(content, kind, math.prod(shape), at).reshape(shape).copy()
+        array = np.frombuffer(content, kind, math.prod(shape), at).reshape(shape).copy()
+        if kind.kind == "b" and (array.view(np.uint8) > 1).any():
+            raise ValueError(f"array {name!r} of a message must hold true and false only")
+        arrays[name] = array
         at += size
     if not isinstance(words, dict) or at != body:
         raise ValueError("a message must be a dictionary and its arrays, and nothing else")
@@ -79,7 +83,7 @@ def _parsed(head: bytes) -> tuple[Any, list[Any]]:
 
 def _described(name: str, kind: str, shape: list[int]) -> tuple[str, np.dtype, tuple[int, ...]]:
     """An entry of the layout."""
-    is_one = isinstance(name, str) and isinstance(kind, str) and len(kind) < 8
+    is_one = isinstance(name, str) and isinstance(kind, str) and KIND.fullmatch(kind)
     if not is_one or len(shape) > AXES:
         raise ValueError("an array must have a name, a type and a shape")
     for n in shape:

@@ -14,7 +14,7 @@ from typing import Any
 import pandas as pd
 
 from eitbench._files import replace_folder
-from eitbench._foreign import as_markdown
+from eitbench._foreign import as_cell, as_markdown
 from eitbench.bench.records import file_name, newest
 from eitbench.report.boards import boards, meanings
 from eitbench.report.site.collect import about_season, collect
@@ -87,8 +87,9 @@ def render(records: list[dict[str, Any]], table: pd.DataFrame | None = None) -> 
     if outdated := newest(records)[1]:
         parts += ["## Outdated records", "Made by an earlier version of the method.\n\n"
                   + "\n".join(f"- {as_markdown(file_name(record))}" for record in outdated)]
-    return {"leaderboard.csv": found.to_csv(index=False, float_format="%.6g", lineterminator="\n"),
-            "leaderboard.md": "\n\n".join(parts) + "\n"}
+    texts = {name: found[name].map(as_cell) for name in ("environment", "method", "title")}
+    plain = found.assign(**texts).to_csv(index=False, float_format="%.6g", lineterminator="\n")
+    return {"leaderboard.csv": plain, "leaderboard.md": "\n\n".join(parts) + "\n"}
 
 
 def read_media(folder: Path) -> dict[str, bytes]:
