@@ -24,10 +24,11 @@ from typing import Any
 
 import jsonschema
 
-from eitbench._files import shipped, write_atomically
+from eitbench._files import write_atomically
 from eitbench._foreign import cleaned
 from eitbench.bench import schema2, tracks
 from eitbench.bench.contradictions import contradictions, version_number
+from eitbench.bench.quick import fits, quickly, schema_text
 from eitbench.bench.strict_json import parsed
 
 SCHEMA = 3
@@ -66,6 +67,21 @@ def read_record(path: Path) -> dict[str, Any]:
 
 def _read(path: Path) -> dict[str, Any]:
     """As `read_record`; what is wrong, without the file's name."""
+    record = quickly(path, SCHEMA)
+    name = None
+    if record is None or _too_many(record):
+        record, name = _carefully(path)
+    else:
+        _refuse(contradictions(record))
+    name = name or file_name(record)
+    if path.name != name:
+        raise ValueError(f"must have the name {name}, as its content asks for")
+    return record
+
+
+def _carefully(path: Path) -> tuple[dict[str, Any], str | None]:
+    """A valid record, and the name that its file must have if the record is of the format
+    before."""
     record = parsed(path)
     written = record
     name = None
@@ -76,10 +92,7 @@ def _read(path: Path) -> dict[str, Any]:
     if written.get("sha256") != sealed(written)["sha256"]:
         raise ValueError("was changed since it was written: its sha256 is no longer that of its "
                          "content")
-    name = name or file_name(record)
-    if path.name != name:
-        raise ValueError(f"must have the name {name}, as its content asks for")
-    return record
+    return record, name
 
 
 def read_records(folder: Path) -> list[dict[str, Any]]:
@@ -119,12 +132,13 @@ def sealed(record: dict[str, Any]) -> dict[str, Any]:
     """The record with the ``sha256`` of its content: canonical JSON of all other fields."""
     content = {key: value for key, value in record.items() if key != "sha256"}
     try:
-        content = json.loads(_json(content))
-        text = _json(content, separators=(",", ":")).encode()
+        text = _json(content, separators=(",", ":"))
+        content = json.loads(text)
+        digest = hashlib.sha256(text.encode()).hexdigest()
     # NaN, or something that is no JSON at all, or too deep
     except (TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"record cannot be written as JSON: {error}") from None
-    return content | {"sha256": hashlib.sha256(text).hexdigest()}
+    return content | {"sha256": digest}
 
 
 def file_name(record: dict[str, Any]) -> str:
@@ -179,7 +193,11 @@ def _lineage(record: dict[str, Any]) -> tuple[str, ...]:
 
 def _check(record: Any) -> None:
     """``ValueError`` naming fields if a record breaks the schema or contradicts itself."""
-    wrong = _too_many(record) or _against_the_schema(record) or contradictions(record)
+    _refuse(_too_many(record) or _against_the_schema(record) or contradictions(record))
+
+
+def _refuse(wrong: list[str]) -> None:
+    """``ValueError`` that says what is wrong, if anything is."""
     if wrong:
         raise ValueError("is not valid: " + "; ".join(map(_shortened, wrong[:5])))
 
@@ -194,6 +212,8 @@ def _too_many(record: Any) -> list[str]:
 
 
 def _against_the_schema(record: Any) -> list[str]:
+    if fits(record):
+        return []
     errors = list(islice(_validator().iter_errors(record), 20))
     return [f"{error.json_path}: {_shortened(error.message)}"
             for error in sorted(errors, key=lambda error: error.json_path)]
@@ -201,8 +221,7 @@ def _against_the_schema(record: Any) -> list[str]:
 
 @lru_cache(maxsize=1)
 def _validator() -> Any:
-    schema = json.loads((shipped("leaderboards") / "schema.json").read_text(encoding="utf-8"))
-    return jsonschema.Draft202012Validator(schema)
+    return jsonschema.Draft202012Validator(json.loads(schema_text()))
 
 
 def _named_by_content(record: dict[str, Any]) -> str:

@@ -24,14 +24,14 @@ def parsed(path: Path) -> Any:
             raise ValueError(f"it is no file of at most {MOST_BYTES >> 20} MiB")
         content = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse,
                              parse_int=_integer, parse_float=_real)
-        _check_depth(content)
+        check_depth(content)
         json.dumps(content, ensure_ascii=False).encode()         # halves of letters are no text
     except (OSError, ValueError, RecursionError) as error:
         raise ValueError(f"cannot be read: {error}") from None
     return content
 
 
-def _check_depth(content: Any) -> None:
+def check_depth(content: Any) -> None:
     """``ValueError`` if lists and objects lie deeper within each other than `DEEPEST`."""
     level = [content]
     for _ in range(DEEPEST):

@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
+from eitbench.bench.ranking import shared_ranks
 from eitbench.bench.records import file_name, finished, newest, read_sound_records
 from eitbench.bench.statistics import (
     interquartile_mean,
     mean_over_environments,
-    shared_ranks,
     stratified_bootstrap,
 )
 from eitbench.bench.text import scores_by_seed, seed_ranges
