@@ -16,7 +16,7 @@ from __future__ import annotations
 import hashlib
 import json
 import warnings
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import lru_cache
 from itertools import islice
 from pathlib import Path
@@ -95,19 +95,21 @@ def _carefully(path: Path) -> tuple[dict[str, Any], str | None]:
     return record, name
 
 
-def read_records(folder: Path) -> list[dict[str, Any]]:
+def read_records(folder: Path, *, keep: Callable[[dict[str, Any]], Any] = dict) -> list[Any]:
     """All records of a folder, by file name; none if there is no such folder. Records of an
     environment that is not registered, or no longer in that version, are left out with a warning.
+    Of many thousands ``keep`` may leave out what nobody asks for, one by one.
 
     ``ValueError``, naming all of them, if some are not as `read_record` asks for.
     """
-    records, complaints = read_sound_records(folder)
+    records, complaints = read_sound_records(folder, keep=keep)
     if complaints:
         raise ValueError("; ".join(complaints))
     return records
 
 
-def read_sound_records(folder: Path) -> tuple[list[dict[str, Any]], list[str]]:
+def read_sound_records(folder: Path, *, keep: Callable[[dict[str, Any]], Any] = dict,
+                       ) -> tuple[list[Any], list[str]]:
     """As `read_records`, but those that are not valid are left out, with a sentence for each that
     names the file."""
     records = []
@@ -121,7 +123,7 @@ def read_sound_records(folder: Path) -> tuple[list[dict[str, Any]], list[str]]:
             continue
         id = record["environment"]["id"]
         if id in known:
-            records.append(record)
+            records.append(keep(record))
         else:
             warnings.warn(f"record {cleaned(str(path))} is left out: there is no environment "
                           f"{cleaned(id)}", stacklevel=3)
@@ -132,13 +134,12 @@ def sealed(record: dict[str, Any]) -> dict[str, Any]:
     """The record with the ``sha256`` of its content: canonical JSON of all other fields."""
     content = {key: value for key, value in record.items() if key != "sha256"}
     try:
-        text = _json(content, separators=(",", ":"))
-        content = json.loads(text)
-        digest = hashlib.sha256(text.encode()).hexdigest()
+        content = json.loads(_json(content))
+        text = _json(content, separators=(",", ":")).encode()
     # NaN, or something that is no JSON at all, or too deep
     except (TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"record cannot be written as JSON: {error}") from None
-    return content | {"sha256": digest}
+    return content | {"sha256": hashlib.sha256(text).hexdigest()}
 
 
 def file_name(record: dict[str, Any]) -> str:

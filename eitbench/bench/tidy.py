@@ -20,7 +20,8 @@ _OF_EPISODES = COLUMNS[10:12]
 
 def tidy(folder: Path | str | None = None) -> pd.DataFrame:
     """The table; `eitbench.bench.load` says what is in it."""
-    groups = newest(read_records(Path(folder or shipped("leaderboards") / "results")))
+    path = Path(folder or shipped("leaderboards") / "results")
+    groups = newest(read_records(path, keep=_without_steps))
     records: list[tuple[Any, ...]] = []
     episodes: list[tuple[str, str]] = []
     record_of: list[int] = []
@@ -59,3 +60,10 @@ def _scores(episode: dict[str, Any]) -> dict[str, float]:
         return {"error": math.nan}
     scores = episode["scores"] | {"peak_memory": episode["peak_memory"]}
     return {metric: value for metric, value in scores.items() if value is not None}
+
+
+def _without_steps(record: dict[str, Any]) -> dict[str, Any]:
+    """The error of each step is most of a record, and in no row."""
+    for episode in record["episodes"]:
+        episode.pop("step_errors", None)
+    return record

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from eitbench.bench.ranking import shared_ranks
 from eitbench.bench.statistics import (
     interquartile_mean,
     mean_over_environments,
     paired_difference,
     paired_probability_of_improvement,
     probability_of_improvement,
-    shared_ranks,
     stratified_bootstrap,
     tail,
 )
