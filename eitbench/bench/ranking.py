@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from itertools import combinations, product
+from typing import Any
 
 import numpy as np
 
@@ -112,12 +113,9 @@ def _significant(scores: Mapping[str, Scores], methods: list[str], statistic: St
         left += [(members[i], members[j]) for i, j in found[2]]
     for i, j in left:
         first, second = methods[i], methods[j]
-        _, low, high = paired_difference(scores[first], scores[second], statistic=statistic,
-                                         draws=draws, seed=seed)
-        lower[second] += high < 0
-        higher[first] += high < 0
-        lower[first] += low > 0  # happens where each has episodes that the other has not
-        higher[second] += low > 0
+        three = paired_difference(scores[first], scores[second], statistic=statistic, draws=draws,
+                                  seed=seed)
+        _note(lower, higher, first, second, three[1:])
     return lower, higher
 
 
@@ -127,7 +125,19 @@ def _by_means(own: list[list[np.ndarray]], draws: int, seed: int) -> Found:
     shares = np.repeat([1.0 / (n * len(sizes)) for n in sizes], sizes)
     weights = (drawn_counts(sizes, draws, seed) * shares).T.astype(np.float32, order="C")
     scores = np.array([np.concatenate(strata) for strata in own])
-    return compare_means(scores, np.cumsum([0, *sizes]), weights, *_places(sizes, draws))
+    lower, higher, unsure = compare_means(scores, np.cumsum([0, *sizes]), weights,
+                                          *_places(sizes, draws))
+    drawn = drawn_counts(sizes, draws, seed) * shares
+    left = []
+    for i, j in unsure:
+        apart = [np.sort(ours - theirs) for ours, theirs in zip(own[i], own[j], strict=True)]
+        ends = np.percentile(drawn @ np.concatenate(apart), [tail(sizes), 100.0 - tail(sizes)])
+        # what the sums in means of so many scores may be wrong by
+        if np.abs(ends).min() <= 1e-15 * scores.shape[1] * np.abs(scores[[i, j]]).max():
+            left.append((i, j))
+        else:
+            _note(lower, higher, i, j, ends)
+    return lower, higher, left
 
 
 def _by_resamples(own: list[list[np.ndarray]], statistic: Statistic, draws: int,
@@ -138,15 +148,20 @@ def _by_resamples(own: list[list[np.ndarray]], statistic: Statistic, draws: int,
     values = np.array([resampled_values(strata, statistic, draws, seed) for strata in own])
     lower, higher, unsure = compare_resamples(values, *_places(sizes, draws))
     for i, j in unsure:                               # an end lies between two resamples
-        low, high = np.percentile(values[i] - values[j], [tail(sizes), 100.0 - tail(sizes)])
-        lower[j] += high < 0
-        higher[i] += high < 0
-        lower[i] += low > 0
-        higher[j] += low > 0
+        ends = np.percentile(values[i] - values[j], [tail(sizes), 100.0 - tail(sizes)])
+        _note(lower, higher, i, j, ends)
     return lower, higher, []
 
 
-def _places(sizes: Sequence[int], draws: int) -> tuple[int, int]:
+def _note(lower: Any, higher: Any, first: Any, second: Any, ends: Any) -> None:
+    """Count a pair whose difference has an interval with these ends."""
+    lower[second] += ends[1] < 0
+    higher[first] += ends[1] < 0
+    lower[first] += ends[0] > 0  # happens where each has episodes that the other has not
+    higher[second] += ends[0] > 0
+
+
+def _places(sizes: tuple[int, ...], draws: int) -> tuple[int, int]:
     """The resamples, in ascending order and counted from 0, at which an interval's ends are or
     after which they come."""
     cut = tail(sizes)

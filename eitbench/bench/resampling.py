@@ -71,6 +71,24 @@ def _repeated(values, order, drawn, begin, end):
 
 
 @njit(cache=True)
+def _add(sums, times, row):
+    """sums += times · row, side by side in vector registers."""
+    for k in range(len(row)):
+        sums[k] += times * row[k]
+
+
+@njit(cache=True)
+def _outside(sums, edge):
+    """How many lie below −edge, and how many above it."""
+    below = np.int32(0)
+    above = np.int32(0)
+    for k in range(len(sums)):
+        below += np.int32(sums[k] < -edge)
+        above += np.int32(sums[k] > edge)
+    return below, above
+
+
+@njit(cache=True)
 def compare_means(scores, starts, weights, low_place, high_place):
     """Which methods have significantly lower means than others, pair by pair.
 
@@ -136,12 +154,10 @@ def compare_means(scores, starts, weights, low_place, high_place):
                 size = min(BLOCK, draws - begin)
                 sums[:] = 0.0
                 for p in range(n):
-                    times = single[p]
-                    for k in range(size):
-                        sums[k] += times * weights[p, begin + k]
-                for k in range(size):
-                    below += sums[k] < -edge
-                    above += sums[k] > edge
+                    _add(sums, single[p], weights[p, begin:begin + size])
+                low, high = _outside(sums[:size], edge)
+                below += low
+                above += high
                 if above > draws - high_place and below > low_place + 2:
                     break
             else:

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -228,7 +229,8 @@ def resampled_values(strata: Sequence[np.ndarray], statistic: Statistic, draws: 
     return values
 
 
-def tail(sizes: Sequence[int]) -> float:
+@lru_cache(maxsize=256)
+def tail(sizes: tuple[int, ...]) -> float:
     """Percent of the resamples to leave out at each end for an interval of 95 %, with so many
     episodes in each stratum.
 

@@ -20,7 +20,15 @@ from eitbench.bench.statistics import (
 from eitbench.bench.text import scores_by_seed, seed_ranges
 from eitbench.bench.tracks import CLASSES, FLOORS, ids, named, track_of_board
 from eitbench.bench.tracks import class_of as class_of_board
-from eitbench.report.summary import columns, explanations, place_of_world, summary_row, world
+from eitbench.report.summary import (
+    Anchors,
+    anchors,
+    columns,
+    explanations,
+    place_of_world,
+    summary_row,
+    world,
+)
 
 ALL = "all"
 """Stands for the environment in the rows of an aggregate."""
@@ -114,6 +122,7 @@ def boards(records: list[dict[str, Any]]) -> pd.DataFrame:
     current, _ = newest(records)
     registered = {named(id, {}) for id in ids()}
     products = _matrix_products(current)
+    known = anchors(current)
     rows: list[dict[str, Any]] = []
     for name in CLASSES:
         members = [record for record in current if class_of(record) == name]
@@ -123,7 +132,7 @@ def boards(records: list[dict[str, Any]]) -> pd.DataFrame:
                                          if record["environment"]["name"] == environment])
                   for _, environment in environments}
         for environment, entries in played.items():
-            rows += _board(environment, entries, current, products)
+            rows += _board(environment, entries, known, products)
         rows += _aggregate(_counted({environment: entries for environment, entries in played.items()
                                      if environment in registered}))
     types: dict[str, Any] = dict.fromkeys([*_NUMBERS, *others(), *_AFTER], float)
@@ -189,7 +198,7 @@ def _entries(records: list[dict[str, Any]]) -> list[Entry]:
     return entries
 
 
-def _board(environment: str, entries: list[Entry], current: list[dict[str, Any]],
+def _board(environment: str, entries: list[Entry], known: Anchors,
            products: dict[str, float]) -> list[dict[str, Any]]:
     """Rows of one environment, by their mean error; after them who has not finished every
     episode."""
@@ -198,7 +207,7 @@ def _board(environment: str, entries: list[Entry], current: list[dict[str, Any]]
     rows = []
     for entry in sorted(entries, key=_place):
         record = entry.record
-        summarised = summary_row(record, current)
+        summarised = summary_row(record, known)
         means = {name: summarised[name] and summarised[name][0] for name in others()}
         rows.append(_row(entry, environment, ranks.get(entry.label)) | {
             "seeds": seed_ranges(record["seeds"]),

@@ -65,7 +65,8 @@ def test_differences_that_rounding_decides():
     base = random.lognormal(size=10)
     rows = {"a": base, "b": base * (1 + 1e-16), "c": np.nextafter(base, 2), "d": base + 1e-13 * random.normal(size=10),
             "e": base + np.array([1e-9, -1e-9] * 5), "f": base + np.eye(10)[3], "g": base - 1e-7}
-    scores = {name: {"pipe": {f"test:{i}": value for i, value in enumerate(row.tolist())}} for name, row in rows.items()}
+    scores = {name: {"pipe": {f"test:{i}": value for i, value in enumerate(row.tolist())}}
+              for name, row in rows.items()}
     assert shared_ranks(scores, draws=DRAWS) == plain_ranks(scores)
 
 
@@ -83,5 +84,5 @@ def test_of_many_a_resample_is_the_same_for_all(monkeypatch):
                                            for name, positions in zip(names, drawn, strict=True)))
               for method, own in scores.items()}
     for method in scores:
-        highs = [np.percentile(values[other] - values[method], 100 - tail(sizes)) for other in scores]
+        highs = [np.percentile(values[other] - values[method], 100 - tail(tuple(sizes))) for other in scores]
         assert found[method] == 1 + sum(high < 0 for high in highs)
