@@ -14,7 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from eitbench.bench.resampling import Found, compare_means, compare_resamples, drawn_counts
+from eitbench.bench.resampling import (
+    Found,
+    compare_means,
+    compare_resamples,
+    drawn_counts,
+    drawn_reach,
+)
 from eitbench.bench.statistics import (
     DRAWS,
     Scores,
@@ -125,7 +131,8 @@ def _by_means(own: list[list[np.ndarray]], draws: int, seed: int) -> Found:
     shares = np.repeat([1.0 / (n * len(sizes)) for n in sizes], sizes)
     weights = (drawn_counts(sizes, draws, seed) * shares).T.astype(np.float32, order="C")
     scores = np.array([np.concatenate(strata) for strata in own])
-    lower, higher, unsure = compare_means(scores, np.cumsum([0, *sizes]), weights,
+    reach = drawn_reach(sizes[0], draws, seed)
+    lower, higher, unsure = compare_means(scores, np.cumsum([0, *sizes]), weights, reach,
                                           *_places(sizes, draws))
     drawn = drawn_counts(sizes, draws, seed) * shares
     left = []

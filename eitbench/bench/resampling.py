@@ -7,6 +7,7 @@ left out here is left out because its outcome is certain.
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 
 import numpy as np
@@ -19,9 +20,21 @@ BLOCK = 500
 """Resamples that are looked at before it is asked whether a pair is decided."""
 
 
-@lru_cache(maxsize=32)
+KEPT = 300
+"""Draws of so many episodes are kept for the next board of that size."""
+
+
 def drawn_positions(sizes: tuple[int, ...], draws: int, seed: int) -> tuple[np.ndarray, ...]:
     """For each stratum of n_e episodes which of them are in each resample: (draws, n_e) each."""
+    return (_kept_positions if sum(sizes) <= KEPT else _positions)(sizes, draws, seed)
+
+
+def drawn_counts(sizes: tuple[int, ...], draws: int, seed: int) -> np.ndarray:
+    """How often each episode is in each resample: (draws, Σ n_e), stratum by stratum."""
+    return (_kept_counts if sum(sizes) <= KEPT else _counts)(sizes, draws, seed)
+
+
+def _positions(sizes: tuple[int, ...], draws: int, seed: int) -> tuple[np.ndarray, ...]:
     random = np.random.default_rng(seed)
     positions = tuple(random.integers(n, size=(draws, n)) for n in sizes)
     for each in positions:
@@ -29,12 +42,28 @@ def drawn_positions(sizes: tuple[int, ...], draws: int, seed: int) -> tuple[np.n
     return positions
 
 
-@lru_cache(maxsize=32)
-def drawn_counts(sizes: tuple[int, ...], draws: int, seed: int) -> np.ndarray:
-    """How often each episode is in each resample: (draws, Σ n_e), stratum by stratum."""
+def _counts(sizes: tuple[int, ...], draws: int, seed: int) -> np.ndarray:
     each = [counts(positions) for positions in drawn_positions(sizes, draws, seed)]
     made = np.concatenate(each, axis=-1).astype(np.int16)
     made.setflags(write=False)
+    return made
+
+
+_kept_positions = lru_cache(maxsize=16)(_positions)
+_kept_counts = lru_cache(maxsize=16)(_counts)
+
+
+def drawn_reach(n: int, draws: int, seed: int) -> np.ndarray:
+    """In how many resamples of n episodes at least c of the first, and of the last, k are drawn:
+    (2, n, n + 1), by k and c; of very many none."""
+    if n > KEPT:
+        return np.zeros((2, 0, 0), np.int64)
+    made = np.zeros((2, n, n + 1), np.int64)
+    drawn = drawn_counts((n,), draws, seed)
+    for side, each in enumerate((drawn, drawn[:, ::-1])):
+        for k in range(1, n):
+            how_many = np.bincount(each[:, :k].sum(axis=-1), minlength=n + 1)
+            made[side, k] = how_many[::-1].cumsum()[::-1]
     return made
 
 
@@ -78,6 +107,27 @@ def _add(sums, times, row):
 
 
 @njit(cache=True)
+def _is_below(apart, tiny, reach, allowed):
+    """Whether all but so many resamples of sorted differences surely have a mean below zero.
+
+    No mean is above what it would be if the k largest differences were all the largest, and the
+    others the largest of these. That depends on how many of the k are drawn, and ``reach[k, c]`` is
+    in how many resamples these are at least c.
+    """
+    n = len(apart)
+    for k in range(1, n):
+        others = apart[n - 1 - k] + tiny
+        if others < 0.0:
+            most = apart[n - 1] + tiny
+            if most <= 0.0:
+                return True
+            count = math.ceil(n * others / (others - most) * (1.0 - 1e-12))
+            if reach[k, min(max(count, 0), n)] <= allowed:
+                return True
+    return False
+
+
+@njit(cache=True)
 def _outside(sums, edge):
     """How many lie below −edge, and how many above it."""
     below = np.int32(0)
@@ -89,7 +139,7 @@ def _outside(sums, edge):
 
 
 @njit(cache=True)
-def compare_means(scores, starts, weights, low_place, high_place):
+def compare_means(scores, starts, weights, reach, low_place, high_place):
     """Which methods have significantly lower means than others, pair by pair.
 
     A pair's differences are sorted within each stratum; the mean of a resample is their sum, each
@@ -105,6 +155,8 @@ def compare_means(scores, starts, weights, low_place, high_place):
         Where each stratum begins, and where the last ends.
     weights : (n, draws), single precision
         Of each episode in each resample; they sum to one.
+    reach : (2, n, n + 1)
+        Of a single stratum `drawn_reach`; of several without effect.
     low_place, high_place : int
         Counted from 0.
 
@@ -147,6 +199,15 @@ def compare_means(scores, starts, weights, low_place, high_place):
             for stratum in range(len(starts) - 1):
                 apart[starts[stratum]:starts[stratum + 1]].sort()
             single[:] = apart
+            if len(starts) == 2 and reach.size:
+                if _is_below(apart, tiny, reach[1], draws - high_place - 3):
+                    lower[j] += 1
+                    higher[i] += 1
+                    continue
+                if _is_below(-apart[::-1], tiny, reach[0], low_place - 1):
+                    lower[i] += 1
+                    higher[j] += 1
+                    continue
             edge = np.float32(1.001 * (tiny + (n + 4.0) * 6e-8 * max(-least, most)))
             below = 0
             above = 0
