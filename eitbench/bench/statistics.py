@@ -25,8 +25,10 @@ from scipy.stats import norm
 from scipy.stats import t as student
 
 from eitbench.bench.resampling import (
+    KEPT,
     counts,
     drawn_counts,
+    drawn_middles,
     drawn_positions,
     middles,
 )
@@ -218,6 +220,9 @@ def resampled_values(strata: Sequence[np.ndarray], statistic: Statistic, draws: 
     """(draws,): a statistic of resamples of each stratum (n_e,)."""
     sizes = sizes_of(strata)
     if statistic is interquartile_mean:               # the same number, without sorting each
+        (first, *others) = strata
+        if not others and len(first) <= KEPT and (first[:-1] <= first[1:]).all():
+            return first[drawn_middles(len(first), draws, seed)].mean(axis=-1)
         pooled = np.concatenate(strata)
         return middles(pooled, drawn_counts(sizes, draws, seed)).mean(axis=-1)
     positions = drawn_positions(sizes, draws, seed)
