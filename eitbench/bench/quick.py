@@ -33,13 +33,13 @@ def quickly(path: Path, schema: int) -> dict[str, Any] | None:
     """The record of a file if its text is as `records.write_record` writes it, fits the schema of
     this number and has the digest that it says; None if that is not certain.
 
-    What its fields say together is not looked at. ``OSError`` if there is no such file.
+    What its fields say together is not looked at.
     """
-    size = os.stat(path)
-    if not stat.S_ISREG(size.st_mode) or size.st_size > MOST_BYTES:
-        return None
-    data = path.read_bytes()
     try:
+        size = os.stat(path)
+        if not stat.S_ISREG(size.st_mode) or size.st_size > MOST_BYTES:
+            return None
+        data = path.read_bytes()
         record = orjson.loads(data)
         if not isinstance(record, dict) or record.get("schema") != schema or not fits(record):
             return None
@@ -47,7 +47,7 @@ def quickly(path: Path, schema: int) -> dict[str, Any] | None:
             _check.nesting(name, record[name], DEEPEST - 1)
         # integers of more than 53 bits are for the careful way
         text = orjson.dumps(record, option=orjson.OPT_SORT_KEYS | orjson.OPT_STRICT_INTEGER)
-    except (TypeError, ValueError):
+    except (OSError, TypeError, ValueError):
         return None
     text = _SMALL.sub(lambda found: repr(float(found[0])).encode(), text)
     text = _TINY.sub(rb"e-0\1", text)
