@@ -255,7 +255,7 @@ def test_mistyped_records_delete_nothing(tmp_path):
     (tmp_path / "none").mkdir()
     write_record(tmp_path / "results", record("homogeneous", [0.2, 0.3]))
     for records, message in (("result", "records must be a folder that exists, got result"),
-                             ("none", "records must be a folder with records of test seeds, got none, where there are none"),
+                             ("none", "with records of test seeds, got none, where there are none"),
                              ("results", "folder must be empty or hold a site of the leaderboards")):
         code, _, complaint = eitbench("leaderboard", "--records", records)
         assert code == 2 and message in complaint
@@ -314,7 +314,7 @@ def test_from_a_file_to_the_boards_by_command(tmp_path):
     (["submit", "--baseline", "homogeneous"], "env must name at least one environment"),
     (["submit", "--env", INJECTION, "--baseline", "homogeneous"], "does not ask for estimates"),
     (["submit", "--env", FILTER.id, "--policy", "adjacent"], "env must be one of eitbench/Pipe2DInjection-v0"),
-    (["submit", "--env", FILTER.id, "--baseline", "homogeneous", "--seeds", "dev:0"], "must be of the season's split test"),
+    (["submit", "--env", FILTER.id, "--baseline", "homogeneous", "--seeds", "dev:0"], "of the season's split test"),
     (["compare", "mine", "yours"], "there is no record of mine in leaderboards/results"),
     (["compare", "mine.json", "yours"], "record mine.json cannot be read"),
 ])
