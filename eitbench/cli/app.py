@@ -1,5 +1,5 @@
 """The command line: `eitbench list | run | bank | train | policies | submit | verify | check |
-season | held-out | migrate | cards | leaderboard | compare | render | reproduce`."""
+season | held-out | migrate | cards | kits | leaderboard | compare | render | reproduce`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import typer
 
 from eitbench._foreign import cleaned
 from eitbench.cli import options
-from eitbench.cli.maintain import cards, held_out, migrate
+from eitbench.cli.maintain import cards, held_out, kits, migrate
 from eitbench.cli.season import app as season_commands
 from eitbench.cli.studies import thesis
 from eitbench.cli.trust import check, verify
@@ -242,6 +242,7 @@ app.add_typer(season_commands, name="season")
 app.command("held-out")(held_out)
 app.command()(migrate)
 app.command()(cards)
+app.command()(kits)
 
 
 @app.command()
