@@ -14,6 +14,7 @@ import numpy as np
 from tqdm import tqdm
 
 from eitbench import _check
+from eitbench._notice import Wait
 from eitbench.data import store
 from eitbench.worlds.instrument import Faults
 from eitbench.worlds.parts import Discretisation
@@ -21,6 +22,8 @@ from eitbench.worlds.streams import randomness
 from eitbench.worlds.world import World
 
 Made = TypeVar("Made")
+BEFOREHAND = "`eitbench bank --env ID --seeds train:0-99` makes episodes beforehand"
+"""What to say to those who wait for one."""
 
 
 class Episode(NamedTuple):
@@ -57,7 +60,7 @@ def simulate(world: World, seed: int, *, cache: bool = True, progress: bool = Tr
         folder). A file that is damaged or of another seed is replaced; files of other versions stay
         beside it.
     progress : bool
-        Show a progress bar, on a terminal only.
+        Show a progress bar, on a terminal only, and say what takes longer than two seconds.
     """
     seed = _check.integer("seed", seed, low=0)
 
@@ -96,12 +99,19 @@ def simulate_together(world: World, seeds: Sequence[int],
     truth = truth_discretisation(world)
     label = f"simulating {world.name}, seed {', '.join(map(str, seeds))}"
     electrodes = truth.observation.cem.n_electrodes
-    with tqdm(total=(world.lead_in + 2 * world.n_steps) * len(seeds), desc=label, unit="step",
-              leave=False, disable=None if progress else True) as bar:
+    total = (world.lead_in + 2 * world.n_steps) * len(seeds)
+    wait = Wait(label, total, BEFOREHAND)
+    with tqdm(total=total, desc=label, unit="step", leave=False,
+              disable=None if progress else True) as bar:
+        def tick(steps: int) -> None:
+            bar.update(steps)
+            if progress:
+                wait.tick(steps)
+
         streams = [randomness(seed) for seed in seeds]
-        for history, random in zip(world.evolve(streams, truth, bar.update), streams, strict=True):
+        for history, random in zip(world.evolve(streams, truth, tick), streams, strict=True):
             noise = random.noise.standard_normal((world.n_steps, electrodes))
             resistance = truth.observation.transfer_resistance(history.concentration[1:])
-            bar.update(world.n_steps)
+            tick(world.n_steps)
             concentration = history.concentration.astype(np.float32)
             yield Episode(concentration, resistance, noise, history.velocity)

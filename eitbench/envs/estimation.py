@@ -12,6 +12,7 @@ from gymnasium import spaces
 from gymnasium.utils import EzPickle
 
 from eitbench import _check
+from eitbench.data.pool import Pool
 from eitbench.data.recordings import cycle_voltages, outline, recording, step_error, velocity_error
 from eitbench.data.regions import integrals, score_mass
 from eitbench.data.seeds import warn_of_reserved
@@ -65,8 +66,9 @@ class EstimationEnv(gym.Env[Observation, np.ndarray], EzPickle):
         See `Task`; default: that of the id.
     assume : dict, optional
         What the task's model wrongly believes of the flow; see `World.model`.
-    episodes : int
-        How many training episodes an unseeded ``reset`` draws from.
+    episodes : int, optional
+        How many training episodes an unseeded ``reset`` draws from. Default: 1 for four resets,
+        then 8, then more as resets go on, up to 1000; see `eitbench.data.pool.Pool`.
     render_mode : None or "rgb_array"
     """
 
@@ -74,14 +76,15 @@ class EstimationEnv(gym.Env[Observation, np.ndarray], EzPickle):
 
     def __init__(self, name: str, *, world: dict[str, Any] | None = None,
                  lag: int | str | None = None, assume: dict[str, Any] | None = None,
-                 episodes: int = 1000, render_mode: str | None = None) -> None:
+                 episodes: int | None = None, render_mode: str | None = None) -> None:
         EzPickle.__init__(self, name, world=world, lag=lag, assume=assume, episodes=episodes,
                           render_mode=render_mode)
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError("render_mode must be None or one of "
                              f"{self.metadata['render_modes']}, got {render_mode!r}")
         self.render_mode = render_mode
-        self.episodes = _check.integer("episodes", episodes, low=1)
+        self.pool = Pool(episodes)
+        """What unseeded resets draw from."""
         self.spread: np.ndarray | None = None
         """(n,) standard deviation in mol/m³ to draw beside the estimate, for whoever has one."""
         self.world, self.lag, self._assumed = asked_for(name, world, lag, assume)
@@ -103,8 +106,11 @@ class EstimationEnv(gym.Env[Observation, np.ndarray], EzPickle):
               options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
         """Begin the episode with this seed (`eitbench.data.seeds`), or a random training one."""
         super().reset(seed=seed)
-        self._seed = int(self.np_random.integers(self.episodes)) if seed is None else seed
+        if seed is not None:
+            self.pool.restart()
+        self._seed = self.pool.draw(self.np_random) if seed is None else seed
         warn_of_reserved([self._seed])
+        self.pool.provide(self.world, self._seed)
         self._entries = recording(self.world, self._seed)
         self._integrals = integrals(self.world, self._seed, self._entries)
         self._voltages = np.zeros_like(self._currents)

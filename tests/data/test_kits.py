@@ -43,9 +43,12 @@ def test_models_are_compared_in_one_basis():
 
 
 @pytest.mark.parametrize(("numbers", "same", "other"), [
-    (kits.outline_numbers, [{"flow": {"mean_velocity": 4.0}}, {"instrument": {"noise_relative": 0.1}}, {"region": None}],
-     [{"vessel": {"electrodes_per_wall": 4}}, {"prior": {"expected_concentration": 24.0}}, {"instrument": {"current": 0.2}}]),
-    (kits.region_numbers, [{"schedule": {"scored_steps": 3}}], [{"region": [0.1, 0.2]}, {"vessel": {"electrodes_per_wall": 4}}]),
+    (kits.outline_numbers,
+     [{"flow": {"mean_velocity": 4.0}}, {"instrument": {"noise_relative": 0.1}}, {"region": None}],
+     [{"vessel": {"electrodes_per_wall": 4}}, {"prior": {"expected_concentration": 24.0}},
+      {"instrument": {"current": 0.2}}]),
+    (kits.region_numbers,
+     [{"schedule": {"scored_steps": 3}}], [{"region": [0.1, 0.2]}, {"vessel": {"electrodes_per_wall": 4}}]),
     (kits.model_numbers, [{"schedule": {"budget": 3, "scored_steps": 9}}, {"instrument": {"dead": [1, 1]}}],
      [{"instrument": {"noise_relative": 0.1}}, {"prior": {"nodal_std": 0.1}}, {"flow": {"mean_velocity": 4.0}},
       {"schedule": {"time_step": 4e-3}}, {"vessel": {"electrodes_per_wall": 4}}])])
@@ -65,7 +68,8 @@ def test_damaged_kit_is_none(tmp_path, monkeypatch):
     store.save(path, {"x": np.arange(3)}, "it", small=True)
 
     def loaded():
-        return kits.shipped_or_kept("it", numbers, tmp_path / "cache" / "it.npz", ("x",), lambda: {"x": np.ones(2)})["x"]
+        place = tmp_path / "cache" / "it.npz"
+        return kits.shipped_or_kept("it", numbers, place, ("x",), lambda: {"x": np.ones(2)})["x"]
 
     assert loaded().tolist() == [0, 1, 2] and not (tmp_path / "cache").exists()
     data = path.read_bytes()

@@ -13,6 +13,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from eitbench._code import code_digest, package_files
+from eitbench._notice import say
 from eitbench.data import kits, store
 from eitbench.data.recordings import outline
 from eitbench.data.regions import score_mass
@@ -200,6 +201,8 @@ def stored_model(world: World, name: str, kind: type[Model], make: Callable[[], 
     path = store.folder(world) / f"{name}-{whose[:16]}.npz"
 
     def made() -> dict[str, np.ndarray]:
+        say(f"making the filter of reduced order of {world.name}, about half a minute; it is kept "
+            f"in {path.parent}")
         with threadpool_limits(1):                         # as many threads as here, the same bits
             return packed(make())
 
