@@ -52,9 +52,10 @@ def kit_path(name: str, numbers: Mapping[str, Any]) -> Path:
     return KITS / f"{name}-{digest[:16]}.npz"
 
 
-def shipped_or_kept(name: str, numbers: Mapping[str, Any], path: Path, entries: Sequence[str],
-                    make: Callable[[], Mapping[str, np.ndarray]]) -> Mapping[str, np.ndarray]:
-    """The arrays ``entries`` from the kit; else from the cache at ``path``; else made, and kept
+def shipped_or_kept(name: str, numbers: Mapping[str, Any], path: Callable[[], Path],
+                    entries: Sequence[str], make: Callable[[], Mapping[str, np.ndarray]],
+                    ) -> Mapping[str, np.ndarray]:
+    """The arrays ``entries`` from the kit; else from the cache at ``path()``; else made, and kept
     there. A kit that is missing or damaged is none."""
     shipped = store.load(kit_path(name, numbers), entries, name)
-    return store.kept(path, entries, make) if shipped is None else shipped
+    return store.kept(path(), entries, make) if shipped is None else shipped

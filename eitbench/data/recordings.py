@@ -134,11 +134,9 @@ def outline(world: World) -> Outline:
 
 @lru_cache(maxsize=4)
 def _outline(fluid: World) -> Outline:
-    def make() -> dict[str, np.ndarray]:
-        return make_outline(fluid)
-
     stored = kits.shipped_or_kept("outline", kits.outline_numbers(fluid),
-                                  store.folder(fluid) / "outline.npz", OUTLINE, make)
+                                  lambda: store.folder(fluid) / "outline.npz", OUTLINE,
+                                  lambda: make_outline(fluid))
     return Outline(sparse_of(stored), float(stored["largest"]))
 
 

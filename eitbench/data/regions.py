@@ -83,7 +83,7 @@ def score_mass(world: World) -> sp.csr_array:
     if world.region is None:
         return outline(world).mass
     return sparse_of(kits.shipped_or_kept(
-        "region", kits.region_numbers(world), store.folder(world) / "region.npz", SPARSE,
+        "region", kits.region_numbers(world), lambda: store.folder(world) / "region.npz", SPARSE,
         lambda: half_mass(*region_operators(world))))
 
 

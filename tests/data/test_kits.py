@@ -69,7 +69,7 @@ def test_damaged_kit_is_none(tmp_path, monkeypatch):
 
     def loaded():
         place = tmp_path / "cache" / "it.npz"
-        return kits.shipped_or_kept("it", numbers, place, ("x",), lambda: {"x": np.ones(2)})["x"]
+        return kits.shipped_or_kept("it", numbers, lambda: place, ("x",), lambda: {"x": np.ones(2)})["x"]
 
     assert loaded().tolist() == [0, 1, 2] and not (tmp_path / "cache").exists()
     data = path.read_bytes()

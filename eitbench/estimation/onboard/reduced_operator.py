@@ -7,6 +7,7 @@ import hashlib
 import math
 from collections.abc import Callable
 from functools import cache, lru_cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -195,14 +196,15 @@ def _stored_model(world: World) -> ReducedModel:
 def stored_model(world: World, name: str, kind: type[Model], make: Callable[[], Model]) -> Model:
     """A model, a named tuple of arrays: shipped, or from the cache if one of this name is there;
     else it is made and kept. Its numbers are rounded to single precision."""
-    code = code_digest(package_files("estimation/*.py", "estimation/onboard/*operator.py",
-                                     "estimation/onboard/packing.py", "worlds/task.py"))
-    whose = hashlib.sha256(f"{code} {store.described(world.sound)}".encode()).hexdigest()
-    path = store.folder(world) / f"{name}-{whose[:16]}.npz"
+    def path() -> Path:
+        code = code_digest(package_files("estimation/*.py", "estimation/onboard/*operator.py",
+                                         "estimation/onboard/packing.py", "worlds/task.py"))
+        whose = hashlib.sha256(f"{code} {store.described(world.sound)}".encode()).hexdigest()
+        return store.folder(world) / f"{name}-{whose[:16]}.npz"
 
     def made() -> dict[str, np.ndarray]:
         say(f"making the filter of reduced order of {world.name}, about half a minute; it is kept "
-            f"in {path.parent}")
+            f"in {store.folder(world)}")
         with threadpool_limits(1):                         # as many threads as here, the same bits
             return packed(make())
 
