@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache, wraps
+from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -69,8 +70,16 @@ def simulate(world: World, seed: int, *, cache: bool = True, progress: bool = Tr
 
     if not cache:
         return Episode(**make())
-    path = store.folder(world) / f"{seed}.truth.npz"
-    return Episode(**store.kept(path, Episode._fields, make, str(seed), small=True))
+    return Episode(**store.kept(_path(world, seed), Episode._fields, make, str(seed), small=True))
+
+
+def is_simulated(world: World, seed: int) -> bool:
+    """Whether the truth is in the cache."""
+    return _path(world, seed).is_file()
+
+
+def _path(world: World, seed: int) -> Path:
+    return store.folder(world) / f"{seed}.truth.npz"
 
 
 def once(many: int) -> Callable[[Callable[[World], Made]], Callable[[World], Made]]:
@@ -89,9 +98,10 @@ def truth_discretisation(world: World) -> Discretisation:
     return world.truth()
 
 
-def simulate_together(world: World, seeds: Sequence[int],
-                      progress: bool = True) -> Iterator[Episode]:
-    """The episodes of several seeds, bit for bit as `simulate` gives them and without the cache.
+def simulate_together(world: World, seeds: Sequence[int], progress: bool = True,
+                      last: int | None = None) -> Iterator[Episode]:
+    """The episodes of several seeds, bit for bit as `simulate` gives them and without the cache; up
+    to the state ``last`` (default: all).
 
     Eight concentrations in one flow are carried on together in the time of two, and eight
     conductivities are solved for at once.
@@ -99,7 +109,8 @@ def simulate_together(world: World, seeds: Sequence[int],
     truth = truth_discretisation(world)
     label = f"simulating {world.name}, seed {', '.join(map(str, seeds))}"
     electrodes = truth.observation.cem.n_electrodes
-    total = (world.lead_in + 2 * world.n_steps) * len(seeds)
+    steps = world.n_steps if last is None else last
+    total = (world.lead_in + 2 * steps) * len(seeds)
     wait = Wait(label, total, BEFOREHAND)
     with tqdm(total=total, desc=label, unit="step", leave=False,
               disable=None if progress else True) as bar:
@@ -109,9 +120,9 @@ def simulate_together(world: World, seeds: Sequence[int],
                 wait.tick(steps)
 
         streams = [randomness(seed) for seed in seeds]
-        for history, random in zip(world.evolve(streams, truth, tick), streams, strict=True):
-            noise = random.noise.standard_normal((world.n_steps, electrodes))
+        for history, random in zip(world.evolve(streams, truth, tick, steps), streams, strict=True):
+            noise = random.noise.standard_normal((world.n_steps, electrodes))[:steps]
             resistance = truth.observation.transfer_resistance(history.concentration[1:])
-            tick(world.n_steps)
+            tick(steps)
             concentration = history.concentration.astype(np.float32)
             yield Episode(concentration, resistance, noise, history.velocity)

@@ -85,8 +85,7 @@ class InjectionEnv(gym.Env[Any, Any], EzPickle):
             self.pool.restart()
         self._seed = self.pool.draw(self.np_random) if seed is None else seed
         warn_of_reserved([self._seed])
-        self.pool.provide(self.world, self._seed)
-        self._core.begin([self._seed])
+        self._core.begin([self._seed], self.pool.provide)
         self._step = 1
         return self._observe(), {"step": 1}
 
@@ -110,11 +109,12 @@ class InjectionEnv(gym.Env[Any, Any], EzPickle):
             return None
         if self._step == 0:
             raise gym.error.ResetNeeded("call reset() before render()")
-        from eitbench.data.episodes import simulate, truth_discretisation
+        from eitbench.data.beginnings import concentration_at
+        from eitbench.data.episodes import truth_discretisation
         from eitbench.envs.rendering import draw_frame
         mean, spread = self._core.estimate()
         t = self._core.first + self._step - 1
-        truth = simulate(self.world, self._seed).concentration[t].astype(float)
+        truth = concentration_at(self.world, self._seed, t, self._core.first + 1)
         return draw_frame(self.task, truth_discretisation(self.world).transport.mesh, truth,
                           mean[0], spread[0], self._core.last_currents[0],
                           t * self.world.time_step, self.world.region)
