@@ -1,10 +1,9 @@
-"""Bank of Kalman filters: nine mean velocities are assumed side by side, and the one that fits
-the voltages speaks.
+"""Bank of Kalman filters: nine mean velocities are assumed side by side, and the one that fits the
+voltages speaks.
 
-Each filter has its own flow, the one believed at first made faster or slower. What fits is
-measured by the innovations,
-whitened (NIS), over the last frame: the voltage discrepancy of thesis 5.13 in units of its own
-uncertainty.
+Each filter has its own flow, the one believed at first made faster or slower. What fits is measured
+by the innovations, whitened (NIS), over the last frame: the voltage discrepancy of thesis 5.13 in
+units of its own uncertainty.
 """
 
 from functools import lru_cache

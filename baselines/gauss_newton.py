@@ -2,11 +2,9 @@
 stands still.
 
 When filtering, the frame is the latest 16 injections; when smoothing, it is the thesis' own: each
-state takes the image
-of the frame that contains it (Fig. 5.6). ALPHA was tuned once, on stationary targets from the
-training seeds, by
-`studies/tune_gauss_newton.py`, whose rule is the smallest mean error on a grid of two values an
-octave.
+state takes the image of the frame that contains it (Fig. 5.6). ALPHA was tuned once, on stationary
+targets from the training seeds, by `studies/tune_gauss_newton.py`, whose rule is the smallest mean
+error on a grid of two values an octave.
 """
 
 import numpy as np

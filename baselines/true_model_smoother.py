@@ -1,9 +1,9 @@
-"""Smoother with the true flow: what the linearised fixed-interval smoother reaches that is told
-how the fluid moves.
+"""Smoother with the true flow: what the linearised fixed-interval smoother reaches that is told how
+the fluid moves.
 
 It is shown the flow and the whole record of the episode, which is more than anyone on a board is
-given. It is no bound:
-where the linearisation about the first frame costs more than the future teaches, others do better.
+given. It is no bound: where the linearisation about the first frame costs more than the future
+teaches, others do better.
 """
 
 from functools import partial

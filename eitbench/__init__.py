@@ -11,6 +11,7 @@ from eitbench.worlds import ours as _ours  # noqa: F401 (registers our ids)
 from eitbench.worlds.registry import register, register_installed
 
 if TYPE_CHECKING:
+    from eitbench.bench.evaluation import evaluate
     from eitbench.data.episodes import Episode, simulate
     from eitbench.envs.pages import page
     from eitbench.estimation.onboard.rules import Rules
@@ -19,11 +20,12 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 __all__ = ["Episode", "Estimate", "Rules", "Task", "World",
-           "make_task", "page", "register", "simulate"]
+           "evaluate", "make_task", "page", "register", "simulate"]
 
 _LATER = {"Estimate": "worlds.task", "Task": "worlds.task", "make_task": "worlds.task",
           "World": "worlds.world", "Episode": "data.episodes", "simulate": "data.episodes",
-          "Rules": "estimation.onboard.rules", "page": "envs.pages"}
+          "Rules": "estimation.onboard.rules", "page": "envs.pages",
+          "evaluate": "bench.evaluation"}
 """Where the public names lie that are loaded on first use."""
 
 

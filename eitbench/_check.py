@@ -16,12 +16,13 @@ NUMBERS = "biufO"
 def number(name: str, value: object, *, low: float = -math.inf, high: float = math.inf,
            open_low: bool = False, units: str = "") -> float:
     """``value`` as a finite float within [low, high] (``open_low``: within (low, high]); else a
-    ``ValueError``."""
+    ``ValueError``, as for booleans and what `array` refuses."""
     try:
-        if isinstance(value, (str, bool)):
+        kind = np.asarray(value).dtype.kind
+        if kind == "b" or kind not in NUMBERS:
             raise TypeError
         result = float(value)  # type: ignore[arg-type]
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ValueError(f"{name} must be a number{_in(units)}, got {value!r}") from None
     if not math.isfinite(result) or result > high or result < low or (open_low and result == low):
         bracket = "(" if open_low else "["
@@ -47,19 +48,24 @@ def array(name: str, value: object, shape: Iterable[int | None], *, units: str =
     """``value`` as a finite float64 array whose trailing axes match ``shape`` (``None``: any
     length).
 
-    A leading ``-1`` in ``shape`` stands for any number of batch axes.
+    A leading ``-1`` in ``shape`` stands for any number of batch axes. ``ValueError`` for other
+    shapes, and for what holds no real numbers: complex ones, text, dates, masked arrays, and
+    objects that are no numbers or too large for a float.
     """
     wanted = list(shape)
     batched = bool(wanted) and wanted[0] == -1
     core = wanted[1:] if batched else wanted
+    came = type(value).__name__
     try:
         given = np.asarray(value)
+        came += f" of {given.dtype}"
         if given.dtype.kind not in NUMBERS or isinstance(value, np.ma.MaskedArray):
             raise TypeError
+        if given.dtype.kind == "O" and any(isinstance(each, (str, bytes)) for each in given.flat):
+            raise TypeError
         result = given.astype(np.float64, copy=False)
-    except (TypeError, ValueError):
-        raise ValueError(f"{name} must be an array of numbers{_in(units)}, got "
-                         f"{type(value).__name__}") from None
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"{name} must be an array of numbers{_in(units)}, got {came}") from None
     trailing = result.shape[result.ndim - len(core):] if result.ndim >= len(core) else ()
     fits = (result.ndim >= len(core) if batched else result.ndim == len(core)) and all(
         want is None or want == have for want, have in zip(core, trailing, strict=True))
@@ -82,15 +88,15 @@ DEEPEST = 20
 """How deep lists and dicts from elsewhere may be nested."""
 
 
-def nesting(name: str, value: Any) -> None:
+def nesting(name: str, value: Any, deepest: int = DEEPEST) -> None:
     """``ValueError`` if lists and dicts are nested too deep for what goes through them."""
     level = [value]
-    for _ in range(DEEPEST):
+    for _ in range(deepest):
         level = [inner for each in level if isinstance(each, (list, tuple, dict))
                  for inner in (each.values() if isinstance(each, dict) else each)]
         if not level:
             return
-    raise ValueError(f"{name} must not be nested deeper than {DEEPEST} levels")
+    raise ValueError(f"{name} must not be nested deeper than {deepest} levels")
 
 
 def document(name: str, value: object, size: int) -> None:

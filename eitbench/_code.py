@@ -18,8 +18,14 @@ def code_digest(files: Iterable[Path]) -> str:
 
 
 def package_files(*patterns: str) -> list[Path]:
-    """Files of this package that match, in order."""
-    return sorted(file for pattern in patterns for file in PACKAGE.glob(pattern))
+    """Files of this package that match, in order. ``FileNotFoundError`` if a pattern matches
+    nothing, since a digest would leave out what has moved."""
+    found: list[Path] = []
+    for pattern in patterns:
+        if not (files := list(PACKAGE.glob(pattern))):
+            raise FileNotFoundError(f"there is no file {pattern} in {PACKAGE}")
+        found += files
+    return sorted(found)
 
 
 def file_of(kind: type) -> Path | None:

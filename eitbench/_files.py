@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import os
 import shutil
 import uuid
@@ -24,9 +25,13 @@ def write_atomically(path: Path, data: bytes) -> None:
 
 def replace_folder(folder: Path, files: Mapping[str, bytes]) -> None:
     """Let the folder hold these files and no others: a new one is written beside it and takes its
-    place when it is whole, so that whoever is interrupted leaves what was there before."""
+    place when it is whole, so that whoever is interrupted leaves what was there before; if they are
+    killed between the two renamings, the next call begins by putting it back."""
     folder = folder.resolve()
     folder.parent.mkdir(parents=True, exist_ok=True)
+    for left in folder.parent.glob(f".{glob.escape(folder.name)}.*.old"):
+        if not folder.exists():
+            os.rename(left, folder)
     mark = uuid.uuid4().hex
     new, old = (folder.with_name(f".{folder.name}.{mark}.{which}") for which in ("new", "old"))
     try:

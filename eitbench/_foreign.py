@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+import traceback
 import unicodedata
+from pathlib import Path
 
 _UNSEEN = {"Cc", "Cf", "Cs", "Cn", "Zl", "Zp"}
 """Categories of characters that are not seen, but move a cursor, turn a line round, or end it."""
@@ -24,3 +26,14 @@ def cleaned(text: str, *, lines: bool = False) -> str:
 def as_markdown(text: str) -> str:
     """`cleaned`, and nothing but text in a line of Markdown either."""
     return _OF_MARKDOWN.sub(r"\\\g<0>", cleaned(text))
+
+
+def where_of(error: BaseException) -> str:
+    """File and line where it was raised, without the folders of this machine."""
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{Path(last.filename).name}:{last.lineno}"
+
+
+def as_cell(text: str) -> str:
+    """The same in a CSV: a program that opens one takes what begins like this for a formula."""
+    return f"'{text}" if text.startswith(("=", "+", "-", "@")) else text

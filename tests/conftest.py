@@ -5,10 +5,13 @@ import os
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[variable] = "1"
 
+settings.register_profile("ours", deadline=None, derandomize=True, database=None)
+settings.load_profile("ours")                         # a busy machine is no failure; each run tries the same examples
 TESTS = Path(__file__).parent
 PLACES = {
     "studies": "study",                        # the statements and figures of the thesis
@@ -25,6 +28,8 @@ PLACES = {
 }
 """What is not the core, by folder, file or test: `pytest -m "not browser and not study"` leaves it
 out."""
+for place in PLACES:
+    assert (TESTS / place.partition("::")[0]).exists(), f"there is no {place}"
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -43,7 +48,17 @@ def pytest_collection_modifyitems(items):
 
 
 @pytest.fixture(scope="session")
-def run_cache(pytestconfig):
+def run_cache(pytestconfig, tmp_path_factory):
     """A cache folder that all processes share, and the next run too: what lies there names the code
-    it was computed with, so that other code never finds it. `pytest --cache-clear` empties it."""
-    return str(pytestconfig.cache.mkdir("episodes"))
+    it was computed with, so that other code never finds it. `pytest --cache-clear` empties it. With
+    `-p no:cacheprovider` a folder of this process."""
+    kept = getattr(pytestconfig, "cache", None)
+    return str(kept.mkdir("episodes") if kept else tmp_path_factory.mktemp("episodes"))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def nobodys_own_cache(run_cache):
+    """Tests that set no cache folder of their own use this one, never the developer's."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("EITBENCH_CACHE", run_cache)
+        yield

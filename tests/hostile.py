@@ -106,6 +106,7 @@ def special(chance: random.Random, made: dict[str, Any]) -> dict[str, Any]:
         {"board": chance.choice(list(IDS))}, {"method": "homogeneous", "role": None}, {"method": "random_pair"},
         {"version": "v" + "9" * chance.choice([3, 9, 5000])}, {"method": "x" * 230}, {"method": "a\x1bb"},
         {"seeds": [{}] * 20_000}, {"split": "dev"}, {"official": True, "runs": [RUN | {"dirty": True}]},
+        {"runs": [RUN | {"walls": [{"a": i} for i in range(20_000)]}]}, {"runs": [RUN] * 20_000},
         {"episodes": made["episodes"] * 50}, {"parameters": {"a": [0] * 10**5}},
         {"episodes": [each | {"step_errors": [0.1] * chance.randint(1, 9)} if each["status"] == "ok" else each
                       for each in made["episodes"]]}]

@@ -1,7 +1,7 @@
 """Digests of code: words do not count, all else does."""
 
 import pytest
-from eitbench._code import code_digest
+from eitbench._code import code_digest, package_files
 
 CODE = '''"""A module."""
 
@@ -40,3 +40,10 @@ def test_order_and_number_of_files_count(tmp_path):
     before = code_digest([two])
     two.write_text('"y"\n')                                            # no docstring: it is not Python
     assert code_digest([two]) != before
+
+
+def test_files_that_are_named_are_there():
+    """A digest never leaves out silently what has moved."""
+    assert [file.name for file in package_files("bench/scores.py", "bench/run.py")] == ["run.py", "scores.py"]
+    with pytest.raises(FileNotFoundError, match=r"no file bench/score\.py"):
+        package_files("bench/run.py", "bench/score.py")

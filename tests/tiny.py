@@ -7,6 +7,7 @@ from pathlib import Path
 from eitbench.bench import store
 from eitbench.bench.contradictions import split_of
 from eitbench.bench.records import SCHEMA, sealed
+from eitbench.bench.sandbox import keeper
 from eitbench.bench.tracks import Environment
 
 SCENARIO = {"flow": {"mean_velocity": 45.0}, "schedule": {"scored_steps": 3, "pattern": {"frame": 2}},
@@ -22,6 +23,8 @@ RUN = {"command": "eitbench run", "blas": "scipy-openblas", "commit": "c0ffee", 
        "versions": {"python": "3.12.1", "eitbench": "0.1.0", "numpy": "2.4.6", "scipy": "1.17.1",
                     "stable-baselines3": None, "torch": None},
        "machine": {"processor": "An abacus", "cores": 2, "system": "Linux", "blas_threads": 1, "matmul_seconds": 0.05}}
+MARKS = ("homogeneous", "random_pair", "true_model_smoother")
+"""Floors and the reference."""
 BOARD_IDS = {"filter": "eitbench/Pipe2D-v0", "fixed-lag": "eitbench/Pipe2DFixedLag-v0",
              "smoothing": "eitbench/Pipe2DSmoothing-v0", "injection": "eitbench/Pipe2DInjection-v0"}
 
@@ -99,11 +102,12 @@ def episode(seed: str, error: float | None, *, seconds_per_step: float = 0.01, *
 
 
 def record(method: str, errors: dict[str, float | None] | list[float | None], *, board: str = "filter",
-           id: str | None = None, version: str = "1", finished: str = "2025-01-01", scores=None,
+           id: str | None = None, version: str = "", finished: str = "2025-01-01", scores=None,
            **changes) -> dict:
     """A valid record of these errors by seed; those of a list are of test:0, test:1 and so on. Version v1, v2, … is one
-    of ours, of any other the file has another sha256."""
+    of ours, of any other the file has another sha256. Default: what a floor or a reference has to have."""
     id = id or BOARD_IDS[board]
+    version = version or ("v1" if method in MARKS else "1")
     errors = errors if isinstance(errors, dict) else {f"test:{i}": error for i, error in enumerate(errors)}
     episodes = [episode(seed, error, **(scores or {})) | {"finished": f"{finished}T00:00:00+00:00"}
                 for seed, error in errors.items()]
@@ -136,3 +140,10 @@ def several_boards() -> list[dict]:
             record("<i>\"odd\"", of(0.8), title="Odd <script>alert(1)</script> & | \"co\"", runs=[RUN | {
                 "command": "eitbench submit --baseline '<b>it' --env x"}]),
             record("greedy_a", of(0.4), board="injection", scores={"spent": 30})]
+
+
+def without_namespaces(folder):
+    """The keeper of a system that grants none."""
+    path = folder / "keeper.py"
+    path.write_text(Path(keeper.__file__).read_text().replace("NAMESPACES[name] for", "1 for"))
+    return str(path)

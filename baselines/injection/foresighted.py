@@ -1,11 +1,10 @@
-"""Foresighted: the pair that leaves least variance where and when it will count; a budget is
-spread evenly.
+"""Foresighted: the pair that leaves least variance where and when it will count; a budget is spread
+evenly.
 
-A-optimal for what the fluid brings: the flow carries what is uncertain now, and what of it lies
-in the region of
-interest is summed over the next steps. Where the flow is unknown a pair that was injected rests
-for a while: the filter
-is surer of the velocity than it should be, and other pairs show where it is wrong.
+A-optimal for what the fluid brings: the flow carries what is uncertain now, and what of it lies in
+the region of interest is summed over the next steps. Where the flow is unknown a pair that was
+injected rests for a while: the filter is surer of the velocity than it should be, and other pairs
+show where it is wrong.
 """
 
 from typing import Any

@@ -1,8 +1,8 @@
 """Offline schedule: every injection chosen beforehand, for the least variances by the model alone.
 
-Greedy first, then, step by step, exchange for a better one; where there is a budget injections
-move in time, too. The
-variances of the model do not depend on what will be measured; where the flow is unknown they do.
+Greedy first, then, step by step, exchange for a better one; where there is a budget injections move
+in time, too. The variances of the model do not depend on what will be measured; where the flow is
+unknown they do.
 """
 
 from functools import lru_cache

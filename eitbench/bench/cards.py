@@ -26,7 +26,7 @@ from eitbench.bench.methods import (
     own_agents,
     own_methods,
 )
-from eitbench.bench.playing import Episode, environment, play
+from eitbench.bench.playing import Episode, can_play, environment, play
 from eitbench.bench.scores import scored, scores
 from eitbench.data.seeds import parse_seeds
 
@@ -174,10 +174,7 @@ def _plays(method: str, id: str, kwargs: dict[str, Any]) -> bool:
         return Path(method).parents[2].name == id.replace("/", "-")
     if method not in own_methods(asked.track):
         return False
-    env: Any = environment(asked)
-    loaded = load_method(method, asked.track)
-    known = env.rules if asked.track == "injection" else env.task
-    return tracks.board_of(env) in loaded.boards and loaded.suits(known)
+    return can_play(load_method(method, asked.track), environment(asked))
 
 
 def _text(card: dict[str, Any]) -> str:

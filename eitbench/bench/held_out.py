@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from eitbench.bench.contradictions import version_number
 from eitbench.bench.methods import is_ours
 from eitbench.bench.run import Job, run_episode
 from eitbench.bench.statistics import FEWEST
@@ -87,6 +88,11 @@ def verdict(record: dict[str, Any], own: list[dict[str, Any]], beside: list[dict
     said = [{"status": "ok", "scores": {"error": error}} for error in errors.values()]
     differences = [f"failed in a held-out episode: {result['message']}"
                    for result in (*own, *beside) if result["status"] == "failed"]
+    if version_number(record["version"]) is None:  # whose file was looked at some time ago
+        played = {result["method_sha256"] for result in own if "method_sha256" in result}
+        differences += [f"the file that played has the sha256 {other}, that of the record has "
+                        f"{record['method_sha256']}"
+                        for other in sorted(played - {record["method_sha256"]})]
     differences += [f"the floor failed in {name}: {result['message']}"
                     for name, result in zip(errors, there, strict=True)
                     if result["status"] == "failed"]

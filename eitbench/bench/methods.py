@@ -27,6 +27,8 @@ and content."""
 ROLES = (None, "floor", "reference")
 """What a method is on a board: ranked, or a mark from which the others are judged."""
 
+MOST_BYTES = 1 << 28
+"""of a method's file, which is read whole"""
 TITLE = 120
 """letters of a title"""
 PARAMETERS = 10_000
@@ -203,7 +205,9 @@ def find_method(name: str, track: str) -> Path:
     if not path.is_file():
         raise ValueError(f"{form.kind} must be the path of {form.files}, or one of "
                          f"{', '.join([*own, *installed_methods()])}; got {name!r}")
-    if path.stem in own and not path.samefile(folder / path.name):
+    if path.stat().st_size > MOST_BYTES:
+        raise ValueError(f"{form.kind} {path} must have {MOST_BYTES >> 20} MiB at most")
+    if path.stem in own and not path.samefile(folder / f"{path.stem}.py"):
         raise ValueError(f"{form.kind} {path} has the name of one of ours, under which results are "
                          "kept; rename it")
     return path
@@ -234,11 +238,21 @@ def _load(path: Path, source: bytes, track: str) -> Method:
         return Method(track, name, title, path, sha256, BOARDS[track], parameters, agent)
     module = load_module(form.kind, path, source)
     method = getattr(module, form.type, None)
-    function = form.answers.partition("(")[0]
-    if not isinstance(method, type) or not callable(getattr(method, function, None)):
+    if not isinstance(method, type):
         raise ValueError(f"{form.kind} {path} must define a class {form.type} with a method "
                          f"{form.answers}")
-    who = f"{form.kind} {path}: {form.type}"
+    return method_of(method, track, path.stem)._replace(
+        title=title_of(module, path), path=path, sha256=sha256)
+
+
+def method_of(method: type[Any], track: str, name: str) -> Method:
+    """A class as a method of a track, without a file. ``ValueError`` if it is not as that asks
+    for."""
+    form = FORMS[track]
+    who = f"{form.kind} {name}: {method.__name__}"
+    function = form.answers.partition("(")[0]
+    if not callable(getattr(method, function, None)):
+        raise ValueError(f"{who} must have a method {form.answers}")
     boards = tuple(getattr(method, "boards", BOARDS[track][:1]))
     if not boards or not set(boards) <= set(BOARDS[track]):
         raise ValueError(f"{who}.boards must be some of {', '.join(BOARDS[track])}, got {boards!r}")
@@ -248,8 +262,8 @@ def _load(path: Path, source: bytes, track: str) -> Method:
     privileged = getattr(method, "privileged", False)
     if not isinstance(privileged, bool):
         raise ValueError(f"{who}.privileged must be True or False, got {privileged!r}")
-    return Method(track, path.stem, title_of(module, path), path, sha256, boards,
-                  _parameters(who, method), method, role, privileged)
+    return Method(track, name, name, Path(), "", boards, _parameters(who, method), method, role,
+                  privileged)
 
 
 def load_module(kind: str, path: Path, source: bytes) -> ModuleType:
@@ -273,7 +287,7 @@ def title_of(module: ModuleType, path: Path) -> str:
     """First line of the docstring, up to a colon, bracket or full stop, 120 letters at most;
     without one, the file's name."""
     line = f"{(module.__doc__ or '').strip()}\n".splitlines()[0]
-    return re.split(r"[:(.]", line)[0].strip()[:TITLE] or path.stem
+    return re.split(r"[:(.]", line)[0].strip()[:TITLE].strip() or path.stem
 
 
 def _parameters(who: str, method: type[Any]) -> dict[str, Any]:

@@ -15,12 +15,16 @@ def migrate(folder: Path) -> Iterator[tuple[Path, Path]]:
 
     A new file is there, whole, before the old one goes: interrupted, the same call goes on. Errors
     as `records.read_record`; ``ValueError`` too, and nothing is changed, if the place of a new
-    record is taken by one that says something else.
+    record is taken by one that says something else, or two would have the same place.
     """
     paths = sorted(Path(folder).glob("*.json"))
     todo = [(path, read_record(path)) for path in paths if _is_old(path)]
-    for _, record in todo:
+    first: dict[Path, Path] = {}
+    for path, record in todo:
         place = Path(folder) / file_name(record)
+        if (other := first.setdefault(place, path)) != path:
+            raise ValueError(f"folder must not hold two records of one thing, but {other} and "
+                             f"{path} would both become {place.name}; remove one")
         if place.exists() and not _is_old(place) and read_record(place) != record:
             raise ValueError(f"folder must not hold two records of one thing, but {place} is there "
                              "already and says something else")

@@ -13,7 +13,7 @@ from eitbench import _check
 from eitbench.bench.methods import Method
 from eitbench.bench.outcomes import Claim, Said, outcome_of, outcome_of_claims
 from eitbench.bench.scores import Outcome
-from eitbench.bench.tracks import Environment, check_track
+from eitbench.bench.tracks import Environment, board_of, check_track
 from eitbench.data.seeds import for_scores
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.injection import InjectionEnv
@@ -44,6 +44,12 @@ def environment(asked: Environment) -> EstimationEnv | InjectionEnv:
 def _made(asked: Environment, world: World) -> EstimationEnv | InjectionEnv:
     """Whose ``world`` is that of the id: another process may have told this one of another."""
     return asked.make()
+
+
+def can_play(method: Method, env: EstimationEnv | InjectionEnv) -> bool:
+    """Whether an environment is of one of a method's boards, and such as suits it."""
+    known = env.rules if isinstance(env, InjectionEnv) else env.task
+    return board_of(env) in method.boards and method.suits(known)
 
 
 def play(asked: Environment, method: Method, seed: int) -> Episode:

@@ -139,7 +139,8 @@ def _play(job: Job, path: Path) -> None:
         result = {"status": "failed", "message": str(error)}
     outcome = {"identity": job.identity(), "status": result["status"]}
     if result["status"] == "ok":
-        outcome |= {"scores": {"error": result["scores"]["error"]}}
+        outcome |= {"scores": {"error": result["scores"]["error"]},
+                    "method_sha256": result["method_sha256"]}
     else:
         outcome |= {"message": result["message"]}
     write_atomically(path, json.dumps(outcome, indent=1).encode())

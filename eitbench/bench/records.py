@@ -15,19 +15,22 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import warnings
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 from functools import lru_cache
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jsonschema
 
-from eitbench._files import shipped, write_atomically
+from eitbench._files import write_atomically
 from eitbench._foreign import cleaned
 from eitbench.bench import schema2, tracks
 from eitbench.bench.contradictions import contradictions, version_number
+from eitbench.bench.names import folded
+from eitbench.bench.quick import fits, quickly, schema_text
 from eitbench.bench.strict_json import parsed
 
 SCHEMA = 3
@@ -36,7 +39,11 @@ SHARED = ("board", "title", "parameters", "role", "privileged", "version", "meth
           "checkpoint_sha256")
 """What all episodes of a record have in common, beside environment and method."""
 MOST_EPISODES = 10_000
-"""of a record"""
+"""of a record; nor has it more runs"""
+MOST_WALLS = 20
+"""of a run"""
+MOST_STEPS = 100_000
+"""errors of an episode"""
 
 
 def write_record(folder: Path, record: dict[str, Any]) -> Path:
@@ -66,6 +73,21 @@ def read_record(path: Path) -> dict[str, Any]:
 
 def _read(path: Path) -> dict[str, Any]:
     """As `read_record`; what is wrong, without the file's name."""
+    record = quickly(path, SCHEMA)
+    name = None
+    if record is None or _too_many(record):
+        record, name = _carefully(path)
+    else:
+        _refuse(contradictions(record))
+    name = name or file_name(record)
+    if path.name != name:
+        raise ValueError(f"must have the name {name}, as its content asks for")
+    return record
+
+
+def _carefully(path: Path) -> tuple[dict[str, Any], str | None]:
+    """A valid record, and the name that its file must have if the record is of the format
+    before."""
     record = parsed(path)
     written = record
     name = None
@@ -76,28 +98,35 @@ def _read(path: Path) -> dict[str, Any]:
     if written.get("sha256") != sealed(written)["sha256"]:
         raise ValueError("was changed since it was written: its sha256 is no longer that of its "
                          "content")
-    name = name or file_name(record)
-    if path.name != name:
-        raise ValueError(f"must have the name {name}, as its content asks for")
-    return record
+    return record, name
 
 
-def read_records(folder: Path) -> list[dict[str, Any]]:
+def read_records(folder: Path, *, keep: Callable[[dict[str, Any]], Any] = dict) -> list[Any]:
     """All records of a folder, by file name; none if there is no such folder. Records of an
     environment that is not registered, or no longer in that version, are left out with a warning.
+    Of many thousands ``keep`` may leave out what nobody asks for, one by one.
 
     ``ValueError``, naming all of them, if some are not as `read_record` asks for.
     """
-    records, complaints = read_sound_records(folder)
+    records, complaints = read_sound_records(folder, keep=keep)
     if complaints:
         raise ValueError("; ".join(complaints))
     return records
 
 
-def read_sound_records(folder: Path) -> tuple[list[dict[str, Any]], list[str]]:
+def read_sound_records(folder: Path, *, keep: Callable[[dict[str, Any]], Any] = dict,
+                       ) -> tuple[list[Any], list[str]]:
     """As `read_records`, but those that are not valid are left out, with a sentence for each that
     names the file."""
-    records = []
+    sound, complaints = read_sound_files(folder, keep=keep)
+    return list(sound.values()), complaints
+
+
+def read_sound_files(folder: Path, *, keep: Callable[[dict[str, Any]], Any] = dict,
+                     ) -> tuple[dict[Path, Any], list[str]]:
+    """As `read_sound_records`, with the path of each record."""
+    kept = {}
+    standing = {}
     complaints = []
     known = set(tracks.ids())
     for path in sorted(Path(folder).glob("*.json")):
@@ -108,11 +137,59 @@ def read_sound_records(folder: Path) -> tuple[list[dict[str, Any]], list[str]]:
             continue
         id = record["environment"]["id"]
         if id in known:
-            records.append(record)
+            kept[path] = keep(record)
+            standing[path] = _Standing.of(record, path)
         else:
             warnings.warn(f"record {cleaned(str(path))} is left out: there is no environment "
-                          f"{cleaned(id)}", stacklevel=3)
-    return records, complaints
+                          f"{cleaned(id)}", stacklevel=4)
+    clashing = _clashing(standing)
+    complaints += [f"record {cleaned(str(path))} {what}" for path, what in clashing.items()]
+    return {path: each for path, each in kept.items() if path not in clashing}, complaints
+
+
+class _Standing(NamedTuple):
+    """What decides between records that cannot stand beside each other: the least stays."""
+
+    unofficial: bool
+    misnamed: bool
+    """Of the format before."""
+    finished: str
+    file: str
+    environment: str
+    kwargs: str
+    method: str
+    split: str
+    version: str
+
+    @classmethod
+    def of(cls, record: dict[str, Any], path: Path) -> _Standing:
+        environment, method, split = _lineage(record)
+        return cls(not record["official"], path.name != file_name(record), finished(record),
+                   path.name, environment, _json(record["environment"]["kwargs"]), method, split,
+                   record["version"])
+
+
+def _clashing(records: dict[Path, _Standing]) -> dict[Path, str]:
+    """Path -> what is wrong, of records that cannot stand beside others of the same folder: they
+    are of the same episodes of one method, of another environment under the same name, or of a
+    method whose name differs from another's for some systems only. Official ones stay, then those
+    of the present format, then older ones."""
+    versions = set[tuple[str, ...]]()
+    given: dict[str, str] = {}
+    methods: dict[str, str] = {}
+    wrong = {}
+    for path, each in sorted(records.items(), key=lambda pair: pair[1]):
+        key = (each.environment, each.method, each.split, each.version)
+        if key in versions:
+            wrong[path] = "is of the same version and the same split as another record"
+        elif given.setdefault(each.environment, each.kwargs) != each.kwargs:
+            wrong[path] = f"gives other arguments to {each.environment} than another record"
+        elif (other := methods.setdefault(folded(each.method), each.method)) != each.method:
+            wrong[path] = ("is of a method whose name differs from that of another only as some "
+                           f"systems do not see: {cleaned(each.method)}, {cleaned(other)}")
+        else:
+            versions.add(key)
+    return wrong
 
 
 def sealed(record: dict[str, Any]) -> dict[str, Any]:
@@ -128,8 +205,9 @@ def sealed(record: dict[str, Any]) -> dict[str, Any]:
 
 
 def file_name(record: dict[str, Any]) -> str:
-    """``ENV--METHOD--VERSION.json``; of other seeds than test with their split in it too."""
-    return schema2.file_name(record, record["version"])
+    """Of the file that a record has; see `tracks.record_name`."""
+    return tracks.record_name(record["environment"]["name"], record["method"], record["version"],
+                              record["split"])
 
 
 def alike(runs: Iterable[dict[str, Any]], *keys: str) -> list[list[dict[str, Any]]]:
@@ -179,21 +257,51 @@ def _lineage(record: dict[str, Any]) -> tuple[str, ...]:
 
 def _check(record: Any) -> None:
     """``ValueError`` naming fields if a record breaks the schema or contradicts itself."""
-    wrong = _too_many(record) or _against_the_schema(record) or contradictions(record)
+    _refuse(_too_many(record) or _against_the_schema(record) or contradictions(record))
+
+
+def _refuse(wrong: list[str]) -> None:
+    """``ValueError`` that says what is wrong, if anything is."""
     if wrong:
         raise ValueError("is not valid: " + "; ".join(map(_shortened, wrong[:5])))
 
 
 def _too_many(record: Any) -> list[str]:
-    """What to compare with each other would take for ever."""
-    seeds = record.get("seeds") if isinstance(record, dict) else None
-    if isinstance(seeds, list) and (len(seeds) > MOST_EPISODES
-                                    or not all(isinstance(seed, str) for seed in seeds)):
-        return [f"$.seeds: must be at most {MOST_EPISODES} texts"]
-    return []
+    """A sentence for each list that is too long to be looked at: to compare the items of one with
+    each other would take for ever."""
+    if not isinstance(record, dict):
+        return []
+    seeds, runs, episodes = (record.get(name) for name in ("seeds", "runs", "episodes"))
+    wrong = []
+    if not _are_texts(seeds, MOST_EPISODES):
+        wrong.append(f"$.seeds: must be at most {MOST_EPISODES} texts")
+    for name, items in (("runs", runs), ("episodes", episodes)):
+        if isinstance(items, list) and len(items) > MOST_EPISODES:
+            wrong.append(f"$.{name}: must be at most {MOST_EPISODES}")
+    if wrong:
+        return wrong
+    wrong += [f"$.runs[{i}].walls: must be at most {MOST_WALLS} texts"
+              for i, walls in _inner(runs, "walls") if not _are_texts(walls, MOST_WALLS)]
+    return wrong + [f"$.episodes[{i}].step_errors: must be at most {MOST_STEPS}"
+                    for i, steps in _inner(episodes, "step_errors")
+                    if isinstance(steps, list) and len(steps) > MOST_STEPS]
+
+
+def _are_texts(items: Any, most: int) -> bool:
+    """False of a list that is longer, or has others in it; what is no list the schema will name."""
+    return not isinstance(items, list) or (
+        len(items) <= most and all(isinstance(item, str) for item in items))
+
+
+def _inner(items: Any, name: str) -> list[tuple[int, Any]]:
+    """What stands under a name in each object of a list, with its place."""
+    return [(i, each.get(name)) for i, each in enumerate(items if isinstance(items, list) else [])
+            if isinstance(each, dict)]
 
 
 def _against_the_schema(record: Any) -> list[str]:
+    if fits(record):
+        return []
     errors = list(islice(_validator().iter_errors(record), 20))
     return [f"{error.json_path}: {_shortened(error.message)}"
             for error in sorted(errors, key=lambda error: error.json_path)]
@@ -201,8 +309,15 @@ def _against_the_schema(record: Any) -> list[str]:
 
 @lru_cache(maxsize=1)
 def _validator() -> Any:
-    schema = json.loads((shipped("leaderboards") / "schema.json").read_text(encoding="utf-8"))
-    return jsonschema.Draft202012Validator(schema)
+    strict = jsonschema.validators.extend(jsonschema.Draft202012Validator, {"pattern": _pattern})
+    return strict(json.loads(schema_text()))
+
+
+def _pattern(_validator: Any, pattern: str, text: Any, _schema: Any) -> Iterator[Exception]:
+    """As the standard has it, where $ is the end; Python's also stands before a last newline."""
+    ending = re.sub(r"\$(?=\)?$)", r"\\Z", pattern)
+    if isinstance(text, str) and not re.search(ending, text):
+        yield jsonschema.ValidationError(f"{text!r} does not match {pattern!r}")
 
 
 def _named_by_content(record: dict[str, Any]) -> str:

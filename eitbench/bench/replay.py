@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,12 +13,20 @@ from tqdm import tqdm
 
 from eitbench import _check
 from eitbench._files import write_atomically
-from eitbench.bench.records import newest, read_record
+from eitbench.bench.records import newest, read_record, read_sound_files
 from eitbench.bench.run import run_episode
 from eitbench.bench.sandbox.host import GuestError
-from eitbench.bench.store import read_json, source_digest
+from eitbench.bench.store import read_json
 from eitbench.bench.table import Cell, Table
-from eitbench.bench.verify import TOLERANCE, differences_of, drawn_of, job_of, outdated
+from eitbench.bench.verify import (
+    OF_OURS,
+    TOLERANCE,
+    differences_of,
+    drawn_of,
+    job_of,
+    outdated,
+    stated_differently,
+)
 from eitbench.data.parallel import in_parallel
 from eitbench.data.seeds import parse_seeds
 from eitbench.data.store import cache_in
@@ -33,14 +40,21 @@ class Replay(NamedTuple):
     """Its place in the record."""
     outcome: Path
     """Where what came out is kept."""
+    identity: str
+    """Of all that the outcome depends on: the record, and what `run.Job.identity` names."""
 
 
 def official_records(folder: Path, environments: Sequence[str] = ()) -> list[Path]:
     """Paths of the official records of a folder that are not outdated, of these environments or of
-    all. ``ValueError`` if there are none, or one of all records is not valid."""
-    read = {path: read_record(path) for path in sorted(folder.glob("*.json"))}
-    current = newest(list(read.values()))[0]
-    chosen = [path for path, record in read.items() if record["official"] and record in current
+    all. Records of an environment that is not registered are left out with a warning.
+
+    ``ValueError`` if there are none, or if some are not valid: then all of those are named.
+    """
+    read, complaints = read_sound_files(folder)
+    if complaints:
+        raise ValueError("; ".join(complaints))
+    current = {id(record) for record in newest(list(read.values()))[0]}
+    chosen = [path for path, record in read.items() if record["official"] and id(record) in current
               and (not environments or record["environment"]["id"] in environments)]
     if not chosen:
         none = f", which has none of {', '.join(environments)}" if environments else ""
@@ -60,7 +74,7 @@ def replays(records: Sequence[Path], episodes: int, seed: int, folder: Path) -> 
             said = record["episodes"][number]
             kept = folder / "outcomes" / f"{path.stem}--{said['seed'].replace(':', '-')}.json"
             found.setdefault(record["environment"]["name"], []).append(
-                (said["seconds"], Replay(path, number, kept)))
+                (said["seconds"], Replay(path, number, kept, _identity(path, record, number))))
     cheap_first = sorted(found.values(), key=lambda timed: sum(seconds for seconds, _ in timed))
     return [replay for timed in cheap_first
             for _, replay in sorted(timed, key=lambda pair: pair[0])]
@@ -96,7 +110,7 @@ def _replay(replay: Replay, isolate: str) -> None:
     record = read_record(replay.record)
     said = record["episodes"][replay.episode]
     outcome: dict[str, Any] = {
-        "identity": _identity(replay), "record": replay.record.name,
+        "identity": replay.identity, "record": replay.record.name,
         "environment": record["environment"]["id"], "method": record["method"],
         "episode": said["seed"], "score": "", "difference": 0.0,
         "said": said.get("scores", {}).get("error"), "again": None, "problem": "", "remark": ""}
@@ -113,19 +127,26 @@ def _replay(replay: Replay, isolate: str) -> None:
             "remark": outdated(record, job), "score": worst,
             "difference": min(off.get(worst, 0.0), 1e300),
             "again": again.get("scores", {}).get("error"),
-            "problem": again.get("message", "") if again["status"] != said["status"] else ""}
+            "problem": "; ".join([
+                *[again.get("message", "")] * (again["status"] != said["status"]),
+                *stated_differently(record, again, (*OF_OURS, "environment"))])}
     write_atomically(replay.outcome, json.dumps(outcome, indent=1).encode())
 
 
 def _kept(replay: Replay) -> dict[str, Any] | None:
-    """What came out, if it is there and of this code."""
+    """What came out, if it is there and of this code, method and world."""
     outcome = read_json(replay.outcome) or {}
-    return outcome if outcome.get("identity") == _identity(replay) else None
+    return outcome if outcome.get("identity") == replay.identity else None
 
 
-def _identity(replay: Replay) -> str:
-    content = hashlib.sha256(replay.record.read_bytes()).hexdigest()
-    return f"{zlib.crc32(content.encode() + source_digest().encode()):08x}"
+def _identity(path: Path, record: dict[str, Any], episode: int) -> str:
+    """As `Replay` has it; where the method is not to be found, of what is missing."""
+    (seed,) = parse_seeds(record["episodes"][episode]["seed"])
+    try:
+        played = job_of(record, isolate="never")._replace(seed=seed).identity()
+    except ValueError as error:
+        played = str(error)
+    return hashlib.sha256(path.read_bytes() + played.encode()).hexdigest()[:16]
 
 
 def differing(rows: pd.DataFrame, tolerance: float = TOLERANCE) -> list[str]:

@@ -7,10 +7,8 @@ import hashlib
 import json
 import platform
 import time
-import traceback
 from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,8 +16,10 @@ import scipy
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
-from eitbench.bench.methods import Method, load_method
+from eitbench._foreign import where_of
+from eitbench.bench.methods import Method, find_method, load_method, version_of
 from eitbench.bench.playing import environment, play
+from eitbench.bench.records import SHARED
 from eitbench.bench.sandbox import guests
 from eitbench.bench.sandbox.host import GuestError
 from eitbench.bench.sandbox.wall import landlock_version
@@ -29,6 +29,11 @@ from eitbench.bench.tracks import Environment, board_of
 from eitbench.data.episodes import simulate
 from eitbench.data.parallel import in_parallel
 from eitbench.data.seeds import name_seed
+from eitbench.data.store import world_digest
+from eitbench.worlds.registry import entry
+
+_LASTING = ("environment", "method", *SHARED)
+"""What a method may not change while it is played: its results are kept by it."""
 
 
 class Job(NamedTuple):
@@ -56,10 +61,15 @@ class Job(NamedTuple):
         return "none" if not self.isolated else "landlock" if landlock_version() else "process"
 
     def identity(self) -> str:
-        """What the outcome depends on; a stored result counts only for the very same."""
-        method = self.load()
-        parts = [*self.environment, method.sha256, method.version, str(self.seed), source_digest(),
-                 np.__version__, scipy.__version__]
+        """What the outcome depends on; a stored result counts only for the very same. Nothing is
+        loaded. ``ValueError`` if there is no such method or environment."""
+        path = find_method(self.method, self.environment.track)
+        sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
+        asked = entry(self.environment.id)
+        world = asked.world.changed(json.loads(self.environment.kwargs).get("world"))
+        parts = [*self.environment, json.dumps(dict(asked.settings), sort_keys=True),
+                 world_digest(world), sha256, version_of(path, sha256), str(self.seed),
+                 source_digest(), np.__version__, scipy.__version__]
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
 
 
@@ -125,13 +135,7 @@ def _failure(error: BaseException) -> dict[str, Any]:
     if isinstance(error, GuestError):
         return {"status": "failed", "message": str(error), "where": error.where}
     return {"status": "failed", "message": f"{type(error).__name__}: {error}",
-            "where": _where(error)}
-
-
-def _where(error: BaseException) -> str:
-    """File and line where it was raised, without the folders of this machine."""
-    last = traceback.extract_tb(error.__traceback__)[-1]
-    return f"{Path(last.filename).name}:{last.lineno}"
+            "where": where_of(error)}
 
 
 def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1, backend: str = "loky",
@@ -203,6 +207,10 @@ def _run_job(job: Job, store: EpisodeStore, run: dict[str, Any], home: str,
              beginning: dict[str, Any]) -> None:
     try:
         result, fields = run_episode(job)
+        if any(result[name] != beginning[name] for name in _LASTING):
+            raise ValueError(f"{job.method} says other things of itself than before")
+        # a world of a script is told apart by the script's file, which this process has not
+        result["identity"] = beginning["identity"]
     # what could be loaded in the beginning and cannot any more: that, too, is only its own result
     except Exception as error:
         result, fields = beginning | _failure(error), {}

@@ -19,7 +19,9 @@ def upgraded(record: dict[str, Any]) -> tuple[dict[str, Any], str]:
     """A record of schema 2 as one of schema 3, not sealed, and the name its file had to have.
     ``ValueError`` if something is missing that the new record is made from."""
     try:
-        return _upgraded(record), file_name(record, record["method_sha256"][:8])
+        name = tracks.record_name(record["environment"]["name"], record["method"],
+                                  record["method_sha256"][:8], record["split"])
+        return _upgraded(record), name
     except (AttributeError, KeyError, TypeError) as error:
         raise ValueError(f"is not valid as one of schema {NUMBER}: {type(error).__name__}: "
                          f"{error}") from None
@@ -45,9 +47,3 @@ def _given(environment: dict[str, Any]) -> dict[str, Any]:
         # The name said that nothing was given, whatever the id was registered with then.
         return {}
     return tracks.changed(environment["id"], environment["kwargs"])
-
-
-def file_name(record: dict[str, Any], version: str) -> str:
-    """``ENV--METHOD--VERSION.json``; of other seeds than test with their split in it too."""
-    split = [] if record["split"] == "test" else [record["split"]]
-    return "--".join([record["environment"]["name"], record["method"], version, *split]) + ".json"

@@ -1,4 +1,4 @@
-"""Statistics of a board: interquartile mean, bootstrap intervals, paired comparisons, shared ranks.
+"""Statistics of a board: interquartile mean, bootstrap intervals, paired comparisons.
 
 Methods play the same episodes, named by their seeds, in several environments. An environment is a
 stratum: episodes are resampled within it, the environments stay as they are. Intervals are
@@ -15,14 +15,23 @@ they compare with rliable's.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
-from itertools import combinations
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import norm
 from scipy.stats import t as student
+
+from eitbench.bench.resampling import (
+    KEPT,
+    counts,
+    drawn_counts,
+    drawn_middles,
+    drawn_positions,
+    middles,
+)
 
 Scores = Mapping[str, Mapping[str, float]]
 """Environment -> seed -> score: of one method, for comparisons seed by seed."""
@@ -92,7 +101,12 @@ def stratified_bootstrap(scores_by_stratum: Mapping[str, ArrayLike], statistic: 
         With fewer than `FEWEST` episodes altogether, or fewer than two in an environment, low and
         high are infinite.
     """
-    return _with_interval(_strata("scores_by_stratum", scores_by_stratum), statistic, draws, seed)
+    strata = sorted_strata("scores_by_stratum", scores_by_stratum)
+
+    def resampled() -> Any:
+        return resampled_values(strata, statistic, draws, seed)
+
+    return _with_interval(float(statistic(*strata)), resampled, sizes_of(strata), draws)
 
 
 def paired_difference(a: Scores, b: Scores, *, statistic: Statistic = mean_over_environments,
@@ -117,14 +131,14 @@ def paired_difference(a: Scores, b: Scores, *, statistic: Statistic = mean_over_
     ``ValueError`` if the environments differ, or there is one without any shared seed.
     """
     pairs = [_sorted(pair) for _, pair in sorted(_pairs(a, b).items())]
+    ours, theirs = ([pair[i] for pair in pairs] for i in (0, 1))
 
-    def difference(*positions: np.ndarray) -> Any:
-        ours, theirs = ([pair[i][drawn] for pair, drawn in zip(pairs, positions, strict=True)]
-                        for i in (0, 1))
-        return statistic(*ours) - statistic(*theirs)
+    def resampled() -> Any:
+        return (resampled_values(ours, statistic, draws, seed)
+                - resampled_values(theirs, statistic, draws, seed))
 
-    positions = [np.arange(pair.shape[1]) for pair in pairs]
-    return _with_interval(positions, difference, draws, seed)
+    value = float(statistic(*ours) - statistic(*theirs))
+    return _with_interval(value, resampled, sizes_of(ours), draws)
 
 
 def paired_probability_of_improvement(a: Scores, b: Scores, *, higher_is_better: bool = False,
@@ -162,9 +176,9 @@ def probability_of_improvement(a: Mapping[str, ArrayLike], b: Mapping[str, Array
         As in `stratified_bootstrap`; so are the three numbers returned, but 0 and 1 stand for
         infinity.
     """
-    _same_environments(a, b)
-    ours = _strata("a", a)
-    theirs = _strata("b", b)
+    check_environments(a, b)
+    ours = sorted_strata("a", a)
+    theirs = sorted_strata("b", b)
     # (n_a, n_b)
     wins = [_wins(x[:, None], y, higher_is_better) for x, y in zip(ours, theirs, strict=True)]
     n = len(wins)
@@ -172,89 +186,56 @@ def probability_of_improvement(a: Mapping[str, ArrayLike], b: Mapping[str, Array
     def probability(*positions: np.ndarray) -> Any:
         # A resample is how often each episode is in it, which makes of all its combinations one
         # matrix product.
-        shares = [((_counts(i) @ won) * _counts(j)).sum(axis=-1) / won.size
+        shares = [((counts(i) @ won) * counts(j)).sum(axis=-1) / won.size
                   for i, j, won in zip(positions[:n], positions[n:], wins, strict=True)]
         return np.mean(shares, axis=0)
 
     positions = [np.arange(len(stratum)) for stratum in [*ours, *theirs]]
-    if not (_enough(ours) and _enough(theirs)):
-        return float(probability(*positions)), 0.0, 1.0
-    return _with_interval(positions, probability, draws, seed)
+    value = float(probability(*positions))
+    if not (is_enough(sizes_of(ours)) and is_enough(sizes_of(theirs))):
+        return value, 0.0, 1.0
+    sizes = sizes_of(positions)
+
+    def resampled() -> Any:
+        return probability(*drawn_positions(sizes, draws, seed))
+
+    return _with_interval(value, resampled, sizes, draws)
 
 
-def shared_ranks(scores: Mapping[str, Scores], unranked: Collection[str] = (), *,
-                 statistic: Statistic = mean_over_environments, higher_is_better: bool = False,
-                 draws: int = DRAWS, seed: int = 0) -> dict[str, int | None]:
-    """Rank of each method: 1 + the number of ranked methods that are significantly better than it.
-
-    Better is one whose `paired_difference` has its whole interval on the better side of zero. Rank
-    1 thus means that nobody was shown to be better, rank 3 that two were, and they can be named. A
-    method too uncertain to be told from others costs them no rank.
-
-    "Cannot be told apart" is not transitive: a and b may be so, and b and c, and still a is better
-    than c. No ranking then gives one rank to exactly those that cannot be told apart; this one
-    gives a and b rank 1 and c rank 2. Nor need ranks rise along the statistic: a method of
-    scattered scores may stand below one of rank 2 and have rank 1. Each comparison is at 95 %,
-    without correction for their number.
-
-    Parameters
-    ----------
-    scores : method -> environment -> seed -> score
-        In the same environments for all.
-    unranked : collection of str
-        Methods outside the competition, such as privileged ones and floors: they have no rank and
-        count for nobody's.
-    statistic : callable
-        Whose differences decide, and whose value orders the methods; as in `stratified_bootstrap`.
-    draws, seed
-        As in `stratified_bootstrap`.
-
-    Returns
-    -------
-    method -> rank, or None if unranked; in the order of the statistic of all own episodes, best
-    first.
-    """
-    for method in scores:
-        _same_environments(next(iter(scores.values())), scores[method])
-    sign = -1.0 if higher_is_better else 1.0
-    values = {}
-    for method, own in scores.items():
-        strata = {name: list(episodes.values()) for name, episodes in own.items()}
-        values[method] = sign * statistic(*_strata("scores", strata))
-    # equal values: not as they happen to come
-    order = sorted(scores, key=lambda method: (values[method], method))
-    ranks = {method: 1 for method in order if method not in unranked}
-    for first, second in combinations(ranks, 2):
-        _, low, high = paired_difference(scores[first], scores[second], statistic=statistic,
-                                         draws=draws, seed=seed)
-        low, high = sorted((sign * low, sign * high))
-        ranks[second] += high < 0
-        ranks[first] += low > 0  # happens where each has episodes that the other has not
-    return {method: ranks.get(method) for method in order}
-
-
-def _with_interval(strata: Sequence[np.ndarray], statistic: Statistic, draws: int,
-                   seed: int) -> tuple[float, float, float]:
-    """A statistic, and the points beyond which `tail` percent of it lie over resamples of each
-    stratum (n_e,); infinite where the episodes are too few."""
-    value = float(statistic(*strata))
-    if not _enough(strata):
+def _with_interval(value: float, resampled: Callable[[], Any], sizes: tuple[int, ...],
+                   draws: int) -> tuple[float, float, float]:
+    """The value of a statistic, and the points beyond which `tail` percent of what it is when
+    ``resampled`` lie, of strata of these sizes; infinite where the episodes are too few."""
+    if not is_enough(sizes):
         return value, -math.inf, math.inf
     if draws < 1:
         raise ValueError(f"draws must be at least 1, got {draws}")
-    random = np.random.default_rng(seed)
-    drawn = (stratum[random.integers(len(stratum), size=(draws, len(stratum)))]
-             for stratum in strata)
-    values = np.asarray(statistic(*drawn))
-    if values.shape != (draws,):  # np.mean, say, would make one number of all draws
-        raise ValueError("statistic must reduce the last axis only: expected shape "
-                         f"{(draws,)}, got {values.shape}")
-    cut = tail([len(stratum) for stratum in strata])
-    low, high = np.percentile(values, [cut, 100.0 - cut])
+    cut = tail(sizes)
+    low, high = np.percentile(resampled(), [cut, 100.0 - cut])
     return value, float(low), float(high)
 
 
-def tail(sizes: Sequence[int]) -> float:
+def resampled_values(strata: Sequence[np.ndarray], statistic: Statistic, draws: int,
+               seed: int) -> np.ndarray:
+    """(draws,): a statistic of resamples of each stratum (n_e,)."""
+    sizes = sizes_of(strata)
+    if statistic is interquartile_mean:               # the same number, without sorting each
+        (first, *others) = strata
+        if not others and len(first) <= KEPT and (first[:-1] <= first[1:]).all():
+            return first[drawn_middles(len(first), draws, seed)].mean(axis=-1)
+        pooled = np.concatenate(strata)
+        return middles(pooled, drawn_counts(sizes, draws, seed)).mean(axis=-1)
+    positions = drawn_positions(sizes, draws, seed)
+    values = np.asarray(statistic(*(stratum[drawn] for stratum, drawn
+                                    in zip(strata, positions, strict=True))))
+    if values.shape != (draws,):  # np.mean, say, would make one number of all draws
+        raise ValueError("statistic must reduce the last axis only: expected shape "
+                         f"{(draws,)}, got {values.shape}")
+    return values
+
+
+@lru_cache(maxsize=256)
+def tail(sizes: tuple[int, ...]) -> float:
     """Percent of the resamples to leave out at each end for an interval of 95 %, with so many
     episodes in each stratum.
 
@@ -267,12 +248,16 @@ def tail(sizes: Sequence[int]) -> float:
     return float(100.0 * norm.cdf(-student.ppf(0.975, freedom) * math.sqrt(n / freedom)))
 
 
-def _enough(strata: Sequence[np.ndarray]) -> bool:
-    sizes = [len(stratum) for stratum in strata]
+def sizes_of(strata: Sequence[np.ndarray]) -> tuple[int, ...]:
+    """Numbers of episodes."""
+    return tuple(len(stratum) for stratum in strata)
+
+
+def is_enough(sizes: Sequence[int]) -> bool:
     return min(sizes) >= 2 and sum(sizes) >= FEWEST
 
 
-def _strata(name: str, scores: Mapping[str, ArrayLike]) -> list[np.ndarray]:
+def sorted_strata(name: str, scores: Mapping[str, ArrayLike]) -> list[np.ndarray]:
     """The scores of each environment, sorted; environments by name."""
     strata = [np.sort(np.asarray(scores[environment], dtype=float), axis=-1)
               for environment in sorted(scores)]
@@ -285,7 +270,7 @@ def _strata(name: str, scores: Mapping[str, ArrayLike]) -> list[np.ndarray]:
 
 def _pairs(a: Scores, b: Scores) -> dict[str, np.ndarray]:
     """Environment -> (2, n_e): scores of the seeds that a and b share."""
-    _same_environments(a, b)
+    check_environments(a, b)
     if not a:
         raise ValueError("a and b must hold scores of at least one environment, got none")
     pairs = {}
@@ -306,7 +291,7 @@ def _sorted(pair: np.ndarray) -> np.ndarray:
     return pair[:, np.lexsort((pair[0], pair[0] - pair[1]))]
 
 
-def _same_environments(a: Mapping[str, Any], b: Mapping[str, Any]) -> None:
+def check_environments(a: Mapping[str, Any], b: Mapping[str, Any]) -> None:
     if set(a) != set(b):
         raise ValueError("environments must be the same for both, got "
                          f"{', '.join(a)} and {', '.join(b)}")
@@ -315,11 +300,3 @@ def _same_environments(a: Mapping[str, Any], b: Mapping[str, Any]) -> None:
 def _wins(a: np.ndarray, b: np.ndarray, higher_is_better: bool) -> np.ndarray:
     """1 where a is better, ½ where they are equal, 0 elsewhere."""
     return 0.5 * (1.0 + (np.sign(a - b) if higher_is_better else np.sign(b - a)))
-
-
-def _counts(positions: np.ndarray) -> np.ndarray:
-    """How often each of 0 … n − 1 is among the n positions: (..., n) of (..., n)."""
-    n = positions.shape[-1]
-    rows = positions.reshape(-1, n)
-    apart = rows + n * np.arange(len(rows))[:, None]
-    return np.bincount(apart.ravel(), minlength=rows.size).reshape(positions.shape)

@@ -10,8 +10,6 @@ import re
 import subprocess
 import timeit
 import warnings
-import zipfile
-import zlib
 from collections.abc import Iterable, Iterator
 from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
@@ -87,8 +85,8 @@ class EpisodeStore:
                 fields = dict(stored)
         except FileNotFoundError:
             raise
-        except (OSError, ValueError, EOFError, TypeError, AttributeError, NotImplementedError,
-                zipfile.BadZipFile, zlib.error) as error:
+        # a damaged archive may raise anything: zlib.error, NotImplementedError, RuntimeError, …
+        except Exception as error:
             raise ValueError(f"estimates {path} cannot be read: {error}") from None
         # no std before a method's first claim: NaN is allowed there
         if "mean" not in fields or not all(
@@ -169,16 +167,15 @@ def _gathered(results: list[dict[str, Any]]) -> dict[str, Any]:
             chosen[result["seed"]] = result
     # 9 before 10
     results = sorted(chosen.values(), key=lambda result: (len(result["seed"]), result["seed"]))
-    runs: list[dict[str, Any]] = []
-    for result in results:
-        if result["run"] not in runs:
-            runs.append(result["run"])
+    said = [json.dumps(result["run"], sort_keys=True) for result in results]
+    runs = dict(zip(said, (result["run"] for result in results), strict=True))
+    place = {run: i for i, run in enumerate(runs)}
     return sealed({
         "schema": SCHEMA, "official": False, "split": split_of(latest["seed"]),
         **{key: latest[key] for key in _OF_ALL},
-        "seeds": [result["seed"] for result in results], "runs": runs,
+        "seeds": [result["seed"] for result in results], "runs": list(runs.values()),
         "episodes": [{key: value for key, value in result.items() if key not in _OF_ALL}
-                     | {"run": runs.index(result["run"])} for result in results],
+                     | {"run": place[run]} for result, run in zip(results, said, strict=True)],
     })
 
 
@@ -234,7 +231,8 @@ def source_digest() -> str:
     """Hash of the code that scores depend on: stored results of other code are played again, and a
     record says of each run which it was."""
     rooms = ("numerics/*", "physics/*", "worlds/*", "data/*", "estimation/**/*", "scoring",
-             "envs/*", "rl/networks", "rl/agents", "bench/run", "bench/score", "bench/policies")
+             "envs/*", "rl/networks", "rl/agents", "bench/outcomes", "bench/playing", "bench/run",
+             "bench/scores")
     return code_digest(package_files(*(f"{room}.py" for room in rooms)))
 
 

@@ -6,13 +6,18 @@ import json
 import math
 import os
 import stat
+from functools import partial
 from pathlib import Path
 from typing import Any
+
+from eitbench import _check
 
 MOST_BYTES = 2**23
 """of a file"""
 DEEPEST = 32
 """levels of lists and objects within each other"""
+LETTERS = 400
+"""of a number that is no integer"""
 
 
 def parsed(path: Path) -> Any:
@@ -22,37 +27,44 @@ def parsed(path: Path) -> Any:
         size = os.stat(path)
         if not stat.S_ISREG(size.st_mode) or size.st_size > MOST_BYTES:
             raise ValueError(f"it is no file of at most {MOST_BYTES >> 20} MiB")
-        content = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse,
-                             parse_int=_integer, parse_float=_real)
-        _check_depth(content)
+        content = _DECODER.decode(path.read_text(encoding="utf-8"))
+        _check.nesting("lists and objects", content, DEEPEST)
         json.dumps(content, ensure_ascii=False).encode()         # halves of letters are no text
     except (OSError, ValueError, RecursionError) as error:
         raise ValueError(f"cannot be read: {error}") from None
     return content
 
 
-def _check_depth(content: Any) -> None:
-    """``ValueError`` if lists and objects lie deeper within each other than `DEEPEST`."""
-    level = [content]
-    for _ in range(DEEPEST):
-        level = [inner for each in level if isinstance(each, dict | list)
-                 for inner in (each.values() if isinstance(each, dict) else each)]
-        if not level:
-            return
-    raise ValueError(f"lists and objects must lie at most {DEEPEST} deep within each other")
+def decoder(bits: int) -> json.JSONDecoder:
+    """Of JSON whose integers have so many bits at most, their sign among them, and whose numbers
+    are finite; else it raises a ``ValueError``."""
+    return json.JSONDecoder(parse_constant=_refuse, parse_int=partial(_integer, bits),
+                            parse_float=_real, object_pairs_hook=_object)
 
 
-def _integer(text: str) -> int:
-    if len(text) > 20 or abs(number := int(text)) >= 2**63:
-        raise ValueError(f"integers must have 64 bits at most, got one of {len(text)} digits")
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):  # readers would believe one of them, this program another
+        raise ValueError("an object must have no name twice")
+    return found
+
+
+def _integer(bits: int, text: str) -> int:
+    # 10 has more than three bits: nothing long is ever made a number
+    if len(text) > 1 + bits // 3 or abs(number := int(text)) >= 1 << bits - 1:
+        raise ValueError(f"integers must have {bits} bits at most, got one of {len(text)} digits")
     return number
 
 
 def _real(text: str) -> float:
-    if not math.isfinite(number := float(text)):
-        raise ValueError(f"numbers must be finite, got {text[:40]}")
+    if len(text) > LETTERS or not math.isfinite(number := float(text)):
+        raise ValueError(f"numbers must be finite and of {LETTERS} letters at most, got "
+                         f"{text[:40]}")
     return number
 
 
 def _refuse(constant: str) -> None:
     raise ValueError(f"{constant} is not JSON")
+
+
+_DECODER = decoder(64)

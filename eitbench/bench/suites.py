@@ -9,7 +9,6 @@ from typing import Any
 from eitbench.bench import playing
 from eitbench.bench.methods import (
     FORMS,
-    Method,
     find_method,
     installed_methods,
     is_ours,
@@ -18,6 +17,7 @@ from eitbench.bench.methods import (
     own_agents,
     own_methods,
 )
+from eitbench.bench.playing import can_play
 from eitbench.bench.run import Job
 from eitbench.bench.tracks import (
     ESTIMATORS,
@@ -84,7 +84,7 @@ def jobs(track: str, environments: list[str], methods: list[str], seeds: list[in
             job = Job(asked, _absolute(method), 0, is_isolated(asked, method, isolate))
             loaded = job.load()
             names[method] = loaded.name
-            if not skipped and _fits(loaded, env):
+            if not skipped and can_play(loaded, env):
                 fitting.add(method)
                 todo += [job._replace(seed=seed) for seed in numbers]
     _distinct(names)
@@ -108,11 +108,6 @@ def _to_look_at(asked: Environment) -> Any:
     if asked.track == "injection":
         asked = asked._replace(kwargs=json.dumps({"estimator": "reduced"}))
     return playing.environment(asked)
-
-
-def _fits(method: Method, env: Any) -> bool:
-    known = env.rules if method.track == "injection" else env.task
-    return board_of(env) in method.boards and method.suits(known)
 
 
 def _distinct(names: dict[str, str]) -> None:

@@ -41,6 +41,7 @@ QUICK = ("eitbench/Pipe2D-v0", "eitbench/Pipe2DFixedLag-v0", "eitbench/Pipe2DSmo
 """What the quick suite runs; the full one runs all that ask for estimates."""
 QUICK_SEEDS = "test:0-3"
 
+
 class Environment(NamedTuple):
     """A registered id with keyword arguments: what is made, and what a record names."""
 
@@ -131,6 +132,13 @@ def named(id: str, given: dict[str, Any]) -> str:
     text = json.dumps(given, sort_keys=True)
     digest = hashlib.sha256(text.encode()).hexdigest()[:8]
     return id.replace("/", "-") + (f"-{digest}" if given else "")
+
+
+def record_name(environment: str, method: str, version: str, split: str) -> str:
+    """Of a record's file: ``ENV--METHOD--VERSION.json``; of other seeds than test with their split
+    in it too."""
+    parts = [environment, method, version, *[split] * (split != "test")]
+    return "--".join(parts) + ".json"
 
 
 def board_of(env: EstimationEnv | InjectionEnv) -> str:

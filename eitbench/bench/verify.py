@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -42,6 +42,10 @@ def job_of(record: dict[str, Any], file: str | None = None, isolate: str = "alwa
         raise ValueError(f"{record['method']} is none of ours: its file must be given, as "
                          "--baseline or --policy")
     path = find_method(method, environment.track)
+    named = own_files(environment.id).get(record["method"])
+    if is_ours(method) and not (named and path.samefile(named)):
+        raise ValueError(f"{path} is one of ours, and not {record['method']}, of which the record "
+                         "is")
     found = hashlib.sha256(path.read_bytes()).hexdigest()
     if found != record["method_sha256"] and not is_ours(method):
         raise ValueError(f"what the record says cannot be played here: the sha256 of {path.name} "
@@ -100,8 +104,7 @@ def verify(record: dict[str, Any], job: Job, *, episodes: int = 3, seed: int = 0
         wrong = differences_of(said, again)
         differences += [f"{said['seed']}: {_difference(name, said, again)}"
                         for name, off in wrong.items() if off > tolerance]
-        differences += [f"{name} is {again[name]!r}, the record says {record[name]!r}"
-                        for name in (*stated, "environment") if again[name] != record[name]]
+        differences += stated_differently(record, again, (*stated, "environment"))
         worst = max(wrong, key=lambda name: wrong[name], default="")
         rows.append({"episode": said["seed"],
                      "greatest difference in": worst if wrong.get(worst) else "none",
@@ -128,6 +131,14 @@ def _own(record: dict[str, Any]) -> str | None:
     if path is None:
         return None
     return name if path.suffix == ".py" and name not in installed_methods() else str(path)
+
+
+def stated_differently(record: dict[str, Any], again: dict[str, Any],
+                       names: Iterable[str]) -> list[str]:
+    """A sentence for each of these fields that is another in an episode's result than in the
+    record."""
+    return [f"{name} is {again[name]!r}, the record says {record[name]!r}"
+            for name in names if again[name] != record[name]]
 
 
 def differences_of(said: dict[str, Any], again: dict[str, Any]) -> dict[str, float]:

@@ -35,7 +35,7 @@ Figure = StrEnum("Figure", {  # type: ignore[misc]
 
 @app.command("list")
 def list_() -> None:
-    """Show the environments and the baselines, and which board each plays on."""
+    """Show the environments, the baselines and policies, and which boards they play on."""
     from eitbench.bench.methods import load_method, own_methods
     from eitbench.bench.tracks import boards_of, ids
     from eitbench.data.recordings import outline
@@ -60,10 +60,11 @@ def list_() -> None:
         allowed = "" if budget is None else f", {budget} of them allowed"
         options.say(f"  {name:40} injection   {what}, {world.n_steps - len(world.currents)} "
                     f"injections{allowed}")
-    options.say("baselines")
-    for name in own_methods("estimation"):
-        baseline = load_method(name, "estimation")
-        options.say(f"  {name:40} {', '.join(baseline.boards):30}  {baseline.title}")
+    for track, heading in (("estimation", "baselines"), ("injection", "policies")):
+        options.say(heading)
+        for name in own_methods(track):
+            method = load_method(name, track)
+            options.say(f"  {name:40} {', '.join(method.boards):30}  {method.title}")
 
 
 @app.command()
@@ -329,6 +330,7 @@ def render(
     out: Annotated[Path, typer.Option(
         "--out", "-o", help="An animation .gif or .webp, or a .png with --step.",
     )] = Path("results/episode.gif"),
+    isolate: options.Isolate = options.Isolation.others,
 ) -> None:
     """Draw an episode: truth, estimate, its spread, electrodes and the injected pair."""
     from eitbench.bench.tracks import track_of
@@ -336,7 +338,8 @@ def render(
     with options.clear_errors():
         if track_of(env) == "injection" and policy is None:
             raise ValueError(f"policy must be given for {env}, which asks for injections")
-        options.say(f"wrote {animate(env, policy or baseline, seed, step, out, every=every)}")
+        drawn = animate(env, policy or baseline, seed, step, out, every=every, isolate=isolate)
+        options.say(f"wrote {drawn}")
 
 
 @app.command()

@@ -44,12 +44,18 @@ def say(text: object, *, err: bool = False) -> None:
 
 @contextmanager
 def clear_errors() -> Iterator[None]:
-    """Turn a ValueError about an argument, the loss of a process, or the want of an extra into a
-    message instead of a traceback."""
+    """Turn a ValueError about an argument, the loss of a process, what a guest did wrong, or the
+    want of an extra into a message instead of a traceback."""
     try:
         yield
     except WorkerLost as error:
         say(error, err=True)
+        raise typer.Exit(1) from error
+    except RuntimeError as error:
+        from eitbench.bench.sandbox.host import GuestError
+        if not isinstance(error, GuestError):
+            raise
+        say(error, err=True)  # a traceback would show a stranger's words as they are
         raise typer.Exit(1) from error
     except ModuleNotFoundError as error:
         if (error.name or "").split(".")[0] not in RL:

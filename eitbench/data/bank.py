@@ -29,7 +29,7 @@ TOGETHER = 8
 
 
 def recording_bytes(world: World) -> int:
-    """Of one recording on disk, with what lies beside it, but for headers of some hundred bytes."""
+    """Bytes of a recording on disk, with what lies beside it, but for headers of some 100 bytes."""
     n = outline(world).mass.shape[0]
     beside = 0 if world.region is None else 4 * n + 16  # see `Integrals`
     return world.n_steps * (recording_type(world, n).itemsize + beside)

@@ -100,7 +100,7 @@ def _explained(error: BaseException) -> WorkerLost:
 
 def _watched(host: int, told: list[Entry], function: Callable[..., Result], *arguments: Any,
              ) -> Result:
-    """The same in a process that ends soon when ``host``, who has started it, does."""
+    """`_pinned`, in a process that ends soon after ``host``, the process that has started it."""
     if os.getppid() == host:
         _end_with(host)
     return _pinned(told, function, *arguments)

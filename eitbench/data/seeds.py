@@ -4,12 +4,16 @@ on the test split of the season (`eitbench.data.seasons`)."""
 from __future__ import annotations
 
 import re
+import sys
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
 
 from eitbench.data.seasons import drawn_names, season_of
 
+OURS = ("eitbench", "gymnasium")
+"""Packages whose lines no user wrote."""
 SPLITS = {"train": range(0, 100_000), "dev": range(100_000, 200_000),
           "test": range(200_000, 300_000)}
 
@@ -62,19 +66,37 @@ class ReservedSeedWarning(UserWarning):
     """Somebody plays an episode of which scores are reported."""
 
 
+_FOR_SCORES = ContextVar("for_scores", default=False)
+
+
 def warn_of_reserved(seeds: Iterable[int]) -> None:
-    """A `ReservedSeedWarning`, which Python shows once, if one of these episodes is of the test
-    split and nobody said that it is played `for_scores`."""
+    """A `ReservedSeedWarning`, which Python shows once a line of the user's, if one of these
+    episodes is of the test split and nobody said that it is played `for_scores`."""
+    if _FOR_SCORES.get():
+        return
     if reserved := [seed for seed in seeds if is_test(seed)]:
         warnings.warn(f"reset(seed={reserved[0]}) began a test episode, {name_seed(reserved[0])}, "
                       "on which methods are scored: what was trained or chosen on it has no fair "
                       f"score; choose on dev seeds, from {SPLITS['dev'][0]}",
-                      ReservedSeedWarning, stacklevel=3)
+                      ReservedSeedWarning, stacklevel=_users_level())
 
 
 @contextmanager
 def for_scores() -> Iterator[None]:
     """Within, test episodes are played as they are meant to be."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ReservedSeedWarning)
+    token = _FOR_SCORES.set(True)
+    try:
         yield
+    finally:
+        _FOR_SCORES.reset(token)
+
+
+def _users_level() -> int:
+    """The ``stacklevel`` of the first caller that is neither of this package nor of gymnasium, for
+    a warning that the caller of this function gives."""
+    level = 1
+    frame = sys._getframe(1)
+    while frame.f_back and frame.f_globals.get("__name__", "").split(".")[0] in OURS:
+        frame = frame.f_back
+        level += 1
+    return level

@@ -51,6 +51,14 @@ def identity(world: World) -> dict[str, Any]:
             "numpy": np.__version__, "scipy": scipy.__version__}
 
 
+@lru_cache(maxsize=64)
+def world_digest(world: World) -> str:
+    """Of all that a score depends on but seed, question and method: what `identity` names, and the
+    instrument, the schedule and what is believed beforehand."""
+    said = [identity(world), described(world), _parts(kinds(world))]
+    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
+
+
 def described(part: Any) -> Any:
     """A dataclass as JSON, with the names of its classes."""
     if is_dataclass(part):

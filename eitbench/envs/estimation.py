@@ -213,7 +213,8 @@ class EstimationEnv(gym.Env[Observation, np.ndarray], EzPickle):
 
 def asked_for(name: str, changes: dict[str, Any] | None, lag: int | str | None,
               assumed: dict[str, Any] | None) -> tuple[World, int, dict[str, Any]]:
-    """World, lag, and what models believe, of an id and its arguments; ``ValueError`` if not."""
+    """The world, the lag, and what models believe, that an id and its arguments ask for;
+    ``ValueError`` if one of them is not allowed."""
     registered = entry(name)
     world = registered.world.changed(changes)
     if lag is None:

@@ -90,7 +90,10 @@ class InjectionEnv(gym.Env[Any, Any], EzPickle):
         return self._observe(), {"step": 1}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Inject what the action asks for, and measure; ``ValueError`` if there is no such one."""
+        """Inject what the action asks for, and measure; ``ValueError`` if there is no such one.
+
+        Currents beyond ±1 are no mistake: they are cut to ±1 before all else, see `Rules`.
+        """
         if not 1 <= self._step <= self._core.length:
             raise gym.error.ResetNeeded(RESET_NEEDED)
         space = self.action_space

@@ -49,15 +49,15 @@ def scaled(rules: Rules, observation: Observation) -> np.ndarray:
     observation but for the scale, the first frame left out.
     """
     world = rules.world
-    level = rules.world.expected_concentration
+    level = world.expected_concentration
     left = np.array([world.n_steps, rules.budget or 1][:observation["left"].shape[-1]])
     parts = [observation["voltages"] / outline(world).largest_voltage,
              observation["recent"] / rules.amplitude,
              observation["innovations"] / 3.0, 2.0 * (observation["mean"] / level - 1.0),
              observation["std"] / (world.prior.inflow_std * level), observation["doubt"],
              observation["left"] / left]
-    if world.velocity_model is not None:
-        flow = world.velocity_model
+    flow = world.velocity_model
+    if flow is not None:
         parts += [2.0 * (observation["velocity"] / flow.nominal - 1.0),
                   observation["velocity_std"] / flow.initial_std]
     batch = observation["voltages"].shape[:-1]
@@ -91,9 +91,8 @@ class InjectionCore:
         rules = self.rules
         L = world.currents.shape[1]
         level = world.expected_concentration
-        # "L2" goes up to √2
         largest = 1e3 * outline(world).largest_voltage
-        current = 1.5 * rules.amplitude
+        current = 1.5 * rules.amplitude                                    # "L2" goes up to √2
         shown: dict[str, spaces.Space] = {
             "voltages": spaces.Box(-largest, largest, (L,), np.float64),
             "currents": spaces.Box(-current, current, (L,), np.float64)}
@@ -106,11 +105,11 @@ class InjectionCore:
                       "mean": spaces.Box(-1e3 * level, 1e3 * level, patches, np.float64),
                       "std": spaces.Box(0.0, 1e3 * level, patches, np.float64),
                       "doubt": spaces.Box(0.0, 1.0, (2, L), np.float64)}
-            if world.velocity_model is not None:
-                k = world.velocity_model.size
-                fastest = 100.0 * max(world.velocity_model.nominal)
-                shown |= {"velocity": spaces.Box(-fastest, fastest, (k,), np.float64),
-                          "velocity_std": spaces.Box(0.0, fastest, (k,), np.float64)}
+            flow = world.velocity_model
+            if flow is not None:
+                fastest = 100.0 * max(flow.nominal)
+                shown |= {"velocity": spaces.Box(-fastest, fastest, (flow.size,), np.float64),
+                          "velocity_std": spaces.Box(0.0, fastest, (flow.size,), np.float64)}
         left = [world.n_steps] if rules.budget is None else [world.n_steps, rules.budget]
         shown["left"] = spaces.Box(np.zeros(len(left)), np.array(left, dtype=float),
                                    dtype=np.float64)
@@ -125,7 +124,7 @@ class InjectionCore:
         """
         world = self.world
         B = len(seeds)
-        L = self.world.currents.shape[1]
+        L = world.currents.shape[1]
         T = world.n_steps
         self.seeds = tuple(seeds)
         self._provide = provide

@@ -158,9 +158,10 @@ def _rows(name: str, value: Any, meaning: str) -> list[str]:
     if not is_dataclass(value):
         return [f"| `{name}` | {list(value) if isinstance(value, tuple) else value} | {meaning} |"]
     kind: type = type(value)
-    first = " ".join((kind.__doc__ or "").partition("\n\n")[0].split())
+    first = (kind.__doc__ or "").partition("\n\n")[0]
     said = _meanings(kind)
-    return [f"| `{name}` | {kind.__name__} | {first} |",
+    whole = ". ".join(filter(None, [meaning, _cell(first)]))
+    return [f"| `{name}` | {kind.__name__} | {whole} |",
             *(row for each in fields(value)
               for row in _rows(f"{name}.{each.name}", getattr(value, each.name),
                                said.get(each.name, "")))]
@@ -173,10 +174,15 @@ def _meanings(kind: type) -> dict[str, str]:
     for each in reversed(kind.__mro__[:-1]):
         try:
             body = ast.parse(textwrap.dedent(inspect.getsource(each))).body[0]
-        except (OSError, TypeError):
+        except (OSError, TypeError, SyntaxError):
             continue
         for line, after in pairwise(getattr(body, "body", [])):
             if (isinstance(line, ast.AnnAssign) and isinstance(line.target, ast.Name)
                     and isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)):
-                found[line.target.id] = " ".join(str(after.value.value).split()).replace("|", "\\|")
+                found[line.target.id] = _cell(str(after.value.value))
     return found
+
+
+def _cell(text: str) -> str:
+    """As a table's cell can hold it: in one line, its bars escaped."""
+    return " ".join(text.split()).replace("|", "\\|")

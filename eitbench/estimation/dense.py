@@ -35,7 +35,8 @@ class Filtered(NamedTuple):
 
 
 class DenseKalmanFilter:
-    """The Kalman filter of c⁺ = F c + s + w with any F at each step, in some 3n³ operations.
+    """The Kalman filter of c⁺ = F c + s + w with any F at each step, in some 3n³ operations a
+    prediction.
 
     Where F X costs far less than a product of full matrices, such as solves with a sparse matrix,
     F is better given as a callable: a prediction then costs F X twice, for n columns.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -12,14 +12,11 @@ from scipy.linalg import cho_factor, cho_solve, lu_factor, lu_solve
 
 from eitbench.numerics.sparse_lu import SparseLU
 
-
-class _ObservationModel(Protocol):
-    def voltages(self, concentration: np.ndarray, currents: np.ndarray) -> np.ndarray: ...
-    def linearise(self, concentration: np.ndarray,
-                  currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]: ...
+if TYPE_CHECKING:
+    from eitbench.physics.observation import VoltageModel
 
 
-def gauss_newton(model: _ObservationModel, voltages: np.ndarray, currents: np.ndarray,
+def gauss_newton(model: VoltageModel, voltages: np.ndarray, currents: np.ndarray,
                  noise_std: np.ndarray, penalty: Any, start: np.ndarray, *,
                  tolerance: float = 1e-3, max_iterations: int = 20) -> np.ndarray:
     """argmin_c ‖(V − R(c))/std‖² + cᵀ penalty c, by Gauss–Newton with step halving.
@@ -28,8 +25,7 @@ def gauss_newton(model: _ObservationModel, voltages: np.ndarray, currents: np.nd
 
     Parameters
     ----------
-    model
-        Has ``linearise`` and ``voltages``, see `ObservationModel`.
+    model : VoltageModel
     voltages, currents, noise_std : (K, L)
         One frame: measurements in V, injections in A (A/m in 2D), standard deviations in V.
     penalty : (n, n) sparse or dense

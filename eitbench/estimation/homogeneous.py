@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from eitbench.physics.observation import ObservationModel, VoltageNoise
+    from eitbench.physics.observation import VoltageModel, VoltageNoise
 
 
-def best_homogeneous(model: ObservationModel, noise: VoltageNoise, n: int, voltages: np.ndarray,
+def best_homogeneous(model: VoltageModel, noise: VoltageNoise, n: int, voltages: np.ndarray,
                      currents: np.ndarray, start: float, *, tolerance: float = 1e-8,
                      max_iterations: int = 30) -> float:
     """ĉ_bh = argmin_c Σ ((V − R(c·1))/std)², by Gauss–Newton in ln c (``docs/methods.md``, 3).
@@ -19,8 +19,7 @@ def best_homogeneous(model: ObservationModel, noise: VoltageNoise, n: int, volta
 
     Parameters
     ----------
-    model
-        Has ``linearise(concentration, currents)``, see `ObservationModel`.
+    model : VoltageModel
     noise
         Has ``std(voltages)``; the weights are those of the measured voltages.
     n : int

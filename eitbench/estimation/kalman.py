@@ -11,7 +11,7 @@ from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from eitbench.estimation.covariance import FreeCovariance
 
 if TYPE_CHECKING:
-    from eitbench.physics.observation import ObservationModel, VoltageNoise
+    from eitbench.physics.observation import VoltageModel, VoltageNoise
 
 
 class Observation(NamedTuple):
@@ -166,7 +166,7 @@ def kalman_filter(start: KalmanFilter, observations: Iterable[Observation]) -> l
 # -- nonlinear observations ------------------------------------------------------------------------
 
 
-def linearised(model: ObservationModel, noise: VoltageNoise, point: np.ndarray,
+def linearised(model: VoltageModel, noise: VoltageNoise, point: np.ndarray,
                voltages: np.ndarray, currents: np.ndarray) -> Observation:
     """V_t − R_t(c*) + J_t c* = J_t c + v (thesis 5.2) about ``point`` (n,), for an injection (L,).
 
@@ -179,7 +179,7 @@ def linearised(model: ObservationModel, noise: VoltageNoise, point: np.ndarray,
 class LinearisedObservations:
     """`linearised` at one point for all injections of an episode; each pattern is computed once."""
 
-    def __init__(self, model: ObservationModel, noise: VoltageNoise, point: np.ndarray) -> None:
+    def __init__(self, model: VoltageModel, noise: VoltageNoise, point: np.ndarray) -> None:
         self.model = model
         self.noise = noise
         self.point = point

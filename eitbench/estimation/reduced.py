@@ -105,15 +105,19 @@ class ReducedFilter:
     model : ReducedModel
     mean, covariance : (B, r), (B, r, r)
         Of the present states; the filter works in the precision that these and the model have.
-    """
 
-    innovation_covariance: np.ndarray
-    """(B, m, m) S of the last measurement; rows and columns of readings left out are those of 1"""
+    Attributes
+    ----------
+    innovation_covariance : (B, m, m)
+        S of the last measurement, m = 0 before the first; rows and columns of readings left out are
+        those of 1.
+    """
 
     def __init__(self, model: ReducedModel, mean: np.ndarray, covariance: np.ndarray) -> None:
         self.model = model
         self.mean = mean
         self.covariance = covariance.copy()
+        self.innovation_covariance = np.empty((len(mean), 0, 0))
         self._half = np.empty_like(covariance)
         self._next = np.empty_like(covariance)
         A = model.transition

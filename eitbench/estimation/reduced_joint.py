@@ -86,6 +86,7 @@ class ReducedJointFilter(ReducedFilter):
         self.tables = tables
         self.mean = mean
         self.covariance = covariance.copy()
+        self.innovation_covariance = np.empty((len(mean), 0, 0))
         self._walk_variance = walk_std**2
         self._bounds = bounds
 

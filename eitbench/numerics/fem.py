@@ -29,7 +29,7 @@ def to_skfem(mesh: Mesh) -> skfem.Mesh:
 
 
 def basis(mesh: Mesh, order: int, intorder: int) -> skfem.CellBasis:
-    """Of that order on a mesh, with integrals exact for polynomials of degree ``intorder``."""
+    """Elements of this order on a mesh; integrals exact for polynomials of degree ``intorder``."""
     return skfem.Basis(to_skfem(mesh), element(mesh.dim, order), intorder=intorder)
 
 

@@ -236,7 +236,8 @@ def condense_lanes(start, first_row, rows, panel, children, first_entry, slot, v
     waiting = np.zeros(n_super, np.int64)
     depth = 0
     for s in range(n_super):
-        width, height = start[s + 1] - start[s], first_row[s + 1] - first_row[s]
+        width = start[s + 1] - start[s]
+        height = first_row[s + 1] - first_row[s]
         for i in range(height):
             place[rows[first_row[s] + i]] = i
         for j in range(height):

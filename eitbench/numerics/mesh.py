@@ -107,7 +107,8 @@ class Mesh:
         """The cell (k,) int that holds each of ``points``, and its weights (k, d + 1) there.
 
         Weights are barycentric coordinates, in the order of the cell's nodes: not negative, with
-        rows that sum to one.
+        rows that sum to one. For a point outside the mesh it is the cell that the nearest boundary
+        facet belongs to.
 
         ``ValueError`` if ``points`` has the wrong shape or is not finite.
 
@@ -216,6 +217,7 @@ def increasing(name: str, line: Sequence[float] | np.ndarray) -> np.ndarray:
         raise ValueError(f"{name} must hold at least two strictly increasing coordinates in m, "
                          f"got {line!r}")
     return line
+
 
 def rectangle_mesh(x: Sequence[float] | np.ndarray, y: Sequence[float] | np.ndarray) -> Mesh:
     """Structured triangles on the tensor grid of increasing coordinates ``x`` and ``y`` (m).

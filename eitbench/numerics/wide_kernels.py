@@ -1,7 +1,7 @@
 """Compiled sub-steps of a linear evolution, for WIDE columns side by side.
 
-Numba keeps compiled code by the file of the kernel: who changes a vector instruction in `_kernels`
-touches this file too.
+Numba keeps compiled code by the file of the kernel: who changes a vector instruction in
+`eitbench.numerics.kernels` touches this file too.
 """
 
 from __future__ import annotations

@@ -30,7 +30,7 @@ class PlugFlow(AxialFlow):
     """v̄ in m/s, ≥ 0"""
 
     def __post_init__(self) -> None:
-        _check.number("mean_velocity", self.mean_velocity, low=0.0, units="m/s")
+        check_flow(self.mean_velocity)
 
     def profile(self, y: np.ndarray) -> np.ndarray:
         return np.full(y.shape, self.mean_velocity)
@@ -46,8 +46,7 @@ class ChannelFlow(AxialFlow):
     """R in m, > 0"""
 
     def __post_init__(self) -> None:
-        _check.number("mean_velocity", self.mean_velocity, low=0.0, units="m/s")
-        _check.number("half_width", self.half_width, low=0.0, open_low=True, units="m")
+        check_flow(self.mean_velocity, half_width=self.half_width)
 
 
 @dataclass(frozen=True)
@@ -89,8 +88,7 @@ class RoundPipeFlow:
     """R in m, > 0"""
 
     def __post_init__(self) -> None:
-        _check.number("mean_velocity", self.mean_velocity, low=0.0, units="m/s")
-        _check.number("radius", self.radius, low=0.0, open_low=True, units="m")
+        check_flow(self.mean_velocity, radius=self.radius)
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
         velocity = np.zeros_like(points, dtype=float)
@@ -98,3 +96,10 @@ class RoundPipeFlow:
         # by rounding r may exceed R
         velocity[:, 2] = 2.0 * self.mean_velocity * np.maximum(1.0 - squared, 0.0)
         return velocity
+
+
+def check_flow(mean_velocity: float, **size: float) -> None:
+    """``ValueError`` unless a mean velocity (m/s) is ≥ 0, and a size (m), if there is one, > 0."""
+    _check.number("mean_velocity", mean_velocity, low=0.0, units="m/s")
+    for name, value in size.items():
+        _check.number(name, value, low=0.0, open_low=True, units="m")

@@ -96,6 +96,17 @@ class VoltageNoise:
         return np.sqrt(of_both + self.floor**2)
 
 
+class VoltageModel(Protocol):
+    """What computes voltages, and their derivatives, as estimators ask for them."""
+
+    def voltages(self, concentration: np.ndarray, currents: np.ndarray) -> np.ndarray:
+        """Noise-free voltages (K, L) in V for currents (K, L) in A (A/m in 2D)."""
+
+    def linearise(self, concentration: np.ndarray,
+                  currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Voltages (K, L) and their derivatives by c, (K, L, n) in V·m³/mol."""
+
+
 class ObservationModel:
     """Voltages for a nodal concentration on the CD mesh: V = R(c).
 

@@ -204,7 +204,8 @@ class ConvectionDiffusion:
 
     @cached_property
     def _transition(self) -> tuple[np.ndarray, np.ndarray]:
-        n, m = self.mesh.n_nodes, len(self.inlet)
+        n = self.mesh.n_nodes
+        m = len(self.inlet)
         identity = np.eye(n)
         F = self._advance(identity, identity[self.inlet], np.zeros((m, n)))
         Y = self._advance(np.zeros((n, m)), np.zeros((m, m)), np.eye(m))
@@ -214,7 +215,8 @@ class ConvectionDiffusion:
 
     @cached_property
     def _evolution_model(self) -> EvolutionModel:
-        n, m = self.mesh.n_nodes, len(self.inlet)
+        n = self.mesh.n_nodes
+        m = len(self.inlet)
         nothing = np.zeros((m, n))
         H = self._advance(np.zeros((n, n)), nothing, nothing, source=np.eye(n) / self.time_step)
         H.setflags(write=False)

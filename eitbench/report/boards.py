@@ -3,24 +3,34 @@
 from __future__ import annotations
 
 import math
+from array import array
 from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple
 
 import pandas as pd
 
+from eitbench.bench.contradictions import version_number
+from eitbench.bench.ranking import shared_ranks
 from eitbench.bench.records import file_name, finished, newest, read_sound_records
 from eitbench.bench.statistics import (
     interquartile_mean,
     mean_over_environments,
-    shared_ranks,
     stratified_bootstrap,
 )
 from eitbench.bench.text import scores_by_seed, seed_ranges
 from eitbench.bench.tracks import CLASSES, FLOORS, ids, named, track_of_board
 from eitbench.bench.tracks import class_of as class_of_board
 from eitbench.data.seasons import Season, current_season, season_of
-from eitbench.report.summary import columns, explanations, place_of_world, summary_row, world
+from eitbench.report.summary import (
+    Anchors,
+    anchors,
+    columns,
+    explanations,
+    place_of_world,
+    summary_row,
+    world,
+)
 
 ALL = "all"
 """Stands for the environment in the rows of an aggregate."""
@@ -114,6 +124,7 @@ def boards(records: list[dict[str, Any]]) -> pd.DataFrame:
     current, _ = newest(records)
     registered = {named(id, {}) for id in ids()}
     products = _matrix_products(current)
+    known = anchors(current)
     rows: list[dict[str, Any]] = []
     for name in CLASSES:
         members = [record for record in current if class_of(record) == name]
@@ -123,7 +134,7 @@ def boards(records: list[dict[str, Any]]) -> pd.DataFrame:
                                          if record["environment"]["name"] == environment])
                   for _, environment in environments}
         for environment, entries in played.items():
-            rows += _board(environment, entries, current, products)
+            rows += _board(environment, entries, known, products)
         rows += _aggregate(_counted({environment: entries for environment, entries in played.items()
                                      if environment in registered}))
     types: dict[str, Any] = dict.fromkeys([*_NUMBERS, *others(), *_AFTER], float)
@@ -143,7 +154,7 @@ def read_for_boards(folder: Path, season: Season | None = None,
     split = (season or current_season()).split
     if not folder.is_dir():
         raise ValueError(f"records must be a folder that exists, got {folder}")
-    read, complaints = read_sound_records(folder)
+    read, complaints = read_sound_records(folder, keep=_packed)
     found = [record for record in read if record["split"] == split]
     complaints += [f"record {folder / file_name(record)} has {record['split']} seeds, and "
                    "leaderboards are made of test seeds"
@@ -153,6 +164,14 @@ def read_for_boards(folder: Path, season: Season | None = None,
         raise ValueError(f"records must be a folder with records of {split} seeds, got {folder}, "
                          f"where there are none that can be shown{named}")
     return found, complaints
+
+
+def _packed(record: dict[str, Any]) -> dict[str, Any]:
+    """With the error of each step, which is most of a record, in a quarter of the memory."""
+    for episode in record["episodes"]:
+        if "step_errors" in episode:
+            episode["step_errors"] = array("d", episode["step_errors"])
+    return record
 
 
 def class_of(record: dict[str, Any]) -> str:
@@ -184,7 +203,7 @@ def _entries(records: list[dict[str, Any]]) -> list[Entry]:
     return entries
 
 
-def _board(environment: str, entries: list[Entry], current: list[dict[str, Any]],
+def _board(environment: str, entries: list[Entry], known: Anchors,
            products: dict[str, float]) -> list[dict[str, Any]]:
     """Rows of one environment, by their mean error; after them who has not finished every
     episode."""
@@ -193,7 +212,7 @@ def _board(environment: str, entries: list[Entry], current: list[dict[str, Any]]
     rows = []
     for entry in sorted(entries, key=_place):
         record = entry.record
-        summarised = summary_row(record, current)
+        summarised = summary_row(record, known)
         means = {name: summarised[name] and summarised[name][0] for name in others()}
         rows.append(_row(entry, environment, ranks.get(entry.label)) | {
             "seeds": seed_ranges(record["seeds"]),
@@ -220,7 +239,9 @@ def _counted(played: dict[str, list[Entry]]) -> dict[str, list[Entry]]:
 
 
 def _is_floor(record: dict[str, Any]) -> bool:
-    return bool(record["method"] == FLOORS[track_of_board(record["board"])])
+    """Whether it is of the floor itself: a stranger's file may have its name, not its version."""
+    return (record["method"] == FLOORS[track_of_board(record["board"])]
+            and version_number(record["version"]) is not None)
 
 
 def _aggregate(played: dict[str, list[Entry]]) -> list[dict[str, Any]]:
@@ -234,14 +255,18 @@ def _aggregate(played: dict[str, list[Entry]]) -> list[dict[str, Any]]:
     gains = {label: {environment: entries[label].gains
                      for environment, entries in zip(played, found, strict=True)}
              for label in labels}
-    competing = {label: own for label, own in gains.items() if not found[0][label].note}
+    notes = {label: list(dict.fromkeys(word for entries in found
+                                       for word in filter(None, entries[label].note.split(", "))))
+             for label in labels}
+    competing = {label: own for label, own in gains.items() if not notes[label]}
     ranks = shared_ranks(competing, statistic=interquartile_mean,
                          higher_is_better=True) if competing else {}
     rows = []
     for label in labels:
         row = _row(found[0][label], ALL, ranks.get(label))
         row |= _three("gain", gains[label], interquartile_mean)
-        rows.append(row | {"official": all(entries[label].record["official"] for entries in found)})
+        rows.append(row | {"note": ", ".join(notes[label]),
+                           "official": all(entries[label].record["official"] for entries in found)})
     return sorted(rows, key=lambda row: (-row["gain"], row["method"], row["version"]))
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
+from eitbench.bench.contradictions import version_number
 from eitbench.bench.records import newest, read_record, read_records
 from eitbench.bench.scores import Score, scores
 from eitbench.bench.statistics import (
@@ -25,11 +26,14 @@ from eitbench.report.templates import template
 
 FIELDS = ("environment", "episodes", "a", "b", "difference", "low", "high",
           "better", "better_low", "better_high")
+FEWEST_DIGITS = 4
+"""of a version that is told by the first digits of a file's sha256"""
 
 
 def find(name: str, folder: Path) -> list[dict[str, Any]]:
     """The records that are meant by the path of one, or by METHOD or METHOD@VERSION within a
-    folder; an outdated one only by its version.
+    folder; an outdated one only by its version. Without a version official records are preferred;
+    of a version that is digits of a file's sha256 the first four do.
 
     Raises
     ------
@@ -41,7 +45,9 @@ def find(name: str, folder: Path) -> list[dict[str, Any]]:
     method, _, asked = name.partition("@")
     there = read_records(folder)
     records = [record for record in (there if asked else newest(there)[0])
-               if record["method"] == method and record["version"].startswith(asked)]
+               if record["method"] == method and (not asked or _is_version(record, asked))]
+    if not asked:
+        records = [record for record in records if record["official"]] or records
     versions = sorted({record["version"] for record in records})
     if not records:
         raise ValueError(f"there is no record of {name} in {folder}")
@@ -49,6 +55,13 @@ def find(name: str, folder: Path) -> list[dict[str, Any]]:
         found = ", ".join(f"{method}@{each}" for each in versions)
         raise ValueError(f"{name} fits several versions: {found}")
     return records
+
+
+def _is_version(record: dict[str, Any], asked: str) -> bool:
+    """Whether a record's version is what was asked for, or begins so, if it is no number."""
+    version = str(record["version"])
+    shortened = version_number(version) is None and len(asked) >= FEWEST_DIGITS
+    return version == asked or (shortened and version.startswith(asked))
 
 
 def comparable(name: str) -> Score:

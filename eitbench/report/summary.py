@@ -6,11 +6,13 @@ from __future__ import annotations
 import json
 import math
 import re
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from eitbench.bench.contradictions import version_number
 from eitbench.bench.records import BOARDS, finished
 from eitbench.bench.scores import scores
 from eitbench.bench.table import NOTHING, Cell, Table
@@ -28,6 +30,11 @@ SPLITS = ["dev", "train", "own"]
 """In the order in which boards are shown, after the reported seeds."""
 _NOT_THE_WORLD = ("lag", "assume", "gate", "episodes", "render_mode", "observation", "estimator")
 """Arguments of an environment that its episodes do not depend on."""
+
+_ANCHORS = ("homogeneous", "true_model_smoother")
+"""Whose skills are 0 and 1."""
+Anchors = Mapping[tuple[str, str, str], Mapping[str, float]]
+"""Method, world, split -> seed -> ẽ_c."""
 
 
 def columns() -> dict[str, tuple[str, str]]:
@@ -47,7 +54,8 @@ def explanations() -> dict[str, str]:
 def summary(records: list[dict[str, Any]]) -> pd.DataFrame:
     """One row a record: world, board, environment, method, episodes, failed, (mean, half interval)
     of each score."""
-    table = pd.DataFrame([summary_row(record, records) for record in records])
+    known = anchors(records)
+    table = pd.DataFrame([summary_row(record, known) for record in records])
     order = table["error"].map(lambda cell: math.inf if cell is None else cell[0])
     worlds = sorted(set(table["world"]), key=place_of_world)
     keys = {"_split": table["split"].map(_place_of_split),
@@ -58,8 +66,21 @@ def summary(records: list[dict[str, Any]]) -> pd.DataFrame:
     return ordered.drop(columns=list(keys)).reset_index(drop=True)
 
 
-def summary_row(record: dict[str, Any], records: list[dict[str, Any]]) -> dict[str, Any]:
-    """The row of one of the ``records``, among which are the anchors of its skill."""
+def anchors(records: list[dict[str, Any]]) -> Anchors:
+    """Between which skills are measured: of each world and split those of the board with the
+    longest record to look back on; official ones, where there are any."""
+    found: dict[tuple[str, str, str], dict[str, Any]] = {}
+    for record in records:
+        # a stranger's of its name is none
+        if record["method"] in _ANCHORS and version_number(record.get("version", "v1")):
+            key = (record["method"], world(record), record["split"])
+            found[key] = max(found.get(key, record), record, key=lambda other: (
+                other["official"], BOARDS.index(other["board"]), finished(other)))
+    return {key: scores_by_seed(record, "error") for key, record in found.items()}
+
+
+def summary_row(record: dict[str, Any], known: Anchors) -> dict[str, Any]:
+    """The row of a record, whose skill is measured between the anchors that are ``known``."""
     status = [episode["status"] for episode in record["episodes"]]
     row: dict[str, Any] = {
         "world": world(record), "board": record["board"], "split": record["split"],
@@ -69,7 +90,7 @@ def summary_row(record: dict[str, Any], records: list[dict[str, Any]]) -> dict[s
         "episodes": len(status), "failed": sum(s != "ok" for s in status)}
     for name in columns():
         skills = name == "skill"
-        found = _skills(record, records) if skills else scores_by_seed(record, name)
+        found = _skills(record, known) if skills else scores_by_seed(record, name)
         values = list(found.values())
         row[name] = mean_and_interval(values) if values else None
         if name == "seconds_per_step" and values:
@@ -128,23 +149,11 @@ def _dotted(arguments: dict[str, Any]) -> dict[str, Any]:
     return flat
 
 
-def _skills(record: dict[str, Any], records: list[dict[str, Any]]) -> dict[str, float]:
+def _skills(record: dict[str, Any], known: Anchors) -> dict[str, float]:
     """(E_bh − E)/(E_bh − E_ref) with the means over the seeds that all three have; one number, or
-    none.
-
-    The anchors are those of the world's board with the longest record to look back on; official
-    ones, where there are any.
-    """
-    def of(baseline: str) -> dict[str, float]:
-        found = [other for other in records if other["method"] == baseline
-                 and world(other) == world(record) and other["split"] == record["split"]]
-        anchor = max(found, default=None, key=lambda other: (
-            other["official"], BOARDS.index(other["board"]), finished(other)))
-        return scores_by_seed(anchor, "error") if anchor else {}
-
+    none."""
     own = scores_by_seed(record, "error")
-    floor = of("homogeneous")
-    reference = of("true_model_smoother")
+    floor, reference = (known.get((name, world(record), record["split"]), {}) for name in _ANCHORS)
     # a sum's last digit depends on the order
     shared = sorted(own.keys() & floor.keys() & reference.keys())
     if not shared:

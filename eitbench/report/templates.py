@@ -8,6 +8,7 @@ from typing import Any
 import jinja2
 
 from eitbench._foreign import cleaned
+from eitbench.report.rows import badge, breakable, rows_html
 
 
 def template(name: str) -> jinja2.Template:
@@ -17,9 +18,11 @@ def template(name: str) -> jinja2.Template:
 
 @lru_cache(maxsize=1)
 def _environment() -> jinja2.Environment:
-    return jinja2.Environment(loader=jinja2.PackageLoader("eitbench.report", "."), autoescape=True,
+    made = jinja2.Environment(loader=jinja2.PackageLoader("eitbench.report", "."), autoescape=True,
                               trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
                               undefined=jinja2.StrictUndefined, finalize=_seen)
+    made.globals |= {"rows_html": rows_html, "breakable": breakable, "badge": badge}
+    return made
 
 
 def _seen(value: Any) -> Any:

@@ -65,8 +65,8 @@ def load_agent(path: Path, content: bytes) -> tuple[str, str, type[Agent], dict[
 
     The name is ALGO_seedK for our own agents, and bears a mark of the configuration,
     ALGO_MARK_seedK, for all others. A model is unpickled, so it is code: the folder must hold its
-    ``sha256``, and a file that differs is not opened. ``ValueError`` if that, or ``config.json`` or
-    ``sha256`` is missing beside it.
+    ``sha256``, and a file that differs is not opened. ``ValueError`` if it differs, or if
+    ``config.json`` or ``sha256`` is missing beside it.
     """
     try:
         asked = json.loads((path.parent / "config.json").read_text())

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from sb3_contrib import MaskablePPO
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from tqdm import tqdm
 
@@ -98,8 +99,7 @@ def _play(model: OnPolicyAlgorithm, world: InjectionEnv, teacher: Any, number: i
         seen.append(scaled(world.rules, observation))
         said.append(action)
         if pupil_acts:
-            is_masked = "Maskable" in type(model).__name__
-            masks = {"action_masks": world.action_masks()} if is_masked else {}
+            masks = {"action_masks": world.action_masks()} if isinstance(model, MaskablePPO) else {}
             action = int(model.predict(seen[-1], **masks)[0])  # type: ignore[arg-type]
         observation, reward, ended, _, _ = world.step(action)
         rewards.append(reward)

@@ -33,20 +33,8 @@ BELIEVED_PAST_A_BULGE = ("parabolic", "real")
 """What a model of the flow past a bulge may assume."""
 
 
-class PipeFlow(Flow):
-    """A flow through a pipe, by default believed to be laminar with this mean velocity."""
-
-    mean_velocity: float
-
-    def nominal(self, world: World, fine: bool) -> VelocityField:
-        return world.vessel.laminar(self.mean_velocity)
-
-    def flush_steps(self, world: World) -> int:
-        return steps_through(world, self.mean_velocity)
-
-
 @dataclass(frozen=True)
-class LaminarFlow(PipeFlow):
+class LaminarFlow(Flow):
     """Laminar flow with a known mean velocity; [T]: the thesis' number; [ours]: our choice."""
 
     mean_velocity: float = 4.5
@@ -57,6 +45,9 @@ class LaminarFlow(PipeFlow):
     def __post_init__(self) -> None:
         check_positive(self, mean_velocity="m/s", diffusivity="m²/s")
 
+    def nominal(self, world: World, fine: bool) -> VelocityField:
+        return world.vessel.laminar(self.mean_velocity)
+
     def check_assumed(self, world: World, assumed: Mapping[str, Any]) -> None:
         """``mean_velocity`` in m/s, and in a plane pipe ``profile``, one of `PROFILES`."""
         laminar_assumption(world, self.mean_velocity, assumed)
@@ -64,11 +55,16 @@ class LaminarFlow(PipeFlow):
     def believed(self, world: World, **assumed: Any) -> VelocityField:
         return laminar_assumption(world, self.mean_velocity, assumed)
 
+    def flush_steps(self, world: World) -> int:
+        return steps_through(world, self.mean_velocity)
+
+
 @dataclass(frozen=True)
-class DrawnFlow(LaminarFlow):
+class DrawnFlow(Flow):
     """A flow through a plane pipe that is drawn for each episode (thesis 5.1.2 and ch. 6).
 
-    v̄(t) = mean·(1 + swing·sin(2πt/period + phase)), its profile (1 − η²)·exp(kη).
+    v̄(t) = mean·(1 + swing·sin(2πt/period + phase)), its profile (1 − η²)·exp(kη). Estimators are
+    told of a laminar one.
     """
 
     mean_velocity: float = 4.5
@@ -91,7 +87,7 @@ class DrawnFlow(LaminarFlow):
     """m/s a time step, standard deviation of the believed random walk [ours]"""
 
     def __post_init__(self) -> None:
-        super().__post_init__()
+        check_positive(self, mean_velocity="m/s", diffusivity="m²/s")
         check_range(self, "velocity_range", "m/s")
         check_range(self, "swing_range", open_low=False)
         check_range(self, "period_range", "s")
@@ -103,6 +99,19 @@ class DrawnFlow(LaminarFlow):
             raise ValueError(f"profiles must be None, 'mean' or 'three', got {self.profiles!r}")
         _check.number("velocity_std", self.velocity_std, low=0.0, units="m/s")
         _check.number("velocity_walk", self.velocity_walk, low=0.0, units="m/s")
+
+    def nominal(self, world: World, fine: bool) -> VelocityField:
+        return world.vessel.laminar(self.mean_velocity)
+
+    def check_assumed(self, world: World, assumed: Mapping[str, Any]) -> None:
+        """As in `LaminarFlow`."""
+        laminar_assumption(world, self.mean_velocity, assumed)
+
+    def believed(self, world: World, **assumed: Any) -> VelocityField:
+        return laminar_assumption(world, self.mean_velocity, assumed)
+
+    def flush_steps(self, world: World) -> int:
+        return steps_through(world, self.mean_velocity)
 
     def lead_in(self, world: World) -> int:
         return steps_through(world, self.velocity_range[0] * (1.0 - self.swing_range[1]))
@@ -135,7 +144,7 @@ class DrawnFlow(LaminarFlow):
 
 
 @dataclass(frozen=True)
-class WanderingFlow(PipeFlow):
+class WanderingFlow(Flow):
     """A parabolic flow in a plane pipe whose mean velocity is a random walk; numbers are ours.
 
     At every time step it goes up or down by ``velocity_walk``, which is also the walk that
@@ -157,6 +166,13 @@ class WanderingFlow(PipeFlow):
         check_positive(self, mean_velocity="m/s", diffusivity="m²/s", velocity_walk="m/s")
         _check.number("velocity_std", self.velocity_std, low=0.0, units="m/s")
         check_range(self, "velocity_range", "m/s")
+
+    def nominal(self, world: World, fine: bool) -> VelocityField:
+        return world.vessel.laminar(self.mean_velocity)
+
+    def flush_steps(self, world: World) -> int:
+        return steps_through(world, self.mean_velocity)
+
     def lead_in(self, world: World) -> int:
         return steps_through(world, self.velocity_range[0])
 
@@ -182,7 +198,7 @@ class WanderingFlow(PipeFlow):
 
 
 @dataclass(frozen=True)
-class FlowPastBulge(PipeFlow):
+class FlowPastBulge(Flow):
     """The steady Navier–Stokes flow through a plane pipe with a bulge, behind which it separates.
 
     Better fluid models are what the thesis names as its next step (5.1.1). Estimators know the
@@ -217,6 +233,9 @@ class FlowPastBulge(PipeFlow):
         if assumed.get("flow") == "real":
             return self.nominal(world, fine=False)
         return LocalParabola(self.mean_velocity, world.vessel.half_width, world.vessel.bulge)
+
+    def flush_steps(self, world: World) -> int:
+        return steps_through(world, self.mean_velocity)
 
     def true_transport(self, world: World, model: Discretisation, random: np.random.Generator,
                        ) -> Callable[[int], Transport]:

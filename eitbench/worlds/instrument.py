@@ -53,7 +53,8 @@ class Instrument:
     """V; std of an absolute noise beside the relative one"""
     limit: str | None = None
     """what an agent may ask for. None: pairs of electrodes. "L1", "L2" or "Linf": a current for
-    each electrode, scaled down to this norm of a pair's currents where it exceeds it"""
+    each electrode, cut to ±1 in parts of `current`, freed of its mean, and scaled down to this norm
+    of a pair's currents where it exceeds it"""
     dead: tuple[int, int] = (0, 0)
     """least and most electrodes whose wire is broken from the beginning"""
     failing: tuple[int, int] = (0, 0)

@@ -18,9 +18,7 @@ if TYPE_CHECKING:
     from eitbench.physics.profiles import SkewedChannelFlow, VelocityModel
     from eitbench.physics.transport import Transport, VelocityField
     from eitbench.worlds.streams import Randomness
-
-World = Any
-"""The `eitbench.worlds.world.World` that is made of parts: one floor up, so not to be imported."""
+    from eitbench.worlds.world import World
 
 
 class Discretisation(NamedTuple):

@@ -26,8 +26,9 @@ This is the same world with a current of its own for each electrode, and as much
 best currents, the same at every step, take a tenth off the ẽ_c of any pairs, and the clairvoyant 2
 % more. The adaptivity gap is none.
 
-Actions are in parts of the instrument's 0.1 A/m. Their mean is taken away (Σ I = 0); if they then
-exceed the limit, they are scaled down to it. The limit is the norm of a pair: Σ|I| ≤ 2 ("L1", a
-total current), Σ I² ≤ 2 ("L2", a power) or |I| ≤ 1 ("Linf", a source for each electrode):
+Actions are in parts of the instrument's 0.1 A/m. Entries beyond ±1 are first cut to ±1; then their
+mean is taken away (Σ I = 0); if they still exceed the limit, they are scaled down to it. The limit
+is the norm of a pair: Σ|I| ≤ 2 ("L1", a total current), Σ I² ≤ 2 ("L2", a power) or |I| ≤ 1
+("Linf", a source for each electrode):
 `world={{"instrument": {{"limit": "L1"}}}}`.
 """)

@@ -35,7 +35,7 @@ def randomness(seed: int) -> Randomness:
 
 def in_state(state: Mapping[str, Any]) -> np.random.Generator:
     """A generator that goes on from this state of another one, and knows nothing of the seed that
-    led to it."""
-    generator = np.random.default_rng(0)
+    led to it; what it spawns is of this state only."""
+    generator = np.random.default_rng([state["state"]["state"], state["state"]["inc"]])
     generator.bit_generator.state = state
     return generator

@@ -37,11 +37,13 @@ class World:
     target: Any
     """a `Target`"""
     instrument: Instrument = field(default_factory=Instrument)
+    """what injects and measures"""
     schedule: Schedule = field(default_factory=Schedule)
+    """when, for how long, and in which pattern"""
     prior: Prior = field(default_factory=Prior)
     """what estimators are told to believe"""
     region: tuple[float, float] | None = None
-    """m along the vessel's axis; only errors between these cross-sections count. None: all"""
+    """m along the vessel's first axis; only errors between these cross-sections count. None: all"""
 
     def __post_init__(self) -> None:
         for part in (self.vessel, self.flow, self.target):

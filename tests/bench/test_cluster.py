@@ -12,7 +12,6 @@ from eitbench.bench.run import Job, run_episode, run_jobs
 from eitbench.bench.store import EpisodeStore
 from eitbench.data import parallel
 from eitbench.data.parallel import BACKENDS, WorkerLost, in_parallel
-from eitbench.data.store import CACHE_VARIABLE
 
 from tiny import FILTER, count, write_baseline
 
@@ -23,8 +22,7 @@ KILL = ("open({log!r}, 'a').write('made\\n'); "
 
 
 @pytest.fixture(autouse=True)
-def cache(run_cache, monkeypatch):
-    monkeypatch.setenv(CACHE_VARIABLE, run_cache)
+def quiet(monkeypatch):
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
 
 

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from eitbench.bench.store import EpisodeStore
 from eitbench.cli import app
-from eitbench.data.store import CACHE_VARIABLE
 from typer.testing import CliRunner
 
 from short import shorten
@@ -15,9 +14,8 @@ from tiny import FILTER, SCENARIO, write_baseline
 
 
 @pytest.fixture(autouse=True)
-def tiny_world(monkeypatch, tmp_path, run_cache):
+def tiny_world(monkeypatch, tmp_path):
     """The registered environment plays a tiny world, in an empty folder."""
-    monkeypatch.setenv(CACHE_VARIABLE, run_cache)
     shorten(monkeypatch, {FILTER.id: SCENARIO})
     monkeypatch.chdir(tmp_path)
 
@@ -65,7 +63,9 @@ def test_arguments_that_there_are_not_are_named(played):
 
 @pytest.mark.parametrize("damage", [
     lambda data: data[:len(data) // 2], lambda data: b"", lambda data: b"PK", lambda data: data[:200] + data[300:],
-    lambda data: b"\x93NUMPY", lambda data: data.replace(b"mean.npy", b"main.npy")])
+    lambda data: b"\x93NUMPY", lambda data: data.replace(b"mean.npy", b"main.npy"),
+    # marked as encrypted
+    lambda data: re.sub(rb"(PK\x01\x02.{4}).", lambda found: found[1] + b"\x01", data, flags=re.DOTALL)])
 def test_damaged_estimates_are_named_and_the_table_is_shown(damage, played):
     """The page is made without pictures."""
     for path in played.glob("*.npz"):

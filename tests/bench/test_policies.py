@@ -312,6 +312,9 @@ def test_wrong_names_are_named(tmp_path):
         load_method("lucky", "injection")
     with pytest.raises(ValueError, match="has the name of one of ours"):
         load_method(write_policy(tmp_path, name="adjacent"), "injection")
+    (tmp_path / "greedy_a.zip").write_bytes(b"PK")
+    with pytest.raises(ValueError, match=r"greedy_a\.zip has the name of one of ours"):
+        load_method(str(tmp_path / "greedy_a.zip"), "injection")
     with pytest.raises(ValueError, match="environment eitbench/Pipe2D-v0 does not ask for injections"):
         injected("eitbench/Pipe2D-v0", {}, "adjacent", 1)
     with pytest.raises(ValueError, match="estimator must be one of full, reduced, got 'none'"):

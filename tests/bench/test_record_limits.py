@@ -98,7 +98,7 @@ def test_numbers_out_of_bounds_are_named_with_the_file(number, place, tmp_path):
 
 def test_what_is_too_deep_or_too_large_is_named(tmp_path):
     """Before anything is made of it."""
-    for depth, message in ((DEEPEST, "deep within each other"), (50_000, "cannot be read")):
+    for depth, message in ((DEEPEST, "nested deeper than 32 levels"), (50_000, "cannot be read")):
         path = left(tmp_path, record("mine", [0.1], parameters={"a": 7}), old='{"a": 7}',
                     new='{"a": ' + "[" * depth + "]" * depth + "}")
         with pytest.raises(ValueError, match=f"record .*{path.name}.*{message}"):
@@ -114,6 +114,19 @@ def test_what_is_too_deep_or_too_large_is_named(tmp_path):
     path.mkdir()
     with pytest.raises(ValueError, match="it is no file"):
         read_record(path)
+
+
+@pytest.mark.parametrize(("place", "changes"), [
+    (r"runs\[0\]\.walls: must be at most 20 texts", {"runs": [RUN | {"walls": [{"a": i} for i in range(100_000)]}]}),
+    (r"runs\[1\]\.walls: must be at most 20 texts", {"runs": [RUN, RUN | {"walls": [[]]}]}),
+    (r"runs: must be at most 10000", {"runs": [RUN] * 10_001}),
+    (r"episodes: must be at most 10000", {"episodes": [1] * 10_001}),
+    (r"step_errors: must be at most 100000", {"episodes": [episode("test:0", 0.1) | {"step_errors": [0.1] * 100_001}]}),
+])
+def test_lists_that_are_too_long_are_not_looked_at(place, changes, tmp_path):
+    """Whether the items of a list are different ones is asked of a few only: each is compared with each."""
+    with pytest.raises(ValueError, match=rf"is not valid: \$\.(episodes\[0\]\.)?{place}"):
+        read_record(left(tmp_path, record("mine", [0.1], **changes)))
 
 
 def test_steps_are_as_many_in_every_episode(tmp_path):

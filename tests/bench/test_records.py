@@ -355,6 +355,18 @@ def test_migrating_replaces_nothing_else(tmp_path):
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
+def test_two_old_records_of_one_method_are_not_migrated_over_each_other(tmp_path):
+    """Of two files of a method of ours both would be its v1: they are named, and stay as they are."""
+    for text in ("one", "two"):
+        write_old(tmp_path, old(record("homogeneous", [0.1], official=True, method_sha256=sha(text))))
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    assert len(before) == 2
+    with pytest.raises(ValueError, match=r"both become eitbench-Pipe2D-v0--homogeneous--v1\.json") as caught:
+        list(migrate(tmp_path))
+    assert all(path.name in str(caught.value) for path in before)
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
 def test_the_published_records_are_of_today():
     """Nobody has to upgrade what the repository holds."""
     texts = [path.read_text() for path in (shipped("leaderboards") / "results").glob("*.json")]

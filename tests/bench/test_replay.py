@@ -5,12 +5,12 @@ import re
 from pathlib import Path
 
 import pytest
-from eitbench.bench import replay
+from eitbench.bench import methods, replay, run
 from eitbench.bench import store as store_module
 from eitbench.bench.records import write_record
 from eitbench.bench.replay import by_environment, differing, official_records, verify_all
 from eitbench.cli import app
-from eitbench.data.store import CACHE_VARIABLE, cache_folder
+from eitbench.data.store import cache_folder
 from typer.testing import CliRunner
 
 from short import PIPE, shorten
@@ -20,9 +20,8 @@ INJECTION = "eitbench/Pipe2DInjection-v0"
 
 
 @pytest.fixture(autouse=True)
-def tiny_world(monkeypatch, tmp_path, run_cache):
+def tiny_world(monkeypatch, tmp_path):
     """The registered environments play tiny worlds, in an empty folder."""
-    monkeypatch.setenv(CACHE_VARIABLE, run_cache)
     git_says(monkeypatch)
     shorten(monkeypatch, {FILTER.id: SCENARIO, INJECTION: PIPE})
     monkeypatch.chdir(tmp_path)
@@ -46,8 +45,8 @@ def official(method, env=FILTER.id, kind="--baseline", change=lambda record: Non
     assert code == 0, complaint
     record = json.loads(Path(said.split(":")[0].removeprefix("wrote ")).read_text())
     record["official"] = True
-    for run in record["runs"]:
-        run |= {"commit": "0" * 40, "dirty": False}
+    for each in record["runs"]:
+        each |= {"commit": "0" * 40, "dirty": False}
     change(record)
     return write_record(Path("records"), record)
 
@@ -96,9 +95,36 @@ def test_what_was_played_is_not_played_again(monkeypatch):
     assert not differing(rows) and "none" in by_environment(rows)
     paths[1] = official("persistence", change=half_of_the_error)
     assert len(differing(verify_all(paths, Path("again")))) == 1 and len(played) == 3
-    monkeypatch.setattr(replay, "source_digest", lambda: "of other code")
+    monkeypatch.setattr(run, "source_digest", lambda: "of other code")
     verify_all(paths, Path("again"))
     assert len(played) == 5
+    monkeypatch.setattr(run.scipy, "__version__", "another")
+    verify_all(paths, Path("again"))
+    assert len(played) == 7
+    monkeypatch.setattr(methods, "card_version", lambda name: 7)
+    verify_all(paths, Path("again"))
+    assert len(played) == 9
+
+
+def test_what_a_record_says_of_its_method_is_compared_too():
+    """As `verify` of a single one does: the scores are true, and the floor calls itself a method like any other."""
+    path = official("homogeneous", change=lambda record: record.update(role=None))
+    (sentence,) = differing(verify_all([path], Path("again")))
+    assert "role is 'floor', the record says None" in sentence
+
+
+def test_all_damaged_files_are_named():
+    """Not the first only; a record of an environment that nobody knows is left out."""
+    path = official("homogeneous")
+    away = json.loads(path.read_text())
+    away["environment"] = {"id": "gone/World-v0", "name": "gone-World-v0", "kwargs": {}}
+    write_record(Path("records"), away)
+    with pytest.warns(UserWarning, match="there is no environment gone/World-v0"):
+        assert official_records(Path("records")) == [path]
+    for name in ("one.json", "two.json"):
+        (Path("records") / name).write_text("{")
+    with pytest.warns(UserWarning), pytest.raises(ValueError, match=r"one\.json.*two\.json"):
+        official_records(Path("records"))
 
 
 def test_the_cache_is_not_believed(monkeypatch):

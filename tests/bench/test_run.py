@@ -26,12 +26,6 @@ from short import merged
 from tiny import FILTER, FIXED_LAG, SCENARIO, SMOOTHING, count, counting, write_baseline
 
 
-@pytest.fixture(autouse=True)
-def cache(run_cache, monkeypatch):
-    """One cache of episodes for all tests of this session."""
-    monkeypatch.setenv(CACHE_VARIABLE, run_cache)
-
-
 @pytest.fixture
 def store(tmp_path):
     return EpisodeStore(tmp_path / "results")

@@ -13,7 +13,6 @@ from eitbench.bench.sandbox.wall import landlock_version
 from eitbench.cli import app
 from eitbench.data import seasons
 from eitbench.data.seasons import drawn_seeds
-from eitbench.data.store import CACHE_VARIABLE
 from typer.testing import CliRunner
 
 from short import shorten
@@ -23,9 +22,8 @@ walled = pytest.mark.skipif(not landlock_version(), reason="this kernel has no L
 
 
 @pytest.fixture(autouse=True)
-def second_season(monkeypatch, tmp_path, run_cache):
+def second_season(monkeypatch, tmp_path):
     """The second season of tiny worlds has begun, in an empty folder."""
-    monkeypatch.setenv(CACHE_VARIABLE, run_cache)
     git_says(monkeypatch)
     shorten(monkeypatch, {FILTER.id: SCENARIO})
     monkeypatch.setattr(salts, "PUBLISHED", tmp_path / "leaderboards" / "held_out.json")

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from eitbench.bench.ranking import shared_ranks
 from eitbench.bench.statistics import (
     interquartile_mean,
     mean_over_environments,
     paired_difference,
     paired_probability_of_improvement,
     probability_of_improvement,
-    shared_ranks,
     stratified_bootstrap,
     tail,
 )
@@ -212,7 +212,7 @@ def test_paired_difference_of_interquartile_means():
         differences.append(x - y)
     value, low, high = paired_difference(a, b, statistic=interquartile_mean)
     assert value == interquartile_mean(*plain(a).values()) - interquartile_mean(*plain(b).values())
-    cut = tail([12, 20, 9])
+    cut = tail((12, 20, 9))
     theirs = tuple(np.percentile(differences, [cut, 100 - cut]))
     assert (low, high) == pytest.approx(theirs, abs=4 * 0.05 * np.std(differences))
     assert paired_difference(shuffled(a, random), shuffled(b, random), statistic=interquartile_mean) == (
@@ -275,7 +275,7 @@ def test_interval_of_the_probability_of_improvement():
         shares.append(np.mean([(0.5 + 0.5 * np.sign(y[name] - x[name][:, None])).mean() for name in a]))
     _, low, high = probability_of_improvement(a, b)
     # The 2.1 % point of 4000 nearly normal draws is known to 0.045 of their spread, that of 10,000 to 0.029.
-    cut = tail([12, 7, 9, 10])
+    cut = tail((12, 7, 9, 10))
     assert (low, high) == pytest.approx(tuple(np.percentile(shares, [cut, 100 - cut])), abs=4 * 0.054 * np.std(shares))
 
 

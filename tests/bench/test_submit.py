@@ -23,9 +23,8 @@ TEST = parse_seeds("test:0-1")
 
 
 @pytest.fixture(autouse=True)
-def tiny_world(monkeypatch, tmp_path, run_cache):
+def tiny_world(monkeypatch, tmp_path):
     """The registered environments play tiny worlds, in an empty folder, from a clean commit."""
-    monkeypatch.setenv(CACHE_VARIABLE, run_cache)
     git_says(monkeypatch, "c0ffee")
     for name in (FILTER.id, SMOOTHING.id):
         shorten(monkeypatch, {name: SCENARIO})
@@ -175,7 +174,7 @@ def test_what_says_more_is_not_replaced(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="would lose its being official"):
         submitted("b", TEST[:1])
     with monkeypatch.context() as patch:
-        patch.setattr(methods, "version_of", lambda path, sha256: "v2")
+        patch.setattr(methods, "card_version", lambda name: 2)
         assert submitted("b", TEST[:1])["seeds"] == ["test:0"]
     newer = read_record(path.with_name(path.name.replace("v1", "v2")))
     assert newest(read_records(to)) == ([read_record(path), newer], [])         # only an official one makes it outdated

@@ -33,9 +33,8 @@ walled = pytest.mark.skipif(not landlock_version(), reason="this kernel has no L
 
 
 @pytest.fixture(autouse=True)
-def tiny_world(monkeypatch, tmp_path, run_cache):
+def tiny_world(monkeypatch, tmp_path):
     """The registered environments play tiny worlds, in an empty folder."""
-    monkeypatch.setenv(CACHE_VARIABLE, run_cache)
     git_says(monkeypatch)
     shorten(monkeypatch, {FILTER.id: SCENARIO, INJECTION: PIPE})
     monkeypatch.setattr(salts, "PUBLISHED", tmp_path / "leaderboards" / "held_out.json")
@@ -204,6 +203,7 @@ def test_another_file_of_a_stranger_is_named_and_not_played(mine, tmp_path):
     code, said, complaint = eitbench("verify", path, "--baseline", changed)
     assert code == 1 and said == "" and "the sha256 of mine.py is" in complaint
 
+
 def test_numbers_decide_and_not_the_text(tmp_path, monkeypatch):
     """A record of ours is played whatever its words and digests are; of an older version it is said to be one."""
     path = submitted("homogeneous", "--seeds", "test:0")
@@ -252,7 +252,7 @@ def test_held_out_seeds_are_the_formula():
     assert drawn_seeds(SALT, 3) == seeds[:3] and drawn_seeds(SALT[::-1], 3) != seeds[:3]
 
 
-def test_a_salt_is_its_owner_s_and_its_hash_everybody_s(tmp_path):
+def test_a_salt_is_its_owner_s_and_its_hash_everybody_s(tmp_path, monkeypatch):
     """A file that others cannot read, and never overwrites another; the published hash decides which salt counts."""
     code, said, _ = eitbench("held-out", "--new", "salt")
     assert code == 0 and (tmp_path / "salt").stat().st_mode & 0o777 == 0o600
@@ -267,12 +267,9 @@ def test_a_salt_is_its_owner_s_and_its_hash_everybody_s(tmp_path):
     assert salts.read_salt(tmp_path / "salt") == salt
     (tmp_path / "words").write_text("hello")
     salts.new_salt(tmp_path / "other")
-    salts.new_salt(package := Path(run.__file__).parent / "test_salt.tmp")
-    try:
-        with pytest.raises(ValueError, match="which guests may read"):
-            salts.read_salt(package)
-    finally:
-        package.unlink()
+    with monkeypatch.context() as patch, pytest.raises(ValueError, match="which guests may read"):
+        patch.setattr(salts, "python_files", lambda: [tmp_path])
+        salts.read_salt(tmp_path / "salt")
     for name, change, message in (("other", 0o600, "has the hash"), ("salt", 0o640, "readable by its owner only"),
                                   ("words", 0o600, "salt .*words must hold hexadecimal digits"),
                                   ("none", None, "cannot be read")):

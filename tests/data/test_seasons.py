@@ -11,7 +11,6 @@ from eitbench.bench.tracks import default_seeds
 from eitbench.cli import app
 from eitbench.data import seasons
 from eitbench.data.seeds import ReservedSeedWarning, name_seed, parse_seeds
-from eitbench.data.store import CACHE_VARIABLE
 from typer.testing import CliRunner
 
 from tiny import FILTER, SCENARIO
@@ -69,9 +68,8 @@ def test_seeds_follow_from_the_salt():
     assert name_seed(200_004) == "test:4" and parse_seeds("test:4") == [200_004]
 
 
-def test_playing_one_of_its_own_accord_warns(monkeypatch, run_cache):
+def test_playing_one_of_its_own_accord_warns():
     """As with those of the first season; training draws none of them."""
-    monkeypatch.setenv(CACHE_VARIABLE, run_cache)
     (seed,) = parse_seeds_of_second()
     env = gym.make(FILTER.id, world=SCENARIO)
     with pytest.warns(ReservedSeedWarning, match="test2:3, on which methods are scored"):

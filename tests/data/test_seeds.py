@@ -1,14 +1,14 @@
 """Public seeds: disjoint ranges, and text that names them."""
 
+import warnings
 from itertools import combinations
 
 import pytest
-from eitbench.data.seeds import SPLITS, name_seed, parse_seeds
-from hypothesis import given, settings
+from eitbench.data.seeds import SPLITS, for_scores, name_seed, parse_seeds, warn_of_reserved
+from hypothesis import given
 from hypothesis import strategies as st
 
 numbers = st.integers(0, 99_999)
-unhurried = settings(deadline=None)                                   # a busy machine is no failure
 
 
 def test_splits_are_disjoint():
@@ -28,14 +28,12 @@ def test_examples_of_the_docstring():
     assert parse_seeds("17, 300017") == [17, 300_017]
 
 
-@unhurried
 @given(st.integers(0, 2**31 - 1))
 def test_names_are_parsed_back(seed):
     """`parse_seeds` undoes `name_seed` for every seed, inside and outside the splits."""
     assert parse_seeds(name_seed(seed)) == [seed]
 
 
-@unhurried
 @given(st.sampled_from(list(SPLITS)), numbers)
 def test_names_are_made_of_what_was_parsed(split, number):
     """`name_seed` undoes `parse_seeds` within a split, and the seed lies in it."""
@@ -44,7 +42,6 @@ def test_names_are_made_of_what_was_parsed(split, number):
     assert name_seed(seed) == f"{split}:{number}"
 
 
-@unhurried
 @given(st.sampled_from(list(SPLITS)),
        st.lists(st.tuples(numbers, st.integers(0, 20)), min_size=1, max_size=5))
 def test_parts_add_up_without_repeats(split, parts):
@@ -71,3 +68,14 @@ def test_errors_say_what_was_expected(text, message):
     with pytest.raises(ValueError, match=message) as caught:
         parse_seeds(text)
     assert repr(text) in str(caught.value)
+
+
+def test_playing_for_scores_leaves_other_warnings_alone():
+    """What Python shows once is not shown again after each episode, and nothing is said within."""
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("default")
+        for _ in range(2):
+            with for_scores():
+                warn_of_reserved([200_000])
+            warnings.warn("the cache is full", stacklevel=1)
+    assert [str(warning.message) for warning in said] == ["the cache is full"]

@@ -177,10 +177,14 @@ def test_frames_show_truth_estimate_and_spread(name):
 
 
 def test_a_test_episode_is_said_to_be_one():
-    """Once, to whoever resets to it; not to who plays for scores, nor of train and dev seeds."""
-    env = make(PIPE).unwrapped
-    with pytest.warns(ReservedSeedWarning, match="began a test episode, test:"):
-        env.reset(seed=200_000)
+    """Once, at the line that resets to it, whatever wraps the environment; not to who plays for scores, nor of train
+    and dev seeds."""
+    wrapped = make(PIPE)
+    env = wrapped.unwrapped
+    for each in (env, wrapped):
+        with pytest.warns(ReservedSeedWarning, match="began a test episode, test:") as said:
+            each.reset(seed=200_000)
+        assert [warning.filename for warning in said] == [__file__]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         env.reset(seed=1)

@@ -2,10 +2,12 @@
 
 import inspect
 import re
+from dataclasses import make_dataclass
 
 import gymnasium as gym
 import pytest
 from eitbench import page
+from eitbench.envs import pages
 from eitbench.worlds import entries
 from gymnasium import spaces
 
@@ -133,3 +135,13 @@ def test_numbers_have_their_units():
     assert said["vessel.contact_impedance"] == "z in Ω·m² [ours]"
     assert said["schedule.time_step"] == "s between two injections [T]"
     assert said["region"].startswith("m along the vessel")
+
+
+def test_parts_say_what_they_are_for():
+    """Before what their own class says; a bar within a cell is escaped."""
+    said = meanings(page("eitbench/Pipe2D-v0"))
+    assert said["prior"].startswith("what estimators are told to believe. What is believed before any measurement")
+    made = type("Bar", (), {"__doc__": "|I| ≤ 1"})
+    part = make_dataclass("Bar", [("size", int, 1)], bases=(made,))
+    part.__doc__ = made.__doc__
+    assert pages._rows("bar", part(), "a limit")[0] == r"| `bar` | Bar | a limit. \|I\| ≤ 1 |"

@@ -42,7 +42,7 @@ def textbook(matrix: np.ndarray, covariance: np.ndarray, noise_variance: np.ndar
     return covariance - covariance @ matrix.T @ np.linalg.inv(S) @ matrix @ covariance
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.integers(0, 2**32 - 1))
 def test_gains_are_what_the_update_takes_away(seed):
     """Of every pair: tr(W P) before less after, and half the logarithm of det P before over

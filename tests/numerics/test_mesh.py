@@ -91,7 +91,7 @@ def test_stiffness_of_a_linear_function(dim):
 
 # -- interpolation ----------------------------------------------------------------------------------------------------
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(dim=st.sampled_from([2, 3]), seed=st.integers(0, 2**32 - 1), candidates=st.sampled_from([1, 4, 32]),
        a=st.lists(st.floats(-100, 100), min_size=4, max_size=4))
 def test_interpolation_is_exact_for_linear_functions(dim, seed, candidates, a):
@@ -208,7 +208,7 @@ def test_rectangle_mesh_is_symmetric():
         assert_allclose(centroids(sign), centroids([1.0, 1.0]), atol=1e-12)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(start=st.floats(-10, 10), length=st.floats(0.01, 10), cells=st.integers(1, 30), grading=st.floats(1.0, 4.0),
        ends=st.sampled_from(["both", "start", "stop"]))
 def test_graded(start, length, cells, grading, ends):

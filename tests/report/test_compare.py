@@ -91,6 +91,20 @@ def test_records_are_found_by_name_version_and_file(tmp_path):
         find("d", tmp_path)
 
 
+def test_versions_are_told_apart(tmp_path):
+    """v1 is not v10; of digits four are enough, fewer are not; without a version the official one is meant."""
+    numbered = [record("c", [0.1], version=version, official=True) for version in ("v1", "v10")]
+    stranger = record("c", [0.2], version="2")
+    for each in [*numbered, stranger]:
+        write_record(tmp_path, each)
+    assert find("c@v1", tmp_path) == numbered[:1] and find("c@v10", tmp_path) == numbered[1:]
+    assert find("c", tmp_path) == numbered[1:]
+    assert find(f"c@{sha('c2')[:4]}", tmp_path) == [stranger]
+    for short in (sha("c2")[:3], "v"):
+        with pytest.raises(ValueError, match=f"there is no record of c@{short} in"):
+            find(f"c@{short}", tmp_path)
+
+
 def test_words_follow_from_the_intervals():
     """The verdict names who is better, if anybody; the Markdown is a table of the same text."""
     a, b = two_methods()

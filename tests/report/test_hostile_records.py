@@ -1,16 +1,20 @@
 """The path of the boards over folders that strangers have filled: honest records are rendered, others named."""
 
+import contextlib
 import os
 import re
-import resource
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
 
+import pandas as pd
 import pytest
 from eitbench import _files
-from eitbench.bench.records import read_records, write_record
+from eitbench._foreign import cleaned
+from eitbench.bench.records import newest, read_record, read_records, write_record
+from eitbench.bench.tracks import ids
 from eitbench.cli import app
+from eitbench.report.boards import ALL
 from typer.testing import CliRunner
 
 import hostile
@@ -30,16 +34,48 @@ def content(folder):
     return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
+def sound_records(folder):
+    """Name of each file that may stand on boards -> its record: it can be read alone, and is of test episodes."""
+    found = {}
+    for path in folder.iterdir():
+        with contextlib.suppress(ValueError):
+            found[path.name] = read_record(path)
+    return {name: record for name, record in found.items()
+            if record["split"] == "test" and record["environment"]["id"] in ids()}
+
+
+def check_boards(folder, records):
+    """Sound records are on the boards and nothing else is, but for those that are outdated, or that have played none
+    of a floor's episodes."""
+    def place(record):
+        return record["environment"]["name"], record["method"], record["version"]
+
+    rows = pd.read_csv(folder.parent / "leaderboard.csv", dtype=str, keep_default_na=False)
+    rows = rows[rows.environment != ALL]
+    shown = set(zip(rows.environment, rows.method, rows.version, strict=True))
+    assert shown <= set(map(place, records)) and len(shown) > len(records) / 3
+    current, _ = newest(records)
+    for each in current:
+        floors = [set(other["seeds"]) for other in current if other["method"] in ("homogeneous", "random_pair")
+                  and other["environment"]["name"] == each["environment"]["name"]]
+        assert place(each) in shown or any(floor.isdisjoint(each["seeds"]) for floor in floors), place(each)
+
+
 def rendered(folder, count, seed):
-    """Fill and render a folder: what is honest is on the boards, and every other file is named."""
-    sound = hostile.folder_of(folder, count, seed)
+    """Fill and render a folder: what is sound is on the boards, and every other file is named, once."""
+    honest = hostile.folder_of(folder, count, seed)
     code, said, complaint = leaderboard(folder)
     assert code == 1 and "wrote " in said
     lines = complaint.splitlines()
-    named = {line.split(".json")[0] + ".json" for line in lines if line.startswith("left out: record ")}
-    left_out = {path.name for path in folder.iterdir() if f"left out: record {path}" in named}
-    shown = {path.name for path in folder.iterdir()} - left_out
-    assert set(sound) <= shown and len(left_out) > count / 4
+    sound = sound_records(folder)
+    assert set(honest) <= set(sound)
+    check_boards(folder, list(sound.values()))
+    others = {path.name for path in folder.iterdir()} - set(sound)
+    named = [line for line in lines if line.startswith("left out: record ")]
+    assert len(named) == len(others) > count / 4
+    for name in others:
+        start = f"left out: record {cleaned(str(folder / name))} "
+        assert sum(line.startswith(start) for line in named) == 1, name
     assert all(len(line) < 2500 for line in lines)
     markdown = (folder.parent / "leaderboard.md").read_text()
     for text in (said, complaint, markdown):
@@ -49,7 +85,6 @@ def rendered(folder, count, seed):
     assert not any(re.search(r"[\u200b-\u200f\u2028-\u202e\u2066-\u2069\x1b]", page) for page in pages)
     assert len(pages) > 10 and not any(re.search(r"<script>|<b>\s*$|<i>odd|{{", page.replace("{{ 7*7 }}", ""))
                                        for page in pages)
-    return shown
 
 
 def test_a_folder_of_strangers(tmp_path):
@@ -58,6 +93,7 @@ def test_a_folder_of_strangers(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="memory is measured as Linux tells it")
 @pytest.mark.parametrize("seed", range(3))
 def test_a_thousand_records_of_strangers(seed, tmp_path):
     """In less than 2 GB, in a process that does nothing else."""
@@ -66,9 +102,9 @@ def test_a_thousand_records_of_strangers(seed, tmp_path):
 
 
 def memory_of_rendering(folder, seed):
-    """kB that this process has held at most, on Linux."""
+    """kB that this process has held at most, on Linux; unlike `ru_maxrss` without what its parent held."""
     rendered(folder, 1000, seed)
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return int(re.search(r"^VmHWM:\s+(\d+) kB$", Path("/proc/self/status").read_text(), re.MULTILINE)[1])
 
 
 def test_honest_records_look_the_same_among_strangers(tmp_path):
@@ -139,6 +175,16 @@ def test_an_interrupted_render_leaves_the_old_site(broken, error, site, monkeypa
         _files.replace_folder(site / "site", {"index.html": b"new", "style.css": b"new"})
     assert content(site / "site") == before
     assert {path.name for path in site.iterdir()} == {"site", "results", "leaderboard.md", "leaderboard.csv"}
+
+
+def test_the_next_call_puts_back_what_a_killed_one_has_left(site):
+    """It was killed when the old folder was out of the way and the new one not yet in its place."""
+    before = content(site / "site")
+    os.rename(site / "site", site / ".site.0123.old")
+    with pytest.raises(TypeError):
+        _files.replace_folder(site / "site", {"a.html": None})
+    assert content(site / "site") == before
+    assert not list(site.glob(".site.*"))
 
 
 def test_a_site_is_replaced_as_a_whole(site):

@@ -14,6 +14,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pandas as pd
 import pytest
+from eitbench._files import PACKAGE
 from eitbench.bench.records import read_records, write_record
 from eitbench.bench.text import number, with_interval
 from eitbench.bench.tracks import ids
@@ -169,6 +170,14 @@ def test_shared_ranks_say_so(pages):
     """Two that cannot be told apart."""
     rows = rows_of(pages["environments/eitbench-Pipe2D-v0.html"])
     assert [cells[0] for cells in rows if cells[0].startswith("1")] == ["1 shared", "1 shared"]
+
+
+def test_a_heading_names_the_episodes_of_current_rows():
+    """An outdated record may have played more."""
+    records = [record("a", [0.1] * 2, version="v2"), record("a", [0.2] * 9, version="v1")]
+    (board,) = collect(records, boards(records)).boards
+    assert [row.outdated for row in board.rows] == [False, True] and board.seeds == "test:0-1"
+    assert board._replace(rows=board.rows[1:]).seeds == "test:0-8"
 
 
 def test_outdated_ones_are_last_and_of_their_own(pages):
@@ -358,3 +367,23 @@ def test_linear_ticks_are_round(low, high, expected):
 def test_logarithmic_ticks_are_few():
     """Over many decades only the powers of ten."""
     assert charts.Axis(1e-6, 1e3, 0, 1, log=True).ticks() == pytest.approx([10.0**e for e in range(-6, 4)])
+
+
+def luminance(colour):
+    """WCAG's, of #rrggbb."""
+    parts = [int(colour[i:i + 2], 16) / 255 for i in (1, 3, 5)]
+    linear = [part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts]
+    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+
+@pytest.mark.parametrize("scheme", [0, 1], ids=["light", "dark"])
+def test_contrast(scheme):
+    """Text 4.5 to 1 and lines of charts 3 to 1 (WCAG AA), on paper and on cards."""
+    colours = {name: pair[scheme] for name, *pair in re.findall(
+        r"--(\w+): light-dark\((#\w{6}), (#\w{6})\)", (PACKAGE / "report" / "style.css").read_text())}
+    assert colours.keys() >= {"paper", "card", "ink", "soft", "accent", *(f"c{k}" for k in range(charts.COLOURS))}
+    for ground in ("paper", "card"):
+        for name, colour in colours.items():
+            least = 4.5 if name in ("ink", "soft", "accent", "c8") else 3.0 if re.fullmatch(r"c\d+", name) else 0.0
+            bright, dim = sorted((luminance(colour), luminance(colours[ground])), reverse=True)
+            assert (bright + 0.05) / (dim + 0.05) >= least, (name, ground)

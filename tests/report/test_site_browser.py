@@ -1,7 +1,6 @@
 """The site in a real browser: sorting, filtering, following a link, the theme, and a phone's width."""
 
 import re
-from pathlib import Path
 
 import pytest
 from browser import Browser, executable
@@ -11,7 +10,6 @@ from eitbench.report.site import render_site, write_site
 from tiny import several_boards
 
 pytestmark = pytest.mark.skipif(executable() is None, reason="there is no Chromium or Chrome on the PATH")
-STYLE = Path(__file__).parents[2] / "eitbench" / "report" / "style.css"
 BOARD = "#board-filter-eitbench-Pipe2D-v0"
 ENVIRONMENT, METHOD = "environments/eitbench-Pipe2D-v0.html", "methods/a.html"
 """One page of each kind, beside the index."""
@@ -155,22 +153,3 @@ def test_less_motion_where_it_is_asked_for(tab, folder):
     for wish, behaviour in (("reduce", "auto"), ("no-preference", "smooth")):
         tab.prefer(prefers_reduced_motion=wish)
         assert tab.js("getComputedStyle(document.documentElement).scrollBehavior") == behaviour
-
-
-def luminance(colour):
-    """WCAG's, of #rrggbb."""
-    parts = [int(colour[i:i + 2], 16) / 255 for i in (1, 3, 5)]
-    linear = [part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts]
-    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
-
-
-@pytest.mark.parametrize("scheme", [0, 1], ids=["light", "dark"])
-def test_contrast(scheme):
-    """Text 4.5 to 1 and lines of charts 3 to 1 (WCAG AA), on paper and on cards."""
-    colours = {name: pair[scheme] for name, *pair in re.findall(
-        r"--(\w+): light-dark\((#\w{6}), (#\w{6})\)", STYLE.read_text())}
-    for ground in ("paper", "card"):
-        for name, colour in colours.items():
-            least = 4.5 if name in ("ink", "soft", "accent", "c8") else 3.0 if re.fullmatch(r"c\d+", name) else 0.0
-            bright, dim = sorted((luminance(colour), luminance(colours[ground])), reverse=True)
-            assert (bright + 0.05) / (dim + 0.05) >= least, (name, ground)

@@ -13,7 +13,6 @@ from eitbench.bench.sandbox import guests
 from eitbench.bench.sandbox.wall import landlock_version
 from eitbench.cli import app
 from eitbench.data import seasons
-from eitbench.data.store import CACHE_VARIABLE
 from typer.testing import CliRunner
 
 from short import shorten
@@ -31,11 +30,11 @@ def eitbench(*arguments):
 
 
 @pytest.fixture(scope="module")
-def honest(tmp_path_factory, run_cache):
+def honest(tmp_path_factory):
     """Two folders of leaderboards: ours with an official floor, and one with a method more."""
     folder = tmp_path_factory.mktemp("submission")
     with pytest.MonkeyPatch.context() as patch:
-        here(patch, run_cache)
+        here(patch)
         patch.chdir(folder)
         git_says(patch, "c0ffee")
         to = "ours/results"
@@ -53,9 +52,8 @@ def honest(tmp_path_factory, run_cache):
     return folder
 
 
-def here(patch, run_cache):
+def here(patch):
     """The registered environment plays a tiny world, outside a checkout."""
-    patch.setenv(CACHE_VARIABLE, run_cache)
     shorten(patch, {FILTER.id: SCENARIO})
     store_module.provenance.cache_clear()
 
@@ -65,9 +63,9 @@ def render(folder):
 
 
 @pytest.fixture
-def theirs(honest, tmp_path, monkeypatch, run_cache):
+def theirs(honest, tmp_path, monkeypatch):
     """A copy of the honest submission, to be spoilt."""
-    here(monkeypatch, run_cache)
+    here(monkeypatch)
     monkeypatch.setattr(seasons, "PUBLISHED", tmp_path / "seasons.json")
     shutil.copytree(honest / "theirs", tmp_path / "theirs")
     shutil.copytree(honest / "ours", tmp_path / "ours")

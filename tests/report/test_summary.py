@@ -8,13 +8,12 @@ import pytest
 from eitbench.bench.scores import scores as registered
 from eitbench.bench.text import mean_and_interval, number, rounded, scores_by_seed, seed_ranges
 from eitbench.report.summary import explanations, shown, summary
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
 from tables import said
 
-unhurried = settings(deadline=None)                                                     # a busy machine is no failure
 BOARD_IDS = {"filter": "eitbench/Pipe2D-v0", "fixed-lag": "eitbench/Pipe2DFixedLag-v0",
              "smoothing": "eitbench/Pipe2DSmoothing-v0"}
 
@@ -47,7 +46,6 @@ def row(records, baseline, board):
 # -- statistics -------------------------------------------------------------------------------------------------------
 
 
-@unhurried
 @given(st.lists(st.floats(0.001, 100.0), min_size=2, max_size=30))
 def test_interval_is_students(values):
     """Mean and half width of the 95 % interval, as scipy.stats has them."""
@@ -73,7 +71,6 @@ def test_rounded_examples(mean, half, text):
     assert rounded(mean, half) == text
 
 
-@unhurried
 @given(st.floats(1e-3, 100.0), st.floats(1.01e-5, 1.0))
 def test_rounding_stays_within_the_interval(mean, part):
     """Read back, the mean lies within the interval, which is right to a third; both end at the same decimal place."""
@@ -86,7 +83,6 @@ def test_rounding_stays_within_the_interval(mean, part):
     assert len(match[2] or "") == len(match[4] or "")
 
 
-@unhurried
 @given(st.floats(1e-4, 1.0), st.floats(0.0, 1e-5))
 def test_no_interval_is_shown_as_nothing(mean, half):
     """An interval too narrow for the table is left out, or keeps a digit; "± 0.00000" would claim certainty."""

@@ -9,6 +9,7 @@ import pytest
 from eitbench.bench import run
 from eitbench.bench.run import Job, run_episode, run_jobs
 from eitbench.bench.sandbox import guests, keeper
+from eitbench.bench.sandbox.host import Guest
 from eitbench.bench.store import EpisodeStore, machine, provenance
 from eitbench.data.store import CACHE_VARIABLE, folder
 from eitbench.worlds.pipe2d import PIPE_2D
@@ -46,6 +47,15 @@ FAULTS = {
     "gone": "os.kill(os.getpid(), 9), os._exit(3)",
 }
 """Name -> what its first update does."""
+
+
+def test_what_cannot_be_made_leaves_no_folder_behind(tmp_path, monkeypatch):
+    """A world that there is not is refused before any process is started."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+    (tmp_path / "temporary").mkdir()
+    with pytest.raises(ValueError, match="flow has no 'viscose'"):
+        Guest("estimation", FILTER.id, {"world": {"flow": {"viscose": 1}}}, write_baseline(tmp_path))
+    assert list((tmp_path / "temporary").iterdir()) == []
 
 
 def test_the_honest_method_beside_them_gets_its_episodes(tmp_path, monkeypatch):

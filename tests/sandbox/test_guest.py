@@ -17,6 +17,7 @@ import pytest
 from eitbench.bench.methods import load_method
 from eitbench.bench.sandbox import wall, wire
 from eitbench.bench.sandbox.host import Guest, GuestError
+from eitbench.bench.sandbox.keeper import Limits
 from eitbench.bench.sandbox.wall import landlock_version
 from eitbench.data.episodes import simulate
 from eitbench.data.recordings import cycle_voltages, recording
@@ -296,7 +297,7 @@ def test_what_goes_wrong_is_said(statement, message, tmp_path):
     """Limits of memory and time, a crash, an exit, nonsense on the wire; what it prints is no answer."""
     path = write_baseline(tmp_path, update=statement)
     began = time.monotonic()
-    with Guest("estimation", FILTER.id, KWARGS, path, memory=3 << 30, patience=60) as guest:
+    with Guest("estimation", FILTER.id, KWARGS, path, limits=Limits(memory=3 << 30), patience=60) as guest:
         guest.begin()
         guest._patience = 3.0
         with pytest.raises(GuestError, match=message):

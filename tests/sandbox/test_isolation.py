@@ -15,7 +15,7 @@ import pytest
 from eitbench.bench import suites
 from eitbench.bench.methods import own_methods
 from eitbench.bench.run import Job, run_episode, run_jobs
-from eitbench.bench.sandbox import guests, host, keeper
+from eitbench.bench.sandbox import guests, host
 from eitbench.bench.sandbox.wall import landlock_version
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.tracks import Environment
@@ -24,7 +24,7 @@ from eitbench.worlds.streams import randomness
 
 from recorded import forget_made
 from short import PIPE
-from tiny import FILTER, FIXED_LAG, SMOOTHING, write_baseline
+from tiny import FILTER, FIXED_LAG, SMOOTHING, without_namespaces, write_baseline
 
 INJECTION = Environment("eitbench/Pipe2DInjection-v0", json.dumps({"world": PIPE, "estimator": "reduced"}))
 WALL = "landlock" if landlock_version() else "process"
@@ -207,13 +207,6 @@ from pathlib import Path
 list(submit(path, [id], [200_000, 200_001, 200_002], EpisodeStore(Path(folder)), Path(folder), n_jobs=int(n_jobs)))
 """
 """As `eitbench submit`, in a world whose episodes take a moment."""
-
-
-def without_namespaces(folder):
-    """The keeper of a system that grants none."""
-    path = folder / "keeper.py"
-    path.write_text(Path(keeper.__file__).read_text().replace("NAMESPACES[name] for", "1 for"))
-    return str(path)
 
 
 def alive(number):

@@ -15,7 +15,7 @@ from eitbench.bench.sandbox.host import Guest, GuestError
 from eitbench.bench.store import EpisodeStore
 from eitbench.data.store import CACHE_VARIABLE
 
-from tiny import FILTER, write_baseline
+from tiny import FILTER, without_namespaces, write_baseline
 
 KWARGS = json.loads(FILTER.kwargs)
 MACHINE = platform.machine()
@@ -153,13 +153,6 @@ def test_a_guest_leaves_nothing_for_another(granted, tmp_path, monkeypatch):
         assert within["place"] > 0
     finally:
         ctypes.CDLL(None).shmctl(within["number"], 0, None)
-
-
-def without_namespaces(folder):
-    """The keeper of a system that grants none."""
-    path = folder / "keeper.py"
-    path.write_text(Path(keeper.__file__).read_text().replace("NAMESPACES[name] for", "1 for"))
-    return str(path)
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Linux has namespaces")

@@ -13,7 +13,7 @@ from eitbench.bench.methods import load_method
 from eitbench.bench.text import seed_ranges
 from eitbench.cli.studies import NAME, thesis
 from eitbench.data.seeds import name_seed
-from eitbench.data.store import CACHE_VARIABLE, cache_folder
+from eitbench.data.store import CACHE_VARIABLE
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.estimation import FirstFrame, initial_covariance
 from eitbench.physics.rest import AtRest
@@ -33,11 +33,12 @@ common, injection, obstacle, parameters, pipe2d, profiles, tanks, velocity = (
     ("common", "injection", "obstacle", "parameters", "pipe2d", "profiles", "tanks", "velocity"))
 error_of, estimates_of = common.error_of, common.estimates_of
 SEED = 100_000
-ORDINARY = str(cache_folder())
 PIPE = merged(CHANGES, {"schedule": {"scored_steps": 32}})
 """A fast fluid flushes the pipe in two steps; pictures of the pipe show states up to the 28th."""
 FLOW = merged(PIPE, {"flow": {"velocity_range": [55.0, 60.0], "velocity_std": 10.0}})
 OBSTACLE = merged(PIPE, {"flow": {"viscosity": 2e-2}})
+BULGE = (32, 8)
+"""Cells along and across the pipe for the flow past the bulge."""
 KINDS = {"unknown": "Unknown", "time-varying": "TimeVarying", "skewed": "Skewed"}
 
 
@@ -81,8 +82,8 @@ def constant(env, name, seed):
 @pytest.fixture(autouse=True)
 def tiny_worlds(monkeypatch, run_cache):
     """Each figure's environment, small; episodes are shared by the tests, and kept from all others,
-    since the flow past the bulge is another's here."""
-    monkeypatch.setenv(CACHE_VARIABLE, f"{run_cache}-of-figures")
+    since the flow past the bulge is another's here, by its cells."""
+    monkeypatch.setenv(CACHE_VARIABLE, "{}-bulge-{}x{}".format(run_cache, *BULGE))
     monkeypatch.setattr(pipe2d, "_env", lambda lag=0, mean_velocity=None: played_in(
         "Pipe2D", PIPE, lag=lag))
     monkeypatch.setattr(velocity, "_env", lambda flow: played_in(
@@ -90,7 +91,7 @@ def tiny_worlds(monkeypatch, run_cache):
     monkeypatch.setattr(obstacle, "_env", lambda flow: played_in(
         "Pipe2DObstacle", OBSTACLE, assume={"flow": flow}))
     monkeypatch.setattr(FlowPastBulge, "nominal", lambda flow, world, fine: _past_bulge(
-        world.vessel, flow, (32, 8)))
+        world.vessel, flow, BULGE))
     for name, id, steps in (("_stirred", "RotatingTank2D", 24),
                             ("_at_rest", "StationaryTank2D", 16)):
         env = played_in(id, {"schedule": {"scored_steps": steps}})
@@ -117,7 +118,7 @@ def draw(monkeypatch, name, folder, estimator):
 
 
 DRAWN = [name for name in FIGURES if name not in ("fig5.8", "fig5.10", "injection")]
-"""fig5.8 is played in earnest in tests/studies; fig5.10 is in 3D, where even a made-up estimate
+"""fig5.8 and injection have tests of their own; fig5.10 is in 3D, where even a made-up estimate
 takes minutes."""
 
 
@@ -140,7 +141,19 @@ def test_words_follow_from_the_data(name, monkeypatch, tmp_path):
     assert "DIFFERS" in draw(monkeypatch, name, tmp_path, constant)
 
 
-def test_injection_is_drawn(monkeypatch, tmp_path):
+@pytest.mark.parametrize(("best", "verdicts"), [(4.5, ["Agrees", "Agrees"]), (5.5, ["DIFFERS", "Agrees"]),
+                                              (2.0, ["DIFFERS", "DIFFERS"])])
+def test_velocity_sweep_is_drawn(best, verdicts, monkeypatch, tmp_path):
+    """Fig. 5.8 of made-up scores: what it says follows from where they are least."""
+    off = np.repeat((pipe2d.VELOCITIES[:, None] - best)**2, 2, axis=1)
+    made = {"error": 0.005 + 0.001 * off, "voltage_discrepancy": 1e-6 * (1.0 + off), "nis": 1.0 + off}
+    monkeypatch.setattr(pipe2d, "velocity_sweep", lambda seeds, jobs: made)
+    remark = draw(monkeypatch, "fig5.8", tmp_path, perfect)
+    assert re.findall("^(Agrees|DIFFERS): ", remark, re.MULTILINE) == verdicts
+    assert f"Minimum at {100 * best:.0f} cm/s" in remark
+
+
+def test_injection_is_drawn(monkeypatch, run_cache, tmp_path):
     """Scores as they were played, told in a table for each world, and an animation with a frame for
     every step; when not told which episodes, in those of the boards."""
     played = {}
@@ -158,7 +171,7 @@ def test_injection_is_drawn(monkeypatch, tmp_path):
     monkeypatch.setattr(injection, "policy_rows", rows)
     monkeypatch.setattr(injection, "results_in", lambda folder: [])
     shorten(monkeypatch, {injection.AT_WORK[0]: SHORT})
-    monkeypatch.setenv(CACHE_VARIABLE, ORDINARY)            # where other tests' reduced model lies
+    monkeypatch.setenv(CACHE_VARIABLE, run_cache)           # where other tests' reduced model lies
     path, remark = FIGURES["injection"](None, 1, tmp_path / "new")
     picture = imread(path)
     assert min(picture.shape[:2]) > 250 and picture[..., :3].std() > 0.05

@@ -1,7 +1,7 @@
 """The 2D pipe as a whole, over dev seeds: the order of the methods and the velocity that fits best.
 
-These take minutes; with pytest-xdist they run side by side. Dev seeds are for choosing and testing,
-never reported.
+By default two seeds are played, dev:0-1; by `pytest -m slow` all twenty, and the sweep of
+velocities on one. Dev seeds are for choosing and testing, never reported.
 """
 
 import importlib
@@ -39,7 +39,7 @@ GOLDEN = {"homogeneous": 0.020354, "filter": 0.0046947, "smoother": 0.0019687,
 @pytest.mark.parametrize("seeds", [SEEDS[:2], pytest.param(SEEDS, marks=pytest.mark.slow)], ids=len)
 def test_order_of_the_methods(seeds):
     """Smoother < Kalman filter < 0.6 × homogeneous < stationary on average, the first two on every
-    seed."""
+    seed; two seeds by default, twenty if slow."""
     errors = {}
     for method, (environment, baseline) in METHODS.items():
         results = [run_episode(Job(Environment(environment), baseline, seed))[0] for seed in seeds]
@@ -59,7 +59,7 @@ def test_order_of_the_methods(seeds):
 
 def test_stationary_method_works_on_a_stationary_target():
     """The same Gauss–Newton, with the same α, beats the homogeneous estimate threefold when the
-    target stands still."""
+    target stands still; three states of two seeds."""
     task = make_task(PIPE_2D)
     interpolation, mass = score_operators(PIPE_2D)
     penalty = load_method("gauss_newton", "estimation").parameters["alpha"]**2 * stiffness_matrix(task.mesh)
@@ -91,7 +91,7 @@ def test_velocity_sweep_finds_the_true_velocity():
     """Over assumed mean velocities of 0, 50, …, 900 cm/s the error is smallest within 400–500; it
     is 450 in truth.
 
-    The voltages alone, by discrepancy and by NIS, point near it too (thesis Fig. 5.8).
+    The voltages alone, by discrepancy and by NIS, point near it too (thesis Fig. 5.8). One seed.
     """
     sweep = {key: values.mean(axis=1) for key,
              values in pipe2d.velocity_sweep(SEEDS[:1], jobs=1).items()}

@@ -3,6 +3,7 @@
 import dataclasses
 import pickle
 
+import numpy as np
 import pytest
 from eitbench.data import store
 from eitbench.worlds import entries
@@ -73,6 +74,9 @@ def test_parts_can_be_swapped():
     ({"vessel": {"electrodes_per_wall": 2.5}}, "^world.vessel: electrodes_per_wall must be an int"),
     ({"flow": {"mean_velocity": 0.0}}, "^world.flow: mean_velocity must be a finite number"),
     ({"flow": {"mean_velocity": None}}, "^world.flow: mean_velocity must be a number in m/s"),
+    ({"flow": {"mean_velocity": 10**400}}, "^world.flow: mean_velocity must be a number in m/s"),
+    ({"flow": {"mean_velocity": b"4"}}, "^world.flow: mean_velocity must be a number in m/s"),
+    ({"flow": {"mean_velocity": np.complex128(4.0)}}, "^world.flow: mean_velocity must be a number in m/s"),
     ({"target": {"width": [0.02, 0.01]}}, "^world.target: width must be a range"),
     ({"target": {"arrivals": {"interval": 0.0}}}, "^world.target.arrivals: interval must be"),
     ({"instrument": {"noise_relative": -0.1}}, "^world.instrument: noise_relative must be"),

@@ -175,7 +175,6 @@ def test_an_id_of_somebody_else_is_refused():
             gym.registry.pop("theirs/CartPole-v7")
 
 
-
 def test_an_id_that_nobody_registered_is_named():
     """With those that there are."""
     with pytest.raises(ValueError, match=r"env must be one of eitbench/Pipe2D-v0, .*; got 'mine/"):

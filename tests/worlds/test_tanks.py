@@ -354,24 +354,29 @@ def test_wrong_numbers_of_the_tank_at_rest_are_named(part, change, message):
         STATIONARY.changed({part: change})
 
 
-def test_cylinders_never_reach_through_the_wall():
-    """Whatever numbers are taken, each stands inside; also where the second is not the smaller."""
-    try:
-        world = STATIONARY.changed({"target": {
-            "large_radius": (0.01, 0.01), "small_radius": (0.04, 0.04), "furthest": 0.92}})
-    except ValueError:
-        return
+@pytest.mark.parametrize("radius", [0.01, 0.02, 0.04])
+def test_cylinders_never_reach_through_the_wall(radius):
+    """As far out as they may stand, each is inside; a millionth further is refused."""
+    most = 1.0 - radius / STATIONARY.vessel.radius
+    sizes = {"large_radius": (radius, radius), "small_radius": (radius, radius), "gap": 0.02}
+    world = STATIONARY.changed({"target": sizes | {"furthest": most}})
     for seed in range(20):
-        for centre, radius in world.target.draw(world, flow_stream(seed)):
-            assert np.hypot(*centre) + radius <= world.vessel.radius
+        for centre, size in world.target.draw(world, flow_stream(seed)):
+            assert size == radius and np.hypot(*centre) + size <= world.vessel.radius
+    with pytest.raises(ValueError, match="furthest must be"):
+        STATIONARY.changed({"target": sizes | {"furthest": most + 1e-6}})
 
 
-@pytest.mark.parametrize("n_electrodes", [4, 6, 7, 8, 12, 32])
+@pytest.mark.parametrize("n_electrodes", [4, 6, 7])
+def test_too_few_electrodes_are_refused(n_electrodes):
+    """Fewer than eight."""
+    with pytest.raises(ValueError, match="n_electrodes must be an integer of at least 8"):
+        STATIONARY.changed({"vessel": {"n_electrodes": n_electrodes}})
+
+
+@pytest.mark.parametrize("n_electrodes", [8, 12, 13, 32])
 def test_every_injection_injects(n_electrodes):
     """With any number of electrodes that is taken, current enters at one and leaves at another."""
-    try:
-        world = STATIONARY.changed({"vessel": {"n_electrodes": n_electrodes}})
-    except ValueError:
-        return
+    world = STATIONARY.changed({"vessel": {"n_electrodes": n_electrodes}})
     ends = np.sort(world.currents, axis=1)[:, [0, -1]]
     np.testing.assert_array_equal(ends, [[-0.1, 0.1]] * 16)

@@ -9,7 +9,6 @@ be kept can be opened.
 from __future__ import annotations
 
 import os
-import traceback
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,18 +16,20 @@ from typing import Any
 import cloudpickle
 import numpy as np
 
+from eitbench._foreign import where_of
 from eitbench.bench.sandbox import wall, wire
+from eitbench.bench.sandbox.keeper import Limits
 from eitbench.worlds import streams
 from eitbench.worlds.registry import take_over
 
 Reply = tuple[dict[str, Any], dict[str, np.ndarray]]
 
 
-def main(folder: str, memory: int, separate: list[str]) -> None:
+def main(folder: str, limits: Limits, separate: list[str]) -> None:
     """Answer one message after another until the other side hangs up.
 
-    ``folder`` is the only one where the guest can write, ``memory`` the bytes of address space that
-    it may take, ``separate`` the namespaces that it has to itself.
+    ``folder`` is the only one where the guest can write, ``limits`` what it may take, ``separate``
+    the namespaces that it has to itself.
     """
     private = Path(folder)
     incoming, outgoing = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
@@ -37,7 +38,7 @@ def main(folder: str, memory: int, separate: list[str]) -> None:
         os.dup2(silent, stream)
     readable = wall.python_files()
     walls = list(separate)
-    wall.limit_memory(memory)
+    wall.limit(limits, counts_apart="user" in separate)
     if wall.drop_capabilities():
         walls.append("capabilities")
     if wall.close_files(readable, [private, Path(os.devnull)]):
@@ -70,7 +71,7 @@ def main(folder: str, memory: int, separate: list[str]) -> None:
             else:
                 say(*answer(words, arrays))
         except (Exception, SystemExit) as error:
-            say({"error": f"{type(error).__name__}: {error}", "where": _where(error)})
+            say({"error": f"{type(error).__name__}: {error}", "where": where_of(error)})
 
 
 def _nothing(words: dict[str, Any], arrays: dict[str, np.ndarray]) -> Reply:
@@ -131,10 +132,3 @@ def _policy(rules: Any, method: Any) -> Callable[..., Reply]:
         return {}, {"action": np.asarray(player.act(arrays))}
 
     return answer
-
-
-def _where(error: BaseException) -> str:
-    """File and line where it was raised, without the folders of this machine."""
-    last = traceback.extract_tb(error.__traceback__)[-1]
-    return f"{Path(last.filename).name}:{last.lineno}"
-

@@ -28,6 +28,7 @@ from eitbench.bench.methods import (
     load_method,
     own_files,
 )
+from eitbench.bench.names import faults
 from eitbench.bench.sandbox.host import Guest, GuestError
 from eitbench.bench.tracks import BOARDS
 
@@ -105,7 +106,7 @@ def _load(track: str, id: str, kwargs: str, method: str, path: Path, sha256: str
         raise ValueError(PRIVILEGED.format(path))
     if path.suffix == ".py":
         about = about | {"name": path.stem}  # a guest may call itself anything
-    _check_about(path, about, track)
+    _check_about(path, about, track, id)
     ours = own_files(id).get(about["name"])
     if ours is not None and hashlib.sha256(ours.read_bytes()).hexdigest() != sha256:
         raise ValueError(f"{path} has the name of one of ours, {about['name']}, under which "
@@ -116,7 +117,7 @@ def _load(track: str, id: str, kwargs: str, method: str, path: Path, sha256: str
                   about["parameters"], there, about["role"])
 
 
-def _check_about(path: Path, about: dict[str, Any], track: str) -> None:
+def _check_about(path: Path, about: dict[str, Any], track: str, id: str) -> None:
     """``ValueError``, naming the file, if a guest says of it what no method can be."""
     boards = about.get("boards")
     sound = {
@@ -128,6 +129,8 @@ def _check_about(path: Path, about: dict[str, Any], track: str) -> None:
     }
     if wrong := [name for name, is_sound in sound.items() if not is_sound]:
         raise ValueError(f"{path} says nonsense of its {', '.join(wrong)}")
+    if wrong := list(faults(about["name"], about["title"], id)):
+        raise ValueError(f"{path} cannot have a record: {'; '.join(wrong)}")
     _check.document(f"{path}: parameters", about.get("parameters"), PARAMETERS)
 
 

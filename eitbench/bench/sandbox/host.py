@@ -25,18 +25,23 @@ import numpy as np
 from eitbench._files import PACKAGE
 from eitbench.bench.methods import is_ours, is_path
 from eitbench.bench.sandbox import keeper, wire
+from eitbench.bench.sandbox.keeper import Limits
 from eitbench.data.store import CACHE_VARIABLE, cache_folder, folder, kinds
 from eitbench.worlds.registry import entry, registered_by_hand
 
-MEMORY = 8 << 30
-"""bytes of address space that a guest may take"""
 PATIENCE = 600.0
 """s that an answer may take; the first after an episode began may hold all preparations"""
+ENDURANCE = 6 * 3600.0
+"""s that all answers of an episode may take together; else one answer after the other could take
+nearly `PATIENCE`"""
 END = 10.0
 """s that its keeper may take to end it"""
 MODELS = ("outline.npz", "region.npz", "reduced-*.npz", "joint-*.npz")
 """What the cache holds of a world, made without any episode; the files of an episode begin with its
 seed."""
+_LIMITS = Limits()
+_LONGEST_WORD = 1000
+"""bytes that a keeper says at most"""
 ARITHMETIC = ("OPENBLAS_", "MKL_", "OMP_", "NPY_", "NUMBA_CPU")
 """Variables on which the last bits of numbers depend begin so."""
 
@@ -59,8 +64,8 @@ class Guest:
     name : str
         One of ours, or the path of a .py file or an agent's model.zip. A file that is not ours is
         copied into a folder of the guest's own, which is the only place where it can write.
-    memory : int
-        bytes
+    limits : Limits
+        What it may take, together with all that it starts.
     patience : float
         s
 
@@ -73,16 +78,22 @@ class Guest:
     """
 
     def __init__(self, track: str, id: str, kwargs: dict[str, Any], name: str, *,
-                 memory: int = MEMORY, patience: float = PATIENCE) -> None:
+                 limits: Limits = _LIMITS, patience: float = PATIENCE) -> None:
         self._patience = patience
+        self._left = ENDURANCE
+        """s that answers may still take in this episode"""
         self.sha256 = ""
         """Of the file that was copied; empty for one of ours."""
         self._private = Path(tempfile.mkdtemp(prefix="eitbench-guest-"))
-        self._process = subprocess.Popen(
-            [sys.executable, "-P", keeper.__file__, str(self._private), str(memory)],
-            # a terminal can be typed into
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
-            start_new_session=True, env=self._surroundings(id, kwargs), cwd=self._private)
+        try:
+            self._process = subprocess.Popen(
+                [sys.executable, "-P", keeper.__file__, str(self._private), *map(str, limits)],
+                # a terminal can be typed into; at the end the keeper says what was too much
+                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+                start_new_session=True, env=self._surroundings(id, kwargs), cwd=self._private)
+        except BaseException:
+            keeper.remove(str(self._private))
+            raise
         try:
             assert self._process.stdin is not None
             os.set_blocking(self._process.stdin.fileno(), False)
@@ -105,6 +116,7 @@ class Guest:
     def begin(self, random: np.random.Generator | None = None) -> None:
         """A new episode: another estimator or policy, of the same class; a policy's generator
         draws what this one would."""
+        self._left = ENDURANCE
         state = None if random is None else random.bit_generator.state
         self._ask({"do": "begin", "random": state})
 
@@ -146,7 +158,7 @@ class Guest:
     def close(self) -> None:
         """End it and its children, and remove its folder."""
         self._end()
-        for pipe in (self._process.stdin, self._process.stdout):
+        for pipe in (self._process.stdin, self._process.stdout, self._process.stderr):
             if pipe:
                 pipe.close()
         keeper.remove(str(self._private))
@@ -199,9 +211,14 @@ class Guest:
 
     def _ask(self, words: dict[str, Any], arrays: dict[str, np.ndarray] | None = None,
              ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        begin = time.monotonic()
         try:
             self._send(wire.pack(words, arrays))
             answer = self._receive()
+            self._left -= time.monotonic() - begin
+            if self._left < 0.0:
+                raise GuestError("TimeoutError: its answers in one episode took more than "
+                                 f"{ENDURANCE:g} s")
         except BaseException:  # whatever it says from now on would answer another question
             self._end()
             raise
@@ -250,7 +267,12 @@ class Guest:
             raise GuestError(f"ValueError: {error}") from None
 
     def _ended(self) -> GuestError:
-        return GuestError(f"ChildProcessError: its process ended with status {self._end()}, which "
+        status = self._end()
+        assert self._process.stderr is not None
+        os.set_blocking(self._process.stderr.fileno(), False)
+        if said := self._process.stderr.read(_LONGEST_WORD):
+            return GuestError(f"ResourceLimitError: it took {said.decode(errors='replace')}")
+        return GuestError(f"ChildProcessError: its process ended with status {status}, which "
                           "is what a crash does, or a limit of memory")
 
     def _end(self) -> int:

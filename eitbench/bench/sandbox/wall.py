@@ -18,6 +18,7 @@ from pathlib import Path
 
 from eitbench._files import PACKAGE
 from eitbench.bench.sandbox import calls
+from eitbench.bench.sandbox.keeper import Limits
 
 _CREATE, _ADD, _RESTRICT = 444, 445, 446
 """System calls of Landlock, the same on every architecture that Python is at home on."""
@@ -32,6 +33,10 @@ _SETTINGS = ("ld.so.cache", "localtime", "timezone", "passwd", "group", "nsswitc
              "mime.types", "os-release", "fonts", "alternatives")
 """What programs look up in /etc; much else there is not for everybody."""
 
+_DESCRIPTORS = 1024
+"""open files of a process; each pipe holds memory that is nobody's"""
+_OWN_COUNT = [5, 14]
+"""From this Linux on a namespace of users has a count of processes of its own."""
 _OFFERS = ("eitbench.worlds", "eitbench.methods", "eitbench.scores", "eitbench.loaders")
 """Groups of entry points by which installed packages offer something to this one."""
 
@@ -110,12 +115,25 @@ def refuse_calls(signals: bool) -> bool:
     return bool(libc.prctl(*_FILTER_CALLS, ctypes.byref(_Filter(len(steps), content)), 0, 0) == 0)
 
 
-def limit_memory(size: int) -> None:
-    """No more than ``size`` bytes of address space, no core dumps; a request beyond raises
-    ``MemoryError``."""
+def limit(limits: Limits, counts_apart: bool) -> None:
+    """What the kernel itself sees to: no more bytes of address space and in a file than that, not
+    many files open at once, no core dumps; a request beyond raises ``MemoryError`` or ``OSError``.
+
+    ``counts_apart``: whether it is in a namespace of users, whose processes newer kernels count by
+    themselves, but for root's. Elsewhere all processes of the user would count.
+    """
     import resource  # not on Windows
-    resource.setrlimit(resource.RLIMIT_AS, (size, size))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    most = {resource.RLIMIT_AS: limits.memory, resource.RLIMIT_FSIZE: limits.disk,
+            resource.RLIMIT_NOFILE: _DESCRIPTORS, resource.RLIMIT_CORE: 0}
+    if counts_apart and _kernel() >= _OWN_COUNT:
+        most[resource.RLIMIT_NPROC] = limits.tasks
+    for what, number in most.items():
+        resource.setrlimit(what, (number, number))
+
+
+def _kernel() -> list[int]:
+    """Its version, as far as it is numbers."""
+    return [int(part) for part in os.uname().release.split("-")[0].split(".") if part.isdecimal()]
 
 
 def drop_capabilities() -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import struct
 from collections.abc import Callable
 from typing import Any
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from eitbench import _check
+from eitbench.bench.strict_json import decoder
 
 LARGEST = 1 << 28
 """bytes; no message is longer"""
@@ -19,10 +21,10 @@ HEAD = 1 << 20
 """bytes of a message's JSON"""
 VALUES = 50_000
 """How many commas and opening brackets the JSON may have, which bounds what it costs to parse."""
-KINDS = "biuf"
-"""Of numbers in arrays."""
-DIGITS = 40
-"""Of a number; the state of a generator has 39."""
+KIND = re.compile(r"[<>|][biuf](1|2|4|8|12|16)")
+"""Of numbers in arrays; numpy would take other words for programs."""
+BITS = 132
+"""Of an integer with its sign; the state of a generator has 128."""
 ARRAYS, AXES = 64, 32
 """How many arrays a message may have, and each of them axes."""
 
@@ -52,10 +54,13 @@ def unpack(read: Callable[[int], bytes]) -> tuple[dict[str, Any], dict[str, np.n
     arrays = {}
     for name, kind, shape in kinds:
         size = math.prod(shape) * kind.itemsize
-        if kind.kind not in KINDS or at + size > body:
+        if at + size > body:
             raise ValueError(f"array {name!r} of a message must hold numbers that are there; got "
                              f"{kind}, {shape}")
-        arrays[name] = np.frombuffer(content, kind, math.prod(shape), at).reshape(shape).copy()
+        array = np.frombuffer(content, kind, math.prod(shape), at).reshape(shape).copy()
+        if kind.kind == "b" and (array.view(np.uint8) > 1).any():
+            raise ValueError(f"array {name!r} of a message must hold true and false only")
+        arrays[name] = array
         at += size
     if not isinstance(words, dict) or at != body:
         raise ValueError("a message must be a dictionary and its arrays, and nothing else")
@@ -78,7 +83,7 @@ def _parsed(head: bytes) -> tuple[Any, list[Any]]:
 
 def _described(name: str, kind: str, shape: list[int]) -> tuple[str, np.dtype, tuple[int, ...]]:
     """An entry of the layout."""
-    is_one = isinstance(name, str) and isinstance(kind, str) and len(kind) < 8
+    is_one = isinstance(name, str) and isinstance(kind, str) and KIND.fullmatch(kind)
     if not is_one or len(shape) > AXES:
         raise ValueError("an array must have a name, a type and a shape")
     for n in shape:
@@ -86,21 +91,4 @@ def _described(name: str, kind: str, shape: list[int]) -> tuple[str, np.dtype, t
     return name, np.dtype(kind), tuple(shape)
 
 
-def _whole(text: str) -> int:
-    if len(text) > DIGITS:
-        raise ValueError(f"an integer of {len(text)} digits")
-    return int(text)
-
-
-def _real(text: str) -> float:
-    number = float(text[:DIGITS])
-    if len(text) > DIGITS or not math.isfinite(number):
-        raise ValueError(f"the number {text[:DIGITS]} is too great or too long")
-    return number
-
-
-def _refuse(constant: str) -> None:
-    raise ValueError(f"{constant} is not JSON")
-
-
-_DECODER = json.JSONDecoder(parse_constant=_refuse, parse_float=_real, parse_int=_whole)
+_DECODER = decoder(BITS)

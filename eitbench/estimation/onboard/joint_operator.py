@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from eitbench.estimation import FreeCovariance, JointFilter, KalmanFilter, initial_covariance
-from eitbench.estimation.onboard.operator import FullOperator
+from eitbench.estimation.onboard.operator import FullOperator, spread
 from eitbench.estimation.onboard.reduced_operator import (
     RANK,
     ReducedOperator,
@@ -67,9 +67,9 @@ class JointFullOperator(FullOperator):
     def grid(self) -> tuple[np.ndarray, np.ndarray]:
         patches = self._patches
         n = self._patches.shape[1]
-        variance = [((patches @ filter_.covariance[:n, :n]) * patches).sum(axis=1)
-                    for filter_ in self._filters]
-        return self._patch_means(), self.concentration[:, None] * np.sqrt(variance)
+        variance = np.array([((patches @ filter_.covariance[:n, :n]) * patches).sum(axis=1)
+                             for filter_ in self._filters])
+        return self._patch_means(), self.concentration[:, None] * spread(variance)
 
     def means(self) -> np.ndarray:
         relative = np.array([filter_.concentration for filter_ in self._filters])
@@ -78,12 +78,12 @@ class JointFullOperator(FullOperator):
     def spreads(self) -> np.ndarray:
         n = self._patches.shape[1]
         variance = np.array([filter_.covariance.diagonal()[:n] for filter_ in self._filters])
-        return self.concentration[:, None] * np.sqrt(np.maximum(variance, 0.0))
+        return self.concentration[:, None] * spread(variance)
 
     def flow(self) -> tuple[np.ndarray, np.ndarray] | None:
         n = self._patches.shape[1]
-        return (np.array([filter_.parameters for filter_ in self._filters]),
-                np.sqrt([filter_.covariance.diagonal()[n:] for filter_ in self._filters]))
+        variance = np.array([filter_.covariance.diagonal()[n:] for filter_ in self._filters])
+        return np.array([filter_.parameters for filter_ in self._filters]), spread(variance)
 
 
 class JointReducedOperator(ReducedOperator):
@@ -128,7 +128,7 @@ class JointReducedOperator(ReducedOperator):
 
     def flow(self) -> tuple[np.ndarray, np.ndarray] | None:
         variance = self._filter.covariance[:, -1, -1:].astype(float)
-        return self._filter.mean[:, -1:].astype(float), np.sqrt(variance)
+        return self._filter.mean[:, -1:].astype(float), spread(variance)
 
 
 class JointShared(Shared):
@@ -148,7 +148,8 @@ class JointShared(Shared):
         return stored_model(world, "joint", JointModel, lambda: make_model(world))
 
     def start(self, episodes: int) -> ReducedFilter:
-        (nominal,), (std,) = self.flow.nominal, self.flow.initial_std
+        (nominal,) = self.flow.nominal
+        (std,) = self.flow.initial_std
         r = len(self.model.initial)
         mean = np.zeros((episodes, r + 1))
         covariance = np.zeros((episodes, r + 1, r + 1))

@@ -77,48 +77,39 @@ class Operator(Protocol):
     def __init__(self, world: World, frames: np.ndarray, *, gate: float,
                  noise_floor: float) -> None:
         """Take in the first frame, voltages (B, K, L) in V of the world's cycle."""
-        ...
 
     def assimilate(self, voltages: np.ndarray,
                    currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """One time step on, with voltages (B, L) in V for currents (B, L), all zero where nothing
         was injected; returns the innovations in predicted standard deviations and which readings
         were believed, both (B, L)."""
-        ...
 
     def innovations(self) -> list[Innovation | None]:
         """Of each episode what it took in last, for scores; None where nothing was injected, or no
         reading was believed."""
-        ...
 
     def grid(self) -> tuple[np.ndarray, np.ndarray]:
         """Mean and standard deviation (B, patches) in mol/m³ on the coarse grid."""
-        ...
 
     def errors(self, moments: np.ndarray, deviations: np.ndarray,
                squares: np.ndarray) -> np.ndarray:
         """Relative errors (5.12) of the present means, from what `project` makes of recorded
         moments (B, …)."""
-        ...
 
     def means(self) -> np.ndarray:
         """(B, n) estimates in mol/m³ on the task's mesh."""
-        ...
 
     def spreads(self) -> np.ndarray:
         """(B, n) their standard deviations in mol/m³."""
-        ...
 
     def flow(self) -> tuple[np.ndarray, np.ndarray] | None:
         """Velocity parameters θ and their standard deviations (B, k) in m/s, None where the flow is
         taken as known."""
-        ...
 
     @staticmethod
     def project(world: World, moment: np.ndarray) -> np.ndarray:
         """Moments over what counts (T, n), see `eitbench.data.regions.integrals`, as `errors` wants
         them."""
-        ...
 
 
 class Linearisation(NamedTuple):
@@ -206,7 +197,7 @@ class FullOperator:
         self._levels = [levels.linearised(levels.best(frame, broken)) for frame in frames]
         self.concentration = np.array([level.concentration for level in self._levels])
         self._filters = self._start(len(frames))
-        self._last = list[tuple[np.ndarray, ...] | None]()
+        self._last: list[tuple[np.ndarray, ...] | None] = []
         self._patches = patch_averages(levels.task.mesh, world.vessel.patches)
         for k, currents in enumerate(world.currents):
             self.assimilate(frames[:, k], np.repeat(currents[None], len(frames), axis=0))
@@ -239,9 +230,8 @@ class FullOperator:
         return [None if last is None else Innovation.of(*last) for last in self._last]
 
     def grid(self) -> tuple[np.ndarray, np.ndarray]:
-        spread = np.array([np.sqrt(filter_.variance_of(self._patches))
-                           for filter_ in self._filters])
-        return self._patch_means(), self.concentration[:, None] * spread
+        variance = np.array([filter_.variance_of(self._patches) for filter_ in self._filters])
+        return self._patch_means(), self.concentration[:, None] * spread(variance)
 
     def _patch_means(self) -> np.ndarray:
         # Episode by episode: the bits of one product of matrices would depend on how many play side
@@ -257,9 +247,8 @@ class FullOperator:
         return self.concentration[:, None] * np.array([filter_.mean for filter_ in self._filters])
 
     def spreads(self) -> np.ndarray:
-        # a difference of two: rounding may leave less than none
-        variance = np.maximum([filter_.variances() for filter_ in self._filters], 0.0)
-        return self.concentration[:, None] * np.sqrt(variance)
+        variance = np.array([filter_.variances() for filter_ in self._filters])
+        return self.concentration[:, None] * spread(variance)
 
     def flow(self) -> tuple[np.ndarray, np.ndarray] | None:
         return None
@@ -267,6 +256,11 @@ class FullOperator:
     @staticmethod
     def project(world: World, moment: np.ndarray) -> np.ndarray:
         return np.asarray(moment)
+
+
+def spread(variance: np.ndarray) -> np.ndarray:
+    """Standard deviations; a variance that is the difference of two may by rounding be below 0."""
+    return np.sqrt(np.maximum(variance, 0.0))
 
 
 def patch_averages(mesh: Mesh, grid: tuple[int, int]) -> np.ndarray:

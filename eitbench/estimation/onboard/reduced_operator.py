@@ -26,6 +26,7 @@ from eitbench.estimation.onboard.operator import (
     levels_of,
     pair_currents,
     patch_averages,
+    spread,
 )
 from eitbench.estimation.onboard.packing import packed, unpacked
 from eitbench.estimation.reduced import ReducedFilter, ReducedModel, reduced_model
@@ -126,7 +127,7 @@ class ReducedOperator:
         patches = self._shared.patches
         mean = 1.0 + (patches @ self.state[..., None])[..., 0]
         variance = ((patches @ self.state_covariance) * patches).sum(axis=2, dtype=float)
-        return self.concentration[:, None] * mean, self.concentration[:, None] * np.sqrt(variance)
+        return self.concentration[:, None] * mean, self.concentration[:, None] * spread(variance)
 
     def errors(self, moments: np.ndarray, deviations: np.ndarray,
                squares: np.ndarray) -> np.ndarray:
@@ -141,8 +142,8 @@ class ReducedOperator:
 
     def spreads(self) -> np.ndarray:
         basis = self._shared.model.basis
-        variance = np.maximum(((basis @ self.state_covariance) * basis).sum(axis=2), 0.0)
-        return self.concentration[:, None] * np.sqrt(variance)
+        variance = ((basis @ self.state_covariance) * basis).sum(axis=2)
+        return self.concentration[:, None] * spread(variance)
 
     def flow(self) -> tuple[np.ndarray, np.ndarray] | None:
         return None

@@ -24,9 +24,10 @@ class Rules:
     ----------
     world : World
         Its instrument's ``limit`` says whether an action is the number of an electrode pair (None),
-        or L currents in parts of the instrument's, of which the mean is taken away, and which are
-        scaled down to the norm of a pair if they exceed it. Its schedule's ``budget`` says how many
-        injections the agent may make in an episode, where it may also inject nothing.
+        or L currents in parts of the instrument's. These are first cut to ±1, the bounds of the
+        action space; then their mean is taken away, and they are scaled down to the norm of a pair
+        if they exceed it. Its schedule's ``budget`` says how many injections the agent may make in
+        an episode, where it may also inject nothing.
     gate : float
         The estimator leaves out readings further from the prediction than this many standard
         deviations.
@@ -114,8 +115,8 @@ class Rules:
         return (k + 1) * self.budget // steps > k * self.budget // steps
 
     def currents(self, actions: np.ndarray) -> np.ndarray:
-        """(B, L) currents in A (A/m in 2D) of actions (B,) or (B, L); what lies outside of the
-        action space is taken for its bound."""
+        """(B, L) currents in A (A/m in 2D) of actions (B,) or (B, L); entries of the latter beyond
+        ±1 are first taken for ±1."""
         if self.limit is None:
             return self.table[actions]
         free = np.clip(np.asarray(actions, dtype=float), -1.0, 1.0)

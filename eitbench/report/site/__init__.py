@@ -14,13 +14,14 @@ from typing import Any
 import pandas as pd
 
 from eitbench._files import replace_folder
-from eitbench._foreign import as_markdown
+from eitbench._foreign import as_cell, as_markdown
 from eitbench.bench.records import file_name, newest
 from eitbench.report.boards import boards, meanings
 from eitbench.report.site.collect import about_season, collect
-from eitbench.report.site.environment import environment_page
-from eitbench.report.site.index import index_page
-from eitbench.report.site.method import method_page
+from eitbench.report.site.environment import environment_pages
+from eitbench.report.site.index import index_pages
+from eitbench.report.site.method import method_pages
+from eitbench.report.site.tables import PAGE
 from eitbench.report.site.tables import table as shown
 
 MARK = b"<strong>eitbench</strong> leaderboards"
@@ -48,13 +49,12 @@ def render_site(records: list[dict[str, Any]], table: pd.DataFrame,
     """
     media = media or {}
     site = collect(records, table)
-    pages = {"index.html": index_page(site)}
+    files = index_pages(site)
     for board in site.boards:
         if not board.is_aggregate:
             name = board.environment
-            pages[f"environments/{name}.html"] = environment_page(site, board, media.get(name))
-    pages |= {f"methods/{name}.html": method_page(site, name) for name in site.methods}
-    files = {path: html.encode() for path, html in pages.items()}
+            files |= environment_pages(site, board, media.get(name))
+    files |= method_pages(site)
     files |= {name: b"".join((HERE / part).read_bytes() for part in parts)
               for name, parts in ASSETS.items()}
     shown = {board.environment for board in site.boards}
@@ -78,17 +78,20 @@ def render(records: list[dict[str, Any]], table: pd.DataFrame | None = None) -> 
         for board in site.boards:
             if board.of_class == name and board.current:
                 seeds = "" if board.is_aggregate else f", {board.seeds}"
-                current = board._replace(rows=board.current)
+                first = board._replace(rows=board.current[:PAGE])
                 parts += [f"### {as_markdown(board.title)}{seeds}",
-                          shown(current, "", compact=False).markdown()]
+                          shown(first, "", compact=False).markdown()]
+                if left := len(board.current) - len(first.rows):
+                    parts.append(f"{left:,} more are in leaderboard.csv.")
     if site.boards:
         said = [f"- **{heading}**: {text}" for heading, text in meanings().items()]
         parts += ["## What the columns say", "\n".join(said)]
     if outdated := newest(records)[1]:
         parts += ["## Outdated records", "Made by an earlier version of the method.\n\n"
                   + "\n".join(f"- {as_markdown(file_name(record))}" for record in outdated)]
-    return {"leaderboard.csv": found.to_csv(index=False, float_format="%.6g", lineterminator="\n"),
-            "leaderboard.md": "\n\n".join(parts) + "\n"}
+    texts = {name: found[name].map(as_cell) for name in ("environment", "method", "title")}
+    plain = found.assign(**texts).to_csv(index=False, float_format="%.6g", lineterminator="\n")
+    return {"leaderboard.csv": plain, "leaderboard.md": "\n\n".join(parts) + "\n"}
 
 
 def read_media(folder: Path) -> dict[str, bytes]:

@@ -40,6 +40,11 @@ class Row(NamedTuple):
         """A floor, a reference, or shown the truth; not one that merely failed."""
         return any(word in self.cells["note"] for word in ("floor", "reference", "privileged"))
 
+    @property
+    def badges(self) -> tuple[str, ...]:
+        """Words that mark it: why it has no rank, and that it is outdated."""
+        return (*filter(None, self.cells["note"].split(", ")), *["outdated"] * self.outdated)
+
     def episodes(self) -> list[dict[str, Any]]:
         """Those finished, of the board's seeds."""
         seeds = {name_seed(seed) for seed in parse_seeds(self.cells["seeds"])}
@@ -67,8 +72,9 @@ class Board(NamedTuple):
 
     @property
     def seeds(self) -> str:
-        """Its episodes, as whoever has played most of them has them."""
-        return str(max((row.cells["seeds"] for row in self.rows),
+        """Its episodes, as whoever has played most of them has them; those of outdated rows only
+        where there are no others."""
+        return str(max((row.cells["seeds"] for row in self.current or self.rows),
                        key=lambda seeds: len(parse_seeds(seeds))))
 
     @property

@@ -15,22 +15,30 @@ from eitbench.bench.statistics import paired_probability_of_improvement
 from eitbench.envs.pages import page
 from eitbench.report import charts
 from eitbench.report.site.collect import Board, Row, Site
-from eitbench.report.site.tables import explanations, table, three
+from eitbench.report.site.tables import explanations, more, rows_file, table, three
 from eitbench.report.templates import template
 
 NOMINAL = ("coverage_50", "coverage_90")
+CHARTED = 30
+"""Methods beside and in the charts of a long board."""
 MOST, TOLD = 7, 5
 """Jagged curves that can be told apart, and how many are drawn strongly where there are more."""
 
 
-def environment_page(site: Site, board: Board, animation: bytes | None) -> str:
-    """The HTML of the page; with an ``animation`` it offers to play it."""
+def environment_pages(site: Site, board: Board, animation: bytes | None) -> dict[str, bytes]:
+    """The HTML of the page, which offers to play an ``animation``, and the lines of its board for
+    which it has no room."""
     id = next(row.record["environment"]["id"] for row in board.rows if row.record)
     made = table(board, "../", compact=False)
     description, details = documentation(id)
-    return template("site/environment.html.j2").render(
-        root="../", season=site.season.number, board=board, id=id, table=made,
-        explanations=explanations([made]),
+    longer = more(made, board.environment, "../")
+    lines = {} if longer is None else {
+        longer.file.removeprefix("../"): rows_file(made, longer.file)}
+    whole = board
+    board = board._replace(rows=_charted(board))
+    html = template("site/environment.html.j2").render(
+        root="../", season=site.season.number, board=whole, id=id, table=made, more=longer,
+        explanations=explanations([made]), charted=len(board.rows),
         description=description, details=details,
         front=_front(board), intervals=_intervals(board), curves=_curves(board),
         duels=_duels(board), calibration=_calibration(board), spread=_spread(board),
@@ -38,6 +46,15 @@ def environment_page(site: Site, board: Board, animation: bytes | None) -> str:
         media_mb=f"{1e-6 * len(animation):.1f} MB" if animation else "",
         siblings=[other for other in site.boards
                   if other.of_class == board.of_class and not other.is_aggregate])
+    return lines | {f"environments/{board.environment}.html": html.encode()}
+
+
+def _charted(board: Board) -> list[Row]:
+    """Whom the charts show: all, or of many the first, and floors and references."""
+    if len(board.current) <= CHARTED:
+        return board.current
+    best = [row for row in board.current if not row.unranked][:CHARTED]
+    return [row for row in board.current if row in best or row.unranked][:2 * CHARTED]
 
 
 def documentation(id: str) -> tuple[Markup, Markup]:

@@ -6,7 +6,7 @@ from typing import Any
 
 from eitbench.bench.records import finished
 from eitbench.report.site.collect import Site, about_season
-from eitbench.report.site.tables import explanations, table
+from eitbench.report.site.tables import explanations, more, rows_file, table
 from eitbench.report.templates import template
 
 ABOUT = {
@@ -19,15 +19,19 @@ ABOUT = {
 """What each class asks for."""
 
 
-def index_page(site: Site) -> str:
-    """The HTML of ``index.html``."""
+def index_pages(site: Site) -> dict[str, bytes]:
+    """The HTML of ``index.html``, and the lines for which it has no room."""
     made = {board.anchor: table(board, "", compact=True) for board in site.boards}
+    longer = {anchor: more(each, anchor, "") for anchor, each in made.items()}
     classes: list[dict[str, Any]] = [{
         "name": name, "about": ABOUT[name],
-        "boards": [(board, made[board.anchor]) for board in site.boards if board.of_class == name],
+        "boards": [(board, made[board.anchor], longer[board.anchor]) for board in site.boards
+                   if board.of_class == name],
     } for name in site.classes]
-    return template("site/index.html.j2").render(
+    html = template("site/index.html.j2").render(
         root="", classes=classes, n_records=len(site.records), n_methods=len(site.methods),
         season=about_season(site.season),
         last=max(map(finished, site.records), default="")[:10],
         explanations=explanations(list(made.values())))
+    return {"index.html": html.encode()} | {
+        each.file: rows_file(made[anchor], each.file) for anchor, each in longer.items() if each}

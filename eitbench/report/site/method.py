@@ -7,6 +7,7 @@ import ast
 import hashlib
 import json
 import shlex
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,48 +23,64 @@ from eitbench.report import charts
 from eitbench.report.boards import headings
 from eitbench.report.site.collect import Board, Row, Site, title_of
 from eitbench.report.site.environment import markdown
-from eitbench.report.site.tables import interval_cell, scale, three
+from eitbench.report.site.tables import SCALES, interval_cell, scale, three
 from eitbench.report.templates import template
 
+Standing = tuple[Board, Row]
+Ends = Mapping[str, tuple[int, Mapping[str, tuple[float, float]]]]
+"""Anchor of a board -> how many compete on it, and the ends of its drawn axes."""
 
-def method_page(site: Site, name: str) -> str:
+
+def method_pages(site: Site) -> dict[str, bytes]:
+    """The HTML of the pages of all methods, by their path."""
+    ends = {board.anchor: (sum(row.competes for row in board.rows),
+                           {name: scale(board, name) for name in SCALES}) for board in site.boards}
+    standings: dict[str, list[Standing]] = {name: [] for name in site.methods}
+    for board in site.boards:
+        for row in board.rows:
+            standings[row.cells["method"]].append((board, row))
+    records: dict[str, list[dict[str, Any]]] = {name: [] for name in site.methods}
+    for record in site.records:
+        records[record["method"]].append(record)
+    return {f"methods/{name}.html": _page(name, records[name], standings[name], ends).encode()
+            for name in site.methods}
+
+
+def _page(name: str, records: list[dict[str, Any]], standings: list[Standing], ends: Ends) -> str:
     """The HTML of the page of all versions of a method."""
-    standings = [(board, row) for board in site.boards for row in board.rows
-                 if row.cells["method"] == name]
-    records = sorted((record for record in site.records if record["method"] == name),
-                     key=lambda record: (record["official"], finished(record)), reverse=True)
+    records = sorted(records, key=lambda record: (record["official"], finished(record)),
+                     reverse=True)
     versions = list(dict.fromkeys(record["version"] for record in records))
     return template("site/method.html.j2").render(
-        root="../", name=name, title=records[0]["title"], standings=_standings(standings),
+        root="../", name=name, title=records[0]["title"], standings=_standings(standings, ends),
         intervals=_intervals(standings),
-        versions=[_version([record for record in records if record["version"] == each], site)
-                  for each in versions])
+        versions=[_version([record for record in records if record["version"] == each],
+                           standings) for each in versions])
 
 
-def _standings(standings: list[tuple[Board, Row]]) -> Table:
+def _standings(standings: list[Standing], ends: Ends) -> Table:
     """A row for each board."""
     several = len({row.cells["version"] for _, row in standings}) > 1
     rows = []
     for board, row in standings:
-        competing = sum(other.competes for other in board.rows)
+        competing, axes = ends[board.anchor]
         rank = row.cells["rank"]
         link = f"../index.html#{board.anchor}" if board.is_aggregate else f"../{board.address}"
-        badges = (*filter(None, row.cells["note"].split(", ")), *["outdated"] * row.outdated)
         cells: dict[str, Cell | str] = {
             "board": Cell(board.title, board.title.casefold(), link=link, small=board.of_class,
-                          badges=badges)}
+                          badges=row.badges)}
         if several:
             cells["version"] = row.cells["version"]
         rows.append(cells | {
             "rank": Cell(NOTHING) if rank is None else Cell(str(rank), float(rank),
                                                             small=f"of {competing}"),
-            "ẽ_c": interval_cell(row, "error", scale(board, "error")),
-            "gain": interval_cell(row, "gain", scale(board, "gain")),
+            "ẽ_c": interval_cell(row, "error", axes["error"]),
+            "gain": interval_cell(row, "gain", axes["gain"]),
             "ms/step": number_cell(row.cells["seconds_per_step"])})
     return Table.of(rows, label="Boards", keep=list(rows[0]) if rows else ())
 
 
-def _intervals(standings: list[tuple[Board, Row]]) -> Markup:
+def _intervals(standings: list[Standing]) -> Markup:
     """Gains on all boards, which are on one scale."""
     colours: dict[str, int] = {}
     series = [charts.Series(f"{board.title} · {board.of_class}" if board.is_aggregate
@@ -76,7 +93,7 @@ def _intervals(standings: list[tuple[Board, Row]]) -> Markup:
     return Markup(charts.intervals(series, "gain: 0 as the floor, 1 perfect", log=False, mark=0.0))
 
 
-def _version(records: list[dict[str, Any]], site: Site) -> dict[str, Any]:
+def _version(records: list[dict[str, Any]], standings: list[Standing]) -> dict[str, Any]:
     """What is said of one version: its file as far as it is ours and the same, and its records."""
     record = records[0]
     file = source_file(record)
@@ -85,13 +102,12 @@ def _version(records: list[dict[str, Any]], site: Site) -> dict[str, Any]:
             "parameters": {key: json.dumps(value, ensure_ascii=False)
                            for key, value in sorted(record["parameters"].items())},
             "file": file, "docstring": docstring(record, file),
-            "records": [_record(each, site) for each in sorted(
+            "records": [_record(each, standings) for each in sorted(
                 records, key=lambda record: record["environment"]["name"])]}
 
 
-def _record(record: dict[str, Any], site: Site) -> dict[str, Any]:
-    board, row = next(((board, row) for board in site.boards for row in board.rows
-                       if row.record is record),
+def _record(record: dict[str, Any], standings: list[Standing]) -> dict[str, Any]:
+    board, row = next(((board, row) for board, row in standings if row.record is record),
                       (None, None))  # it played none of the board's episodes
     return {"title": title_of(record), "address": board and board.address,
             "official": record["official"],

@@ -1,5 +1,6 @@
 "use strict";
-// Sorting, filtering and the theme. Without this file the pages say the same: all rows, best first.
+// Sorting, filtering, paging and the theme. Without this file the pages say the same, best first; of
+// a board of thousands the first hundred.
 
 const root = document.documentElement;
 const darkByDefault = matchMedia("(prefers-color-scheme: dark)");
@@ -29,19 +30,93 @@ function themeButton(button) {
   show();
 }
 
+const boards = new Map();                // table -> its lines, wherever they are
+const PAGE = 100;
+
+class Board {                            // a table; of a long one a page at a time is in the document
+  constructor(table) {
+    this.body = table.tBodies[0];
+    this.rows = [...this.body.rows];
+    this.file = table.dataset.rows;      // with all lines; undefined where all are in the document
+    this.all = Number(table.dataset.all) || this.rows.length;
+    this.page = 0;
+    if (this.file) this.pager(table.closest(".card").nextElementSibling);
+  }
+
+  async whole() {                        // a script, since a page that is a file may read no other
+    if (this.file && !this.given) {
+      this.given = new Promise((resolve, reject) => {
+        waiting.set(this.file, resolve);
+        const script = document.createElement("script");
+        script.src = this.file;
+        script.onerror = reject;
+        document.head.append(script);
+      }).then((lines) => {
+        const made = document.createElement("template");
+        made.innerHTML = lines.join("");
+        this.rows = [...made.content.children];
+        applyAll();
+      });
+    }
+    await this.given;
+  }
+
+  get shown() { return this.rows.filter((row) => !row.hidden); }
+
+  draw(page = 0) {
+    if (!this.given) return;
+    const shown = this.shown;
+    const last = Math.max(0, Math.ceil(shown.length / PAGE) - 1);
+    this.page = Math.min(Math.max(page, 0), last);
+    const begin = this.page * PAGE;
+    const rows = shown.slice(begin, begin + PAGE);
+    this.body.replaceChildren(...rows);
+    this.words.textContent = `${rows.length ? begin + 1 : 0} to ${begin + rows.length} of ${shown.length}.`;
+    this.buttons[0].disabled = this.page === 0;
+    this.buttons[1].disabled = this.page === last;
+  }
+
+  pager(line) {
+    this.words = line.querySelector("span");
+    this.buttons = ["Previous", "Next"].map((text, i) => {
+      const button = document.createElement("button");
+      button.type = "button";
+      button.textContent = text;
+      button.addEventListener("click", async () => {
+        await this.whole();
+        this.draw(this.page + (i ? 1 : -1));
+      });
+      return button;
+    });
+    this.buttons[0].disabled = true;
+    line.prepend(...this.buttons);
+  }
+}
+
+const waiting = new Map();
+function giveRows(file, lines) {         // what a file of lines calls
+  waiting.get(file)(lines);
+}
+
+let applyAll = () => {};                 // what is looked for and left out, once there is a form
+
 function sortable(table) {
   const headers = [...table.tHead.rows[0].cells];
-  const body = table.tBodies[0];
+  const board = new Board(table);
+  boards.set(table, board);
   headers.forEach((header, column) => {
     const button = document.createElement("button");
     button.type = "button";
     button.append(...header.childNodes);
     header.append(button);
-    button.addEventListener("click", () => {
+    button.addEventListener("click", async () => {
       const descending = header.getAttribute("aria-sort") === "ascending";
       headers.forEach((other) => other.removeAttribute("aria-sort"));
       header.setAttribute("aria-sort", descending ? "descending" : "ascending");
-      body.append(...sorted([...body.rows], column, descending));
+      await board.whole();
+      board.rows = sorted(board.rows, column, descending);
+      if (board.file) board.draw();
+      else board.body.append(...board.rows);
     });
   });
 }
@@ -63,16 +138,19 @@ function filtering(form) {
     const left_out = [...form.querySelectorAll("input[type=checkbox]")].filter((box) => !box.checked).map((box) => box.name);
     let shown = 0, all = 0;
     for (const block of blocks) {
-      let any = false;
-      for (const row of block.querySelectorAll("tbody tr")) {
+      const board = boards.get(block.querySelector("table.board"));
+      let any = 0;
+      for (const row of board.rows) {
         const text = `${block.dataset.words} ${row.querySelector("td:nth-child(2)").textContent}`.toLocaleLowerCase("en");
         const flags = (row.dataset.flags || "").split(" ");
         row.hidden = left_out.some((name) => flags.includes(name)) || !words.every((word) => text.includes(word));
-        any ||= !row.hidden;
-        shown += !row.hidden;
-        all += 1;
+        any += !row.hidden;
       }
+      any += board.all - board.rows.length;           // not looked at yet
       block.hidden = !any;
+      shown += any;
+      all += board.all;
+      board.draw();
     }
     for (const section of document.querySelectorAll("section")) {
       const own = [...section.querySelectorAll(".block")];
@@ -81,9 +159,13 @@ function filtering(form) {
     said.textContent = `${shown} of ${all} rows`;
   };
   for (const box of form.querySelectorAll("input[type=checkbox]")) {          // no choice where there is nothing to hide
-    box.parentElement.hidden = !document.querySelector(`[data-flags~="${box.name}"]`);
+    box.parentElement.hidden = !document.querySelector(`[data-flags~="${box.name}"], [data-rows]`);
   }
-  form.addEventListener("input", apply);
+  applyAll = apply;
+  form.addEventListener("input", async () => {
+    await Promise.all([...boards.values()].map((board) => board.whole()));
+    apply();
+  });
   form.addEventListener("submit", (event) => event.preventDefault());
   form.hidden = false;
   apply();

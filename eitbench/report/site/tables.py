@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections import Counter
-from typing import Any
+from typing import Any, NamedTuple
+from urllib.parse import quote
 
 from markupsafe import Markup
 
 from eitbench.bench.table import NOTHING, Cell, Table, number_cell
+from eitbench.bench.table import Row as TableRow
 from eitbench.bench.text import with_interval
 from eitbench.report import charts
 from eitbench.report.boards import headings, meanings
+from eitbench.report.rows import rows_html
 from eitbench.report.site.collect import Board, Row, method_address
 
+PAGE = 100
+"""Lines of a board that a page shows at first; others are in a file of their own."""
 COMPACT = ("seconds_per_step", "peak_memory")
 """Beside ranks and intervals in the index; the page of an environment has all columns."""
 WORST_GAIN = -1.0
@@ -25,7 +31,8 @@ SCALES = {"error": ("ẽ_c", True), "gain": ("gain", False)}
 
 def table(board: Board, root: str, *, compact: bool) -> Table:
     """A board; ``root`` leads from the page to the site's folder."""
-    scores = [name for name in headings() if not compact or name in COMPACT]
+    said = headings()
+    scores = [name for name in said if not compact or name in COMPACT]
     drawn = {name: scale(board, name) for name in SCALES}
     shared = Counter(row.cells["rank"] for row in board.rows)
     rows = [{
@@ -33,10 +40,40 @@ def table(board: Board, root: str, *, compact: bool) -> Table:
         "method": _method(row, root),
         **{heading: interval_cell(row, name, drawn[name]) for name, (heading, _) in SCALES.items()},
         "by": "official" if row.cells["official"] else "self-reported",
-        **{headings()[name]: number_cell(row.cells[name]) for name in scores},
+        **{said[name]: number_cell(row.cells[name]) for name in scores},
     } for row in board.rows]
     flags = [_flags(row) for row in board.rows]
     return Table.of(rows, label=board.title, keep=["rank"], flags=flags)
+
+
+class More(NamedTuple):
+    """Of a board that is longer than a page."""
+
+    first: list[TableRow]
+    """Its first lines, and those of floors and references."""
+    all: int
+    """How many lines it has."""
+    file: str
+    """Where all of them are, from the page."""
+    csv: str
+    """The table of all boards, from the page."""
+    page: int = PAGE
+
+
+def more(made: Table, name: str, root: str) -> More | None:
+    """What a page says of a long board, whose lines are in a file of this ``name``; None of any
+    other."""
+    if len(made.rows) <= PAGE:
+        return None
+    first = [row for i, row in enumerate(made.rows) if i < PAGE or "unranked" in row.flags]
+    return More(first, len(made.rows), f"{root}rows/{quote(name)}.js", f"{root}../leaderboard.csv")
+
+
+def rows_file(made: Table, file: str) -> bytes:
+    """A script that hands all lines of a table over to the page that asks for them: a page that is
+    a file may read no other."""
+    lines = str(rows_html(made)).splitlines()
+    return f"giveRows({json.dumps(file)}, {json.dumps(lines, indent=0)});\n".encode()
 
 
 def explanations(tables: list[Table]) -> dict[str, str]:
@@ -80,8 +117,7 @@ def _rank(row: Row, shared: Counter[Any]) -> Cell:
 
 def _method(row: Row, root: str) -> Cell:
     cells = row.cells
-    badges = (*filter(None, cells["note"].split(", ")), *["outdated"] * row.outdated)
-    return Cell(cells["title"], cells["title"].casefold(), small=row.label, badges=badges,
+    return Cell(cells["title"], cells["title"].casefold(), small=row.label, badges=row.badges,
                 link=root + method_address(cells["method"]))
 
 

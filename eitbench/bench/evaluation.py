@@ -1,0 +1,100 @@
+"""`evaluate`: the scores of a method as a table, from Python, with nothing written to disk."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import pandas as pd
+from tqdm import tqdm
+
+from eitbench import _check
+from eitbench.bench.methods import FORMS, Method, load_method, method_of
+from eitbench.bench.playing import play
+from eitbench.bench.scores import scored
+from eitbench.bench.tracks import Environment
+from eitbench.data.parallel import in_parallel
+from eitbench.data.seeds import name_seed, parse_seeds
+
+
+def evaluate(method: Any, env: str | gym.Env, seeds: str | Iterable[int], *,
+             world: dict[str, Any] | None = None, n_jobs: int = 1) -> pd.DataFrame:
+    """Play a method on episodes, and score it as the commands do.
+
+    Parameters
+    ----------
+    method : class, name or path
+        A class ``Estimator`` or ``Policy`` as in a method's file, under whatever name; or the name
+        of one of ours; or the path of a file. It plays in this process (with ``n_jobs`` in those
+        that are started), not behind a wall.
+    env : str or Env
+        A registered id, or an environment that `gymnasium.make` has made, whose arguments count.
+    seeds : str or iterable of int
+        As in ``"dev:0-9"``, or the seeds themselves.
+    world : dict
+        Changes of the world's parts, as `gymnasium.make` takes them.
+    n_jobs : int
+        Processes. With one, what the method prints is seen, and a debugger stops in it.
+
+    Returns
+    -------
+    DataFrame
+        A row for each seed: environment, method, seed (as ``dev:3``), and each score by its name,
+        in SI units as in ``leaderboards/schema.json``; None where the method claims nothing.
+
+    Raises
+    ------
+    ValueError
+        If an argument is wrong, or the method does not suit the environment.
+    Exception
+        Whatever the method raises, with a note that says in which episode.
+    """
+    asked = _environment(env, world)
+    loaded = _method(method, asked.track)
+    numbers = parse_seeds(seeds) if isinstance(seeds, str) else [
+        _check.integer("seeds", seed, low=0) for seed in seeds]
+    if not numbers:
+        raise ValueError("seeds must name at least one episode, got none")
+    work = [(asked, loaded, seed) for seed in numbers]
+    if _check.integer("n_jobs", n_jobs, low=1) == 1:
+        played: Iterable[dict[str, Any]] = (_row(*each) for each in work)
+    else:
+        played = in_parallel(_row, work, n_jobs)
+    bar = tqdm(played, total=len(work), desc=loaded.name, unit="episode", disable=None)
+    rows = {row["seed"]: row for row in bar}
+    return pd.DataFrame([rows[name_seed(seed)] for seed in dict.fromkeys(numbers)])
+
+
+def _row(asked: Environment, method: Method, seed: int) -> dict[str, Any]:
+    try:
+        outcome = play(asked, method, seed).outcome
+    except Exception as error:
+        error.add_note(f"{method.name} on {asked.id}, {name_seed(seed)}")
+        raise
+    return {"environment": asked.name, "method": method.name, "seed": name_seed(seed),
+            **scored(method.track, outcome)}
+
+
+def _environment(given: str | gym.Env, world: dict[str, Any] | None) -> Environment:
+    changes = {} if world is None else {"world": world}
+    if isinstance(given, str):
+        return Environment(given, json.dumps(changes))
+    spec = getattr(given, "spec", None)
+    if spec is None:
+        raise ValueError("env must be an id, or made by gymnasium.make, got "
+                         f"{type(given).__name__}")
+    arguments = {key: value for key, value in spec.kwargs.items() if key != "name"}
+    return Environment(spec.id, json.dumps(arguments | changes))
+
+
+def _method(given: Any, track: str) -> Method:
+    if isinstance(given, str | Path):
+        return load_method(str(given), track)
+    if not isinstance(given, type):
+        form = FORMS[track]
+        raise ValueError(f"method must be a class with {form.answers}, or the name or file of a "
+                         f"{form.kind}, got {type(given).__name__}")
+    return method_of(given, track, given.__name__)

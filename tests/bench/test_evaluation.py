@@ -1,0 +1,88 @@
+"""`eitbench.evaluate`: the numbers of the commands, from Python, of classes, names and files."""
+
+import eitbench
+import gymnasium as gym
+import numpy as np
+import pytest
+from eitbench import Estimate
+from eitbench.bench.run import Job, run_episode
+from eitbench.bench.tracks import Environment
+
+from short import PIPE, shorten
+from tiny import FILTER, SCENARIO, write_baseline
+
+INJECTION = "eitbench/Pipe2DInjection-v0"
+
+
+@pytest.fixture(autouse=True)
+def tiny_world(monkeypatch):
+    shorten(monkeypatch, {INJECTION: PIPE})
+
+
+class Level:
+    """The same everywhere, as loud as the voltages."""
+
+    def __init__(self, task):
+        self.level = np.full(task.mesh.n_nodes, 29.0)
+
+    def update(self, voltages, currents):
+        return Estimate(self.level + voltages.sum())
+
+
+def without_time(table):
+    return table.drop(columns=["seconds_per_step", "method"])
+
+
+def test_the_numbers_are_those_of_the_commands(tmp_path):
+    """Of a class, of the file that holds it, of a made environment, and in two processes."""
+    table = eitbench.evaluate(Level, FILTER.id, "dev:0-2", world=SCENARIO)
+    assert table["seed"].tolist() == ["dev:0", "dev:1", "dev:2"] and set(table["method"]) == {"Level"}
+    path = write_baseline(tmp_path, update="return Estimate(self.level + voltages.sum())")
+    for seed, error, bias in zip((100_000, 100_001, 100_002), table["error"], table["contrast_error"], strict=True):
+        said = run_episode(Job(FILTER, path, seed))[0]["scores"]
+        assert (said["error"], said["contrast_error"]) == (error, bias) and error > 0
+    file = eitbench.evaluate(path, FILTER.id, [100_000, 100_001, 100_002], world=SCENARIO)
+    made = eitbench.evaluate(Level, gym.make(FILTER.id, world=SCENARIO), "dev:0-2")
+    both = eitbench.evaluate(Level, FILTER.id, "dev:0-2", world=SCENARIO, n_jobs=2)
+    for other in (file, made, both):
+        assert without_time(other).equals(without_time(table))
+    assert set(table["environment"]) == {Environment(FILTER.id, FILTER.kwargs).name}
+
+
+def test_policies_too():
+    """Ours by name, and a class of one's own."""
+    class First:
+        def __init__(self, rules, random):
+            self.limit = rules.limit
+
+        def act(self, observation):
+            return 0
+
+    ours = eitbench.evaluate("random_pair", INJECTION, "dev:0-1")
+    mine = eitbench.evaluate(First, INJECTION, "dev:0-1")
+    assert list(ours.columns) == list(mine.columns) and (ours["spent"] == mine["spent"]).all()
+    assert (ours["error"] != mine["error"]).all()
+
+
+def test_what_the_method_raises_is_seen():
+    """Its own exception, with a note of where."""
+    class Fails(Level):
+        def update(self, voltages, currents):
+            raise ZeroDivisionError("dry")
+
+    with pytest.raises(ZeroDivisionError, match="dry") as caught:
+        eitbench.evaluate(Fails, FILTER.id, "dev:0", world=SCENARIO)
+    assert caught.value.__notes__ == ["Fails on eitbench/Pipe2D-v0, dev:0"]
+
+
+@pytest.mark.parametrize(("arguments", "message"), [
+    ((3, FILTER.id, "dev:0"), r"method must be a class with update\(voltages, currents\), or the name"),
+    ((int, FILTER.id, "dev:0"), r"baseline int: int must have a method update\(voltages, currents\)"),
+    ((Level, FILTER.id, []), "seeds must name at least one episode"),
+    ((Level, FILTER.id, [-1]), "seeds must be an integer of at least 0, got -1"),
+    ((Level, "eitbench/Pipe-v0", "dev:0"), "env must be one of"),
+    ((Level, 3, "dev:0"), "env must be an id, or made by gymnasium.make, got int"),
+    (("nobody", FILTER.id, "dev:0"), "baseline")])
+def test_mistakes_are_explained(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        eitbench.evaluate(*arguments)

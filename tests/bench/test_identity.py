@@ -1,0 +1,83 @@
+"""What a stored result is recognised by: an episode of another world is none of this one's."""
+
+import subprocess
+import sys
+from dataclasses import replace
+
+import pytest
+from eitbench.bench.run import Job, run_jobs
+from eitbench.bench.store import EpisodeStore
+from eitbench.bench.tracks import Environment
+from eitbench.data.store import CACHE_VARIABLE
+from eitbench.worlds import entry, register, registry
+
+from short import register_apart
+from tiny import FILTER, count, counting, write_baseline
+from tiny_worlds import CHANGES, TINY
+
+ID = "mine/Tiny-v0"
+SCRIPT = '''
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+from eitbench.bench.run import Job, run_jobs
+from eitbench.bench.store import EpisodeStore
+from eitbench.bench.tracks import Environment
+from eitbench.worlds import register
+from eitbench.worlds.flows import LaminarFlow
+from eitbench.worlds.pipe2d import PIPE_2D
+
+
+@dataclass(frozen=True)
+class Mine(LaminarFlow):
+    """A flow of the script's own."""
+
+
+world = PIPE_2D.changed({changes!r})
+flow = Mine(**{{each.name: getattr(world.flow, each.name) for each in fields(world.flow)}})
+register(replace(world, name="Mine", flow=flow), "mine/Own-v0")
+jobs = [Job(Environment("mine/Own-v0"), {baseline!r}, seed) for seed in (1, 2)]
+for _ in range(2):
+    run_jobs(jobs, EpisodeStore(Path({folder!r})), n_jobs=2)
+'''
+
+
+@pytest.fixture(autouse=True)
+def apart(run_cache, monkeypatch):
+    """What a test registers is forgotten after it."""
+    monkeypatch.setenv(CACHE_VARIABLE, run_cache)
+    register_apart(monkeypatch)
+
+
+def test_an_edited_world_of_a_script_is_played_again(tmp_path):
+    """Under the same id: another instrument, prior or question is another episode; the same again is none."""
+    log = tmp_path / "log"
+    path = write_baseline(tmp_path, init=counting(log))
+    register(TINY, ID)
+    mine = entry(ID)
+    store = EpisodeStore(tmp_path / "results")
+    noisy = TINY.changed({"instrument": {"noise_relative": 0.02}})
+    sure = TINY.changed({"prior": {"inflow_std": 0.5}})
+    for n, (world, settings) in enumerate([(TINY, {}), (noisy, {}), (sure, {}), (sure, {"lag": 1})], 1):
+        registry.take_over([replace(mine, world=world, settings=settings)])
+        for _ in range(2):
+            run_jobs([Job(Environment(ID), path, 1)], store)
+        assert count(log) == n
+
+
+def test_a_world_that_is_changed_to_itself_has_the_same_identity(tmp_path):
+    """It is made anew for each job, and recognised by its numbers."""
+    path = write_baseline(tmp_path)
+    first = Job(FILTER, path, 1).identity()
+    registry.take_over([replace(entry(FILTER.id), world=replace(entry(FILTER.id).world))])
+    assert Job(FILTER, path, 1).identity() == first
+
+
+def test_a_script_with_a_part_of_its_own_resumes(tmp_path):
+    """Its workers do not know the file in which the part is written; what they played counts all the same."""
+    log = tmp_path / "log"
+    path = write_baseline(tmp_path, init=counting(log))
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT.format(changes=CHANGES, baseline=path, folder=str(tmp_path / "results")))
+    subprocess.run([sys.executable, str(script)], check=True, capture_output=True)
+    assert count(log) == 2
