@@ -10,13 +10,14 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from eitbench.data import kits, store
+from eitbench.data.beginnings import beginning_entries, make_beginning
 from eitbench.data.recordings import OUTLINE, SPARSE, half_mass, make_outline
 from eitbench.data.regions import region_operators
 from eitbench.estimation.onboard import joint_operator, reduced_operator
 from eitbench.estimation.onboard.packing import packed, unpacked
 from eitbench.estimation.reduced import ReducedModel
 from eitbench.estimation.reduced_joint import JointModel
-from eitbench.worlds.registry import Entry, entry
+from eitbench.worlds.registry import Entry, entries, entry
 from eitbench.worlds.world import World
 
 TOLERANCE = 1e-5
@@ -48,12 +49,20 @@ def _of(registered: Entry) -> Iterator[Kit]:
     if world.region is not None:
         yield Kit("region", kits.kit_path("region", kits.region_numbers(world)), SPARSE,
                   lambda: half_mass(*region_operators(world)))
+    needed = max(_needed(each) for each in entries().values() if each.world.fluid == world.fluid)
+    yield Kit("beginning", kits.kit_path("beginning", kits.beginning_numbers(world)),
+              beginning_entries(world), lambda: make_beginning(world, needed))
     if registered.track == "injection":
         joint = world.velocity_model is not None
         name = "joint" if joint else "reduced"
-        entries = (JointModel if joint else ReducedModel)._fields
-        yield Kit(name, kits.kit_path(name, kits.model_numbers(world)), entries,
+        model = JointModel if joint else ReducedModel
+        yield Kit(name, kits.kit_path(name, kits.model_numbers(world)), model._fields,
                   lambda: _model(world, joint))
+
+
+def _needed(registered: Entry) -> int:
+    """Steps of an episode that the first observation needs."""
+    return 1 + (registered.track == "injection") * len(registered.world.currents)
 
 
 def _model(world: World, joint: bool) -> Arrays:

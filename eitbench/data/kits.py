@@ -46,6 +46,12 @@ def model_numbers(world: World) -> dict[str, Any]:
         name: schedule[name] for name in ("pattern", "time_step")}
 
 
+def beginning_numbers(world: World) -> dict[str, Any]:
+    """What the first steps of the first training episode depend on: all that is not the
+    instrument's, nor what is believed."""
+    return store.described(world.fluid)  # type: ignore[no-any-return]
+
+
 def kit_path(name: str, numbers: Mapping[str, Any]) -> Path:
     """Where the kit of this name, such as ``outline``, is for these numbers."""
     digest = hashlib.sha256(json.dumps(numbers, sort_keys=True).encode()).hexdigest()

@@ -6,7 +6,6 @@ import pytest
 from eitbench.data import bank, pool, store
 from eitbench.data.bank import fill
 from eitbench.data.pool import MOST, Pool
-from eitbench.data.recordings import is_recorded
 from eitbench.worlds import entry
 
 from recorded import forget
@@ -69,7 +68,6 @@ def test_the_sequence_depends_on_the_seed_alone(id, place):
         return [env.reset()[0] for _ in range(12)]
 
     first = seen()
-    assert all(is_recorded(entry(id).world.changed(world), seed) for seed in range(8))
     fill(entry(id).world.changed(world), range(20))
     again = seen()
     for one, other in zip(first, again, strict=True):
