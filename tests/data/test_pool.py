@@ -10,7 +10,10 @@ from eitbench.worlds import entry
 
 from recorded import forget
 from short import short
-from tiny_worlds import TINY
+from tiny_worlds import FAST, TINY
+
+DRAWN = entry("eitbench/Pipe2DBiasedVelocity-v0").world.changed(FAST)
+"""Whose flow is drawn for each episode."""
 
 ENVIRONMENTS = {"eitbench/Pipe2D-v0": {}, "eitbench/Pipe2DInjection-v0": {"estimator": "none"}}
 
@@ -74,20 +77,21 @@ def test_the_sequence_depends_on_the_seed_alone(id, place):
         np.testing.assert_equal(one, other)
 
 
-def test_what_is_simulated_is_what_is_drawn_from(monkeypatch):
-    """One episode for the first resets; then the other seven together."""
+@pytest.mark.parametrize(("world", "expected"), [
+    (TINY, [[0, 1, 2, 3, 4, 5, 6, 7]]), (DRAWN, [[0], [1, 2, 3, 4, 5, 6, 7]])])
+def test_what_is_simulated_is_what_is_drawn_from(world, expected, monkeypatch):
+    """Eight episodes together where one flow carries them; else one for the first resets."""
     groups = []
     real = bank.simulate_together
     monkeypatch.setattr(bank, "simulate_together", lambda world, seeds, *how: (
         groups.append(list(seeds)) or real(world, seeds, *how)))
     drawn = Pool(None)
     for _ in range(30):
-        drawn.provide(TINY, drawn.draw(np.random.default_rng(5)))
-    assert groups == [[0], [1, 2, 3, 4, 5, 6, 7]]
-    drawn.provide(TINY, 300)                                                  # not one of the pool
-    assert len(groups) == 2
-    Pool(3).provide(TINY, 2)                                                  # one that does not grow
-    assert len(groups) == 2
+        drawn.provide(world, drawn.draw(np.random.default_rng(5)))
+    assert groups == expected
+    drawn.provide(world, 300)                                                 # not one of the pool
+    Pool(30).provide(world, 20)                                               # one that does not grow
+    assert groups == expected
 
 
 def test_a_cache_that_cannot_be_written_is_tried_once(monkeypatch):
