@@ -50,8 +50,7 @@ class Job(NamedTuple):
         """The method's file."""
         track = self.environment.track
         if self.isolated:
-            kwargs = json.dumps(self.environment.rules_only())
-            return guests.load(track, self.environment.id, kwargs, self.method)
+            return guests.load(track, self.environment.id, self.environment.kwargs, self.method)
         return load_method(self.method, track)
 
     @property

@@ -81,12 +81,6 @@ class Environment(NamedTuple):
         made: Any = gym.make(self.id, disable_env_checker=True, **(arguments | extra)).unwrapped
         return made
 
-    def rules_only(self) -> dict[str, Any]:
-        """Arguments that make an environment without an estimator inside, for who needs to know
-        only what is allowed."""
-        without = {"estimator": "none"} if self.track == "injection" else {}
-        return json.loads(self.kwargs) | without
-
 
 def ids(track: str | None = None) -> list[str]:
     """Registered environments of one track, or of all, as they were registered."""

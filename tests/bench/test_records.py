@@ -118,7 +118,7 @@ def test_the_digest_is_what_the_schema_says():
     ("method_sha256", "5ha", r"\$\.method_sha256: '5ha' does not match"),
     ("checkpoint_sha256", "5ha", r"\$\.checkpoint_sha256: "),
     ("checkpoint_sha256", ..., "'checkpoint_sha256' is a required property"),
-    ("split", "exam", r"\$\.split: 'exam' is not one of"),
+    ("split", "exam", r"\$\.split: 'exam' does not match"),
     ("seeds", [], r"\$\.seeds: "),
     ("score", 1, "'score' was unexpected"),
     ("environment.id", "Pipe2D", r"\$\.environment\.id: 'Pipe2D' does not match"),

@@ -23,7 +23,7 @@ from eitbench.data.store import CACHE_VARIABLE
 from eitbench.worlds.streams import randomness
 
 from recorded import forget_made
-from short import PIPE
+from short import PIPE, merged
 from tiny import FILTER, FIXED_LAG, SMOOTHING, without_namespaces, write_baseline
 
 INJECTION = Environment("eitbench/Pipe2DInjection-v0", json.dumps({"world": PIPE, "estimator": "reduced"}))
@@ -87,6 +87,16 @@ def test_scores_are_the_same_to_the_bit(environment, tmp_path):
         assert set(fields) == set(others) and all((fields[name] == others[name]).all() for name in fields)
         assert here["peak_memory"] is None and 50e6 < there["peak_memory"] < 8e9
         assert there["scores"]["seconds_per_step"] > 0
+
+
+def test_a_policy_is_told_the_same_rules(tmp_path):
+    """Where the first frame is measured before its first injection, a budget is spread over the steps that are left."""
+    budget = Environment("eitbench/Pipe2DInjectionBudget-v0", json.dumps({
+        "world": merged(PIPE, {"schedule": {"budget": 2}}), "estimator": "reduced"}))
+    path = write_policy(tmp_path, act="raise RuntimeError(repr([self.rules.spaced([left, 1.0]) "
+                                      "for left in range(7)]))")
+    here, there = (run_episode(Job(budget, path, 1, isolated))[0] for isolated in (False, True))
+    assert here["message"] == there["message"] and "True" in here["message"] and "False" in here["message"]
 
 
 @pytest.mark.parametrize("isolated", [False, True])
