@@ -20,7 +20,8 @@ from common import COLUMNS, Row, ceilings, in_fresh_process, machine, quantity
 from eitbench._files import write_atomically
 
 HERE = Path(__file__).parent
-SECTIONS = {"forward": "Complete electrode model", "kernels": "What the compiled kernels buy",
+SECTIONS = {"first_hour": "The first hour, with an empty cache",
+            "forward": "Complete electrode model", "kernels": "What the compiled kernels buy",
             "filtering": "Kalman filter and smoother", "greedy": "Choosing the injection",
             "stepping": "Environments",
             "simulation": "Simulation of new episodes", "scaling": "Growth with size"}

@@ -1,5 +1,5 @@
 """The command line: `eitbench list | run | bank | train | policies | submit | verify | check |
-season | held-out | migrate | cards | leaderboard | compare | render | reproduce`."""
+season | held-out | migrate | cards | kits | leaderboard | compare | render | reproduce`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import typer
 
 from eitbench._foreign import cleaned
 from eitbench.cli import options
-from eitbench.cli.maintain import cards, held_out, migrate
+from eitbench.cli.maintain import cards, held_out, kits, migrate
 from eitbench.cli.season import app as season_commands
 from eitbench.cli.studies import thesis
 from eitbench.cli.trust import check, verify
@@ -36,22 +36,30 @@ Figure = StrEnum("Figure", {  # type: ignore[misc]
 @app.command("list")
 def list_() -> None:
     """Show the environments, the baselines and policies, and which boards they play on."""
-    import gymnasium as gym
-
     from eitbench.bench.methods import load_method, own_methods
-    from eitbench.bench.tracks import Environment, board_of, ids
+    from eitbench.bench.tracks import boards_of, ids
+    from eitbench.data.recordings import outline
+    from eitbench.worlds.registry import entry
+    from eitbench.worlds.task import lag_steps
+    # Nothing is built: what takes long to make is shipped, the rest are numbers of the world.
     options.say("environments")
     for name in ids("estimation"):
-        env: Any = Environment(name).make()
-        steps = env.world.n_steps
-        options.say(f"  {name:40} {board_of(env):10}  lag {env.lag}, {steps - env.world.warm_up} "
-                    f"scored of {steps} states, {env.action_space.shape[0]} numbers each")
+        world = entry(name).world
+        flow = world.velocity_model
+        numbers = outline(world).mass.shape[0] + (0 if flow is None else flow.size)
+        lag = lag_steps(world, entry(name).settings.get("lag", 0))
+        options.say(f"  {name:40} {boards_of(name, {})[0]:10}  lag {lag}, "
+                    f"{world.schedule.scored_steps} scored of {world.n_steps} states, "
+                    f"{numbers} numbers each")
     for name in ids("injection"):
-        core = gym.make(name).unwrapped.core  # type: ignore[attr-defined]
-        rules = core.rules
-        what = f"{rules.limit} currents" if rules.limit else f"{len(rules.pairs)} electrode pairs"
-        allowed = "" if rules.budget is None else f", {rules.budget} of them allowed"
-        options.say(f"  {name:40} injection   {what}, {core.length} injections{allowed}")
+        world = entry(name).world
+        L = world.vessel.n_electrodes
+        limit = world.instrument.limit
+        budget = world.schedule.budget
+        what = f"{limit} currents" if limit else f"{L * (L - 1) // 2} electrode pairs"
+        allowed = "" if budget is None else f", {budget} of them allowed"
+        options.say(f"  {name:40} injection   {what}, {world.n_steps - len(world.currents)} "
+                    f"injections{allowed}")
     for track, heading in (("estimation", "baselines"), ("injection", "policies")):
         options.say(heading)
         for name in own_methods(track):
@@ -243,6 +251,7 @@ app.add_typer(season_commands, name="season")
 app.command("held-out")(held_out)
 app.command()(migrate)
 app.command()(cards)
+app.command()(kits)
 
 
 @app.command()

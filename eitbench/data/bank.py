@@ -47,14 +47,25 @@ def fill(world: World, seeds: Sequence[int], *, n_jobs: int = 1, backend: str = 
     """
     n_jobs = _check.integer("n_jobs", n_jobs, low=1)
     missing = missing_seeds(world, seeds)
-    together = max(1, min(TOGETHER, -(-len(missing) // n_jobs)))
-    # Paths are found out here: by now a worker may live in another environment than its parent.
-    todo = [(seed, recording_path(world, seed), integrals_path(world, seed)) for seed in missing]
-    groups = [(world, todo[k:k + together]) for k in range(0, len(todo), together)]
+    groups = _groups(world, missing, max(1, min(TOGETHER, -(-len(missing) // n_jobs))))
     with tqdm(total=len(missing), desc="recording", unit="episode", disable=None) as bar:
         for done in in_parallel(_record, groups, n_jobs, backend):
             bar.update(done)
     return len(missing)
+
+
+def fill_here(world: World, seeds: Sequence[int]) -> None:
+    """The same in this process, while somebody waits who is told for how long."""
+    for group in _groups(world, missing_seeds(world, seeds), TOGETHER):
+        _record(*group, progress=True)
+
+
+def _groups(world: World, seeds: Sequence[int],
+            together: int) -> list[tuple[World, list[tuple[int, Path, Path]]]]:
+    """Arguments of `_record` for so many seeds at a time."""
+    # Paths are found out here: by now a worker may live in another environment than its parent.
+    todo = [(seed, recording_path(world, seed), integrals_path(world, seed)) for seed in seeds]
+    return [(world, todo[k:k + together]) for k in range(0, len(todo), together)]
 
 
 def missing_seeds(world: World, seeds: Sequence[int]) -> list[int]:
@@ -64,8 +75,8 @@ def missing_seeds(world: World, seeds: Sequence[int]) -> list[int]:
             if not (is_recorded(world, seed) and are_kept(world, seed))]
 
 
-def _record(world: World, todo: Sequence[tuple[int, Path, Path]]) -> int:
-    episodes = simulate_together(world, [seed for seed, *_ in todo], progress=False)
+def _record(world: World, todo: Sequence[tuple[int, Path, Path]], progress: bool = False) -> int:
+    episodes = simulate_together(world, [seed for seed, *_ in todo], progress)
     for (seed, path, beside), episode in zip(todo, episodes, strict=True):
         if world.region is not None:
             store_integrals(beside, seed, make_integrals(world, episode))

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache, wraps
+from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from tqdm import tqdm
 
 from eitbench import _check
+from eitbench._notice import Wait
 from eitbench.data import store
 from eitbench.worlds.instrument import Faults
 from eitbench.worlds.parts import Discretisation
@@ -21,6 +23,8 @@ from eitbench.worlds.streams import randomness
 from eitbench.worlds.world import World
 
 Made = TypeVar("Made")
+BEFOREHAND = "`eitbench bank --env ID --seeds train:0-99` makes episodes beforehand"
+"""What to say to those who wait for one."""
 
 
 class Episode(NamedTuple):
@@ -57,7 +61,7 @@ def simulate(world: World, seed: int, *, cache: bool = True, progress: bool = Tr
         folder). A file that is damaged or of another seed is replaced; files of other versions stay
         beside it.
     progress : bool
-        Show a progress bar, on a terminal only.
+        Show a progress bar, on a terminal only, and say what takes longer than two seconds.
     """
     seed = _check.integer("seed", seed, low=0)
 
@@ -66,8 +70,16 @@ def simulate(world: World, seed: int, *, cache: bool = True, progress: bool = Tr
 
     if not cache:
         return Episode(**make())
-    path = store.folder(world) / f"{seed}.truth.npz"
-    return Episode(**store.kept(path, Episode._fields, make, str(seed), small=True))
+    return Episode(**store.kept(_path(world, seed), Episode._fields, make, str(seed), small=True))
+
+
+def is_simulated(world: World, seed: int) -> bool:
+    """Whether the truth is in the cache."""
+    return _path(world, seed).is_file()
+
+
+def _path(world: World, seed: int) -> Path:
+    return store.folder(world) / f"{seed}.truth.npz"
 
 
 def once(many: int) -> Callable[[Callable[[World], Made]], Callable[[World], Made]]:
@@ -86,9 +98,10 @@ def truth_discretisation(world: World) -> Discretisation:
     return world.truth()
 
 
-def simulate_together(world: World, seeds: Sequence[int],
-                      progress: bool = True) -> Iterator[Episode]:
-    """The episodes of several seeds, bit for bit as `simulate` gives them and without the cache.
+def simulate_together(world: World, seeds: Sequence[int], progress: bool = True,
+                      last: int | None = None) -> Iterator[Episode]:
+    """The episodes of several seeds, bit for bit as `simulate` gives them and without the cache; up
+    to the state ``last`` (default: all).
 
     Eight concentrations in one flow are carried on together in the time of two, and eight
     conductivities are solved for at once.
@@ -96,12 +109,20 @@ def simulate_together(world: World, seeds: Sequence[int],
     truth = truth_discretisation(world)
     label = f"simulating {world.name}, seed {', '.join(map(str, seeds))}"
     electrodes = truth.observation.cem.n_electrodes
-    with tqdm(total=(world.lead_in + 2 * world.n_steps) * len(seeds), desc=label, unit="step",
-              leave=False, disable=None if progress else True) as bar:
+    steps = world.n_steps if last is None else last
+    total = (world.lead_in + 2 * steps) * len(seeds)
+    wait = Wait(label, total, BEFOREHAND)
+    with tqdm(total=total, desc=label, unit="step", leave=False,
+              disable=None if progress else True) as bar:
+        def tick(steps: int) -> None:
+            bar.update(steps)
+            if progress:
+                wait.tick(steps)
+
         streams = [randomness(seed) for seed in seeds]
-        for history, random in zip(world.evolve(streams, truth, bar.update), streams, strict=True):
-            noise = random.noise.standard_normal((world.n_steps, electrodes))
+        for history, random in zip(world.evolve(streams, truth, tick, steps), streams, strict=True):
+            noise = random.noise.standard_normal((world.n_steps, electrodes))[:steps]
             resistance = truth.observation.transfer_resistance(history.concentration[1:])
-            bar.update(world.n_steps)
+            tick(steps)
             concentration = history.concentration.astype(np.float32)
             yield Episode(concentration, resistance, noise, history.velocity)

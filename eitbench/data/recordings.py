@@ -19,7 +19,7 @@ import numpy as np
 
 from eitbench import _check
 from eitbench._files import write_atomically
-from eitbench.data import store
+from eitbench.data import kits, store
 from eitbench.data.episodes import Episode, once, simulate, truth_discretisation
 from eitbench.worlds.streams import randomness
 from eitbench.worlds.task import make_task
@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 
 SPARSE = ("data", "indices", "indptr")
 """Arrays that hold a sparse matrix."""
+OUTLINE = (*SPARSE, "largest")
+"""Those that hold an `Outline`."""
 
 
 class Outline(NamedTuple):
@@ -126,20 +128,24 @@ def recording_type(world: World, n_nodes: int) -> np.dtype:
 
 
 def outline(world: World) -> Outline:
-    """The outline of a world, from the cache if it is there."""
+    """The outline of a world: shipped, or from the cache if it is there."""
     return _outline(world.fluid)
 
 
 @lru_cache(maxsize=4)
 def _outline(fluid: World) -> Outline:
-    def make() -> dict[str, np.ndarray]:
-        task = make_task(fluid)
-        level = np.full(task.mesh.n_nodes, fluid.expected_concentration)
-        largest = np.abs(task.observation.voltages(level, fluid.currents)).max()
-        return half_mass(*score_operators(fluid)) | {"largest": np.array(largest)}
-
-    stored = store.kept(store.folder(fluid) / "outline.npz", (*SPARSE, "largest"), make)
+    stored = kits.shipped_or_kept("outline", kits.outline_numbers(fluid),
+                                  lambda: store.folder(fluid) / "outline.npz", OUTLINE,
+                                  lambda: make_outline(fluid))
     return Outline(sparse_of(stored), float(stored["largest"]))
+
+
+def make_outline(world: World) -> dict[str, np.ndarray]:
+    """The arrays `OUTLINE` of a world, made anew."""
+    task = make_task(world.fluid)
+    level = np.full(task.mesh.n_nodes, world.expected_concentration)
+    largest = np.abs(task.observation.voltages(level, world.fluid.currents)).max()
+    return half_mass(*score_operators(world)) | {"largest": np.array(largest)}
 
 
 def half_mass(interpolation: sp.csr_array, mass: sp.csr_array) -> dict[str, np.ndarray]:

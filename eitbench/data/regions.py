@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from eitbench.data import store
+from eitbench.data import kits, store
 from eitbench.data.episodes import Episode, once, simulate, truth_discretisation
 from eitbench.data.recordings import (
     SPARSE,
@@ -82,8 +82,9 @@ def score_mass(world: World) -> sp.csr_array:
     """(n, n) M̃ of what counts, one triangle with doubled entries as `Outline.mass`."""
     if world.region is None:
         return outline(world).mass
-    return sparse_of(store.kept(store.folder(world) / "region.npz", SPARSE,
-                                lambda: half_mass(*region_operators(world))))
+    return sparse_of(kits.shipped_or_kept(
+        "region", kits.region_numbers(world), lambda: store.folder(world) / "region.npz", SPARSE,
+        lambda: half_mass(*region_operators(world))))
 
 
 @once(2)

@@ -12,8 +12,10 @@ from gymnasium import spaces
 from gymnasium.utils import EzPickle
 
 from eitbench import _check
-from eitbench.data.recordings import cycle_voltages, outline, recording, step_error, velocity_error
-from eitbench.data.regions import integrals, score_mass
+from eitbench.data.beginnings import Script, concentration_at, script, script_so_far
+from eitbench.data.pool import Pool
+from eitbench.data.recordings import cycle_voltages, outline, step_error, velocity_error
+from eitbench.data.regions import score_mass
 from eitbench.data.seeds import warn_of_reserved
 from eitbench.worlds.parts import Discretisation
 from eitbench.worlds.registry import entry
@@ -65,8 +67,9 @@ class EstimationEnv(gym.Env[Observation, np.ndarray], EzPickle):
         See `Task`; default: that of the id.
     assume : dict, optional
         What the task's model wrongly believes of the flow; see `World.model`.
-    episodes : int
-        How many training episodes an unseeded ``reset`` draws from.
+    episodes : int, optional
+        How many training episodes an unseeded ``reset`` draws from. Default: 1 for four resets,
+        then 8, then more as resets go on, up to 1000; see `eitbench.data.pool.Pool`.
     render_mode : None or "rgb_array"
     """
 
@@ -74,14 +77,15 @@ class EstimationEnv(gym.Env[Observation, np.ndarray], EzPickle):
 
     def __init__(self, name: str, *, world: dict[str, Any] | None = None,
                  lag: int | str | None = None, assume: dict[str, Any] | None = None,
-                 episodes: int = 1000, render_mode: str | None = None) -> None:
+                 episodes: int | None = None, render_mode: str | None = None) -> None:
         EzPickle.__init__(self, name, world=world, lag=lag, assume=assume, episodes=episodes,
                           render_mode=render_mode)
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError("render_mode must be None or one of "
                              f"{self.metadata['render_modes']}, got {render_mode!r}")
         self.render_mode = render_mode
-        self.episodes = _check.integer("episodes", episodes, low=1)
+        self.pool = Pool(episodes)
+        """What unseeded resets draw from."""
         self.spread: np.ndarray | None = None
         """(n,) standard deviation in mol/m³ to draw beside the estimate, for whoever has one."""
         self.world, self.lag, self._assumed = asked_for(name, world, lag, assume)
@@ -103,12 +107,11 @@ class EstimationEnv(gym.Env[Observation, np.ndarray], EzPickle):
               options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
         """Begin the episode with this seed (`eitbench.data.seeds`), or a random training one."""
         super().reset(seed=seed)
-        self._seed = int(self.np_random.integers(self.episodes)) if seed is None else seed
+        if seed is not None:
+            self.pool.restart()
+        self._seed = self.pool.draw(self.np_random) if seed is None else seed
         warn_of_reserved([self._seed])
-        self._entries = recording(self.world, self._seed)
-        self._integrals = integrals(self.world, self._seed, self._entries)
-        self._voltages = np.zeros_like(self._currents)
-        self._voltages[:self.world.n_steps] = cycle_voltages(self.world, self._seed, self._entries)
+        self._read(script_so_far(self.world, self._seed, 1))
         self._step = 1
         self.spread = None
         self._last: np.ndarray | None = None
@@ -140,6 +143,20 @@ class EstimationEnv(gym.Env[Observation, np.ndarray], EzPickle):
         self._step += 1
         return self._observe(), reward, self._step > last_step, False, {"step": self._step}
 
+    def _read(self, script: Script) -> None:
+        """Play from this; of a beginning the rest is asked for when it is needed."""
+        assert self._seed is not None
+        self._entries, self._integrals = script
+        self._voltages = np.zeros_like(self._currents)
+        self._voltages[:len(self._entries)] = cycle_voltages(self.world, self._seed, self._entries)
+
+    def _read_until(self, steps: int) -> None:
+        """Have so many steps of the episode, or all that it has."""
+        if len(self._entries) < min(steps, self.world.n_steps):
+            assert self._seed is not None
+            self.pool.provide(self.world, self._seed)
+            self._read(script(self.world, self._seed))
+
     def render(self) -> np.ndarray | None:  # type: ignore[override]
         """(height, width, 3) uint8: truth, last estimate, its spread, electrodes, active pair."""
         if self.render_mode is None:
@@ -147,7 +164,9 @@ class EstimationEnv(gym.Env[Observation, np.ndarray], EzPickle):
             return None
         from eitbench.envs.rendering import draw_frame
         t = min(max(self._step - 1 - self.lag, 0), self.world.n_steps)
-        concentration = self._episode("render").concentration[t]
+        if self._seed is None:
+            raise gym.error.ResetNeeded("call reset() before render()")
+        concentration = concentration_at(self.world, self._seed, t, 1)
         estimate = self._last
         if estimate is None:
             estimate = np.full(self.task.mesh.n_nodes, self.task.expected_concentration)
@@ -168,6 +187,7 @@ class EstimationEnv(gym.Env[Observation, np.ndarray], EzPickle):
         velocity = self._episode("reveal").velocity.copy()
         assert self._seed is not None
         n_steps = self.world.n_steps
+        self._read_until(n_steps)
         told_nothing_wrong = make_task(self.world, self.lag)
         model = Discretisation(told_nothing_wrong.transport, told_nothing_wrong.observation)
         transport = self.world.true_transport(model, randomness(self._seed).flow)
@@ -187,6 +207,7 @@ class EstimationEnv(gym.Env[Observation, np.ndarray], EzPickle):
 
     def _observe(self) -> Observation:
         k = self._step - 1
+        self._read_until(self._step)
         return {"voltages": self._voltages[k].copy(), "currents": self._currents[k].copy()}
 
 

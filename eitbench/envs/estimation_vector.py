@@ -26,7 +26,7 @@ class EstimationVectorEnv(LockstepVectorEnv):
 
     def __init__(self, name: str, *, num_envs: int = 1, world: dict[str, Any] | None = None,
                  lag: int | str | None = None, assume: dict[str, Any] | None = None,
-                 episodes: int = 1000) -> None:
+                 episodes: int | None = None) -> None:
         super().__init__(num_envs, episodes)
         self.world, self._lag, _ = asked_for(name, world, lag, assume)
         self._show(*estimation_spaces(self.world))

@@ -12,6 +12,7 @@ from gymnasium import spaces
 from gymnasium.utils import EzPickle
 
 from eitbench import _check
+from eitbench.data.pool import Pool
 from eitbench.data.seeds import warn_of_reserved
 from eitbench.envs.estimation import RESET_NEEDED
 from eitbench.envs.injection_core import FURTHEST, InjectionCore, scaled
@@ -54,14 +55,15 @@ class InjectionEnv(gym.Env[Any, Any], EzPickle):
 
     def __init__(self, name: str, *, world: dict[str, Any] | None = None,
                  estimator: str = "reduced", observation: str = "scaled",
-                 gate: float | None = None, episodes: int = 1000,
+                 gate: float | None = None, episodes: int | None = None,
                  render_mode: str | None = None) -> None:
         EzPickle.__init__(self, name, world=world, estimator=estimator, observation=observation,
                           gate=gate, episodes=episodes, render_mode=render_mode)
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be 'rgb_array' or None, got {render_mode!r}")
         self.render_mode = render_mode
-        self.episodes = _check.integer("episodes", episodes, low=1)
+        self.pool = Pool(episodes)
+        """What unseeded resets draw from."""
         self.rules = asked_for(name, world, gate, estimator)
         self.world = self.rules.world
         self._core = InjectionCore(self.rules, estimator)
@@ -79,9 +81,11 @@ class InjectionEnv(gym.Env[Any, Any], EzPickle):
               options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin the episode with this seed (`eitbench.data.seeds`), or a random training one."""
         super().reset(seed=seed)
-        self._seed = int(self.np_random.integers(self.episodes)) if seed is None else seed
+        if seed is not None:
+            self.pool.restart()
+        self._seed = self.pool.draw(self.np_random) if seed is None else seed
         warn_of_reserved([self._seed])
-        self._core.begin([self._seed])
+        self._core.begin([self._seed], self.pool.provide)
         self._step = 1
         return self._observe(), {"step": 1}
 
@@ -108,11 +112,12 @@ class InjectionEnv(gym.Env[Any, Any], EzPickle):
             return None
         if self._step == 0:
             raise gym.error.ResetNeeded("call reset() before render()")
-        from eitbench.data.episodes import simulate, truth_discretisation
+        from eitbench.data.beginnings import concentration_at
+        from eitbench.data.episodes import truth_discretisation
         from eitbench.envs.rendering import draw_frame
         mean, spread = self._core.estimate()
         t = self._core.first + self._step - 1
-        truth = simulate(self.world, self._seed).concentration[t].astype(float)
+        truth = concentration_at(self.world, self._seed, t, self._core.first + 1)
         return draw_frame(self.task, truth_discretisation(self.world).transport.mesh, truth,
                           mean[0], spread[0], self._core.last_currents[0],
                           t * self.world.time_step, self.world.region)
@@ -181,7 +186,7 @@ class InjectionVectorEnv(LockstepVectorEnv):
 
     def __init__(self, name: str, *, num_envs: int = 1, world: dict[str, Any] | None = None,
                  estimator: str = "reduced", observation: str = "scaled", gate: float | None = None,
-                 episodes: int = 1000, threads: int = 1) -> None:
+                 episodes: int | None = None, threads: int = 1) -> None:
         super().__init__(num_envs, episodes)
         threads = _check.integer("threads", threads, low=1)
         self.rules = rules = asked_for(name, world, gate, estimator)

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 from gymnasium import spaces
 
-from eitbench.data.recordings import faults_of, outline, recording
-from eitbench.data.regions import integrals, score_mass
+from eitbench.data.beginnings import Script, script, script_so_far
+from eitbench.data.recordings import faults_of, outline
+from eitbench.data.regions import score_mass
 from eitbench.estimation.onboard.console import Console
 from eitbench.estimation.onboard.joint_operator import JointFullOperator, JointReducedOperator
 from eitbench.estimation.onboard.operator import FullOperator, Innovation, Operator
@@ -114,49 +115,82 @@ class InjectionCore:
                                    dtype=np.float64)
         return spaces.Dict(shown)
 
-    def begin(self, seeds: Sequence[int]) -> None:
-        """Play these episodes up to the agent's first injection."""
+    def begin(self, seeds: Sequence[int],
+              provide: Callable[[World, int], None] | None = None) -> None:
+        """Play these episodes up to the agent's first injection.
+
+        With ``provide`` of those that are not recorded the first steps alone are simulated; for the
+        rest it is called with the world and each seed, when the rest is needed.
+        """
         world = self.world
-        rules = self.rules
         B = len(seeds)
         L = world.currents.shape[1]
         T = world.n_steps
         self.seeds = tuple(seeds)
+        self._provide = provide
         self._t = self.first
         self._spent = np.zeros(B, dtype=int)
         self._resistance = np.empty((T, B, L, L))
         self._draws = np.empty((T, B, L))
-        self._deviations, self._squares, totals = np.empty((3, B, T))
+        self._deviations, self._squares, self._totals = np.empty((3, B, T))
         self._voltages, self._currents = np.zeros((2, B, L))
         self._recent = np.zeros((B, RECENT, L))
-        moments = []
-        faults = []
-        # all is copied: a mapped file is open, and there may be more than may be
-        for k, seed in enumerate(seeds):
-            entries = recording(world, seed)
-            self._resistance[:, k] = entries["transfer_resistance"]
-            self._draws[:, k] = entries["noise"]
-            moment, self._deviations[k], self._squares[k] = integrals(world, seed, entries)
-            totals[k] = moment.sum(axis=1, dtype=float)
-            faults.append(faults_of(world, seed))
-            if self._operator_type:
-                moments.append(self._operator_type.project(world, moment))
+        faults = [faults_of(world, seed) for seed in seeds]
         self._faults = Faults(*(np.array(part) for part in zip(*faults, strict=True)))
+        if provide is None:
+            self._read([script(world, seed) for seed in seeds])
+        else:
+            self._read([script_so_far(world, seed, self.first + 1) for seed in seeds])
         if not self._operator_type:
             return
-        self._moments = np.array(moments)
         self._frames = np.stack([self._measure(k, np.repeat(cycle[None], B, axis=0))
                                  for k, cycle in enumerate(world.currents)], axis=1)
-        self._console = Console(self._operator_type, rules, self._frames)
+        self._console = Console(self._operator_type, self.rules, self._frames)
         self._operator = self._console.operator
         self._voltages = self._frames[:, -1].copy()
         self._currents = np.repeat(world.currents[-1:], B, axis=0)
         for k in range(RECENT):
             self._recent[:, k] = world.currents[(self.first - 1 - k) % self.first]
-        level = self._operator.concentration[:, None] - world.background
-        area = score_mass(world).sum()
-        error = area * level**2 - 2.0 * level * totals + self._deviations
-        self._homogeneous = error / self._squares
+        self._weigh()
+
+    def _read(self, scripts: Sequence[Script]) -> None:
+        """Take in what is known of the episodes."""
+        moments = []
+        self._known = min(len(entries) for entries, _ in scripts)
+        """Injections that can be made before more has to be read."""
+        k = slice(self._known)
+        # all is copied: a mapped file is open, and there may be more than may be
+        for b, (entries, integrals) in enumerate(scripts):
+            self._resistance[k, b] = entries["transfer_resistance"][k]
+            self._draws[k, b] = entries["noise"][k]
+            self._deviations[b, k] = integrals.deviation[k]
+            self._squares[b, k] = integrals.square[k]
+            self._totals[b, k] = integrals.moment[k].sum(axis=1, dtype=float)
+            if self._operator_type:
+                # All rows, so that the bits of a product of matrices do not depend on their number.
+                moment = np.zeros((self.world.n_steps, integrals.moment.shape[1]), np.float32)
+                moment[k] = integrals.moment[k]
+                moments.append(self._operator_type.project(self.world, moment))
+        self._moments = np.array(moments)
+
+    def _read_until(self, steps: int) -> None:
+        """Have so many steps of each episode."""
+        if steps <= self._known:
+            return
+        assert self._provide is not None
+        for seed in self.seeds:
+            self._provide(self.world, seed)
+        self._read([script(self.world, seed) for seed in self.seeds])
+        if self._operator_type:
+            self._weigh()
+
+    def _weigh(self) -> None:
+        """Of the homogeneous estimates the errors, (B, known)."""
+        level = self._operator.concentration[:, None] - self.world.background
+        area = score_mass(self.world).sum()
+        k = slice(self._known)
+        error = area * level**2 - 2.0 * level * self._totals[:, k] + self._deviations[:, k]
+        self._homogeneous = error / self._squares[:, k]
 
     def _measure(self, k: int, currents: np.ndarray) -> np.ndarray:
         """(B, L) voltages of injection t = k + 1."""
@@ -170,6 +204,7 @@ class InjectionCore:
             currents = currents * (self._spent < self.rules.budget)[:, None]
             self._spent += currents.any(axis=1)
         self._currents = currents
+        self._read_until(self._t + 1)
         self._voltages = self._measure(self._t, currents)
         self._recent = np.concatenate([currents[:, None], self._recent[:, :-1]], axis=1)
         self._t += 1

@@ -11,8 +11,10 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from eitbench import _check
+from eitbench.data.pool import Pool
 from eitbench.data.seeds import warn_of_reserved
 from eitbench.envs.estimation import Observation
+from eitbench.worlds.world import World
 
 
 class LockstepVectorEnv(gym.vector.VectorEnv[Observation, np.ndarray, np.ndarray]):
@@ -20,20 +22,23 @@ class LockstepVectorEnv(gym.vector.VectorEnv[Observation, np.ndarray, np.ndarray
 
     Observations equal those of ``SyncVectorEnv`` over the scalar environment, bit for bit:
     ``reset(seed=s)`` plays episode s + k in environment k, and the step after an episode's end
-    begins the next one (``NEXT_STEP``).
+    begins the next one (``NEXT_STEP``). A growing pool of training episodes (`episodes` not given)
+    counts the resets of all environments here, and those of each there.
 
     Parameters
     ----------
     num_envs : int
-    episodes : int
-        How many training episodes an unseeded reset draws from.
+    episodes : int, optional
+        How many training episodes an unseeded reset draws from; default: a growing number, see
+        `eitbench.data.pool.Pool`.
     """
 
     metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
 
-    def __init__(self, num_envs: int, episodes: int) -> None:
+    def __init__(self, num_envs: int, episodes: int | None) -> None:
         self.num_envs = _check.integer("num_envs", num_envs, low=1)
-        self.episodes = _check.integer("episodes", episodes, low=1)
+        self.pool = Pool(episodes)
+        """What unseeded resets draw from."""
         self._randoms: list[np.random.Generator | None] = [None] * num_envs
         self._step = 0
         self._ended = False
@@ -52,13 +57,18 @@ class LockstepVectorEnv(gym.vector.VectorEnv[Observation, np.ndarray, np.ndarray
             raise ValueError("options must not hold 'reset_mask': all environments begin and end "
                              "together")
         chosen = []
-        for k, one in enumerate(self._seeds(seed)):
+        seeds = self._seeds(seed)
+        if any(one is not None for one in seeds):
+            self.pool.restart()
+        for k, one in enumerate(seeds):
             if one is not None or self._randoms[k] is None:
                 self._randoms[k] = seeding.np_random(one)[0]
             random = self._randoms[k]
             assert random is not None
-            chosen.append(int(random.integers(self.episodes)) if one is None else one)
+            chosen.append(self.pool.draw(random) if one is None else one)
         warn_of_reserved(chosen)
+        for one in chosen:
+            self.pool.provide(self.world, one)
         self._begin(chosen)
         self._step = 1
         self._ended = False
@@ -93,6 +103,7 @@ class LockstepVectorEnv(gym.vector.VectorEnv[Observation, np.ndarray, np.ndarray
         everyone = np.ones(self.num_envs, dtype=bool)
         return {"step": np.full(self.num_envs, self._step), "_step": everyone}
 
+    world: World
     _length: int
     """Steps in an episode."""
 

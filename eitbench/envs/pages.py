@@ -38,7 +38,7 @@ ESTIMATION_ARGUMENTS = """
 | `lag` | {lag} | an integer from 0 to {last}, or "all" (= {last}): whole record first |
 | `assume` | None | dict of what the task's model wrongly believes of the flow |
 | `world` | None | numbers to change, as in `{{"instrument": {{"noise_relative": 0.02}}}}` |
-| `episodes` | 1000 | number of training episodes for unseeded resets |
+| `episodes` | None | training episodes of unseeded resets; None: 1, soon 8, more, up to 1000 |
 | `render_mode` | None | "rgb_array": truth, estimate, spread and active pair |
 """
 INJECTION_ARGUMENTS = """
@@ -48,7 +48,7 @@ INJECTION_ARGUMENTS = """
 | `observation` | "scaled" | or "raw" |
 | `gate` | {gate} | standard deviations beyond which no reading is believed; None: all are |
 | `world` | None | dict of numbers to change, as in `{{"schedule": {{"budget": 20}}}}`; see below |
-| `episodes` | 1000 | number of training episodes for unseeded resets |
+| `episodes` | None | training episodes of unseeded resets; None: 1, soon 8, more, up to 1000 |
 | `render_mode` | None | "rgb_array": truth, estimate, spread, injection |
 | `threads` | 1 | vectorised only: cores that the filters may use; give BLAS one thread then |
 """
@@ -83,8 +83,8 @@ def _estimation(env: EstimationEnv) -> dict[str, str]:
                   f"t = {first} … {world.n_steps}, else 0: minus the mean of "
                   "the first term over the scored states is ẽ_c (thesis 5.12).",
         "Starting state": f"{_flowing(world)}`reset(seed=s)` plays episode s (train, dev and test "
-                          "have ranges of their own); without a seed a random one of the first "
-                          "`episodes` training episodes. The first use of a seed simulates its "
+                          "have ranges of their own); without a seed a random one of the "
+                          "training episodes, few at first. The first use of a seed simulates its "
                           "truth, which is then kept on disk; `eitbench bank` does so for many "
                           "seeds ahead of time.",
         "Episode end": f"Terminated after {world.n_steps + env.lag} steps. Never truncated.",

@@ -11,7 +11,6 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from eitbench.estimation.reduced import ReducedFilter
 
@@ -48,6 +47,7 @@ class JointTables:
 
     def _coefficients(self, table: np.ndarray, dtype: type) -> np.ndarray:
         """(K − 1, 4, r, r) those of (θ − θ_k)³ … 1."""
+        from scipy.interpolate import CubicSpline  # half a second, for those who need it
         coefficients = np.moveaxis(CubicSpline(self.velocities, table).c, 0, 1)
         return np.ascontiguousarray(coefficients.astype(dtype))
 

@@ -48,7 +48,7 @@ def imitate(model: OnPolicyAlgorithm, world: InjectionEnv, options: dict[str, An
               desc=f"learning from {teacher.name}") as bar:
         for turn in range(settings["rounds"]):
             for _ in range(settings["episodes"]):
-                number = int(random.integers(world.episodes))
+                number = int(random.integers(world.pool.most))
                 seen, said, rewards = _play(model, world, teacher, number, random,
                                             pupil_acts=turn > 0)
                 if reference is not None:

@@ -214,9 +214,9 @@ def rewards_of(policy: str, world: InjectionEnv, path: Path) -> np.ndarray:
     """(episodes, steps) what a policy earns in every training episode; kept at ``path``."""
     if path.exists():
         return np.asarray(np.load(path))
-    rewards = np.zeros((world.episodes, world.core.length))
+    rewards = np.zeros((world.pool.most, world.core.length))
     loaded = load_method(policy, "injection")
-    for episode in tqdm(range(world.episodes), desc=f"playing {policy}", unit="episode",
+    for episode in tqdm(range(world.pool.most), desc=f"playing {policy}", unit="episode",
                         disable=None):
         observation, _ = world.reset(seed=episode)
         random = np.random.default_rng(episode)

@@ -39,9 +39,9 @@ class InjectionVecEnv(VecEnv):
         first = self._seeds[0]
         seeds = None
         if first is not None:
-            scarce = self.num_envs > self.envs.episodes
+            many = self.envs.pool.size
             seeds = np.random.default_rng(first).choice(
-                self.envs.episodes, size=self.num_envs, replace=scarce).tolist()
+                many, size=self.num_envs, replace=self.num_envs > many).tolist()
         self._reset_seeds()
         return self._begin(seeds)
 

@@ -23,8 +23,8 @@ from tiny import git_says
 
 ROOT = Path(__file__).parents[2]
 PIPE, INJECTION = "eitbench/Pipe2D-v0", "eitbench/Pipe2DInjection-v0"
-COMMANDS = ("list", "run", "bank", "train", "policies", "submit", "verify", "held-out", "migrate", "cards",
-            "leaderboard", "compare", "render", "reproduce")
+COMMANDS = ("list", "run", "bank", "train", "policies", "submit", "verify", "held-out", "migrate", "cards", "kits",
+            "leaderboard", "compare", "render", "reproduce", "check", "season")
 TINY = {"flow": {"mean_velocity": 45.0}, "schedule": {"scored_steps": 3, "pattern": {"frame": 2}},
         "vessel": {"electrodes_per_wall": 2}}
 """A fast fluid flushes the pipe in two steps: an episode of five takes a third of a second."""
@@ -191,9 +191,11 @@ def test_documented_commands_are_commands():
         lines = re.findall(r"^.*?\beitbench (.*)$", "\n".join(blocks), re.MULTILINE)
         for words in lines + re.findall(r"`eitbench ([^`]*)`", text):
             command, *rest = words.split("#")[0].split()
+            if command == "season" and rest and not rest[0].startswith("-"):
+                command = f"{command} {rest.pop(0)}"
             named.setdefault(command, set()).update(word for word in rest if word.startswith("--"))
-            helps.setdefault(command, eitbench(command, "--help")[1])
-    assert named.keys() == set(COMMANDS)
+            helps.setdefault(command, eitbench(*command.split(), "--help")[1])
+    assert {command.split()[0] for command in named} == set(COMMANDS)
     for command, options in named.items():
         assert all(re.search(rf"{option}\b", helps[command]) for option in options), (command, options)
 

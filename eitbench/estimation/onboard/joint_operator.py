@@ -145,7 +145,7 @@ class JointShared(Shared):
 
     @staticmethod
     def _make(world: World) -> Any:
-        return stored_model(world, "joint", JointModel, lambda: _make_model(world))
+        return stored_model(world, "joint", JointModel, lambda: make_model(world))
 
     def start(self, episodes: int) -> ReducedFilter:
         (nominal,) = self.flow.nominal
@@ -172,8 +172,8 @@ def one_velocity(task: Task) -> VelocityModel:
     return task.velocity
 
 
-def _make_model(world: World) -> JointModel:
-    """Some 45 s."""
+def make_model(world: World) -> JointModel:
+    """The model in double precision; some 45 s."""
     from eitbench.numerics.fem import mass_matrix
     task = make_task(world)
     flow = one_velocity(task)

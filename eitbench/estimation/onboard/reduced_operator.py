@@ -7,13 +7,15 @@ import hashlib
 import math
 from collections.abc import Callable
 from functools import cache, lru_cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from eitbench._code import code_digest, package_files
-from eitbench.data import store
+from eitbench._notice import say
+from eitbench.data import kits, store
 from eitbench.data.recordings import outline
 from eitbench.data.regions import score_mass
 from eitbench.estimation import LinearisedObservations, Observation, starting_filter
@@ -26,6 +28,7 @@ from eitbench.estimation.onboard.operator import (
     patch_averages,
     spread,
 )
+from eitbench.estimation.onboard.packing import packed, unpacked
 from eitbench.estimation.reduced import ReducedFilter, ReducedModel, reduced_model
 from eitbench.worlds.task import make_task
 
@@ -187,26 +190,32 @@ _shared = lru_cache(maxsize=2)(Shared)
 
 
 def _stored_model(world: World) -> ReducedModel:
-    """The reduced model, from the cache if it is there: making it takes half a minute."""
-    return stored_model(world, "reduced", ReducedModel, lambda: _make_model(world))
+    """The reduced model; making it takes half a minute."""
+    return stored_model(world, "reduced", ReducedModel, lambda: make_model(world))
 
 
 def stored_model(world: World, name: str, kind: type[Model], make: Callable[[], Model]) -> Model:
-    """A model, a named tuple of arrays, from the cache if one of this name is there; else it is
-    made and kept."""
-    code = code_digest(package_files("estimation/*.py", "estimation/onboard/*operator.py",
-                                     "worlds/task.py"))
-    whose = hashlib.sha256(f"{code} {store.described(world.sound)}".encode()).hexdigest()
-    path = store.folder(world) / f"{name}-{whose[:16]}.npz"
+    """A model, a named tuple of arrays: shipped, or from the cache if one of this name is there;
+    else it is made and kept. Its numbers are rounded to single precision."""
+    def path() -> Path:
+        code = code_digest(package_files("estimation/*.py", "estimation/onboard/*operator.py",
+                                         "estimation/onboard/packing.py", "worlds/task.py"))
+        whose = hashlib.sha256(f"{code} {store.described(world.sound)}".encode()).hexdigest()
+        return store.folder(world) / f"{name}-{whose[:16]}.npz"
 
     def made() -> dict[str, np.ndarray]:
+        say(f"making the filter of reduced order of {world.name}, about half a minute; it is kept "
+            f"in {store.folder(world)}")
         with threadpool_limits(1):                         # as many threads as here, the same bits
-            return make()._asdict()  # type: ignore[attr-defined, no-any-return]
+            return packed(make())
 
-    return kind(**store.kept(path, kind._fields, made))  # type: ignore[attr-defined]
+    entries = kind._fields  # type: ignore[attr-defined]
+    return kind(**unpacked(kits.shipped_or_kept(name, kits.model_numbers(world), path, entries,
+                                                made)))
 
 
-def _make_model(world: World) -> ReducedModel:
+def make_model(world: World) -> ReducedModel:
+    """The model in double precision; half a minute."""
     from eitbench.numerics.fem import mass_matrix
     task = make_task(world)
     start = starting_filter(task.transport, task.prior, 1.0)
