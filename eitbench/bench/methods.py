@@ -238,20 +238,19 @@ def _load(path: Path, source: bytes, track: str) -> Method:
         return Method(track, name, title, path, sha256, BOARDS[track], parameters, agent)
     module = load_module(form.kind, path, source)
     method = getattr(module, form.type, None)
-    if not isinstance(method, type):
+    if not isinstance(method, type) or not _answers(method, form):
         raise ValueError(f"{form.kind} {path} must define a class {form.type} with a method "
                          f"{form.answers}")
-    return method_of(method, track, path.stem)._replace(
+    return method_of(method, track, path.stem, str(path))._replace(
         title=title_of(module, path), path=path, sha256=sha256)
 
 
-def method_of(method: type[Any], track: str, name: str) -> Method:
-    """A class as a method of a track, without a file. ``ValueError`` if it is not as that asks
-    for."""
+def method_of(method: type[Any], track: str, name: str, where: str = "") -> Method:
+    """A class as a method of a track, without a file. ``ValueError``, saying ``where`` it is
+    (default: its name), if it is not as that asks for."""
     form = FORMS[track]
-    who = f"{form.kind} {name}: {method.__name__}"
-    function = form.answers.partition("(")[0]
-    if not callable(getattr(method, function, None)):
+    who = f"{form.kind} {where or name}: {method.__name__}"
+    if not _answers(method, form):
         raise ValueError(f"{who} must have a method {form.answers}")
     boards = tuple(getattr(method, "boards", BOARDS[track][:1]))
     if not boards or not set(boards) <= set(BOARDS[track]):
@@ -264,6 +263,10 @@ def method_of(method: type[Any], track: str, name: str) -> Method:
         raise ValueError(f"{who}.privileged must be True or False, got {privileged!r}")
     return Method(track, name, name, Path(), "", boards, _parameters(who, method), method, role,
                   privileged)
+
+
+def _answers(method: type[Any], form: Form) -> bool:
+    return callable(getattr(method, form.answers.partition("(")[0], None))
 
 
 def load_module(kind: str, path: Path, source: bytes) -> ModuleType:
