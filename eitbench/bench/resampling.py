@@ -147,6 +147,18 @@ def _outside(sums, edge):
 
 
 @njit(cache=True)
+def _is_decided(first_is_lower, second_is_lower, i, j, lower, higher):
+    """Count that one of the methods i and j is below the other, if it is known which."""
+    if first_is_lower:
+        lower[j] += 1
+        higher[i] += 1
+    elif second_is_lower:
+        lower[i] += 1
+        higher[j] += 1
+    return first_is_lower or second_is_lower
+
+
+@njit(cache=True)
 def compare_means(scores, starts, weights, reach, low_place, high_place):
     """Which methods have significantly lower means than others, pair by pair.
 
@@ -230,13 +242,8 @@ def compare_means(scores, starts, weights, reach, low_place, high_place):
                 if above > draws - high_place and below > low_place + 2:
                     break
             else:
-                if below > high_place + 2:
-                    lower[j] += 1
-                    higher[i] += 1
-                elif above > draws - low_place:
-                    lower[i] += 1
-                    higher[j] += 1
-                else:
+                if not _is_decided(below > high_place + 2, above > draws - low_place, i, j,
+                                   lower, higher):
                     unsure.append((i, j))
     return lower, higher, unsure
 
@@ -261,12 +268,7 @@ def compare_resamples(values, low_place, high_place):
                 if seen - below > draws - high_place and seen - above > low_place + 2:
                     break
             else:
-                if below > high_place + 2:
-                    lower[j] += 1
-                    higher[i] += 1
-                elif above > draws - low_place:
-                    lower[i] += 1
-                    higher[j] += 1
-                else:
+                if not _is_decided(below > high_place + 2, above > draws - low_place, i, j,
+                                   lower, higher):
                     unsure.append((i, j))
     return lower, higher, unsure
