@@ -7,6 +7,8 @@ notebook.
 """
 
 import argparse
+import contextlib
+import io
 import os
 import re
 import shutil
@@ -64,7 +66,7 @@ def staged(source: Path) -> str:
         if not there.exists():
             raise SystemExit(f"{source.relative_to(ROOT)} links to {target}, which is not there")
         if there.suffix == ".svg":
-            return there.read_text(encoding="utf-8")
+            return f"<div>\n{there.read_text(encoding='utf-8')}</div>"
         page = place(there)
         if there.is_file() and there.suffix == page[page.rfind("."):] != ".md":
             write(page, there.read_bytes())
@@ -112,6 +114,8 @@ def main() -> None:
         write(place(source), staged(source))
     write("extra.css", (ROOT / "docs" / "extra.css").read_bytes())
     shutil.copytree(ROOT / "leaderboards" / "site", PAGES / "boards", dirs_exist_ok=True)
+    if not draft:
+        check_readme()
     pages = generated.environments() | generated.baselines() | generated.reference()
     for source in sorted((ROOT / "docs" / "notebooks").glob("*.ipynb")):
         pages |= generated.notebook(source, execute=not draft)
@@ -129,6 +133,22 @@ def main() -> None:
     if built.returncode or found:
         raise SystemExit("\n".join([*found, "the documentation was not built"]))
     print(f"{BUILD / 'site' / 'index.html'}, in {time.perf_counter() - began:.0f} s")
+
+
+def check_readme() -> None:
+    """`SystemExit` unless README's first snippet prints what README says, but for the last digit
+    of a number, which another processor may round otherwise."""
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    snippet = re.search(r"^```python\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)
+    said = re.search(r"It prints `([^`]*)`", text)
+    assert snippet and said, "README.md must have a snippet, and what it prints"
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out):
+        exec(compile(snippet[1], "README.md", "exec"), {})
+    numbers = [[float(number) for number in re.findall(r"-?\d+\.\d+", words)]
+               for words in (said[1], out.getvalue())]
+    if any(abs(a - b) > 1.1e-4 for a, b in zip(*numbers, strict=True)):
+        raise SystemExit(f"README.md says {said[1]}, but its snippet prints {out.getvalue()}")
 
 
 def expanded(nav: list[object], pages: list[str]) -> list[object]:

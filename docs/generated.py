@@ -9,6 +9,7 @@ from pathlib import Path
 
 import eitbench
 from eitbench.bench.methods import load_method, own_methods
+from eitbench.bench.text import with_interval
 from eitbench.bench.tracks import own_ids
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -109,11 +110,13 @@ def kind(role: str | None, privileged: bool) -> str:
 
 def table(rows: list[dict[str, str]], first: str) -> str:
     """Ranks and errors of some lines of the boards, named by method or by environment."""
-    lines = ["| | rank | ẽ_c | 95 % interval | gain over the floor |", "|---|---:|---:|---:|---:|"]
+    lines = ["| | rank | ẽ_c (95 % interval) | gain over the floor |", "|---|---:|---:|---:|"]
     for row in rows:
-        error, low, high = (short(row[key]) for key in ("error", "error_low", "error_high"))
+        error = with_interval(*(float(row[key] or "nan")
+                                for key in ("error", "error_low", "error_high")))
+        gain = f"{float(row['gain']):.2f}" if row["gain"] else "–"
         lines.append(f"| {name_of(row, first)} | {row['rank'] or row['note'] or '–'} | {error} | "
-                     f"{low} to {high} | {short(row['gain'], 2)} |")
+                     f"{gain} |")
     return "\n".join(lines) if rows else "There is no record yet."
 
 
@@ -125,11 +128,6 @@ def name_of(row: dict[str, str], first: str) -> str:
     if re.search(r"_seed\d+$", row["method"]):
         return f"[{row['title']}](../injection.md#trained-agents)"
     return f"[{row['title']}](../baselines/{row['method']}.md)"
-
-
-def short(number: str, digits: int = 4) -> str:
-    """A number of the CSV, rounded; – where it has none."""
-    return f"{float(number):.{digits}f}" if number else "–"
 
 
 def linked(text: str) -> str:
