@@ -123,7 +123,7 @@ def main() -> None:
     for name, content in pages.items():
         write(name, content)
     config = (ROOT / "docs" / "zensical.toml").read_text(encoding="utf-8")
-    nav = expanded(tomllib.loads(config)["project"]["nav"], sorted(pages))
+    nav = expanded(tomllib.loads(config)["project"]["nav"], list(pages))
     config = re.sub(r"^nav = \[.*?^\]$", lambda _: f"nav = {toml(nav)}", config,
                     flags=re.DOTALL | re.MULTILINE)
     (BUILD / "zensical.toml").write_text(config, encoding="utf-8")

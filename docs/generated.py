@@ -14,10 +14,9 @@ from eitbench.bench.tracks import own_ids
 
 ROOT = Path(__file__).resolve().parent.parent
 REFERENCE = {
-    "eitbench": ["eitbench.bench.evaluation.evaluate", "eitbench.worlds.task.Task",
-                 "eitbench.worlds.task.Estimate", "eitbench.worlds.task.make_task",
-                 "eitbench.data.episodes.simulate", "eitbench.data.episodes.Episode",
-                 "eitbench.worlds.registry.register", "eitbench.envs.pages.page"],
+    "eitbench": [f"eitbench.{name}" for name in (
+        "evaluate", "Task", "Estimate", "make_task", "simulate", "Episode", "World", "Rules",
+        "register", "page")],
     "eitbench.envs": ["eitbench.envs.estimation.EstimationEnv",
                       "eitbench.envs.injection.InjectionEnv"],
     "eitbench.estimation": ["eitbench.estimation"],
