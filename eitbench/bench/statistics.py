@@ -128,7 +128,10 @@ def paired_difference(a: Scores, b: Scores, *, statistic: Statistic = mean_over_
     draws, seed
         As in `stratified_bootstrap`; so are the three numbers returned.
 
-    ``ValueError`` if the environments differ, or there is one without any shared seed.
+    Raises
+    ------
+    ValueError
+        If the environments differ, or there is one without any shared seed.
     """
     pairs = [_sorted(pair) for _, pair in sorted(_pairs(a, b).items())]
     ours, theirs = ([pair[i] for pair in pairs] for i in (0, 1))

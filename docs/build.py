@@ -1,0 +1,170 @@
+"""Build the documentation: `python docs/build.py`, then open build/docs/site/index.html.
+
+Needs the extra `docs`. The pages of docs/ are staged in build/docs/pages with those that are
+generated (environments, methods, reference) and with the notebooks, which are executed. Zensical
+turns them into a site; every link, anchor and picture of it is checked. `--draft` executes no
+notebook.
+"""
+
+import argparse
+import contextlib
+import io
+import os
+import re
+import shutil
+import subprocess
+import sys
+import time
+import tomllib
+from pathlib import Path
+
+import generated
+from check_site import problems
+
+ROOT = Path(__file__).resolve().parent.parent
+BUILD = ROOT / "build" / "docs"
+PAGES = BUILD / "pages"
+ELSEWHERE = {
+    "CHANGELOG.md": "changes.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "README.md": "index.md",
+    "baselines": "baselines.md",
+    "baselines/checkpoints": "injection.md",
+    "baselines/injection": "baselines.md",
+    "benchmarks/README.md": "speed.md",
+    "examples/bubble_tank": "worlds.md",
+    "leaderboards/README.md": "leaderboards.md",
+    "leaderboards/leaderboard.md": "boards-as-text.md",
+    "leaderboards/site": "boards",
+    "studies/README.md": "studies.md",
+}
+"""Where on the site things lie that are not in docs/."""
+
+
+def place(source: Path) -> str:
+    """Where a file or folder of the repository lies on the site; what is no page, as a file."""
+    name = source.relative_to(ROOT).as_posix()
+    if name in ELSEWHERE:
+        return ELSEWHERE[name]
+    for folder, there in (("docs/", ""), ("leaderboards/site/", "boards/")):
+        if name.startswith(folder):
+            return there + name.removeprefix(folder).replace(".ipynb", ".md")
+    return f"files/{name.removeprefix('.')}"
+
+
+def staged(source: Path) -> str:
+    """A page with links as on the site; files that it links to are copied.
+
+    Drawings become part of the text, so that their colours follow the page's, and ids of
+    environments become links. `SystemExit` if a link leads nowhere.
+    """
+    def linked(match: re.Match[str]) -> str:
+        target, hash, anchor = match[2].partition("#")
+        there = (source.parent / target).resolve()
+        if not target or "://" in target:
+            return match[0]
+        if not there.exists():
+            raise SystemExit(f"{source.relative_to(ROOT)} links to {target}, which is not there")
+        if there.suffix == ".svg":
+            return f"<div>\n{there.read_text(encoding='utf-8')}</div>"
+        page = place(there)
+        if there.is_file() and there.suffix == page[page.rfind("."):] != ".md":
+            write(page, there.read_bytes())
+        return f"{match[1]}({os.path.relpath(page, Path(place(source)).parent)}{hash}{anchor})"
+
+    text = source.read_text(encoding="utf-8")
+    parts = re.split(r"(^ *```.*?^ *```$)", text, flags=re.DOTALL | re.MULTILINE)
+    for number in range(0, len(parts), 2):
+        text = re.sub(r"(!?\[[^]]*\])\(([^)\s]+)\)", linked, parts[number])
+        parts[number] = re.sub(r"^(?!#)(.*)$", with_environments, text, flags=re.MULTILINE)
+    return "".join(parts)
+
+
+def with_environments(line: re.Match[str]) -> str:
+    """A line in which the ids of our environments, where they are no links, lead to their pages."""
+    return re.sub(r"(?<!\[)`(eitbench/(\w+-v\d+))`", r"[`\1`](environments/\2.md)", line[1])
+
+
+def write(name: str, content: str | bytes) -> None:
+    """A file of the staged pages."""
+    path = PAGES / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+def toml(value: object) -> str:
+    """Strings, lists and dicts of them as TOML."""
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{toml(key)} = {toml(of)}" for key, of in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(toml, value)) + "]"
+    return '"' + str(value).replace('"', '\\"') + '"'
+
+
+def main() -> None:
+    """Stage, build, check."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--draft", action="store_true", help="leave the notebooks unexecuted")
+    draft = parser.parse_args().draft
+    began = time.perf_counter()
+    shutil.rmtree(BUILD, ignore_errors=True)
+    sources = [*sorted((ROOT / "docs").glob("*.md")),
+               *(ROOT / name for name in ELSEWHERE if name.endswith(".md") and name != "README.md")]
+    for source in sources:
+        write(place(source), staged(source))
+    write("extra.css", (ROOT / "docs" / "extra.css").read_bytes())
+    shutil.copytree(ROOT / "leaderboards" / "site", PAGES / "boards", dirs_exist_ok=True)
+    if not draft:
+        check_readme()
+    pages = generated.environments() | generated.baselines() | generated.reference()
+    for source in sorted((ROOT / "docs" / "notebooks").glob("*.ipynb")):
+        pages |= generated.notebook(source, execute=not draft)
+        print(f"{source.name}, {time.perf_counter() - began:.0f} s from the start")
+    for name, content in pages.items():
+        write(name, content)
+    config = (ROOT / "docs" / "zensical.toml").read_text(encoding="utf-8")
+    nav = expanded(tomllib.loads(config)["project"]["nav"], list(pages))
+    config = re.sub(r"^nav = \[.*?^\]$", lambda _: f"nav = {toml(nav)}", config,
+                    flags=re.DOTALL | re.MULTILINE)
+    (BUILD / "zensical.toml").write_text(config, encoding="utf-8")
+    built = subprocess.run([sys.executable, "-m", "zensical", "build", "--strict",
+                            "--config-file", str(BUILD / "zensical.toml")], check=False)
+    found = [] if built.returncode else problems(BUILD / "site")
+    if built.returncode or found:
+        raise SystemExit("\n".join([*found, "the documentation was not built"]))
+    print(f"{BUILD / 'site' / 'index.html'}, in {time.perf_counter() - began:.0f} s")
+
+
+def check_readme() -> None:
+    """`SystemExit` unless README's first snippet prints what README says, but for the last digit
+    of a number, which another processor may round otherwise."""
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    snippet = re.search(r"^```python\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)
+    said = re.search(r"It prints `([^`]*)`", text)
+    assert snippet and said, "README.md must have a snippet, and what it prints"
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out):
+        exec(compile(snippet[1], "README.md", "exec"), {})
+    numbers = [[float(number) for number in re.findall(r"-?\d+\.\d+", words)]
+               for words in (said[1], out.getvalue())]
+    if any(abs(a - b) > 1.1e-4 for a, b in zip(*numbers, strict=True)):
+        raise SystemExit(f"README.md says {said[1]}, but its snippet prints {out.getvalue()}")
+
+
+def expanded(nav: list[object], pages: list[str]) -> list[object]:
+    """The navigation with each "folder/*" replaced by the pages that were generated there."""
+    entries: list[object] = []
+    for entry in nav:
+        if isinstance(entry, dict):
+            entries.append({title: expanded(inner, pages) if isinstance(inner, list) else inner
+                            for title, inner in entry.items()})
+        elif str(entry).endswith("/*"):
+            entries += [page for page in pages
+                        if page.startswith(str(entry)[:-1]) and page.endswith(".md")]
+        else:
+            entries.append(entry)
+    return entries
+
+
+if __name__ == "__main__":
+    main()

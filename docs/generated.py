@@ -1,0 +1,167 @@
+"""Pages made from what is there: environments, methods, the reference, and executed notebooks.
+
+Each function gives the staged files by their names on the site.
+"""
+
+import csv
+import re
+from pathlib import Path
+
+import eitbench
+from eitbench.bench.methods import load_method, own_methods
+from eitbench.bench.text import with_interval
+from eitbench.bench.tracks import own_ids
+
+ROOT = Path(__file__).resolve().parent.parent
+REFERENCE = {
+    "eitbench": [f"eitbench.{name}" for name in (
+        "evaluate", "Task", "Estimate", "make_task", "simulate", "Episode", "World", "Rules",
+        "register", "page")],
+    "eitbench.envs": ["eitbench.envs.estimation.EstimationEnv",
+                      "eitbench.envs.injection.InjectionEnv"],
+    "eitbench.estimation": ["eitbench.estimation"],
+    "eitbench.estimation.onboard": ["eitbench.estimation.onboard.rules",
+                                    "eitbench.estimation.onboard.belief"],
+    "eitbench.physics": ["eitbench.physics.cem", "eitbench.physics.transport",
+                         "eitbench.physics.observation", "eitbench.physics.flow",
+                         "eitbench.physics.navier_stokes", "eitbench.numerics.mesh"],
+    "eitbench.worlds": ["eitbench.worlds.world", "eitbench.worlds.vessels",
+                        "eitbench.worlds.mesh_vessel", "eitbench.worlds.flows",
+                        "eitbench.worlds.slugs", "eitbench.worlds.bodies",
+                        "eitbench.worlds.instrument", "eitbench.worlds.schedule",
+                        "eitbench.worlds.parts"],
+    "eitbench.scoring": ["eitbench.scoring", "eitbench.bench.scores"],
+    "eitbench.bench": ["eitbench.bench", "eitbench.bench.statistics", "eitbench.bench.ranking"],
+    "eitbench.rl": ["eitbench.rl.training", "eitbench.rl.agents", "eitbench.rl.vec_env",
+                    "eitbench.rl.networks"],
+}
+"""Page of the reference -> what it describes."""
+
+Files = dict[str, str | bytes]
+
+
+def scores() -> list[dict[str, str]]:
+    """Lines of the boards of single environments."""
+    with open(ROOT / "leaderboards" / "leaderboard.csv", encoding="utf-8", newline="") as file:
+        return [row for row in csv.DictReader(file) if row["environment"] != "all"]
+
+
+def environments() -> Files:
+    """A page for each id of ours: its animation, what it asks for, its board."""
+    files: Files = {}
+    rows = scores()
+    for id in own_ids():
+        name = id.partition("/")[2]
+        slug = id.replace("/", "-")
+        media = ROOT / "leaderboards" / "media" / f"{slug}.webp"
+        parts = [f"# {name}"]
+        if media.exists():
+            files[f"environments/{media.name}"] = media.read_bytes()
+            parts.append(f"![An episode of {id}, in motion]({media.name})")
+        parts.append(f'```python\nenv = gym.make("{id}")\n```')
+        parts.append(linked(eitbench.page(id)))
+        board = [row for row in rows if row["environment"] == slug]
+        parts.append(f"## Scores\n\n{table(board, 'method')}\n\n[The whole board, with intervals "
+                     f"and pictures](../boards/environments/{slug}.html)")
+        files[f"environments/{name}.md"] = "\n\n".join(parts) + "\n"
+    return files
+
+
+def baselines() -> Files:
+    """A page for each method of ours: what it does, its scores, its code; and the list of them."""
+    files: Files = {}
+    rows = scores()
+    lists = []
+    for track, heading in (("estimation", "Estimators"), ("injection", "Injection policies")):
+        lines = []
+        for name in own_methods(track):
+            method = load_method(name, track)
+            source = method.path.read_text(encoding="utf-8")
+            docstring, code = re.fullmatch(r'"""(.*?)"""\n+(.*)', source, re.DOTALL).groups()
+            told = " ".join(docstring.split("\n\n")[0].split())
+            where = method.path.relative_to(ROOT).as_posix()
+            mine = table([row for row in rows if row["method"] == name], "environment")
+            files[f"baselines/{name}.md"] = "\n\n".join([
+                f"# {method.title}", f"`{name}`" + kind(method.role, method.privileged),
+                linked(docstring), f"## Scores\n\n{mine}",
+                f"## Code\n\n`{where}`\n\n```python\n{code.strip()}\n```"]) + "\n"
+            lines.append(f"- [`{name}`](baselines/{name}.md): {told}")
+        lists.append(f"## {heading}\n\n" + "\n".join(lines))
+    files["baselines.md"] = BASELINES + "\n\n".join(lists) + "\n"
+    return files
+
+
+BASELINES = """# Methods
+
+One file each, written as you would write yours, with the public API only. Each page has the code.
+Agents that were trained are described [with the injection worlds](injection.md#trained-agents).
+
+"""
+
+
+def kind(role: str | None, privileged: bool) -> str:
+    """What a method is on a board, where it is not ranked."""
+    said = {"floor": "a floor: what knowing next to nothing scores",
+            "reference": "a reference: about what can be reached"}.get(role or "", "")
+    shown = "it is shown the truth, and has no rank" if privileged else ""
+    return "".join(f" – {words}" for words in (said, shown) if words)
+
+
+def table(rows: list[dict[str, str]], first: str) -> str:
+    """Ranks and errors of some lines of the boards, named by method or by environment."""
+    lines = ["| | rank | ẽ_c (95 % interval) | gain over the floor |", "|---|---:|---:|---:|"]
+    for row in rows:
+        error = with_interval(*(float(row[key] or "nan")
+                                for key in ("error", "error_low", "error_high")))
+        gain = f"{float(row['gain']):.2f}" if row["gain"] else "–"
+        lines.append(f"| {name_of(row, first)} | {row['rank'] or row['note'] or '–'} | {error} | "
+                     f"{gain} |")
+    return "\n".join(lines) if rows else "There is no record yet."
+
+
+def name_of(row: dict[str, str], first: str) -> str:
+    """A line's name with a link to its page."""
+    if first == "environment":
+        name = row["environment"].removeprefix("eitbench-")
+        return f"[{name}](../environments/{name}.md)"
+    if re.search(r"_seed\d+$", row["method"]):
+        return f"[{row['title']}](../injection.md#trained-agents)"
+    return f"[{row['title']}](../baselines/{row['method']}.md)"
+
+
+def linked(text: str) -> str:
+    """Our pages, where a docstring names their files, as links."""
+    return re.sub(r"`+docs/([\w-]+)\.md`+", r"[\1](../\1.md)", text)
+
+
+def reference() -> Files:
+    """The pages of the reference, whose text mkdocstrings takes from docstrings."""
+    return {f"api/{page}.md": f"# {page}\n\n" + "\n\n".join(f"::: {name}" for name in names) + "\n"
+            for page, names in REFERENCE.items()}
+
+
+def notebook(source: Path, execute: bool) -> Files:
+    """A notebook as a page with what its cells print and draw; the notebook itself lies beside it.
+
+    Whatever a cell raises ends the build.
+    """
+    import nbformat
+    from jupyter_client.manager import AsyncKernelManager
+    from nbclient import NotebookClient
+    from nbconvert import MarkdownExporter
+
+    book = nbformat.read(source, as_version=4)
+    if execute:
+        kernel = AsyncKernelManager(kernel_name="python3", transport="ipc")
+        NotebookClient(book, km=kernel, timeout=1200).execute()
+    for cell in book.cells:
+        if cell.cell_type == "code":
+            cell.outputs = [out for out in cell.outputs if out.get("name") != "stderr"]
+    text, resources = MarkdownExporter().from_notebook_node(
+        book, {"output_files_dir": f"{source.stem}_files"})
+    heading, rest = text.split("\n", 1)
+    note = (f"*A notebook, executed when this site was built. Take it: "
+            f"[{source.name}]({source.name}).*")
+    pictures = {f"notebooks/{name}": data for name, data in resources["outputs"].items()}
+    return pictures | {f"notebooks/{source.stem}.md": f"{heading}\n\n{note}\n{rest}",
+                       f"notebooks/{source.name}": nbformat.writes(book)}
