@@ -319,8 +319,8 @@ def compare(
 @app.command()
 def render(
     env: Annotated[str, typer.Option(help="Environment id.")] = "eitbench/Pipe2D-v0",
-    baseline: Annotated[str, typer.Option(
-        help="Name of one of ours, or the path of a .py file.")] = "kalman_filter",
+    baseline: Annotated[list[str] | None, typer.Option(
+        help="Name of one of ours, or a .py file; repeatable. Default: kalman_filter.")] = None,
     policy: Annotated[str | None, typer.Option(
         help="The same of an injection policy, or of an agent's model.zip, in place of a baseline "
              "where injections are asked for.")] = None,
@@ -332,13 +332,14 @@ def render(
     )] = Path("results/episode.gif"),
     isolate: options.Isolate = options.Isolation.others,
 ) -> None:
-    """Draw an episode: truth, estimate, its spread, electrodes and the injected pair."""
+    """Draw an episode: truth, estimate, its spread, electrodes; of several baselines estimates."""
     from eitbench.bench.tracks import track_of
     from eitbench.report.animate import animate
     with options.clear_errors():
         if track_of(env) == "injection" and policy is None:
             raise ValueError(f"policy must be given for {env}, which asks for injections")
-        drawn = animate(env, policy or baseline, seed, step, out, every=every, isolate=isolate)
+        methods = [policy] if policy else baseline or ["kalman_filter"]
+        drawn = animate(env, methods, seed, step, out, every=every, isolate=isolate)
         options.say(f"wrote {drawn}")
 
 
