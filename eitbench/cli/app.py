@@ -275,18 +275,19 @@ def leaderboard(
     from eitbench._files import write_atomically
     from eitbench.data.seasons import season_numbered
     from eitbench.report.boards import boards, read_for_boards
-    from eitbench.report.site import read_media, render, render_site, write_site
+    from eitbench.report.site import render, render_site, write_site
+    from eitbench.report.site.beside import Beside
     with options.clear_errors():
         found, complaints = read_for_boards(records, season_numbered(season))
         table = boards(found)
-        pages = render_site(found, table, read_media(records.parent / "media"))
-        beside = records.parent if season is None else records.parent / f"season-{season}"
+        out = records.parent if season is None else records.parent / f"season-{season}"
+        pages = render_site(found, table, Beside.of(records.parent, out / "site"))
         texts = render(found, table)
-        write_site(beside / "site", pages)
+        write_site(out / "site", pages)
     for name, text in texts.items():
-        write_atomically(beside / name, text.encode())
-        options.say(f"wrote {beside / name}")
-    options.say(f"wrote {beside / 'site' / 'index.html'}")
+        write_atomically(out / name, text.encode())
+        options.say(f"wrote {out / name}")
+    options.say(f"wrote {out / 'site' / 'index.html'}")
     for complaint in complaints:
         options.say(f"left out: {complaint}", err=True)
     if complaints:

@@ -121,9 +121,9 @@ def test_dark_by_preference_and_by_choice(index, folder):
     index.prefer(prefers_color_scheme="dark")
     dark = paper()
     assert light != dark
-    index.wait("document.querySelector('.theme').ariaPressed === 'true'")
+    index.wait("document.querySelector('.theme').textContent === 'Use light colours'")
     index.click(".theme")
-    assert paper() == light and index.js("document.querySelector('.theme').ariaPressed") == "false"
+    assert paper() == light and index.js("document.querySelector('.theme').textContent") == "Use dark colours"
     index.open((folder / METHOD).as_uri())
     assert paper() == light
     index.js("document.querySelector('.theme').focus()")
