@@ -84,8 +84,10 @@ def _average(values: list[float | None]) -> float | None:
 
 
 def _over_episodes(board: Board, rows: list[Row]) -> dict[str, Any]:
-    """Error and gain with their intervals; nothing where there are no episodes, as in an
-    aggregate."""
+    """Error and gain with their intervals; nothing in an aggregate, which has no episodes, or
+    where the trainings share none."""
+    if board.is_aggregate:
+        return {}
     played = [{episode["seed"]: episode["scores"]["error"] for episode in row.episodes()}
               for row in rows]
     errors = {seed: float(np.mean([own[seed] for own in played]))
