@@ -39,12 +39,14 @@ def _line(row: Row, kinds: list[str], of: str = "") -> str:
 def breakable(text: str) -> str:
     """A long name may break after its underscores and its slash and before its version, but ẽ_c may
     not."""
-    said = str(escape(text)).replace("_", "_<wbr/>").replace("ẽ_<wbr/>", "ẽ_")
-    return re.sub(r"/(?=\w{3})", "/<wbr/>", said.replace("@", "<wbr/>@"))
+    said = str(escape(text))
+    if "_" in said or "@" in said:  # of the many numbers none has to be looked at further
+        said = said.replace("_", "_<wbr/>").replace("ẽ_<wbr/>", "ẽ_").replace("@", "<wbr/>@")
+    return re.sub(r"/(?=\w{3})", "/<wbr/>", said) if "/" in said else said
 
 
 def _cell(cell: Cell, kind: str) -> str:
-    value = "" if cell.value is None else f' data-value="{_said(str(cell.value))}"'
+    value = "" if cell.value is None else f' data-value="{_sorted_by(cell.value)}"'
     if cell.link:
         text = f'<a href="{_said(cell.link)}">{_said(cell.text)}</a>'
     else:
@@ -55,6 +57,10 @@ def _cell(cell: Cell, kind: str) -> str:
         badges += f"<details><summary>{_said(cell.opens)}</summary></details>"
     of_kind = f' class="{kind}"' if kind else ""
     return f"<td{value}{of_kind}>{cell.picture}{text}{small}{badges}</td>"
+
+
+def _sorted_by(value: float | str) -> str:
+    return _said(value) if isinstance(value, str) else str(value)
 
 
 def badge(word: str) -> Markup:
