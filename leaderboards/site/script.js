@@ -177,14 +177,21 @@ function explaining(tip, header) {       // what a heading means, while it is po
   const text = header.title;
   const button = header.querySelector("button");
   header.removeAttribute("title");
-  const show = () => {
-    tip.textContent = text;
-    tip.showPopover();
+  const place = () => {
     const box = button.getBoundingClientRect();
     tip.style.left = `${Math.max(8, Math.min(box.left, innerWidth - tip.offsetWidth - 8))}px`;
     tip.style.top = `${box.bottom + tip.offsetHeight > innerHeight ? box.top - tip.offsetHeight : box.bottom}px`;
   };
-  const hide = () => tip.hidePopover();
+  const show = () => {
+    tip.textContent = text;
+    tip.showPopover();
+    place();
+    addEventListener("scroll", place, {passive: true});
+  };
+  const hide = () => {
+    tip.hidePopover();
+    removeEventListener("scroll", place);
+  };
   button.setAttribute("aria-description", text);
   header.addEventListener("mouseenter", show);
   button.addEventListener("focus", () => { if (button.matches(":focus-visible")) show(); });
@@ -202,7 +209,6 @@ function explanations() {
   tip.ariaHidden = "true";                              // the button says it too
   document.body.append(tip);
   headers.forEach((header) => explaining(tip, header));
-  addEventListener("scroll", () => tip.hidePopover(), {passive: true});
 }
 
 function pausing(button) {               // puts the still picture in the place of the moving one, and back
