@@ -197,7 +197,7 @@ def test_headings_explain_themselves(index):
     button = f"{BOARD} thead th:nth-child(4) button"
     index.js(f"document.querySelector('{button}').focus({{focusVisible: true}})")
     assert tip().startswith("1 − ẽ_c") and index.js(f"document.querySelector('{button}').ariaDescription") == tip()
-    index.wait("document.querySelector('.tip').getBoundingClientRect().bottom <= innerHeight")     # it goes with the page
+    assert index.js("document.querySelector('.tip').getBoundingClientRect().bottom <= innerHeight")
     index.press("Escape")
     assert tip() is None
     x, y = index.js(f"(() => {{ const button = document.querySelector('{button}'); button.scrollIntoView("
@@ -216,3 +216,5 @@ def test_an_axis_and_the_floor_are_drawn(index):
                       ".map(line => line.getAttribute('d'))")
     assert len(places) == len(column(index, 2)) + 1 and len(set(places)) == 1     # the outdated one is hidden
     assert index.js(f"document.querySelectorAll('{BOARD} thead svg.axis text').length") >= 3
+    left = "document.querySelector('{} {} svg').getBoundingClientRect().left"
+    assert index.js(left.format(BOARD, "thead")) == index.js(left.format(BOARD, "td:nth-child(3)"))
