@@ -275,8 +275,7 @@ def leaderboard(
     from eitbench._files import write_atomically
     from eitbench.data.seasons import season_numbered
     from eitbench.report.boards import boards, read_for_boards
-    from eitbench.report.site import render, render_site, write_site
-    from eitbench.report.site.beside import Beside
+    from eitbench.report.site import Beside, render, render_site, write_site
     with options.clear_errors():
         found, complaints = read_for_boards(records, season_numbered(season))
         table = boards(found)
@@ -290,8 +289,7 @@ def leaderboard(
     options.say(f"wrote {out / 'site' / 'index.html'}")
     for complaint in complaints:
         options.say(f"left out: {complaint}", err=True)
-    if complaints:
-        raise typer.Exit(1)
+    raise typer.Exit(bool(complaints))
 
 
 @app.command()
@@ -339,9 +337,9 @@ def render(
     with options.clear_errors():
         if track_of(env) == "injection" and policy is None:
             raise ValueError(f"policy must be given for {env}, which asks for injections")
-        methods = [policy] if policy else baseline or ["kalman_filter"]
-        drawn = animate(env, methods, seed, step, out, every=every, isolate=isolate)
-        options.say(f"wrote {drawn}")
+        animate(env, [policy] if policy else baseline or ["kalman_filter"], seed, step, out,
+                every=every, isolate=isolate)
+        options.say(f"wrote {out}")
 
 
 @app.command()

@@ -21,8 +21,7 @@ from eitbench.bench.tracks import ids
 from eitbench.bench.verify import empty_cache, job_of, verify
 from eitbench.data.seasons import current_season
 from eitbench.report.boards import boards, read_for_boards
-from eitbench.report.site import render, render_site
-from eitbench.report.site.beside import Beside
+from eitbench.report.site import Beside, render, render_site
 
 RENDERED = ("leaderboard.csv", "leaderboard.md", "site")
 """What `eitbench leaderboard` writes beside the records."""
