@@ -1,11 +1,12 @@
-"""Clairvoyant: knows what is broken and what flows through the pipe; a bound for the others.
+"""Clairvoyant: knows what is broken and what flows through the pipe.
 
-It plays a few plans ahead on the very episode and then follows the best of them: greedy A-optimal
-among the electrodes that are sound, each of a few fixed pairs, the best fixed currents where each
-electrode may have its own, and, where there is a budget, injecting when its true error is large.
-Where the flow is unknown its variances are those about the true one and weigh errors by what they
-will do in the next steps; it tries more pairs, and cycles of them, and goes over from one plan to
-another wherever that turns out better.
+It shows about what can be reached: it plays a few plans ahead on the very episode and then follows
+the best of them. These are greedy A-optimal among the electrodes that are sound, each of a few
+fixed pairs, the best fixed currents where each electrode may have its own, and, where there is a
+budget, injecting when its true error is large. Where the flow is unknown its variances are those
+about the true one and weigh errors by what they will do in the next steps; it tries more pairs, and
+cycles of them, and goes over from one plan to another wherever that turns out better. It is no
+bound: there are more plans, and it tries its own with the filter of reduced order.
 """
 
 from itertools import product

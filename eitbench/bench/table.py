@@ -25,6 +25,8 @@ class Cell(NamedTuple):
     small: str = ""
     """Said after the text, quietly."""
     badges: tuple[str, ...] = ()
+    opens: str = ""
+    """What a click shows: the parts of its line, by this name."""
 
     @property
     def plain(self) -> str:
@@ -41,6 +43,8 @@ class Row(NamedTuple):
     """What the toggles of a page go by, separated by spaces."""
     group: str = ""
     """Lines of one group follow each other, below its name."""
+    parts: tuple[Row, ...] = ()
+    """Lines that it stands for, shown where they are asked for."""
 
 
 class Table(NamedTuple):

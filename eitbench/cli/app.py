@@ -275,22 +275,21 @@ def leaderboard(
     from eitbench._files import write_atomically
     from eitbench.data.seasons import season_numbered
     from eitbench.report.boards import boards, read_for_boards
-    from eitbench.report.site import read_media, render, render_site, write_site
+    from eitbench.report.site import Beside, render, render_site, write_site
     with options.clear_errors():
         found, complaints = read_for_boards(records, season_numbered(season))
         table = boards(found)
-        pages = render_site(found, table, read_media(records.parent / "media"))
-        beside = records.parent if season is None else records.parent / f"season-{season}"
+        out = records.parent if season is None else records.parent / f"season-{season}"
+        pages = render_site(found, table, Beside.of(records.parent, out / "site"))
         texts = render(found, table)
-        write_site(beside / "site", pages)
+        write_site(out / "site", pages)
     for name, text in texts.items():
-        write_atomically(beside / name, text.encode())
-        options.say(f"wrote {beside / name}")
-    options.say(f"wrote {beside / 'site' / 'index.html'}")
+        write_atomically(out / name, text.encode())
+        options.say(f"wrote {out / name}")
+    options.say(f"wrote {out / 'site' / 'index.html'}")
     for complaint in complaints:
         options.say(f"left out: {complaint}", err=True)
-    if complaints:
-        raise typer.Exit(1)
+    raise typer.Exit(bool(complaints))
 
 
 @app.command()
@@ -319,8 +318,8 @@ def compare(
 @app.command()
 def render(
     env: Annotated[str, typer.Option(help="Environment id.")] = "eitbench/Pipe2D-v0",
-    baseline: Annotated[str, typer.Option(
-        help="Name of one of ours, or the path of a .py file.")] = "kalman_filter",
+    baseline: Annotated[list[str] | None, typer.Option(
+        help="Name of one of ours, or a .py file; repeatable. Default: kalman_filter.")] = None,
     policy: Annotated[str | None, typer.Option(
         help="The same of an injection policy, or of an agent's model.zip, in place of a baseline "
              "where injections are asked for.")] = None,
@@ -332,14 +331,15 @@ def render(
     )] = Path("results/episode.gif"),
     isolate: options.Isolate = options.Isolation.others,
 ) -> None:
-    """Draw an episode: truth, estimate, its spread, electrodes and the injected pair."""
+    """Draw an episode: truth, estimate, its spread, electrodes; of several baselines estimates."""
     from eitbench.bench.tracks import track_of
     from eitbench.report.animate import animate
     with options.clear_errors():
         if track_of(env) == "injection" and policy is None:
             raise ValueError(f"policy must be given for {env}, which asks for injections")
-        drawn = animate(env, policy or baseline, seed, step, out, every=every, isolate=isolate)
-        options.say(f"wrote {drawn}")
+        animate(env, [policy] if policy else baseline or ["kalman_filter"], seed, step, out,
+                every=every, isolate=isolate)
+        options.say(f"wrote {out}")
 
 
 @app.command()

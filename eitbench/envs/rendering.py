@@ -133,6 +133,35 @@ def draw_frame(task: Task, truth_mesh: Mesh, truth: np.ndarray, estimate: np.nda
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
+def draw_comparison(task: Task, fields: list[tuple[str, Mesh, np.ndarray]], currents: np.ndarray,
+                    time: float) -> np.ndarray:
+    """(height, width, 3) uint8: fields of one moment in one colour scale, each with its name.
+
+    Pipes lie one below the other; tanks stand side by side.
+
+    Parameters
+    ----------
+    task : Task
+    fields : name, mesh, (n,) in mol/m³ on the mesh
+    currents : (L,) A
+    time : float, s
+    """
+    tank = task.vessel is not None and not task.vessel.is_long
+    size = (3.0 * len(fields), 3.6) if tank else (7.2, 1.85 * len(fields) + 0.5)
+    figure = Figure(figsize=size, dpi=100, layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    panels = figure.subplots(*((1, len(fields)) if tank else (len(fields), 1)), squeeze=False).flat
+    for axes, (name, mesh, values) in zip(panels, fields, strict=True):
+        mappable = draw_field(axes, mesh, values, *colour_range(task))
+        axes.set_title(name, loc="left", fontsize=11)
+        axes.set(xticks=(), yticks=(), ylabel="")
+        draw_electrodes(axes, task, currents)
+    figure.colorbar(mappable, ax=list(figure.axes), location="bottom", aspect=50, shrink=0.8,
+                    extend="both", label=f"concentration / (mol/m³) after {1e3 * time:.0f} ms")
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
 def draw_solids(figure: Figure, grid: GridSpec, task: Task, fields: list[tuple[Mesh, np.ndarray]],
                 levels: tuple[float, float], currents: np.ndarray) -> None:
     """Isosurfaces of truth and estimate in ``grid``'s second column, electrodes below them."""

@@ -48,8 +48,8 @@ _FIRST = {
             "is. Floors, references, privileged methods and those that have not finished every "
             "episode have none",
     "by": "who ran it: the maintainers (official), or its author (self-reported)",
-    "ẽ_c": "relative estimation error (5.12), mean over episodes with its 95 % bootstrap interval; "
-           "lower is better",
+    "ẽ_c": "error of the estimate: squared distance from the truth over the square of the truth "
+           "(thesis 5.12), mean over episodes with its 95 % bootstrap interval; lower is better",
     "gain": "1 − ẽ_c over that of the floor (homogeneous; random_pair) in the same episode: 0 as "
             "the floor, 1 perfect. Interquartile mean with its 95 % bootstrap interval",
 }
@@ -181,8 +181,7 @@ def class_of(record: dict[str, Any]) -> str:
 
 def _entries(records: list[dict[str, Any]]) -> list[Entry]:
     """The records of one environment on the board's episodes."""
-    floors = [record for record in records if _is_floor(record)]
-    floor = max(floors, key=lambda record: (record["official"], finished(record)), default=None)
+    floor = floor_of(records)
     seeds = {seed for record in ([floor] if floor else records) for seed in record["seeds"]}
     zero = scores_by_seed(floor, "error") if floor else {}
     entries = []
@@ -203,6 +202,12 @@ def _entries(records: list[dict[str, Any]]) -> list[Entry]:
     return entries
 
 
+def floor_of(records: list[dict[str, Any]]) -> dict[str, Any] | None:
+    """Whose gain is 0, of the records of one environment; None if its floor is not among them."""
+    floors = [record for record in records if _is_floor(record)]
+    return max(floors, key=lambda record: (record["official"], finished(record)), default=None)
+
+
 def _board(environment: str, entries: list[Entry], known: Anchors,
            products: dict[str, float]) -> list[dict[str, Any]]:
     """Rows of one environment, by their mean error; after them who has not finished every
@@ -216,8 +221,8 @@ def _board(environment: str, entries: list[Entry], known: Anchors,
         means = {name: summarised[name] and summarised[name][0] for name in others()}
         rows.append(_row(entry, environment, ranks.get(entry.label)) | {
             "seeds": seed_ranges(record["seeds"]),
-            **_three("error", {environment: entry.errors}, mean_over_environments),
-            **_three("gain", {environment: entry.gains}, interquartile_mean),
+            **with_ends("error", {environment: entry.errors}, mean_over_environments),
+            **with_ends("gain", {environment: entry.gains}, interquartile_mean),
             **means,
             "matmuls_per_step": _in_products(record, products), "peak_memory": _peak(record)})
     return rows
@@ -264,7 +269,7 @@ def _aggregate(played: dict[str, list[Entry]]) -> list[dict[str, Any]]:
     rows = []
     for label in labels:
         row = _row(found[0][label], ALL, ranks.get(label))
-        row |= _three("gain", gains[label], interquartile_mean)
+        row |= with_ends("gain", gains[label], interquartile_mean)
         rows.append(row | {"note": ", ".join(notes[label]),
                            "official": all(entries[label].record["official"] for entries in found)})
     return sorted(rows, key=lambda row: (-row["gain"], row["method"], row["version"]))
@@ -277,10 +282,10 @@ def _row(entry: Entry, environment: str, rank: int | None) -> dict[str, Any]:
             "note": entry.note, "official": record["official"]}
 
 
-def _three(name: str, scores: dict[str, dict[str, float]],
-           statistic: Any) -> dict[str, float | None]:
-    """A statistic of environment -> seed -> score, and the ends of its interval, as far as there
-    are any."""
+def with_ends(name: str, scores: dict[str, dict[str, float]],
+              statistic: Any) -> dict[str, float | None]:
+    """A statistic of environment -> seed -> score, ``name``, and the ends of its 95 % interval,
+    ``name_low`` and ``name_high``; None as far as there are none."""
     if not all(scores.values()):
         return dict.fromkeys((name, f"{name}_low", f"{name}_high"))
     values = {key: list(own.values()) for key, own in scores.items()}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from html import escape
 from itertools import pairwise
 from typing import NamedTuple
@@ -13,6 +13,8 @@ import numpy as np
 WIDTH, HEIGHT, LEFT, RIGHT, TOP, BOTTOM = 860, 360, 76, 30, 12, 46
 COLOURS = 12
 """--c0 … --c11 of the style sheet; who comes after them has the same again, dashed."""
+CELL = 96
+"""Width of what is drawn in a table's cell."""
 LETTER = 7.0
 """Width of a letter in px, about."""
 LONGEST, LONGEST_BESIDE = 36, 60
@@ -171,16 +173,40 @@ def intervals(rows: list[Series], x_label: str, *, log: bool = True,
 
 
 def cell(three: tuple[float, float, float], low: float, high: float, *, log: bool = False,
-         mark: float | None = None) -> str:
+         mark: float | None = None, each: Sequence[float] = ()) -> str:
     """A dot and its interval within a table's cell, on the scale of its column from ``low`` to
-    ``high``, perhaps with a line at a ``mark``; the number beside it says the same, so that it is
-    hidden from those who listen."""
-    px = Axis(low, high, 4, 76, log=log)
+    ``high``, perhaps with a line at a ``mark``, and a stroke for ``each`` value that the dot is the
+    mean of; the number beside it says the same, so that it is hidden from those who listen."""
+    px = _in_cell(low, high, log=log)
     value, a, b = (min(end if math.isfinite(end) else three[0], px.high) for end in three)
-    line = "" if mark is None else f'<path class="grid" d="M{px(mark):.1f} 0V14"/>'
-    return (f'<svg class="cell" viewBox="0 0 80 14" aria-hidden="true">{line}'
+    strokes = "".join(f"M{px(min(one, px.high)):.1f} 2V12" for one in each)
+    return (f'<svg class="cell" viewBox="0 0 {CELL} 14" aria-hidden="true">{_mark(px, mark)}'
             f'<line x1="{px(a):.1f}" x2="{px(b):.1f}" y1="7" y2="7"/>'
-            f'<circle cx="{px(value):.1f}" cy="7" r="3"/></svg>')
+            + (f'<path class="each" d="{strokes}"/>' if strokes else "")
+            + f'<circle cx="{px(value):.1f}" cy="7" r="3"/></svg>')
+
+
+def cell_axis(low: float, high: float, *, log: bool = False, mark: float | None = None) -> str:
+    """The axis of a column of `cell`s, with a number at its first and its last tick."""
+    px = _in_cell(low, high, log=log)
+    ticks = px.ticks()
+    strokes = "".join(f"M{px(tick):.1f} 0V4" for tick in ticks)
+    far = len(ticks) > 1 and px(ticks[-1]) - px(ticks[0]) > 0.5 * CELL
+    said = "".join(_text(f"{px(tick):.1f}", 14, "middle", _said(tick).replace("-", "−"))
+                   for tick in (ticks[:1] if far else []) + ticks[-1:])
+    return (f'<svg class="cell axis" viewBox="0 0 {CELL} 16" aria-hidden="true">'
+            f'<path d="M{px.begin} 0H{px.end}{strokes}"/>{_mark(px, mark, 6)}{said}</svg>')
+
+
+def _in_cell(low: float, high: float, *, log: bool) -> Axis:
+    return Axis(low, high, 4, CELL - 4, log=log)
+
+
+def _mark(px: Axis, mark: float | None, height: float = 14) -> str:
+    """A line across a cell, if it is on the axis."""
+    if mark is None or not px.low <= mark <= px.high:
+        return ""
+    return f'<path class="grid" d="M{px(mark):.1f} 0V{height}"/>'
 
 
 def _frame(px: Axis, py: Axis, x_label: str, y_label: str) -> list[str]:

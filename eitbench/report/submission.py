@@ -21,7 +21,7 @@ from eitbench.bench.tracks import ids
 from eitbench.bench.verify import empty_cache, job_of, verify
 from eitbench.data.seasons import current_season
 from eitbench.report.boards import boards, read_for_boards
-from eitbench.report.site import read_media, render, render_site
+from eitbench.report.site import Beside, render, render_site
 
 RENDERED = ("leaderboard.csv", "leaderboard.md", "site")
 """What `eitbench leaderboard` writes beside the records."""
@@ -186,7 +186,7 @@ def _pages(submitted: Path) -> Finding:
         records, complaints = read_for_boards(submitted / "results")
         table = boards(records)
         texts = {name: text.encode() for name, text in render(records, table).items()}
-        site = render_site(records, table, read_media(submitted / "media"))
+        site = render_site(records, table, Beside.of(submitted, submitted / "site"))
     except ValueError as error:
         return Finding("Rendered pages", "", [str(error)])
     made = texts | {f"site/{name}": content for name, content in site.items()}

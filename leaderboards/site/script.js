@@ -1,6 +1,6 @@
 "use strict";
-// Sorting, filtering, paging and the theme. Without this file the pages say the same, best first; of
-// a board of thousands the first hundred.
+// Sorting, filtering, paging, what headings mean, the theme. Without this file the pages say the same,
+// best first; of a board of thousands the first hundred.
 
 const root = document.documentElement;
 const darkByDefault = matchMedia("(prefers-color-scheme: dark)");
@@ -19,7 +19,7 @@ if (chosen === "dark" || chosen === "light") root.dataset.theme = chosen;   // b
 
 function themeButton(button) {
   const isDark = () => (root.dataset.theme || (darkByDefault.matches ? "dark" : "light")) === "dark";
-  const show = () => button.setAttribute("aria-pressed", isDark());
+  const show = () => { button.textContent = isDark() ? "Use light colours" : "Use dark colours"; };
   button.addEventListener("click", () => {
     root.dataset.theme = isDark() ? "light" : "dark";
     remembered(root.dataset.theme);
@@ -35,8 +35,8 @@ const PAGE = 100;
 
 class Board {                            // a table; of a long one a page at a time is in the document
   constructor(table) {
-    this.body = table.tBodies[0];
-    this.rows = [...this.body.rows];
+    this.table = table;
+    this.rows = [...table.tBodies];      // each a line with its parts, which are a method and its trainings
     this.file = table.dataset.rows;      // with all lines; undefined where all are in the document
     this.all = Number(table.dataset.all) || this.rows.length;
     this.page = 0;
@@ -70,7 +70,8 @@ class Board {                            // a table; of a long one a page at a t
     this.page = Math.min(Math.max(page, 0), last);
     const begin = this.page * PAGE;
     const rows = shown.slice(begin, begin + PAGE);
-    this.body.replaceChildren(...rows);
+    [...this.table.tBodies].forEach((body) => body.remove());
+    this.table.append(...rows);
     this.words.textContent = `${rows.length ? begin + 1 : 0} to ${begin + rows.length} of ${shown.length}.`;
     this.buttons[0].disabled = this.page === 0;
     this.buttons[1].disabled = this.page === last;
@@ -116,13 +117,13 @@ function sortable(table) {
       await board.whole();
       board.rows = sorted(board.rows, column, descending);
       if (board.file) board.draw();
-      else board.body.append(...board.rows);
+      else table.append(...board.rows);
     });
   });
 }
 
 function sorted(rows, column, descending) {
-  const value = (row) => row.cells[column].dataset.value;
+  const value = (row) => row.rows[0].cells[column].dataset.value;
   const known = rows.filter((row) => value(row) !== undefined);
   const isNumber = known.every((row) => Number.isFinite(Number(value(row))));
   const order = (a, b) => isNumber ? value(a) - value(b) : value(a).localeCompare(value(b), "en");
@@ -141,8 +142,9 @@ function filtering(form) {
       const board = boards.get(block.querySelector("table.board"));
       let any = 0;
       for (const row of board.rows) {
-        const text = `${block.dataset.words} ${row.querySelector("td:nth-child(2)").textContent}`.toLocaleLowerCase("en");
-        const flags = (row.dataset.flags || "").split(" ");
+        const names = [...row.querySelectorAll("td:nth-child(2)")].map((cell) => cell.textContent);
+        const text = `${block.dataset.words} ${names.join(" ")}`.toLocaleLowerCase("en");
+        const flags = (row.rows[0].dataset.flags || "").split(" ");
         row.hidden = left_out.some((name) => flags.includes(name)) || !words.every((word) => text.includes(word));
         any += !row.hidden;
       }
@@ -156,7 +158,7 @@ function filtering(form) {
       const own = [...section.querySelectorAll(".block")];
       section.hidden = own.length > 0 && own.every((block) => block.hidden);
     }
-    said.textContent = `${shown} of ${all} rows`;
+    said.textContent = `${shown} of ${all} lines`;
   };
   for (const box of form.querySelectorAll("input[type=checkbox]")) {          // no choice where there is nothing to hide
     box.parentElement.hidden = !document.querySelector(`[data-flags~="${box.name}"], [data-rows]`);
@@ -171,8 +173,64 @@ function filtering(form) {
   apply();
 }
 
+function explaining(tip, header) {       // what a heading means, while it is pointed at or has the focus
+  const text = header.title;
+  const button = header.querySelector("button");
+  header.removeAttribute("title");
+  const place = () => {
+    const box = button.getBoundingClientRect();
+    tip.style.left = `${Math.max(8, Math.min(box.left, innerWidth - tip.offsetWidth - 8))}px`;
+    tip.style.top = `${box.bottom + tip.offsetHeight > innerHeight ? box.top - tip.offsetHeight : box.bottom}px`;
+  };
+  const show = () => {
+    tip.textContent = text;
+    tip.showPopover();
+    place();
+    addEventListener("scroll", place, {passive: true});
+  };
+  const hide = () => {
+    tip.hidePopover();
+    removeEventListener("scroll", place);
+  };
+  button.setAttribute("aria-description", text);
+  header.addEventListener("mouseenter", show);
+  button.addEventListener("focus", () => { if (button.matches(":focus-visible")) show(); });
+  header.addEventListener("mouseleave", hide);
+  button.addEventListener("blur", hide);
+  button.addEventListener("keydown", (event) => { if (event.key === "Escape") hide(); });
+}
+
+function explanations() {
+  const headers = document.querySelectorAll("table.board th[title]");
+  const tip = document.createElement("div");
+  if (!headers.length || !tip.showPopover) return;      // an older browser shows the title
+  tip.className = "tip";
+  tip.popover = "manual";
+  tip.ariaHidden = "true";                              // the button says it too
+  document.body.append(tip);
+  headers.forEach((header) => explaining(tip, header));
+}
+
+function pausing(button) {               // puts the still picture in the place of the moving one, and back
+  const picture = button.parentElement.querySelector("picture");
+  const image = picture.querySelector("img");
+  const moving = image.getAttribute("src");
+  let moves = !matchMedia("(prefers-reduced-motion: reduce)").matches;
+  const show = () => { button.textContent = moves ? "Stop the picture" : "Play the picture"; };
+  button.addEventListener("click", () => {
+    picture.querySelector("source")?.remove();
+    moves = !moves;
+    image.src = moves ? moving : image.dataset.still;
+    show();
+  });
+  button.hidden = false;
+  show();
+}
+
 document.addEventListener("DOMContentLoaded", () => {
+  document.querySelectorAll(".pause").forEach(pausing);
   document.querySelectorAll(".theme").forEach(themeButton);
   document.querySelectorAll("table.board").forEach(sortable);
+  explanations();
   document.querySelectorAll("form.controls").forEach(filtering);
 });

@@ -14,7 +14,7 @@ import time
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 SECONDS = 60
-KEYS = {"Enter": (13, "\r"), " ": (32, " "), "Tab": (9, ""), "Backspace": (8, "")}
+KEYS = {"Enter": (13, "\r"), " ": (32, " "), "Tab": (9, ""), "Backspace": (8, ""), "Escape": (27, "")}
 
 
 def executable():

@@ -141,7 +141,7 @@ def test_page_needs_nothing_else():
     found = [text for cell in tree.iter("td") if (text := "".join(cell.itertext()).strip())]
     assert found == said(shown(table, evil, "yours")).to_numpy().ravel().tolist()
     circles = [float(circle.get("cx")) for circle in tree.iter("circle")]
-    assert [x < 40 for x in circles] == [difference < 0 for difference in table["difference"]]
+    assert [x < 48 for x in circles] == [difference < 0 for difference in table["difference"]]
     assert len(list(tree.iter("line"))) == len(list(tree.iter("path"))) == 3
     few = html(compare([record("a", [0.1])], [record("b", [0.4])]), "a", "b")
     assert '<line x1="4.0" x2="4.0"' in few            # no interval, and the only difference

@@ -4,20 +4,36 @@ import re
 
 import pytest
 from browser import Browser, executable
+from eitbench.bench.records import sealed
 from eitbench.report.boards import boards
 from eitbench.report.site import render_site, write_site
 
-from tiny import several_boards
+from tiny import record, several_boards
 
 pytestmark = pytest.mark.skipif(executable() is None, reason="there is no Chromium or Chrome on the PATH")
 BOARD = "#board-filter-eitbench-Pipe2D-v0"
 ENVIRONMENT, METHOD = "environments/eitbench-Pipe2D-v0.html", "methods/a.html"
 """One page of each kind, beside the index."""
+WIDE = "environments/eitbench-Pipe2DUnknownVelocity-v0.html"
+"""That of the board with the most columns."""
+
+
+def widest():
+    """Records with every score of an estimator, and the anchors of its skill."""
+    scores = {"contrast_error": 2.28, "nis": 1.44, "crps": 0.98, "velocity_error": 2.3e-32, "coverage_50": 0.58,
+              "coverage_90": 0.88, "spread_ratio": 1.44, "voltage_discrepancy": 1e-4, "seconds_per_step": 0.465}
+    errors = {"homogeneous": 0.0213, "true_model_smoother": 0.0027, "extended_kalman_filter": 0.0048}
+    found = [record(name, [0.8 * error, error, 1.3 * error, error, error, 1.1 * error], scores=scores, official=True,
+                    id="eitbench/Pipe2DUnknownVelocity-v0", role={"homogeneous": "floor"}.get(name))
+             for name, error in errors.items()]
+    for each in (episode for one in found for episode in one["episodes"]):
+        each["peak_memory"] = 3_071_000_000
+    return [sealed(one) for one in found]
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    made, records = tmp_path_factory.mktemp("site"), several_boards()
+    made, records = tmp_path_factory.mktemp("site"), [*several_boards(), *widest()]
     write_site(made, render_site(records, boards(records)))
     return made
 
@@ -121,9 +137,9 @@ def test_dark_by_preference_and_by_choice(index, folder):
     index.prefer(prefers_color_scheme="dark")
     dark = paper()
     assert light != dark
-    index.wait("document.querySelector('.theme').ariaPressed === 'true'")
+    index.wait("document.querySelector('.theme').textContent === 'Use light colours'")
     index.click(".theme")
-    assert paper() == light and index.js("document.querySelector('.theme').ariaPressed") == "false"
+    assert paper() == light and index.js("document.querySelector('.theme').textContent") == "Use dark colours"
     index.open((folder / METHOD).as_uri())
     assert paper() == light
     index.js("document.querySelector('.theme').focus()")
@@ -153,3 +169,52 @@ def test_less_motion_where_it_is_asked_for(tab, folder):
     for wish, behaviour in (("reduce", "auto"), ("no-preference", "smooth")):
         tab.prefer(prefers_reduced_motion=wish)
         assert tab.js("getComputedStyle(document.documentElement).scrollBehavior") == behaviour
+
+
+WITHIN = """(() => { const card = document.querySelector('.block .card'), right = card.getBoundingClientRect().right;
+    return [...card.querySelectorAll('thead th')].filter(cell => cell.getBoundingClientRect().right <= right)
+        .map(cell => cell.textContent.trim()); })()"""
+
+
+def test_columns_that_are_seen_without_scrolling(tab, folder):
+    """All at 1280 px, whatever is scored; rank, method, error and gain on a phone."""
+    tab.open((folder / WIDE).as_uri())
+    tab.size(1280)
+    seen = tab.js(WITHIN)
+    assert len(seen) == tab.js("document.querySelectorAll('.block thead th').length") > 15
+    tab.size(390)
+    tab.wait("innerWidth === 390")
+    narrow = tab.js(WITHIN)
+    assert narrow[:2] == ["rank", "method"] and narrow[2].startswith("ẽ_c") and narrow[3].startswith("gain")
+
+
+def test_headings_explain_themselves(index):
+    """To whoever points at them or comes by keyboard; Escape takes it away."""
+    def tip():
+        return index.js("document.querySelector('.tip:popover-open')?.textContent")
+
+    index.prefer(prefers_reduced_motion="reduce")                  # what is focused is there at once
+    button = f"{BOARD} thead th:nth-child(4) button"
+    index.js(f"document.querySelector('{button}').focus({{focusVisible: true}})")
+    assert tip().startswith("1 − ẽ_c") and index.js(f"document.querySelector('{button}').ariaDescription") == tip()
+    assert index.js("document.querySelector('.tip').getBoundingClientRect().bottom <= innerHeight")
+    index.press("Escape")
+    assert tip() is None
+    x, y = index.js(f"(() => {{ const button = document.querySelector('{button}'); button.scrollIntoView("
+                    "{block: 'center', behavior: 'instant'}); const box = button.getBoundingClientRect(); "
+                    "return [box.x + 9, box.y + 9]; })()")
+    for place in ((1, 1), (x, y)):
+        index.send("Input.dispatchMouseEvent", type="mouseMoved", x=place[0], y=place[1])
+    index.wait("!!document.querySelector('.tip:popover-open')")
+    index.send("Input.dispatchMouseEvent", type="mouseMoved", x=1, y=1)
+    index.wait("!document.querySelector('.tip:popover-open')")
+
+
+def test_an_axis_and_the_floor_are_drawn(index):
+    """In the heading of each drawn column, and as a line in each cell of it, at one place."""
+    places = index.js(f"[...document.querySelectorAll('{BOARD} td:nth-child(3) path.grid')]"
+                      ".map(line => line.getAttribute('d'))")
+    assert len(places) == len(column(index, 2)) + 1 and len(set(places)) == 1     # the outdated one is hidden
+    assert index.js(f"document.querySelectorAll('{BOARD} thead svg.axis text').length") >= 3
+    left = "document.querySelector('{} {} svg').getBoundingClientRect().left"
+    assert index.js(left.format(BOARD, "thead")) == index.js(left.format(BOARD, "td:nth-child(3)"))

@@ -17,25 +17,22 @@ from eitbench._files import replace_folder
 from eitbench._foreign import as_cell, as_markdown
 from eitbench.bench.records import file_name, newest
 from eitbench.report.boards import boards, meanings
+from eitbench.report.site.beside import Beside
 from eitbench.report.site.collect import about_season, collect
 from eitbench.report.site.environment import environment_pages
 from eitbench.report.site.index import index_pages
 from eitbench.report.site.method import method_pages
-from eitbench.report.site.tables import PAGE
-from eitbench.report.site.tables import table as shown
+from eitbench.report.site.tables import PAGE, plain_table
 
 MARK = b"<strong>eitbench</strong> leaderboards"
 """By which an index.html is known to be ours."""
 HERE = Path(__file__).parent
 ASSETS = {"style.css": ("../style.css", "site.css"), "script.js": ("script.js",)}
 """Files that all pages share, and what they are put together from."""
-MEDIA = "*.webp"
-"""Animations beside the records' folder, in ``media/``: named like an environment, as in
-eitbench-Pipe2D-v0.webp."""
 
 
 def render_site(records: list[dict[str, Any]], table: pd.DataFrame,
-                media: Mapping[str, bytes] | None = None) -> dict[str, bytes]:
+                beside: Beside = Beside()) -> dict[str, bytes]:  # noqa: B008 (it is never changed)
     """All files of the site, by their path within it.
 
     Parameters
@@ -44,22 +41,18 @@ def render_site(records: list[dict[str, Any]], table: pd.DataFrame,
         As `records.read_records` has them.
     table : DataFrame
         Their `boards.boards`.
-    media : environment -> WebP
-        Animations of episodes, shown where their environment is. Default: none.
+    beside : Beside
+        What lies beside the site's folder: animations of episodes, and what is linked to. Default:
+        nothing.
     """
-    media = media or {}
     site = collect(records, table)
-    files = index_pages(site)
+    files = index_pages(site, beside)
     for board in site.boards:
         if not board.is_aggregate:
-            name = board.environment
-            files |= environment_pages(site, board, media.get(name))
-    files |= method_pages(site)
-    files |= {name: b"".join((HERE / part).read_bytes() for part in parts)
-              for name, parts in ASSETS.items()}
-    shown = {board.environment for board in site.boards}
-    return files | {f"media/{name}.webp": content for name, content in media.items()
-                    if name in shown}
+            files |= environment_pages(site, board, beside)
+    return files | method_pages(site, beside) | {
+        name: b"".join((HERE / part).read_bytes() for part in parts)
+        for name, parts in ASSETS.items()}
 
 
 def render(records: list[dict[str, Any]], table: pd.DataFrame | None = None) -> dict[str, str]:
@@ -80,7 +73,7 @@ def render(records: list[dict[str, Any]], table: pd.DataFrame | None = None) -> 
                 seeds = "" if board.is_aggregate else f", {board.seeds}"
                 first = board._replace(rows=board.current[:PAGE])
                 parts += [f"### {as_markdown(board.title)}{seeds}",
-                          shown(first, "", compact=False).markdown()]
+                          plain_table(first).markdown()]
                 if left := len(board.current) - len(first.rows):
                     parts.append(f"{left:,} more are in leaderboard.csv.")
     if site.boards:
@@ -92,11 +85,6 @@ def render(records: list[dict[str, Any]], table: pd.DataFrame | None = None) -> 
     texts = {name: found[name].map(as_cell) for name in ("environment", "method", "title")}
     plain = found.assign(**texts).to_csv(index=False, float_format="%.6g", lineterminator="\n")
     return {"leaderboard.csv": plain, "leaderboard.md": "\n\n".join(parts) + "\n"}
-
-
-def read_media(folder: Path) -> dict[str, bytes]:
-    """Environment -> animation, of those in a folder; none if there is no such folder."""
-    return {path.stem: path.read_bytes() for path in sorted(folder.glob(MEDIA))}
 
 
 def write_site(folder: Path, files: Mapping[str, bytes]) -> None:

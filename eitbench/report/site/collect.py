@@ -41,6 +41,11 @@ class Row(NamedTuple):
         return any(word in self.cells["note"] for word in ("floor", "reference", "privileged"))
 
     @property
+    def complete(self) -> bool:
+        """Whether it has finished every episode."""
+        return not any(word in self.cells["note"] for word in ("failed", "missing"))
+
+    @property
     def badges(self) -> tuple[str, ...]:
         """Words that mark it: why it has no rank, and that it is outdated."""
         return (*filter(None, self.cells["note"].split(", ")), *["outdated"] * self.outdated)

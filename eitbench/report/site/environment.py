@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from itertools import combinations
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 from markdown_it import MarkdownIt
@@ -14,8 +15,10 @@ from eitbench._files import shipped
 from eitbench.bench.statistics import paired_probability_of_improvement
 from eitbench.envs.pages import page
 from eitbench.report import charts
+from eitbench.report.site.beside import Beside
 from eitbench.report.site.collect import Board, Row, Site
-from eitbench.report.site.tables import explanations, more, rows_file, table, three
+from eitbench.report.site.tables import axes, explanations, more, rows_file, table, three
+from eitbench.report.site.trainings import agent
 from eitbench.report.templates import template
 
 NOMINAL = ("coverage_50", "coverage_90")
@@ -25,9 +28,9 @@ MOST, TOLD = 7, 5
 """Jagged curves that can be told apart, and how many are drawn strongly where there are more."""
 
 
-def environment_pages(site: Site, board: Board, animation: bytes | None) -> dict[str, bytes]:
-    """The HTML of the page, which offers to play an ``animation``, and the lines of its board for
-    which it has no room."""
+def environment_pages(site: Site, board: Board, beside: Beside) -> dict[str, bytes]:
+    """The HTML of the page, which offers to play the animation that lies ``beside`` the site, and
+    the lines of its board for which it has no room."""
     id = next(row.record["environment"]["id"] for row in board.rows if row.record)
     made = table(board, "../", compact=False)
     description, details = documentation(id)
@@ -35,15 +38,18 @@ def environment_pages(site: Site, board: Board, animation: bytes | None) -> dict
     lines = {} if longer is None else {
         longer.file.removeprefix("../"): rows_file(made, longer.file)}
     whole = board
+    animation = f"{board.environment}.webp"
     board = board._replace(rows=_charted(board))
     html = template("site/environment.html.j2").render(
-        root="../", season=site.season.number, board=whole, id=id, table=made, more=longer,
+        root="../", links=beside.links("../"), season=site.season.number, board=whole, id=id,
+        table=made, axes=axes(whole), more=longer,
         explanations=explanations([made]), charted=len(board.rows),
         description=description, details=details,
         front=_front(board), intervals=_intervals(board), curves=_curves(board),
         duels=_duels(board), calibration=_calibration(board), spread=_spread(board),
         learning=learning_curves(board.environment),
-        media_mb=f"{1e-6 * len(animation):.1f} MB" if animation else "",
+        moving=beside.picture(quote(animation), "../"),
+        media_mb=f"{1e-6 * beside.media.get(animation, 0):.1f} MB",
         siblings=[other for other in site.boards
                   if other.of_class == board.of_class and not other.is_aggregate])
     return lines | {f"environments/{board.environment}.html": html.encode()}
@@ -132,7 +138,7 @@ def _told(rows: list[Row]) -> list[Row]:
     kinds: dict[str, Row] = {}
     for row in rows:
         if row.competes:
-            kinds.setdefault(re.sub(r"seed\d+$", "", row.cells["method"]), row)
+            kinds.setdefault(agent(row.cells["method"]), row)
     unranked = [row for row in rows if row.unranked][:2]
     best = list(kinds.values())[:TOLD - len(unranked)]
     return [row for row in rows if row in unranked or row in best]

@@ -5,8 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 from eitbench.bench.records import finished
+from eitbench.report.site.beside import HEADLINE, Beside
 from eitbench.report.site.collect import Site, about_season
-from eitbench.report.site.tables import explanations, more, rows_file, table
+from eitbench.report.site.headline import headline, numbers
+from eitbench.report.site.tables import axes, explanations, more, rows_file, table
 from eitbench.report.templates import template
 
 ABOUT = {
@@ -19,17 +21,20 @@ ABOUT = {
 """What each class asks for."""
 
 
-def index_pages(site: Site) -> dict[str, bytes]:
+def index_pages(site: Site, beside: Beside) -> dict[str, bytes]:
     """The HTML of ``index.html``, and the lines for which it has no room."""
     made = {board.anchor: table(board, "", compact=True) for board in site.boards}
     longer = {anchor: more(each, anchor, "") for anchor, each in made.items()}
     classes: list[dict[str, Any]] = [{
         "name": name, "about": ABOUT[name],
-        "boards": [(board, made[board.anchor], longer[board.anchor]) for board in site.boards
-                   if board.of_class == name],
+        "boards": [(board, made[board.anchor], longer[board.anchor], axes(board))
+                   for board in site.boards if board.of_class == name],
     } for name in site.classes]
     html = template("site/index.html.j2").render(
-        root="", classes=classes, n_records=len(site.records), n_methods=len(site.methods),
+        root="", links=beside.links(""), headline=headline(site), numbers=numbers(site),
+        moving=beside.picture(HEADLINE[0], ""), still=beside.picture(HEADLINE[1], ""),
+        n_environments=sum(not board.is_aggregate for board in site.boards),
+        n_records=len(site.records), n_methods=len(site.methods), classes=classes,
         season=about_season(site.season),
         last=max(map(finished, site.records), default="")[:10],
         explanations=explanations(list(made.values())))

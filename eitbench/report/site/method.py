@@ -21,6 +21,7 @@ from eitbench.bench.table import NOTHING, Cell, Table, number_cell
 from eitbench.bench.text import scores_by_seed, seed_ranges
 from eitbench.report import charts
 from eitbench.report.boards import headings
+from eitbench.report.site.beside import METHODS, Beside
 from eitbench.report.site.collect import Board, Row, Site, title_of
 from eitbench.report.site.environment import markdown
 from eitbench.report.site.tables import SCALES, interval_cell, scale, three
@@ -31,7 +32,7 @@ Ends = Mapping[str, tuple[int, Mapping[str, tuple[float, float]]]]
 """Anchor of a board -> how many compete on it, and the ends of its drawn axes."""
 
 
-def method_pages(site: Site) -> dict[str, bytes]:
+def method_pages(site: Site, beside: Beside) -> dict[str, bytes]:
     """The HTML of the pages of all methods, by their path."""
     ends = {board.anchor: (sum(row.competes for row in board.rows),
                            {name: scale(board, name) for name in SCALES}) for board in site.boards}
@@ -42,18 +43,22 @@ def method_pages(site: Site) -> dict[str, bytes]:
     records: dict[str, list[dict[str, Any]]] = {name: [] for name in site.methods}
     for record in site.records:
         records[record["method"]].append(record)
-    return {f"methods/{name}.html": _page(name, records[name], standings[name], ends).encode()
+    return {f"methods/{name}.html":
+            _page(name, records[name], standings[name], ends, beside).encode()
             for name in site.methods}
 
 
-def _page(name: str, records: list[dict[str, Any]], standings: list[Standing], ends: Ends) -> str:
+def _page(name: str, records: list[dict[str, Any]], standings: list[Standing], ends: Ends,
+          beside: Beside) -> str:
     """The HTML of the page of all versions of a method."""
     records = sorted(records, key=lambda record: (record["official"], finished(record)),
                      reverse=True)
     versions = list(dict.fromkeys(record["version"] for record in records))
     return template("site/method.html.j2").render(
-        root="../", name=name, title=records[0]["title"], standings=_standings(standings, ends),
+        root="../", links=beside.links("../"), name=name, title=records[0]["title"],
+        standings=_standings(standings, ends),
         intervals=_intervals(standings),
+        checkout=f"../{beside.root}../" if METHODS in beside.found else "",
         versions=[_version([record for record in records if record["version"] == each],
                            standings) for each in versions])
 
@@ -75,7 +80,7 @@ def _standings(standings: list[Standing], ends: Ends) -> Table:
             "rank": Cell(NOTHING) if rank is None else Cell(str(rank), float(rank),
                                                             small=f"of {competing}"),
             "ẽ_c": interval_cell(row, "error", axes["error"]),
-            "gain": interval_cell(row, "gain", axes["gain"]),
+            "gain": interval_cell(row, "gain", axes["gain"], mark=0.0),
             "ms/step": number_cell(row.cells["seconds_per_step"])})
     return Table.of(rows, label="Boards", keep=list(rows[0]) if rows else ())
 
