@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 from eitbench import _check
 from eitbench._files import shipped
+from eitbench._foreign import where_of
 from eitbench.bench.tracks import BOARDS, TRACKS
 
 METHODS = "eitbench.methods"
@@ -281,7 +282,8 @@ def load_module(kind: str, path: Path, source: bytes) -> ModuleType:
         # a cached .pyc may lag behind an edit by a second
         exec(compile(source, path, "exec"), module.__dict__)
     except Exception as error:
-        raise ValueError(f"{kind} {path} cannot be loaded: {type(error).__name__}: {error}"
+        where = "" if isinstance(error, SyntaxError) else f" ({where_of(error, path)})"
+        raise ValueError(f"{kind} {path} cannot be loaded: {type(error).__name__}: {error}{where}"
                          ) from error
     return module
 

@@ -37,6 +37,17 @@ RL = ("torch", "stable_baselines3", "sb3_contrib", "yaml")
 """What the extra rl installs for training and for trained agents."""
 
 
+def numbers(seeds: str | None) -> list[int] | None:
+    """The episodes that are asked for, None if nothing is; ``ValueError`` without a split."""
+    from eitbench.data.seeds import parse_seeds
+    if seeds is None:
+        return None
+    if seeds[:1].isdigit():
+        asked = ", ".join(f"{split}:{seeds}" for split in ("train", "dev"))
+        raise ValueError(f"seeds must say of which split: {asked} or test:{seeds}; got {seeds!r}")
+    return parse_seeds(seeds)
+
+
 def say(text: object, *, err: bool = False) -> None:
     """Print what may hold a stranger's words: nothing in them moves the cursor."""
     typer.echo(cleaned(str(text), lines=True), err=err)
