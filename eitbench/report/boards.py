@@ -181,7 +181,7 @@ def class_of(record: dict[str, Any]) -> str:
 
 def _entries(records: list[dict[str, Any]]) -> list[Entry]:
     """The records of one environment on the board's episodes."""
-    floors = [record for record in records if _is_floor(record)]
+    floors = [record for record in records if is_floor(record)]
     floor = max(floors, key=lambda record: (record["official"], finished(record)), default=None)
     seeds = {seed for record in ([floor] if floor else records) for seed in record["seeds"]}
     zero = scores_by_seed(floor, "error") if floor else {}
@@ -234,11 +234,11 @@ def _counted(played: dict[str, list[Entry]]) -> dict[str, list[Entry]]:
     own = {environment: entries for environment, entries in played.items()
            if any(entry.gains for entry in entries)}
     official = {environment: entries for environment, entries in own.items()
-                if any(_is_floor(entry.record) and entry.record["official"] for entry in entries)}
+                if any(is_floor(entry.record) and entry.record["official"] for entry in entries)}
     return official or own
 
 
-def _is_floor(record: dict[str, Any]) -> bool:
+def is_floor(record: dict[str, Any]) -> bool:
     """Whether it is of the floor itself: a stranger's file may have its name, not its version."""
     return (record["method"] == FLOORS[track_of_board(record["board"])]
             and version_number(record["version"]) is not None)
