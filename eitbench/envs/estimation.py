@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from gymnasium.utils import EzPickle
 
 from eitbench import _check
 from eitbench.data.beginnings import Script, concentration_at, script, script_so_far
@@ -45,7 +44,7 @@ class Revealed(NamedTuple):
     """(T, p) axial velocity in m/s at `VelocityModel.points`; p = 0 where it is not asked for"""
 
 
-class EstimationEnv(gym.Env[Observation, np.ndarray], EzPickle):
+class EstimationEnv(gym.Env[Observation, np.ndarray]):
     """One episode of a world, seen through its voltages; the action is the estimate.
 
     At step i = 1, 2, … the agent has seen the measurements up to min(i, T) and says what it thinks
@@ -78,8 +77,6 @@ class EstimationEnv(gym.Env[Observation, np.ndarray], EzPickle):
     def __init__(self, name: str, *, world: dict[str, Any] | None = None,
                  lag: int | str | None = None, assume: dict[str, Any] | None = None,
                  episodes: int | None = None, render_mode: str | None = None) -> None:
-        EzPickle.__init__(self, name, world=world, lag=lag, assume=assume, episodes=episodes,
-                          render_mode=render_mode)
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError("render_mode must be None or one of "
                              f"{self.metadata['render_modes']}, got {render_mode!r}")
@@ -102,6 +99,11 @@ class EstimationEnv(gym.Env[Observation, np.ndarray], EzPickle):
     def task(self) -> Task:
         """What the agent may know; built on first use, since playing needs none of its models."""
         return make_task(self.world, self.lag, **self._assumed)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All of the episode, so that a copy, also in another process, goes on as this would; not
+        the models, which are made again."""
+        return {name: value for name, value in vars(self).items() if name != "task"}
 
     def reset(self, *, seed: int | None = None,
               options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:

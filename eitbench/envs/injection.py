@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from gymnasium.utils import EzPickle
 
 from eitbench import _check
 from eitbench.data.pool import Pool
@@ -27,7 +26,7 @@ if TYPE_CHECKING:
 OBSERVATIONS = ("scaled", "raw")
 
 
-class InjectionEnv(gym.Env[Any, Any], EzPickle):
+class InjectionEnv(gym.Env[Any, Any]):
     """One episode in which the agent chooses every injection.
 
     The reward is, for scored states, by how much the estimate's relative error ∫(ĉ_t − c_t)² /
@@ -57,8 +56,6 @@ class InjectionEnv(gym.Env[Any, Any], EzPickle):
                  estimator: str = "reduced", observation: str = "scaled",
                  gate: float | None = None, episodes: int | None = None,
                  render_mode: str | None = None) -> None:
-        EzPickle.__init__(self, name, world=world, estimator=estimator, observation=observation,
-                          gate=gate, episodes=episodes, render_mode=render_mode)
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be 'rgb_array' or None, got {render_mode!r}")
         self.render_mode = render_mode
@@ -76,6 +73,11 @@ class InjectionEnv(gym.Env[Any, Any], EzPickle):
     def task(self) -> Task:
         """What an estimator of one's own may know; built on first use."""
         return make_task(self.world)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All of the episode, so that a copy, also in another process, goes on as this would; not
+        the models, which are made again."""
+        return {name: value for name, value in vars(self).items() if name != "task"}
 
     def reset(self, *, seed: int | None = None,
               options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -198,8 +200,20 @@ class InjectionVectorEnv(LockstepVectorEnv):
         self._length = self._cores[0].length
         self._scaled = check_observation(observation, estimator)
         self._show(*spaces_of(self._cores[0], self._scaled))
-        self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
+        self._threads = threads
+        self._start_threads()
+
+    def _start_threads(self) -> None:
+        self._pool = ThreadPoolExecutor(self._threads) if self._threads > 1 else None
         self._map = self._pool.map if self._pool else map
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the threads: a copy has its own."""
+        return {name: value for name, value in vars(self).items() if name not in ("_pool", "_map")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._start_threads()
 
     def close_extras(self, **kwargs: Any) -> None:
         """Let the threads go."""
