@@ -204,8 +204,9 @@ def find_method(name: str, track: str) -> Path:
         known = installed_methods() | {each: folder / f"{each}.py" for each in own}
         path = known.get(name, Path())
     if not path.is_file():
+        names = [*own, *installed_methods()]
         raise ValueError(f"{form.kind} must be the path of {form.files}, or one of "
-                         f"{', '.join([*own, *installed_methods()])}; got {name!r}")
+                         f"{', '.join(names)}; got {name!r}{_check.nearest(name, names)}")
     if path.stat().st_size > MOST_BYTES:
         raise ValueError(f"{form.kind} {path} must have {MOST_BYTES >> 20} MiB at most")
     if path.stem in own and not path.samefile(folder / f"{path.stem}.py"):

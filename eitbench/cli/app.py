@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from eitbench import __version__
 from eitbench.cli import options
 from eitbench.cli.maintain import cards, held_out, kits, migrate
 from eitbench.cli.play import policies, report, run, typed
@@ -28,6 +29,20 @@ writes results/index.html.
 Algorithm = StrEnum("Algorithm", ["ppo", "dqn", "sac", "recurrent_ppo", "maskable_ppo"])
 Figure = StrEnum("Figure", {  # type: ignore[misc]
     re.sub(r"\W", "_", name).upper(): name for name in thesis().FIGURES})
+
+
+def _say_version(asked: bool) -> None:
+    if asked:
+        options.say(f"eitbench {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _main(
+    version: Annotated[bool, typer.Option(
+        "--version", callback=_say_version, is_eager=True, help="Say which this is.")] = False,
+) -> None:
+    pass
 
 
 @app.command("list")

@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
+from eitbench import _check
 from eitbench.bench.contradictions import version_number
 from eitbench.bench.records import finished, newest, read_record, read_records
 from eitbench.bench.scores import Score, scores
@@ -58,7 +59,8 @@ def find(name: str, folder: Path) -> list[dict[str, Any]]:
         records = [record for record in records if record["official"]] or records
     versions = sorted({record["version"] for record in records})
     if not records:
-        raise ValueError(f"there is no record of {name} in {folder}")
+        raise ValueError(f"there is no record of {name} in {folder}"
+                         + _check.nearest(method, {record["method"] for record in there}))
     if len(versions) > 1:
         found = ", ".join(f"{method}@{each}" for each in versions)
         raise ValueError(f"{name} fits several versions: {found}")
@@ -76,7 +78,8 @@ def comparable(name: str) -> Score:
     """The score of this name; ``ValueError`` if there is none of which less or more is better."""
     known = {each.name: each for each in scores().values() if each.better in ("lower", "higher")}
     if name not in known:
-        raise ValueError(f"score must be one of {', '.join(known)}; got {name!r}")
+        raise ValueError(f"score must be one of {', '.join(known)}; got {name!r}"
+                         + _check.nearest(name, known))
     return known[name]
 
 

@@ -233,7 +233,8 @@ def _changed(part: Any, changes: Mapping[str, Any], where: str) -> Any:
     made: dict[str, Any] = {}
     for name, value in changes.items():
         if name not in known:
-            raise ValueError(f"{where} has no {name!r}; there are {', '.join(known)}")
+            raise ValueError(f"{where} has no {name!r}; there are {', '.join(known)}"
+                             + _check.nearest(name, known))
         old = getattr(part, name)
         if is_dataclass(old) and isinstance(value, Mapping):
             made[name] = _changed(old, value, f"{where}.{name}")

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from eitbench import __version__
 from eitbench.bench import suites, tracks
 from eitbench.bench.methods import own_methods
 from eitbench.bench.tracks import ids
@@ -165,6 +166,11 @@ def test_every_option_has_a_help():
             assert param.help, f"{name} {param.name}"
 
 
+def test_version():
+    """That of the installed package."""
+    assert eitbench("--version")[:2] == (0, f"eitbench {__version__}\n")
+
+
 def test_module_can_be_run(monkeypatch, capsys):
     """`python -m eitbench.cli --help` is the same program."""
     monkeypatch.setattr(sys, "argv", ["eitbench", "--help"])
@@ -204,6 +210,11 @@ def test_documented_commands_are_commands():
     (["run", "--seeds", "", "--baseline", "mine.py", "-j", "1"], "seeds must look like"),
     (["run", "--env", "eitbench/Pipe4D-v0"], "env must be one of eitbench/Pipe2D-v0"),
     (["run", "--baseline", "kalman"], "one of extended_kalman_filter"),
+    (["run", "--env", "eitbench/pip2D-v0"], "Did you mean eitbench/Pipe2D-v0?"),
+    (["run", "--baseline", "kalman_fliter"], "Did you mean kalman_filter?"),
+    (["run", "--set", "instrument.noise_relativ=0.1"], "Did you mean noise_relative?"),
+    (["compare", "kalmann_filter", "homogeneous"], "Did you mean kalman_filter?"),
+    (["compare", "kalman_filter", "homogeneous", "--score", "eror"], "Did you mean error?"),
     (["run", "--baseline", "nowhere.py"], "got 'nowhere.py'"),
     (["run", "--baseline", "mine.py", "--baseline", "other/mine.py", "--seeds", "dev:1", "-j", "1"], "other/mine.py"),
     (["run", "--baseline", "empty.py"], "empty.py must define a class Estimator with a method update"),
