@@ -15,6 +15,7 @@ from eitbench.bench.table import NOTHING, Cell, Table
 from eitbench.bench.text import mean_and_interval, number, rounded, scores_by_seed
 from eitbench.bench.variants import flat, said
 from eitbench.report.charts import shortened
+from eitbench.report.plot import logarithmic
 from eitbench.report.summary import kind_of
 from eitbench.report.terminal import LONGEST
 
@@ -106,8 +107,8 @@ def draw(axes: Axes, sweep: Sweep) -> None:
             axes.errorbar(at, means, bars, label=shortened(method, LONGEST), marker="o",
                           markersize=4, capsize=3, linewidth=1.4)
     if are_numbers and min(sweep.values) > 0 and max(sweep.values) >= 8 * min(sweep.values):
-        axes.set_xscale("log")
-    axes.set_yscale("log")
+        logarithmic(axes, "x")
+    logarithmic(axes, "y")
     axes.set(xlabel=sweep.number, ylabel="ẽ_c (± 95 %)", title=f"{sweep.world}, {sweep.board}")
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
