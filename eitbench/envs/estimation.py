@@ -16,6 +16,7 @@ from eitbench.data.pool import Pool
 from eitbench.data.recordings import cycle_voltages, outline, step_error, velocity_error
 from eitbench.data.regions import score_mass
 from eitbench.data.seeds import warn_of_reserved
+from eitbench.envs.spec import KnowsItsLength
 from eitbench.worlds.parts import Discretisation
 from eitbench.worlds.registry import entry
 from eitbench.worlds.streams import randomness
@@ -44,7 +45,7 @@ class Revealed(NamedTuple):
     """(T, p) axial velocity in m/s at `VelocityModel.points`; p = 0 where it is not asked for"""
 
 
-class EstimationEnv(gym.Env[Observation, np.ndarray]):
+class EstimationEnv(KnowsItsLength, gym.Env[Observation, np.ndarray]):  # type: ignore[misc]
     """One episode of a world, seen through its voltages; the action is the estimate.
 
     At step i = 1, 2, … the agent has seen the measurements up to min(i, T) and says what it thinks
@@ -87,6 +88,7 @@ class EstimationEnv(gym.Env[Observation, np.ndarray]):
         """(n,) standard deviation in mol/m³ to draw beside the estimate, for whoever has one."""
         self.world, self.lag, self._assumed = asked_for(name, world, lag, assume)
         # The world played; estimators are given `task` instead.
+        self.episode_steps = self.world.n_steps + self.lag
         self._currents = cycle_currents(self.world, self.lag)
         self.observation_space: spaces.Dict  # type: ignore[assignment]
         self.observation_space, self.action_space = estimation_spaces(self.world)
@@ -124,8 +126,7 @@ class EstimationEnv(gym.Env[Observation, np.ndarray]):
 
         The flow's only where it is asked for. ``ValueError`` if it is not in the action space.
         """
-        last_step = self.world.n_steps + self.lag
-        if self._seed is None or self._step > last_step:
+        if self._seed is None or self._step > self.episode_steps:
             raise gym.error.ResetNeeded(RESET_NEEDED)
         action = checked_actions(action, self.action_space, self.n_nodes)  # type: ignore[arg-type]
         estimate, parameters = np.split(action, [self.n_nodes])
@@ -143,7 +144,8 @@ class EstimationEnv(gym.Env[Observation, np.ndarray]):
                 reward -= float(velocity_error(velocity, parameters, entry["velocity_moment"],
                                                entry["velocity_square"]))
         self._step += 1
-        return self._observe(), reward, self._step > last_step, False, {"step": self._step}
+        ended = self._step > self.episode_steps
+        return self._observe(), reward, ended, False, {"step": self._step}
 
     def _read(self, script: Script) -> None:
         """Play from this; of a beginning the rest is asked for when it is needed."""

@@ -16,6 +16,7 @@ from eitbench.data.seeds import warn_of_reserved
 from eitbench.envs.estimation import RESET_NEEDED
 from eitbench.envs.injection_core import FURTHEST, InjectionCore, scaled
 from eitbench.envs.lockstep import LockstepVectorEnv
+from eitbench.envs.spec import KnowsItsLength
 from eitbench.estimation.onboard.rules import Rules
 from eitbench.worlds.registry import entry
 from eitbench.worlds.task import Task, make_task
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 OBSERVATIONS = ("scaled", "raw")
 
 
-class InjectionEnv(gym.Env[Any, Any]):
+class InjectionEnv(KnowsItsLength, gym.Env[Any, Any]):  # type: ignore[misc]
     """One episode in which the agent chooses every injection.
 
     The reward is, for scored states, by how much the estimate's relative error ∫(ĉ_t − c_t)² /
@@ -64,6 +65,7 @@ class InjectionEnv(gym.Env[Any, Any]):
         self.rules = asked_for(name, world, gate, estimator)
         self.world = self.rules.world
         self._core = InjectionCore(self.rules, estimator)
+        self.episode_steps = self._core.length
         self._scaled = check_observation(observation, estimator)
         self.observation_space, self.action_space = spaces_of(self._core, self._scaled)
         self._step = 0
@@ -188,7 +190,8 @@ class InjectionVectorEnv(LockstepVectorEnv):
 
     def __init__(self, name: str, *, num_envs: int = 1, world: dict[str, Any] | None = None,
                  estimator: str = "reduced", observation: str = "scaled", gate: float | None = None,
-                 episodes: int | None = None, threads: int = 1) -> None:
+                 episodes: int | None = None, threads: int = 1,
+                 max_episode_steps: int | None = None) -> None:
         super().__init__(num_envs, episodes)
         threads = _check.integer("threads", threads, low=1)
         self.rules = rules = asked_for(name, world, gate, estimator)
@@ -198,6 +201,7 @@ class InjectionVectorEnv(LockstepVectorEnv):
         self._parts = [slice(first, first + size) for first in range(0, num_envs, size)]
         self._cores = [InjectionCore(rules, estimator) for _ in self._parts]
         self._length = self._cores[0].length
+        self._check_length(max_episode_steps)
         self._scaled = check_observation(observation, estimator)
         self._show(*spaces_of(self._cores[0], self._scaled))
         self._threads = threads
