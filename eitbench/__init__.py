@@ -15,26 +15,29 @@ if TYPE_CHECKING:
     from eitbench.data.episodes import Episode, simulate
     from eitbench.envs.pages import page
     from eitbench.estimation.onboard.rules import Rules
+    from eitbench.report import plot
     from eitbench.worlds.task import Estimate, Task, make_task
     from eitbench.worlds.world import World
 
 __version__ = "0.1.0"
 __all__ = ["Episode", "Estimate", "Rules", "Task", "World",
-           "evaluate", "make_task", "page", "register", "simulate"]
+           "evaluate", "make_task", "page", "plot", "register", "simulate"]
 
 _LATER = {"Estimate": "worlds.task", "Task": "worlds.task", "make_task": "worlds.task",
           "World": "worlds.world", "Episode": "data.episodes", "simulate": "data.episodes",
           "Rules": "estimation.onboard.rules", "page": "envs.pages",
           "evaluate": "bench.evaluation"}
 """Where the public names lie that are loaded on first use."""
+_MODULES = {"leaderboard": "bench", "plot": "report.plot"}
+"""And where the modules lie."""
 
 
 def __getattr__(name: str) -> Any:
-    """Load the public nouns, their makers and the leaderboards on first use."""
+    """Load the public nouns, their makers, leaderboards and pictures on first use."""
     if name in _LATER:
         return getattr(import_module(f"eitbench.{_LATER[name]}"), name)
-    if name == "leaderboard":
-        return import_module("eitbench.bench")
+    if name in _MODULES:
+        return import_module(f"eitbench.{_MODULES[name]}")
     raise AttributeError(f"module 'eitbench' has no attribute {name!r}")
 
 

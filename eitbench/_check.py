@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import json
 import math
 from collections.abc import Iterable
@@ -82,6 +83,14 @@ def array(name: str, value: object, shape: Iterable[int | None], *, units: str =
         raise ValueError(f"{name} must be positive{_in(units)}, got {result.min():g} at index "
                          f"{_first(result <= 0)}")
     return result
+
+
+def nearest(given: object, known: Iterable[str]) -> str:
+    """`` Did you mean …?``, to end a message that names what is ``known``; empty if nothing is
+    near."""
+    names = {name.casefold(): name for name in known}
+    found = difflib.get_close_matches(str(given).casefold(), names, n=1)
+    return f". Did you mean {names[found[0]]}?" if found else ""
 
 
 DEEPEST = 20

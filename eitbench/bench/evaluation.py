@@ -52,8 +52,8 @@ def evaluate(method: Any, env: str | gym.Env, seeds: str | Iterable[int], *,
     Exception
         Whatever the method raises, with a note that says in which episode.
     """
-    asked = _environment(env, world)
-    loaded = _method(method, asked.track)
+    asked = environment_of(env, world)
+    loaded = method_given(method, asked.track)
     numbers = parse_seeds(seeds) if isinstance(seeds, str) else [
         _check.integer("seeds", seed, low=0) for seed in seeds]
     if not numbers:
@@ -78,7 +78,7 @@ def _row(asked: Environment, method: Method, seed: int) -> dict[str, Any]:
             **scored(method.track, outcome)}
 
 
-def _environment(given: str | gym.Env, world: dict[str, Any] | None) -> Environment:
+def environment_of(given: str | gym.Env, world: dict[str, Any] | None) -> Environment:
     changes = {} if world is None else {"world": world}
     if isinstance(given, str):
         return Environment(given, json.dumps(changes))
@@ -90,7 +90,7 @@ def _environment(given: str | gym.Env, world: dict[str, Any] | None) -> Environm
     return Environment(spec.id, json.dumps(arguments | changes))
 
 
-def _method(given: Any, track: str) -> Method:
+def method_given(given: Any, track: str) -> Method:
     if isinstance(given, str | Path):
         return load_method(str(given), track)
     if not isinstance(given, type):

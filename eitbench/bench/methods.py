@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 from eitbench import _check
 from eitbench._files import shipped
+from eitbench._foreign import where_of
 from eitbench.bench.tracks import BOARDS, TRACKS
 
 METHODS = "eitbench.methods"
@@ -203,8 +204,9 @@ def find_method(name: str, track: str) -> Path:
         known = installed_methods() | {each: folder / f"{each}.py" for each in own}
         path = known.get(name, Path())
     if not path.is_file():
+        names = [*own, *installed_methods()]
         raise ValueError(f"{form.kind} must be the path of {form.files}, or one of "
-                         f"{', '.join([*own, *installed_methods()])}; got {name!r}")
+                         f"{', '.join(names)}; got {name!r}{_check.nearest(name, names)}")
     if path.stat().st_size > MOST_BYTES:
         raise ValueError(f"{form.kind} {path} must have {MOST_BYTES >> 20} MiB at most")
     if path.stem in own and not path.samefile(folder / f"{path.stem}.py"):
@@ -281,7 +283,8 @@ def load_module(kind: str, path: Path, source: bytes) -> ModuleType:
         # a cached .pyc may lag behind an edit by a second
         exec(compile(source, path, "exec"), module.__dict__)
     except Exception as error:
-        raise ValueError(f"{kind} {path} cannot be loaded: {type(error).__name__}: {error}"
+        where = "" if isinstance(error, SyntaxError) else f" ({where_of(error, path)})"
+        raise ValueError(f"{kind} {path} cannot be loaded: {type(error).__name__}: {error}{where}"
                          ) from error
     return module
 

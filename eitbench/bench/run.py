@@ -9,6 +9,7 @@ import platform
 import time
 from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,9 +17,10 @@ import scipy
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
-from eitbench._foreign import where_of
+from eitbench._foreign import traceback_of, where_of
 from eitbench.bench.methods import Method, find_method, load_method, version_of
 from eitbench.bench.playing import environment, play
+from eitbench.bench.prints import passed_on
 from eitbench.bench.records import SHARED
 from eitbench.bench.sandbox import guests
 from eitbench.bench.sandbox.host import GuestError
@@ -51,7 +53,8 @@ class Job(NamedTuple):
         track = self.environment.track
         if self.isolated:
             return guests.load(track, self.environment.id, self.environment.kwargs, self.method)
-        return load_method(self.method, track)
+        with passed_on(self.method):
+            return load_method(self.method, track)
 
     @property
     def isolation(self) -> str:
@@ -79,7 +82,7 @@ def run_episode(job: Job) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     -------
     result : dict
         JSON-ready: status "ok" with scores and the error of every scored step, or "failed" with a
-        message.
+        message, file and line, and the traceback of the method's own code.
     fields : dict of arrays
         The estimates' means and standard deviations (float32); empty for policies and after a
         failure.
@@ -89,7 +92,7 @@ def run_episode(job: Job) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     fields: dict[str, np.ndarray] = {}
     begin = time.perf_counter()
     try:
-        with threadpool_limits(1):
+        with threadpool_limits(1), passed_on(method.name):
             played = play(job.environment, method, job.seed)
             numbers = scored(method.track, played.outcome)
         said = {"scores": numbers, "step_errors": played.outcome.errors.tolist()}
@@ -98,7 +101,7 @@ def run_episode(job: Job) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         fields = played.fields
     # whatever a method does wrong is its result, not our crash
     except (Exception, SystemExit) as error:
-        result |= _failure(error)
+        result |= _failure(error, method.path)
     if job.isolated:
         result["peak_memory"] = guests.peak_memory()
     result["finished"] = datetime.now(UTC).isoformat(timespec="microseconds")
@@ -129,12 +132,13 @@ def _beginning(job: Job, method: Method) -> dict[str, Any]:
     }
 
 
-def _failure(error: BaseException) -> dict[str, Any]:
-    """What a result says of it."""
+def _failure(error: BaseException, own: Path) -> dict[str, Any]:
+    """What a result says of it; ``own`` is the method's file."""
     if isinstance(error, GuestError):
-        return {"status": "failed", "message": str(error), "where": error.where}
+        return {"status": "failed", "message": str(error), "where": error.where,
+                "traceback": error.traceback}
     return {"status": "failed", "message": f"{type(error).__name__}: {error}",
-            "where": where_of(error)}
+            "where": where_of(error, own), "traceback": traceback_of(error, own)}
 
 
 def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1, backend: str = "loky",
@@ -212,7 +216,7 @@ def _run_job(job: Job, store: EpisodeStore, run: dict[str, Any], home: str,
         result["identity"] = beginning["identity"]
     # what could be loaded in the beginning and cannot any more: that, too, is only its own result
     except Exception as error:
-        result, fields = beginning | _failure(error), {}
+        result, fields = beginning | _failure(error, Path(job.method)), {}
     # whose times these are, not who asked
     elsewhere = {} if platform.node() == home else {"machine": machine()}
     walls = {"walls": guests.walls()} if job.isolated else {}

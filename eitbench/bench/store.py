@@ -32,6 +32,8 @@ PACKAGES = ("eitbench", "numpy", "scipy", "gymnasium", "scikit-fem", "numba", "s
 """Whose versions a record names."""
 _OF_ALL = ("environment", "method", *SHARED)
 """What the results that make one record have in common."""
+_HERE = ("traceback",)
+"""What a result says for its user, and a record does not."""
 _NEEDED = {"identity", "seed", "finished", "status", "run", *_OF_ALL}
 _TEXTS = ("identity", "seed", "finished", "status", "method", "title", "board", "version",
           "method_sha256")
@@ -71,6 +73,14 @@ class EpisodeStore:
             else:
                 warnings.warn(f"{cleaned(str(path))} is left out: it is no result of an episode",
                               stacklevel=2)
+
+    def tracebacks(self, record: dict[str, Any]) -> dict[str, str]:
+        """Seed -> the lines of the method's own code that led to the failure of that episode."""
+        environment, method = record["environment"]["name"], record["method"]
+        failed = [episode["seed"] for episode in record["episodes"] if episode["status"] != "ok"]
+        kept = {seed: _read(self._path(environment, method, seed)) for seed in failed}
+        return {seed: str(result.get("traceback", "")) if result else ""
+                for seed, result in kept.items()}
 
     def fields(self, result: dict[str, Any]) -> dict[str, np.ndarray]:
         """The estimates that belong to a result: ``mean`` and perhaps ``std``, (T, n) in mol/m³.
@@ -174,7 +184,7 @@ def _gathered(results: list[dict[str, Any]]) -> dict[str, Any]:
         "schema": SCHEMA, "official": False, "split": split_of(latest["seed"]),
         **{key: latest[key] for key in _OF_ALL},
         "seeds": [result["seed"] for result in results], "runs": list(runs.values()),
-        "episodes": [{key: value for key, value in result.items() if key not in _OF_ALL}
+        "episodes": [{key: value for key, value in result.items() if key not in _OF_ALL + _HERE}
                      | {"run": place[run]} for result, run in zip(results, said, strict=True)],
     })
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,9 +38,10 @@ ISOLATE = ("never", "others", "always")
 
 
 def jobs(track: str, environments: list[str], methods: list[str], seeds: list[int] | None = None, *,
-         suite: str = "full", estimator: str = "full", isolate: str = "others") -> list[Job]:
-    """Every named method of a track in every named environment that it suits, ordered by
-    environment, method and seed.
+         suite: str = "full", estimator: str = "full", isolate: str = "others",
+         worlds: Sequence[dict[str, Any]] = ({},)) -> list[Job]:
+    """Every named method of a track in every named environment that it suits, and in each variant
+    of that, ordered by environment, method and seed.
 
     Parameters
     ----------
@@ -53,6 +56,8 @@ def jobs(track: str, environments: list[str], methods: list[str], seeds: list[in
         What stands inside environments that ask for injections: one of `tracks.ESTIMATORS`.
     isolate : str
         One of `ISOLATE`.
+    worlds : sequence of dict
+        Variants of each environment: what `gymnasium.make` takes as ``world``.
 
     Raises
     ------
@@ -71,9 +76,9 @@ def jobs(track: str, environments: list[str], methods: list[str], seeds: list[in
     todo = []
     names = dict[str, str]()
     fitting = set[str]()
-    for id in environments:
+    for id, changes in itertools.product(environments, worlds):
         check_track(id, track)
-        asked = Environment(id, json.dumps(given))
+        asked = Environment(id, json.dumps(given | ({"world": changes} if changes else {})))
         env = _to_look_at(asked)
         board = board_of(env)
         numbers = default_seeds(id, suite) if seeds is None else seeds
@@ -106,7 +111,8 @@ def is_isolated(environment: Environment, method: str, isolate: str) -> bool:
 def _to_look_at(asked: Environment) -> Any:
     """The environment, with whatever filter is made fastest: for what it asks, not to be played."""
     if asked.track == "injection":
-        asked = asked._replace(kwargs=json.dumps({"estimator": "reduced"}))
+        kwargs = json.loads(asked.kwargs) | {"estimator": "reduced"}
+        asked = asked._replace(kwargs=json.dumps(kwargs))
     return playing.environment(asked)
 
 

@@ -75,6 +75,26 @@ class Table(NamedTuple):
         numbers, which is empty."""
         return [_kind([row.cells[i] for row in self.rows]) for i in range(len(self.headings))]
 
+    def fitted(self, width: int, order: Sequence[str] = ()) -> Table:
+        """With as many columns as lines of ``width`` letters hold; what is not in ``order`` goes
+        first, the last column before the others, then what stands last there. The first of the
+        ``order`` stays."""
+        def place(heading: str) -> tuple[int, int]:
+            at = order.index(heading) if heading in order else len(order)
+            return at, self.headings.index(heading)
+
+        table = self
+        for heading in sorted(self.headings, key=place)[:0:-1]:
+            if len(table.markdown().partition("\n")[0]) <= width:
+                break
+            table = table._without(heading)
+        return table
+
+    def _without(self, heading: str) -> Table:
+        i = self.headings.index(heading)
+        rows = [row._replace(cells=row.cells[:i] + row.cells[i + 1:]) for row in self.rows]
+        return self._replace(headings=self.headings[:i] + self.headings[i + 1:], rows=rows)
+
     def markdown(self) -> str:
         """Also pleasant to read in a terminal."""
         said = [self.headings, *([cell.plain for cell in row.cells] for row in self.rows)]

@@ -4,17 +4,16 @@ season | held-out | migrate | cards | kits | leaderboard | compare | render | re
 from __future__ import annotations
 
 import re
-import shlex
-import sys
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from eitbench._foreign import cleaned
+from eitbench import __version__
 from eitbench.cli import options
 from eitbench.cli.maintain import cards, held_out, kits, migrate
+from eitbench.cli.play import policies, report, run, typed
 from eitbench.cli.season import app as season_commands
 from eitbench.cli.studies import thesis
 from eitbench.cli.trust import check, verify
@@ -27,10 +26,23 @@ A first look:  eitbench run  — runs our baselines on four test episodes, print
 writes results/index.html.
 """)
 
-Suite = StrEnum("Suite", ["quick", "full"])
 Algorithm = StrEnum("Algorithm", ["ppo", "dqn", "sac", "recurrent_ppo", "maskable_ppo"])
 Figure = StrEnum("Figure", {  # type: ignore[misc]
     re.sub(r"\W", "_", name).upper(): name for name in thesis().FIGURES})
+
+
+def _say_version(asked: bool) -> None:
+    if asked:
+        options.say(f"eitbench {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _main(
+    version: Annotated[bool, typer.Option(
+        "--version", callback=_say_version, is_eager=True, help="Say which this is.")] = False,
+) -> None:
+    pass
 
 
 @app.command("list")
@@ -67,36 +79,8 @@ def list_() -> None:
             options.say(f"  {name:40} {', '.join(method.boards):30}  {method.title}")
 
 
-@app.command()
-def run(
-    suite: Annotated[Suite, typer.Option(
-        help="quick: the 2D pipe, test:0-3, two minutes on two cores; full: every environment, "
-             "more seeds, methods that take long.")] = Suite.quick,
-    env: Annotated[list[str] | None, typer.Option(
-        help="Environment id; may be repeated. Default: suite's.")] = None,
-    baseline: Annotated[list[str] | None, typer.Option(
-        help="Name of one of ours, or the path of your own .py file; may be repeated. Default: "
-             "all of ours.")] = None,
-    seeds: Annotated[str | None, typer.Option(
-        help="Episodes, as in dev:0-9 or test:3. Default: the suite's.")] = None,
-    isolate: options.Isolate = options.Isolation.others,
-    jobs: options.Jobs = options.CORES,
-    backend: options.Backends = options.Backend.loky,
-    out: options.Out = Path("results"),
-) -> None:
-    """Run baselines on environments, print the table and write the page.
-
-    Each episode is stored the moment it is done; the same command again resumes where it was
-    interrupted.
-    """
-    from eitbench.bench import suites
-    from eitbench.bench.run import run_jobs
-    from eitbench.bench.store import EpisodeStore
-    with options.clear_errors():
-        todo = suites.jobs("estimation", env or [], baseline or [], _numbers(seeds), suite=suite,
-                           isolate=isolate)
-        run_jobs(todo, EpisodeStore(out), n_jobs=jobs, backend=backend, command=_command())
-        _report(out)
+app.command()(run)
+app.command()(policies)
 
 
 @app.command()
@@ -168,46 +152,6 @@ def train(
 
 
 @app.command()
-def policies(
-    env: options.InjectionId,
-    policy: Annotated[list[str] | None, typer.Option(
-        help="Name of one of ours, the path of your own .py file, or of an agent's model.zip; may "
-             "be repeated. Default: all of ours.")] = None,
-    seeds: Annotated[str | None, typer.Option(
-        help="Episodes, such as dev:0-49. Default: those of the boards.")] = None,
-    estimator: Annotated[str, typer.Option(
-        help="full: the exact filter, for scores; reduced: that of training.")] = "full",
-    isolate: options.Isolate = options.Isolation.others,
-    jobs: options.Jobs = options.CORES,
-    backend: options.Backends = options.Backend.loky,
-    out: options.Out = Path("results"),
-    records: Annotated[Path | None, typer.Option(
-        exists=True, file_okay=False,
-        help="Folder of records, such as leaderboards/results: what they hold of these episodes is "
-             "not played again.")] = None,
-) -> None:
-    """Play injection policies, print their scores and the environment's adaptivity gap.
-
-    Each episode is stored the moment it is done; the same command again resumes.
-    """
-    from eitbench.bench.run import run_jobs, unplayed
-    from eitbench.bench.store import EpisodeStore, results_in
-    from eitbench.bench.suites import jobs as jobs_of
-    from eitbench.report.policy_table import policy_rows, policy_table
-    with options.clear_errors():
-        todo = jobs_of("injection", [env], policy or [], _numbers(seeds), estimator=estimator,
-                       isolate=isolate)
-        before = results_in(records) if records else []
-        store = EpisodeStore(out)
-        run_jobs(unplayed(todo, before), store, n_jobs=jobs, backend=backend, command=_command())
-    asked = {job.load().name: job.load().privileged for job in todo}
-    rows = policy_rows(todo, [*before, *store.results()])
-    options.say(policy_table(rows, [name for name, privileged in asked.items() if privileged]))
-    _say_failures([record for record in store.write_records()
-                   if record["method"] in asked and record["environment"]["id"] == env])
-
-
-@app.command()
 def submit(
     env: options.Environments = None,
     baseline: Annotated[str | None, typer.Option(
@@ -236,9 +180,10 @@ def submit(
     with options.clear_errors():
         if baseline and policy:
             raise ValueError("one of --baseline and --policy may be given, got both")
-        for path in submit(baseline or policy, env or [], _numbers(seeds), EpisodeStore(out), to,
+        seeds_asked = options.numbers(seeds)
+        for path in submit(baseline or policy, env or [], seeds_asked, EpisodeStore(out), to,
                            policy=policy is not None, official=official, isolate=isolate,
-                           n_jobs=jobs, backend=backend, command=_command()):
+                           n_jobs=jobs, backend=backend, command=typed()):
             episodes = read_record(path)["episodes"]
             failed = sum(episode["status"] != "ok" for episode in episodes)
             options.say(f"wrote {path}: {len(episodes)} episodes"
@@ -271,7 +216,7 @@ def leaderboard(
     """
     if records is None:
         with options.clear_errors():
-            return _report(out)
+            return report(out)
     from eitbench._files import write_atomically
     from eitbench.data.seasons import season_numbered
     from eitbench.report.boards import boards, read_for_boards
@@ -297,17 +242,20 @@ def compare(
     a: Annotated[str, typer.Argument(
         help="A record's file, or METHOD or METHOD@VERSION among the records.")],
     b: Annotated[str, typer.Argument(help="The same of the other.")],
-    records: Annotated[Path, typer.Option(help="Folder of the records.")] = options.RECORDS,
+    records: Annotated[Path | None, typer.Option(
+        help="Folder of the records. Default: leaderboards/results, and where there is none the "
+             "records that come with the package.")] = None,
     score: Annotated[str, typer.Option(help="By which score.")] = "error",
     html: Annotated[Path | None, typer.Option(help="Write a page too.")] = None,
 ) -> None:
     """Compare two methods seed by seed: differences with intervals, and how often the first is
-    better."""
+    better; over several environments by gains, as on the boards."""
     from eitbench._files import write_atomically
     from eitbench.report import compare as comparison
+    folder = records or options.records_there()
     with options.clear_errors():
-        ours, theirs = (comparison.find(name, records) for name in (a, b))
-        table = comparison.compare(ours, theirs, score)
+        ours, theirs = (comparison.find(name, folder) for name in (a, b))
+        table = comparison.compare(ours, theirs, score, comparison.floors(folder))
     names = comparison.names(ours[0], theirs[0])
     options.say(comparison.shown(table, *names, score).markdown())
     if html is not None:
@@ -354,45 +302,8 @@ def reproduce(
 ) -> None:
     """Draw a figure of the thesis from our data, and say what agrees and what differs."""
     with options.clear_errors():
-        path, remark = thesis().FIGURES[name.value](_numbers(seeds), jobs, out)
+        path, remark = thesis().FIGURES[name.value](options.numbers(seeds), jobs, out)
     options.say(f"wrote {path}\n{remark}")
-
-
-def _numbers(seeds: str | None) -> list[int] | None:
-    """What is asked for; None if nothing is."""
-    from eitbench.data.seeds import parse_seeds
-    return None if seeds is None else parse_seeds(seeds)
-
-
-def _report(out: Path) -> None:
-    from eitbench._files import write_atomically
-    from eitbench.bench.store import EpisodeStore
-    from eitbench.report.page import write_page
-    from eitbench.report.summary import shown, summary
-    store = EpisodeStore(out)
-    records = store.write_records()
-    if not records:
-        raise typer.BadParameter(f"no results in {out}; make some with `eitbench run`")
-    table = summary(records)
-    text = shown(table).markdown()
-    write_atomically(out / "leaderboard.md", f"{text}\n".encode())
-    options.say(text)
-    _say_failures(records)
-    write_page(store, records, table)
-    options.say(f"\nwrote {out / 'index.html'}")
-
-
-def _command() -> str:
-    """What was typed."""
-    return shlex.join(["eitbench", *sys.argv[1:]])
-
-
-def _say_failures(records: list[dict[str, Any]]) -> None:
-    for record in records:
-        for episode in record["episodes"]:
-            if episode["status"] != "ok":
-                options.say(f"failed: {record['method']} on {episode['seed']}: "
-                            f"{cleaned(episode['message'])}", err=True)
 
 
 if __name__ == "__main__":

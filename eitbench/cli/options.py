@@ -11,6 +11,7 @@ from typing import Annotated
 
 import typer
 
+from eitbench._files import shipped
 from eitbench._foreign import cleaned
 from eitbench.data.parallel import WorkerLost
 
@@ -35,6 +36,22 @@ METHODS = Path("leaderboards/methods")
 
 RL = ("torch", "stable_baselines3", "sb3_contrib", "yaml")
 """What the extra rl installs for training and for trained agents."""
+
+
+def records_there() -> Path:
+    """The folder of records to read: that of a checkout, or the one that comes with the package."""
+    return RECORDS if RECORDS.is_dir() else shipped("leaderboards") / "results"
+
+
+def numbers(seeds: str | None) -> list[int] | None:
+    """The episodes that are asked for, None if nothing is; ``ValueError`` without a split."""
+    from eitbench.data.seeds import parse_seeds
+    if seeds is None:
+        return None
+    if seeds[:1].isdigit():
+        asked = ", ".join(f"{split}:{seeds}" for split in ("train", "dev"))
+        raise ValueError(f"seeds must say of which split: {asked} or test:{seeds}; got {seeds!r}")
+    return parse_seeds(seeds)
 
 
 def say(text: object, *, err: bool = False) -> None:

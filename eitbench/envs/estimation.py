@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from gymnasium.utils import EzPickle
 
 from eitbench import _check
 from eitbench.data.beginnings import Script, concentration_at, script, script_so_far
@@ -17,6 +16,7 @@ from eitbench.data.pool import Pool
 from eitbench.data.recordings import cycle_voltages, outline, step_error, velocity_error
 from eitbench.data.regions import score_mass
 from eitbench.data.seeds import warn_of_reserved
+from eitbench.envs.spec import KnowsItsLength
 from eitbench.worlds.parts import Discretisation
 from eitbench.worlds.registry import entry
 from eitbench.worlds.streams import randomness
@@ -45,7 +45,7 @@ class Revealed(NamedTuple):
     """(T, p) axial velocity in m/s at `VelocityModel.points`; p = 0 where it is not asked for"""
 
 
-class EstimationEnv(gym.Env[Observation, np.ndarray], EzPickle):
+class EstimationEnv(KnowsItsLength, gym.Env[Observation, np.ndarray]):  # type: ignore[misc]
     """One episode of a world, seen through its voltages; the action is the estimate.
 
     At step i = 1, 2, … the agent has seen the measurements up to min(i, T) and says what it thinks
@@ -78,8 +78,6 @@ class EstimationEnv(gym.Env[Observation, np.ndarray], EzPickle):
     def __init__(self, name: str, *, world: dict[str, Any] | None = None,
                  lag: int | str | None = None, assume: dict[str, Any] | None = None,
                  episodes: int | None = None, render_mode: str | None = None) -> None:
-        EzPickle.__init__(self, name, world=world, lag=lag, assume=assume, episodes=episodes,
-                          render_mode=render_mode)
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError("render_mode must be None or one of "
                              f"{self.metadata['render_modes']}, got {render_mode!r}")
@@ -90,6 +88,7 @@ class EstimationEnv(gym.Env[Observation, np.ndarray], EzPickle):
         """(n,) standard deviation in mol/m³ to draw beside the estimate, for whoever has one."""
         self.world, self.lag, self._assumed = asked_for(name, world, lag, assume)
         # The world played; estimators are given `task` instead.
+        self.episode_steps = self.world.n_steps + self.lag
         self._currents = cycle_currents(self.world, self.lag)
         self.observation_space: spaces.Dict  # type: ignore[assignment]
         self.observation_space, self.action_space = estimation_spaces(self.world)
@@ -102,6 +101,11 @@ class EstimationEnv(gym.Env[Observation, np.ndarray], EzPickle):
     def task(self) -> Task:
         """What the agent may know; built on first use, since playing needs none of its models."""
         return make_task(self.world, self.lag, **self._assumed)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All of the episode, so that a copy, also in another process, goes on as this would; not
+        the models, which are made again."""
+        return {name: value for name, value in vars(self).items() if name != "task"}
 
     def reset(self, *, seed: int | None = None,
               options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
@@ -122,8 +126,7 @@ class EstimationEnv(gym.Env[Observation, np.ndarray], EzPickle):
 
         The flow's only where it is asked for. ``ValueError`` if it is not in the action space.
         """
-        last_step = self.world.n_steps + self.lag
-        if self._seed is None or self._step > last_step:
+        if self._seed is None or self._step > self.episode_steps:
             raise gym.error.ResetNeeded(RESET_NEEDED)
         action = checked_actions(action, self.action_space, self.n_nodes)  # type: ignore[arg-type]
         estimate, parameters = np.split(action, [self.n_nodes])
@@ -141,7 +144,8 @@ class EstimationEnv(gym.Env[Observation, np.ndarray], EzPickle):
                 reward -= float(velocity_error(velocity, parameters, entry["velocity_moment"],
                                                entry["velocity_square"]))
         self._step += 1
-        return self._observe(), reward, self._step > last_step, False, {"step": self._step}
+        ended = self._step > self.episode_steps
+        return self._observe(), reward, ended, False, {"step": self._step}
 
     def _read(self, script: Script) -> None:
         """Play from this; of a beginning the rest is asked for when it is needed."""

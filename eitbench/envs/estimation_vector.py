@@ -26,11 +26,12 @@ class EstimationVectorEnv(LockstepVectorEnv):
 
     def __init__(self, name: str, *, num_envs: int = 1, world: dict[str, Any] | None = None,
                  lag: int | str | None = None, assume: dict[str, Any] | None = None,
-                 episodes: int | None = None) -> None:
+                 episodes: int | None = None, max_episode_steps: int | None = None) -> None:
         super().__init__(num_envs, episodes)
         self.world, self._lag, _ = asked_for(name, world, lag, assume)
         self._show(*estimation_spaces(self.world))
         self._length = self.world.n_steps + self._lag
+        self._check_length(max_episode_steps)
         self._currents = cycle_currents(self.world, self._lag)
         self._n_nodes = outline(self.world).mass.shape[0]
 

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from gymnasium.utils import EzPickle
 
 from eitbench import _check
 from eitbench.data.pool import Pool
@@ -17,6 +16,7 @@ from eitbench.data.seeds import warn_of_reserved
 from eitbench.envs.estimation import RESET_NEEDED
 from eitbench.envs.injection_core import FURTHEST, InjectionCore, scaled
 from eitbench.envs.lockstep import LockstepVectorEnv
+from eitbench.envs.spec import KnowsItsLength
 from eitbench.estimation.onboard.rules import Rules
 from eitbench.worlds.registry import entry
 from eitbench.worlds.task import Task, make_task
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 OBSERVATIONS = ("scaled", "raw")
 
 
-class InjectionEnv(gym.Env[Any, Any], EzPickle):
+class InjectionEnv(KnowsItsLength, gym.Env[Any, Any]):  # type: ignore[misc]
     """One episode in which the agent chooses every injection.
 
     The reward is, for scored states, by how much the estimate's relative error ∫(ĉ_t − c_t)² /
@@ -57,8 +57,6 @@ class InjectionEnv(gym.Env[Any, Any], EzPickle):
                  estimator: str = "reduced", observation: str = "scaled",
                  gate: float | None = None, episodes: int | None = None,
                  render_mode: str | None = None) -> None:
-        EzPickle.__init__(self, name, world=world, estimator=estimator, observation=observation,
-                          gate=gate, episodes=episodes, render_mode=render_mode)
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be 'rgb_array' or None, got {render_mode!r}")
         self.render_mode = render_mode
@@ -67,6 +65,7 @@ class InjectionEnv(gym.Env[Any, Any], EzPickle):
         self.rules = asked_for(name, world, gate, estimator)
         self.world = self.rules.world
         self._core = InjectionCore(self.rules, estimator)
+        self.episode_steps = self._core.length
         self._scaled = check_observation(observation, estimator)
         self.observation_space, self.action_space = spaces_of(self._core, self._scaled)
         self._step = 0
@@ -76,6 +75,11 @@ class InjectionEnv(gym.Env[Any, Any], EzPickle):
     def task(self) -> Task:
         """What an estimator of one's own may know; built on first use."""
         return make_task(self.world)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All of the episode, so that a copy, also in another process, goes on as this would; not
+        the models, which are made again."""
+        return {name: value for name, value in vars(self).items() if name != "task"}
 
     def reset(self, *, seed: int | None = None,
               options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -186,7 +190,8 @@ class InjectionVectorEnv(LockstepVectorEnv):
 
     def __init__(self, name: str, *, num_envs: int = 1, world: dict[str, Any] | None = None,
                  estimator: str = "reduced", observation: str = "scaled", gate: float | None = None,
-                 episodes: int | None = None, threads: int = 1) -> None:
+                 episodes: int | None = None, threads: int = 1,
+                 max_episode_steps: int | None = None) -> None:
         super().__init__(num_envs, episodes)
         threads = _check.integer("threads", threads, low=1)
         self.rules = rules = asked_for(name, world, gate, estimator)
@@ -196,10 +201,23 @@ class InjectionVectorEnv(LockstepVectorEnv):
         self._parts = [slice(first, first + size) for first in range(0, num_envs, size)]
         self._cores = [InjectionCore(rules, estimator) for _ in self._parts]
         self._length = self._cores[0].length
+        self._check_length(max_episode_steps)
         self._scaled = check_observation(observation, estimator)
         self._show(*spaces_of(self._cores[0], self._scaled))
-        self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
+        self._threads = threads
+        self._start_threads()
+
+    def _start_threads(self) -> None:
+        self._pool = ThreadPoolExecutor(self._threads) if self._threads > 1 else None
         self._map = self._pool.map if self._pool else map
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the threads: a copy has its own."""
+        return {name: value for name, value in vars(self).items() if name not in ("_pool", "_map")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._start_threads()
 
     def close_extras(self, **kwargs: Any) -> None:
         """Let the threads go."""

@@ -31,6 +31,9 @@ class LockstepVectorEnv(gym.vector.VectorEnv[Observation, np.ndarray, np.ndarray
     episodes : int, optional
         How many training episodes an unseeded reset draws from; default: a growing number, see
         `eitbench.data.pool.Pool`.
+
+    Those of our environments also take ``max_episode_steps``, which gymnasium hands over from a
+    spec: the steps of an episode, which it does not change.
     """
 
     metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
@@ -49,6 +52,12 @@ class LockstepVectorEnv(gym.vector.VectorEnv[Observation, np.ndarray, np.ndarray
         self.single_action_space = action_space
         self.observation_space = batch_space(observation_space, self.num_envs)
         self.action_space = batch_space(action_space, self.num_envs)
+
+    def _check_length(self, max_episode_steps: int | None) -> None:
+        """``ValueError`` if gymnasium hands over another length than that of an episode."""
+        if max_episode_steps not in (None, self._length):
+            raise ValueError("max_episode_steps must be None or the steps of an episode, "
+                             f"{self._length}, got {max_episode_steps!r}")
 
     def reset(self, *, seed: int | list[int | None] | None = None,
               options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:

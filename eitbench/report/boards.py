@@ -204,7 +204,7 @@ def _entries(records: list[dict[str, Any]]) -> list[Entry]:
 
 def floor_of(records: list[dict[str, Any]]) -> dict[str, Any] | None:
     """Whose gain is 0, of the records of one environment; None if its floor is not among them."""
-    floors = [record for record in records if _is_floor(record)]
+    floors = [record for record in records if is_floor(record)]
     return max(floors, key=lambda record: (record["official"], finished(record)), default=None)
 
 
@@ -239,11 +239,11 @@ def _counted(played: dict[str, list[Entry]]) -> dict[str, list[Entry]]:
     own = {environment: entries for environment, entries in played.items()
            if any(entry.gains for entry in entries)}
     official = {environment: entries for environment, entries in own.items()
-                if any(_is_floor(entry.record) and entry.record["official"] for entry in entries)}
+                if any(is_floor(entry.record) and entry.record["official"] for entry in entries)}
     return official or own
 
 
-def _is_floor(record: dict[str, Any]) -> bool:
+def is_floor(record: dict[str, Any]) -> bool:
     """Whether it is of the floor itself: a stranger's file may have its name, not its version."""
     return (record["method"] == FLOORS[track_of_board(record["board"])]
             and version_number(record["version"]) is not None)

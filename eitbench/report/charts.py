@@ -107,7 +107,7 @@ def front(points: list[Point], x_label: str, y_label: str) -> str:
         fill = colour if p in best else "var(--card)"
         parts.append(_dot(f"fill:{fill};stroke:{colour};stroke-width:2", px(p.x), py(p.y),
                           f"{escape(p.name)}: {p.x:.3g}, {p.y:.3g}"))
-        name = _shortened(p.name, LONGEST)
+        name = shortened(p.name, LONGEST)
         if place := _room(px(p.x), py(p.y), LETTER * len(name), taken):
             x, y, anchor = place
             parts.append(f'<text class="name" x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">'
@@ -144,7 +144,7 @@ def calibration(series: list[Series], nominal: tuple[float, ...], x_label: str,
 def intervals(rows: list[Series], x_label: str, *, log: bool = True,
               mark: float | None = None) -> str:
     """A dot and its interval a row, over a logarithmic or linear axis, with a line at ``mark``."""
-    names = [_shortened(s.name, LONGEST_BESIDE) for s in rows]
+    names = [shortened(s.name, LONGEST_BESIDE) for s in rows]
     row_height = 28
     label = 24 + LETTER * max(8, *map(len, names))
     height = TOP + row_height * len(rows) + BOTTOM
@@ -262,7 +262,7 @@ def _said(tick: float) -> str:
     return f"{tick:,.0f}" if abs(tick) >= 1e4 else f"{tick:g}"
 
 
-def _shortened(name: str, letters: int) -> str:
+def shortened(name: str, letters: int) -> str:
     return name if len(name) <= letters else f"{name[:letters - 1].rstrip()}…"
 
 

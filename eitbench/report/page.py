@@ -25,6 +25,7 @@ from eitbench.data.seeds import for_scores, parse_seeds
 from eitbench.envs.rendering import FIELD_MAP, colour_range, draw_field
 from eitbench.numerics.mesh import Mesh
 from eitbench.report import charts
+from eitbench.report.failures import failures
 from eitbench.report.summary import board_label, explanations, method, shown
 from eitbench.report.templates import template
 from eitbench.worlds.task import Task
@@ -56,8 +57,8 @@ def _section(store: EpisodeStore, records: list[dict[str, Any]], name: str,
         "intervals": _intervals(table), "curves": _curves(ordered),
         "legend": [(i % charts.COLOURS, _title(record)) for i, record in enumerate(ordered)],
         "snapshots": _snapshots(store, ordered),
-        "failures": [(method(record), episode["seed"], episode["message"]) for record in ordered
-                     for episode in record["episodes"] if episode["status"] != "ok"],
+        "failures": [(method(failure.record), failure.seeds, failure.message, failure.traceback)
+                     for failure in failures(store, ordered)],
     }
 
 

@@ -46,7 +46,7 @@ def _without_training_seed(rows: pd.DataFrame) -> pd.Series:
     return rows["policy"].str.replace(r"_seed\d+$", "", regex=True)
 
 
-def policy_table(rows: pd.DataFrame, privileged: Sequence[str]) -> str:
+def policy_table(rows: pd.DataFrame, privileged: Sequence[str], letters: int | None = None) -> str:
     """Markdown: policies by their mean ẽ_c, and by how much each is worse than the best that is not
     privileged, both with 95 % intervals over episodes; the means of all other scores that any of
     them has; below it the adaptivity gap, if the policies for it were played.
@@ -54,6 +54,7 @@ def policy_table(rows: pd.DataFrame, privileged: Sequence[str]) -> str:
     Agents that differ in the seed of their training only are one policy: an episode's error is the
     mean of theirs. Policies that did not finish every episode are below all that did, with the
     number of those they did. What the filter says of itself has columns where an episode has it.
+    Of columns for which lines of so many ``letters`` have no room the last are left out.
     """
     if rows.empty:
         return "no episode was finished"
@@ -75,7 +76,11 @@ def policy_table(rows: pd.DataFrame, privileged: Sequence[str]) -> str:
             f"worse than {best} by": Cell(NOTHING) if name == best else behind,
             **{score.heading: _summarised(own, score) for score in others.values()}}
         lines.append(cells)
-    text = Table.of(lines, keep=list(lines[0])[:3]).markdown()
+    whole = Table.of(lines, keep=list(lines[0])[:3])
+    table = whole if letters is None else whole.fitted(letters, whole.headings)
+    text = table.markdown()
+    if left_out := whole.headings[len(table.headings):]:
+        text += f"\n\nno room for {', '.join(left_out)}"
     there = [name for name in OPEN_LOOP if name in errors]
     needed = [*there, "clairvoyant", "random_pair"]
     if there and set(needed) <= set(errors) and not errors[needed].isna().any().any():

@@ -3,7 +3,6 @@ board."""
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Mapping
@@ -18,12 +17,15 @@ from eitbench.bench.scores import scores
 from eitbench.bench.table import NOTHING, Cell, Table
 from eitbench.bench.text import mean_and_interval, number, rounded, scores_by_seed, seed_ranges
 from eitbench.bench.tracks import ids
+from eitbench.bench.variants import flat, said
 from eitbench.data.seasons import current_season, season_of
 from eitbench.scoring import skill
 
 SKILL = ("skill", "0 for the homogeneous estimate, 1 for the fixed-interval smoother that is told "
          "the true flow; both with the whole record, where the environment has such a board, so "
-         "that filters may fall below 0")
+         "that filters may fall below 0. With †, where these two did not play the same episodes: "
+         "1 − contrast, so that 0 is the homogeneous estimate of the whole record and 1 no error "
+         "at all")
 """Heading and explanation of the one number that follows from several records, not from an
 episode."""
 SPLITS = ["dev", "train", "own"]
@@ -31,8 +33,8 @@ SPLITS = ["dev", "train", "own"]
 _NOT_THE_WORLD = ("lag", "assume", "gate", "episodes", "render_mode", "observation", "estimator")
 """Arguments of an environment that its episodes do not depend on."""
 
-_ANCHORS = ("homogeneous", "true_model_smoother")
-"""Whose skills are 0 and 1."""
+ANCHORS = ("homogeneous", "true_model_smoother")
+"""Methods whose skills are 0 and 1."""
 Anchors = Mapping[tuple[str, str, str], Mapping[str, float]]
 """Method, world, split -> seed -> ẽ_c."""
 
@@ -51,10 +53,10 @@ def explanations() -> dict[str, str]:
     return dict(columns().values())
 
 
-def summary(records: list[dict[str, Any]]) -> pd.DataFrame:
+def summary(records: list[dict[str, Any]], known: Anchors | None = None) -> pd.DataFrame:
     """One row a record: world, board, environment, method, episodes, failed, (mean, half interval)
-    of each score."""
-    known = anchors(records)
+    of each score; skills between anchors that are ``known``, by default those among the records."""
+    known = anchors(records) if known is None else known
     table = pd.DataFrame([summary_row(record, known) for record in records])
     order = table["error"].map(lambda cell: math.inf if cell is None else cell[0])
     worlds = sorted(set(table["world"]), key=place_of_world)
@@ -72,7 +74,7 @@ def anchors(records: list[dict[str, Any]]) -> Anchors:
     found: dict[tuple[str, str, str], dict[str, Any]] = {}
     for record in records:
         # a stranger's of its name is none
-        if record["method"] in _ANCHORS and version_number(record.get("version", "v1")):
+        if record["method"] in ANCHORS and version_number(record.get("version", "v1")):
             key = (record["method"], world(record), record["split"])
             found[key] = max(found.get(key, record), record, key=lambda other: (
                 other["official"], BOARDS.index(other["board"]), finished(other)))
@@ -86,6 +88,7 @@ def summary_row(record: dict[str, Any], known: Anchors) -> dict[str, Any]:
         "world": world(record), "board": record["board"], "split": record["split"],
         "environment": record["environment"]["name"],
         "baseline": record["method"], "method": method(record),
+        "name": _believing(record, record["method"]),
         "seeds": seed_ranges(record["seeds"]),
         "episodes": len(status), "failed": sum(s != "ok" for s in status)}
     for name in columns():
@@ -105,16 +108,20 @@ def world(record: dict[str, Any]) -> str:
     changed = {key: value for key, value in environment["kwargs"].items()
                if value is not None and key not in _NOT_THE_WORLD}
     changed |= changed.pop("world", {})
-    return _kind(environment["id"]) + (f" ({_arguments(changed)})" if changed else "")
+    return kind_of(environment["id"]) + (f" ({_arguments(changed)})" if changed else "")
 
 
 def method(record: dict[str, Any]) -> str:
     """The method's title, and what it was made to believe: ``Linearised Kalman filter,
     assume.flow=real``."""
-    return ", ".join([record["title"], *filter(None, [_arguments(_beliefs(record))])])
+    return _believing(record, record["title"])
 
 
-def _kind(environment: str) -> str:
+def _believing(record: dict[str, Any], name: str) -> str:
+    return ", ".join([name, *filter(None, [_arguments(_beliefs(record))])])
+
+
+def kind_of(environment: str) -> str:
     """``eitbench/Pipe2DSmoothing-v0`` -> ``Pipe2D``."""
     name = re.sub(r"(FixedLag|Smoothing)(?=(-v\d+)?$)", "", environment)
     return name.removeprefix("eitbench/").removesuffix("-v0")
@@ -122,7 +129,7 @@ def _kind(environment: str) -> str:
 
 def place_of_world(name: str) -> tuple[int, str]:
     """Where a world stands: as the ids were registered, and after them what is not ours."""
-    kinds = [_kind(environment) for environment in ids()]
+    kinds = [kind_of(environment) for environment in ids()]
     kind = name.split(" (")[0]
     return kinds.index(kind) if kind in kinds else len(kinds), name
 
@@ -135,25 +142,14 @@ def _beliefs(record: dict[str, Any]) -> dict[str, Any]:
 
 def _arguments(arguments: dict[str, Any]) -> str:
     """``flow.mean_velocity=45.0, region=null``: those of parts by dotted names."""
-    return ", ".join(f"{key}={value if isinstance(value, str) else json.dumps(value)}"
-                     for key, value in sorted(_dotted(arguments).items()))
-
-
-def _dotted(arguments: dict[str, Any]) -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in arguments.items():
-        if isinstance(value, dict):
-            flat |= {f"{key}.{inner}": each for inner, each in _dotted(value).items()}
-        else:
-            flat[key] = value
-    return flat
+    return ", ".join(f"{key}={said(value)}" for key, value in sorted(flat(arguments).items()))
 
 
 def _skills(record: dict[str, Any], known: Anchors) -> dict[str, float]:
     """(E_bh − E)/(E_bh − E_ref) with the means over the seeds that all three have; one number, or
     none."""
     own = scores_by_seed(record, "error")
-    floor, reference = (known.get((name, world(record), record["split"]), {}) for name in _ANCHORS)
+    floor, reference = (known.get((name, world(record), record["split"]), {}) for name in ANCHORS)
     # a sum's last digit depends on the order
     shared = sorted(own.keys() & floor.keys() & reference.keys())
     if not shared:
@@ -175,7 +171,7 @@ def shown(table: pd.DataFrame, *, grouped: bool = False) -> Table:
             cells["board"] = board_label(row)
         failed = f", {row['failed']} failed" if row["failed"] else ""
         cells |= {"method": row["method"], "seeds": row["seeds"] + failed}
-        cells |= {heading: _cell(name, row[name]) for name, (heading, _) in columns().items()}
+        cells |= scores_shown(row)
         rows.append(cells)
     keep = [heading for name, (heading, _) in columns().items()
             if name == "skill" or known[name].everywhere]
@@ -193,6 +189,16 @@ def _place_of_split(split: str) -> int:
     """The latest season first."""
     season = season_of(split)
     return -season.number if season else SPLITS.index(split)
+
+
+def scores_shown(row: Any) -> dict[str, Cell | str]:
+    """Heading -> cell of each column of numbers of a summary's row."""
+    cells: dict[str, Cell | str] = {
+        heading: _cell(name, row[name]) for name, (heading, _) in columns().items()}
+    if row["skill"] is None and row["contrast_error"] is not None:
+        skill = 1.0 - row["contrast_error"][0]
+        cells[SKILL[0]] = Cell(f"{number(skill)}†", skill)
+    return cells
 
 
 def _cell(name: str, value: tuple[float, float] | None) -> Cell:

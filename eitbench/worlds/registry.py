@@ -12,6 +12,7 @@ from typing import Any
 
 import gymnasium as gym
 
+from eitbench import _check
 from eitbench.worlds.world import World
 
 GROUP = "eitbench.worlds"
@@ -104,7 +105,8 @@ def entries() -> dict[str, Entry]:
 def entry(id: str) -> Entry:
     """The entry of this id; ``ValueError`` naming all, if there is none."""
     if id not in _entries:
-        raise ValueError(f"env must be one of {', '.join(_entries)}; got {id!r}")
+        raise ValueError(f"env must be one of {', '.join(_entries)}; got {id!r}"
+                         + _check.nearest(id, _entries))
     return _entries[id]
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from eitbench import _check
+from eitbench._html import small_table
 from eitbench.physics.observation import LinearConductivity, ObservationModel, VoltageNoise
 from eitbench.worlds.instrument import Instrument
 from eitbench.worlds.parts import Discretisation, History, Prior
@@ -195,6 +196,15 @@ class World:
         """Without what is derived: a hash holds in its own process only."""
         return {each.name: getattr(self, each.name) for each in fields(self)}
 
+    def _repr_html_(self) -> str:
+        """Every number of each part."""
+        parts = {each.name: getattr(self, each.name) for each in fields(self)}
+        name = parts.pop("name")
+        rows = {part: f"{type(value).__name__}: " + ", ".join(
+                    f"{each.name} = {getattr(value, each.name)}" for each in fields(value))
+                if is_dataclass(value) else str(value) for part, value in parts.items()}
+        return small_table(f"World {name}", rows)
+
     # -- variants --
 
     def changed(self, changes: Mapping[str, Any] | None) -> World:
@@ -233,7 +243,8 @@ def _changed(part: Any, changes: Mapping[str, Any], where: str) -> Any:
     made: dict[str, Any] = {}
     for name, value in changes.items():
         if name not in known:
-            raise ValueError(f"{where} has no {name!r}; there are {', '.join(known)}")
+            raise ValueError(f"{where} has no {name!r}; there are {', '.join(known)}"
+                             + _check.nearest(name, known))
         old = getattr(part, name)
         if is_dataclass(old) and isinstance(value, Mapping):
             made[name] = _changed(old, value, f"{where}.{name}")

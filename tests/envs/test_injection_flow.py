@@ -45,7 +45,7 @@ def env():
 
 @pytest.fixture(scope="module")
 def shared(env):
-    return joint_operator._shared(env.world.sound)
+    return joint_operator.JointShared.of(env.world)
 
 
 def integrated(mesh, values: np.ndarray, region: tuple[float, float]) -> float:

@@ -7,8 +7,13 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from eitbench.bench.records import write_record
-from eitbench.bench.statistics import paired_difference, paired_probability_of_improvement
+from eitbench.bench.statistics import (
+    interquartile_mean,
+    paired_difference,
+    paired_probability_of_improvement,
+)
 from eitbench.bench.text import scores_by_seed
+from eitbench.report.boards import boards
 from eitbench.report.compare import compare, find, html, names, shown
 
 from tables import said
@@ -33,22 +38,51 @@ def errors_of(records):
 
 
 def test_numbers_are_those_of_the_statistics():
-    """Environment by environment and over all: differences, shares, and their intervals."""
+    """Environment by environment: differences, shares, and their intervals."""
     a, b = two_methods()
     table = compare(a, b).set_index("environment")
-    assert list(table.index) == [PIPE_NAME, TANK_NAME, "all"] and list(table["episodes"]) == [12, 12, 24]
+    assert list(table.index) == [PIPE_NAME, TANK_NAME] and list(table["episodes"]) == [12, 12]
     x, y = errors_of(a), errors_of(b)
-    for name, these in ((PIPE_NAME, [PIPE_NAME]), (TANK_NAME, [TANK_NAME]), ("all", [PIPE_NAME, TANK_NAME])):
-        own, other = ({each: scores[each] for each in these} for scores in (x, y))
+    for name in (PIPE_NAME, TANK_NAME):
+        own, other = ({name: scores[name]} for scores in (x, y))
         assert tuple(table.loc[name, ["difference", "low", "high"]]) == paired_difference(own, other)
         assert tuple(table.loc[name, ["better", "better_low", "better_high"]]) == (
             paired_probability_of_improvement(own, other))
-        assert table["a"][name] == pytest.approx(np.mean([np.mean(list(s.values())) for s in own.values()]))
+        assert table["a"][name] == pytest.approx(np.mean(list(x[name].values())))
         assert table["a"][name] - table["b"][name] == pytest.approx(table["difference"][name])
     assert table["high"][TANK_NAME] < 0 < table["better_low"][TANK_NAME]
     swapped = compare(b, a).set_index("environment")
     np.testing.assert_allclose(swapped["difference"], -table["difference"])
     np.testing.assert_allclose(swapped["better"], 1 - table["better"])
+
+
+def test_over_environments_gains_are_compared():
+    """a halves the error of the pipe and is a little worse in the tank, whose errors are a hundred times larger: by
+    gains it is better, as the boards say of the same records. Without floors there is nothing over all."""
+    floor = [record("homogeneous", [scale] * 12, official=True, **where)
+             for scale, where in ((0.02, {}), (2.0, {"id": TANK}))]
+    noise = 1.0 + 0.01 * np.random.default_rng(1).normal(size=12)
+    a, b = ([record(name, (scale * 0.02 * noise).tolist(), official=True),
+             record(name, (other * 2.0 * noise).tolist(), id=TANK, official=True)]
+            for name, scale, other in (("a", 0.25, 0.52), ("b", 0.5, 0.5)))
+    table = compare(a, b, zero=floor)
+    assert list(table["environment"]) == [PIPE_NAME, TANK_NAME, "all filter"]
+    assert list(table["score"]) == ["error", "error", "gain"] and table["episodes"][2] == 24
+    one, other = ({name: {seed: 1 - error / scale for seed, error in errors.items()}
+                   for (name, errors), scale in zip(errors_of(side).items(), (0.02, 2.0), strict=True)}
+                  for side in (a, b))
+    assert table["a"][2] == pytest.approx(interquartile_mean(*[list(each.values()) for each in one.values()]))
+    assert tuple(table.loc[2, ["difference", "low", "high"]]) == pytest.approx(
+        paired_difference(one, other, statistic=interquartile_mean), rel=1e-12)
+    assert table["low"][2] > 0 and table["better"][2] == 0.5
+    on_boards = boards([*floor, *a, *b])
+    gains = on_boards[on_boards["environment"] == "all"].set_index("method")["gain"]
+    assert (table["a"][2], table["b"][2]) == pytest.approx((gains["a"], gains["b"]), rel=1e-12)
+    text = said(shown(table, "a", "b"))
+    assert list(text["verdict"]) == ["a", "b", "a"] and text["ẽ_c of a"][2].startswith("gain 0.")
+    assert list(compare(a, b)["environment"]) == [PIPE_NAME, TANK_NAME]
+    others = compare(a, b, "seconds_per_step", floor)
+    assert list(others["environment"]) == [PIPE_NAME, TANK_NAME, "all"]
 
 
 def test_only_shared_episodes_count():
@@ -59,7 +93,7 @@ def test_only_shared_episodes_count():
     assert (row["episodes"], row["a"], row["b"], row["better"]) == (1, 0.1, 0.4, 1.0)
     dev = [record(name, {"dev:0": error}) for name, error in (("a", 0.2), ("b", 0.1))]
     table = compare([*a, dev[0]], [dev[1], *b])
-    assert list(table["environment"]) == [PIPE_NAME, f"{PIPE_NAME} (dev seeds)", "all"]
+    assert list(table["environment"]) == [f"{PIPE_NAME} (dev seeds)", PIPE_NAME]
     assert row["difference"] == pytest.approx(-0.3) and (row["low"], row["high"]) == (-math.inf, math.inf)
 
 
@@ -116,7 +150,7 @@ def test_words_follow_from_the_intervals():
     assert re.fullmatch(r"-0\.\d+ \(-0\.\d+ to -0\.\d+\)", text["difference"][1])
     assert re.fullmatch(r"\d+ % \(\d+ to \d+ %\)", text["mine better"][0])
     lines = shown(table, "mine", "yours").markdown().splitlines()
-    assert len(lines) == 5 and len({len(line) for line in lines}) == 1 and all(
+    assert len(lines) == 4 and len({len(line) for line in lines}) == 1 and all(
         cell in lines[3] for cell in text.iloc[1])
     few = said(shown(compare([record("a", [0.1])], [record("b", [0.4])]), "a", "b"))
     assert (few["verdict"][0], few["a better"][0], few["difference"][0]) == ("–", "100 %", "-0.3")
@@ -142,6 +176,6 @@ def test_page_needs_nothing_else():
     assert found == said(shown(table, evil, "yours")).to_numpy().ravel().tolist()
     circles = [float(circle.get("cx")) for circle in tree.iter("circle")]
     assert [x < 48 for x in circles] == [difference < 0 for difference in table["difference"]]
-    assert len(list(tree.iter("line"))) == len(list(tree.iter("path"))) == 3
+    assert len(list(tree.iter("line"))) == len(list(tree.iter("path"))) == 2
     few = html(compare([record("a", [0.1])], [record("b", [0.4])]), "a", "b")
     assert '<line x1="4.0" x2="4.0"' in few            # no interval, and the only difference

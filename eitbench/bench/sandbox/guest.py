@@ -8,7 +8,9 @@ be kept can be opened.
 
 from __future__ import annotations
 
+import io
 import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,7 +18,7 @@ from typing import Any
 import cloudpickle
 import numpy as np
 
-from eitbench._foreign import where_of
+from eitbench._foreign import traceback_of, where_of
 from eitbench.bench.sandbox import wall, wire
 from eitbench.bench.sandbox.keeper import Limits
 from eitbench.worlds import streams
@@ -36,6 +38,8 @@ def main(folder: str, limits: Limits, separate: list[str]) -> None:
     silent = os.open(os.devnull, os.O_RDWR)
     for stream in range(3):  # what the guest prints is no answer
         os.dup2(silent, stream)
+    prints = _Prints()
+    sys.stdout = sys.stderr = prints
     readable = wall.python_files()
     walls = list(separate)
     wall.limit(limits, counts_apart="user" in separate)
@@ -53,12 +57,13 @@ def main(folder: str, limits: Limits, separate: list[str]) -> None:
         return content
 
     def say(words: dict[str, Any], arrays: dict[str, np.ndarray] | None = None) -> None:
-        outgoing.write(wire.pack(words, arrays))
+        outgoing.write(wire.pack(words | prints.taken(), arrays))
         outgoing.flush()
 
     say({"walls": sorted(walls), "readable": [str(place) for place in readable],
          "process": wall.own_number()})
     answer: Callable[..., Reply] = _nothing
+    own = Path()
     while True:
         try:
             words, arrays = wire.unpack(read)
@@ -66,12 +71,32 @@ def main(folder: str, limits: Limits, separate: list[str]) -> None:
             return
         try:
             if words["do"] == "play":
+                own = Path(words["name"])
                 answer, about = _player(words, arrays)
                 say(about)
             else:
                 say(*answer(words, arrays))
         except (Exception, SystemExit) as error:
-            say({"error": f"{type(error).__name__}: {error}", "where": where_of(error)})
+            say({"error": f"{type(error).__name__}: {error}", "where": where_of(error, own),
+                 "traceback": traceback_of(error, own)})
+
+
+class _Prints(io.TextIOWrapper):
+    """Where the method prints: the first letters go along with the next answer."""
+
+    def __init__(self) -> None:
+        super().__init__(io.BytesIO())
+        self._kept = ""
+
+    def write(self, text: str) -> int:
+        self._kept = (self._kept + text)[:wire.PRINTED]
+        return len(text)
+
+    def taken(self) -> dict[str, str]:
+        """What there is, as words of an answer."""
+        printed = self._kept.encode(errors="replace").decode()
+        self._kept = ""
+        return {"printed": printed} if printed else {}
 
 
 def _nothing(words: dict[str, Any], arrays: dict[str, np.ndarray]) -> Reply:

@@ -24,6 +24,7 @@ import numpy as np
 
 from eitbench._files import PACKAGE
 from eitbench.bench.methods import is_ours, is_path
+from eitbench.bench.prints import Prints
 from eitbench.bench.sandbox import keeper, wire
 from eitbench.bench.sandbox.keeper import Limits
 from eitbench.data.store import CACHE_VARIABLE, cache_folder, folder, kinds
@@ -50,6 +51,8 @@ class GuestError(RuntimeError):
     """The guest raised an exception, broke a limit, or does not speak the language."""
 
     where: str = "guest"
+    traceback: str = ""
+    """The lines of the method's own code that led to it."""
 
 
 class Guest:
@@ -82,6 +85,9 @@ class Guest:
         self._patience = patience
         self._left = ENDURANCE
         """s that answers may still take in this episode"""
+        self._prints = Prints(name)
+        self._printed = 0
+        """letters that it has printed in this episode"""
         self.sha256 = ""
         """Of the file that was copied; empty for one of ours."""
         self._private = Path(tempfile.mkdtemp(prefix="eitbench-guest-"))
@@ -117,6 +123,7 @@ class Guest:
         """A new episode: another estimator or policy, of the same class; a policy's generator
         draws what this one would."""
         self._left = ENDURANCE
+        self._printed = 0
         state = None if random is None else random.bit_generator.state
         self._ask({"do": "begin", "random": state})
 
@@ -158,6 +165,7 @@ class Guest:
     def close(self) -> None:
         """End it and its children, and remove its folder."""
         self._end()
+        self._prints.end()
         for pipe in (self._process.stdin, self._process.stdout, self._process.stderr):
             if pipe:
                 pipe.close()
@@ -222,12 +230,22 @@ class Guest:
         except BaseException:  # whatever it says from now on would answer another question
             self._end()
             raise
+        self._pass_on(str(answer[0].pop("printed", "")))
         if "error" in answer[0]:
             own = f"{self._private}{os.sep}own{os.sep}"
             error = GuestError(_plain(answer[0]["error"]).replace(own, ""))
             error.where = _plain(answer[0].get("where"))
+            error.traceback = _plain(answer[0].get("traceback"))
             raise error
         return answer
+
+    def _pass_on(self, printed: str) -> None:
+        """Show what it has printed since its last answer, as long as that is not too much."""
+        shown = printed[:max(0, wire.PRINTED - self._printed)]
+        if len(shown) < len(printed) and self._printed <= wire.PRINTED:
+            shown += f"\n… more than {wire.PRINTED} letters in an episode are not shown\n"
+        self._printed += len(printed)
+        self._prints.write(shown)
 
     def _send(self, message: bytes) -> None:
         assert self._process.stdin is not None

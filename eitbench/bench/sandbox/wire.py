@@ -25,6 +25,8 @@ KIND = re.compile(r"[<>|][biuf](1|2|4|8|12|16)")
 """Of numbers in arrays; numpy would take other words for programs."""
 BITS = 132
 """Of an integer with its sign; the state of a generator has 128."""
+PRINTED = 10_000
+"""letters of what a guest prints that are passed on: with one answer, and in one episode"""
 ARRAYS, AXES = 64, 32
 """How many arrays a message may have, and each of them axes."""
 

@@ -9,7 +9,6 @@ table of few velocities serves the one of reduced order.
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -93,7 +92,7 @@ class JointReducedOperator(ReducedOperator):
 
     @staticmethod
     def _share(world: World) -> Shared:
-        return _shared(world.sound)
+        return JointShared.of(world)
 
     @property
     def state(self) -> np.ndarray:
@@ -159,9 +158,6 @@ class JointShared(Shared):
         return ReducedJointFilter(self._single, mean.astype(np.float32),
                                   covariance.astype(np.float32), self.walk_std,
                                   (BOUNDS[0] * nominal, BOUNDS[1] * nominal))
-
-
-_shared = lru_cache(maxsize=2)(JointShared)
 
 
 def one_velocity(task: Task) -> VelocityModel:

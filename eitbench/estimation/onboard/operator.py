@@ -8,7 +8,7 @@ on, and `eitbench.estimation.onboard.joint_operator` those for a flow that is to
 from __future__ import annotations
 
 import math
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import combinations
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
@@ -152,6 +152,13 @@ class Levels:
         """number of a level -> (its concentration, 𝓡, derivatives (L, L, n) by the state); the last
         64 are kept"""
 
+    def __deepcopy__(self, memo: dict[int, Any]) -> Levels:
+        return self
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Another process makes its own."""
+        return levels_of, (self.world,)
+
     def best(self, frame: np.ndarray, broken: float) -> int:
         """Number of the level that fits the voltages (K, L) best, weighted as in
         `best_homogeneous`; readings further than ``broken`` standard deviations away count as that
@@ -159,6 +166,11 @@ class Levels:
         of = frame if math.isinf(broken) else self._homogeneous
         off = (frame - self._homogeneous) / self.world.noise.std(of)
         return int(LEVELS[np.argmin(np.minimum(off**2, broken**2).sum(axis=(1, 2)))])
+
+    @cached_property
+    def patches(self) -> np.ndarray:
+        """See `patch_averages`."""
+        return patch_averages(self.task.mesh, self.world.vessel.patches)
 
     def noise_std(self, computed: np.ndarray, floor: float) -> np.ndarray:
         """What the estimators take for the noise (V) of computed voltages (L,).
@@ -194,13 +206,24 @@ class FullOperator:
         self._floor = noise_floor
         self._shared = levels = levels_of(world)
         broken = BROKEN if math.isfinite(gate) else math.inf
-        self._levels = [levels.linearised(levels.best(frame, broken)) for frame in frames]
+        self._numbers = [levels.best(frame, broken) for frame in frames]
+        self._levels = [levels.linearised(number) for number in self._numbers]
         self.concentration = np.array([level.concentration for level in self._levels])
         self._filters = self._start(len(frames))
         self._last: list[tuple[np.ndarray, ...] | None] = []
-        self._patches = patch_averages(levels.task.mesh, world.vessel.patches)
+        self._patches = levels.patches
         for k, currents in enumerate(world.currents):
             self.assimilate(frames[:, k], np.repeat(currents[None], len(frames), axis=0))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what all episodes share."""
+        return {name: value for name, value in vars(self).items()
+                if name not in ("_levels", "_patches")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._levels = [self._shared.linearised(number) for number in self._numbers]
+        self._patches = self._shared.patches
 
     def _start(self, episodes: int) -> list[Any]:
         """Filters at t = 0."""

@@ -25,7 +25,6 @@ from eitbench.estimation.onboard.operator import (
     Linearisation,
     levels_of,
     pair_currents,
-    patch_averages,
     spread,
 )
 from eitbench.estimation.onboard.packing import packed, unpacked
@@ -57,8 +56,8 @@ class ReducedOperator:
 
     @staticmethod
     def _share(world: World) -> Shared:
-        """What all episodes have in common; made once a process."""
-        return _shared(world.sound)
+        """What all episodes have in common."""
+        return Shared.of(world)
 
     def assimilate(self, voltages: np.ndarray,
                    currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -165,9 +164,20 @@ class Shared:
         half = score_mass(world)
         self.mass = 0.5 * (basis.T @ (half @ basis) + basis.T @ (half.T @ basis))
         self.basis = basis.astype(np.float32)
-        averages = patch_averages(self.levels.task.mesh, world.vessel.patches)
-        self.patches = (averages @ self.model.basis).astype(np.float32)
+        self.patches = (self.levels.patches @ self.model.basis).astype(np.float32)
         self.level = cache(self._level)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Shared:
+        return self
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Another process makes its own."""
+        return self.of, (self.world,)
+
+    @classmethod
+    def of(cls, world: World) -> Shared:
+        """That of a world; made once a process."""
+        return _made(cls, world.sound)  # type: ignore[arg-type]  # a class can be hashed
 
     @staticmethod
     def _make(world: World) -> Any:
@@ -186,7 +196,9 @@ class Shared:
         return Linearisation(concentration, resistance, by_state)
 
 
-_shared = lru_cache(maxsize=2)(Shared)
+@lru_cache(maxsize=4)
+def _made(kind: type[Shared], world: World) -> Shared:
+    return kind(world)
 
 
 def _stored_model(world: World) -> ReducedModel:

@@ -1,0 +1,79 @@
+"""Variants of a world from words, as in ``instrument.noise_relative=0.01,0.02``."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Iterable
+from typing import Any
+
+
+def variants(settings: Iterable[str]) -> list[dict[str, Any]]:
+    """What `gymnasium.make` takes as ``world``, once for each combination of the values; of no
+    settings one without changes.
+
+    Parameters
+    ----------
+    settings : iterable of str
+        ``part.number=value``, or several values with commas between them; values as JSON has them,
+        or words.
+
+    Raises
+    ------
+    ValueError
+        If one has another form, or two set the same number.
+    """
+    chosen: dict[str, list[Any]] = {}
+    for setting in settings:
+        path, sign, text = setting.partition("=")
+        if not sign or not text or not all(path.split(".")):
+            raise ValueError("set must look like 'instrument.noise_relative=0.02' or "
+                             f"'instrument.noise_relative=0.01,0.02', got {setting!r}")
+        if any(path == other or path.startswith(f"{other}.") or other.startswith(f"{path}.")
+               for other in chosen):
+            raise ValueError(f"set must name each number once, got {path!r} again")
+        chosen[path] = _values(text)
+    return [_nested(zip(chosen, values, strict=True))
+            for values in itertools.product(*chosen.values())]
+
+
+def flat(changes: dict[str, Any]) -> dict[str, Any]:
+    """``{"instrument.noise_relative": 0.02}`` of ``{"instrument": {"noise_relative": 0.02}}``."""
+    found: dict[str, Any] = {}
+    for key, value in changes.items():
+        if isinstance(value, dict):
+            found |= {f"{key}.{inner}": each for inner, each in flat(value).items()}
+        else:
+            found[key] = value
+    return found
+
+
+def said(value: Any) -> str:
+    """A value as it is set: words without quotation marks."""
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def _values(text: str) -> list[Any]:
+    """``0.01,0.02`` -> both; ``[1, 2]`` -> one list; ``a,b`` -> two words."""
+    try:
+        return list(json.loads(f"[{text}]"))
+    except ValueError:
+        return [_value(word) for word in text.split(",")]
+
+
+def _value(word: str) -> Any:
+    try:
+        return json.loads(word)
+    except ValueError:
+        return word
+
+
+def _nested(settings: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+    made: dict[str, Any] = {}
+    for path, value in settings:
+        *parts, name = path.split(".")
+        part = made
+        for each in parts:
+            part = part.setdefault(each, {})
+        part[name] = value
+    return made

@@ -1,0 +1,217 @@
+"""Pictures for one's own scripts and notebooks, as axes of matplotlib: ``eitbench.plot``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, Literal
+
+import gymnasium as gym
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.ticker import LogLocator, NullFormatter
+
+from eitbench import _check, scoring
+from eitbench.bench.evaluation import environment_of, method_given
+from eitbench.bench.playing import can_play, estimates, injections
+from eitbench.bench.scores import scores
+from eitbench.bench.text import mean_and_interval
+from eitbench.data.episodes import simulate, truth_discretisation
+from eitbench.data.regions import region_operators
+from eitbench.data.seeds import name_seed, parse_seeds
+from eitbench.envs.injection import InjectionEnv
+from eitbench.envs.rendering import colour_range, draw_electrodes, draw_field
+from eitbench.numerics.mesh import Mesh
+from eitbench.worlds.task import Task
+
+LABEL = "concentration / (mol/m³)"
+
+
+def field(task: Task, c: Any, ax: Axes | None = None, *, currents: Any = None,
+          colour_bar: bool = True) -> Axes:
+    """Draw a concentration within the electrodes of a task.
+
+    Parameters
+    ----------
+    task : Task
+    c : (n,) array or Estimate
+        mol/m³ at the nodes of ``task.mesh``; of an estimate the mean.
+    ax : Axes, optional
+        Where; default: of a new figure.
+    currents : (L,) array, optional
+        In A: the electrode where a current enters is red, where it leaves blue.
+    colour_bar : bool
+
+    Returns
+    -------
+    Axes
+        In cm. All fields of one task have one colour scale. In 3D the slice along the axis.
+
+    Raises
+    ------
+    ValueError
+        If ``c`` or ``currents`` has another shape, or is not finite.
+    """
+    values = _check.array("c", getattr(c, "mean", c) if isinstance(c, tuple) else c,
+                          (task.mesh.n_nodes,), units="mol/m³")
+    L = task.currents.shape[1]
+    current = np.zeros(L) if currents is None else _check.array("currents", currents, (L,))
+    if ax is None:
+        import matplotlib.pyplot as plt
+        ax = plt.subplots(figsize=_size(task, 1, 1), layout="constrained")[1]
+    _draw(ax, task, task.mesh, values, current, colour_bar=colour_bar)
+    return ax
+
+
+def episode(method: Any, env: str | gym.Env, seed: int | str, *,
+            world: dict[str, Any] | None = None, times: int = 4) -> np.ndarray:
+    """Play a method on an episode, and draw truth and estimate side by side.
+
+    Parameters
+    ----------
+    method, env, world
+        As in `eitbench.evaluate`. Of a policy the estimate is that of the environment's filter.
+    seed : int or str
+        The episode, as in ``"dev:0"``.
+    times : int
+        How many scored states are drawn, evenly spread over the episode.
+
+    Returns
+    -------
+    (times, 2) array of Axes
+        Titles say the time and ẽ_c of the estimate.
+
+    Raises
+    ------
+    ValueError
+        If an argument is wrong, or the method does not suit the environment.
+    """
+    import matplotlib.pyplot as plt
+    asked = environment_of(env, world)
+    loaded = method_given(method, asked.track)
+    (number,) = parse_seeds(seed) if isinstance(seed, str) else [
+        _check.integer("seed", seed, low=0)]
+    made = asked.make()
+    if not can_play(loaded, made):
+        raise ValueError(f"method {loaded.name} does not play {asked.id}")
+    played = made.world
+    _check.integer("times", times, low=1, high=played.schedule.scored_steps)
+    spread_over = np.linspace(played.warm_up + 1, played.n_steps, times + 2)[1:-1]
+    wanted = list(map(int, spread_over))
+    found = _states(made, loaded, number, set(wanted))
+    mesh = truth_discretisation(played).transport.mesh
+    interpolation, mass = region_operators(played)
+    task = made.task
+    figure, axes = plt.subplots(times, 2, figsize=_size(task, times, 2), squeeze=False,
+                                sharex=True, sharey=True, layout="constrained")
+    for row, t in zip(axes, wanted, strict=True):
+        truth, mean, currents = found[t]
+        error = scoring.step_errors((interpolation @ mean)[None], truth[None], mass)[0]
+        last = _draw(row[0], task, mesh, truth, currents)
+        _draw(row[1], task, task.mesh, mean, currents)
+        row[0].set_title(f"truth, t = {1e3 * t * played.time_step:.0f} ms", fontsize=9)
+        row[1].set_title(f"{loaded.name}, ẽ_c = {error:.2g}", fontsize=9)
+    for ax in axes.flat:
+        ax.label_outer()
+    figure.colorbar(last, ax=axes, label=LABEL, extend="both")
+    figure.suptitle(f"{asked.id}, {name_seed(number)}", fontsize=10)
+    return axes
+
+
+def compare(table: pd.DataFrame | Iterable[pd.DataFrame], ax: Axes | None = None, *,
+            score: str = "error") -> Axes:
+    """Draw the scores of methods below each other, the best first: a dot for each episode, and
+    their mean with its 95 % interval.
+
+    Parameters
+    ----------
+    table : DataFrame, or several
+        As `eitbench.evaluate` gives them.
+    ax : Axes, optional
+        Where; default: of a new figure.
+    score : str
+        A column of the tables.
+
+    Raises
+    ------
+    ValueError
+        If there is no such column, or nobody has the score.
+    """
+    rows = table if isinstance(table, pd.DataFrame) else pd.concat(list(table))
+    if score not in rows or score in ("environment", "method", "seed"):
+        known = [name for name in rows if name in scores()]
+        raise ValueError(f"score must be one of {', '.join(known)}; got {score!r}"
+                         + _check.nearest(score, known))
+    several = rows["environment"].nunique() > 1
+    names = rows["method"] + (", " + rows["environment"] if several else "")
+    values = {str(name): own.dropna().astype(float).to_numpy()
+              for name, own in rows[score].groupby(names)}
+    values = {name: own for name, own in values.items() if len(own)}
+    if not values:
+        raise ValueError(f"table must have a method with the score {score}, got none")
+    asked = scores()[score]
+    sign = -1.0 if asked.better == "higher" else 1.0
+    order = sorted(values, key=lambda name: -sign * values[name].mean())
+    if ax is None:
+        import matplotlib.pyplot as plt
+        ax = plt.subplots(figsize=(6.4, 1.2 + 0.4 * len(order)), layout="constrained")[1]
+    for place, name in enumerate(order):
+        own = asked.factor * values[name]
+        mean, half = mean_and_interval(list(own))
+        ax.plot(own, np.full(len(own), place + 0.2), "o", color="#2e86ab", markersize=4)
+        ax.errorbar(mean, place, xerr=half if np.isfinite(half) else None, fmt="o", color="#1b4965",
+                    capsize=4, markersize=6)
+    if min(own.min() for own in values.values()) > 0:
+        logarithmic(ax, "x")
+    ax.set_yticks(range(len(order)), order)
+    ax.set_ylim(-0.6, len(order) - 0.4)
+    ax.set_xlabel(asked.heading)
+    ax.grid(axis="x", alpha=0.3)
+    return ax
+
+
+def logarithmic(ax: Axes, which: Literal["x", "y"]) -> None:
+    """A logarithmic axis whose ticks are plain numbers: 1, 2, 5 times powers of ten."""
+    ax.set(**{f"{which}scale": "log"})  # type: ignore[arg-type]
+    axis = ax.xaxis if which == "x" else ax.yaxis
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter(lambda value, place: f"{value:g}")
+    axis.set_minor_formatter(NullFormatter())
+
+
+def _states(env: Any, method: Any, seed: int, wanted: set[int],
+            ) -> dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """t -> truth (m,), estimate (n,) and currents (L,) of the states that are wanted."""
+    truth = simulate(env.world, seed).concentration
+    found = {}
+    if isinstance(env, InjectionEnv):
+        for t, observation, _ in injections(env, method, seed):
+            if t in wanted:
+                mean = env.core.estimate()[0][0]
+                found[t] = truth[t].astype(float), mean, observation["currents"]
+        return found
+    cycle = env.world.currents
+    for t, estimate in estimates(env, method, seed):
+        if t in wanted:
+            mean = np.array(estimate.mean, dtype=float)
+            found[t] = truth[t].astype(float), mean, cycle[(t - 1) % len(cycle)]
+    return found
+
+
+def _draw(ax: Axes, task: Task, mesh: Mesh, values: np.ndarray, currents: np.ndarray, *,
+          colour_bar: bool = False) -> Any:
+    drawn = draw_field(ax, mesh, values, *colour_range(task))
+    draw_electrodes(ax, task, currents, width=3.0)
+    ax.set_xlabel("z / cm" if mesh.dim == 3 else "x / cm")
+    if colour_bar:
+        assert ax.figure is not None
+        ax.figure.colorbar(drawn, ax=ax, label=LABEL, extend="both")
+    return drawn
+
+
+def _size(task: Task, rows: int, columns: int) -> tuple[float, float]:
+    """inches of a figure with so many fields."""
+    extent = np.ptp(task.mesh.points, axis=0)
+    length, height = (extent[2], extent[1]) if task.mesh.dim == 3 else extent
+    width = 5.0 if length > 2 * height else 3.0
+    return 1.2 + columns * width, 0.6 + rows * (width * height / length + 0.4)

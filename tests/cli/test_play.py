@@ -1,0 +1,135 @@
+"""`eitbench run` for somebody whose method does not work yet, and for somebody who asks how far one carries."""
+
+import re
+
+import numpy as np
+import pytest
+from eitbench.bench.variants import flat, variants
+from eitbench.cli import app
+from eitbench.report import sweep
+from matplotlib import image
+from typer.testing import CliRunner
+
+from short import shorten
+from tiny import SCENARIO, git_says, write_baseline
+
+PIPE = "eitbench/Pipe2D-v0"
+HELPER = "import numpy as np; print('one', end=' '); print('\\x1b[31mtwo'); np.linalg.inv(np.zeros((2, 2)))"
+
+
+@pytest.fixture(autouse=True)
+def tiny_world(monkeypatch, tmp_path):
+    """A world of five steps, in an empty folder; 80 columns."""
+    git_says(monkeypatch)
+    monkeypatch.setenv("COLUMNS", "80")
+    shorten(monkeypatch, {PIPE: SCENARIO})
+    monkeypatch.chdir(tmp_path)
+
+
+def run(*arguments, command="run"):
+    """Exit code, standard output, standard error."""
+    done = CliRunner().invoke(app, [command, "--env", PIPE, "--seeds", "dev:0-1", "-j", "1", *arguments])
+    if done.exception is not None and not isinstance(done.exception, SystemExit):
+        raise done.exception                                           # a user would see a traceback
+    return done.exit_code, done.stdout, done.stderr
+
+
+@pytest.mark.parametrize("isolate", ["others", "never"])
+def test_a_failure_names_the_users_own_lines(isolate, tmp_path):
+    """File, line and function, here as on the page, whoever's process it was; none of ours, none of numpy's. What it
+    prints is marked and harmless. Nothing was finished: exit status 1."""
+    write_baseline(tmp_path, "bad", update=HELPER)
+    code, _, complaint = run("--baseline", "bad.py", "--isolate", isolate)
+    assert code == 1 and complaint.count("[bad] one \\x1b[31mtwo\n") == 2 and "\x1b" not in complaint
+    line = next(i for i, text in enumerate((tmp_path / "bad.py").read_text().splitlines(), 1) if HELPER in text)
+    failure = complaint[complaint.index("failed:"):]
+    assert failure.startswith(f"failed: bad in {PIPE} on dev:0-1: LinAlgError: Singular matrix\n"
+                              f'    File "bad.py", line {line}, in update\n      import numpy as np; print(')
+    assert failure.count("File ") == 1 and "no episode was finished by bad" in failure
+    hint = f"--baseline {tmp_path / 'bad.py'} --seeds dev:0 --isolate never --jobs 1"
+    assert hint in failure
+    page = (tmp_path / "results" / "index.html").read_text(encoding="utf-8")
+    assert f"File &#34;bad.py&#34;, line {line}, in update" in page and str(tmp_path) not in page
+    (record,) = (tmp_path / "results" / "records").glob("*.json")
+    assert f"bad.py:{line}" in record.read_text() and "traceback" not in record.read_text()
+
+
+def test_only_a_method_that_finished_nothing_is_an_error(tmp_path):
+    """One episode is enough, and who did not finish any is named, beside others that did."""
+    write_baseline(tmp_path, "sometimes", init="assert not Path(folder := 'there').exists(); Path(folder).mkdir()")
+    write_baseline(tmp_path, "never", init="raise KeyError('x')")
+    write_baseline(tmp_path, "always")
+    given = ["--isolate", "never", *(word for name in ("sometimes", "never", "always")
+                                     for word in ("--baseline", f"{name}.py"))]
+    code, said, complaint = run(*given)
+    assert code == 1 and "no episode was finished by never\n" in complaint
+    assert "dev:0-1, 1 failed" in said and "dev:0-1, 2 failed" in said
+    assert run(*given[:4])[0] == 0
+
+
+def test_a_file_that_cannot_be_executed_says_where(tmp_path):
+    (tmp_path / "broken.py").write_text("import numpy\n\nnumpy.nothing\n")
+    for isolate in ("never", "others"):
+        code, _, complaint = run("--baseline", "broken.py", "--isolate", isolate)
+        assert code == 2 and "(broken.py:3)" in re.sub(r"[│\s]+", " ", complaint)
+
+
+def test_the_table_is_of_what_was_asked_and_fits(tmp_path):
+    """Whatever else the folder holds; 80 columns or those of the terminal; every skill is a number."""
+    for name in ("first", "second_" + 40 * "x"):
+        write_baseline(tmp_path, name, update="return Estimate(self.level, np.ones_like(self.level))")
+    run("--baseline", "first.py", "--isolate", "never")
+    _, said, _ = run("--baseline", f"second_{40 * 'x'}.py", "--baseline", "homogeneous", "--isolate", "never")
+    lines = [line for line in said.splitlines() if line.startswith("|")]
+    assert len(lines) == 4 and {len(line) for line in lines} == {len(lines[0])} and len(lines[0]) <= 80
+    assert "first" not in said and "skill" in lines[0] and "no room for " in said
+    assert [bool(re.search(r"\| +-?[\d.]+† \|", line)) for line in lines[2:]] == [True, True]
+    assert len((tmp_path / "results" / "leaderboard.md").read_text().splitlines()) == 2 + 3
+
+
+def test_a_sweep_has_a_table_and_a_plot(tmp_path):
+    """A column for each value, by size; each variant is stored under a name of its own, and the plot is a picture."""
+    code, said, complaint = run("--baseline", "homogeneous", "--set", "instrument.noise_relative=0.3,0.01")
+    assert code == 0, complaint
+    assert "ẽ_c for instrument.noise_relative =" in said
+    head, _, row = (line for line in said.splitlines() if line.startswith("|"))
+    assert [cell.strip() for cell in head.split("|")[2:4]] == ["0.01", "0.3"]
+    quiet, noisy = (float(cell.split("±")[0]) for cell in row.split("|")[2:4])
+    assert quiet < noisy
+    assert len(list((tmp_path / "results" / "episodes").iterdir())) == 2
+    picture = image.imread(tmp_path / "results" / "sweep-instrument.noise_relative.png")
+    assert np.ptp(picture[..., :3]) > 0.5
+    code, said, _ = run("--baseline", "homogeneous", "--set", "instrument.noise_relative=0.3")
+    assert code == 0 and "Pipe2D (instrument.noise_relative=0.3), filter, dev:0-1\n" in said
+
+
+@pytest.mark.parametrize(("settings", "worlds"), [
+    ([], [{}]),
+    (["a.b=0.1"], [{"a": {"b": 0.1}}]),
+    (["a.b=1,2", "a.c=[1, 2]"], [{"a": {"b": 1, "c": [1, 2]}}, {"a": {"b": 2, "c": [1, 2]}}]),
+    (["a.b=x,null"], [{"a": {"b": "x"}}, {"a": {"b": None}}]),
+    (["a.b=1,2", "c=3,4"], [{"a": {"b": i}, "c": j} for i in (1, 2) for j in (3, 4)]),
+])
+def test_variants(settings, worlds):
+    """Words become what `world=` takes; one number that differs is swept, two are not."""
+    assert variants(settings) == worlds
+    differ = {key for key in flat(worlds[0]) if len({str(flat(world)[key]) for world in worlds}) > 1}
+    assert sweep.swept(worlds) == (differ.pop() if len(differ) == 1 else None)
+
+
+@pytest.mark.parametrize(("settings", "message"), [
+    (["noise"], "set must look like 'instrument.noise_relative=0.02'"),
+    (["a..b=1"], "set must look like"),
+    (["a.b="], "set must look like"),
+    (["a.b=1", "a.b=2"], "set must name each number once, got 'a.b' again"),
+    (["a.b=1", "a=2"], "set must name each number once, got 'a' again"),
+])
+def test_settings_that_are_none(settings, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        variants(settings)
+
+
+def test_what_a_world_has_not_is_told(tmp_path):
+    """Before anything is played or written."""
+    code, _, complaint = run("--set", "instrument.noise=0.02")
+    assert code == 2 and "noise_relative" in complaint and not (tmp_path / "results").exists()

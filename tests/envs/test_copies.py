@@ -1,0 +1,115 @@
+"""A copy made in mid-episode goes on exactly as the original would, and leaves it alone: for planning and saving."""
+
+import copy
+import pickle
+import subprocess
+import sys
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from short import short
+
+PIPE, SKEWED, TANK = "eitbench/Pipe2D-v0", "eitbench/Pipe2DSkewedVelocity-v0", "eitbench/RotatingTank2D-v0"
+INJECTION, FLOW = "eitbench/Pipe2DInjection-v0", "eitbench/Pipe2DInjectionFlow-v0"
+FAULTS, CURRENTS = "eitbench/Pipe2DInjectionFaults-v0", "eitbench/Pipe2DInjectionCurrents-v0"
+KINDS = [(PIPE, {}), ("eitbench/Pipe2DFixedLag-v0", {"lag": 2}), (SKEWED, {}), (TANK, {}),
+         (INJECTION, {}), (INJECTION, {"estimator": "full", "observation": "raw"}), (INJECTION, {"estimator": "none"}),
+         ("eitbench/Pipe2DInjectionBudget-v0", {}), (FAULTS, {}), (CURRENTS, {}), (FLOW, {}),
+         (FLOW, {"estimator": "full"})]
+COPIES = {"deepcopy": copy.deepcopy, "pickle": lambda env: pickle.loads(pickle.dumps(env))}
+every = pytest.mark.parametrize(("name", "given"), KINDS)
+copied = pytest.mark.parametrize("how", COPIES)
+
+
+def begun(name: str, given: dict, seed: int | None = 3):
+    """An environment after a reset and one step, and actions for steps to come."""
+    env = gym.make(name, **short(name) | given)
+    env.reset(seed=seed)
+    env.action_space.seed(0)
+    actions = [env.action_space.sample() for _ in range(12)]
+    env.step(actions.pop())
+    return env, actions
+
+
+def to_the_end(env, actions, resets: int = 0):
+    """All that is seen and paid until the episode ends, and of so many episodes after it."""
+    seen = []
+    for action in actions:
+        seen.append(env.step(action))
+        if seen[-1][2]:
+            break
+    for _ in range(resets):
+        seen.append(env.reset())
+        seen.append(env.step(actions[0]))
+    return seen
+
+
+def assert_equal(these, those):
+    """To the last bit."""
+    assert len(these) == len(those)
+    for a, b in zip(these, those, strict=True):
+        np.testing.assert_equal(a, b)
+
+
+@every
+@copied
+def test_a_copy_goes_on_as_the_original_would(name, given, how):
+    """To the end, and in the episodes that are drawn after it."""
+    env, actions = begun(name, given)
+    other = COPIES[how](env)
+    played = to_the_end(env, actions, resets=2)
+    assert played[-5][2] is True
+    assert_equal(to_the_end(other, actions, resets=2), played)
+    assert other.unwrapped is not env.unwrapped and other.spec == env.spec
+
+
+@every
+def test_two_actions_can_be_tried(name, given):
+    """The original does not notice, whatever its copies do, and they may differ."""
+    env, actions = begun(name, given, seed=None)
+    alone = to_the_end(copy.deepcopy(env), actions)
+    tried = [copy.deepcopy(env).step(action) for action in actions[:2]]
+    assert any(not np.array_equal(a, b) for a, b in zip(*(
+        [np.ravel(part) for part in (*(step[0].values() if isinstance(step[0], dict) else [step[0]]), step[1])]
+        for step in tried), strict=True)) or tried[0][1] == 0.0
+    assert_equal(to_the_end(env, actions), alone)
+
+
+@copied
+@pytest.mark.parametrize(("name", "given"), [(PIPE, {}), (INJECTION, {}), (INJECTION, {"threads": 2}), (FLOW, {})])
+def test_many_at_once(name, given, how):
+    """Vector environments too, with or without threads, also beyond the episode's end."""
+    envs = gym.make_vec(name, num_envs=3, vectorization_mode="vector_entry_point", **short(name) | given)
+    envs.reset(seed=1)
+    envs.action_space.seed(0)
+    actions = [envs.action_space.sample() for _ in range(9)]
+    envs.step(actions[0])
+    other = COPIES[how](envs)
+    assert_equal([other.step(action) for action in actions], [envs.step(action) for action in actions])
+    for each in (envs, other):
+        each.close()
+
+
+@pytest.mark.parametrize("name", [PIPE, INJECTION])
+def test_in_another_process(name, tmp_path):
+    """What is pickled here goes on there."""
+    env, actions = begun(name, {})
+    (tmp_path / "env").write_bytes(pickle.dumps((env, actions)))
+    code = (f"import pathlib, pickle, sys\nimport eitbench\nhere = pathlib.Path({str(tmp_path)!r})\n"
+            "env, actions = pickle.loads((here / 'env').read_bytes())\n"
+            "(here / 'played').write_bytes(pickle.dumps([env.step(action) for action in actions[:3]]))\n")
+    subprocess.run([sys.executable, "-c", code], check=True)
+    there = pickle.loads((tmp_path / "played").read_bytes())
+    for a, b in zip(there, [env.step(action) for action in actions[:3]], strict=True):
+        np.testing.assert_allclose(a[1], b[1], rtol=1e-9)
+        assert a[2:] == b[2:]
+
+
+def test_a_copy_is_small():
+    """Models are not copied: in a pipe of the thesis' size a copy is of an episode, not of its meshes."""
+    env = gym.make(PIPE)
+    env.reset(seed=0)
+    assert env.unwrapped.task.mesh.n_nodes > 1000
+    assert len(pickle.dumps(env)) < 5e6

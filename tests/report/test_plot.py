@@ -1,0 +1,121 @@
+"""`eitbench.plot` and what notebooks show: axes that hold the numbers they were given."""
+
+import eitbench
+import gymnasium as gym
+import matplotlib
+import numpy as np
+import pandas as pd
+import pytest
+from eitbench.bench.methods import load_method
+from eitbench.bench.playing import estimates
+from eitbench.bench.tracks import Environment
+from eitbench.worlds import entry
+from matplotlib import pyplot as plt
+
+from short import world
+
+matplotlib.use("Agg")
+PIPE, TANK, SOLID = "eitbench/Pipe2D-v0", "eitbench/RotatingTank2D-v0", "eitbench/Pipe3D-v0"
+INJECTION = "eitbench/Pipe2DInjection-v0"
+
+
+@pytest.fixture(autouse=True)
+def closed():
+    yield
+    plt.close("all")
+
+
+def task_of(name):
+    return gym.make(name, **world(name)).unwrapped.task
+
+
+def painted(ax):
+    """The values of the field that was drawn last on axes."""
+    return np.asarray(ax.collections[0].get_array())
+
+
+def means_of(ax):
+    """From below."""
+    return [float(bar[0].get_xdata()[0]) for bar in ax.containers]
+
+
+@pytest.mark.parametrize("name", [PIPE, TANK, SOLID])
+def test_a_field_is_drawn_to_scale(name):
+    """In cm, on the axes that are given, in the colour scale of the task; of an estimate the mean."""
+    task = task_of(name)
+    c = np.linspace(20.0, 40.0, task.mesh.n_nodes)
+    ax = plt.subplots()[1]
+    assert eitbench.plot.field(task, c, ax, currents=task.currents[0]) is ax
+    again = eitbench.plot.field(task, eitbench.Estimate(c))
+    np.testing.assert_array_equal(painted(ax), painted(again))
+    if task.mesh.dim == 2:
+        np.testing.assert_array_equal(painted(ax), c)
+        size = 100 * np.ptp(task.mesh.points, axis=0)
+        assert np.ptp(ax.get_xlim()) == pytest.approx(size[0]) and ax.get_xlabel() == "x / cm"
+    colours = {tuple(np.round(each.get_color()[0][:3], 2)) for each in ax.collections[1:]}
+    assert len(colours) > 1 or task.mesh.dim == 3        # source, sink and the others; in 3D those that are cut
+
+
+def test_a_field_of_another_mesh_is_told():
+    task = task_of(PIPE)
+    with pytest.raises(ValueError, match=rf"c must have shape \({task.mesh.n_nodes},\), got \(3,\)"):
+        eitbench.plot.field(task, np.ones(3))
+    with pytest.raises(ValueError, match="currents must have shape"):
+        eitbench.plot.field(task, np.ones(task.mesh.n_nodes), currents=np.ones(3))
+
+
+def test_an_episode_shows_truth_and_estimate():
+    """The numbers drawn are those of the truth and of the estimate at the times that the titles say; ẽ_c is that of the
+    score."""
+    given = world(PIPE)["world"]
+    axes = eitbench.plot.episode("kalman_filter", PIPE, "dev:0", world=given, times=2)
+    assert axes.shape == (2, 2)
+    asked = Environment(PIPE).make(world=given)
+    said = dict(estimates(asked, load_method("kalman_filter", "estimation"), 100_000))
+    errors = eitbench.evaluate("kalman_filter", PIPE, "dev:0", world=given)["error"][0]
+    told = []
+    for truth, estimate in axes:
+        t = round(float(truth.get_title().split()[3]) / (1e3 * asked.world.time_step))
+        np.testing.assert_array_equal(painted(truth), asked.truth()[t - 1])
+        np.testing.assert_array_equal(painted(estimate), said[t].mean)
+        told.append(float(estimate.get_title().rpartition(" ")[2]))
+    assert min(told) < 2 * errors and max(told) > errors / 2
+
+
+def test_an_episode_of_a_policy():
+    axes = eitbench.plot.episode("random_pair", INJECTION, 3, world=world(INJECTION)["world"], times=1)
+    assert axes.shape == (1, 2) and "random_pair, ẽ_c =" in axes[0, 1].get_title()
+    with pytest.raises(ValueError, match="times must be an integer of at least 1 and at most 5, got 6"):
+        eitbench.plot.episode("homogeneous", PIPE, 3, world=world(PIPE)["world"], times=6)
+    with pytest.raises(ValueError, match="method fixed_interval_smoother does not play"):
+        eitbench.plot.episode("fixed_interval_smoother", PIPE, 3, world=world(PIPE)["world"])
+
+
+def test_methods_are_compared_best_first():
+    """A dot for each episode, the mean in its interval; from one table or several; scores that are better when higher
+    are too."""
+    tables = [pd.DataFrame({"environment": "a", "method": method, "seed": ["dev:0", "dev:1"], "error": errors,
+                            "seconds_per_step": [0.002, 0.004]})
+              for method, errors in (("worse", [0.3, 0.5]), ("better", [0.1, 0.2]))]
+    for given in (tables, pd.concat(tables)):
+        ax = eitbench.plot.compare(given)
+        names = [label.get_text() for label in ax.get_yticklabels()]
+        assert names == ["worse", "better"] and ax.get_xlabel() == "ẽ_c"
+        assert means_of(ax) == pytest.approx([0.4, 0.15])
+    assert means_of(eitbench.plot.compare(tables, score="seconds_per_step")) == pytest.approx([3.0, 3.0])
+    with pytest.raises(ValueError, match=r"one of error, seconds_per_step; got 'eror'. Did you mean error"):
+        eitbench.plot.compare(tables, score="eror")
+
+
+def test_what_notebooks_show():
+    """Tables of the numbers; strangers' words are text."""
+    task = task_of(PIPE)
+    shown = task._repr_html_()
+    assert f"{task.mesh.n_nodes} nodes in 2D" in shown and f"at measurement t of the state t − {task.lag}" in shown
+    estimate = eitbench.Estimate(np.array([1.0, 2.5]))._repr_html_()
+    assert "(2,), 1 to 2.5" in estimate and estimate.count("no claim") == 5
+    played = entry(PIPE).world
+    of_world = played._repr_html_()
+    assert "noise_relative = 0.01" in of_world and "PlanePipe: " in of_world and "Pipe2D" in of_world
+    odd = eitbench.World("<script>x", played.vessel, played.flow, played.target)
+    assert "<script" not in odd._repr_html_() and "&lt;script&gt;x" in odd._repr_html_()
