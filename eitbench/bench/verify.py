@@ -14,7 +14,7 @@ import numpy as np
 
 from eitbench import _check
 from eitbench.bench.contradictions import version_number
-from eitbench.bench.methods import find_method, installed_methods, is_ours, own_files
+from eitbench.bench.methods import find_method, installed_methods, is_ours, own_files, own_sha256
 from eitbench.bench.records import SHARED
 from eitbench.bench.run import Job, run_episode
 from eitbench.bench.sandbox import guests
@@ -95,7 +95,7 @@ def verify(record: dict[str, Any], job: Job, *, episodes: int = 3, seed: int = 0
         Markdown, and a sentence for each thing that is not as the record says.
     """
     _check.integer("episodes", episodes, low=1)
-    stated = OF_OURS if is_ours(job.method) else (*SHARED, "method")
+    stated = OF_OURS if is_ours(job.method) or _is_our_agent(record) else (*SHARED, "method")
     rows = []
     differences = unknown_version(record, job)
     for said in (record["episodes"][i] for i in drawn_of(record, episodes, seed)):
@@ -131,6 +131,13 @@ def _own(record: dict[str, Any]) -> str | None:
     if path is None:
         return None
     return name if path.suffix == ".py" and name not in installed_methods() else str(path)
+
+
+def _is_our_agent(record: dict[str, Any]) -> bool:
+    """Whether its file, wherever it lies, is the model of one of our agents."""
+    ours = own_files(record["environment"]["id"]).get(record["method"])
+    return (ours is not None and ours.suffix == ".zip"
+            and own_sha256(ours) == record["method_sha256"])
 
 
 def stated_differently(record: dict[str, Any], again: dict[str, Any],

@@ -297,7 +297,7 @@ def compare(
     a: Annotated[str, typer.Argument(
         help="A record's file, or METHOD or METHOD@VERSION among the records.")],
     b: Annotated[str, typer.Argument(help="The same of the other.")],
-    records: Annotated[Path, typer.Option(help="Folder of the records.")] = options.RECORDS,
+    records: options.Records = options.RECORDS,
     score: Annotated[str, typer.Option(help="By which score.")] = "error",
     html: Annotated[Path | None, typer.Option(help="Write a page too.")] = None,
 ) -> None:
