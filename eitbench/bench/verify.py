@@ -53,6 +53,14 @@ def job_of(record: dict[str, Any], file: str | None = None, isolate: str = "alwa
     return Job(environment, method, 0, is_isolated(environment, method, isolate))
 
 
+def is_of_ours(record: dict[str, Any], method: str) -> bool:
+    """Whether the method of a record's `job_of` is one of ours: the model of an agent of ours is,
+    wherever its copy lies."""
+    ours = own_files(record["environment"]["id"]).get(record["method"])
+    return is_ours(method) or (ours is not None and ours.suffix == ".zip"
+                               and own_sha256(ours) == record["method_sha256"])
+
+
 def outdated(record: dict[str, Any], job: Job) -> str:
     """A sentence if the record is of an older version than the method of ours now; else nothing."""
     now, then = version_number(job.load().version), version_number(record["version"])
@@ -95,7 +103,7 @@ def verify(record: dict[str, Any], job: Job, *, episodes: int = 3, seed: int = 0
         Markdown, and a sentence for each thing that is not as the record says.
     """
     _check.integer("episodes", episodes, low=1)
-    stated = OF_OURS if is_ours(job.method) or _is_our_agent(record) else (*SHARED, "method")
+    stated = OF_OURS if is_of_ours(record, job.method) else (*SHARED, "method")
     rows = []
     differences = unknown_version(record, job)
     for said in (record["episodes"][i] for i in drawn_of(record, episodes, seed)):
@@ -131,13 +139,6 @@ def _own(record: dict[str, Any]) -> str | None:
     if path is None:
         return None
     return name if path.suffix == ".py" and name not in installed_methods() else str(path)
-
-
-def _is_our_agent(record: dict[str, Any]) -> bool:
-    """Whether its file, wherever it lies, is the model of one of our agents."""
-    ours = own_files(record["environment"]["id"]).get(record["method"])
-    return (ours is not None and ours.suffix == ".zip"
-            and own_sha256(ours) == record["method_sha256"])
 
 
 def stated_differently(record: dict[str, Any], again: dict[str, Any],
