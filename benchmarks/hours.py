@@ -2,8 +2,9 @@
 
 Builds the wheel, installs it into a fresh environment, and does in an empty folder, with an empty
 cache, what each would do: who has an estimator, who knows stable-baselines3, who reads the boards.
-Prints every step with its seconds by the clock; the first that fails ends it. FOLDER (default: a
-temporary one) is left behind for a look at what was made.
+Prints every step with its seconds by the clock and its seconds of processor time, which one waits
+on an idle core; the first step that fails ends it. FOLDER (default: a temporary one) is left behind
+for a look at what was made.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from resource import RUSAGE_CHILDREN, getrusage
 
 ROOT = Path(__file__).parents[1]
 MINE = '''"""Exponential smoothing: the tomographer's first baseline."""
@@ -126,9 +128,12 @@ def main() -> None:
 def timed(name: str, words: list[str], where: Path, **environment: str) -> None:
     """Run a command and print how long it took; ends the program if it fails."""
     begin = time.perf_counter()
+    before = getrusage(RUSAGE_CHILDREN)
     done = subprocess.run(words, cwd=where, env=os.environ | {"PYTHONPATH": ""} | environment,
                           capture_output=True, text=True, check=False)
-    print(f"{time.perf_counter() - begin:8.1f} s  {name}", flush=True)
+    after = getrusage(RUSAGE_CHILDREN)
+    worked = after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime
+    print(f"{time.perf_counter() - begin:8.1f} s {worked:8.1f} s  {name}", flush=True)
     if done.returncode:
         sys.exit(done.stdout[-3000:] + done.stderr[-3000:])
 
