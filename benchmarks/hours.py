@@ -39,6 +39,13 @@ class Estimator:
         self.level += 0.2 * (found - self.level)
         return Estimate(np.full(n, self.level))
 '''
+SHORT = """
+total_steps: 6144
+n_envs: 8
+episodes: 8
+evaluation_episodes: 4
+algorithm: {n_steps: 192, batch_size: 256}
+"""
 LOOK = """
 import eitbench, gymnasium
 env = gymnasium.make("eitbench/Pipe2D-v0")
@@ -88,8 +95,8 @@ HOURS: dict[str, list[Step]] = {
     "Who knows stable-baselines3": [
         ("its `check_env`", ["-c", CHECK]),
         ("`PPO(\"MlpPolicy\", env).learn(6144)`", ["-c", LEARN]),
-        command("train", "--env", BUDGET, "--algo", "maskable_ppo", "--config",
-                "baselines/rl/tutorial.yml", "--steps", "2000", "--out", "agent"),
+        command("train", "--env", BUDGET, "--algo", "maskable_ppo", "--config", "short.yml",
+                "--out", "agent"),
         command("policies", "--env", BUDGET, "--policy", "agent/model.zip", "--policy",
                 "best_cycle", "--seeds", "dev:0-1", "--estimator", "reduced"),
     ],
@@ -108,6 +115,7 @@ def main() -> None:
     empty = folder / "empty"
     empty.mkdir(parents=True)
     (empty / "mine.py").write_text(MINE)
+    (empty / "short.yml").write_text(SHORT)
     python = str(folder / "venv" / "bin" / "python")
     install = [python, "-m", "pip", "install", "-q", "-c", str(ROOT / "constraints.txt")]
     timed("the wheel", [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", str(folder),
