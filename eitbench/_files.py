@@ -52,8 +52,20 @@ def replace_folder(folder: Path, files: Mapping[str, bytes]) -> None:
 
 PACKAGE = Path(__file__).parent
 """Where this package lies."""
+SHIPPED = ("baselines", "leaderboards", "studies")
+"""Folders that come with the package. Models of our agents, animations and the rendered site are in
+a checkout only: an installed package would have four times its size."""
 
 
 def shipped(name: str) -> Path:
     """A folder that comes with the package: within an installed one, beside it in a checkout."""
     return PACKAGE / name if (PACKAGE / name).is_dir() else PACKAGE.parent / name
+
+
+def readable(path: Path) -> Path:
+    """The file or folder to read: the path itself if it leads to one; if not, and it begins as one
+    of ours does, as ``leaderboards/results`` in an empty folder, the one that is shipped."""
+    if path.exists() or path.parts[:1] not in {(name,) for name in SHIPPED}:
+        return path
+    ours = shipped(path.parts[0]).joinpath(*path.parts[1:])
+    return ours if ours.exists() else path

@@ -16,8 +16,9 @@ from types import ModuleType
 from typing import Any, NamedTuple
 
 from eitbench import _check
-from eitbench._files import shipped
+from eitbench._files import readable, shipped
 from eitbench._foreign import where_of
+from eitbench._notice import say
 from eitbench.bench.tracks import BOARDS, TRACKS
 
 METHODS = "eitbench.methods"
@@ -34,6 +35,8 @@ TITLE = 120
 """letters of a title"""
 PARAMETERS = 10_000
 """bytes of JSON that the parameters of a method may take in a record"""
+ELSEWHERE = ("models of our trained agents are in a checkout only, not in an installed package; "
+             "--policy takes the path of a model.zip")
 
 
 class Form(NamedTuple):
@@ -105,15 +108,19 @@ def own_methods(track: str) -> list[str]:
 
 
 def own_agents(id: str) -> list[str]:
-    """Paths of our own trained agents for an environment; none without the extra ``rl``."""
+    """Paths of our own trained agents for an environment; none without the extra ``rl``, and none
+    where their models are not, which is said."""
     if not importlib.util.find_spec("stable_baselines3"):
         return []
-    return [str(path) for path in _agents(id)]
+    there = [str(path) for path in _agents(id) if path.is_file()]
+    if not there and _agents(id):
+        say(f"our agents for {id} are left out: {ELSEWHERE}")
+    return there
 
 
 def own_files(id: str) -> dict[str, Path]:
     """Name under which results are kept in an environment -> file, of each of our own methods and
-    of its agents."""
+    of its agents, whose models may be elsewhere."""
     folders = [baseline_folder() / form.folder for form in FORMS.values()]
     return ({path.stem: path for folder in folders for path in sorted(folder.glob("*.py"))}
             | {f"{path.parents[1].name}_{path.parent.name}": path for path in _agents(id)})
@@ -122,7 +129,14 @@ def own_files(id: str) -> dict[str, Path]:
 def _agents(id: str) -> list[Path]:
     """``baselines/checkpoints/ENV/ALGO/seedK/model.zip``"""
     folder = baseline_folder() / "checkpoints" / id.replace("/", "-")
-    return sorted(folder.glob("*/seed*/model.zip"))
+    return [path.with_name("model.zip") for path in sorted(folder.glob("*/seed*/sha256"))]
+
+
+def own_sha256(path: Path) -> str:
+    """Of the file of one of our own methods; of an agent what its training left beside it."""
+    if path.suffix == ".py":
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    return path.with_name("sha256").read_text(encoding="ascii").strip()
 
 
 def is_ours(name: str) -> bool:
@@ -199,14 +213,16 @@ def find_method(name: str, track: str) -> Path:
     folder = baseline_folder() / form.folder
     own = own_methods(track)
     if is_path(name):
-        path = Path(name)
+        path = readable(Path(name))
     else:
         known = installed_methods() | {each: folder / f"{each}.py" for each in own}
         path = known.get(name, Path())
     if not path.is_file():
         names = [*own, *installed_methods()]
+        hint = (f": {ELSEWHERE}" if "checkpoints" in path.parts
+                else _check.nearest(name, names))
         raise ValueError(f"{form.kind} must be the path of {form.files}, or one of "
-                         f"{', '.join(names)}; got {name!r}{_check.nearest(name, names)}")
+                         f"{', '.join(names)}; got {name!r}{hint}")
     if path.stat().st_size > MOST_BYTES:
         raise ValueError(f"{form.kind} {path} must have {MOST_BYTES >> 20} MiB at most")
     if path.stem in own and not path.samefile(folder / f"{path.stem}.py"):

@@ -41,7 +41,9 @@ def quickly(path: Path, schema: int) -> dict[str, Any] | None:
             return None
         data = path.read_bytes()
         record = orjson.loads(data)
-        if not isinstance(record, dict) or record.get("schema") != schema or not fits(record):
+        if not isinstance(record, dict) or record.get("schema") != schema:
+            return None
+        if not validator().is_valid(record):
             return None
         for name in ("environment", "parameters"):
             _check.nesting(name, record[name], DEEPEST - 1)
@@ -62,24 +64,12 @@ def quickly(path: Path, schema: int) -> dict[str, Any] | None:
     return record if hashlib.sha256(content).hexdigest() == record["sha256"] else None
 
 
-def fits(record: Any) -> bool:
-    """Whether a record surely fits the schema; one that does not, or may not, is for jsonschema to
-    judge, which has words for it."""
-    try:
-        if not _validator().is_valid(record):
-            return False
-    except (TypeError, ValueError):                   # deeper, or larger numbers, than it takes
-        return False
-    environment = record["environment"]
-    # \w is not the same letters to both
-    return bool(environment["id"].isascii() and environment["name"].isascii())
-
-
 def schema_text() -> str:
     """The published schema."""
     return (shipped("leaderboards") / "schema.json").read_text(encoding="utf-8")
 
 
 @lru_cache(maxsize=1)
-def _validator() -> Any:
+def validator() -> Any:
+    """Judges records by it."""
     return jsonschema_rs.validator_for(json.loads(schema_text()))

@@ -14,7 +14,7 @@ import numpy as np
 
 from eitbench import _check
 from eitbench.bench.contradictions import version_number
-from eitbench.bench.methods import find_method, installed_methods, is_ours, own_files
+from eitbench.bench.methods import find_method, installed_methods, is_ours, own_files, own_sha256
 from eitbench.bench.records import SHARED
 from eitbench.bench.run import Job, run_episode
 from eitbench.bench.sandbox import guests
@@ -51,6 +51,14 @@ def job_of(record: dict[str, Any], file: str | None = None, isolate: str = "alwa
         raise ValueError(f"what the record says cannot be played here: the sha256 of {path.name} "
                          f"is {found}, that of the record {record['method_sha256']}")
     return Job(environment, method, 0, is_isolated(environment, method, isolate))
+
+
+def is_of_ours(record: dict[str, Any], method: str) -> bool:
+    """Whether the method of a record's `job_of` is one of ours: the model of an agent of ours is,
+    wherever its copy lies."""
+    ours = own_files(record["environment"]["id"]).get(record["method"])
+    return is_ours(method) or (ours is not None and ours.suffix == ".zip"
+                               and own_sha256(ours) == record["method_sha256"])
 
 
 def outdated(record: dict[str, Any], job: Job) -> str:
@@ -95,7 +103,7 @@ def verify(record: dict[str, Any], job: Job, *, episodes: int = 3, seed: int = 0
         Markdown, and a sentence for each thing that is not as the record says.
     """
     _check.integer("episodes", episodes, low=1)
-    stated = OF_OURS if is_ours(job.method) else (*SHARED, "method")
+    stated = OF_OURS if is_of_ours(record, job.method) else (*SHARED, "method")
     rows = []
     differences = unknown_version(record, job)
     for said in (record["episodes"][i] for i in drawn_of(record, episodes, seed)):

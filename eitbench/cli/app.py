@@ -242,9 +242,7 @@ def compare(
     a: Annotated[str, typer.Argument(
         help="A record's file, or METHOD or METHOD@VERSION among the records.")],
     b: Annotated[str, typer.Argument(help="The same of the other.")],
-    records: Annotated[Path | None, typer.Option(
-        help="Folder of the records. Default: leaderboards/results, and where there is none the "
-             "records that come with the package.")] = None,
+    records: options.Records = options.RECORDS,
     score: Annotated[str, typer.Option(help="By which score.")] = "error",
     html: Annotated[Path | None, typer.Option(help="Write a page too.")] = None,
 ) -> None:
@@ -252,10 +250,9 @@ def compare(
     better; over several environments by gains, as on the boards."""
     from eitbench._files import write_atomically
     from eitbench.report import compare as comparison
-    folder = records or options.records_there()
     with options.clear_errors():
-        ours, theirs = (comparison.find(name, folder) for name in (a, b))
-        table = comparison.compare(ours, theirs, score, comparison.floors(folder))
+        ours, theirs = (comparison.find(name, records) for name in (a, b))
+        table = comparison.compare(ours, theirs, score, comparison.floors(records))
     names = comparison.names(ours[0], theirs[0])
     options.say(comparison.shown(table, *names, score).markdown())
     if html is not None:

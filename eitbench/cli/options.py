@@ -11,13 +11,19 @@ from typing import Annotated
 
 import typer
 
-from eitbench._files import shipped
+from eitbench._files import readable
 from eitbench._foreign import cleaned
 from eitbench.data.parallel import WorkerLost
 
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 Backend = StrEnum("Backend", ["loky", "ray", "dask"])
 Isolation = StrEnum("Isolation", ["never", "others", "always"])
+
+
+def found(path: Path | None) -> Path | None:
+    """The file or folder of an option, as `readable` finds it."""
+    return path and readable(path)
+
 
 Out = Annotated[Path, typer.Option("--out", "-o", help="Folder of the results.")]
 Jobs = Annotated[int, typer.Option(
@@ -30,17 +36,15 @@ Isolate = Annotated[Isolation, typer.Option(
          "that are not ours, or all.")]
 Environments = Annotated[list[str] | None, typer.Option(help="Environment id; may be repeated.")]
 InjectionId = Annotated[str, typer.Option(help="Id of an injection environment.")]
+Records = Annotated[Path, typer.Option(
+    help="Folder of the records. Where there is none, those that come with the package.",
+    callback=found)]
 RECORDS = Path("leaderboards/results")
 METHODS = Path("leaderboards/methods")
 """Where pull requests put the files of methods."""
 
 RL = ("torch", "stable_baselines3", "sb3_contrib", "yaml")
 """What the extra rl installs for training and for trained agents."""
-
-
-def records_there() -> Path:
-    """The folder of records to read: that of a checkout, or the one that comes with the package."""
-    return RECORDS if RECORDS.is_dir() else shipped("leaderboards") / "results"
 
 
 def numbers(seeds: str | None) -> list[int] | None:
@@ -77,8 +81,8 @@ def clear_errors() -> Iterator[None]:
     except ModuleNotFoundError as error:
         if (error.name or "").split(".")[0] not in RL:
             raise
-        say("training and trained agents need the extra rl, pip install -e '.[rl]': "
-            f"{error}", err=True)
+        say("training and trained agents need the extra rl, pip install 'eitbench[rl]', or in a "
+            f"checkout pip install -e '.[rl]': {error}", err=True)
         raise typer.Exit(1) from error
     except ValueError as error:
         raise typer.BadParameter(cleaned(str(error), lines=True)) from error

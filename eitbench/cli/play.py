@@ -75,7 +75,7 @@ def policies(
     backend: options.Backends = options.Backend.loky,
     out: options.Out = Path("results"),
     records: Annotated[Path | None, typer.Option(
-        exists=True, file_okay=False,
+        callback=options.found,
         help="Folder of records, such as leaderboards/results: what they hold of these episodes is "
              "not played again.")] = None,
 ) -> None:

@@ -63,7 +63,7 @@ def verify(
     top: Annotated[int, typer.Option(min=1, help="How many of each board.")] = 3,
     episodes: Annotated[int, typer.Option(min=2, help="Held-out episodes of each.")] = 20,
     env: options.Environments = None,
-    records: Annotated[Path, typer.Option(help="Folder of the records.")] = options.RECORDS,
+    records: options.Records = options.RECORDS,
     methods: Annotated[Path, typer.Option(
         help="Folder of the files of methods that are not ours.")] = options.METHODS,
     jobs: options.Jobs = options.CORES,

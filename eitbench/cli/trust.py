@@ -11,7 +11,8 @@ from eitbench.cli import options
 
 
 def verify(
-    record: Annotated[Path | None, typer.Argument(help="A record's file.")] = None,
+    record: Annotated[Path | None, typer.Argument(
+        help="A record's file.", callback=options.found)] = None,
     baseline: Annotated[str | None, typer.Option(
         help="The method's file, if it is not one of ours.")] = None,
     policy: Annotated[str | None, typer.Option(help="The same of an injection policy.")] = None,
@@ -28,8 +29,7 @@ def verify(
         help="From which they follow; see `eitbench held-out`.")] = None,
     every: Annotated[bool, typer.Option(
         "--all", help="Every official record of a folder; resumes.")] = False,
-    records: Annotated[Path, typer.Option(
-        help="With --all: the folder of the records.")] = options.RECORDS,
+    records: options.Records = options.RECORDS,
     env: Annotated[list[str] | None, typer.Option(
         help="With --all: only this environment; may be repeated.")] = None,
     jobs: options.Jobs = options.CORES,
@@ -108,7 +108,8 @@ def check(
     submitted: Annotated[Path, typer.Argument(
         help="The submission's folder leaderboards.")],
     against: Annotated[Path, typer.Option(
-        help="The folder into which it is to be merged.")] = Path("leaderboards"),
+        help="The folder into which it is to be merged.",
+        callback=options.found)] = Path("leaderboards"),
     episodes: Annotated[int, typer.Option(
         min=1, help="How many of each new record are played again.")] = 1,
     seed: Annotated[int | None, typer.Option(

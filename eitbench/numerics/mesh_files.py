@@ -104,8 +104,6 @@ def write_mesh(path: str | PathLike[str], mesh: Mesh,
     groups : mapping from str to (k ≥ 1, d) int, optional
         Boundary facets by name; a facet may be in several groups.
     """
-    import meshio
-
     path = Path(path)
     if path.suffix != ".msh":
         raise ValueError(f"{path}: the name of the file must end with .msh")
@@ -114,7 +112,7 @@ def write_mesh(path: str | PathLike[str], mesh: Mesh,
     cells = [(_CELL[mesh.dim], mesh.cells)]
     cells += [(_FACET[mesh.dim], facets) for facets in groups.values()]
     tags = [np.full(len(data), tag) for tag, (_, data) in enumerate(cells)]
-    file = meshio.Mesh(
+    file = _meshio().Mesh(
         np.pad(mesh.points, ((0, 0), (0, 3 - mesh.dim))), cells,
         cell_data={"gmsh:physical": tags, "gmsh:geometrical": [tag + 1 for tag in tags]},
         field_data={name: np.array([1 + k, mesh.dim - 1]) for k, name in enumerate(groups)})
@@ -134,10 +132,19 @@ def _check_file(path: Path, sha256: str | None) -> None:
         raise ValueError(f"{path}: must be the file with SHA-256 {sha256}, got one with {found}")
 
 
+def _meshio() -> Any:
+    """The module; `ValueError` without it, which playing our worlds does not need."""
+    try:
+        import meshio
+    except ModuleNotFoundError as error:
+        raise ValueError("mesh files need the extra mesh, pip install 'eitbench[mesh]', or in a "
+                         f"checkout pip install -e '.[mesh]': {error}") from None
+    return meshio
+
+
 def _content(path: Path) -> Any:
     """A `meshio.Mesh`."""
-    import meshio
-
+    meshio = _meshio()
     said = StringIO()
     try:
         with redirect_stdout(said), redirect_stderr(said):

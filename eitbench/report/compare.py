@@ -12,6 +12,7 @@ import pandas as pd
 from markupsafe import Markup
 
 from eitbench import _check
+from eitbench._files import readable
 from eitbench.bench.contradictions import version_number
 from eitbench.bench.records import finished, newest, read_record, read_records
 from eitbench.bench.scores import Score, scores
@@ -50,7 +51,7 @@ def find(name: str, folder: Path) -> list[dict[str, Any]]:
         If there is none, or a name without version fits several versions.
     """
     if name.endswith(".json"):
-        return [read_record(Path(name))]
+        return [read_record(readable(Path(name)))]
     method, _, asked = name.partition("@")
     there = read_records(folder)
     records = [record for record in (there if asked else newest(there)[0])

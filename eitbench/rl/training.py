@@ -38,7 +38,7 @@ from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from eitbench import _check
-from eitbench._files import write_atomically
+from eitbench._files import readable, write_atomically
 from eitbench.bench.methods import load_method
 from eitbench.data.seeds import SPLITS
 from eitbench.data.store import npy
@@ -102,13 +102,14 @@ class Config:
 
 
 def read_config(path: str | Path) -> Config:
-    """The configuration in a YAML file, where an entry without a value is the default.
+    """The configuration in a YAML file, where an entry without a value is the default; one of ours,
+    such as ``baselines/rl/ppo.yml``, is found from any folder.
 
     ``ValueError`` if there is none, or an entry is unknown or wrong.
     """
     import yaml
     try:
-        content = yaml.safe_load(Path(path).read_text())
+        content = yaml.safe_load(readable(Path(path)).read_text())
     except (OSError, yaml.YAMLError) as error:
         raise ValueError(f"config must be a YAML file, got {str(path)!r}: {error}") from None
     known = Config.__dataclass_fields__

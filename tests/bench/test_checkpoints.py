@@ -1,7 +1,9 @@
 """Our trained agents: each is whole, loads, and plays as it did when it was kept."""
 
+import io
 import json
 import shutil
+import zipfile
 
 import numpy as np
 import pytest
@@ -22,6 +24,15 @@ def test_every_checkpoint_is_an_agent_of_an_environment():
     """None lies where nobody finds it, and all together stay small enough for git."""
     assert sorted(AGENTS) == sorted(map(str, FOLDER.glob("**/model.zip")))
     assert sum(path.stat().st_size for path in FOLDER.glob("**/*") if path.is_file()) < 20e6
+
+
+def test_no_checkpoint_remembers_its_optimiser():
+    """Its moments have twice the size of the networks; who goes on with a training has its latest.zip."""
+    torch = pytest.importorskip("torch")
+    for path in FOLDER.glob("**/model.zip"):
+        with zipfile.ZipFile(path) as file:
+            optimiser = torch.load(io.BytesIO(file.read("policy.optimizer.pth")), weights_only=True)
+        assert optimiser["state"] == {} and optimiser["param_groups"], path
 
 
 @pytest.mark.parametrize("path", AGENTS, ids=lambda path: "-".join(path.split("/")[-4:-1]))

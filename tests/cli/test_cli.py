@@ -261,5 +261,5 @@ def test_a_missing_extra_is_named(monkeypatch, tmp_path):
     """Without what training needs, exit code 1 and the name of what to install."""
     monkeypatch.setitem(sys.modules, "yaml", None)
     code, said, complaint = eitbench("train", "--env", INJECTION)
-    assert code == 1 and said == "" and "need the extra rl, pip install -e '.[rl]'" in complaint
+    assert code == 1 and said == "" and "need the extra rl, pip install 'eitbench[rl]'" in complaint
     assert not (tmp_path / "results").exists()

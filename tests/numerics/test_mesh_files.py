@@ -2,6 +2,7 @@
 
 import hashlib
 import re
+import sys
 from pathlib import Path
 
 import meshio
@@ -311,3 +312,12 @@ def test_groups_that_cannot_be_written(name, facets, match, tmp_path):
 def test_only_gmsh_is_written(tmp_path):
     with pytest.raises(ValueError, match=r"box\.vtu: the name of the file must end with \.msh"):
         write_mesh(tmp_path / "box.vtu", MESHES[2])
+
+
+def test_without_meshio_the_extra_is_named(tmp_path, monkeypatch):
+    """Our own worlds are built without it."""
+    path = tmp_path / "it.msh"
+    path.write_text(SQUARE)
+    monkeypatch.setitem(sys.modules, "meshio", None)
+    with pytest.raises(ValueError, match=r"mesh files need the extra mesh, pip install 'eitbench\[mesh\]'"):
+        read_mesh(path)

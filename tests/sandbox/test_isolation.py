@@ -347,7 +347,7 @@ def test_a_guest_does_not_choose_its_name(tmp_path, monkeypatch):
     agent.write_bytes(b"")
     ours = tmp_path / "ppo" / "seed3" / "model.zip"
     ours.parent.mkdir(parents=True)
-    ours.write_bytes(b"another")
+    ours.with_name("sha256").write_text("another")
     own = guests.own_files
     monkeypatch.setattr(guests, "own_files", lambda id: own(id) | {"ppo_seed3": ours})
     about = {"title": "Mine", "boards": ["injection"], "parameters": {}, "role": None, "suits": True}

@@ -27,6 +27,7 @@ from eitbench.bench.methods import (
     is_ours,
     load_method,
     own_files,
+    own_sha256,
 )
 from eitbench.bench.names import faults
 from eitbench.bench.sandbox.host import Guest, GuestError
@@ -108,7 +109,7 @@ def _load(track: str, id: str, kwargs: str, method: str, path: Path, sha256: str
         about = about | {"name": path.stem}  # a guest may call itself anything
     _check_about(path, about, track, id)
     ours = own_files(id).get(about["name"])
-    if ours is not None and hashlib.sha256(ours.read_bytes()).hexdigest() != sha256:
+    if ours is not None and own_sha256(ours) != sha256:
         raise ValueError(f"{path} has the name of one of ours, {about['name']}, under which "
                          "results are kept")
     # in the one that its guest knows

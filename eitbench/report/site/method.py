@@ -4,7 +4,6 @@ episode."""
 from __future__ import annotations
 
 import ast
-import hashlib
 import json
 import shlex
 from collections.abc import Mapping
@@ -15,7 +14,7 @@ import numpy as np
 from markupsafe import Markup
 
 from eitbench._files import shipped
-from eitbench.bench.methods import baseline_folder, own_files, version_of
+from eitbench.bench.methods import baseline_folder, own_files, own_sha256, version_of
 from eitbench.bench.records import alike, finished
 from eitbench.bench.table import NOTHING, Cell, Table, number_cell
 from eitbench.bench.text import scores_by_seed, seed_ranges
@@ -202,5 +201,5 @@ def docstring(record: dict[str, Any], file: str) -> Markup:
 
 def _is_version(path: Path, record: dict[str, Any]) -> bool:
     """Whether the file is what was played: of ours the same version, of others the very same."""
-    sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
+    sha256 = own_sha256(path)
     return record["version"] == version_of(path, sha256) or sha256 == record["method_sha256"]

@@ -1,0 +1,40 @@
+"""Our wheel and that of the example, built once and installed where there is no checkout."""
+
+import os
+import subprocess
+import sys
+import sysconfig
+import venv
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="session")
+def installed(tmp_path_factory):
+    """Runs commands in a fresh virtual environment, into which two wheels were installed: ours and
+    that of the example. What they need comes from here."""
+    folder = tmp_path_factory.mktemp("fresh")
+    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "-q"]
+    subprocess.run([*pip, "wheel", "--no-deps", "--no-build-isolation", "-w", folder / "wheels", ROOT,
+                    ROOT / "examples" / "bubble_tank"], check=True)
+    venv.create(folder / "venv")
+    packages = next((folder / "venv").glob("lib/python*/site-packages"))
+    subprocess.run([*pip, "install", "--no-deps", "--no-index", "--target", packages,
+                    *(folder / "wheels").glob("*.whl")], check=True)
+    (packages / "what_they_need.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    python = folder / "venv" / "bin" / "python"
+
+    def run(*arguments, code=0, cwd=folder):
+        done = subprocess.run(
+            [python, *arguments], cwd=cwd, capture_output=True, text=True, check=False,
+            env=os.environ | {"EITBENCH_CACHE": str(folder / "cache"), "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": ""})
+        assert done.returncode == code, done.stdout + done.stderr
+        return done.stdout if code == 0 else done.stderr
+
+    run.folder = folder
+    where = run("-c", "import eitbench; print(eitbench.__file__)").strip()
+    assert Path(where).is_relative_to(folder)
+    return run

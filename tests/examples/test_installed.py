@@ -1,0 +1,94 @@
+"""What an installed package can do in an empty folder: every command, and what the README shows."""
+
+import re
+import shutil
+import zipfile
+from pathlib import Path
+
+import pytest
+from eitbench.bench.methods import own_files
+from eitbench.bench.records import read_record
+from eitbench.bench.verify import is_of_ours, job_of
+from eitbench.cli import app
+from typer.main import get_command
+
+ROOT = Path(__file__).parents[2]
+TANK = ("--env", "eitbench/StationaryTank2D-v0")
+INJECTION = ("--env", "eitbench/Pipe2DInjection-v0")
+RECORD = "leaderboards/results/eitbench-StationaryTank2D-v0--homogeneous--v1.json"
+AGENT = "leaderboards/results/eitbench-Pipe2DInjectionFlow-v0--ppo_seed0--v1.json"
+TINY = "{total_steps: 0, n_envs: 1, evaluation_episodes: 1, episodes: 1}"
+COMMANDS = [
+    ("list", "eitbench/Pipe2D-v0"),
+    (("run", *TANK, "--baseline", "homogeneous", "--seeds", "dev:0", "-j", "1"), "wrote results/index.html"),
+    ("leaderboard", "wrote results/index.html"),
+    (("bank", *TANK, "--seeds", "train:0", "-j", "1"), "1 simulated"),
+    (("policies", *INJECTION, "--policy", "opposite", "--seeds", "dev:0", "--estimator", "reduced", "-j", "1"),
+     "opposite"),
+    (("train", *INJECTION, "--config", "tiny.yml", "-o", "agent"), "wrote agent/model.zip"),
+    (("submit", *TANK, "--baseline", "homogeneous", "--seeds", "test:0", "--to", "mine/results", "-j", "1"),
+     "1 episodes"),
+    (("leaderboard", "--records", "mine/results"), "wrote mine/site/index.html"),
+    (("check", "mine", "--against", "mine"), "Nothing speaks against it"),
+    (("verify", RECORD, "--episodes", "1"), "what was played again is as it says"),
+    (("verify", "--all", *TANK, "--episodes", "1", "-j", "1"), "StationaryTank2D"),
+    (("compare", "kalman_filter", "extended_kalman_filter"), "extended_kalman_filter"),
+    (("compare", RECORD, RECORD.replace("homogeneous", "kalman_filter")), "kalman_filter"),
+    (("render", *TANK, "--baseline", "homogeneous", "--step", "3", "-o", "it.png"), "wrote it.png"),
+    (("reproduce", "fig7.3", "--seeds", "dev:0", "-j", "1"), "wrote results/figures"),
+    ("season", "season 1"),
+    (("cards", "eitbench/StationaryTank2D-v0", "homogeneous"), "homogeneous: same"),
+    (("kits", "eitbench/StationaryTank2D-v0"), ": same"),
+    (("migrate", "mine/results"), ""),
+    (("held-out", "--help"), "salt"),
+]
+"""Words, and what is said when it has worked."""
+
+
+@pytest.fixture(scope="module")
+def empty(installed):
+    """A folder without a checkout, and only what these tests leave in it."""
+    folder = installed.folder / "empty"
+    folder.mkdir()
+    (folder / "tiny.yml").write_text(TINY)
+    return folder
+
+
+def test_the_wheel_is_small_and_whole(installed):
+    """Ten megabytes; agents' models, animations and the rendered site are in a checkout only."""
+    (wheel,) = (installed.folder / "wheels").glob("eitbench-*.whl")
+    assert wheel.stat().st_size < 10e6
+    names = set(zipfile.ZipFile(wheel).namelist())
+    assert {"eitbench/py.typed", "eitbench/leaderboards/schema.json", f"eitbench/{RECORD}",
+            "eitbench/baselines/rl/ppo.yml", "eitbench/studies/thesis/__init__.py"} <= names
+    assert not [name for name in names if Path(name).suffix in (".zip", ".webp", ".html")
+                and not name.startswith("eitbench/report")]
+
+
+def test_every_command_works_in_an_empty_folder(installed, empty):
+    """In the order of a first hour: what one has written the next one reads."""
+    assert {words if isinstance(words, str) else words[0] for words, _ in COMMANDS} == set(get_command(app).commands)
+    for words, said in COMMANDS:
+        words = [words] if isinstance(words, str) else words
+        assert said in installed("-m", "eitbench.cli", *words, cwd=empty), words
+
+
+def test_what_the_readme_shows_works(installed, empty):
+    """Its Python, from the first block to the last, and the records as a table."""
+    readme = (ROOT / "README.md").read_text()
+    blocks = re.findall(r"```python\n(.*?)```", readme, re.DOTALL)
+    assert blocks
+    installed("-c", "\n".join(blocks), cwd=empty)
+    said = installed("-c", "import eitbench; print(len(eitbench.leaderboard.load()))", cwd=empty)
+    assert int(said) > 10_000
+
+
+def test_an_agent_s_record_asks_for_its_model(installed, empty, tmp_path):
+    """By name it cannot be played, and that is said; a copy of its model is known as ours, wherever it lies."""
+    said = installed("-m", "eitbench.cli", "verify", AGENT, "--episodes", "1", cwd=empty, code=1)
+    assert "models of our trained agents are in a checkout only" in said
+    record = read_record(ROOT / AGENT)
+    ours = own_files(record["environment"]["id"])[record["method"]]
+    copy = shutil.copy(ours, tmp_path / "model.zip")
+    assert job_of(record, copy).method == str(copy) and is_of_ours(record, str(copy))
+    assert not is_of_ours(record | {"method_sha256": "0" * 64}, str(copy))
