@@ -85,6 +85,8 @@ def policies(
 
     Exit status 1 if a policy finished none of its episodes.
     """
+    if records is not None and not records.is_dir():
+        raise typer.BadParameter(f"--records must be a folder, got {records}")
     from eitbench.bench.run import run_jobs, unplayed
     from eitbench.bench.store import EpisodeStore, results_in
     from eitbench.bench.suites import jobs as jobs_of
