@@ -15,6 +15,7 @@ import typer
 from eitbench._foreign import cleaned
 from eitbench.cli import options
 from eitbench.cli.maintain import cards, held_out, kits, migrate
+from eitbench.cli.priors import fit_prior
 from eitbench.cli.season import app as season_commands
 from eitbench.cli.studies import thesis
 from eitbench.cli.trust import check, verify
@@ -252,6 +253,7 @@ app.command("held-out")(held_out)
 app.command()(migrate)
 app.command()(cards)
 app.command()(kits)
+app.command("fit-prior")(fit_prior)
 
 
 @app.command()
