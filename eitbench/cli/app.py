@@ -14,6 +14,7 @@ from eitbench import __version__
 from eitbench.cli import options
 from eitbench.cli.maintain import cards, held_out, kits, migrate
 from eitbench.cli.play import policies, report, run, typed
+from eitbench.cli.priors import fit_prior
 from eitbench.cli.season import app as season_commands
 from eitbench.cli.studies import thesis
 from eitbench.cli.trust import check, verify
@@ -197,6 +198,7 @@ app.command("held-out")(held_out)
 app.command()(migrate)
 app.command()(cards)
 app.command()(kits)
+app.command("fit-prior")(fit_prior)
 
 
 @app.command()

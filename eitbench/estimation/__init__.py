@@ -6,6 +6,15 @@ from eitbench.estimation.first_frame import FirstFrame
 from eitbench.estimation.gains import GainSequence, gain_sequence
 from eitbench.estimation.gauss_newton import gauss_newton
 from eitbench.estimation.homogeneous import best_homogeneous
+from eitbench.estimation.inflow_history import InflowFilter
+from eitbench.estimation.inflow_map import most_probable_inflow, smoothed_inflow
+from eitbench.estimation.inflow_prior import (
+    InflowPrior,
+    fit_inflow_prior,
+    learned_inflow_prior,
+    suiting_priors,
+    white_inflow,
+)
 from eitbench.estimation.joint import JointFilter, JointStep
 from eitbench.estimation.kalman import (
     FilterStep,
@@ -26,8 +35,10 @@ from eitbench.estimation.smoothness import smoothness_covariance
 
 __all__ = [
     "DenseKalmanFilter", "FilterStep", "Filtered", "FirstFrame", "FreeCovariance", "GainSequence",
-    "JointFilter", "JointStep", "KalmanFilter", "LinearisedObservations", "Observation", "Smoothed",
-    "best_homogeneous", "fixed_interval_smoother", "gain_sequence", "gauss_newton",
-    "initial_covariance", "kalman_filter", "linearised", "smoothed_means", "smoothed_state",
-    "smoothness_covariance", "starting_filter", "table_5_1",
+    "InflowFilter", "InflowPrior", "JointFilter", "JointStep", "KalmanFilter",
+    "LinearisedObservations", "Observation", "Smoothed", "best_homogeneous", "fit_inflow_prior",
+    "fixed_interval_smoother", "gain_sequence", "gauss_newton", "initial_covariance",
+    "kalman_filter", "learned_inflow_prior", "linearised", "most_probable_inflow",
+    "smoothed_inflow", "smoothed_means", "smoothed_state", "smoothness_covariance",
+    "starting_filter", "suiting_priors", "table_5_1", "white_inflow",
 ]

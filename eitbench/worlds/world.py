@@ -15,11 +15,11 @@ from eitbench.physics.observation import LinearConductivity, ObservationModel, V
 from eitbench.worlds.instrument import Instrument
 from eitbench.worlds.parts import Discretisation, History, Prior
 from eitbench.worlds.schedule import Schedule
+from eitbench.worlds.streams import Randomness, randomness
 
 if TYPE_CHECKING:
     from eitbench.physics.profiles import VelocityModel
     from eitbench.physics.transport import Transport, VelocityField
-    from eitbench.worlds.streams import Randomness
 
 
 @dataclass(frozen=True)
@@ -166,6 +166,21 @@ class World:
         """What moves in each episode, up to state ``last`` (default: all); see `Target.evolve`."""
         until = self.n_steps if last is None else last
         return self.target.evolve(self, episodes, truth, tick, until)
+
+    def sample_inflow(self, seed: int) -> np.ndarray:
+        """(lead_in + n_steps + 1, n_inlet) mol/m³ that enters in the episode of this seed, from the
+        lead-in's beginning on, at the nodes of the model's inlet; without a simulation.
+
+        ``ValueError`` if this world has no inlet, or its target does not say what flows in.
+        """
+        seed = _check.integer("seed", seed, low=0)
+        if not hasattr(self.target, "draw_inflow"):
+            raise ValueError(f"the target must have an inflow, got {type(self.target).__name__}")
+        mesh, inlet = self.vessel.carrier(fine=False)
+        inflow = self.target.draw_inflow(self, randomness(seed).inflow)
+        points = mesh.points[np.unique(inlet)]
+        return np.array([inflow(points, t * self.time_step)
+                         for t in range(-self.lead_in, self.n_steps + 1)])
 
     def _discretise(self, velocity: VelocityField | None, fine: bool) -> Discretisation:
         from eitbench.physics.rest import AtRest  # finite elements: not needed to play recordings

@@ -1,0 +1,180 @@
+"""Filtering the history of the inflow, from which the flow makes the concentration
+(``docs/methods.md``, 10)."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from scipy.linalg import cho_factor, solve_triangular, toeplitz
+
+from eitbench.estimation.kalman import Observation, linearised
+
+if TYPE_CHECKING:
+    from eitbench.estimation.inflow_prior import InflowPrior
+    from eitbench.physics.transport import Transport
+    from eitbench.worlds.task import Task
+
+FORGOTTEN = 0.01
+"""The pipe has forgotten an inflow of which less than this part is left, in the Frobenius norm."""
+LONGEST = 400
+"""Steps after which it has to be forgotten."""
+DROPPED = 1e-3
+"""Directions that past inflows reach this much less than the first are left out."""
+
+
+class Response(NamedTuple):
+    """c_t = level + basis · Σ_k weights_k (c_in,t−k − level): what past inflows leave in a pipe."""
+
+    basis: np.ndarray
+    """(n, q) orthonormal: concentrations that inflows can make"""
+    weights: np.ndarray
+    """(q, K, n_inlet) of the inflow k = 0 … K − 1 steps ago: Fᵏ Y in the basis"""
+
+
+class State(NamedTuple):
+    """What is known of one concentration."""
+
+    mean: np.ndarray
+    """(n,) mol/m³"""
+    variance: np.ndarray
+    """(n,) (mol/m³)²"""
+
+
+class Innovation(NamedTuple):
+    """How a measurement compared with what was known before it."""
+
+    value: np.ndarray
+    """(m,) V, measured less predicted"""
+    covariance: np.ndarray
+    """(m, m) V²"""
+
+
+@lru_cache(maxsize=4)
+def response(transport: Transport) -> Response:
+    """Of a flow that stays as it is; ``ValueError`` if it never forgets what flowed in."""
+    F, Y = transport.transition()
+    if not Y.shape[1]:
+        raise ValueError("the transport must have an inlet, got one without")
+    parts = [Y]
+    while np.linalg.norm(parts[-1]) > FORGOTTEN * np.linalg.norm(Y):
+        if len(parts) == LONGEST:
+            raise ValueError(f"the transport must forget an inflow within {LONGEST} steps")
+        parts.append(F @ parts[-1])
+    together = np.concatenate(parts, axis=1)
+    # the smaller of both products holds the singular values
+    if together.shape[1] <= len(together):
+        squares, right = np.linalg.eigh(together.T @ together)
+        keep = squares > DROPPED**2 * squares[-1]
+        basis = together @ (right[:, keep] / np.sqrt(squares[keep]))
+    else:
+        squares, left = np.linalg.eigh(together @ together.T)
+        basis = left[:, squares > DROPPED**2 * squares[-1]]
+    weights = (basis.T @ together).reshape(basis.shape[1], len(parts), Y.shape[1])
+    return Response(basis, weights)
+
+
+class InflowFilter:
+    """The extended Kalman filter of the last inflows x_t … x_{t−W+1}, with u = E x the inflow's
+    deviation (`InflowPrior`).
+
+    In time they only move on, so that the prior is exact but for what lies more than W steps apart;
+    all that is nonlinear is in the observation, and is linearised anew about each prediction.
+
+    Parameters
+    ----------
+    task : Task
+    prior : InflowPrior
+        Of the task's inlet; ``ValueError`` if it is not.
+    level : float
+        ĉ_bh in mol/m³.
+    lag : int
+        The oldest state that is asked for, in steps before the present one.
+    """
+
+    def __init__(self, task: Task, prior: InflowPrior, level: float, lag: int = 0) -> None:
+        prior.check_task(task)
+        self.task = task
+        self.prior = prior
+        self.level = level
+        self.response = response(task.transport)
+        self.memory = self.response.weights.shape[1]
+        """K, steps until the pipe has forgotten an inflow"""
+        self.window = W = self.memory + lag
+        entries = prior.time_covariance(W + 1)
+        before = toeplitz(entries[:-1])
+        self._regression = np.linalg.solve(before, entries[1:])
+        """(W,) of an inflow on the W before it"""
+        self._new_variance = float(entries[0] - self._regression @ entries[1:])
+        modes = prior.modes.shape[1]
+        self.mean = np.zeros((W, modes))
+        """of x, the newest first"""
+        self.covariance = np.kron(before, np.eye(modes))
+        """(W·r, W·r)"""
+
+    def predict(self) -> None:
+        """Move one time step on: a new inflow is expected, the oldest is forgotten."""
+        W, r = self.mean.shape
+        newest = self._regression @ self.mean
+        self.mean = np.concatenate([newest[None], self.mean[:-1]])
+        old = self.covariance
+        cross = np.tensordot(self._regression, old.reshape(W, r, W * r), 1)          # (r, W·r)
+        variance = np.tensordot(cross.reshape(r, W, r), self._regression, (1, 0))
+        moved = np.empty_like(old)
+        moved[r:, r:] = old[:-r, :-r]
+        moved[:r, r:] = cross[:, :-r]
+        moved[r:, :r] = cross[:, :-r].T
+        moved[:r, :r] = 0.5 * (variance + variance.T) + self._new_variance * np.eye(r)
+        self.covariance = moved
+
+    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Innovation:
+        """Take in a measurement (L,) in V of the present state, for the injection (L,) in A."""
+        task = self.task
+        point = self.concentration()
+        return self.take_in(linearised(task.observation, task.noise, point, voltages, currents),
+                            point)
+
+    def take_in(self, observation: Observation, point: np.ndarray) -> Innovation:
+        """Take in a measurement that is linear in the concentration near ``point`` (n,), which is
+        `concentration`."""
+        H = self.by_inflow(observation.matrix)
+        seen = H.shape[1]
+        cross = self.covariance[:, :seen] @ H.T
+        S = H @ cross[:seen] + np.diag(observation.noise_variance)
+        S = 0.5 * (S + S.T)
+        innovation = observation.value - observation.matrix @ point
+        factor = cho_factor(S, lower=True)[0]
+        gained = solve_triangular(factor, cross.T, lower=True)                       # L⁻¹ H Γ
+        change = solve_triangular(factor, innovation, lower=True) @ gained
+        self.mean = self.mean + change.reshape(self.mean.shape)
+        self.covariance = self.covariance - gained.T @ gained
+        return Innovation(innovation, S)
+
+    def concentration(self, lag: int = 0) -> np.ndarray:
+        """(n,) mol/m³, ``lag`` steps ago, of the expected inflows."""
+        recent = self.mean[lag:lag + self.memory]
+        deviation = self.prior.inflow(recent @ self.prior.modes.T) - 1.0
+        made = np.tensordot(self.response.weights, deviation, 2)
+        return self.level * (1.0 + self.response.basis @ made)
+
+    def state(self, lag: int = 0) -> State:
+        """What is known of the state ``lag`` steps ago."""
+        slope = self._slope(lag)
+        r = self.mean.shape[1]
+        here = slice(lag * r, (lag + self.memory) * r)
+        reduced = slope @ self.covariance[here, here] @ slope.T
+        basis = self.response.basis
+        return State(self.concentration(lag), ((basis @ reduced) * basis).sum(axis=1))
+
+    def by_inflow(self, matrix: np.ndarray, lag: int = 0) -> np.ndarray:
+        """(m, K·r) derivatives by x of readings of the state ``lag`` steps ago, whose derivatives
+        by c are ``matrix`` (m, n)."""
+        return (matrix @ self.response.basis) @ self._slope(lag)
+
+    def _slope(self, lag: int) -> np.ndarray:
+        """(q, K·r) derivatives of the concentration in the basis by x."""
+        recent = self.mean[lag:lag + self.memory]
+        by_u = self.level * self.prior.slope(recent @ self.prior.modes.T)
+        by_x = (self.response.weights * by_u) @ self.prior.modes
+        return by_x.reshape(len(by_x), -1)

@@ -1,0 +1,187 @@
+"""What is believed of the inflow: a Gaussian process in time and across the inlet, or its
+exponential (``docs/methods.md``, 10)."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from eitbench import _check
+from eitbench._files import write_atomically
+from eitbench.data.seeds import SPLITS, name_seed
+
+if TYPE_CHECKING:
+    from eitbench.worlds.task import Task
+    from eitbench.worlds.world import World
+
+LINKS = ("linear", "logarithm")
+"""What is Gaussian: c_in/ĉ_bh − 1, or ln(c_in/ĉ_bh)."""
+FEWEST = 16
+"""Steps that an inflow must have to learn a correlation from."""
+
+
+@dataclass(frozen=True, eq=False)
+class InflowPrior:
+    """u ~ N(0, Γ_time ⊗ Γ_across), u = c_in/ĉ_bh − 1 or ln(c_in/ĉ_bh) at the inlet's nodes.
+
+    Γ_across = E Eᵀ with E the `modes`, and Γ_time is stationary: u = E x with independent rows of
+    x, each of unit variance and of this `correlation` in time. ``ValueError`` naming what is wrong.
+    """
+
+    link: str
+    """one of `LINKS`"""
+    points: np.ndarray
+    """(n_inlet, d) m; the nodes of the model's inlet"""
+    modes: np.ndarray
+    """(n_inlet, r) E, in parts of ĉ_bh"""
+    correlation: np.ndarray
+    """(K,) of two moments 0 … K − 1 time steps apart, the first 1; none beyond"""
+    time_step: float
+    """s"""
+    source: Mapping[str, Any] = field(default_factory=dict)
+    """where it comes from, fit for JSON"""
+
+    def __post_init__(self) -> None:
+        if self.link not in LINKS:
+            raise ValueError(f"link must be one of {', '.join(LINKS)}, got {self.link!r}")
+        _check.number("time_step", self.time_step, low=0.0, open_low=True, units="s")
+        points = _check.array("points", self.points, (None, None), units="m")
+        modes = _check.array("modes", self.modes, (len(points), None))
+        correlation = _check.array("correlation", self.correlation, (None,))
+        if not len(correlation) or correlation[0] != 1.0 or np.abs(correlation).max() > 1.0:
+            raise ValueError("correlation must begin with 1 and have no larger entry, got "
+                             f"{correlation[:3]} …")
+        for name, array in (("points", points), ("modes", modes), ("correlation", correlation)):
+            object.__setattr__(self, name, array)
+
+    @property
+    def memory(self) -> int:
+        """Time steps from which on two moments have less than a tenth in common."""
+        return int(np.flatnonzero(np.abs(self.correlation) >= 0.1)[-1]) + 1
+
+    def inflow(self, u: np.ndarray) -> np.ndarray:
+        """c_in/ĉ_bh (..., n_inlet) for u of the same shape."""
+        return 1.0 + u if self.link == "linear" else np.exp(u)
+
+    def slope(self, u: np.ndarray) -> np.ndarray:
+        """Derivative of `inflow` by u, entry by entry."""
+        return np.ones_like(u) if self.link == "linear" else np.exp(u)
+
+    def time_covariance(self, steps: int) -> np.ndarray:
+        """(steps,) covariance of an entry of x with those 0 … steps − 1 time steps before."""
+        entries = np.zeros(steps)
+        known = min(steps, len(self.correlation))
+        entries[:known] = self.correlation[:known]
+        return entries
+
+    def suits(self, task: Task) -> bool:
+        """Whether it was made for this task's inlet and time step."""
+        there = task.mesh.points[task.transport.inlet]
+        return (there.shape == self.points.shape
+                and bool(np.allclose(there, self.points, atol=1e-9))
+                and bool(np.isclose(self.time_step, task.transport.time_step)))
+
+    def check_task(self, task: Task) -> None:
+        """``ValueError`` if it was made for another inlet or another time step."""
+        if not self.suits(task):
+            raise ValueError(
+                f"the prior must be of the task's inlet, {len(task.transport.inlet)} nodes in "
+                f"steps of {task.transport.time_step:g} s; got one of {len(self.points)} nodes in "
+                f"steps of {self.time_step:g} s; make one by `eitbench fit-prior`")
+
+    def save(self, path: Path) -> None:
+        """Write a file that `load` reads."""
+        text = json.dumps({
+            "link": self.link, "time_step": self.time_step, "source": dict(self.source),
+            "correlation": _rounded(self.correlation), "points": _rounded(self.points),
+            "modes": _rounded(self.modes)})
+        write_atomically(path, (text + "\n").encode())
+
+    @classmethod
+    def load(cls, path: Path) -> InflowPrior:
+        """What `save` has written; ``ValueError`` naming the file if it is nothing of the kind."""
+        try:
+            said = json.loads(path.read_text(encoding="utf-8"))
+            return cls(**said)
+        except (OSError, ValueError, TypeError) as error:
+            raise ValueError(f"{path} must be a prior of `eitbench fit-prior`: {error}") from None
+
+
+def white_inflow(task: Task) -> InflowPrior:
+    """That of Table 5.1: every node and every step is independent of all others."""
+    points = task.mesh.points[task.transport.inlet]
+    return InflowPrior("linear", points, task.prior.inflow_std * np.eye(len(points)),
+                       np.ones(1), task.transport.time_step)
+
+
+def fit_inflow_prior(ratios: np.ndarray, points: np.ndarray, time_step: float, *,
+                     link: str = "logarithm", nugget: float = 0.01, kept: float = 1e-4,
+                     source: Mapping[str, Any] | None = None) -> InflowPrior:
+    """The prior that inflows of the past suggest.
+
+    Γ_across is the mean of u uᵀ over all moments. The correlation is the mean product of what lies
+    k steps apart, divided by the number of all steps and tapered to zero (Wendland 1995), so that
+    it stays a covariance whatever the sample is.
+
+    Parameters
+    ----------
+    ratios : (N, T, n_inlet)
+        c_in over its usual level, > 0, of N episodes.
+    points, time_step, link, source
+        As in `InflowPrior`.
+    nugget : float
+        Part of the variance that is white in time: what the model does not know of.
+    kept : float
+        Modes across the inlet of less than this part of the variance are left out.
+    """
+    ratios = _check.array("ratios", ratios, (None, None, len(points)))
+    _check.number("nugget", nugget, low=0.0, high=1.0)
+    _check.number("kept", kept, low=0.0, high=1.0)
+    N, T, _ = ratios.shape
+    if not N or T < FEWEST:
+        raise ValueError(f"ratios must be of at least one episode of {FEWEST} steps, got {N} of "
+                         f"{T}")
+    if (ratios <= 0).any():
+        raise ValueError(f"ratios must be above 0, got {ratios.min():g}")
+    u = ratios - 1.0 if link == "linear" else np.log(ratios)
+    if not u.any():
+        raise ValueError("ratios must change, got inflows that are always the same")
+    values, vectors = np.linalg.eigh(np.einsum("nti,ntj->ij", u, u) / (N * T))
+    keep = values > kept * values.sum()
+    modes = (vectors[:, keep] * np.sqrt(values[keep]))[:, ::-1]
+    lags = np.arange(T // 2)
+    products = np.array([(u[:, k:] * u[:, :T - k]).sum() for k in lags])
+    taper = (1.0 - lags / len(lags))**4 * (1.0 + 4.0 * lags / len(lags))
+    correlation = (1.0 - nugget) * taper * products / products[0]
+    correlation[0] = 1.0
+    return InflowPrior(link, points, modes, correlation, time_step, source or {})
+
+
+def learned_inflow_prior(world: World, seeds: Sequence[int], **how: Any) -> InflowPrior:
+    """`fit_inflow_prior` from what flows in in these episodes, which are not simulated for it.
+
+    ``ValueError`` if the world has no inflow, or an episode is not of the split ``train``.
+    """
+    if others := [seed for seed in seeds if seed not in SPLITS["train"]]:
+        raise ValueError("seeds must be of the split train, from which alone is learned; got "
+                         f"{name_seed(others[0])}")
+    inflows = np.array([world.sample_inflow(seed) for seed in seeds])
+    mesh, inlet = world.vessel.carrier(fine=False)
+    return fit_inflow_prior(inflows / world.background, mesh.points[np.unique(inlet)],
+                            world.time_step, **how)
+
+
+def suiting_priors(folder: Path, task: Task, link: str) -> list[InflowPrior]:
+    """Those in a folder's files, by name, that are of this link and this task's inlet."""
+    found = map(InflowPrior.load, sorted(folder.glob("*.json")))
+    return [prior for prior in found if prior.link == link and prior.suits(task)]
+
+
+def _rounded(array: np.ndarray) -> Any:
+    """Nested lists of nine digits, which is more than a sample knows."""
+    return np.vectorize(lambda entry: float(f"{entry:.9g}"), otypes=[float])(array).tolist()

@@ -1,0 +1,47 @@
+"""`eitbench fit-prior`: what it writes is what filters read, and it learns from training episodes alone."""
+
+import json
+
+import numpy as np
+import pytest
+from eitbench.bench.methods import baseline_folder
+from eitbench.cli import app
+from eitbench.estimation import InflowPrior, suiting_priors
+from eitbench.worlds.pipe2d import PIPE_2D
+from eitbench.worlds.task import make_task
+from typer.testing import CliRunner
+
+
+def told(*arguments):
+    return CliRunner().invoke(app, ["fit-prior", *map(str, arguments)])
+
+
+def test_writes_what_filters_read(tmp_path):
+    done = told("--env", "eitbench/Pipe2D-v0", "--seeds", "train:0-9", "--out", tmp_path / "mine.json")
+    assert done.exit_code == 0, done.output
+    assert suiting_priors(tmp_path, make_task(PIPE_2D), "logarithm")
+    source = json.loads((tmp_path / "mine.json").read_text())["source"]
+    assert source == {"environment": "eitbench/Pipe2D-v0", "seeds": "train:0-9", "nugget": 0.01}
+
+
+@pytest.mark.parametrize("link", ["linear", "logarithm"])
+def test_shipped_priors_are_what_the_command_writes(tmp_path, link):
+    """With the source that they name, to nine digits."""
+    shipped = InflowPrior.load(baseline_folder() / "priors" / f"pipe2d-{link}.json")
+    done = told("--env", shipped.source["environment"], "--seeds", shipped.source["seeds"], "--link", link,
+                "--nugget", shipped.source["nugget"], "--out", tmp_path / "again.json")
+    assert done.exit_code == 0, done.output
+    again = InflowPrior.load(tmp_path / "again.json")
+    np.testing.assert_allclose(again.correlation, shipped.correlation, atol=1e-8)
+    np.testing.assert_allclose(again.modes @ again.modes.T, shipped.modes @ shipped.modes.T, atol=1e-8)
+
+
+@pytest.mark.parametrize("arguments, said", [
+    (["--env", "eitbench/Pipe2D-v0", "--seeds", "test:0-3"], "seeds must be of the split train"),
+    (["--env", "eitbench/RotatingTank2D-v0"], "target must have an inflow"),
+    (["--env", "eitbench/Nowhere-v0"], "env must be one of"),
+])
+def test_mistakes_are_told_before_anything_is_written(tmp_path, arguments, said):
+    done = told(*arguments, "--out", tmp_path / "mine.json")
+    assert done.exit_code != 0 and said in " ".join(done.output.replace("│", " ").split())
+    assert not (tmp_path / "mine.json").exists()
