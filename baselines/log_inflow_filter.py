@@ -1,5 +1,5 @@
-"""Extended Kalman filter of the inflow's logarithm, which is Gaussian, coloured in time and across
-the inlet as in training episodes; relinearised about each prediction.
+"""Extended Kalman filter of the inflow's logarithm: Gaussian, and coloured in time and across the
+inlet as in training episodes; relinearised about each prediction.
 
 With a lag it looks back over as many measurements.
 """
