@@ -6,9 +6,8 @@ import re
 import numpy as np
 import pytest
 from eitbench.bench.store import EpisodeStore
-from eitbench.cli import app
-from typer.testing import CliRunner
 
+from commands import eitbench
 from short import shorten
 from tiny import FILTER, SCENARIO, write_baseline
 
@@ -18,14 +17,6 @@ def tiny_world(monkeypatch, tmp_path):
     """The registered environment plays a tiny world, in an empty folder."""
     shorten(monkeypatch, {FILTER.id: SCENARIO})
     monkeypatch.chdir(tmp_path)
-
-
-def eitbench(*arguments):
-    """Exit code, standard output and error without boxes and line breaks."""
-    done = CliRunner().invoke(app, list(map(str, arguments)))
-    if done.exception is not None and not isinstance(done.exception, SystemExit):
-        raise done.exception
-    return done.exit_code, done.stdout, re.sub(r"[│╭╮╰╯─\s]+", " ", done.stderr)
 
 
 @pytest.fixture
@@ -48,7 +39,7 @@ def test_a_damaged_result_is_named_and_the_others_are_shown(field, value, played
     path.write_text(json.dumps(json.loads(path.read_text()) | {field: value}))
     with pytest.warns(UserWarning, match=r"mine/dev-0\.json is left out: it is no result of an episode"):
         code, said, complaint = eitbench("leaderboard")
-    assert code == 0 and "dev:0-1" in said and re.search(r"Mine +\| dev:1 ", said), complaint
+    assert code == 0 and "dev:0-1" in said and re.search(r"mine +\| dev:1 ", said), complaint
 
 
 def test_arguments_that_there_are_not_are_named(played):
@@ -58,7 +49,7 @@ def test_arguments_that_there_are_not_are_named(played):
         path.write_text(json.dumps(result | {"environment": result["environment"] | {"kwargs": {"scenario": 5}}}))
     with pytest.warns(UserWarning, match=r"left out: record .*--mine--.*scenario is no argument|environment\.name"):
         code, said, complaint = eitbench("leaderboard")
-    assert code == 0 and "Mine" not in said and "dev:0-1" in said, complaint
+    assert code == 0 and "| mine" not in said and "dev:0-1" in said, complaint
 
 
 @pytest.mark.parametrize("damage", [
@@ -72,7 +63,7 @@ def test_damaged_estimates_are_named_and_the_table_is_shown(damage, played):
         path.write_bytes(damage(path.read_bytes()))
     with pytest.warns(UserWarning, match=r"no pictures of dev:0: estimates .*mine/dev-0\.npz"):
         code, said, complaint = eitbench("leaderboard")
-    assert code == 0 and "Mine" in said, complaint
+    assert code == 0 and "| mine" in said, complaint
 
 
 @pytest.mark.parametrize("fields", [
@@ -98,8 +89,10 @@ def test_an_exception_s_words_move_no_cursor(tmp_path):
     write_baseline(tmp_path, "loud", doc="Loud *",
                    update="raise ValueError('\\x1b[2J\\u202eall well\\nfailed: nobody')")
     code, said, complaint = eitbench("run", "--baseline", "loud.py", "--env", FILTER.id, "--seeds", "dev:0", "-j", 1)
-    assert code == 0 and r"failed: loud on dev:0: ValueError: \x1b[2J\u202eall well\nfailed: nobody" in complaint
-    assert r"Loud \*" in said
+    words = r"failed: loud in eitbench/Pipe2D-v0 on dev:0: ValueError: \x1b[2J\u202eall well\nfailed: nobody"
+    assert code == 1 and words in complaint
     page = (tmp_path / "results" / "index.html").read_text()
-    for text in (said, complaint, page, (tmp_path / "results" / "leaderboard.md").read_text()):
+    table = (tmp_path / "results" / "leaderboard.md").read_text()
+    assert r"Loud \*" in table
+    for text in (said, complaint, page, table):
         assert "\x1b" not in text and "\u202e" not in text

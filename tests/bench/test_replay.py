@@ -9,10 +9,9 @@ from eitbench.bench import methods, replay, run
 from eitbench.bench import store as store_module
 from eitbench.bench.records import write_record
 from eitbench.bench.replay import by_environment, differing, official_records, verify_all
-from eitbench.cli import app
 from eitbench.data.store import cache_folder
-from typer.testing import CliRunner
 
+from commands import eitbench
 from short import PIPE, shorten
 from tiny import FILTER, SCENARIO, git_says
 
@@ -28,14 +27,6 @@ def tiny_world(monkeypatch, tmp_path):
     store_module.provenance.cache_clear()
     yield
     store_module.provenance.cache_clear()
-
-
-def eitbench(*arguments):
-    """Exit code, standard output, standard error."""
-    done = CliRunner().invoke(app, list(map(str, arguments)))
-    if done.exception is not None and not isinstance(done.exception, SystemExit):
-        raise done.exception
-    return done.exit_code, done.stdout, done.stderr
 
 
 def official(method, env=FILTER.id, kind="--baseline", change=lambda record: None):

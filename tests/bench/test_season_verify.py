@@ -1,7 +1,6 @@
 """A season's best are played on held-out episodes, by one command that resumes; the boards say the season."""
 
 import json
-import re
 from pathlib import Path
 
 import pytest
@@ -15,6 +14,7 @@ from eitbench.data import seasons
 from eitbench.data.seasons import drawn_seeds
 from typer.testing import CliRunner
 
+from commands import eitbench
 from short import shorten
 from tiny import FILTER, SCENARIO, git_says, write_baseline
 
@@ -38,14 +38,6 @@ def second_season(monkeypatch, tmp_path):
     yield
     guests.close()
     store_module.provenance.cache_clear()
-
-
-def eitbench(*arguments):
-    """Exit code, standard output, and standard error without boxes and line breaks."""
-    done = CliRunner().invoke(app, list(map(str, arguments)))
-    if done.exception is not None and not isinstance(done.exception, SystemExit):
-        raise done.exception
-    return done.exit_code, done.stdout, re.sub(r"[│╭╮╰╯─\s]+", " ", done.stderr)
 
 
 def submitted(method, *more):

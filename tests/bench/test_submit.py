@@ -9,12 +9,11 @@ from eitbench.bench import store as store_module
 from eitbench.bench.records import newest, read_record, read_records, sealed, write_record
 from eitbench.bench.store import EpisodeStore, provenance
 from eitbench.bench.submit import submit
-from eitbench.cli import app
 from eitbench.data import bank
 from eitbench.data.seeds import parse_seeds
 from eitbench.data.store import CACHE_VARIABLE
-from typer.testing import CliRunner
 
+from commands import eitbench
 from short import PIPE, shorten
 from tiny import FILTER, SCENARIO, SMOOTHING, count, counting, git_says, record, write_baseline
 
@@ -33,14 +32,6 @@ def tiny_world(monkeypatch, tmp_path):
     provenance.cache_clear()
     yield
     provenance.cache_clear()
-
-
-def eitbench(*arguments):
-    """What the command does: exit code, standard output, standard error without boxes and line breaks."""
-    done = CliRunner().invoke(app, list(arguments))
-    if done.exception is not None and not isinstance(done.exception, SystemExit):
-        raise done.exception
-    return done.exit_code, done.stdout, re.sub(r"[│╭╮╰╯─\s]+", " ", done.stderr)
 
 
 def test_a_submission_is_a_record_an_environment(tmp_path):

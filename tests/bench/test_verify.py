@@ -16,14 +16,13 @@ from eitbench.bench.records import read_record, write_record
 from eitbench.bench.sandbox import guests, host, wire
 from eitbench.bench.sandbox.wall import landlock_version
 from eitbench.bench.tracks import named
-from eitbench.cli import app
 from eitbench.data.episodes import simulate
 from eitbench.data.seasons import drawn_seeds
 from eitbench.data.seeds import SPLITS, parse_seeds
 from eitbench.data.store import CACHE_VARIABLE, cache_folder, folder
 from eitbench.worlds.pipe2d import PIPE_2D
-from typer.testing import CliRunner
 
+from commands import eitbench
 from short import PIPE, merged, shorten
 from tiny import FILTER, SCENARIO, git_says, write_baseline
 
@@ -43,14 +42,6 @@ def tiny_world(monkeypatch, tmp_path):
     yield
     guests.close()
     store_module.provenance.cache_clear()
-
-
-def eitbench(*arguments):
-    """Exit code, standard output, and standard error without boxes and line breaks."""
-    done = CliRunner().invoke(app, list(map(str, arguments)))
-    if done.exception is not None and not isinstance(done.exception, SystemExit):
-        raise done.exception
-    return done.exit_code, done.stdout, re.sub(r"[│╭╮╰╯─\s]+", " ", done.stderr)
 
 
 def submitted(method, *more, env=FILTER.id, kind="--baseline"):

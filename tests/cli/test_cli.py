@@ -17,8 +17,8 @@ from eitbench.data.seeds import parse_seeds
 from eitbench.report import animate
 from eitbench.worlds import entry, registry
 from typer.main import get_command
-from typer.testing import CliRunner
 
+from commands import eitbench
 from short import PLAIN, shorten, world
 from tiny import git_says
 
@@ -52,14 +52,6 @@ def tiny_world(monkeypatch, tmp_path):
     registry.take_over([lagged])
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.py").write_text(MINE)
-
-
-def eitbench(*arguments):
-    """What the command does: exit code, standard output, standard error without boxes and line breaks."""
-    done = CliRunner().invoke(app, list(arguments))
-    if done.exception is not None and not isinstance(done.exception, SystemExit):
-        raise done.exception                                           # a user would see a traceback
-    return done.exit_code, done.stdout, re.sub(r"[│╭╮╰╯─\s]+", " ", done.stderr)
 
 
 def run_mine(*more):

@@ -11,22 +11,13 @@ from eitbench.bench import store as store_module
 from eitbench.bench.records import write_record
 from eitbench.bench.sandbox import guests
 from eitbench.bench.sandbox.wall import landlock_version
-from eitbench.cli import app
 from eitbench.data import seasons
-from typer.testing import CliRunner
 
+from commands import eitbench
 from short import shorten
 from tiny import FILTER, SCENARIO, git_says, write_baseline
 
 MINE = "methods/somebody/mine.py"
-
-
-def eitbench(*arguments):
-    """Exit code, standard output, and standard error without boxes and line breaks."""
-    done = CliRunner().invoke(app, list(map(str, arguments)))
-    if done.exception is not None and not isinstance(done.exception, SystemExit):
-        raise done.exception
-    return done.exit_code, done.stdout, re.sub(r"[│╭╮╰╯─\s]+", " ", done.stderr)
 
 
 @pytest.fixture(scope="module")
