@@ -72,9 +72,10 @@ def injection(seeds: list[int] | None, jobs: int, out: Path) -> tuple[Path, str]
                   frameon=False, ncols=5, loc="outside upper center")
     path = out / "injection.png"
     save(figure, path)
-    first = jobs_of("injection", [AT_WORK[0]], [AT_WORK[1]], seeds)[0].seed
-    moving = animate(*AT_WORK, name_seed(first), None, out / "injection.gif")
-    return path, "\n".join([*said, f"wrote {moving}: {AT_WORK[1]} in {AT_WORK[0]}"])
+    env, policy = AT_WORK
+    first = jobs_of("injection", [env], [policy], seeds)[0].seed
+    moving = animate(env, [policy], name_seed(first), None, out / "injection.gif")
+    return path, "\n".join([*said, f"wrote {moving}: {policy} in {env}"])
 
 
 def _scores(axes: Axes, rows: pd.DataFrame, privileged: list[str]) -> None:

@@ -25,7 +25,7 @@ from tiny import git_says
 ROOT = Path(__file__).parents[2]
 PIPE, INJECTION = "eitbench/Pipe2D-v0", "eitbench/Pipe2DInjection-v0"
 COMMANDS = ("list", "run", "bank", "train", "policies", "submit", "verify", "held-out", "migrate", "cards", "kits",
-            "leaderboard", "compare", "render", "reproduce", "check", "season")
+            "fit-prior", "leaderboard", "compare", "render", "reproduce", "check", "season")
 TINY = {"flow": {"mean_velocity": 45.0}, "schedule": {"scored_steps": 3, "pattern": {"frame": 2}},
         "vessel": {"electrodes_per_wall": 2}}
 """A fast fluid flushes the pipe in two steps: an episode of five takes a third of a second."""
@@ -201,7 +201,7 @@ def test_documented_commands_are_commands():
     (["run", "--seeds", "0-3"], "seeds must say of which split: train:0-3, dev:0-3 or test:0-3; got '0-3'"),
     (["run", "--seeds", "", "--baseline", "mine.py", "-j", "1"], "seeds must look like"),
     (["run", "--env", "eitbench/Pipe4D-v0"], "env must be one of eitbench/Pipe2D-v0"),
-    (["run", "--baseline", "kalman"], "one of extended_kalman_filter"),
+    (["run", "--baseline", "kalman"], "one of coloured_extended_kalman_filter"),
     (["run", "--env", "eitbench/pip2D-v0"], "Did you mean eitbench/Pipe2D-v0?"),
     (["run", "--baseline", "kalman_fliter"], "Did you mean kalman_filter?"),
     (["run", "--set", "instrument.noise_relativ=0.1"], "Did you mean noise_relative?"),

@@ -39,6 +39,7 @@ COMMANDS = [
     ("season", "season 1"),
     (("cards", "eitbench/StationaryTank2D-v0", "homogeneous"), "homogeneous: same"),
     (("kits", "eitbench/StationaryTank2D-v0"), ": same"),
+    (("fit-prior", "--env", "eitbench/Pipe2D-v0", "--seeds", "train:0-3", "-o", "prior.json"), "prior.json: "),
     (("migrate", "mine/results"), ""),
     (("held-out", "--help"), "salt"),
 ]
@@ -74,11 +75,11 @@ def test_every_command_works_in_an_empty_folder(installed, empty):
 
 
 def test_what_the_readme_shows_works(installed, empty):
-    """Its Python, from the first block to the last, and the records as a table."""
+    """Its Python, from the first block to the last, and the records as a table; the agent learns once only."""
     readme = (ROOT / "README.md").read_text()
-    blocks = re.findall(r"```python\n(.*?)```", readme, re.DOTALL)
-    assert blocks
-    installed("-c", "\n".join(blocks), cwd=empty)
+    shown = "\n".join(re.findall(r"```python\n(.*?)```", readme, re.DOTALL))
+    assert "learn(100_000)" in shown
+    installed("-c", shown.replace("learn(100_000)", "learn(2048)"), cwd=empty)
     said = installed("-c", "import eitbench; print(len(eitbench.leaderboard.load()))", cwd=empty)
     assert int(said) > 10_000
 
