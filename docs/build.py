@@ -80,6 +80,25 @@ def staged(source: Path) -> str:
     return "".join(parts)
 
 
+def staged_boards(source: Path) -> str:
+    """A rendered page of the leaderboards, whose links to what lies beside them are as on the site;
+    what is no page there is copied."""
+    folder = ROOT / "leaderboards" / "site"
+
+    def linked(match: re.Match[str]) -> str:
+        there = (source.parent / match[2]).resolve()
+        if "://" in match[2] or there.is_relative_to(folder) or not there.is_file():
+            return match[0]
+        page = place(there)
+        if page.endswith(".md"):
+            page = f"{page.removesuffix('.md')}.html"
+        else:
+            write(page, there.read_bytes())
+        return f'{match[1]}="{os.path.relpath(page, Path(place(source)).parent)}"'
+
+    return re.sub(r'\b(href|src|srcset)="([^"#]+)"', linked, source.read_text(encoding="utf-8"))
+
+
 def with_environments(line: re.Match[str]) -> str:
     """A line in which the ids of our environments, where they are no links, lead to their pages."""
     return re.sub(r"(?<!\[)`(eitbench/(\w+-v\d+))`", r"[`\1`](environments/\2.md)", line[1])
@@ -113,7 +132,10 @@ def main() -> None:
     for source in sources:
         write(place(source), staged(source))
     write("extra.css", (ROOT / "docs" / "extra.css").read_bytes())
-    shutil.copytree(ROOT / "leaderboards" / "site", PAGES / "boards", dirs_exist_ok=True)
+    boards = ROOT / "leaderboards" / "site"
+    shutil.copytree(boards, PAGES / "boards", dirs_exist_ok=True)
+    for source in sorted(boards.rglob("*.html")):
+        write(place(source), staged_boards(source))
     if not draft:
         check_readme()
     pages = generated.environments() | generated.baselines() | generated.reference()
