@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 LINKS = ("linear", "logarithm")
 """What is Gaussian: c_in/ĉ_bh − 1, or ln(c_in/ĉ_bh)."""
+NEAR = 1e-6
+"""m between nodes that are taken for the same: an obstacle downstream moves them a little."""
 FEWEST = 16
 """Steps that an inflow must have to learn a correlation from."""
 
@@ -83,7 +85,7 @@ class InflowPrior:
         """Whether it was made for this task's inlet and time step."""
         there = task.mesh.points[task.transport.inlet]
         return (there.shape == self.points.shape
-                and bool(np.allclose(there, self.points, atol=1e-9))
+                and bool(np.allclose(there, self.points, atol=NEAR))
                 and bool(np.isclose(self.time_step, task.transport.time_step)))
 
     def check_task(self, task: Task) -> None:

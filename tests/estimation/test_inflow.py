@@ -5,6 +5,7 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
+from eitbench.bench.methods import baseline_folder
 from eitbench.data.episodes import simulate, truth_discretisation
 from eitbench.data.seeds import parse_seeds
 from eitbench.estimation import (
@@ -18,6 +19,7 @@ from eitbench.estimation import (
     suiting_priors,
     white_inflow,
 )
+from eitbench.worlds.pipe2d_obstacle import PIPE_2D_OBSTACLE
 from eitbench.worlds.rotating_tank import ROTATING_TANK_2D as ROTATING_TANK
 from eitbench.worlds.stationary_tank import STATIONARY_TANK_2D as STATIONARY_TANK
 from eitbench.worlds.task import make_task
@@ -281,6 +283,14 @@ def test_a_file_says_all(tmp_path):
     assert suiting_priors(tmp_path, task(), "logarithm")
     assert not suiting_priors(tmp_path, task(), "linear")
     assert not suiting_priors(tmp_path, make_task(ROTATING_TANK), "logarithm")
+
+
+def test_an_inlet_that_hardly_differs_is_the_same():
+    """Behind the obstacle's inlet, whose nodes lie nanometres beside the straight pipe's; not those of half a pipe."""
+    shipped = InflowPrior.load(baseline_folder() / "priors" / "pipe2d-logarithm.json")
+    assert shipped.suits(make_task(PIPE_2D_OBSTACLE))
+    narrow = TINY.changed({"vessel": {"half_width": 0.04}})
+    assert not shipped.suits(make_task(narrow))
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{", '{"link": "linear"}', '{"link": 3}'])
