@@ -15,6 +15,7 @@ from eitbench.estimation.inflow_prior import (
     suiting_priors,
     white_inflow,
 )
+from eitbench.estimation.inflow_tracker import InflowTracker
 from eitbench.estimation.joint import JointFilter, JointStep
 from eitbench.estimation.kalman import (
     FilterStep,
@@ -35,7 +36,7 @@ from eitbench.estimation.smoothness import smoothness_covariance
 
 __all__ = [
     "DenseKalmanFilter", "FilterStep", "Filtered", "FirstFrame", "FreeCovariance", "GainSequence",
-    "InflowFilter", "InflowPrior", "JointFilter", "JointStep", "KalmanFilter",
+    "InflowFilter", "InflowPrior", "InflowTracker", "JointFilter", "JointStep", "KalmanFilter",
     "LinearisedObservations", "Observation", "Smoothed", "best_homogeneous", "fit_inflow_prior",
     "fixed_interval_smoother", "gain_sequence", "gauss_newton", "initial_covariance",
     "kalman_filter", "learned_inflow_prior", "linearised", "most_probable_inflow",
