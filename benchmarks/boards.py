@@ -36,7 +36,7 @@ of estimators, and both play every environment of their track."""
 FAILING = 0.02
 """Part of the records with an episode that failed."""
 LOAD = "import sys, eitbench.bench as b; print(len(b.load(sys.argv[1])), 'rows')"
-RENDER = "from eitbench.cli import app; app()"
+RENDER = "from eitbench.cli.app import app; app()"
 
 
 def make(folder: Path, count: int = COUNT, seed: int = 0) -> None:

@@ -123,7 +123,7 @@ def main() -> None:
     (wheel,) = folder.glob("*.whl")
     print(f"{wheel.stat().st_size / 1e6:.1f} MB")
     timed("a virtual environment", [sys.executable, "-m", "venv", str(folder / "venv")], folder)
-    timed("`pip install`", [*install, str(wheel)], folder)
+    timed("`pip install`", [*install, f"{wheel}[bench]"], folder)
     for who, steps in HOURS.items():
         print(f"\n{who}")
         if "stable-baselines3" in who:

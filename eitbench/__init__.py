@@ -7,6 +7,7 @@ heavy is loaded before something is used.
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from eitbench._extras import needed_by as _needed_by
 from eitbench.worlds import ours as _ours  # noqa: F401 (registers our ids)
 from eitbench.worlds.registry import register, register_installed
 
@@ -34,10 +35,11 @@ _MODULES = {"leaderboard": "bench", "plot": "report.plot"}
 
 def __getattr__(name: str) -> Any:
     """Load the public nouns, their makers, leaderboards and pictures on first use."""
-    if name in _LATER:
-        return getattr(import_module(f"eitbench.{_LATER[name]}"), name)
-    if name in _MODULES:
-        return import_module(f"eitbench.{_MODULES[name]}")
+    with _needed_by(f"eitbench.{name}"):
+        if name in _LATER:
+            return getattr(import_module(f"eitbench.{_LATER[name]}"), name)
+        if name in _MODULES:
+            return import_module(f"eitbench.{_MODULES[name]}")
     raise AttributeError(f"module 'eitbench' has no attribute {name!r}")
 
 

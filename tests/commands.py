@@ -2,7 +2,7 @@
 
 import re
 
-from eitbench.cli import app
+from eitbench.cli.app import app
 from typer.testing import CliRunner
 
 

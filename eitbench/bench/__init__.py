@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from eitbench._extras import needed_by
+
 if TYPE_CHECKING:
     import pandas as pd
 
@@ -31,5 +33,6 @@ def load(folder: Path | str | None = None) -> pd.DataFrame:
     ValueError
         Naming the file, if one is no valid record.
     """
-    from eitbench.bench.tidy import tidy
+    with needed_by("eitbench.leaderboard.load"):
+        from eitbench.bench.tidy import tidy
     return tidy(folder)

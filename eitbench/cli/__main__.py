@@ -1,5 +1,19 @@
-"""`python -m eitbench.cli` is the command `eitbench`."""
+"""The command `eitbench`, also as `python -m eitbench.cli`."""
 
-from eitbench.cli import app
+import sys
 
-app()
+from eitbench._extras import needed_by
+
+
+def main() -> None:
+    """Run the command, or say what it needs to be installed."""
+    try:
+        with needed_by("the command eitbench"):
+            from eitbench.cli.app import app
+    except ModuleNotFoundError as error:
+        sys.exit(str(error))
+    app()
+
+
+if __name__ == "__main__":
+    main()

@@ -11,6 +11,7 @@ from typing import Annotated
 
 import typer
 
+from eitbench._extras import explained
 from eitbench._files import readable
 from eitbench._foreign import cleaned
 from eitbench.data.parallel import WorkerLost
@@ -42,9 +43,6 @@ Records = Annotated[Path, typer.Option(
 RECORDS = Path("leaderboards/results")
 METHODS = Path("leaderboards/methods")
 """Where pull requests put the files of methods."""
-
-RL = ("torch", "stable_baselines3", "sb3_contrib", "yaml")
-"""What the extra rl installs for training and for trained agents."""
 
 
 def numbers(seeds: str | None) -> list[int] | None:
@@ -79,10 +77,9 @@ def clear_errors() -> Iterator[None]:
         say(error, err=True)  # a traceback would show a stranger's words as they are
         raise typer.Exit(1) from error
     except ModuleNotFoundError as error:
-        if (error.name or "").split(".")[0] not in RL:
+        if (sentence := explained("this command", error)) is None:
             raise
-        say("training and trained agents need the extra rl, pip install 'eitbench[rl]', or in a "
-            f"checkout pip install -e '.[rl]': {error}", err=True)
+        say(sentence, err=True)
         raise typer.Exit(1) from error
     except ValueError as error:
         raise typer.BadParameter(cleaned(str(error), lines=True)) from error

@@ -11,6 +11,7 @@ import numpy as np
 from gymnasium import spaces
 
 from eitbench import _check
+from eitbench._extras import needed_by
 from eitbench.data.beginnings import Script, concentration_at, script, script_so_far
 from eitbench.data.pool import Pool
 from eitbench.data.recordings import cycle_voltages, outline, step_error, velocity_error
@@ -166,7 +167,8 @@ class EstimationEnv(KnowsItsLength, gym.Env[Observation, np.ndarray]):  # type: 
         if self.render_mode is None:
             gym.logger.warn("render() needs gym.make(..., render_mode='rgb_array')")
             return None
-        from eitbench.envs.rendering import draw_frame
+        with needed_by("render()"):
+            from eitbench.envs.rendering import draw_frame
         t = min(max(self._step - 1 - self.lag, 0), self.world.n_steps)
         if self._seed is None:
             raise gym.error.ResetNeeded("call reset() before render()")

@@ -11,6 +11,7 @@ import numpy as np
 from gymnasium import spaces
 
 from eitbench import _check
+from eitbench._extras import needed_by
 from eitbench.data.pool import Pool
 from eitbench.data.seeds import warn_of_reserved
 from eitbench.envs.estimation import RESET_NEEDED
@@ -118,7 +119,8 @@ class InjectionEnv(KnowsItsLength, gym.Env[Any, Any]):  # type: ignore[misc]
             raise gym.error.ResetNeeded("call reset() before render()")
         from eitbench.data.beginnings import concentration_at
         from eitbench.data.episodes import truth_discretisation
-        from eitbench.envs.rendering import draw_frame
+        with needed_by("render()"):
+            from eitbench.envs.rendering import draw_frame
         mean, spread = self._core.estimate()
         t = self._core.first + self._step - 1
         truth = concentration_at(self.world, self._seed, t, self._core.first + 1)

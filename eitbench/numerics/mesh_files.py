@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from eitbench import _check
+from eitbench._extras import explained
 from eitbench.numerics.mesh import Mesh, as_set, checked_facets
 
 _CELL = {2: "triangle", 3: "tetra"}
@@ -137,8 +138,7 @@ def _meshio() -> Any:
     try:
         import meshio
     except ModuleNotFoundError as error:
-        raise ValueError("mesh files need the extra mesh, pip install 'eitbench[mesh]', or in a "
-                         f"checkout pip install -e '.[mesh]': {error}") from None
+        raise ValueError(explained("reading mesh files", error) or error) from None
     return meshio
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from eitbench.bench import cards, methods
 from eitbench.bench.methods import baseline_folder, load_method, own_agents
-from eitbench.cli import app
+from eitbench.cli.app import app
 from typer.testing import CliRunner
 
 SLOW = ("filter_bank", "eitbench-Pipe2DInjectionFlow-v0--ppo")

@@ -9,7 +9,7 @@ from eitbench.bench import store as store_module
 from eitbench.bench.records import read_record, write_record
 from eitbench.bench.sandbox import guests
 from eitbench.bench.sandbox.wall import landlock_version
-from eitbench.cli import app
+from eitbench.cli.app import app
 from eitbench.data import seasons
 from eitbench.data.seasons import drawn_seeds
 from typer.testing import CliRunner

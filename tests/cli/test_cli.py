@@ -12,7 +12,7 @@ from eitbench import __version__
 from eitbench.bench import suites, tracks
 from eitbench.bench.methods import own_methods
 from eitbench.bench.tracks import ids
-from eitbench.cli import app
+from eitbench.cli.app import app
 from eitbench.data.seeds import parse_seeds
 from eitbench.report import animate
 from eitbench.worlds import entry, registry
@@ -253,5 +253,5 @@ def test_a_missing_extra_is_named(monkeypatch, tmp_path):
     """Without what training needs, exit code 1 and the name of what to install."""
     monkeypatch.setitem(sys.modules, "yaml", None)
     code, said, complaint = eitbench("train", "--env", INJECTION)
-    assert code == 1 and said == "" and "need the extra rl, pip install 'eitbench[rl]'" in complaint
+    assert code == 1 and said == "" and "needs the extra rl, pip install 'eitbench[rl]'" in complaint
     assert not (tmp_path / "results").exists()

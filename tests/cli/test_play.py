@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 from eitbench.bench.variants import flat, variants
-from eitbench.cli import app
+from eitbench.cli.app import app
 from eitbench.report import sweep
 from matplotlib import image
 from typer.testing import CliRunner

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 from eitbench.bench.methods import baseline_folder
-from eitbench.cli import app
+from eitbench.cli.app import app
 from eitbench.estimation import InflowPrior, suiting_priors
 from eitbench.worlds.pipe2d import PIPE_2D
 from eitbench.worlds.task import make_task

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import eitbench  # noqa: F401 (registers)
 import pytest
-from eitbench.cli import app
+from eitbench.cli.app import app
 from eitbench.data import bank, recordings
 from eitbench.data.bank import fill, recording_bytes
 from eitbench.data.episodes import simulate, simulate_together

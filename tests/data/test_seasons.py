@@ -8,7 +8,7 @@ import gymnasium as gym
 import pytest
 from eitbench.bench import salts
 from eitbench.bench.tracks import default_seeds
-from eitbench.cli import app
+from eitbench.cli.app import app
 from eitbench.data import seasons
 from eitbench.data.seeds import ReservedSeedWarning, name_seed, parse_seeds
 from typer.testing import CliRunner

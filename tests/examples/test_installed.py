@@ -9,7 +9,7 @@ import pytest
 from eitbench.bench.methods import own_files
 from eitbench.bench.records import read_record
 from eitbench.bench.verify import is_of_ours, job_of
-from eitbench.cli import app
+from eitbench.cli.app import app
 from typer.main import get_command
 
 ROOT = Path(__file__).parents[2]

@@ -319,5 +319,5 @@ def test_without_meshio_the_extra_is_named(tmp_path, monkeypatch):
     path = tmp_path / "it.msh"
     path.write_text(SQUARE)
     monkeypatch.setitem(sys.modules, "meshio", None)
-    with pytest.raises(ValueError, match=r"mesh files need the extra mesh, pip install 'eitbench\[mesh\]'"):
+    with pytest.raises(ValueError, match=r"reading mesh files needs the extra mesh, pip install 'eitbench\[mesh\]'"):
         read_mesh(path)

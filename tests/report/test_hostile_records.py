@@ -13,7 +13,7 @@ from eitbench import _files
 from eitbench._foreign import cleaned
 from eitbench.bench.records import newest, read_record, read_records, write_record
 from eitbench.bench.tracks import ids
-from eitbench.cli import app
+from eitbench.cli.app import app
 from eitbench.report.boards import ALL
 from typer.testing import CliRunner
 
