@@ -15,7 +15,7 @@ import secrets
 from datetime import UTC, datetime
 from pathlib import Path
 
-from eitbench._files import shipped, write_atomically
+from eitbench._files import check_checkout, shipped, write_atomically
 from eitbench.bench.sandbox.wall import python_files
 from eitbench.data import seasons
 
@@ -68,8 +68,10 @@ def publish_new_salt(path: Path) -> str:
     """Write a new salt of held-out episodes, and its hash, which is returned, where everybody can
     see it.
 
-    ``ValueError`` if a hash is published already: who could replace it unseen could choose a salt.
+    ``ValueError`` if a hash is published already: who could replace it unseen could choose a salt;
+    or outside a checkout.
     """
+    check_checkout(PUBLISHED)
     if PUBLISHED.exists():
         raise ValueError(f"the hash of a salt is published in {PUBLISHED} already; to draw another "
                          "one, remove that file in a commit of its own first, for everybody to see")
@@ -92,8 +94,9 @@ def read_published_salt(path: Path) -> bytes:
 def announce_season(path: Path) -> seasons.Season:
     """Write a new salt and publish its hash as that of the next season.
 
-    ``ValueError`` if one is announced already, or there is a file.
+    ``ValueError`` if one is announced already, there is a file, or outside a checkout.
     """
+    check_checkout(seasons.PUBLISHED)
     last = seasons.seasons()[-1]
     if not last.has_begun:
         raise ValueError(f"season {last.number} is announced already, with the salt of sha256 "
@@ -104,6 +107,7 @@ def announce_season(path: Path) -> seasons.Season:
 def begin_season(path: Path) -> seasons.Season:
     """Publish the salt in a file: the season that was announced begins today (UTC).
 
-    ``ValueError`` as `read_salt`, if none is announced, or with another salt.
+    ``ValueError`` as `read_salt`, if none is announced, with another salt, or outside a checkout.
     """
+    check_checkout(seasons.PUBLISHED)
     return seasons.begin(read_salt(path), datetime.now(UTC).date().isoformat())

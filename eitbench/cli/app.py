@@ -252,11 +252,12 @@ def compare(
     better; over several environments by gains, as on the boards."""
     from eitbench._files import write_atomically
     from eitbench.report import compare as comparison
+    from eitbench.report.terminal import width
     with options.clear_errors():
         ours, theirs = (comparison.find(name, records) for name in (a, b))
         table = comparison.compare(ours, theirs, score, comparison.floors(records))
     names = comparison.names(ours[0], theirs[0])
-    options.say(comparison.shown(table, *names, score).markdown())
+    options.say(comparison.in_terminal(table, *names, score, width()))
     if html is not None:
         write_atomically(html, comparison.html(table, *names, score).encode())
         options.say(f"\nwrote {html}")

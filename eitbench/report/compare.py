@@ -12,7 +12,7 @@ import pandas as pd
 from markupsafe import Markup
 
 from eitbench import _check
-from eitbench._files import readable
+from eitbench._files import readable, shipped
 from eitbench.bench.contradictions import version_number
 from eitbench.bench.records import finished, newest, read_record, read_records
 from eitbench.bench.scores import Score, scores
@@ -36,13 +36,16 @@ FIELDS = ("environment", "score", "episodes", "a", "b", "difference", "low", "hi
 GAIN = "gain"
 """The score over several environments, where that of each is the error: errors of one would hide
 those of the others. As on the boards it is 1 − ẽ_c over that of the floor in the same episode."""
+SHIPPED = shipped("leaderboards") / "results"
+"""The records that come with the package."""
 FEWEST_DIGITS = 4
 """of a version that is told by the first digits of a file's sha256"""
 
 
 def find(name: str, folder: Path) -> list[dict[str, Any]]:
     """The records that are meant by the path of one, or by METHOD or METHOD@VERSION within a
-    folder; an outdated one only by its version. Without a version official records are preferred;
+    folder, and if there is none, among those that come with the package; an outdated one only by
+    its version. Without a version official records are preferred;
     of a version that is digits of a file's sha256 the first four do.
 
     Raises
@@ -54,8 +57,10 @@ def find(name: str, folder: Path) -> list[dict[str, Any]]:
         return [read_record(readable(Path(name)))]
     method, _, asked = name.partition("@")
     there = read_records(folder)
-    records = [record for record in (there if asked else newest(there)[0])
-               if record["method"] == method and (not asked or _is_version(record, asked))]
+    records = _called(method, asked, there)
+    if not records and folder.resolve() != SHIPPED.resolve():
+        there += read_records(SHIPPED)
+        records = _called(method, asked, there)
     if not asked:
         records = [record for record in records if record["official"]] or records
     versions = sorted({record["version"] for record in records})
@@ -66,6 +71,12 @@ def find(name: str, folder: Path) -> list[dict[str, Any]]:
         found = ", ".join(f"{method}@{each}" for each in versions)
         raise ValueError(f"{name} fits several versions: {found}")
     return records
+
+
+def _called(method: str, version: str, there: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Of records those of a method: of this version, and if none is asked for, the newest."""
+    return [record for record in (there if version else newest(there)[0])
+            if record["method"] == method and (not version or _is_version(record, version))]
 
 
 def _is_version(record: dict[str, Any], asked: str) -> bool:
@@ -85,8 +96,11 @@ def comparable(name: str) -> Score:
 
 
 def floors(folder: Path) -> list[dict[str, Any]]:
-    """The records of the floors in a folder, from which gains are counted."""
-    return newest([record for record in read_records(folder) if is_floor(record)])[0]
+    """The records of the floors, from which gains are counted: those that come with the package,
+    and those in a folder, which count where there are both."""
+    folders = dict.fromkeys([SHIPPED.resolve(), folder.resolve()])
+    there = [record for each in folders for record in read_records(each) if is_floor(record)]
+    return newest(there)[0]
 
 
 def compare(a: list[dict[str, Any]], b: list[dict[str, Any]], score: str = "error",
@@ -217,6 +231,18 @@ def shown(table: pd.DataFrame, a: str, b: str, score: str = "error") -> Table:
             f"{a} better": Cell(share, row["better"]),
         })
     return Table.of(rows, label="Comparison", keep=list(rows[0]))
+
+
+def in_terminal(table: pd.DataFrame, a: str, b: str, score: str, letters: int) -> str:
+    """The comparison in lines of so many letters, where the methods are A and B."""
+    short = table.assign(environment=table["environment"].str.removeprefix("eitbench-"))
+    whole = shown(short, "A", "B", score)
+    first = ("environment", "verdict", "difference", *whole.headings[3:5], "A better", "episodes")
+    lines = whole.fitted(letters, first)
+    text = f"A: {a}\nB: {b}\n\n{lines.markdown()}"
+    if left_out := [heading for heading in whole.headings if heading not in lines.headings]:
+        text += f"\n\nno room for {', '.join(left_out)}"
+    return text
 
 
 def _widest(rows: pd.DataFrame) -> float:

@@ -6,6 +6,7 @@ import sys
 
 import gymnasium as gym
 import pytest
+from eitbench._files import PACKAGE
 from eitbench.bench import salts
 from eitbench.bench.tracks import default_seeds
 from eitbench.cli.app import app
@@ -129,3 +130,13 @@ def test_what_is_published_is_found_from_everywhere(tmp_path):
     program = "from eitbench.data.seasons import PUBLISHED; print(PUBLISHED)"
     said = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, text=True, capture_output=True, check=True)
     assert said.stdout.strip().endswith("leaderboards/seasons.json") and str(tmp_path) not in said.stdout
+
+
+@pytest.mark.parametrize("command", [("season", "announce", "--new", "salt"), ("held-out", "--new", "salt")])
+def test_nothing_is_published_in_an_installed_package(command, monkeypatch, tmp_path):
+    """Nobody would ever see it there, and the secret would be drawn for nothing."""
+    for module in (seasons, salts):
+        monkeypatch.setattr(module, "PUBLISHED", PACKAGE / "leaderboards" / "published.json")
+    done = CliRunner().invoke(app, command)
+    assert done.exit_code == 2 and "installed without one" in " ".join(done.stderr.replace("│", "").split())
+    assert not (tmp_path / "salt").exists() and not (PACKAGE / "leaderboards").exists()

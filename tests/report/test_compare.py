@@ -6,7 +6,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from eitbench.bench.records import write_record
+from eitbench.bench.records import read_records, write_record
 from eitbench.bench.statistics import (
     interquartile_mean,
     paired_difference,
@@ -14,7 +14,7 @@ from eitbench.bench.statistics import (
 )
 from eitbench.bench.text import scores_by_seed
 from eitbench.report.boards import boards
-from eitbench.report.compare import compare, find, html, names, shown
+from eitbench.report.compare import SHIPPED, compare, find, floors, html, in_terminal, names, shown
 
 from tables import said
 from tiny import record, sha
@@ -179,3 +179,26 @@ def test_page_needs_nothing_else():
     assert len(list(tree.iter("line"))) == len(list(tree.iter("path"))) == 2
     few = html(compare([record("a", [0.1])], [record("b", [0.4])]), "a", "b")
     assert '<line x1="4.0" x2="4.0"' in few            # no interval, and the only difference
+
+
+def test_who_is_not_in_the_folder_comes_with_the_package(tmp_path):
+    """After a first submission, in a folder of one's own: my method against ours, and our floors."""
+    write_record(tmp_path, record("mine", [0.1]))
+    assert find("mine", tmp_path) == read_records(tmp_path)
+    ours = find("kalman_filter", tmp_path)
+    assert ours == find("kalman_filter", SHIPPED) and all(each["method"] == "kalman_filter" for each in ours)
+    assert {each["environment"]["name"] for each in floors(tmp_path)} == {
+        each["environment"]["name"] for each in floors(SHIPPED)}
+    assert floors(tmp_path / "nowhere") == floors(SHIPPED)
+
+
+def test_in_a_terminal_lines_are_not_wrapped():
+    """Names stand above, and what has no room is named below."""
+    a, b = two_methods()
+    table = compare(a, b)
+    whole, narrow = (in_terminal(table, "a_long_name", "another", "error", letters) for letters in (200, 60))
+    assert whole.startswith("A: a_long_name\nB: another\n\n| environment") and "no room" not in whole
+    assert narrow.endswith("no room for episodes, ẽ_c of A, ẽ_c of B, A better")
+    rows = narrow.split("\n\n")[1].splitlines()
+    assert max(map(len, rows)) <= 60 and rows[0].split() == "| environment | verdict | difference |".split()
+    assert rows[3].split()[:4] == ["|", TANK_NAME.removeprefix("eitbench-"), "|", "A"]
