@@ -200,5 +200,5 @@ def test_in_a_terminal_lines_are_not_wrapped():
     assert whole.startswith("A: a_long_name\nB: another\n\n| environment") and "no room" not in whole
     assert narrow.endswith("no room for episodes, ẽ_c of A, ẽ_c of B, A better")
     rows = narrow.split("\n\n")[1].splitlines()
-    assert max(map(len, rows)) <= 60 and rows[0].split() == "| environment | verdict | difference |".split()
+    assert max(map(len, rows)) <= 60 and rows[0].split() == ["|", "environment", "|", "verdict", "|", "difference", "|"]
     assert rows[3].split()[:4] == ["|", TANK_NAME.removeprefix("eitbench-"), "|", "A"]
