@@ -1,7 +1,7 @@
 """Run somebody else's estimator or policy in a process of its own: `Guest`. What passes between is
 measured numbers.
 
-What this protects against, and what not, is in ``docs/trust.md``.
+``docs/sandbox.md`` says what this protects against, ``docs/trust.md`` what not.
 """
 
 from __future__ import annotations
