@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import io
 import os
+import sys
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import nullcontext
+from contextlib import nullcontext, redirect_stderr
 from functools import lru_cache
 from threading import Thread
 from typing import Any, TypeVar
+
+from tqdm import tqdm
 
 from eitbench.worlds.registry import Entry, registered_by_hand, take_over
 
@@ -50,6 +55,9 @@ def _with_joblib(function: Callable[..., Result], arguments: Sequence[tuple], n_
                  ) -> Iterator[Result]:
     from joblib import Parallel, delayed
     how = {"return_as": "generator_unordered", "batch_size": 1, "pre_dispatch": n_jobs}
+    # loky ends workers whose memory has grown, and starts others
+    warnings.filterwarnings("ignore", "A worker stopped while some jobs were given", UserWarning,
+                            r"joblib\.externals\.loky\.")
     try:
         with config or nullcontext(), Parallel(n_jobs=n_jobs, **how) as parallel:
             told = registered_by_hand()
@@ -73,7 +81,10 @@ def _with_dask(function: Callable[..., Result], arguments: Sequence[tuple], n_jo
 
 def _with_ray(function: Callable[..., Result], arguments: Sequence[tuple], n_jobs: int,
               ) -> Iterator[Result]:
-    """Without joblib, whose backend for ray gives all results at the end or, if one fails, none."""
+    """Without joblib, whose backend for ray gives all results at the end or, if one fails, none.
+
+    What a call writes to standard error comes with its result.
+    """
     import ray
     from ray.exceptions import NodeDiedError, OutOfMemoryError, WorkerCrashedError
     here = {} if "RAY_ADDRESS" in os.environ else {"num_cpus": n_jobs, "include_dashboard": False}
@@ -81,10 +92,13 @@ def _with_ray(function: Callable[..., Result], arguments: Sequence[tuple], n_job
         ray.init(log_to_driver=False, **here)
     try:
         told = registered_by_hand()
-        waiting = [ray.remote(_pinned).remote(told, function, *each) for each in arguments]
+        waiting = [ray.remote(_heard).remote(told, function, *each) for each in arguments]
         while waiting:
-            done, waiting = ray.wait(waiting)
-            yield from ray.get(done)
+            (done,), waiting = ray.wait(waiting)
+            result, written = ray.get(done)
+            if written:
+                tqdm.write(written, file=sys.stderr, end="")
+            yield result
     except (WorkerCrashedError, NodeDiedError, OutOfMemoryError) as error:
         raise _explained(error) from error
     finally:
@@ -118,6 +132,14 @@ def _end_with(host: int) -> None:
         os._exit(1)
 
     Thread(target=look, daemon=True, name="end with the host").start()
+
+
+def _heard(told: list[Entry], function: Callable[..., Result], *arguments: Any,
+           ) -> tuple[Result, str]:
+    """The result of `_pinned`, and what was written to standard error."""
+    written = io.StringIO()
+    with redirect_stderr(written):
+        return _pinned(told, function, *arguments), written.getvalue()
 
 
 def _pinned(told: list[Entry], function: Callable[..., Result], *arguments: Any) -> Result:
