@@ -9,6 +9,7 @@ notebook.
 import argparse
 import contextlib
 import io
+import json
 import os
 import re
 import shutil
@@ -52,6 +53,19 @@ def place(source: Path) -> str:
     return f"files/{name.removeprefix('.')}"
 
 
+def placed(linked: Path) -> str:
+    """Where what a page links to lies on the site; a file that is no page is copied there."""
+    page = place(linked)
+    if linked.is_file() and not page.endswith(".md"):
+        write(page, linked.read_bytes())
+    return page
+
+
+def relative(page: str, source: Path) -> str:
+    """The way on the site from the page that ``source`` becomes to another one."""
+    return os.path.relpath(page, Path(place(source)).parent)
+
+
 def staged(source: Path) -> str:
     """A page with links as on the site; files that it links to are copied.
 
@@ -59,7 +73,7 @@ def staged(source: Path) -> str:
     environments become links. `SystemExit` if a link leads nowhere.
     """
     def linked(match: re.Match[str]) -> str:
-        target, hash, anchor = match[2].partition("#")
+        target, sharp, anchor = match[2].partition("#")
         there = (source.parent / target).resolve()
         if not target or "://" in target:
             return match[0]
@@ -67,10 +81,7 @@ def staged(source: Path) -> str:
             raise SystemExit(f"{source.relative_to(ROOT)} links to {target}, which is not there")
         if there.suffix == ".svg":
             return f"<div>\n{there.read_text(encoding='utf-8')}</div>"
-        page = place(there)
-        if there.is_file() and there.suffix == page[page.rfind("."):] != ".md":
-            write(page, there.read_bytes())
-        return f"{match[1]}({os.path.relpath(page, Path(place(source)).parent)}{hash}{anchor})"
+        return f"{match[1]}({relative(placed(there), source)}{sharp}{anchor})"
 
     text = source.read_text(encoding="utf-8")
     parts = re.split(r"(^ *```.*?^ *```$)", text, flags=re.DOTALL | re.MULTILINE)
@@ -81,20 +92,16 @@ def staged(source: Path) -> str:
 
 
 def staged_boards(source: Path) -> str:
-    """A rendered page of the leaderboards, whose links to what lies beside them are as on the site;
-    what is no page there is copied."""
+    """A rendered page of the leaderboards with links as on the site to what lies outside them;
+    files that it links to are copied."""
     folder = ROOT / "leaderboards" / "site"
 
     def linked(match: re.Match[str]) -> str:
         there = (source.parent / match[2]).resolve()
         if "://" in match[2] or there.is_relative_to(folder) or not there.is_file():
             return match[0]
-        page = place(there)
-        if page.endswith(".md"):
-            page = f"{page.removesuffix('.md')}.html"
-        else:
-            write(page, there.read_bytes())
-        return f'{match[1]}="{os.path.relpath(page, Path(place(source)).parent)}"'
+        page = re.sub(r"\.md$", ".html", placed(there))
+        return f'{match[1]}="{relative(page, source)}"'
 
     return re.sub(r'\b(href|src|srcset)="([^"#]+)"', linked, source.read_text(encoding="utf-8"))
 
@@ -112,12 +119,12 @@ def write(name: str, content: str | bytes) -> None:
 
 
 def toml(value: object) -> str:
-    """Strings, lists and dicts of them as TOML."""
+    """Strings, lists and dicts of them as TOML, which writes strings as JSON does."""
     if isinstance(value, dict):
         return "{" + ", ".join(f"{toml(key)} = {toml(of)}" for key, of in value.items()) + "}"
     if isinstance(value, list):
         return "[" + ", ".join(map(toml, value)) + "]"
-    return '"' + str(value).replace('"', '\\"') + '"'
+    return json.dumps(value, ensure_ascii=False)
 
 
 def main() -> None:
@@ -127,6 +134,21 @@ def main() -> None:
     draft = parser.parse_args().draft
     began = time.perf_counter()
     shutil.rmtree(BUILD, ignore_errors=True)
+    if not draft:
+        check_readme()
+    stage_written()
+    configure(stage_generated(execute=not draft))
+    print(f"staged in {time.perf_counter() - began:.0f} s")
+    built = subprocess.run([sys.executable, "-m", "zensical", "build", "--strict",
+                            "--config-file", str(BUILD / "zensical.toml")], check=False)
+    found = [] if built.returncode else problems(BUILD / "site")
+    if built.returncode or found:
+        raise SystemExit("\n".join([*found, "the documentation was not built"]))
+    print(f"{BUILD / 'site' / 'index.html'}, in {time.perf_counter() - began:.0f} s")
+
+
+def stage_written() -> None:
+    """The pages that somebody wrote, and the boards."""
     sources = [*sorted((ROOT / "docs").glob("*.md")),
                *(ROOT / name for name in ELSEWHERE if name.endswith(".md") and name != "README.md")]
     for source in sources:
@@ -136,25 +158,27 @@ def main() -> None:
     shutil.copytree(boards, PAGES / "boards", dirs_exist_ok=True)
     for source in sorted(boards.rglob("*.html")):
         write(place(source), staged_boards(source))
-    if not draft:
-        check_readme()
+
+
+def stage_generated(*, execute: bool) -> list[str]:
+    """Environments, methods, the reference and notebooks; gives the names of their files."""
     pages = generated.environments() | generated.baselines() | generated.reference()
     for source in sorted((ROOT / "docs" / "notebooks").glob("*.ipynb")):
-        pages |= generated.notebook(source, execute=not draft)
-        print(f"{source.name}, {time.perf_counter() - began:.0f} s from the start")
+        began = time.perf_counter()
+        pages |= generated.notebook(source, execute)
+        print(f"{source.name}, {time.perf_counter() - began:.0f} s")
     for name, content in pages.items():
         write(name, content)
+    return list(pages)
+
+
+def configure(pages: list[str]) -> None:
+    """Write the site's configuration, with the generated pages in its navigation."""
     config = (ROOT / "docs" / "zensical.toml").read_text(encoding="utf-8")
-    nav = expanded(tomllib.loads(config)["project"]["nav"], list(pages))
-    config = re.sub(r"^nav = \[.*?^\]$", lambda _: f"nav = {toml(nav)}", config,
+    nav = toml(expanded(tomllib.loads(config)["project"]["nav"], pages))
+    config = re.sub(r"^nav = \[.*?^\]$", lambda _: f"nav = {nav}", config,
                     flags=re.DOTALL | re.MULTILINE)
     (BUILD / "zensical.toml").write_text(config, encoding="utf-8")
-    built = subprocess.run([sys.executable, "-m", "zensical", "build", "--strict",
-                            "--config-file", str(BUILD / "zensical.toml")], check=False)
-    found = [] if built.returncode else problems(BUILD / "site")
-    if built.returncode or found:
-        raise SystemExit("\n".join([*found, "the documentation was not built"]))
-    print(f"{BUILD / 'site' / 'index.html'}, in {time.perf_counter() - began:.0f} s")
 
 
 def check_readme() -> None:

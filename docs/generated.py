@@ -37,11 +37,19 @@ REFERENCE = {
 }
 """Page of the reference -> what it describes."""
 
+BASELINES = """# Methods
+
+One file each, written as you would write yours, with the public API only. Each page has the code.
+Agents that were trained are described [with the injection worlds](injection.md#trained-agents).
+
+"""
+"""How the page that lists the methods begins."""
+
 Files = dict[str, str | bytes]
 
 
 def scores() -> list[dict[str, str]]:
-    """Lines of the boards of single environments."""
+    """Rows of the boards of single environments."""
     with open(ROOT / "leaderboards" / "leaderboard.csv", encoding="utf-8", newline="") as file:
         return [row for row in csv.DictReader(file) if row["environment"] != "all"]
 
@@ -78,33 +86,29 @@ def baselines() -> Files:
             method = load_method(name, track)
             source = method.path.read_text(encoding="utf-8")
             docstring, code = re.fullmatch(r'"""(.*?)"""\n+(.*)', source, re.DOTALL).groups()
-            told = " ".join(docstring.split("\n\n")[0].split())
+            summary = " ".join(docstring.split("\n\n")[0].split())
             where = method.path.relative_to(ROOT).as_posix()
             mine = table([row for row in rows if row["method"] == name], "environment")
             files[f"baselines/{name}.md"] = "\n\n".join([
                 f"# {method.title}", f"`{name}`" + kind(method.role, method.privileged),
                 linked(docstring), f"## Scores\n\n{mine}",
                 f"## Code\n\n`{where}`\n\n```python\n{code.strip()}\n```"]) + "\n"
-            lines.append(f"- [`{name}`](baselines/{name}.md): {told}")
+            lines.append(f"- [`{name}`](baselines/{name}.md): {summary}")
         lists.append(f"## {heading}\n\n" + "\n".join(lines))
     files["baselines.md"] = BASELINES + "\n\n".join(lists) + "\n"
     return files
 
 
-BASELINES = """# Methods
-
-One file each, written as you would write yours, with the public API only. Each page has the code.
-Agents that were trained are described [with the injection worlds](injection.md#trained-agents).
-
-"""
-
-
 def kind(role: str | None, privileged: bool) -> str:
     """What a method is on a board, where it is not ranked."""
-    said = {"floor": "a floor: what knowing next to nothing scores",
-            "reference": "a reference: about what can be reached"}.get(role or "", "")
-    shown = "it is shown the truth, and has no rank" if privileged else ""
-    return "".join(f" – {words}" for words in (said, shown) if words)
+    kinds = []
+    if role == "floor":
+        kinds.append("a floor: what knowing next to nothing scores")
+    if role == "reference":
+        kinds.append("a reference: about what can be reached")
+    if privileged:
+        kinds.append("it is shown the truth, and has no rank")
+    return "".join(f" – {each}" for each in kinds)
 
 
 def table(rows: list[dict[str, str]], first: str) -> str:
