@@ -75,6 +75,7 @@ OURS = "leaderboards/results/eitbench-Pipe2D-v0--{}--v1.json"
 """A record that comes with the package."""
 
 Step = tuple[str, Sequence[str]]
+"""Its name, and what Python is given."""
 
 
 def command(*words: str) -> Step:
@@ -112,6 +113,8 @@ HOURS: dict[str, list[Step]] = {
 def main() -> None:
     given = sys.argv[1] if len(sys.argv) > 1 else tempfile.mkdtemp(prefix="hours-")
     folder = Path(given).absolute()
+    if folder.exists() and any(folder.iterdir()):
+        sys.exit(f"FOLDER must be new or empty, got {folder}")
     empty = folder / "empty"
     empty.mkdir(parents=True)
     (empty / "mine.py").write_text(MINE)
@@ -133,8 +136,8 @@ def main() -> None:
     print(f"\nleft in {folder}")
 
 
-def timed(name: str, words: list[str], where: Path, **environment: str) -> None:
-    """Run a command and print how long it took; ends the program if it fails."""
+def timed(name: str, words: Sequence[str], where: Path, **environment: str) -> None:
+    """Run a command in a folder and print how long it took; ends the program if it fails."""
     begin = time.perf_counter()
     before = getrusage(RUSAGE_CHILDREN)
     done = subprocess.run(words, cwd=where, env=os.environ | {"PYTHONPATH": ""} | environment,
