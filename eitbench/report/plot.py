@@ -89,8 +89,7 @@ def episode(method: Any, env: str | gym.Env, seed: int | str, *,
     import matplotlib.pyplot as plt
     asked = environment_of(env, world)
     loaded = method_given(method, asked.track)
-    (number,) = parse_seeds(seed) if isinstance(seed, str) else [
-        _check.integer("seed", seed, low=0)]
+    number = _number_of(seed)
     made = asked.make()
     if not can_play(loaded, made):
         raise ValueError(f"method {loaded.name} does not play {asked.id}")
@@ -135,9 +134,14 @@ def compare(table: pd.DataFrame | Iterable[pd.DataFrame], ax: Axes | None = None
     Raises
     ------
     ValueError
-        If there is no such column, or nobody has the score.
+        If there is no table or no such column, or nobody has the score.
     """
-    rows = table if isinstance(table, pd.DataFrame) else pd.concat(list(table))
+    tables = [table] if isinstance(table, pd.DataFrame) else list(table)
+    if not tables or not all(isinstance(each, pd.DataFrame) for each in tables):
+        kinds = ", ".join(type(each).__name__ for each in tables)
+        raise ValueError("table must be a DataFrame or several, as eitbench.evaluate gives them, "
+                         f"got {kinds or 'none'}")
+    rows = pd.concat(tables)
     if score not in rows or score in ("environment", "method", "seed"):
         known = [name for name in rows if name in scores()]
         raise ValueError(f"score must be one of {', '.join(known)}; got {score!r}"
@@ -177,6 +181,15 @@ def logarithmic(ax: Axes, which: Literal["x", "y"]) -> None:
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axis.set_major_formatter(lambda value, place: f"{value:g}")
     axis.set_minor_formatter(NullFormatter())
+
+
+def _number_of(seed: int | str) -> int:
+    if not isinstance(seed, str):
+        return _check.integer("seed", seed, low=0)
+    numbers = parse_seeds(seed)
+    if len(numbers) != 1:
+        raise ValueError(f"seed must name one episode, as in 'dev:0', got {seed!r}")
+    return numbers[0]
 
 
 def _states(env: Any, method: Any, seed: int, wanted: set[int],

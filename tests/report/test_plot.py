@@ -89,6 +89,8 @@ def test_an_episode_of_a_policy():
         eitbench.plot.episode("homogeneous", PIPE, 3, world=world(PIPE)["world"], times=6)
     with pytest.raises(ValueError, match="method fixed_interval_smoother does not play"):
         eitbench.plot.episode("fixed_interval_smoother", PIPE, 3, world=world(PIPE)["world"])
+    with pytest.raises(ValueError, match="seed must name one episode, as in 'dev:0', got 'dev:0-1'"):
+        eitbench.plot.episode("homogeneous", PIPE, "dev:0-1", world=world(PIPE)["world"])
 
 
 def test_methods_are_compared_best_first():
@@ -105,6 +107,9 @@ def test_methods_are_compared_best_first():
     assert means_of(eitbench.plot.compare(tables, score="seconds_per_step")) == pytest.approx([3.0, 3.0])
     with pytest.raises(ValueError, match=r"one of error, seconds_per_step; got 'eror'. Did you mean error"):
         eitbench.plot.compare(tables, score="eror")
+    for nothing in ([], ["error"]):
+        with pytest.raises(ValueError, match="table must be a DataFrame or several"):
+            eitbench.plot.compare(nothing)
 
 
 def test_what_notebooks_show():
