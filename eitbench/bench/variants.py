@@ -1,4 +1,4 @@
-"""Variants of a world from words, as in ``instrument.noise_relative=0.01,0.02``."""
+"""Variants of a world from what is typed, as in ``instrument.noise_relative=0.01,0.02``."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Any
 
 
 def variants(settings: Iterable[str]) -> list[dict[str, Any]]:
-    """What `gymnasium.make` takes as ``world``, once for each combination of the values; of no
-    settings one without changes.
+    """What `gymnasium.make` takes as ``world``, once for each combination of the values; without
+    settings a single one without changes.
 
     Parameters
     ----------
@@ -21,7 +21,7 @@ def variants(settings: Iterable[str]) -> list[dict[str, Any]]:
     Raises
     ------
     ValueError
-        If one has another form, or two set the same number.
+        If one has another form, two set the same number, or one gives a value twice.
     """
     chosen: dict[str, list[Any]] = {}
     for setting in settings:
@@ -32,7 +32,10 @@ def variants(settings: Iterable[str]) -> list[dict[str, Any]]:
         if any(path == other or path.startswith(f"{other}.") or other.startswith(f"{path}.")
                for other in chosen):
             raise ValueError(f"set must name each number once, got {path!r} again")
-        chosen[path] = _values(text)
+        values = _values(text)
+        if "" in values or len({as_typed(value) for value in values}) < len(values):
+            raise ValueError(f"set must give different values, none of them empty, got {setting!r}")
+        chosen[path] = values
     return [_nested(zip(chosen, values, strict=True))
             for values in itertools.product(*chosen.values())]
 
@@ -48,8 +51,8 @@ def flat(changes: dict[str, Any]) -> dict[str, Any]:
     return found
 
 
-def said(value: Any) -> str:
-    """A value as it is set: words without quotation marks."""
+def as_typed(value: Any) -> str:
+    """A value as in a setting: words without quotation marks."""
     return value if isinstance(value, str) else json.dumps(value)
 
 
@@ -69,6 +72,7 @@ def _value(word: str) -> Any:
 
 
 def _nested(settings: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+    """The inverse of `flat`."""
     made: dict[str, Any] = {}
     for path, value in settings:
         *parts, name = path.split(".")

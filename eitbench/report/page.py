@@ -20,6 +20,7 @@ from eitbench._files import write_atomically
 from eitbench._foreign import cleaned
 from eitbench.bench.records import alike
 from eitbench.bench.store import EpisodeStore
+from eitbench.bench.text import seed_ranges
 from eitbench.bench.tracks import Environment
 from eitbench.data.seeds import for_scores, parse_seeds
 from eitbench.envs.rendering import FIELD_MAP, colour_range, draw_field
@@ -57,7 +58,8 @@ def _section(store: EpisodeStore, records: list[dict[str, Any]], name: str,
         "intervals": _intervals(table), "curves": _curves(ordered),
         "legend": [(i % charts.COLOURS, _title(record)) for i, record in enumerate(ordered)],
         "snapshots": _snapshots(store, ordered),
-        "failures": [(method(failure.record), failure.seeds, failure.message, failure.traceback)
+        "failures": [(method(failure.record), seed_ranges(failure.seeds), failure.message,
+                      failure.traceback)
                      for failure in failures(store, ordered)],
     }
 

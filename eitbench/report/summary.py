@@ -17,7 +17,7 @@ from eitbench.bench.scores import scores
 from eitbench.bench.table import NOTHING, Cell, Table
 from eitbench.bench.text import mean_and_interval, number, rounded, scores_by_seed, seed_ranges
 from eitbench.bench.tracks import ids
-from eitbench.bench.variants import flat, said
+from eitbench.bench.variants import as_typed, flat
 from eitbench.data.seasons import current_season, season_of
 from eitbench.scoring import skill
 
@@ -142,7 +142,7 @@ def _beliefs(record: dict[str, Any]) -> dict[str, Any]:
 
 def _arguments(arguments: dict[str, Any]) -> str:
     """``flow.mean_velocity=45.0, region=null``: those of parts by dotted names."""
-    return ", ".join(f"{key}={said(value)}" for key, value in sorted(flat(arguments).items()))
+    return ", ".join(f"{key}={as_typed(value)}" for key, value in sorted(flat(arguments).items()))
 
 
 def _skills(record: dict[str, Any], known: Anchors) -> dict[str, float]:

@@ -13,13 +13,11 @@ from matplotlib.figure import Figure
 
 from eitbench.bench.table import NOTHING, Cell, Table
 from eitbench.bench.text import mean_and_interval, number, rounded, scores_by_seed
-from eitbench.bench.variants import flat, said
+from eitbench.bench.variants import as_typed, flat
 from eitbench.report.charts import shortened
 from eitbench.report.plot import logarithmic
 from eitbench.report.summary import kind_of
 from eitbench.report.terminal import LONGEST
-
-_METHOD = "method"
 
 
 class Sweep(NamedTuple):
@@ -38,7 +36,7 @@ class Sweep(NamedTuple):
 def swept(worlds: Iterable[dict[str, Any]]) -> str | None:
     """The one number in which variants differ; None where there is not just one."""
     changes = [flat(world) for world in worlds]
-    differ = [key for key in changes[0] if len({said(each.get(key)) for each in changes}) > 1]
+    differ = [key for key in changes[0] if len({as_typed(each.get(key)) for each in changes}) > 1]
     return differ[0] if len(differ) == 1 else None
 
 
@@ -48,11 +46,11 @@ def sweeps(records: Iterable[dict[str, Any]], number: str) -> Iterator[Sweep]:
     values: dict[str, Any] = {}
     for record in records:
         value = flat(record["environment"]["kwargs"].get("world", {})).get(number)
-        values.setdefault(said(value), value)
+        values.setdefault(as_typed(value), value)
         key = (kind_of(record["environment"]["id"]), record["board"])
         errors = list(scores_by_seed(record, "error").values())
         of_method = boards.setdefault(key, {}).setdefault(record["method"], {})
-        of_method[said(value)] = mean_and_interval(errors) if errors else None
+        of_method[as_typed(value)] = mean_and_interval(errors) if errors else None
     names = sorted(values, key=lambda name: _place(values[name]))
     for (world, board), methods in boards.items():
         yield Sweep(world, board, number, [values[name] for name in names],
@@ -62,14 +60,17 @@ def sweeps(records: Iterable[dict[str, Any]], number: str) -> Iterator[Sweep]:
 def text(sweep: Sweep, letters: int) -> str:
     """A table with a column for each value; with intervals, if lines of so many letters hold
     them."""
-    title = f"{sweep.world}, {sweep.board}: ẽ_c for {sweep.number} ="
+    parts = [f"{sweep.world}, {sweep.board}: ẽ_c for {sweep.number} ="]
     wide = _table(sweep, intervals=True).markdown()
     if len(wide.partition("\n")[0]) <= letters:
-        return f"{title}\n\n{wide}"
+        return "\n\n".join([*parts, wide])
     whole = _table(sweep, intervals=False)
     table = whole.fitted(letters, whole.headings)
+    parts.append(table.markdown())
     hidden = len(whole.headings) - len(table.headings)
-    return f"{title}\n\n{table.markdown()}" + f"\n\nno room for {hidden} values" * (hidden > 0)
+    if hidden:
+        parts.append(f"no room for {hidden} values")
+    return "\n\n".join(parts)
 
 
 def _table(sweep: Sweep, *, intervals: bool) -> Table:
@@ -78,10 +79,10 @@ def _table(sweep: Sweep, *, intervals: bool) -> Table:
             return Cell(NOTHING)
         return Cell(rounded(*error) if intervals else number(error[0]), error[0])
 
-    return Table.of([
-        {_METHOD: shortened(method, LONGEST)}
-        | {said(value): cell(error) for value, error in zip(sweep.values, errors, strict=True)}
-        for method, errors in sweep.errors.items()], keep=[said(value) for value in sweep.values])
+    names = [as_typed(value) for value in sweep.values]
+    rows = [{"method": shortened(method, LONGEST), **dict(zip(names, map(cell, each), strict=True))}
+            for method, each in sweep.errors.items()]
+    return Table.of(rows, keep=names)
 
 
 def png(found: list[Sweep]) -> bytes:
@@ -89,16 +90,16 @@ def png(found: list[Sweep]) -> bytes:
     figure = Figure(figsize=(6.4, 3.9 * len(found)), dpi=120, layout="constrained")
     FigureCanvasAgg(figure)
     for axes, sweep in zip(figure.subplots(len(found), squeeze=False)[:, 0], found, strict=True):
-        draw(axes, sweep)
+        _draw(axes, sweep)
     content = io.BytesIO()
     figure.savefig(content, format="png")
     return content.getvalue()
 
 
-def draw(axes: Axes, sweep: Sweep) -> None:
+def _draw(axes: Axes, sweep: Sweep) -> None:
     """A line for each method."""
     are_numbers = all(isinstance(value, int | float) for value in sweep.values)
-    x = sweep.values if are_numbers else [said(value) for value in sweep.values]
+    x = sweep.values if are_numbers else [as_typed(value) for value in sweep.values]
     for method, errors in sweep.errors.items():
         known = [(at, *error) for at, error in zip(x, errors, strict=True) if error]
         if known:
@@ -117,4 +118,4 @@ def draw(axes: Axes, sweep: Sweep) -> None:
 def _place(value: Any) -> tuple[bool, Any]:
     """Numbers by size, then words."""
     is_number = isinstance(value, int | float)
-    return not is_number, value if is_number else said(value)
+    return not is_number, value if is_number else as_typed(value)

@@ -121,6 +121,8 @@ def test_variants(settings, worlds):
     (["noise"], "set must look like 'instrument.noise_relative=0.02'"),
     (["a..b=1"], "set must look like"),
     (["a.b="], "set must look like"),
+    (["a.b=1,"], "set must give different values, none of them empty, got 'a.b=1,'"),
+    (["a.b=1,2,1"], "set must give different values"),
     (["a.b=1", "a.b=2"], "set must name each number once, got 'a.b' again"),
     (["a.b=1", "a=2"], "set must name each number once, got 'a' again"),
 ])
