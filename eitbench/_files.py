@@ -72,7 +72,7 @@ def check_checkout(path: Path) -> None:
 def readable(path: Path) -> Path:
     """The file or folder to read: the path itself if it leads to one; if not, and it begins as one
     of ours does, as ``leaderboards/results`` in an empty folder, the one that is shipped."""
-    if path.exists() or path.parts[:1] not in {(name,) for name in SHIPPED}:
+    if path.exists() or not path.parts or path.parts[0] not in SHIPPED:
         return path
     ours = shipped(path.parts[0]).joinpath(*path.parts[1:])
     return ours if ours.exists() else path

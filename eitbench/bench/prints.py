@@ -1,5 +1,5 @@
-"""What a method prints, passed on under its name: to standard error, since tables go to the other.
-"""
+"""What a method prints, passed on under its name: to standard error, since standard output is for
+tables."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _CLEAR_LINE = "\r\x1b[K"
 
 @contextmanager
 def passed_on(method: str) -> Iterator[None]:
-    """Within, what is printed is a method's, known by name or path."""
+    """Within, what is printed is taken for that of a method, known by name or path."""
     prints = Prints(method)
     try:
         with redirect_stdout(prints):
@@ -32,7 +32,7 @@ class Prints(io.TextIOBase):
     def __init__(self, method: str) -> None:
         self._mark = f"[{cleaned(Path(method).stem)}] "
         self._line = ""
-        self._is_marked = False
+        self._is_within_line = False
 
     def write(self, text: str) -> int:
         """Pass on the lines that end here, each whole: other processes print too."""
@@ -49,12 +49,12 @@ class Prints(io.TextIOBase):
 
     def end(self) -> None:
         """End the line that is not ended."""
-        if self._line or self._is_marked:
+        if self._line or self._is_within_line:
             self.write("\n")
 
     def _say(self, text: str) -> None:
         clear = _CLEAR_LINE if sys.stderr.isatty() else ""
-        mark = "" if self._is_marked else clear + self._mark
+        mark = "" if self._is_within_line else clear + self._mark
         sys.stderr.write(mark + cleaned(text, lines=True))
         sys.stderr.flush()
-        self._is_marked = not text.endswith("\n")
+        self._is_within_line = not text.endswith("\n")

@@ -150,7 +150,7 @@ def _say_failures(store: EpisodeStore, records: list[dict[str, Any]],
     for failure in found:
         options.say(failure, err=True)
     hints = filter(None, (debugging(failure, asked) for failure in found))
-    if (hint := next(hints, "")) and "--isolate never" not in typed():
+    if (hint := next(hints, "")) and "--isolate never" not in typed().replace("=", " "):
         options.say(f"to debug it in this process, where breakpoint() stops:\n  {hint}", err=True)
 
 

@@ -88,8 +88,10 @@ def _table(world: str, rows: pd.DataFrame) -> tuple[str, Table]:
     lines = []
     for board, seeds, (_, row) in zip(boards, played, rows.iterrows(), strict=True):
         cells: dict[str, Cell | str] = {"method": shortened(row["name"], LONGEST)}
-        cells |= {"board": board} if len(set(boards)) > 1 else {}
-        cells |= {"seeds": shortened(seeds, LONGEST)} if len(set(played)) > 1 else {}
+        if len(set(boards)) > 1:
+            cells["board"] = board
+        if len(set(played)) > 1:
+            cells["seeds"] = shortened(seeds, LONGEST)
         lines.append(cells | scores_shown(row))
     shared = [each[0] for each in (boards, played) if len(set(each)) == 1]
     return ", ".join([world, *shared]), Table.of(lines)
