@@ -80,7 +80,7 @@ def _table(sweep: Sweep, *, intervals: bool) -> Table:
         return Cell(rounded(*error) if intervals else number(error[0]), error[0])
 
     names = [as_typed(value) for value in sweep.values]
-    rows = [{"method": shortened(method, LONGEST), **dict(zip(names, map(cell, each), strict=True))}
+    rows = [{"method": shortened(method, LONGEST)} | dict(zip(names, map(cell, each), strict=True))
             for method, each in sweep.errors.items()]
     return Table.of(rows, keep=names)
 
