@@ -21,6 +21,9 @@ def fit_prior(
         help="What is Gaussian: the inflow's logarithm, or the inflow.")] = Link.logarithm,
     nugget: Annotated[float, typer.Option(
         min=0.0, max=1.0, help="Part of the variance that is white in time.")] = 0.01,
+    kept: Annotated[float, typer.Option(
+        min=0.0, max=1.0, help="Modes across the inlet of less than this part of the variance are "
+                               "left out; each makes filters slower.")] = 1e-4,
 ) -> None:
     """Learn what to expect of the inflow from training episodes, which are not simulated for it,
     and write it as a prior for filters (`eitbench.estimation.InflowPrior`)."""
@@ -29,8 +32,8 @@ def fit_prior(
     from eitbench.worlds.registry import entry
     with options.clear_errors():
         prior = learned_inflow_prior(
-            entry(env).world, parse_seeds(seeds), link=link.value, nugget=nugget,
-            source={"environment": env, "seeds": seeds, "nugget": nugget})
+            entry(env).world, parse_seeds(seeds), link=link.value, nugget=nugget, kept=kept,
+            source={"environment": env, "seeds": seeds, "nugget": nugget, "kept": kept})
         prior.save(out)
     options.say(f"{out}: {prior.modes.shape[1]} modes across {len(prior.points)} nodes of the "
                 f"inlet, correlated over {prior.memory} steps of {prior.time_step:g} s")

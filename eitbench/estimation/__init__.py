@@ -15,6 +15,7 @@ from eitbench.estimation.inflow_prior import (
     suiting_priors,
     white_inflow,
 )
+from eitbench.estimation.inflow_response import Response, changing_responses, steady_response
 from eitbench.estimation.inflow_tracker import InflowTracker
 from eitbench.estimation.joint import JointFilter, JointStep
 from eitbench.estimation.kalman import (
@@ -37,9 +38,10 @@ from eitbench.estimation.smoothness import smoothness_covariance
 __all__ = [
     "DenseKalmanFilter", "FilterStep", "Filtered", "FirstFrame", "FreeCovariance", "GainSequence",
     "InflowFilter", "InflowPrior", "InflowTracker", "JointFilter", "JointStep", "KalmanFilter",
-    "LinearisedObservations", "Observation", "Smoothed", "best_homogeneous", "fit_inflow_prior",
-    "fixed_interval_smoother", "gain_sequence", "gauss_newton", "initial_covariance",
-    "kalman_filter", "learned_inflow_prior", "linearised", "most_probable_inflow",
-    "smoothed_inflow", "smoothed_means", "smoothed_state", "smoothness_covariance",
-    "starting_filter", "suiting_priors", "table_5_1", "white_inflow",
+    "LinearisedObservations", "Observation", "Response", "Smoothed", "best_homogeneous",
+    "changing_responses", "fit_inflow_prior", "fixed_interval_smoother", "gain_sequence",
+    "gauss_newton", "initial_covariance", "kalman_filter", "learned_inflow_prior", "linearised",
+    "most_probable_inflow", "smoothed_inflow", "smoothed_means", "smoothed_state",
+    "smoothness_covariance", "starting_filter", "steady_response", "suiting_priors", "table_5_1",
+    "white_inflow",
 ]

@@ -3,34 +3,18 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_factor, solve_triangular, toeplitz
 
+from eitbench.estimation.inflow_response import Response, steady_response
 from eitbench.estimation.kalman import Observation, linearised
 
 if TYPE_CHECKING:
     from eitbench.estimation.inflow_prior import InflowPrior
-    from eitbench.physics.transport import Transport
     from eitbench.worlds.task import Task
-
-FORGOTTEN = 0.01
-"""The pipe has forgotten an inflow of which less than this part is left, in the Frobenius norm."""
-LONGEST = 400
-"""Steps after which it has to be forgotten."""
-DROPPED = 1e-3
-"""Directions that past inflows reach this much less than the first are left out."""
-
-
-class Response(NamedTuple):
-    """c_t = level + basis · Σ_k weights_k (c_in,t−k − level): what past inflows leave in a pipe."""
-
-    basis: np.ndarray
-    """(n, q) orthonormal: concentrations that inflows can make"""
-    weights: np.ndarray
-    """(q, K, n_inlet) of the inflow k = 0 … K − 1 steps ago: Fᵏ Y in the basis"""
 
 
 class State(NamedTuple):
@@ -51,30 +35,6 @@ class Innovation(NamedTuple):
     """(m, m) V²"""
 
 
-@lru_cache(maxsize=4)
-def response(transport: Transport) -> Response:
-    """Of a flow that stays as it is; ``ValueError`` if it never forgets what flowed in."""
-    F, Y = transport.transition()
-    if not Y.shape[1]:
-        raise ValueError("the transport must have an inlet, got one without")
-    parts = [Y]
-    while np.linalg.norm(parts[-1]) > FORGOTTEN * np.linalg.norm(Y):
-        if len(parts) == LONGEST:
-            raise ValueError(f"the transport must forget an inflow within {LONGEST} steps")
-        parts.append(F @ parts[-1])
-    together = np.concatenate(parts, axis=1)
-    # the smaller of both products holds the singular values
-    if together.shape[1] <= len(together):
-        squares, right = np.linalg.eigh(together.T @ together)
-        keep = squares > DROPPED**2 * squares[-1]
-        basis = together @ (right[:, keep] / np.sqrt(squares[keep]))
-    else:
-        squares, left = np.linalg.eigh(together @ together.T)
-        basis = left[:, squares > DROPPED**2 * squares[-1]]
-    weights = (basis.T @ together).reshape(basis.shape[1], len(parts), Y.shape[1])
-    return Response(basis, weights)
-
-
 class InflowFilter:
     """The extended Kalman filter of the last inflows x_t … x_{t−W+1}, with u = E x the inflow's
     deviation (`InflowPrior`).
@@ -91,15 +51,21 @@ class InflowFilter:
         ĉ_bh in mol/m³.
     lag : int
         The oldest state that is asked for, in steps before the present one.
+    responses : sequence of Response, optional
+        Of the states t = 1, 2, …, where the last holds from then on; default: that of the task's
+        flow for all.
     """
 
-    def __init__(self, task: Task, prior: InflowPrior, level: float, lag: int = 0) -> None:
+    def __init__(self, task: Task, prior: InflowPrior, level: float, lag: int = 0,
+                 responses: Sequence[Response] | None = None) -> None:
         prior.check_task(task)
         self.task = task
         self.prior = prior
         self.level = level
-        self.response = response(task.transport)
-        self.memory = self.response.weights.shape[1]
+        self.responses = responses or [steady_response(task.transport)]
+        self._present = 0
+        """t"""
+        self.memory = self.responses[0].weights.shape[1]
         """K, steps until the pipe has forgotten an inflow"""
         self.window = W = self.memory + lag
         entries = prior.time_covariance(W + 1)
@@ -115,6 +81,7 @@ class InflowFilter:
 
     def predict(self) -> None:
         """Move one time step on: a new inflow is expected, the oldest is forgotten."""
+        self._present += 1
         W, r = self.mean.shape
         newest = self._regression @ self.mean
         self.mean = np.concatenate([newest[None], self.mean[:-1]])
@@ -151,12 +118,17 @@ class InflowFilter:
         self.covariance = self.covariance - gained.T @ gained
         return Innovation(innovation, S)
 
+    def response(self, lag: int = 0) -> Response:
+        """Of the state ``lag`` steps ago."""
+        t = min(max(self._present - lag, 1), len(self.responses))
+        return self.responses[t - 1]
+
     def concentration(self, lag: int = 0) -> np.ndarray:
         """(n,) mol/m³, ``lag`` steps ago, of the expected inflows."""
         recent = self.mean[lag:lag + self.memory]
         deviation = self.prior.inflow(recent @ self.prior.modes.T) - 1.0
-        made = np.tensordot(self.response.weights, deviation, 2)
-        return self.level * (1.0 + self.response.basis @ made)
+        basis, weights = self.response(lag)
+        return self.level * (1.0 + basis @ np.tensordot(weights, deviation, 2))
 
     def state(self, lag: int = 0) -> State:
         """What is known of the state ``lag`` steps ago."""
@@ -164,17 +136,23 @@ class InflowFilter:
         r = self.mean.shape[1]
         here = slice(lag * r, (lag + self.memory) * r)
         reduced = slope @ self.covariance[here, here] @ slope.T
-        basis = self.response.basis
+        basis = self.response(lag).basis
         return State(self.concentration(lag), ((basis @ reduced) * basis).sum(axis=1))
 
     def by_inflow(self, matrix: np.ndarray, lag: int = 0) -> np.ndarray:
         """(m, K·r) derivatives by x of readings of the state ``lag`` steps ago, whose derivatives
         by c are ``matrix`` (m, n)."""
-        return (matrix @ self.response.basis) @ self._slope(lag)
+        basis, weights = self.response(lag)
+        return self._by_x(np.tensordot(matrix @ basis, weights, 1), lag)
 
     def _slope(self, lag: int) -> np.ndarray:
         """(q, K·r) derivatives of the concentration in the basis by x."""
+        return self._by_x(self.response(lag).weights, lag)
+
+    def _by_x(self, by_inflow: np.ndarray, lag: int) -> np.ndarray:
+        """(m, K·r) derivatives by x of what has those by the inflows (m, K, n_inlet)."""
         recent = self.mean[lag:lag + self.memory]
-        by_u = self.level * self.prior.slope(recent @ self.prior.modes.T)
-        by_x = (self.response.weights * by_u) @ self.prior.modes
-        return by_x.reshape(len(by_x), -1)
+        by_u = by_inflow * (self.level * self.prior.slope(recent @ self.prior.modes.T))
+        # one product of matrices; of three dimensions it would be many small ones
+        by_x = by_u.reshape(-1, by_u.shape[-1]) @ self.prior.modes
+        return by_x.reshape(len(by_inflow), -1)

@@ -9,6 +9,7 @@ from scipy.linalg import cho_factor, cho_solve, solve_triangular, toeplitz
 
 from eitbench.estimation.inflow_history import InflowFilter
 from eitbench.estimation.inflow_prior import InflowPrior
+from eitbench.estimation.inflow_response import Response
 from eitbench.worlds.task import Task
 
 SETTLED = 1e-3
@@ -18,10 +19,11 @@ MOST = 12
 
 
 def smoothed_inflow(task: Task, prior: InflowPrior, level: float,
-                    record: Sequence[tuple[np.ndarray, np.ndarray]]) -> InflowFilter:
+                    record: Sequence[tuple[np.ndarray, np.ndarray]],
+                    responses: Sequence[Response] | None = None) -> InflowFilter:
     """The filter at the end of a record of (voltages, currents), (L,) each: `InflowFilter.state`
-    tells all states from there, with everything measured known."""
-    smoother = InflowFilter(task, prior, level, lag=len(record))
+    tells all states from there, with everything measured known. ``responses`` as there."""
+    smoother = InflowFilter(task, prior, level, len(record), responses)
     for voltages, currents in record:
         smoother.predict()
         smoother.update(voltages, currents)

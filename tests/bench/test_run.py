@@ -141,16 +141,20 @@ BIASED = Environment("eitbench/Pipe2DSmoothing-v0",
 @pytest.mark.parametrize("environment", [FILTER, FIXED_LAG, SMOOTHING, BIASED],
                          ids=["filter", "fixed-lag", "smoothing", "biased"])
 def test_reference_with_the_true_model(environment):
-    """Whatever a board asks for and believes, the reference says what the smoother with the true velocity says."""
+    """Whatever a board asks for and believes, the reference says what the smoother with the true velocity says: that of
+    the most probable inflow."""
     reference, _ = run_episode(Job(environment, "true_model_smoother", 3))
-    smoother, _ = run_episode(Job(SMOOTHING, "fixed_interval_smoother", 3))
+    smoother, _ = run_episode(Job(SMOOTHING, "inflow_smoother", 3))
     assert (reference["role"], reference["privileged"]) == ("reference", True)
     np.testing.assert_allclose(reference["step_errors"], smoother["step_errors"], rtol=1e-6)
 
 
-def test_reference_in_a_flow_that_changes():
-    """Told the flow of every step it errs less than the filter that is told the first guess, and knows the flow."""
-    changes = merged(SCENARIO, {"schedule": {"scored_steps": 12}, "flow": {"velocity_range": [30.0, 60.0]}})
+@pytest.mark.parametrize("vessel", [{}, {"half_width": 0.06}], ids=["inflows", "states"])
+def test_reference_in_a_flow_that_changes(vessel):
+    """Told the flow of every step it errs less than the filter that is told the first guess, and knows the flow; also
+    where the inlet is another one than that of the prior that was learned."""
+    changes = merged(SCENARIO, {"schedule": {"scored_steps": 12}, "flow": {"velocity_range": [30.0, 60.0]},
+                                "vessel": vessel})
     world = Environment("eitbench/Pipe2DTimeVaryingVelocity-v0", json.dumps({"world": changes}))
     reference, guessing = (run_episode(Job(world, name, 3))[0]["scores"]
                            for name in ("true_model_smoother", "kalman_filter"))

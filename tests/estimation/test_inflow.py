@@ -12,6 +12,7 @@ from eitbench.estimation import (
     InflowFilter,
     InflowPrior,
     Observation,
+    changing_responses,
     fit_inflow_prior,
     learned_inflow_prior,
     most_probable_inflow,
@@ -70,6 +71,24 @@ def stepped(inflow, lag=0):
     return LEVEL + deviation
 
 
+# -- a flow that changes ----------------------------------------------------------------------------------------------
+
+
+def test_a_flow_that_changes_carries_each_inflow_by_what_flowed_then():
+    """Inflows carried on step by step, each step by its own transport; before the first it was as in it."""
+    nominal, faster = (make_task(TINY.changed({"flow": {"mean_velocity": speed}})).transport for speed in (45.0, 60.0))
+    transports = [nominal, faster, nominal]
+    response = changing_responses(lambda t: transports[t - 1], 3)[-1]
+    K, inlet = response.weights.shape[1:]
+    inflow = 1.0 + 0.3 * np.random.default_rng(5).standard_normal((K + 2, inlet))        # the oldest first
+    state, before = np.zeros(task().mesh.n_nodes), np.zeros(inlet)
+    for k, after in enumerate(inflow):
+        state = transports[max(k - K + 1, 0)].step(state, before, after)
+        before = after
+    made = response.basis @ np.tensordot(response.weights, inflow[::-1][:K], 2)
+    assert np.linalg.norm(made - state) < 0.02 * np.linalg.norm(state)                   # 0.01 is forgotten
+
+
 # -- the history makes the concentration ------------------------------------------------------------------------------
 
 
@@ -110,7 +129,7 @@ def dense(filter_, observations, times):
     T = len(observations)
     K, r = filter_.memory, filter_.mean.shape[1]
     covariance = np.kron(toeplitz(filter_.prior.time_covariance(T + K - 1)), np.eye(r))
-    basis, weights = filter_.response
+    basis, weights = filter_.response()
     part = (LEVEL * basis @ (weights @ filter_.prior.modes).reshape(len(weights), -1))  # (n, K·r)
     G = np.zeros((T, len(part), (T + K - 1) * r))
     for t in range(T):                                                                  # the newest first
