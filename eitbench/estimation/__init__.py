@@ -18,6 +18,7 @@ from eitbench.estimation.inflow_prior import (
 from eitbench.estimation.inflow_response import Response, changing_responses, steady_response
 from eitbench.estimation.inflow_tracker import InflowTracker
 from eitbench.estimation.joint import JointFilter, JointStep
+from eitbench.estimation.joint_inflow import JointInflowFilter
 from eitbench.estimation.kalman import (
     FilterStep,
     KalmanFilter,
@@ -34,14 +35,15 @@ from eitbench.estimation.smoother import (
     smoothed_state,
 )
 from eitbench.estimation.smoothness import smoothness_covariance
+from eitbench.estimation.unknown_flow import UnknownFlow, asked_flow, scaled_flow
 
 __all__ = [
     "DenseKalmanFilter", "FilterStep", "Filtered", "FirstFrame", "FreeCovariance", "GainSequence",
-    "InflowFilter", "InflowPrior", "InflowTracker", "JointFilter", "JointStep", "KalmanFilter",
-    "LinearisedObservations", "Observation", "Response", "Smoothed", "best_homogeneous",
-    "changing_responses", "fit_inflow_prior", "fixed_interval_smoother", "gain_sequence",
-    "gauss_newton", "initial_covariance", "kalman_filter", "learned_inflow_prior", "linearised",
-    "most_probable_inflow", "smoothed_inflow", "smoothed_means", "smoothed_state",
-    "smoothness_covariance", "starting_filter", "steady_response", "suiting_priors", "table_5_1",
-    "white_inflow",
+    "InflowFilter", "InflowPrior", "InflowTracker", "JointFilter", "JointInflowFilter", "JointStep",
+    "KalmanFilter", "LinearisedObservations", "Observation", "Response", "Smoothed", "UnknownFlow",
+    "asked_flow", "best_homogeneous", "changing_responses", "fit_inflow_prior",
+    "fixed_interval_smoother", "gain_sequence", "gauss_newton", "initial_covariance",
+    "kalman_filter", "learned_inflow_prior", "linearised", "most_probable_inflow", "scaled_flow",
+    "smoothed_inflow", "smoothed_means", "smoothed_state", "smoothness_covariance",
+    "starting_filter", "steady_response", "suiting_priors", "table_5_1", "white_inflow",
 ]

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.linalg import cho_factor, solve_triangular, toeplitz
 
 from eitbench.estimation.inflow_response import Response, steady_response
 from eitbench.estimation.kalman import Observation, linearised
+from eitbench.estimation.moving_window import Innovation, conditioned, moved, stationary
 
 if TYPE_CHECKING:
     from eitbench.estimation.inflow_prior import InflowPrior
@@ -24,15 +24,6 @@ class State(NamedTuple):
     """(n,) mol/m³"""
     variance: np.ndarray
     """(n,) (mol/m³)²"""
-
-
-class Innovation(NamedTuple):
-    """How a measurement compared with what was known before it."""
-
-    value: np.ndarray
-    """(m,) V, measured less predicted"""
-    covariance: np.ndarray
-    """(m, m) V²"""
 
 
 class InflowFilter:
@@ -68,11 +59,7 @@ class InflowFilter:
         self.memory = self.responses[0].weights.shape[1]
         """K, steps until the pipe has forgotten an inflow"""
         self.window = W = self.memory + lag
-        entries = prior.time_covariance(W + 1)
-        before = toeplitz(entries[:-1])
-        self._regression = np.linalg.solve(before, entries[1:])
-        """(W,) of an inflow on the W before it"""
-        self._new_variance = float(entries[0] - self._regression @ entries[1:])
+        before, self._regression = stationary(prior.time_covariance(W + 1))
         modes = prior.modes.shape[1]
         self.mean = np.zeros((W, modes))
         """of x, the newest first"""
@@ -82,18 +69,9 @@ class InflowFilter:
     def predict(self) -> None:
         """Move one time step on: a new inflow is expected, the oldest is forgotten."""
         self._present += 1
-        W, r = self.mean.shape
-        newest = self._regression @ self.mean
-        self.mean = np.concatenate([newest[None], self.mean[:-1]])
-        old = self.covariance
-        cross = np.tensordot(self._regression, old.reshape(W, r, W * r), 1)          # (r, W·r)
-        variance = np.tensordot(cross.reshape(r, W, r), self._regression, (1, 0))
-        moved = np.empty_like(old)
-        moved[r:, r:] = old[:-r, :-r]
-        moved[:r, r:] = cross[:, :-r]
-        moved[r:, :r] = cross[:, :-r].T
-        moved[:r, :r] = 0.5 * (variance + variance.T) + self._new_variance * np.eye(r)
-        self.covariance = moved
+        weights, variance = self._regression
+        self.mean, self.covariance = moved(self.mean, self.covariance, weights[:, None],
+                                           np.full(self.mean.shape[1], variance))
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Innovation:
         """Take in a measurement (L,) in V of the present state, for the injection (L,) in A."""
@@ -105,18 +83,11 @@ class InflowFilter:
     def take_in(self, observation: Observation, point: np.ndarray) -> Innovation:
         """Take in a measurement that is linear in the concentration near ``point`` (n,), which is
         `concentration`."""
-        H = self.by_inflow(observation.matrix)
-        seen = H.shape[1]
-        cross = self.covariance[:, :seen] @ H.T
-        S = H @ cross[:seen] + np.diag(observation.noise_variance)
-        S = 0.5 * (S + S.T)
         innovation = observation.value - observation.matrix @ point
-        factor = cho_factor(S, lower=True)[0]
-        gained = solve_triangular(factor, cross.T, lower=True)                       # L⁻¹ H Γ
-        change = solve_triangular(factor, innovation, lower=True) @ gained
-        self.mean = self.mean + change.reshape(self.mean.shape)
-        self.covariance = self.covariance - gained.T @ gained
-        return Innovation(innovation, S)
+        self.mean, self.covariance, told = conditioned(
+            self.mean, self.covariance, self.by_inflow(observation.matrix), innovation,
+            observation.noise_variance)
+        return told
 
     def response(self, lag: int = 0) -> Response:
         """Of the state ``lag`` steps ago."""

@@ -148,7 +148,8 @@ class JointFilter:
         """Take in readings of the present c: their matrix (m, n), and what `expect` says."""
         n = self._n
         step = self._filter.take_in(self._blind(H), cross, innovation, S)
-        step.mean[n:] = self._physical(step.mean[n:])  # the filter's own array
+        step.mean[n:] = physical(step.mean[n:], self._start, self._profiles,
+                                 self._bounds)  # the filter's own array
         return JointStep(step.mean[:n].copy(), step.variance[:n], step.mean[n:].copy(),
                          self.covariance[n:, n:].copy(), step.innovation,
                          step.innovation_covariance)
@@ -157,11 +158,16 @@ class JointFilter:
         """(m, n + k): θ itself is not seen."""
         return np.hstack([matrix, np.zeros((len(matrix), len(self._start)))])
 
-    def _physical(self, parameters: np.ndarray) -> np.ndarray:
-        """``parameters``, or the nearest point within the bounds on the line towards θ_0."""
-        change = self._profiles @ (parameters - self._start)  # in parts of the start
-        room = np.where(change < 0, *self._bounds) - 1.0
-        beyond = np.abs(change) > np.abs(room)
-        if not beyond.any():
-            return parameters
-        return self._start + (room[beyond] / change[beyond]).min() * (parameters - self._start)
+
+def physical(parameters: np.ndarray, start: np.ndarray, profiles: np.ndarray,
+             bounds: Sequence[float] | np.ndarray) -> np.ndarray:
+    """``parameters`` (k,), or the nearest point within ``bounds`` on the line towards ``start``.
+
+    ``profiles`` (p, k) gives the axial velocity at p points in parts of the one at the start.
+    """
+    change = profiles @ (parameters - start)
+    room = np.where(change < 0, *bounds) - 1.0
+    beyond = np.abs(change) > np.abs(room)
+    if not beyond.any():
+        return parameters
+    return start + (room[beyond] / change[beyond]).min() * (parameters - start)

@@ -112,7 +112,7 @@ class ConvectionDiffusion:
             raise ValueError(f"inlet must hold node numbers in [0, {mesh.n_nodes - 1}], "
                              f"got {nodes}")
         self.inlet = nodes.astype(np.int64)
-        self._velocity = velocity
+        self.velocity = velocity
         mass, transport = _supg_matrices(mesh, velocity, self.diffusivity)
         dt = self.time_step / self.substeps
         free = self._free = np.setdiff1d(np.arange(mesh.n_nodes), self.inlet)
@@ -174,7 +174,7 @@ class ConvectionDiffusion:
         c = _check.array("c", c, (self.mesh.n_nodes,))[:, None]
         before = self._inflow("inflow_before", inflow_before, 1)
         after = self._inflow("inflow_after", inflow_after, 1)
-        changes = _supg_derivatives(self.mesh, self._velocity, self.diffusivity, directions)
+        changes = _supg_derivatives(self.mesh, self.velocity, self.diffusivity, directions)
         substeps = self._substeps(c, before, after, self._no_loads())
         states = np.hstack([state.copy() for state in substeps])
         # A sub-step solves M (c⁺ − c)/Δt + K (c⁺ + c)/2 = 0, backward Euler the same with K c⁺/2.
