@@ -90,9 +90,7 @@ class JointFilter:
             raise ValueError("profiles must give a positive velocity with parameters, "
                              f"got {nominal.min():g} m/s")
         self._profiles = shapes / nominal[:, None]
-        low, high = self._bounds = _check.array("bounds", bounds, (2,))
-        if not 0 < low < 1 < high:
-            raise ValueError(f"bounds must be a range 0 < least < 1 < largest, got {bounds!r}")
+        self._bounds = check_bounds(bounds)
         joint = np.zeros((n + k, n + k))
         joint[:n, :n] = _check.array("covariance", covariance, (n, n))
         joint[n:, n:] = _check.array("parameter_covariance", parameter_covariance, (k, k))
@@ -159,8 +157,16 @@ class JointFilter:
         return np.hstack([matrix, np.zeros((len(matrix), len(self._start)))])
 
 
+def check_bounds(bounds: tuple[float, float]) -> np.ndarray:
+    """``bounds`` of `JointFilter` (2,); ``ValueError`` if they are none."""
+    low, high = checked = _check.array("bounds", bounds, (2,))
+    if not 0 < low < 1 < high:
+        raise ValueError(f"bounds must be a range 0 < least < 1 < largest, got {bounds!r}")
+    return checked
+
+
 def physical(parameters: np.ndarray, start: np.ndarray, profiles: np.ndarray,
-             bounds: Sequence[float] | np.ndarray) -> np.ndarray:
+             bounds: np.ndarray) -> np.ndarray:
     """``parameters`` (k,), or the nearest point within ``bounds`` on the line towards ``start``.
 
     ``profiles`` (p, k) gives the axial velocity at p points in parts of the one at the start.

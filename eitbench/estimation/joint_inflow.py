@@ -9,7 +9,7 @@ import numpy as np
 
 from eitbench import _check
 from eitbench.estimation.inflow_history import State
-from eitbench.estimation.joint import physical
+from eitbench.estimation.joint import check_bounds, physical
 from eitbench.estimation.kalman import Observation, linearised
 from eitbench.estimation.moving_window import Innovation, conditioned, moved, stationary
 
@@ -53,7 +53,8 @@ class JointInflowFilter:
         self.prior = prior
         self.level = level
         self.flow = flow
-        self.bounds = bounds
+        self._bounds = check_bounds(bounds)
+        self._profiles = flow.profiles / (flow.profiles @ flow.start)[:, None]
         r = self._modes = prior.modes.shape[1]
         k = len(flow.start)
         before, (weights, variance) = stationary(prior.time_covariance(W + 1))
@@ -137,11 +138,15 @@ class JointInflowFilter:
         innovation = observation.value - matrix @ self.concentration()
         self.mean, self.covariance, told = conditioned(
             self.mean, self.covariance, self.slope(matrix), innovation, observation.noise_variance)
-        flow = self.flow
-        nominal = flow.profiles @ flow.start
-        self.mean[0, self._modes:] = physical(self.parameters, flow.start,
-                                              flow.profiles / nominal[:, None], self.bounds)
+        self._keep_physical()
         return told
+
+    def _keep_physical(self) -> None:
+        """Move θ back within its bounds; the concentration stays what it is."""
+        free = self.parameters
+        kept = physical(free, self.flow.start, self._profiles, self._bounds)
+        self._constant += self._made[:, 0, len(self._inlet):] @ (free - kept)
+        self.mean[0, self._modes:] = kept
 
     def concentration(self) -> np.ndarray:
         """(n,) mol/m³, of the expected inflows and flows."""

@@ -1,0 +1,239 @@
+"""The joint filter of inflow and flow against the transport stepped by hand, the filter of a known flow, the joint
+filter with a white inflow, and a known truth."""
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from eitbench.estimation import (
+    InflowFilter,
+    InflowPrior,
+    JointFilter,
+    JointInflowFilter,
+    Observation,
+    UnknownFlow,
+    asked_flow,
+    inflow_history,
+    scaled_flow,
+    white_inflow,
+)
+from eitbench.numerics.mesh import rectangle_mesh
+from eitbench.physics.transport import ConvectionDiffusion
+from eitbench.worlds.pipe2d_skewed import PIPE_2D_SKEWED
+from eitbench.worlds.stationary_tank import STATIONARY_TANK_2D
+from eitbench.worlds.task import make_task
+
+from tiny_worlds import TINY
+
+# -- a coarse pipe of 147 nodes, seen by local averages ---------------------------------------------------------------
+
+R, LEVEL, N = 0.05, 29.0, 147
+MESH = rectangle_mesh(np.linspace(0.0, 0.4, 21), np.linspace(-R, R, 7))
+PROFILES = [lambda eta: 1.5 * (1 - eta**2), lambda eta: 1.5 * eta * (1 - eta**2)]
+HEIGHTS = np.linspace(-0.9, 0.9, 13)
+BOUNDS = (0.05, 4.0)
+
+
+def direction(profile):
+    return lambda points: np.column_stack([profile(points[:, 1] / R), np.zeros(len(points))])
+
+
+DIRECTIONS = [direction(profile) for profile in PROFILES]
+
+
+def transport_at(theta):
+    return ConvectionDiffusion(MESH, lambda points: sum(t * v(points) for t, v in zip(theta, DIRECTIONS, strict=True)),
+                               1e-2, 5e-3, substeps=4, inlet=np.arange(7))
+
+
+def flow(std=(1.0, 2.0), walk=(0.05, 0.02)):
+    """v = θ_1 v_1 + θ_2 v_2 with a mean of 4.5 m/s at first, which passes the pipe in 18 steps."""
+    shapes = np.stack([profile(HEIGHTS) for profile in PROFILES], axis=1)
+    return UnknownFlow(transport_at, DIRECTIONS, np.array([4.5, 0.0]), np.array(std), np.array(walk), shapes)
+
+
+@lru_cache(maxsize=1)
+def task():
+    return replace(make_task(TINY), transport=transport_at([4.5, 0.0]))
+
+
+@lru_cache(maxsize=2)
+def prior(link="logarithm"):
+    """Two modes across the inlet, a correlation over four steps."""
+    r = MESH.points[:7, 1] / R
+    return InflowPrior(link, MESH.points[:7], 0.2 * np.stack([np.exp(-r**2), r], axis=1), 0.6**np.arange(5)**2.0, 5e-3)
+
+
+def observations(count, seed=5, m=8):
+    """Averages about random places, a little wider than a cell."""
+    random = np.random.default_rng(seed)
+    for _ in range(count):
+        places = random.uniform([0.0, -R], [0.4, R], (m, 2))
+        weights = np.exp(-0.5 * (((MESH.points - places[:, None]) / [0.02, 0.015])**2).sum(axis=2))
+        H = weights / weights.sum(axis=1, keepdims=True)
+        yield Observation(H, LEVEL + 3.0 * random.normal(size=m), np.full(m, 0.1))
+
+
+def near(actual, expected, part):
+    np.testing.assert_allclose(actual, expected, atol=part * np.abs(expected).max(), rtol=0)
+
+
+# -- the histories make the concentration -----------------------------------------------------------------------------
+
+
+def stepped(z, steps):
+    """The concentration that z (steps + W, 2 + 2), the oldest first, makes of a pipe full of c_bh: the first W at the
+    velocity believed at first, the others at their own."""
+    c, before = np.full(N, LEVEL), LEVEL
+    for number, (x, theta) in enumerate(zip(z[:, :2], z[:, 2:], strict=True)):
+        after = LEVEL * np.exp(prior().modes @ x)
+        c = transport_at(theta if number >= len(z) - steps else [4.5, 0.0]).step(c, before, after)
+        before = after
+    return c
+
+
+def test_concentration_and_derivatives_are_those_of_the_transport():
+    """Four steps from other inflows than the expected ones: the concentration to 1e-10, and its derivatives by inflows
+    and by the velocity of each step to 1e-6 of the largest, by central differences."""
+    W, steps, h = 12, 4, 1e-4
+    filter_ = JointInflowFilter(task(), prior(), LEVEL, flow(), W, BOUNDS)
+    start = filter_.mean.copy()
+    start[:, :2] = 0.5 * np.random.default_rng(1).standard_normal((W, 2))
+    filter_.mean = start.copy()
+    for _ in range(steps):
+        filter_.predict()
+    z = np.concatenate([start[::-1], filter_.mean[:steps][::-1]])
+    near(filter_.concentration(), stepped(z, steps), 1e-10)
+    slope = filter_.slope().reshape(N, W, 4)
+    for k, part in [(0, 0), (3, 1), (6, 0), (0, 2), (0, 3), (1, 2), (3, 2), (3, 3)]:
+        change = np.zeros_like(z)
+        change[-1 - k, part] = h
+        difference = (stepped(z + change, steps) - stepped(z - change, steps)) / (2 * h)
+        assert np.abs(difference).max() > 1e-3
+        near(slope[:, k, part], difference, 1e-6)
+
+
+# -- against other filters --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("link", ["linear", "logarithm"])
+def test_a_known_velocity_gives_the_filter_of_the_inflow(link, monkeypatch):
+    """Without any doubt of θ, where the other filter drops next to nothing: to 1e-4."""
+    monkeypatch.setattr(inflow_history, "FORGOTTEN", 1e-6)
+    monkeypatch.setattr(inflow_history, "DROPPED", 1e-7)
+    other = InflowFilter(task(), prior(link), LEVEL)
+    filter_ = JointInflowFilter(task(), prior(link), LEVEL, flow((0.0, 0.0), (0.0, 0.0)), other.window, BOUNDS)
+    for observation in observations(12):
+        other.predict()
+        filter_.predict()
+        theirs = other.take_in(observation, other.concentration())
+        ours = filter_.take_in(observation)
+        near(ours.value, theirs.value, 1e-4)
+        near(ours.covariance, theirs.covariance, 1e-4)
+    near(filter_.concentration() - LEVEL, other.concentration() - LEVEL, 1e-4)
+    near(filter_.state().variance, other.state().variance, 1e-4)
+    np.testing.assert_array_equal(filter_.parameters, [4.5, 0.0])
+    assert not filter_.parameter_covariance.any()
+
+
+def test_a_white_inflow_gives_the_joint_filter():
+    """From the same covariance of c, of all inflows before, and with a constant velocity: means, covariances and
+    innovations of ten steps to 1e-7, which is what inflows have left that fell out of the window. (Where θ walks, a
+    step moves the fluid at once here, and one time step later there.)"""
+    belief = flow(walk=(0.0, 0.0))
+    filter_ = JointInflowFilter(task(), white_inflow(task()), LEVEL, belief, 90, BOUNDS)
+    slope = filter_.slope()
+    joint = JointFilter(transport_at, DIRECTIONS, mean=np.full(N, LEVEL),
+                        covariance=slope @ filter_.covariance @ slope.T, parameters=belief.start,
+                        parameter_covariance=np.diag(belief.start_std**2), walk_std=belief.walk_std, inflow=LEVEL,
+                        inflow_std=task().prior.inflow_std * LEVEL, nodal_noise=np.zeros((N, N)),
+                        profiles=belief.profiles, bounds=BOUNDS)
+    for observation in observations(10):
+        filter_.predict()
+        joint.predict()
+        ours = filter_.take_in(observation)
+        theirs = joint.update(observation)
+        state = filter_.state()
+        near(ours.value, theirs.innovation, 1e-7)
+        near(ours.covariance, theirs.innovation_covariance, 1e-7)
+        near(state.mean, theirs.mean, 1e-7)
+        near(state.variance, theirs.variance, 1e-7)
+        near(filter_.parameters, theirs.parameters, 1e-7)
+        near(filter_.parameter_covariance, theirs.parameter_covariance, 1e-7)
+    assert np.linalg.norm(filter_.parameters - belief.start) > 0.1
+
+
+# -- against a truth --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("truth", [[3.4, 0.0], [5.6, 0.0], [4.0, 1.2]], ids=["slow", "fast", "skew"])
+def test_velocity_is_found(truth):
+    """Inflows of the prior's own law in a flow one to two σ off: θ to 5 %, within its 3σ."""
+    random = np.random.default_rng(3)
+    process = np.linalg.cholesky(np.array([[prior().time_covariance(80)[abs(i - j)] for i in range(80)]
+                                           for j in range(80)])) @ random.standard_normal((80, 2))
+    filter_ = JointInflowFilter(task(), prior(), LEVEL, flow(walk=(0.0, 0.0)), 30, BOUNDS)
+    transport = transport_at(truth)
+    c, before = np.full(N, LEVEL), LEVEL
+    for t, x in enumerate(process):
+        after = LEVEL * np.exp(prior().modes @ x)
+        c = transport.step(c, before, after)
+        before = after
+        if t < 30:
+            continue
+        (seen,) = observations(1, seed=t)
+        filter_.predict()
+        filter_.take_in(seen._replace(value=seen.matrix @ c + 0.3 * random.normal(size=len(seen.value))))
+    off, std = filter_.parameters - truth, np.sqrt(filter_.parameter_covariance.diagonal())
+    assert (np.abs(off) < 3 * std).all()
+    assert np.linalg.norm(off) < 0.05 * np.linalg.norm(truth)
+
+
+def test_velocity_stays_within_its_bounds():
+    """A measurement that says the fluid flows back moves the velocity to the least that is possible."""
+    filter_ = JointInflowFilter(task(), prior(), LEVEL, flow((3.0, 0.0), (0.05, 0.0)), 12, BOUNDS)
+    for observation in observations(4):
+        filter_.predict()
+        filter_.take_in(observation)
+    filter_.predict()
+    (observation,) = observations(1, seed=8)
+    by_theta = filter_.slope(observation.matrix) @ filter_.covariance[:, 2]     # how readings vary with θ_1
+    value = observation.matrix @ filter_.concentration() - 1e3 * by_theta
+    filter_.take_in(observation._replace(value=value))
+    assert filter_.parameters[0] == pytest.approx(0.05 * 4.5)
+    filter_.predict()
+    assert np.isfinite(filter_.concentration()).all()
+
+
+# -- flows, and what does not fit -------------------------------------------------------------------------------------
+
+
+def test_flows_of_a_task():
+    """What a task asks for is believed as it says; what it tells is the transport itself at a factor of 1."""
+    asked = asked_flow(make_task(PIPE_2D_SKEWED))
+    np.testing.assert_array_equal(asked.start, [4.5, 0.0, 0.0])
+    np.testing.assert_array_equal(asked.start_std, [1.0, 3.0, 1.0])
+    told = scaled_flow(task(), 0.3, 0.01)
+    c = LEVEL + np.random.default_rng(0).normal(size=N)
+    for factor in (1.0, 1.2):
+        there = told.transport_at(np.array([factor])).step(c, LEVEL, LEVEL)
+        near(there, transport_at([factor * 4.5, 0.0]).step(c, LEVEL, LEVEL), 1e-12)
+    assert (told.start_std, told.walk_std) == (0.3, 0.01)
+
+
+def test_what_does_not_fit_is_told():
+    with pytest.raises(ValueError, match="task must ask for the flow"):
+        asked_flow(task())
+    with pytest.raises(ValueError, match="task must have a flow, got AtRest"):
+        scaled_flow(make_task(STATIONARY_TANK_2D), 0.3, 0.0)
+    with pytest.raises(ValueError, match="walk_std"):
+        flow(walk=(0.1,))
+    with pytest.raises(ValueError, match=r"profiles must give a positive velocity with start, got -4\.5"):
+        replace(flow(), profiles=-np.ones((3, 2)))
+    with pytest.raises(ValueError, match="window"):
+        JointInflowFilter(task(), prior(), LEVEL, flow(), 0, BOUNDS)
+    with pytest.raises(ValueError, match="bounds must be a range"):
+        JointInflowFilter(task(), prior(), LEVEL, flow(), 12, (0.5, 0.9))
+    with pytest.raises(ValueError, match="the prior must be of the task's inlet"):
+        JointInflowFilter(make_task(TINY), prior(), LEVEL, flow(), 12, BOUNDS)
