@@ -167,7 +167,7 @@ def test_a_white_inflow_gives_the_joint_filter():
 # -- against a truth --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("truth", [[3.4, 0.0], [5.6, 0.0], [4.0, 1.2]], ids=["slow", "fast", "skew"])
+@pytest.mark.parametrize("truth", [[3.4, 0.0], [5.0, 1.2]], ids=["slow", "skew"])
 def test_velocity_is_found(truth):
     """Inflows of the prior's own law in a flow one to two σ off: θ to 5 %, within its 3σ."""
     random = np.random.default_rng(3)
