@@ -14,7 +14,7 @@ from eitbench.estimation import (
     Observation,
     UnknownFlow,
     asked_flow,
-    inflow_history,
+    inflow_response,
     scaled_flow,
     white_inflow,
 )
@@ -120,8 +120,8 @@ def test_concentration_and_derivatives_are_those_of_the_transport():
 @pytest.mark.parametrize("link", ["linear", "logarithm"])
 def test_a_known_velocity_gives_the_filter_of_the_inflow(link, monkeypatch):
     """Without any doubt of θ, where the other filter drops next to nothing: to 1e-4."""
-    monkeypatch.setattr(inflow_history, "FORGOTTEN", 1e-6)
-    monkeypatch.setattr(inflow_history, "DROPPED", 1e-7)
+    monkeypatch.setattr(inflow_response, "FORGOTTEN", 1e-6)
+    monkeypatch.setattr(inflow_response, "DROPPED", 1e-7)
     other = InflowFilter(task(), prior(link), LEVEL)
     filter_ = JointInflowFilter(task(), prior(link), LEVEL, flow((0.0, 0.0), (0.0, 0.0)), other.window, BOUNDS)
     for observation in observations(12):
