@@ -1,0 +1,54 @@
+"""How many training episodes the inflow's prior needs: `python studies/inflow_prior.py`, minutes
+once the episodes are simulated.
+
+The filter of the inflow's logarithm plays dev:0-7 of Pipe2D with priors from the first so many
+training inflows; printed are its errors, and how well it knows them.
+"""
+
+from __future__ import annotations
+
+import gymnasium as gym
+import numpy as np
+from tqdm import tqdm
+
+import eitbench
+from eitbench.bench.text import mean_and_interval, rounded
+from eitbench.data.seeds import parse_seeds
+from eitbench.estimation import InflowPrior, InflowTracker, learned_inflow_prior
+from eitbench.worlds.registry import entry
+
+ID = "eitbench/Pipe2D-v0"
+COUNTS = (1, 10, 100)
+PLAYED = parse_seeds("dev:0-7")
+
+
+def play(prior: InflowPrior, seed: int) -> tuple[float, float]:
+    """Mean relative error, and NIS per reading, of the states that are scored."""
+    env = gym.make(ID).unwrapped
+    task: eitbench.Task = env.task
+    tracker = InflowTracker(task, prior)
+    observation, _ = env.reset(seed=seed)
+    rewards, surprises = [], []
+    for _ in range(task.n_steps):
+        estimate = tracker.update(**observation)
+        if estimate.innovation is not None:
+            whitened = np.linalg.solve(estimate.innovation_covariance, estimate.innovation)
+            surprises.append(estimate.innovation @ whitened / len(whitened))
+        observation, reward, *_ = env.step(estimate.mean)
+        rewards.append(reward)
+    return -np.mean(rewards[task.warm_up:]), float(np.mean(surprises))
+
+
+def main() -> None:
+    print("| training episodes | modes | ẽ_c | NIS/m |\n|---:|---:|---:|---:|")
+    for count in COUNTS:
+        prior = learned_inflow_prior(entry(ID).world, parse_seeds(f"train:0-{count - 1}"))
+        played = [play(prior, seed)
+                  for seed in tqdm(PLAYED, desc=f"{count} episodes", leave=False, disable=None)]
+        errors, surprises = zip(*played, strict=True)
+        print(f"| {count} | {prior.modes.shape[1]} | {rounded(*mean_and_interval(list(errors)))} | "
+              f"{np.mean(surprises):.2f} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
