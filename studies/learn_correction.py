@@ -1,6 +1,6 @@
 """Train the network of `baselines/learned_correction.py`, and how it learns.
 
-`python studies/learn_correction.py` (extra learn) plays the log-inflow filter in training episodes
+`python studies/learn_correction.py` (extra rl) plays the log-inflow filter in training episodes
 of eitbench/Pipe2DBiasedVelocity-v0, trains a GRU on what it sees, from 100, 300 and 1000 of them,
 writes the network of most, and draws docs/learned_correction.png with scores on dev:0-31. Episodes
 and what the filter made of them are kept in results/learned; the same command goes on from there.

@@ -110,8 +110,8 @@ def test_every_board_by_default(tmp_path):
 
 
 def test_suites():
-    """full is every environment; quick the plain pipe on fewer seeds, but for the one method that takes minutes. What was
-    learned in a real pipe plays no tiny one."""
+    """full is every environment; quick the plain pipe on fewer seeds, but for the one method that takes minutes.
+    What was learned in a real pipe plays no tiny one."""
     quick, full = (suites.jobs("estimation", [], [], [1], suite=suite) for suite in ("quick", "full"))
     plain = set(PLAIN) & set(ids("estimation"))
     assert {job.environment.id for job in quick} == plain and len(plain) == 3

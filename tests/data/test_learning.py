@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from eitbench.cli import app
+from eitbench.cli.app import app
 from eitbench.data import bank
 from eitbench.data.episodes import simulate
 from eitbench.data.learning.export import export
