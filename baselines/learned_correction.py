@@ -4,7 +4,7 @@ the fluid flows faster or slower than the model says.
 A GRU (Cho et al. 2014) sees how each measurement compares with the filter's prediction, and what
 the filter thinks before and after it, in the modes of training concentrations. It says in these
 modes by how much the filter is off, and with which variance. `studies/learn_correction.py` trains
-it; here it needs numpy alone.
+it; here it needs numpy alone, and the network, which is in a checkout only.
 """
 
 from functools import lru_cache
@@ -33,11 +33,12 @@ class Estimator:
     def suits(task: Task) -> bool:
         """Only the task that it was trained for: that vessel, those injections, that model of the
         flow."""
-        if task.velocity is not None or not suiting_priors(HERE / "priors", task, "logarithm"):
+        known_inlet = bool(suiting_priors(HERE / "priors", task, "logarithm"))
+        if task.velocity is not None or not known_inlet or not (HERE / NETWORK).is_file():
             return False
         known = load(HERE / NETWORK)["task"]
         there = fingerprint(task)
-        return there.shape == known.shape and np.allclose(there, known, atol=1e-3)
+        return there.shape == known.shape and np.allclose(there, known, atol=1e-4)
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate:
         if not self.first.complete:
