@@ -14,6 +14,7 @@ from eitbench.worlds.registry import register, register_installed
 if TYPE_CHECKING:
     from eitbench.bench.evaluation import evaluate
     from eitbench.data.episodes import Episode, simulate
+    from eitbench.data.learning.examples import dataset
     from eitbench.envs.pages import page
     from eitbench.estimation.onboard.rules import Rules
     from eitbench.report import plot
@@ -22,10 +23,11 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 __all__ = ["Episode", "Estimate", "Rules", "Task", "World",
-           "evaluate", "make_task", "page", "plot", "register", "simulate"]
+           "dataset", "evaluate", "make_task", "page", "plot", "register", "simulate"]
 
 _LATER = {"Estimate": "worlds.task", "Task": "worlds.task", "make_task": "worlds.task",
           "World": "worlds.world", "Episode": "data.episodes", "simulate": "data.episodes",
+          "dataset": "data.learning.examples",
           "Rules": "estimation.onboard.rules", "page": "envs.pages",
           "evaluate": "bench.evaluation"}
 """Where the public names lie that are loaded on first use."""

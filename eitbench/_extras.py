@@ -8,6 +8,7 @@ from contextlib import contextmanager
 EXTRAS = {
     "bench": ("cloudpickle", "jinja2", "jsonschema_rs", "markdown_it", "matplotlib", "orjson",
               "pandas", "PIL", "typer"),
+    "export": ("h5py", "pyarrow"),
     "mesh": ("meshio",),
     "rl": ("torch", "stable_baselines3", "sb3_contrib", "yaml"),
 }

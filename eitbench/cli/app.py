@@ -1,5 +1,6 @@
-"""The command line: `eitbench list | run | bank | train | policies | submit | verify | check |
-season | held-out | migrate | cards | kits | leaderboard | compare | render | reproduce`."""
+"""The command line: `eitbench list | run | bank | export | train | policies | submit | verify |
+check | season | held-out | migrate | cards | kits | fit-prior | leaderboard | compare | render |
+reproduce`."""
 
 from __future__ import annotations
 
@@ -12,6 +13,7 @@ import typer
 
 from eitbench import __version__
 from eitbench.cli import options
+from eitbench.cli.export import export
 from eitbench.cli.maintain import cards, held_out, kits, migrate
 from eitbench.cli.play import policies, report, run, typed
 from eitbench.cli.priors import fit_prior
@@ -199,6 +201,7 @@ app.command()(migrate)
 app.command()(cards)
 app.command()(kits)
 app.command("fit-prior")(fit_prior)
+app.command()(export)
 
 
 @app.command()

@@ -23,6 +23,7 @@ COMMANDS = [
     (("run", *TANK, "--baseline", "homogeneous", "--seeds", "dev:0", "-j", "1"), "wrote results/index.html"),
     ("leaderboard", "wrote results/index.html"),
     (("bank", *TANK, "--seeds", "train:0", "-j", "1"), "1 simulated"),
+    (("export", *TANK, "--seeds", "train:0", "-o", "episodes", "-j", "1"), "1 episodes written"),
     (("policies", *INJECTION, "--policy", "opposite", "--seeds", "dev:0", "--estimator", "reduced", "-j", "1"),
      "opposite"),
     (("train", *INJECTION, "--config", "tiny.yml", "-o", "agent"), "wrote agent/model.zip"),

@@ -1,0 +1,1 @@
+"""Data for people who learn: episodes as examples, for numpy and torch, and as files."""
