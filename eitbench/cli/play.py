@@ -22,7 +22,7 @@ Suite = StrEnum("Suite", ["quick", "full"])
 
 def run(
     suite: Annotated[Suite, typer.Option(
-        help="quick: the 2D pipe, test:0-3, three minutes on two cores; full: every environment, "
+        help="quick: the 2D pipe, test:0-3, four minutes on two cores; full: every environment, "
              "more seeds, methods that take long.")] = Suite.quick,
     env: Annotated[list[str] | None, typer.Option(
         help="Environment id; may be repeated. Default: suite's.")] = None,
