@@ -21,7 +21,7 @@ def test_writes_what_filters_read(tmp_path):
     assert done.exit_code == 0, done.output
     assert suiting_priors(tmp_path, make_task(PIPE_2D), "logarithm")
     source = json.loads((tmp_path / "mine.json").read_text())["source"]
-    assert source == {"environment": "eitbench/Pipe2D-v0", "seeds": "train:0-9", "nugget": 0.01}
+    assert source == {"environment": "eitbench/Pipe2D-v0", "seeds": "train:0-9", "nugget": 0.01, "kept": 1e-4}
 
 
 @pytest.mark.parametrize("link", ["linear", "logarithm"])

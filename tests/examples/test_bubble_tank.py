@@ -52,7 +52,7 @@ def test_method_and_score_make_a_record_and_a_board(installed):
     assert float(rows["bubble_tracker"]["bubble_distance"]) == pytest.approx(1e3 * np.mean(distance), 1e-5)
     said = eitbench(installed, "compare", "bubble_tracker", "gauss_newton", "--records", str(records),
                     "--score", "bubble_distance")
-    assert "distance of bubble_tracker" in said
+    assert said.startswith("A: bubble_tracker\n") and "distance of A" in said
     path = next(records.glob("*bubble_tracker*.json"))
     eitbench(installed, "verify", str(path), "--episodes", "1")
 
