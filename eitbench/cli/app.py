@@ -1,6 +1,6 @@
 """The command line: `eitbench list | run | bank | export | train | policies | submit | verify |
-check | season | held-out | migrate | cards | kits | fit-prior | leaderboard | compare | render |
-reproduce`."""
+check | season | held-out | migrate | cards | kits | fit-prior | fit-model | leaderboard | compare |
+render | reproduce`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from eitbench.cli import options
 from eitbench.cli.export import export
 from eitbench.cli.maintain import cards, held_out, kits, migrate
 from eitbench.cli.play import policies, report, run, typed
-from eitbench.cli.priors import fit_prior
+from eitbench.cli.priors import fit_model, fit_prior
 from eitbench.cli.season import app as season_commands
 from eitbench.cli.studies import thesis
 from eitbench.cli.trust import check, verify
@@ -201,6 +201,7 @@ app.command()(migrate)
 app.command()(cards)
 app.command()(kits)
 app.command("fit-prior")(fit_prior)
+app.command("fit-model")(fit_model)
 app.command()(export)
 
 

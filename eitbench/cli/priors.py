@@ -1,4 +1,4 @@
-"""The command `fit-prior`: what training episodes teach of the inflow."""
+"""The commands `fit-prior` and `fit-model`: what training episodes teach of inflow and flow."""
 
 from __future__ import annotations
 
@@ -37,3 +37,30 @@ def fit_prior(
         prior.save(out)
     options.say(f"{out}: {prior.modes.shape[1]} modes across {len(prior.points)} nodes of the "
                 f"inlet, correlated over {prior.memory} steps of {prior.time_step:g} s")
+
+
+def fit_model(
+    env: Annotated[str, typer.Option(help="Id of an environment whose world has an inflow.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="File to write, npz.")],
+    seeds: Annotated[str, typer.Option(help="Episodes of the split train.")] = "train:0-199",
+    modes: Annotated[int, typer.Option(
+        min=1, help="Of the concentration; more of them make filters slower.")] = 64,
+) -> None:
+    """Learn from training episodes what an inflow leaves in the pipe, and by how much that and the
+    voltages are off, and write it for filters (`eitbench.estimation.IdentifiedModel`). Episodes
+    that are not there yet are simulated, on one core; `eitbench bank` does so on all."""
+    from tqdm import tqdm
+
+    import eitbench
+    from eitbench.estimation import identified_model
+    with options.clear_errors():
+        examples = eitbench.dataset(env, seeds)
+        model = identified_model(
+            examples, modes=modes,
+            progress=lambda each: tqdm(each, desc="learning", unit="episode", disable=None),
+            source={"environment": env, "seeds": seeds, "modes": modes})
+        model.save(out)
+    left = float(model.spread.trace() / examples.mass.sum())
+    options.say(f"{out}: {modes} modes of the concentration, which remembers "
+                f"{model.weights.shape[1]} inflows; {100 * left**0.5:.2g} % (root mean square) "
+                "is left")

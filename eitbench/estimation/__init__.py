@@ -6,6 +6,8 @@ from eitbench.estimation.first_frame import FirstFrame
 from eitbench.estimation.gains import GainSequence, gain_sequence
 from eitbench.estimation.gauss_newton import gauss_newton
 from eitbench.estimation.homogeneous import best_homogeneous
+from eitbench.estimation.identification import identified_model
+from eitbench.estimation.identified import IdentifiedModel, suiting_models
 from eitbench.estimation.inflow_history import InflowFilter
 from eitbench.estimation.inflow_map import most_probable_inflow, smoothed_inflow
 from eitbench.estimation.inflow_prior import (
@@ -16,7 +18,7 @@ from eitbench.estimation.inflow_prior import (
     white_inflow,
 )
 from eitbench.estimation.inflow_response import Response, changing_responses, steady_response
-from eitbench.estimation.inflow_tracker import InflowTracker
+from eitbench.estimation.inflow_tracker import InflowSmoother, InflowTracker
 from eitbench.estimation.joint import JointFilter, JointStep
 from eitbench.estimation.joint_inflow import JointInflowFilter
 from eitbench.estimation.kalman import (
@@ -28,6 +30,7 @@ from eitbench.estimation.kalman import (
     linearised,
 )
 from eitbench.estimation.parameters import initial_covariance, starting_filter, table_5_1
+from eitbench.estimation.quadratic_voltages import QuadraticVoltages
 from eitbench.estimation.smoother import (
     Smoothed,
     fixed_interval_smoother,
@@ -38,12 +41,14 @@ from eitbench.estimation.smoothness import smoothness_covariance
 from eitbench.estimation.unknown_flow import UnknownFlow, asked_flow, scaled_flow
 
 __all__ = [
-    "DenseKalmanFilter", "FilterStep", "Filtered", "FirstFrame", "FreeCovariance", "GainSequence",
-    "InflowFilter", "InflowPrior", "InflowTracker", "JointFilter", "JointInflowFilter", "JointStep",
-    "KalmanFilter", "LinearisedObservations", "Observation", "Response", "Smoothed", "UnknownFlow",
-    "asked_flow", "best_homogeneous", "changing_responses", "fit_inflow_prior",
-    "fixed_interval_smoother", "gain_sequence", "gauss_newton", "initial_covariance",
-    "kalman_filter", "learned_inflow_prior", "linearised", "most_probable_inflow", "scaled_flow",
-    "smoothed_inflow", "smoothed_means", "smoothed_state", "smoothness_covariance",
-    "starting_filter", "steady_response", "suiting_priors", "table_5_1", "white_inflow",
+    "DenseKalmanFilter", "FilterStep", "Filtered", "FirstFrame", "FreeCovariance",
+    "GainSequence", "IdentifiedModel", "InflowFilter", "InflowPrior", "InflowSmoother",
+    "InflowTracker", "JointFilter", "JointInflowFilter", "JointStep", "KalmanFilter",
+    "LinearisedObservations", "Observation", "QuadraticVoltages", "Response", "Smoothed",
+    "UnknownFlow", "asked_flow", "best_homogeneous", "changing_responses", "fit_inflow_prior",
+    "fixed_interval_smoother", "gain_sequence", "gauss_newton", "identified_model",
+    "initial_covariance", "kalman_filter", "learned_inflow_prior", "linearised",
+    "most_probable_inflow", "scaled_flow", "smoothed_inflow", "smoothed_means",
+    "smoothed_state", "smoothness_covariance", "starting_filter", "steady_response",
+    "suiting_models", "suiting_priors", "table_5_1", "white_inflow",
 ]

@@ -13,6 +13,7 @@ from eitbench.estimation.kalman import Observation, linearised
 from eitbench.estimation.moving_window import Innovation, conditioned, moved, stationary
 
 if TYPE_CHECKING:
+    from eitbench.estimation.identified import IdentifiedModel
     from eitbench.estimation.inflow_prior import InflowPrior
     from eitbench.worlds.task import Task
 
@@ -45,14 +46,20 @@ class InflowFilter:
     responses : sequence of Response, optional
         Of the states t = 1, 2, …, where the last holds from then on; default: that of the task's
         flow for all.
+    model : IdentifiedModel, optional
+        Whose response and errors take the place of the task's flow.
     """
 
     def __init__(self, task: Task, prior: InflowPrior, level: float, lag: int = 0,
-                 responses: Sequence[Response] | None = None) -> None:
+                 responses: Sequence[Response] | None = None,
+                 model: IdentifiedModel | None = None) -> None:
         prior.check_task(task)
         self.task = task
         self.prior = prior
         self.level = level
+        self.model = model
+        if model is not None:
+            responses = [model.response]
         self.responses = responses or [steady_response(task.transport)]
         self._present = 0
         """t"""
@@ -75,18 +82,44 @@ class InflowFilter:
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Innovation:
         """Take in a measurement (L,) in V of the present state, for the injection (L,) in A."""
+        return self.take_in(self._linearised(voltages, currents), self.concentration())
+
+    def update_again(self, voltages: np.ndarray, currents: np.ndarray) -> Innovation:
+        """`update`, and once more linearised about what that finds (the iterated filter); the
+        innovation is that of the first."""
+        expected = self.mean
+        covariance = self.covariance
+        first = self.update(voltages, currents)
+        observation = self._linearised(voltages, currents)
+        slope = self.by_inflow(observation.matrix)
+        away = (self.mean - expected)[:self.memory].ravel()
+        innovation = observation.value - observation.matrix @ self.concentration() + slope @ away
+        self.mean, self.covariance = expected, covariance
+        self._condition(observation, slope, innovation)
+        return first
+
+    def _linearised(self, voltages: np.ndarray, currents: np.ndarray) -> Observation:
+        """About the present mean, with readings less what the model says of their error."""
         task = self.task
-        point = self.concentration()
-        return self.take_in(linearised(task.observation, task.noise, point, voltages, currents),
-                            point)
+        observation = linearised(task.observation, task.noise, self.concentration(), voltages,
+                                 currents)
+        if self.model is None:
+            return observation
+        error = self.model.mean_error(currents, np.sqrt(observation.noise_variance))
+        return observation._replace(value=observation.value - error)
 
     def take_in(self, observation: Observation, point: np.ndarray) -> Innovation:
         """Take in a measurement that is linear in the concentration near ``point`` (n,), which is
         `concentration`."""
-        innovation = observation.value - observation.matrix @ point
+        return self._condition(observation, self.by_inflow(observation.matrix),
+                               observation.value - observation.matrix @ point)
+
+    def _condition(self, observation: Observation, slope: np.ndarray,
+                   innovation: np.ndarray) -> Innovation:
+        shared = (None if self.model is None
+                  else self.level * (observation.matrix @ self.model.root))
         self.mean, self.covariance, told = conditioned(
-            self.mean, self.covariance, self.by_inflow(observation.matrix), innovation,
-            observation.noise_variance)
+            self.mean, self.covariance, slope, innovation, observation.noise_variance, shared)
         return told
 
     def response(self, lag: int = 0) -> Response:
@@ -107,6 +140,8 @@ class InflowFilter:
         r = self.mean.shape[1]
         here = slice(lag * r, (lag + self.memory) * r)
         reduced = slope @ self.covariance[here, here] @ slope.T
+        if self.model is not None:
+            reduced = reduced + self.level**2 * self.model.spread
         basis = self.response(lag).basis
         return State(self.concentration(lag), ((basis @ reduced) * basis).sum(axis=1))
 

@@ -60,6 +60,12 @@ def changing_responses(transport_at: Callable[[int], Transport], n_steps: int) -
     return [_projected(parts, basis) for parts in _changing(transport_at, n_steps)]
 
 
+def newest_inflow(transport: Transport) -> np.ndarray:
+    """Y (n, n_inlet): what an inflow leaves by the end of the step in which it comes."""
+    inlet = len(transport.inlet)
+    return transport.step(np.zeros((transport.mesh.n_nodes, inlet)), 0.0, np.eye(inlet))
+
+
 def _changing(transport_at: Callable[[int], Transport],
               n_steps: int) -> Iterator[list[np.ndarray]]:
     """What the inflows k = 0, 1, … steps before t leave of themselves (n, n_inlet), t = 1, 2, …"""
@@ -69,7 +75,7 @@ def _changing(transport_at: Callable[[int], Transport],
         transport = transport_at(t)
         older = np.concatenate(parts[:-1], axis=1)
         moved = transport.step(older, older[transport.inlet], 0.0)
-        parts = [_newest(transport), *np.split(moved, len(parts) - 1, axis=1)]
+        parts = [newest_inflow(transport), *np.split(moved, len(parts) - 1, axis=1)]
         yield parts
 
 
@@ -84,12 +90,6 @@ def _steady(transport: Transport) -> list[np.ndarray]:
             raise ValueError(f"the transport must forget an inflow within {LONGEST} steps")
         parts.append(F @ parts[-1])
     return parts
-
-
-def _newest(transport: Transport) -> np.ndarray:
-    """Y (n, n_inlet)."""
-    inlet = len(transport.inlet)
-    return transport.step(np.zeros((transport.mesh.n_nodes, inlet)), 0.0, np.eye(inlet))
 
 
 def _leading(squared: np.ndarray) -> np.ndarray:

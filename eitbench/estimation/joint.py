@@ -9,6 +9,7 @@ import numpy as np
 
 from eitbench import _check
 from eitbench.estimation.dense import DenseKalmanFilter
+from eitbench.estimation.inflow_response import newest_inflow
 from eitbench.estimation.kalman import Expected, Observation
 
 if TYPE_CHECKING:
@@ -128,7 +129,7 @@ class JointFilter:
             moved += by_theta @ X[n:]
             return np.concatenate([moved, X[n:]])
 
-        Y = transport.step(np.zeros((n, len(inlet))), 0.0, self._inflow_std * np.eye(len(inlet)))
+        Y = self._inflow_std * newest_inflow(transport)
         np.matmul(Y, Y.T, out=self._noise[:n, :n])
         self._noise[:n, :n] += self._nodal_noise
         self._filter.predict(carried, noise=self._noise, mean=np.concatenate([after, theta]))

@@ -9,6 +9,7 @@ import numpy as np
 
 from eitbench import _check
 from eitbench.estimation.inflow_history import State
+from eitbench.estimation.inflow_response import newest_inflow
 from eitbench.estimation.joint import check_bounds, physical
 from eitbench.estimation.kalman import Observation, linearised
 from eitbench.estimation.moving_window import Innovation, conditioned, moved, stationary
@@ -16,7 +17,6 @@ from eitbench.estimation.moving_window import Innovation, conditioned, moved, st
 if TYPE_CHECKING:
     from eitbench.estimation.inflow_prior import InflowPrior
     from eitbench.estimation.unknown_flow import UnknownFlow
-    from eitbench.physics.transport import ConvectionDiffusion
     from eitbench.worlds.task import Task
 
 
@@ -78,7 +78,7 @@ class JointInflowFilter:
         """Past inflows fill the pipe at the velocity believed at first."""
         transport = self.flow.transport_at(self.flow.start)
         self._inlet = transport.inlet
-        parts = [self._new_inflow(transport)]
+        parts = [newest_inflow(transport)]
         for _ in range(W - 1):
             parts.append(transport.step(parts[-1], parts[-1][self._inlet], 0.0))
         by_inflow = np.stack(parts, axis=1)
@@ -118,13 +118,8 @@ class JointInflowFilter:
                                   self._made[:, :-1].reshape(n, -1)], axis=1)
         carried = transport.step(carried, carried[inlet], 0.0)
         self._constant = carried[:, 0] - by_flow @ theta
-        self._made = np.concatenate([self._new_inflow(transport), by_flow, carried[:, 1:]],
+        self._made = np.concatenate([newest_inflow(transport), by_flow, carried[:, 1:]],
                                     axis=1).reshape(n, W, parts)
-
-    def _new_inflow(self, transport: ConvectionDiffusion) -> np.ndarray:
-        """Y (n, n_inlet)."""
-        m = len(transport.inlet)
-        return transport.step(np.zeros((transport.mesh.n_nodes, m)), 0.0, np.eye(m))
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Innovation:
         """Take in a measurement (L,) in V of the present state, for the injection (L,) in A."""
@@ -166,7 +161,9 @@ class JointInflowFilter:
             made = (matrix @ made.reshape(n, -1)).reshape(-1, W, parts)
         m = len(self._inlet)
         by_u = self.level * self.prior.slope(self._inflow_deviation())
-        by_x = (made[:, :, :m] * by_u) @ self.prior.modes
+        by_inflow = made[:, :, :m] * by_u
+        # one product of matrices; of three dimensions it would be many small ones
+        by_x = (by_inflow.reshape(-1, m) @ self.prior.modes).reshape(len(made), W, -1)
         return np.concatenate([by_x, made[:, :, m:]], axis=2).reshape(len(made), -1)
 
     def _inflow_deviation(self) -> np.ndarray:

@@ -54,13 +54,16 @@ def moved(mean: np.ndarray, covariance: np.ndarray, weights: np.ndarray,
 
 
 def conditioned(mean: np.ndarray, covariance: np.ndarray, matrix: np.ndarray,
-                innovation: np.ndarray,
-                noise_variance: np.ndarray) -> tuple[np.ndarray, np.ndarray, Innovation]:
+                innovation: np.ndarray, noise_variance: np.ndarray,
+                shared: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, Innovation]:
     """Mean and covariance given readings that are ``innovation`` (m,) above what was predicted, and
-    whose derivatives by the newest K values are ``matrix`` (m, K·d)."""
+    whose derivatives by the newest K values are ``matrix`` (m, K·d). Their errors are independent,
+    of ``noise_variance`` (m,), but for what they have in common, N ``shared`` (m, s): N Nᵀ."""
     seen = matrix.shape[1]
     cross = covariance[:, :seen] @ matrix.T
     S = matrix @ cross[:seen] + np.diag(noise_variance)
+    if shared is not None:
+        S += shared @ shared.T
     S = 0.5 * (S + S.T)
     factor = cho_factor(S, lower=True)[0]
     gained = solve_triangular(factor, cross.T, lower=True)                           # L⁻¹ H Γ

@@ -1,4 +1,5 @@
-"""`eitbench fit-prior`: what it writes is what filters read, and it learns from training episodes alone."""
+"""`eitbench fit-prior`, `fit-model`: what they write is what filters read, and they learn from training episodes
+alone."""
 
 import json
 
@@ -41,7 +42,8 @@ def test_shipped_priors_are_what_the_command_writes(tmp_path, link):
     (["--env", "eitbench/RotatingTank2D-v0"], "target must have an inflow"),
     (["--env", "eitbench/Nowhere-v0"], "env must be one of"),
 ])
-def test_mistakes_are_told_before_anything_is_written(tmp_path, arguments, said):
-    done = told(*arguments, "--out", tmp_path / "mine.json")
+@pytest.mark.parametrize("command", ["fit-prior", "fit-model"])
+def test_mistakes_are_told_before_anything_is_written(tmp_path, command, arguments, said):
+    done = CliRunner().invoke(app, [command, *arguments, "--out", str(tmp_path / "mine")])
     assert done.exit_code != 0 and said in " ".join(done.output.replace("│", " ").split())
-    assert not (tmp_path / "mine.json").exists()
+    assert not (tmp_path / "mine").exists()

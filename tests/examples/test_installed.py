@@ -41,6 +41,7 @@ COMMANDS = [
     (("cards", "eitbench/StationaryTank2D-v0", "homogeneous"), "homogeneous: same"),
     (("kits", "eitbench/StationaryTank2D-v0"), ": same"),
     (("fit-prior", "--env", "eitbench/Pipe2D-v0", "--seeds", "train:0-3", "-o", "prior.json"), "prior.json: "),
+    (("fit-model", "--env", "eitbench/Pipe2D-v0", "--seeds", "train:0-1", "-o", "model.npz"), "model.npz: "),
     (("migrate", "mine/results"), ""),
     (("held-out", "--help"), "salt"),
 ]

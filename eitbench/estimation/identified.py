@@ -1,0 +1,133 @@
+"""A pipe's model as training episodes show it: what an inflow leaves, and by how much that and the
+voltages are off (``docs/methods.md``, 12)."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from eitbench import _check
+from eitbench._files import write_atomically
+from eitbench.estimation.inflow_response import Response
+
+if TYPE_CHECKING:
+    from eitbench.worlds.task import Task
+
+ARRAYS = ("basis", "weights", "across", "spread", "patterns", "bias", "told")
+CLOSE = 1e-4
+"""Tasks whose `told` differ by less are the same."""
+SPOT = 0.02
+"""m: standard deviation of the blob that `told` lets the flow carry."""
+
+
+@dataclass(frozen=True, eq=False)
+class IdentifiedModel:
+    """c_t = ĉ_bh (1 + B (Σ_k W_k s_{t−k} + e_t)), s = c_in/ĉ_bh − 1, and V = R(c) + std·b + v.
+
+    e_t ~ N(0, Γ_e) is taken for white. Where a model is wrong in the same way each time, its mean
+    error b, and the response W that takes in what is wrong with the flow, correct it; Γ_e says how
+    much is left (Kaipio & Somersalo 2007). ``ValueError`` naming what is of the wrong shape.
+    """
+
+    basis: np.ndarray
+    """(n, q) B, orthonormal in M̃"""
+    weights: np.ndarray
+    """(q, K, r) of the inflow k = 0 … K − 1 steps ago, in modes across the inlet: W_k = weights_k
+    acrossᵀ"""
+    across: np.ndarray
+    """(n_inlet, r)"""
+    spread: np.ndarray
+    """(q, q) Γ_e"""
+    patterns: np.ndarray
+    """(P, L) A (A/m in 2D): injections that were seen"""
+    bias: np.ndarray
+    """(P, L) b of each, in standard deviations of the reading's noise"""
+    told: np.ndarray
+    """(J,) of the task, by `told`"""
+    level: float
+    """mol/m³ with which the pipe was filled"""
+    source: Mapping[str, Any] = field(default_factory=dict)
+    """where it comes from, fit for JSON"""
+
+    def __post_init__(self) -> None:
+        q = _check.array("basis", self.basis, (None, None)).shape[1]
+        *_, r = _check.array("weights", self.weights, (q, None, None)).shape
+        _check.array("across", self.across, (None, r))
+        _check.array("spread", self.spread, (q, q))
+        P, L = _check.array("patterns", self.patterns, (None, None)).shape
+        _check.array("bias", self.bias, (P, L))
+        _check.array("told", self.told, (None,))
+        _check.number("level", self.level, low=0.0, open_low=True, units="mol/m³")
+
+    @property
+    def response(self) -> Response:
+        """B and W."""
+        return Response(self.basis, self.weights @ self.across.T)
+
+    @cached_property
+    def root(self) -> np.ndarray:
+        """(n, q) N with N Nᵀ = B Γ_e Bᵀ."""
+        values, vectors = np.linalg.eigh(self.spread)
+        root: np.ndarray = self.basis @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+        return root
+
+    def mean_error(self, currents: np.ndarray, std: np.ndarray) -> np.ndarray:
+        """(L,) V by which readings of an injection (L,) exceed R(c), with ``std`` (L,) V of their
+        noise; zero if that injection never was seen."""
+        seen = np.flatnonzero(np.isclose(self.patterns, currents).all(axis=1))
+        return self.bias[seen[0]] * std if len(seen) else np.zeros_like(std)
+
+    def suits(self, task: Task) -> bool:
+        """Whether it was made for a task with this mesh, these injections and this told flow."""
+        if task.mesh.n_nodes != len(self.basis) or task.currents.shape[1] != self.bias.shape[1]:
+            return False
+        there = told(task)
+        return there.shape == self.told.shape and bool(np.allclose(there, self.told, atol=CLOSE))
+
+    def save(self, path: Path) -> None:
+        """Write a file that `load` reads, in single precision."""
+        buffer = io.BytesIO()
+        arrays = {name: getattr(self, name).astype(np.float32) for name in ARRAYS}
+        np.savez_compressed(buffer, source=np.array(json.dumps(dict(self.source))),
+                            level=self.level, **arrays)
+        write_atomically(path, buffer.getvalue())
+
+    @classmethod
+    def load(cls, path: Path) -> IdentifiedModel:
+        """What `save` has written; ``ValueError`` naming the file if it is nothing of the kind."""
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                arrays = {name: file[name].astype(float) for name in ARRAYS}
+                return cls(**arrays, level=float(file["level"]),
+                           source=json.loads(str(file["source"])))
+        except (OSError, ValueError, KeyError, EOFError) as error:
+            raise ValueError(f"{path} must be a model of `eitbench fit-model`: {error}") from None
+
+
+def told(task: Task) -> np.ndarray:
+    """What a task tells of vessel, injections and flow: voltages of a homogeneous vessel in parts
+    of the largest, and where (m) one time step carries a blob in its middle."""
+    level = task.expected_concentration
+    x = task.mesh.points
+    blob = np.exp(-0.5 * ((x - x.mean(axis=0))**2).sum(axis=1) / SPOT**2)
+    still = np.zeros(len(task.transport.inlet))
+    moved = task.transport.step(blob, still, still)
+    voltages = task.observation.voltages(np.full(len(x), level), task.currents)
+    return np.concatenate([voltages.ravel() / np.abs(voltages).max(), moved @ x / moved.sum()])
+
+
+def suiting_models(folder: Path, task: Task) -> list[IdentifiedModel]:
+    """Those in a folder's files, by name, that are of this task."""
+    return [model for model in map(_loaded, sorted(folder.glob("*.npz"))) if model.suits(task)]
+
+
+@lru_cache(maxsize=8)
+def _loaded(path: Path) -> IdentifiedModel:
+    return IdentifiedModel.load(path)

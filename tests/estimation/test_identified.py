@@ -1,0 +1,269 @@
+"""A model that training episodes have shown: against episodes it never saw, against one Gaussian conditioned at once,
+and against the density that it stands for."""
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from eitbench.bench.methods import baseline_folder
+from eitbench.data.learning.examples import Dataset
+from eitbench.data.seeds import parse_seeds
+from eitbench.estimation import (
+    IdentifiedModel,
+    InflowFilter,
+    InflowPrior,
+    QuadraticVoltages,
+    identified_model,
+    most_probable_inflow,
+    smoothed_inflow,
+    steady_response,
+    suiting_models,
+)
+from eitbench.estimation.kalman import Observation, linearised
+from eitbench.worlds.pipe2d import PIPE_2D
+from eitbench.worlds.pipe2d_obstacle import PIPE_2D_OBSTACLE
+from eitbench.worlds.task import make_task
+from scipy.linalg import toeplitz
+
+from tiny_worlds import TINY
+
+LEVEL = 29.0
+
+
+def examples(seeds):
+    return Dataset("tiny", TINY, tuple(parse_seeds(seeds)))
+
+
+@lru_cache(maxsize=1)
+def task():
+    return make_task(TINY)
+
+
+@lru_cache(maxsize=1)
+def model():
+    return identified_model(examples("train:0-23"), modes=24)
+
+
+@lru_cache(maxsize=1)
+def prior():
+    points = task().mesh.points[task().transport.inlet]
+    r = points[:, 1] / 0.05
+    return InflowPrior("logarithm", points, 0.2 * np.stack([np.exp(-r**2), r], axis=1), 0.6**np.arange(5)**2.0,
+                       task().transport.time_step)
+
+
+def made(response, seed):
+    """States of an episode (T, n) in parts of the background, less 1, as a response makes them of its inflows."""
+    s = TINY.sample_inflow(seed) / TINY.background - 1.0
+    K = response.weights.shape[1]
+    s = np.concatenate([np.zeros((K, s.shape[1])), s])
+    end = len(s) - TINY.n_steps
+    past = [s[end + t:end + t - K:-1] for t in range(TINY.n_steps)]
+    return np.array([response.basis @ np.tensordot(response.weights, each, 2) for each in past])
+
+
+# -- what is learned --------------------------------------------------------------------------------------------------
+
+
+def test_makes_states_of_episodes_that_it_never_saw():
+    """Its mean square error there is about what it says, and a tenth at most of that of a flow a fifth too slow."""
+    mass = examples("train:0").mass
+    slow = steady_response(make_task(TINY, mean_velocity=36.0).transport)
+    off, told = [], []
+    for seed in parse_seeds("train:40-47"):
+        (example,) = Dataset("tiny", TINY, (seed,))
+        truth = example.truth / TINY.background - 1.0
+        for kept, response in ((off, model().response), (told, slow)):
+            error = made(response, seed) - truth
+            kept.append(np.einsum("tn,nt->t", error, mass @ error.T).mean())
+    assert np.mean(off) < 0.1 * np.mean(told)
+    assert 0.5 < np.mean(off) / model().spread.trace() < 6.0
+
+
+def test_basis_is_orthonormal_in_the_scores_norm():
+    mass = examples("train:0").mass
+    np.testing.assert_allclose(model().basis.T @ (mass @ model().basis), np.eye(24), atol=1e-9)
+
+
+def test_mean_error_is_that_of_the_readings():
+    """What readings that it never saw exceed the model's by has no mean left, within its statistical error."""
+    left = []
+    for seed in parse_seeds("train:40-47"):
+        (example,) = Dataset("tiny", TINY, (seed,))
+        for voltages, currents, truth in zip(example.voltages, example.currents, example.truth, strict=True):
+            computed = task().observation.voltages(truth.astype(float), currents[None])[0]
+            std = task().noise.std(computed)
+            left.append((voltages - computed - model().mean_error(currents, std)) / std)
+    left = np.array(left)
+    assert np.abs(left.mean(axis=0)).max() < 4.5 / np.sqrt(len(left))
+    assert (left**2).mean() < 1.5
+    strange = np.arange(4.0)
+    assert not model().mean_error(strange, np.ones(4)).any()
+
+
+def test_learns_from_train_alone():
+    with pytest.raises(ValueError, match=r"seeds must be of the split train.*dev:0"):
+        identified_model(examples("dev:0"))
+    with pytest.raises(ValueError, match="more states than modes, 24; got 5"):
+        identified_model(examples("train:0"), modes=24)
+
+
+# -- filters that take it ---------------------------------------------------------------------------------------------
+
+
+def test_filter_is_gaussian_conditioning():
+    """Three measurements of linear inflows, whose states are off by independent errors of its spread."""
+    linear = replace(prior(), link="linear")
+    filter_ = InflowFilter(task(), linear, LEVEL, model=model())
+    random = np.random.default_rng(3)
+    n = task().mesh.n_nodes
+    noise = np.array([0.01, 0.02, 0.1])
+    seen = [Observation(random.normal(size=(3, n)) / n, LEVEL + 0.3 * random.normal(size=3), noise) for _ in range(3)]
+    for observation in seen:
+        filter_.predict()
+        told = filter_.take_in(observation, filter_.concentration())
+    K, r = filter_.memory, filter_.mean.shape[1]
+    basis, weights = model().response
+    part = LEVEL * basis @ (weights @ linear.modes).reshape(len(weights), -1)
+    G = np.zeros((3, n, (3 + K - 1) * r))
+    for t in range(3):
+        G[t][:, (2 - t) * r:(2 - t + K) * r] = part
+    covariance = np.kron(toeplitz(linear.time_covariance(3 + K - 1)), np.eye(r))
+    H = np.concatenate([o.matrix @ G[t] for t, o in enumerate(seen)])
+    y = np.concatenate([o.value - LEVEL * o.matrix.sum(axis=1) for o in seen])
+    S = H @ covariance @ H.T
+    for t, o in enumerate(seen):
+        here = slice(3 * t, 3 * t + 3)
+        off = LEVEL**2 * o.matrix @ basis @ model().spread @ basis.T @ o.matrix.T
+        S[here, here] += off + np.diag(o.noise_variance)
+    gain = np.linalg.solve(S, H @ covariance).T
+    rest = covariance - gain @ H @ covariance
+    state = filter_.state()
+    np.testing.assert_allclose(state.mean, LEVEL + G[-1] @ gain @ y, atol=1e-4 * LEVEL)
+    variance = np.einsum("ij,jk,ik->i", G[-1], rest, G[-1])
+    variance += LEVEL**2 * np.einsum("ij,jk,ik->i", basis, model().spread, basis)
+    np.testing.assert_allclose(state.variance, variance, atol=1e-4 * variance.max())
+    Sb = S[6:, 6:] - S[6:, :6] @ np.linalg.solve(S[:6, :6], S[:6, 6:])
+    np.testing.assert_allclose(told.covariance, Sb, atol=1e-3 * Sb.max())
+
+
+def surprise(filter_, before, covariance, x, voltages, currents):
+    """−2 ln of the density of the newest inflows x given what was known before, and the readings."""
+    away = (x - before).ravel()
+    filter_.mean = x
+    observation = linearised(task().observation, task().noise, filter_.concentration(), voltages, currents)
+    predicted = observation.matrix @ filter_.concentration()
+    off = (observation.value - predicted) / np.sqrt(observation.noise_variance)
+    return away @ np.linalg.solve(covariance, away) + (off**2).sum()
+
+
+def test_a_second_linearisation_is_nearer_to_the_most_probable():
+    """Of the inflows given one measurement; and the innovation is the first one's."""
+    (example,) = examples("train:0")
+    once, again = (InflowFilter(task(), prior(), LEVEL) for _ in range(2))
+    for filter_ in (once, again):
+        filter_.predict()
+    before, covariance = once.mean.copy(), once.covariance.copy()
+    first = once.update(example.voltages[0], example.currents[0])
+    second = again.update_again(example.voltages[0], example.currents[0])
+    np.testing.assert_array_equal(first.value, second.value)
+    np.testing.assert_array_equal(first.covariance, second.covariance)
+    values = [surprise(InflowFilter(task(), prior(), LEVEL), before, covariance, filter_.mean, example.voltages[0],
+                       example.currents[0]) for filter_ in (once, again)]
+    assert values[1] < values[0]
+
+
+def test_smoother_takes_out_the_mean_error():
+    """Readings that exceed the model's by just the mean error are explained by the inflows without it."""
+    (example,) = examples("train:0")
+    plain = replace(model(), bias=np.zeros_like(model().bias))
+    first = list(zip(example.voltages, example.currents, strict=True))
+    without = smoothed_inflow(task(), prior(), LEVEL, first, model=plain)
+    most_probable_inflow(without, first)
+    last = len(first) - 1
+    stds = [task().noise.std(task().observation.voltages(without.concentration(last - t), I[None])[0])
+            for t, (_, I) in enumerate(first)]
+    shifted = [(V + model().mean_error(I, std), I) for (V, I), std in zip(first, stds, strict=True)]
+    with_error = smoothed_inflow(task(), prior(), LEVEL, shifted, model=model())
+    most_probable_inflow(with_error, shifted)
+    np.testing.assert_allclose(with_error.mean, without.mean, atol=0.02)
+
+
+# -- files ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_file_says_all(tmp_path):
+    """To single precision."""
+    model().save(tmp_path / "a.npz")
+    again = IdentifiedModel.load(tmp_path / "a.npz")
+    np.testing.assert_allclose(again.response.weights, model().response.weights, atol=1e-6)
+    np.testing.assert_allclose(again.spread, model().spread, atol=1e-7 * model().spread.max())
+    np.testing.assert_allclose(again.mean_error(task().currents[0], np.ones(4)),
+                               model().mean_error(task().currents[0], np.ones(4)), atol=1e-6)
+    assert suiting_models(tmp_path, task())
+    assert not suiting_models(tmp_path, make_task(PIPE_2D))
+
+
+def test_other_files_are_told(tmp_path):
+    for content in (b"", b"PK", b"{}"):
+        (tmp_path / "b.npz").write_bytes(content)
+        with pytest.raises(ValueError, match=r"b\.npz must be a model of `eitbench fit-model`"):
+            IdentifiedModel.load(tmp_path / "b.npz")
+    with pytest.raises(ValueError, match=r"spread must have shape \(24, 24\)"):
+        replace(model(), spread=np.eye(3))
+
+
+def test_ours_are_of_the_boards_they_name():
+    """And of a task that is told another flow they are not."""
+    folder = baseline_folder() / "models"
+    for world, name in ((PIPE_2D, "Pipe2D"), (PIPE_2D_OBSTACLE, "Pipe2DObstacle")):
+        (ours,) = suiting_models(folder, make_task(world))
+        assert ours.source == {"environment": f"eitbench/{name}-v0", "seeds": "train:0-199", "modes": 64}
+    assert not suiting_models(folder, make_task(PIPE_2D, mean_velocity=4.0))
+
+
+# -- voltages in no time ----------------------------------------------------------------------------------------------
+
+
+@lru_cache(maxsize=1)
+def quadratic():
+    return QuadraticVoltages(task().observation, LEVEL, model().basis)
+
+
+def along_modes(size):
+    """A concentration whose logarithm is off by ``size`` in some modes."""
+    a = np.random.default_rng(7).standard_normal(model().basis.shape[1])
+    u = model().basis @ a
+    return LEVEL * np.exp(size * u / np.abs(u).max())
+
+
+def test_quadratic_voltages_are_of_second_order():
+    """Along the modes the error of half the contrast is an eighth; third differences are what is left. It begins with
+    the exact voltages."""
+    I = task().currents
+
+    def off(size):
+        c = along_modes(size)
+        return np.linalg.norm(quadratic().voltages(c, I) - task().observation.voltages(c, I))
+
+    assert off(0.0) < 1e-12
+    assert 6.0 < off(0.2) / off(0.1) < 10.0
+
+
+def test_derivatives_of_quadratic_voltages():
+    """By finite differences along the modes and across all nodes."""
+    I = task().currents
+    c = along_modes(0.2)
+    _, by_c = quadratic().linearise(c, I)
+    for seed in range(3):
+        step = 1e-4 * np.random.default_rng(seed).standard_normal(len(c))
+        change = (quadratic().voltages(c + step, I) - quadratic().voltages(c - step, I)) / 2
+        np.testing.assert_allclose(by_c @ step, change, atol=1e-6 * np.abs(change).max())
+
+
+def test_quadratic_voltages_name_what_is_wrong():
+    with pytest.raises(ValueError, match="level must be"):
+        QuadraticVoltages(task().observation, 0.0, model().basis)
+    with pytest.raises(ValueError, match="modes must have shape"):
+        QuadraticVoltages(task().observation, LEVEL, np.ones(3))
