@@ -122,7 +122,8 @@ def simulate_together(world: World, seeds: Sequence[int], progress: bool = True,
         streams = [randomness(seed) for seed in seeds]
         for history, random in zip(world.evolve(streams, truth, tick, steps), streams, strict=True):
             noise = random.noise.standard_normal((world.n_steps, electrodes))[:steps]
-            resistance = truth.observation.transfer_resistance(history.concentration[1:])
+            observation = world.true_observation(truth, random.contacts)
+            resistance = observation.transfer_resistance(history.concentration[1:])
             tick(steps)
             concentration = history.concentration.astype(np.float32)
             yield Episode(concentration, resistance, noise, history.velocity)
