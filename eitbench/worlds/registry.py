@@ -71,7 +71,7 @@ def register(world: World, id: str, *, track: str = "estimation", about: str = "
         The test episodes of its board.
     home : str
         Of a shift: the registered id whose task estimators get here too, though the truth is
-        another. The robustness board compares the two.
+        another. The robustness board compares the two, and quotes the first paragraph of ``about``.
     settings
         Of the environment: ``lag`` and ``assume`` for estimates, ``gate`` for injections.
     """
