@@ -1,18 +1,19 @@
 """The robustness board: what methods score at home, and where the truth is not what they believe.
 
 Errors of two worlds cannot be compared as they are: strong slugs are a larger part of what is
-there. So a method is judged by its gain over the floor in the same world, and by the least of them.
+there. So a method is judged by its gains, each over the floor in the same world, and by the least.
 """
 
 from __future__ import annotations
 
 import math
 import re
+from statistics import fmean
 from typing import NamedTuple
 
 from markupsafe import Markup
 
-from eitbench.bench.table import NOTHING, Cell, Table
+from eitbench.bench.table import NOTHING, Cell, Table, number_cell
 from eitbench.bench.text import number
 from eitbench.bench.tracks import home_of, ids, named
 from eitbench.report.site.beside import Beside
@@ -29,12 +30,13 @@ MEANINGS = {
             "square of the truth, mean over the episodes; lower is better",
     "a shift": "ẽ_c where one thing is not what methods are told or learned from, and how many "
                "times that of home it is",
-    BELOW: "worse in this world than the best floor, which knows next to nothing of the flow: its "
-           "estimate is worse than none",
-    "most": "the largest of the ratios to home",
-    "least gain": "1 − ẽ_c over that of the best floor in the same world, the least of all shifts: "
-                  "0 as the floor, 1 perfect. The board is ordered by it; who has not finished all "
-                  "shifts has none. The ratio alone would praise who is bad at home already",
+    BELOW: "its ẽ_c is larger than that of the best floor in the same world, which knows next to "
+           "nothing",
+    "most": "the largest of the ratios to home, and of which shift",
+    "mean gain": "over the floor in the same world, as on the boards (0 as the floor, 1 perfect): "
+                 "the mean of all shifts",
+    "least gain": "the least of these, and of which shift; the board is ordered by it. Who has not "
+                  "finished all shifts has neither. Ratios alone would praise who is bad at home",
     "reference": "is told the true flow; of noise, contacts and slugs that have changed it is told "
                  "nothing, and is no bound",
 }
@@ -59,9 +61,9 @@ class Standing(NamedTuple):
     shifted: dict[str, Row]
     """Heading of a shift -> its row there, one at least."""
     gains: dict[str, float]
-    """Heading of a shift that it has finished -> gain over the best floor there."""
-    least: str | None
-    """The shift in which it gains least; None if it has not finished all of them."""
+    """Heading of a shift -> gain over the floor there; empty if it has not finished all shifts."""
+    below: frozenset[str]
+    """Headings of the shifts in which it is worse than the best floor, and no floor itself."""
 
     @property
     def row(self) -> Row:
@@ -98,18 +100,20 @@ def standings(family: Family) -> list[Standing]:
     made = []
     for label in dict.fromkeys(label for own in rows.values() for label in own):
         shifted = {name: own[label] for name, own in rows.items() if label in own}
-        gains = {name: 1.0 - row.cells["error"] / zero for name, row in shifted.items()
-                 if row.complete and (zero := floors[name])}
-        least = min(gains, key=gains.__getitem__) if gains.keys() == rows.keys() else None
-        made.append(Standing(at_home.get(label), shifted, gains, least))
-    return sorted(made, key=lambda each: -each.gains[each.least] if each.least else math.inf)
+        gains = {name: row.cells["gain"] for name, row in shifted.items()
+                 if row.complete and row.cells["gain"] is not None}
+        below = frozenset(name for name, row in shifted.items() if "floor" not in row.badges
+                          and (row.cells["error"] or 0.0) > floors[name])
+        whole = gains.keys() == rows.keys()
+        made.append(Standing(at_home.get(label), shifted, gains if whole else {}, below))
+    return sorted(made, key=lambda each: -min(each.gains.values(), default=-math.inf))
 
 
-def floor(board: Board) -> float | None:
-    """The least ẽ_c of a board's floors, the official ones where there are any; None without."""
+def floor(board: Board) -> float:
+    """The least ẽ_c of a board's floors, the official ones where there are any; without, ∞."""
     floors = [row for row in board.current if "floor" in row.badges and row.complete]
     official = [row for row in floors if row.cells["official"]]
-    return min((row.cells["error"] for row in official or floors), default=None)
+    return min((row.cells["error"] for row in official or floors), default=math.inf)
 
 
 def robustness_table(family: Family) -> Table:
@@ -117,7 +121,8 @@ def robustness_table(family: Family) -> Table:
     found = standings(family)
     lines = [{"method": _method(each.row), "home": _error(each.at_home),
               **{name: _shifted(each, name) for name in family.shifts},
-              "most": _most(each), "least gain": _least(each)} for each in found]
+              "most": _most(each), "mean gain": _mean(each), "least gain": _least(each)}
+             for each in found]
     return Table.of(lines, label=f"{kind_of(family.home)} and its shifts", keep=["home"],
                     flags=[flags(each.row) for each in found])
 
@@ -143,8 +148,8 @@ def _error(row: Row | None, small: str = "", badges: tuple[str, ...] = ()) -> Ce
 def _shifted(standing: Standing, name: str) -> Cell:
     row = standing.shifted.get(name)
     ratio = _ratio(standing, name)
-    below = standing.gains.get(name, 0.0) < 0.0 and "floor" not in standing.row.badges
-    return _error(row, "" if ratio is None else f"× {number(ratio)}", (BELOW,) * below)
+    marks = (BELOW,) if name in standing.below else ()
+    return _error(row, "" if ratio is None else f"× {number(ratio)}", marks)
 
 
 def _ratio(standing: Standing, name: str) -> float | None:
@@ -160,17 +165,21 @@ def _ratio(standing: Standing, name: str) -> float | None:
 def _most(standing: Standing) -> Cell:
     ratios = {name: ratio for name in standing.shifted
               if (ratio := _ratio(standing, name)) is not None}
-    if standing.least is None or not ratios:
+    if not standing.gains or not ratios:
         return Cell(NOTHING)
     name = max(ratios, key=ratios.__getitem__)
     return Cell(f"× {number(ratios[name])}", ratios[name], small=name)
 
 
+def _mean(standing: Standing) -> Cell:
+    return number_cell(fmean(standing.gains.values()) if standing.gains else None)
+
+
 def _least(standing: Standing) -> Cell:
-    if standing.least is None:
+    if not standing.gains:
         return Cell(NOTHING)
-    gain = standing.gains[standing.least]
-    return Cell(number(gain), gain, small=standing.least)
+    name = min(standing.gains, key=standing.gains.__getitem__)
+    return Cell(number(standing.gains[name]), standing.gains[name], small=name)
 
 
 def robustness_pages(site: Site, beside: Beside) -> dict[str, bytes]:
@@ -199,7 +208,7 @@ def robustness_text(site: Site) -> list[str]:
         return []
     parts = ["## robustness", "What methods score where the truth is not what they are told or "
              "learned from, beside what they score at home; ordered by the least gain over the "
-             "best floor in the same world."]
+             "floor in the same world."]
     for family in found:
         parts += [f"### {kind_of(family.home)} and its shifts",
                   robustness_table(family).markdown()]
