@@ -83,8 +83,8 @@ def _path(world: World, seed: int) -> Path:
 
 
 def once(many: int) -> Callable[[Callable[[World], Made]], Callable[[World], Made]]:
-    """What a function makes of a world is made once a process for all worlds that differ in the
-    instrument only, and kept for so ``many``."""
+    """What a function makes of a world is made once a process for all worlds with one `World.fluid`,
+    and kept for so ``many``."""
     def decorated(make: Callable[[World], Made]) -> Callable[[World], Made]:
         kept = lru_cache(maxsize=many)(make)
         return wraps(make)(lambda world: kept(world.fluid))

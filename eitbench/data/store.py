@@ -39,7 +39,8 @@ def cache_folder() -> Path:
 def folder(world: World) -> Path:
     """Where the episodes of a world, as this version simulates them, are kept.
 
-    Worlds that differ in the instrument only, or in what is believed, share their episodes.
+    Worlds that differ in the instrument only, but for its contacts, or in what is believed, share
+    their episodes.
     """
     return cache_folder() / f"{world.name}-{_digest(world.fluid)}"
 
