@@ -83,7 +83,7 @@ def _path(world: World, seed: int) -> Path:
 
 
 def once(many: int) -> Callable[[Callable[[World], Made]], Callable[[World], Made]]:
-    """What a function makes of a world is made once a process for all worlds with one `World.fluid`,
+    """What a function makes of a world is made once a process for all with the same `World.fluid`,
     and kept for so ``many``."""
     def decorated(make: Callable[[World], Made]) -> Callable[[World], Made]:
         kept = lru_cache(maxsize=many)(make)
