@@ -49,9 +49,11 @@ def _of(registered: Entry) -> Iterator[Kit]:
     if world.region is not None:
         yield Kit("region", kits.kit_path("region", kits.region_numbers(world)), SPARSE,
                   lambda: half_mass(*region_operators(world)))
-    needed = max(_needed(each) for each in entries().values() if each.world.fluid == world.fluid)
-    yield Kit("beginning", kits.kit_path("beginning", kits.beginning_numbers(world)),
-              beginning_entries(world), lambda: make_beginning(world, needed))
+    alike = [each for each in entries().values() if each.world.fluid == world.fluid]
+    if not all(each.home for each in alike):  # a shift is to be tested in, which nobody begins with
+        needed = max(map(_needed, alike))
+        yield Kit("beginning", kits.kit_path("beginning", kits.beginning_numbers(world)),
+                  beginning_entries(world), lambda: make_beginning(world, needed))
     if registered.track == "injection":
         joint = world.velocity_model is not None
         name = "joint" if joint else "reduced"

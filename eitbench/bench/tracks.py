@@ -97,6 +97,11 @@ def track_of(id: str) -> str:
     return entry(id).track
 
 
+def home_of(id: str) -> str:
+    """The id whose task estimators get in this one too, though the truth is another; else empty."""
+    return entry(id).home
+
+
 def check_track(id: str, track: str) -> None:
     """``ValueError`` if an environment is of another track, or there is none."""
     if track_of(id) != track:

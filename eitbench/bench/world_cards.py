@@ -167,7 +167,8 @@ def _episodes(world: World) -> list[Episode]:
         noise = random.noise.standard_normal((world.n_steps, L))[:last]
         states = history.concentration[1:]
         resistance = np.full((last, L, L), np.nan)
-        resistance[used] = truth.observation.transfer_resistance(states[used])
+        observation = world.true_observation(truth, random.contacts)
+        resistance[used] = observation.transfer_resistance(states[used])
         made.append(Episode(history.concentration.astype(np.float32), resistance, noise,
                             history.velocity))
     return made

@@ -83,8 +83,8 @@ def _path(world: World, seed: int) -> Path:
 
 
 def once(many: int) -> Callable[[Callable[[World], Made]], Callable[[World], Made]]:
-    """What a function makes of a world is made once a process for all worlds that differ in the
-    instrument only, and kept for so ``many``."""
+    """What a function makes of a world is made once a process for all with the same `World.fluid`,
+    and kept for so ``many``."""
     def decorated(make: Callable[[World], Made]) -> Callable[[World], Made]:
         kept = lru_cache(maxsize=many)(make)
         return wraps(make)(lambda world: kept(world.fluid))
@@ -122,7 +122,8 @@ def simulate_together(world: World, seeds: Sequence[int], progress: bool = True,
         streams = [randomness(seed) for seed in seeds]
         for history, random in zip(world.evolve(streams, truth, tick, steps), streams, strict=True):
             noise = random.noise.standard_normal((world.n_steps, electrodes))[:steps]
-            resistance = truth.observation.transfer_resistance(history.concentration[1:])
+            observation = world.true_observation(truth, random.contacts)
+            resistance = observation.transfer_resistance(history.concentration[1:])
             tick(steps)
             concentration = history.concentration.astype(np.float32)
             yield Episode(concentration, resistance, noise, history.velocity)

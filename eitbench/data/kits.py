@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +18,7 @@ import numpy as np
 
 from eitbench._files import PACKAGE
 from eitbench.data import store
+from eitbench.worlds.instrument import Instrument
 
 if TYPE_CHECKING:
     from eitbench.worlds.world import World
@@ -26,8 +28,9 @@ KITS = PACKAGE / "data" / "kits"
 
 
 def outline_numbers(world: World) -> dict[str, Any]:
-    """What an `Outline` depends on, whatever flows in the vessel."""
-    fluid = store.described(world.fluid)
+    """What an `Outline` depends on, whatever flows in the vessel and however it is touched."""
+    instrument = Instrument(current=world.instrument.current)
+    fluid = store.described(replace(world.fluid, instrument=instrument))
     return {name: fluid[name] for name in ("kind", "vessel", "instrument", "prior")} | {
         "pattern": fluid["schedule"]["pattern"]}
 

@@ -21,6 +21,7 @@ import scipy
 
 from eitbench._code import code_digest, file_of, package_files
 from eitbench._files import PACKAGE, write_atomically
+from eitbench.worlds.parts import LATER
 from eitbench.worlds.world import World
 
 CACHE_VARIABLE = "EITBENCH_CACHE"
@@ -38,7 +39,8 @@ def cache_folder() -> Path:
 def folder(world: World) -> Path:
     """Where the episodes of a world, as this version simulates them, are kept.
 
-    Worlds that differ in the instrument only, or in what is believed, share their episodes.
+    Worlds that differ in the instrument only, but for its contacts, or in what is believed, share
+    their episodes.
     """
     return cache_folder() / f"{world.name}-{_digest(world.fluid)}"
 
@@ -60,11 +62,14 @@ def world_digest(world: World) -> str:
 
 
 def described(part: Any) -> Any:
-    """A dataclass as JSON, with the names of its classes."""
+    """A dataclass as JSON, with the names of its classes; without those of its numbers that came
+    later (`LATER`) and are at their default."""
     if is_dataclass(part):
         kind = type(part)
         return {"kind": f"{kind.__module__}.{kind.__qualname__}"} | {
-            each.name: described(getattr(part, each.name)) for each in fields(part)}
+            each.name: described(value) for each in fields(part)
+            if not ((value := getattr(part, each.name)) == each.default
+                    and each.metadata == LATER)}
     return list(part) if isinstance(part, tuple) else part
 
 

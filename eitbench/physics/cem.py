@@ -7,6 +7,7 @@ elsewhere,  ΣI = ΣU = 0.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 
 import numpy as np
 import scipy.sparse as sp
@@ -49,14 +50,9 @@ class CompleteElectrodeModel:
         self.order = order
         self.electrodes = _checked_electrodes(mesh, electrodes)
         self.n_electrodes = n_electrodes = len(self.electrodes)
-        z = contact_impedance
-        if np.ndim(z) == 0:
-            z = np.full(n_electrodes, z)
-        z = _check.array("contact_impedance", z, (n_electrodes,), units="Ω·m²", positive=True)
-        self.contact_impedance = z.copy()
-        self.contact_impedance.setflags(write=False)
+        self.contact_impedance = self._checked_contacts(contact_impedance)
 
-        basis = basis_on(mesh, order, intorder=2 * order - 1)
+        basis = self._basis()
         contact = self._contact_terms(basis)
         rows, columns, derivatives = _conduction(basis)
         pattern = sp.coo_array((np.ones(len(rows)), (rows, columns)), shape=contact.shape).tocsc()
@@ -76,6 +72,15 @@ class CompleteElectrodeModel:
         self._sensitivity = Sensitivity(basis)
 
     # -- public ------------------------------------------------------------------------------------
+
+    def with_contacts(self, contact_impedance: float | np.ndarray) -> CompleteElectrodeModel:
+        """The same electrodes with other z_l in Ω·m², > 0, one or (L,); in a small part of the time
+        that a new model takes."""
+        made = copy(self)
+        made.contact_impedance = self._checked_contacts(contact_impedance)
+        contact = made._contact_terms(self._basis())
+        made._constant = contact[self._system.rows, self._system.columns]
+        return made
 
     def transfer_resistance(self, conductivity: np.ndarray) -> np.ndarray:
         """(..., L, L) 𝓡 with U = 𝓡 I, in Ω (in 2D Ω·m); symmetric, rows sum to zero.
@@ -130,6 +135,9 @@ class CompleteElectrodeModel:
 
     # -- the linear system -------------------------------------------------------------------------
 
+    def _basis(self) -> skfem.CellBasis:
+        return basis_on(self.mesh, self.order, intorder=2 * self.order - 1)
+
     def _contact_terms(self, basis: skfem.CellBasis) -> sp.csr_array:
         """Σ_l (1/z_l)∫_{e_l}(u − U_l)(φ − Φ_l) on all N + L unknowns."""
         mesh = basis.mesh
@@ -157,6 +165,15 @@ class CompleteElectrodeModel:
         return 0.5 * (resistance + np.swapaxes(resistance, -1, -2))
 
     # -- checks ------------------------------------------------------------------------------------
+
+    def _checked_contacts(self, contact_impedance: float | np.ndarray) -> np.ndarray:
+        z = contact_impedance
+        if np.ndim(z) == 0:
+            z = np.full(self.n_electrodes, z)
+        z = _check.array("contact_impedance", z, (self.n_electrodes,), units="Ω·m²", positive=True)
+        z = z.copy()
+        z.setflags(write=False)
+        return z
 
     def _checked_conductivity(self, conductivity: np.ndarray, batched: bool = False) -> np.ndarray:
         shape = (-1, self.mesh.n_nodes) if batched else (self.mesh.n_nodes,)

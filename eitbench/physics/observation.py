@@ -133,6 +133,11 @@ class ObservationModel:
             "smallest_concentration", smallest_concentration, low=0.0, open_low=True,
             units="mol/m³")
 
+    def with_contacts(self, contact_impedance: np.ndarray) -> ObservationModel:
+        """The same with electrodes of these contact impedances (L,) in Ω·m², > 0."""
+        return ObservationModel(self.cem.with_contacts(contact_impedance), self.interpolation,
+                                self.conductivity, self.smallest_concentration)
+
     def transfer_resistance(self, concentration: np.ndarray) -> np.ndarray:
         """𝓡 (..., L, L) in Ω (Ω·m in 2D) for nodal ``concentration`` (..., n_cd) in mol/m³."""
         return self.cem.transfer_resistance(self.conductivity(self._at_eit_nodes(concentration)))

@@ -19,7 +19,7 @@ from eitbench.bench.statistics import (
     stratified_bootstrap,
 )
 from eitbench.bench.text import scores_by_seed, seed_ranges
-from eitbench.bench.tracks import CLASSES, FLOORS, ids, named, track_of_board
+from eitbench.bench.tracks import CLASSES, FLOORS, home_of, ids, named, track_of_board
 from eitbench.bench.tracks import class_of as class_of_board
 from eitbench.data.seasons import Season, current_season, season_of
 from eitbench.report.summary import (
@@ -106,9 +106,8 @@ def boards(records: list[dict[str, Any]]) -> pd.DataFrame:
 
     A board is an environment. Its episodes are those that its floor has played (without one, those
     that anybody has); others are not looked at. After the boards of a class comes its aggregate,
-    with ``environment`` `ALL`, if there are several registered environments with a floor (an
+    with ``environment`` `ALL`, if there are several `counted` environments with a floor (an
     official one, where any is): of methods that have finished every episode of every one of them.
-    Environments with arguments of somebody's own have boards, and no part in it.
     ``seconds_per_step`` is in ms of the fastest episode, ``voltage_discrepancy`` in mV²,
     ``peak_memory`` in 10⁶ bytes.
 
@@ -122,7 +121,6 @@ def boards(records: list[dict[str, Any]]) -> pd.DataFrame:
             raise ValueError("leaderboards are made of the test seeds of one season; "
                              f"{file_name(record)} has {record['split']} seeds")
     current, _ = newest(records)
-    registered = {named(id, {}) for id in ids()}
     products = _matrix_products(current)
     known = anchors(current)
     rows: list[dict[str, Any]] = []
@@ -136,9 +134,16 @@ def boards(records: list[dict[str, Any]]) -> pd.DataFrame:
         for environment, entries in played.items():
             rows += _board(environment, entries, known, products)
         rows += _aggregate(_counted({environment: entries for environment, entries in played.items()
-                                     if environment in registered}))
+                                     if environment in counted()}))
     types: dict[str, Any] = dict.fromkeys([*_NUMBERS, *others(), *_AFTER], float)
     return pd.DataFrame(rows, columns=fields()).astype(types | {"rank": "Int64"})
+
+
+def counted() -> set[str]:
+    """Names of the environments that aggregates are of: all that are registered, without those with
+    arguments of somebody's own, and without shifts, which have a board of their own: a pipe and its
+    shifts would count as so many."""
+    return {named(id, {}) for id in ids() if not home_of(id)}
 
 
 def read_for_boards(folder: Path, season: Season | None = None,

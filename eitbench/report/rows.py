@@ -65,7 +65,7 @@ def _sorted_by(value: float | str) -> str:
 
 def badge(word: str) -> Markup:
     """A word in a frame; what speaks against a method is coloured."""
-    warns = any(what in word for what in ("outdated", "failed", "missing", "unfinished"))
+    warns = any(what in word for what in ("outdated", "failed", "missing", "unfinished", "below"))
     return Markup(f'<span class="badge{" warn" * warns}">{_said(word)}</span>')
 
 

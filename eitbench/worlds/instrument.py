@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 
 from eitbench import _check
 from eitbench.physics.observation import VoltageNoise
-from eitbench.worlds.parts import check_positive, check_range
+from eitbench.worlds.parts import LATER, check_positive, check_range
 
 LIMITS = ("L1", "L2", "Linf")
 """Norms that may bound the currents."""
@@ -67,6 +67,11 @@ class Instrument:
     """factor of a bad contact's noise"""
     interference: float = 0.1
     """V; std of what a broken wire reads"""
+    untold_noise: float = field(default=1.0, metadata=LATER)
+    """factor by which the noise of all readings exceeds what estimators are told"""
+    contact_spread: float = field(default=0.0, metadata=LATER)
+    """how far each electrode's contact impedance may be from what estimators are told, in parts of
+    it; drawn evenly, anew for each episode"""
 
     def __post_init__(self) -> None:
         check_positive(self, current="A")
@@ -76,6 +81,8 @@ class Instrument:
         if self.limit is not None and self.limit not in LIMITS:
             raise ValueError(f"limit must be one of {', '.join(LIMITS)}, got {self.limit!r}")
         _check.number("loose_noise", self.loose_noise, low=1.0)
+        _check.number("untold_noise", self.untold_noise, low=0.0)
+        _check.number("contact_spread", self.contact_spread, low=0.0, high=0.95)
         for name in ("dead", "failing", "loose"):
             bounds = getattr(self, name)
             if not isinstance(bounds, (tuple, list)) or len(bounds) != 2:
@@ -92,7 +99,7 @@ class Instrument:
 
     @property
     def noise(self) -> VoltageNoise:
-        """Of a sound electrode's reading, without the floor."""
+        """What estimators take for that of a sound electrode's reading, without the floor."""
         return VoltageNoise(self.noise_relative, self.noise_of_largest)
 
     @property
@@ -115,6 +122,10 @@ class Instrument:
         factor[shaky] = self.loose_noise
         return Faults(broken, resistance, factor)
 
+    def draw_contacts(self, random: np.random.Generator, n_electrodes: int) -> np.ndarray:
+        """(L,) of one episode: contact impedances in parts of what estimators are told."""
+        return random.uniform(1.0 - self.contact_spread, 1.0 + self.contact_spread, n_electrodes)
+
     def measure(self, faults: Faults, t: np.ndarray | int, transfer_resistance: np.ndarray,
                 currents: np.ndarray, draws: np.ndarray) -> np.ndarray:
         """Voltages (B, L) in V, 𝓡 I and noise: B episodes at one step, or one at steps t (B,).
@@ -131,5 +142,6 @@ class Instrument:
         flows = ~(broken & (currents != 0.0)).any(axis=1, keepdims=True)
         driven = currents * flows
         clean = (transfer_resistance @ driven[..., None])[..., 0] + faults.resistance * driven
-        std = np.hypot(self.noise.std(clean) * faults.noise_factor, self.noise_floor)
+        told = np.hypot(self.noise.std(clean) * faults.noise_factor, self.noise_floor)
+        std = self.untold_noise * told
         return np.where(broken, self.interference * draws, clean + std * draws)

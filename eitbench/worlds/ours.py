@@ -7,6 +7,7 @@ from eitbench.worlds import (  # noqa: F401, I001 (in the order of boards and pa
     pipe2d_time_varying,
     pipe2d_skewed,
     pipe2d_obstacle,
+    pipe2d_shifted,
     pipe3d,
     rotating_tank,
     stationary_tank,

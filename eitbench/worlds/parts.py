@@ -21,6 +21,11 @@ if TYPE_CHECKING:
     from eitbench.worlds.world import World
 
 
+LATER = {"later": True}
+"""Metadata of a number that a part was given later: at its default it is left out of the names
+under which things are kept, so that what was kept before it came is still found."""
+
+
 class Discretisation(NamedTuple):
     """A world on meshes: how the concentration moves and how it is seen."""
 

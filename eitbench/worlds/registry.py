@@ -42,6 +42,8 @@ class Entry:
     """Markdown: what the page of the environment says first"""
     seeds: str = "test:0-9"
     """the episodes of its board"""
+    home: str = ""
+    """the id whose task estimators get here too, though the truth is another; empty: its own"""
 
 
 _entries: dict[str, Entry] = {}
@@ -50,10 +52,11 @@ _by_hand: set[str] = set()
 
 
 def register(world: World, id: str, *, track: str = "estimation", about: str = "",
-             seeds: str = "test:0-9", **settings: Any) -> None:
+             seeds: str = "test:0-9", home: str = "", **settings: Any) -> None:
     """Make a world playable under an id, for `gymnasium.make` and for everything here.
 
-    ``ValueError`` if the id has another form or belongs to another world, or a setting is unknown.
+    ``ValueError`` if the id has another form or belongs to another world, a setting is unknown, or
+    estimators are told something else than at ``home``.
 
     Parameters
     ----------
@@ -66,6 +69,9 @@ def register(world: World, id: str, *, track: str = "estimation", about: str = "
         Markdown, for the environment's page.
     seeds : str
         The test episodes of its board.
+    home : str
+        Of a shift: the registered id whose task estimators get here too, though the truth is
+        another. The robustness board compares the two, and quotes the first paragraph of ``about``.
     settings
         Of the environment: ``lag`` and ``assume`` for estimates, ``gate`` for injections.
     """
@@ -80,13 +86,36 @@ def register(world: World, id: str, *, track: str = "estimation", about: str = "
         json.dumps(settings, allow_nan=False)
     except (TypeError, ValueError) as error:
         raise ValueError(f"settings must be fit for JSON: {error}") from None
-    entry = Entry(id, world, track, settings, about, seeds)
+    entry = Entry(id, world, track, settings, about, seeds, home)
+    if home:
+        _check_home(entry)
     taken = _entries[id] != entry if id in _entries else id in gym.registry
     if taken:
         raise ValueError(f"id {id} belongs to another world already; take another name or version")
     _entries[id] = entry
     _by_hand.add(id)
     _make_known(entry)
+
+
+def _check_home(shifted: Entry) -> None:
+    """``ValueError`` unless estimators are told of this world what they are told at its home."""
+    home = _entries.get(shifted.home)
+    if home is None or home.home:
+        raise ValueError("home must be a registered id that is no shift itself, "
+                         f"got {shifted.home!r}")
+    here, there = _told(shifted), _told(home)
+    if other := [name for name in here if here[name] != there[name]]:
+        raise ValueError(f"home must be an id of which estimators are told the same; {shifted.id} "
+                         f"and {home.id} differ in {', '.join(other)}")
+
+
+def _told(entry: Entry) -> dict[str, Any]:
+    """Numbers that estimators are told; beside them what is believed of the flow."""
+    world = entry.world
+    return {"track": entry.track, "settings": dict(entry.settings), "vessel": world.vessel,
+            "schedule": world.schedule, "steps": (world.n_steps, world.warm_up),
+            "noise": world.instrument.believed_noise, "current": world.instrument.current,
+            "prior": world.prior}
 
 
 def _make_known(entry: Entry) -> None:

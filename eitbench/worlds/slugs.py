@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from eitbench.worlds.parts import Discretisation, History, Target, check_positive, check_range
+from eitbench.worlds.parts import (
+    LATER,
+    Discretisation,
+    History,
+    Target,
+    check_positive,
+    check_range,
+)
 from eitbench.worlds.world import World
 
 if TYPE_CHECKING:
@@ -82,6 +89,8 @@ class Slugs(Target):
     """s, standard deviation in time of a slug's Gaussian"""
     width: tuple[float, float] = (0.010, 0.025)
     """m, standard deviation across the pipe"""
+    reach: tuple[float, float] = field(default=(0.0, 0.7), metadata=LATER)
+    """least and largest distance of a slug's centre from the axis, in parts of R"""
     arrivals: Arrivals = field(default_factory=OneInEach)
     """when they come"""
 
@@ -92,6 +101,10 @@ class Slugs(Target):
         check_range(self, "strength")
         check_range(self, "duration", "s")
         check_range(self, "width", "m")
+        check_range(self, "reach", open_low=False)
+        if not 0 < self.reach[1] <= 1:
+            raise ValueError("reach must end above 0 and at most at 1, at the wall, "
+                             f"got {self.reach!r}")
 
     def draw_inflow(self, world: World, random: np.random.Generator) -> Inflow:
         """What enters in one episode."""
@@ -99,7 +112,7 @@ class Slugs(Target):
         end = world.n_steps * world.time_step + 0.05
         when = self.arrivals.draw(random, begin, end)
         n = len(when)
-        where = world.vessel.draw_places(random, n)
+        where = world.vessel.draw_places(random, n, self.reach)
         strength = random.choice([-1.0, 1.0], n) * random.uniform(*self.strength, n)
         duration = random.uniform(*self.duration, n)
         width = random.uniform(*self.width, n)

@@ -21,6 +21,8 @@ class Randomness(NamedTuple):
     """what is broken"""
     policy: np.random.Generator
     """what a policy draws"""
+    contacts: np.random.Generator
+    """how well electrodes touch the liquid"""
 
 
 STREAMS = Randomness._fields

@@ -101,9 +101,13 @@ class PlanePipe:
         """(k, 1) coordinates across the pipe of points (k, 2), in m."""
         return points[:, 1:2]
 
-    def draw_places(self, random: np.random.Generator, n: int) -> np.ndarray:
-        """(n, 1) places on the inlet in m, as `across` counts them, within 0.7 R of the axis."""
-        return random.uniform(-0.7, 0.7, n)[:, None] * self.half_width
+    def draw_places(self, random: np.random.Generator, n: int,
+                    reach: tuple[float, float] = (0.0, 0.7)) -> np.ndarray:
+        """(n, 1) places on the inlet in m, as `across` counts them, ``reach`` from the axis in
+        parts of R."""
+        low, high = reach
+        beyond = random.uniform(low - high, high - low, n)[:, None]
+        return (beyond + np.copysign(low, beyond)) * self.half_width
 
     def substeps(self, fine: bool) -> int:
         return 16 if fine else 8
@@ -218,9 +222,13 @@ class RoundPipe:
         """(k, 2) coordinates across the pipe of points (k, 3), in m."""
         return points[:, :2]
 
-    def draw_places(self, random: np.random.Generator, n: int) -> np.ndarray:
-        """(n, 2) places on the inlet in m, as `across` counts them, within 0.7 R of the axis."""
-        distance = 0.7 * self.radius * np.sqrt(random.uniform(size=n))
+    def draw_places(self, random: np.random.Generator, n: int,
+                    reach: tuple[float, float] = (0.0, 0.7)) -> np.ndarray:
+        """(n, 2) places on the inlet in m, as `across` counts them, ``reach`` from the axis in
+        parts of R; every area as often."""
+        low, high = reach
+        inner = (low / high)**2
+        distance = high * self.radius * np.sqrt(inner + (1.0 - inner) * random.uniform(size=n))
         angle = random.uniform(0.0, 2.0 * np.pi, n)
         return distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 

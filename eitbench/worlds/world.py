@@ -117,7 +117,7 @@ class World:
 
     @property
     def noise(self) -> VoltageNoise:
-        """Of a sound electrode's reading."""
+        """What estimators take for that of a sound electrode's reading."""
         return self.instrument.noise
 
     # -- what is believed --
@@ -160,6 +160,16 @@ class World:
         episode's fresh stream.
         """
         return self.flow.true_transport(self, model, flow)
+
+    def true_observation(self, truth: Discretisation,
+                         contacts: np.random.Generator) -> ObservationModel:
+        """What the voltages of an episode are computed by, of ``truth``: with its electrodes'
+        contact impedances, drawn from the episode's fresh stream where they are not those told."""
+        seen = truth.observation
+        if self.instrument.contact_spread == 0.0:
+            return seen
+        factor = self.instrument.draw_contacts(contacts, self.vessel.n_electrodes)
+        return seen.with_contacts(factor * seen.cem.contact_impedance)
 
     def evolve(self, episodes: Sequence[Randomness], truth: Discretisation,
                tick: Callable[[int], object], last: int | None = None) -> Iterator[History]:
@@ -246,9 +256,11 @@ class World:
 
     @cached_property
     def fluid(self) -> World:
-        """What the truth depends on, with a sound instrument: variants share their episodes."""
-        return replace(self.sound, instrument=Instrument(current=self.instrument.current),
-                       prior=Prior(self.expected_concentration))
+        """What the truth depends on: variants share their episodes. Of the instrument those are the
+        currents and the contacts, which show in the transfer resistances."""
+        instrument = Instrument(current=self.instrument.current,
+                                contact_spread=self.instrument.contact_spread)
+        return replace(self.sound, instrument=instrument, prior=Prior(self.expected_concentration))
 
 
 def _changed(part: Any, changes: Mapping[str, Any], where: str) -> Any:

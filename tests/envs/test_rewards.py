@@ -5,14 +5,14 @@ import pytest
 from eitbench import scoring
 from eitbench.data.recordings import score_operators
 from eitbench.worlds import entry
-from estimating import ESTIMATION, VELOCITY, best_velocity, make
+from estimating import AT_HOME, VELOCITY, best_velocity, make
 
 PARAMETERS = {"Pipe2DUnknownVelocity": 1, "Pipe2DTimeVaryingVelocity": 1, "Pipe2DSkewedVelocity": 3}
 """Of the flow, by the name of the world."""
 each_velocity = pytest.mark.parametrize("name", VELOCITY)
 
 
-@pytest.fixture(scope="module", params=ESTIMATION)
+@pytest.fixture(scope="module", params=AT_HOME)
 def name(request):
     """Every id; all tests of one id run in a row, while its meshes are kept."""
     return request.param

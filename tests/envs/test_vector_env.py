@@ -14,7 +14,7 @@ from eitbench.envs import estimation, estimation_vector
 from eitbench.worlds import entry
 from eitbench.worlds.pipe2d import PIPE_2D
 from eitbench.worlds.task import lag_steps
-from estimating import ESTIMATION, PIPE
+from estimating import AT_HOME, ESTIMATION, PIPE
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 
@@ -73,7 +73,7 @@ def assert_same_play(one, other):
 
 
 @pytest.mark.parametrize("num_envs", [1, 5])
-@pytest.mark.parametrize("name", ESTIMATION)
+@pytest.mark.parametrize("name", AT_HOME)
 def test_same_as_so_many_scalar_environments(name, num_envs):
     """Over three whole episodes, of which two begin by themselves, it is gymnasium's
     SyncVectorEnv."""
@@ -177,7 +177,7 @@ def test_actions_are_left_alone():
         buffer[...] = 0.0
 
 
-@pytest.mark.parametrize("name", ESTIMATION)
+@pytest.mark.parametrize("name", AT_HOME)
 def test_made_again_from_its_specification(name):
     """From its own EnvSpec, through JSON, from that of the scalar environment, or pickled."""
     envs = make(name)

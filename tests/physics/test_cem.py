@@ -77,6 +77,23 @@ def test_dense_reference(dim, order):
 
 
 @every_element
+def test_other_contacts_are_solved_with(dim, order):
+    """The dense solution with these impedances; the model that they were changed of stays what it was."""
+    mesh, electrodes, sigma = small(dim)
+    currents = patterns(4)
+    cem = small_cem(dim, order)
+    before = cem.voltages(sigma, currents)
+    others = IMPEDANCE * np.array([0.5, 1.5, 1.2, 0.8])
+    other = cem.with_contacts(others)
+    dense = dense_solution(mesh, electrodes, others, order, sigma, currents)
+    assert_allclose(other.voltages(sigma, currents), dense.voltages, atol=1e-10 * np.abs(before).max())
+    assert_allclose(other.contact_impedance, others)
+    assert_allclose(cem.voltages(sigma, currents), before, rtol=1e-12)
+    with pytest.raises(ValueError, match="contact_impedance"):
+        cem.with_contacts(-others)
+
+
+@every_element
 def test_scipy_agrees(dim, order):
     """scipy's factorisation gives the kernels' 𝓡, of one state or a batch, and its derivatives."""
     mesh, electrodes, _ = small(dim)

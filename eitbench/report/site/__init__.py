@@ -22,6 +22,7 @@ from eitbench.report.site.collect import about_season, collect
 from eitbench.report.site.environment import environment_pages
 from eitbench.report.site.index import index_pages
 from eitbench.report.site.method import method_pages
+from eitbench.report.site.robustness import robustness_pages, robustness_text
 from eitbench.report.site.tables import PAGE, plain_table
 
 MARK = b"<strong>eitbench</strong> leaderboards"
@@ -50,7 +51,7 @@ def render_site(records: list[dict[str, Any]], table: pd.DataFrame,
     for board in site.boards:
         if not board.is_aggregate:
             files |= environment_pages(site, board, beside)
-    return files | method_pages(site, beside) | {
+    return files | method_pages(site, beside) | robustness_pages(site, beside) | {
         name: b"".join((HERE / part).read_bytes() for part in parts)
         for name, parts in ASSETS.items()}
 
@@ -76,6 +77,7 @@ def render(records: list[dict[str, Any]], table: pd.DataFrame | None = None) -> 
                           plain_table(first).markdown()]
                 if left := len(board.current) - len(first.rows):
                     parts.append(f"{left:,} more are in leaderboard.csv.")
+    parts += robustness_text(site)
     if site.boards:
         said = [f"- **{heading}**: {text}" for heading, text in meanings().items()]
         parts += ["## What the columns say", "\n".join(said)]

@@ -13,6 +13,9 @@ from eitbench.data.seasons import Season, current_season, season_of
 from eitbench.data.seeds import name_seed, parse_seeds
 from eitbench.report.boards import ALL, boards
 
+ROBUSTNESS = "robustness.html"
+"""The page of the robustness board within the site."""
+
 
 class Row(NamedTuple):
     """A method on a board."""

@@ -13,10 +13,11 @@ from markupsafe import Markup
 
 from eitbench._files import shipped
 from eitbench.bench.statistics import paired_probability_of_improvement
+from eitbench.bench.tracks import home_of, named
 from eitbench.envs.pages import page
 from eitbench.report import charts
 from eitbench.report.site.beside import Beside
-from eitbench.report.site.collect import Board, Row, Site
+from eitbench.report.site.collect import ROBUSTNESS, Board, Row, Site
 from eitbench.report.site.tables import axes, explanations, more, rows_file, table, three
 from eitbench.report.site.trainings import agent
 from eitbench.report.templates import template
@@ -50,6 +51,7 @@ def environment_pages(site: Site, board: Board, beside: Beside) -> dict[str, byt
         learning=learning_curves(board.environment),
         moving=beside.picture(quote(animation), "../"),
         media_mb=f"{1e-6 * beside.media.get(animation, 0):.1f} MB",
+        robustness=ROBUSTNESS if home_of(id) and named(id, {}) == board.environment else "",
         siblings=[other for other in site.boards
                   if other.of_class == board.of_class and not other.is_aggregate])
     return lines | {f"environments/{board.environment}.html": html.encode()}

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from eitbench.report.boards import ALL
+from eitbench.report.boards import ALL, counted
 from eitbench.report.site.collect import Board, Row, Site
 from eitbench.report.site.trainings import Line, lines
 
@@ -78,7 +78,7 @@ def _best_filter(site: Site) -> Number | None:
     best = _best(lines(board)) if board else None
     if board is None or best is None:
         return None
-    count = sum(each.of_class == "filter" for each in site.boards) - 1
+    count = sum(each.of_class == "filter" and each.environment in counted() for each in site.boards)
     return Number(f"{best.row.cells['gain']:.0%}".replace("%", " %"),
                   f"less error than the floor with the best filter ({best.row.cells['title']}), "
                   f"over {count} environments", board)

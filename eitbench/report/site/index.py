@@ -6,8 +6,9 @@ from typing import Any
 
 from eitbench.bench.records import finished
 from eitbench.report.site.beside import HEADLINE, Beside
-from eitbench.report.site.collect import Site, about_season
+from eitbench.report.site.collect import ROBUSTNESS, Site, about_season
 from eitbench.report.site.headline import headline, numbers
+from eitbench.report.site.robustness import families
 from eitbench.report.site.tables import axes, explanations, more, rows_file, table
 from eitbench.report.templates import template
 
@@ -35,7 +36,7 @@ def index_pages(site: Site, beside: Beside) -> dict[str, bytes]:
         moving=beside.picture(HEADLINE[0], ""), still=beside.picture(HEADLINE[1], ""),
         n_environments=sum(not board.is_aggregate for board in site.boards),
         n_records=len(site.records), n_methods=len(site.methods), classes=classes,
-        season=about_season(site.season),
+        season=about_season(site.season), robustness=ROBUSTNESS if families(site) else "",
         last=max(map(finished, site.records), default="")[:10],
         explanations=explanations(list(made.values())))
     return {"index.html": html.encode()} | {

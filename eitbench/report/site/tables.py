@@ -47,7 +47,7 @@ def table(board: Board, root: str, *, compact: bool) -> Table:
               **drawn.cells(row, parts), **_numbers(row, COMPACT if compact else None)}
              for row, parts, shared in flat]
     made = Table.of(cells, label=board.title, keep=["rank"],
-                    flags=[_flags(row) for row, _, _ in flat])
+                    flags=[flags(row) for row, _, _ in flat])
     rows = iter(made.rows)
     return made._replace(rows=[next(rows)._replace(parts=tuple(islice(rows, len(line.parts))))
                                for line in together])
@@ -199,7 +199,8 @@ def _method(row: Row, root: str, parts: Sequence[Row] = (), said: Sequence[str] 
                 link=root + method_address(row.cells["method"]))
 
 
-def _flags(row: Row) -> str:
-    flags = {"self-reported": not row.cells["official"], "unranked": row.unranked,
+def flags(row: Row) -> str:
+    """What the toggles of a page go by."""
+    holding = {"self-reported": not row.cells["official"], "unranked": row.unranked,
              "outdated": row.outdated}
-    return " ".join(name for name, holds in flags.items() if holds)
+    return " ".join(name for name, holds in holding.items() if holds)

@@ -1,0 +1,169 @@
+"""Shifts of the thesis' pipe: the task of home to the last number, and a truth that is what is said."""
+
+import numpy as np
+import pytest
+from eitbench.data.episodes import simulate, truth_discretisation
+from eitbench.data.recordings import cycle_voltages, make_recording
+from eitbench.physics.cem import CompleteElectrodeModel
+from eitbench.worlds import entries, entry, register, registry
+from eitbench.worlds.instrument import Faults, Instrument
+from eitbench.worlds.pipe2d import PIPE_2D
+from eitbench.worlds.pipe2d_shifted import (
+    HOME,
+    PIPE_2D_DOUBLE_NOISE,
+    PIPE_2D_OTHER_CONTACTS,
+    PIPE_2D_OTHER_INLET,
+    PIPE_2D_OTHER_VELOCITY,
+    PIPE_2D_SHORT_SLUGS,
+    PIPE_2D_STRONG_SLUGS,
+)
+from eitbench.worlds.streams import randomness
+from eitbench.worlds.task import make_task
+from eitbench.worlds.vessels import PlanePipe, RoundPipe
+from scipy.stats import kstest
+
+from short import register_apart, world
+
+SHIFTS = [id for id, each in entries().items() if each.home == HOME]
+
+
+def small(id):
+    """The world of an id, whose episodes take a third of a second."""
+    return entry(id).world.changed(world(id)["world"])
+
+
+def test_there_are_six():
+    assert len(SHIFTS) == 6 and all(id.startswith("eitbench/Pipe2D") for id in SHIFTS)
+
+
+# -- what estimators are told ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("id", SHIFTS)
+def test_the_task_is_that_of_home(id):
+    """Numbers, and what the models compute: where fluid is carried, and voltages with their derivatives."""
+    here, there = make_task(small(id)), make_task(small(HOME))
+    for name in ("noise", "n_steps", "warm_up", "lag", "expected_concentration", "calibration", "prior",
+                 "velocity", "vessel"):
+        assert getattr(here, name) == getattr(there, name), name
+    np.testing.assert_array_equal(here.currents, there.currents)
+    np.testing.assert_array_equal(here.mesh.points, there.mesh.points)
+    c = 30.0 + 5.0 * np.sin(np.arange(there.mesh.n_nodes))
+    np.testing.assert_array_equal(here.transport.step(c, 30.0, 31.0), there.transport.step(c, 30.0, 31.0))
+    for one, other in zip(here.observation.linearise(c, here.currents),
+                          there.observation.linearise(c, there.currents), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize(("id", "changes", "home", "message"), [
+    ("me/Shift-v0", {}, "eitbench/Nowhere-v0", "home must be a registered id that is no shift itself, got 'eitbench/N"),
+    ("me/Shift-v0", {}, SHIFTS[0], "home must be a registered id that is no shift itself"),
+    ("me/Shift-v0", {"instrument": {"noise_relative": 0.02}}, HOME, "me/Shift-v0 and .* differ in noise$"),
+    ("me/Shift-v0", {"schedule": {"scored_steps": 9}}, HOME, "differ in schedule, steps$"),
+    ("me/Shift-v0", {"prior": {"nodal_std": 0.1}}, HOME, "differ in prior$"),
+    ("me/Shift-v0", {}, "eitbench/Pipe2DFixedLag-v0", "differ in settings$"),
+    ("me/Shift-v0", {}, "eitbench/Pipe2DInjection-v0", "differ in track$"),
+])
+def test_a_home_where_other_things_are_told_is_refused(id, changes, home, message, monkeypatch):
+    register_apart(monkeypatch)
+    with pytest.raises(ValueError, match=message):
+        register(PIPE_2D.changed(changes), id, home=home)
+    assert id not in registry.entries()
+
+
+# -- what is true ---------------------------------------------------------------------------------
+
+
+def wave(world, seed, times):
+    """ln(c/background) that flows in at the model's inlet, (times, nodes)."""
+    mesh, inlet = world.vessel.carrier(fine=False)
+    inflow = world.target.draw_inflow(world, randomness(seed).inflow)
+    return np.log(np.array([inflow(mesh.points[inlet], time) for time in times]) / world.background)
+
+
+def test_strong_slugs_are_those_of_home_half_as_strong_again():
+    times = np.arange(0.0, 0.3, 5e-3)
+    np.testing.assert_allclose(wave(PIPE_2D_STRONG_SLUGS, 3, times), 1.5 * wave(PIPE_2D, 3, times), atol=1e-12)
+
+
+def test_short_slugs_last_half_as_long():
+    """∫(d ln c/dt)² over ∫(ln c)² of a Gaussian of width s is 1/2s²; of all slugs mean of 1/2s over mean of s."""
+    times = np.arange(0.0, 0.4, 1e-3)
+
+    def speed(world):
+        waves = np.array([wave(world, seed, times) for seed in range(12)])
+        return ((np.diff(waves, axis=1) / 1e-3)**2).mean() / (waves**2).mean()
+
+    shifted, home = speed(PIPE_2D_SHORT_SLUGS), speed(PIPE_2D)
+    assert home == pytest.approx(0.5 * np.log(14 / 6) / 8e-3 / 10e-3, rel=0.2)
+    assert shifted / home == pytest.approx(4.0, rel=0.1)
+
+
+def test_readings_have_twice_the_noise_that_is_told():
+    """Of every kind, and drawn as at home; the fluid is that of home."""
+    assert PIPE_2D_DOUBLE_NOISE.fluid == PIPE_2D.fluid and PIPE_2D_DOUBLE_NOISE.name == PIPE_2D.name
+    random = np.random.default_rng(0)
+    resistance = random.normal(size=(2000, 16, 16))
+    currents = random.normal(size=(2000, 16))
+    draws = random.normal(size=(2000, 16))
+    clean = (resistance @ currents[..., None])[..., 0]
+    for floor in (0.0, 3.0):
+        instrument = Instrument(noise_floor=floor, untold_noise=2.0)
+        read = instrument.measure(Faults.none(16), np.arange(2000), resistance, currents, draws)
+        told = instrument.believed_noise.std(clean)
+        assert np.std((read - clean) / told) == pytest.approx(2.0, rel=0.02)
+    here, there = small(SHIFTS[2]), small(HOME)
+    assert here.instrument.untold_noise == 2.0
+    entries = make_recording(there, 7, simulate(there, 7))
+    task = make_task(here)
+    steps = np.arange(len(entries))
+    currents = task.currents[steps % len(task.currents)]
+    clean = np.einsum("tij,tj->ti", entries["transfer_resistance"], currents)
+    read = cycle_voltages(here, 7, entries)
+    np.testing.assert_allclose(read - clean, 2.0 * task.noise.std(clean) * entries["noise"], rtol=1e-9, atol=1e-15)
+
+
+def test_velocity_is_drawn_within_a_tenth():
+    drawn = np.array([PIPE_2D_OTHER_VELOCITY.flow.draw(PIPE_2D_OTHER_VELOCITY, randomness(seed).flow)(1).mean_velocity
+                      for seed in range(300)])
+    assert drawn.min() >= 0.9 * 4.5 and drawn.max() <= 1.1 * 4.5
+    assert kstest(drawn, "uniform", (4.05, 0.9)).pvalue > 1e-3
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+def test_voltages_are_those_of_electrodes_with_these_contacts(seed):
+    """A complete electrode model built anew with the impedances drawn; with those told it is another."""
+    shifted, home = small("eitbench/Pipe2DOtherContacts-v0"), small(HOME)
+    assert shifted.instrument.contact_spread == PIPE_2D_OTHER_CONTACTS.instrument.contact_spread == 0.5
+    episode, sound = (simulate(each, seed, cache=False) for each in (shifted, home))
+    np.testing.assert_array_equal(episode.concentration, sound.concentration)
+    told = shifted.vessel.contact_impedance
+    impedance = told * randomness(seed).contacts.uniform(0.5, 1.5, 4)
+    truth = truth_discretisation(home).observation
+    sigma = truth.conductivity(truth.interpolation @ episode.concentration[2].astype(float))
+    cem = truth.cem
+    anew = CompleteElectrodeModel(cem.mesh, cem.electrodes, impedance)
+    expected = anew.transfer_resistance(sigma)
+    np.testing.assert_allclose(episode.transfer_resistance[1], expected, atol=1e-6 * np.abs(expected).max())
+    off = np.abs(sound.transfer_resistance[1] - expected).max() / np.abs(expected).max()
+    assert off > 0.002
+
+
+def test_contacts_are_drawn_evenly_and_anew():
+    drawn = np.array([PIPE_2D_OTHER_CONTACTS.instrument.draw_contacts(randomness(seed).contacts, 16)
+                      for seed in range(100)])
+    assert drawn.shape == (100, 16) and kstest(drawn.ravel(), "uniform", (0.5, 1.0)).pvalue > 1e-3
+    assert len(np.unique(drawn)) == drawn.size
+
+
+def test_slugs_of_the_other_inlet_are_at_the_walls():
+    """Between 0.7 and 0.95 R on both sides, where at home none is; and half as wide as the narrowest there."""
+    places = PlanePipe().draw_places(np.random.default_rng(0), 5000, PIPE_2D_OTHER_INLET.target.reach)[:, 0] / 0.05
+    assert kstest(np.abs(places), "uniform", (0.7, 0.25)).pvalue > 1e-3 and abs(np.sign(places).mean()) < 0.05
+    there = np.abs(PlanePipe().draw_places(np.random.default_rng(0), 5000)) / 0.05
+    assert there.max() <= 0.7
+    assert PIPE_2D_OTHER_INLET.target.width[1] < PIPE_2D.target.width[0]
+    square = ((RoundPipe().draw_places(np.random.default_rng(0), 5000, (0.7, 0.95)) / 0.05)**2).sum(axis=1)
+    assert kstest(square, "uniform", (0.49, 0.95**2 - 0.49)).pvalue > 1e-3          # every area as often
+    middle = np.abs(wave(PIPE_2D_OTHER_INLET, 0, np.arange(0.0, 0.3, 5e-3))).max(axis=0)
+    assert middle[10] < 0.02 < 0.2 < middle.max()
