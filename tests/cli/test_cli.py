@@ -116,9 +116,10 @@ def test_suites():
     plain = set(PLAIN) & set(ids("estimation"))
     assert {job.environment.id for job in quick} == plain and len(plain) == 3
     assert {job.environment.id for job in full} == set(ids("estimation"))
+    real_only = {"identified_flow", "learned_correction", "real_time_filter"}
     missing = {job for job in full if job.environment.id in plain} - set(quick)
     assert missing == {suites.Job(suites.Environment(PIPE), "gauss_newton", 1)} and set(quick) < set(full)
-    assert {job.method for job in full} == set(own_methods("estimation")) - {"learned_correction"}
+    assert {job.method for job in full} == set(own_methods("estimation")) - real_only
     assert set(parse_seeds(tracks.QUICK_SEEDS)) < set(parse_seeds(entry(PIPE).seeds))
     assert min(parse_seeds(entry(PIPE).seeds)) == 200_000
     asked_for = suites.jobs("estimation", [PIPE], ["gauss_newton"], [1, 2], suite="quick")
