@@ -141,12 +141,13 @@ class EnsembleFilter:
         seen -= mean[:, None]
         innovation = observation.value - mean
         # (I + Sᵀ S)⁻¹ and its root, of the deviations in parts of the noise, S = U diag(s) Vᵀ
-        U, s, Vt = np.linalg.svd(seen / std[:, None] / np.sqrt(N - 1.0), full_matrices=False)
+        S = seen / std[:, None] / np.sqrt(N - 1.0)
+        U, s, Vt = np.linalg.svd(S, full_matrices=False)
         moves = Vt.T @ (s / (1.0 + s**2) * (U.T @ (innovation / std))) / np.sqrt(N - 1.0)
-        shrinks = (Vt.T * (1.0 / np.sqrt(1.0 + s**2) - 1.0)) @ Vt
-        weights = shrinks + moves[:, None]
+        shrinks = 1.0 / np.sqrt(1.0 + s**2) - 1.0
         for part in (self.concentration, self.inflows, self.parameters):
-            part += (part - part.mean(axis=-1, keepdims=True)) @ weights
+            deviations = part - part.mean(axis=-1, keepdims=True)
+            part += (deviations @ Vt.T * shrinks) @ Vt + (deviations @ moves)[..., None]
         self._keep_physical()
         covariance = seen @ seen.T / (N - 1.0) + np.diag(observation.noise_variance)
         return Innovation(innovation, covariance)
