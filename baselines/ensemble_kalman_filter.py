@@ -25,7 +25,6 @@ LEAD_IN = 30
 """Time steps until the members' inflows fill the pipe."""
 BOUNDS = (0.05, 4.0)
 """Of the axial velocity, in parts of the one believed at first."""
-INFLATION = 1.0
 SEED = 0
 """Every episode is filtered by the same draws."""
 
@@ -33,8 +32,7 @@ SEED = 0
 class Estimator:
     boards = ("filter",)
     parameters = {  # noqa: RUF012 (as a record has it)
-        "members": MEMBERS, "lead_in": LEAD_IN, "bounds": list(BOUNDS), "inflation": INFLATION,
-        "seed": SEED}
+        "members": MEMBERS, "lead_in": LEAD_IN, "bounds": list(BOUNDS), "seed": SEED}
 
     def __init__(self, task: Task) -> None:
         self.task = task
@@ -54,7 +52,7 @@ class Estimator:
                 return Estimate(self.first.mean)
             self.filter = EnsembleFilter(
                 self.task, self.prior, self.first.c_bh, self.flow, MEMBERS, LEAD_IN,
-                np.random.default_rng(SEED), BOUNDS, INFLATION)
+                np.random.default_rng(SEED), BOUNDS)
             for earlier in self.first.measurements[:-1]:
                 self.filter.predict()
                 self.filter.update(*earlier)

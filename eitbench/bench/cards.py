@@ -60,8 +60,8 @@ SHORT: dict[str, dict[str, Any]] = {
     "eitbench/Pipe2DIntermittent-v0": {"world": _FAST},
 }
 """Arguments with which an episode takes a moment, since a fast fluid flushes the pipe in a few
-steps; that of the biased velocity is for what was learned in the real one. A method's card is of the first of these
-environments that it plays."""
+steps; that of the biased velocity is for what was learned in the real one. A method's card is of
+the first of these environments that it plays."""
 
 
 def card_folder() -> Path:

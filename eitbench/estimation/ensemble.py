@@ -1,5 +1,5 @@
 """An ensemble of inflows, flows and concentrations instead of a covariance
-(``docs/methods.md``, 12)."""
+(``docs/methods.md``, 14)."""
 
 from __future__ import annotations
 
@@ -50,17 +50,14 @@ class EnsembleFilter:
     random : Generator
     bounds : (float, float)
         As in `JointFilter`.
-    inflation : float
-        What deviations grow by at each prediction, ≥ 1, since few members see too little variance.
     """
 
     def __init__(self, task: Task, prior: InflowPrior, level: float, flow: UnknownFlow,
                  members: int, lead_in: int, random: np.random.Generator,
-                 bounds: tuple[float, float], inflation: float = 1.0) -> None:
+                 bounds: tuple[float, float]) -> None:
         prior.check_task(task)
         N = _check.integer("members", members, low=2)
         _check.integer("lead_in", lead_in, low=0)
-        self._inflation = _check.number("inflation", inflation, low=1.0)
         self._bounds = check_bounds(bounds)
         self.task = task
         self.prior = prior
@@ -78,16 +75,12 @@ class EnsembleFilter:
         self._keep_physical()
         self.concentration = np.full((task.mesh.n_nodes, N), level)
         """(n, N) mol/m³ of each member"""
-        walk = self.flow.walk_std
         for _ in range(lead_in):
-            self._advance(0.0 * walk)
+            self._advance(0.0 * flow.walk_std)
 
     def predict(self) -> None:
         """Move each member one time step on, with an inflow and a flow of its own."""
         self._advance(self.flow.walk_std)
-        for part in (self.concentration, self.inflows, self.parameters):
-            mean = part.mean(axis=-1, keepdims=True)
-            part[:] = mean + self._inflation * (part - mean)
 
     def _advance(self, walk_std: np.ndarray) -> None:
         r, N = self.inflows.shape[1:]

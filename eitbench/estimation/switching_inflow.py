@@ -1,4 +1,4 @@
-"""Filtering the history of an inflow in which slugs are rare (``docs/methods.md``, 13)."""
+"""Filtering the history of an inflow in which slugs are rare (``docs/methods.md``, 15)."""
 
 from __future__ import annotations
 

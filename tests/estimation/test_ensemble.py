@@ -45,10 +45,10 @@ def prior(link):
     return InflowPrior(link, MESH.points[:5], 0.2 * np.stack([np.exp(-r**2), r], axis=1), 0.6**np.arange(5)**2.0, 5e-3)
 
 
-def ensemble(link="logarithm", members=40, std=0.5, lead_in=24, **options):
+def ensemble(link="logarithm", members=40, std=0.5, lead_in=24):
     flow = UnknownFlow(transport_at, [parabola], np.array([4.5]), np.array([std]), np.array([0.1 * std]),
                        np.ones((1, 1)))
-    return EnsembleFilter(task(), prior(link), LEVEL, flow, members, lead_in, np.random.default_rng(0), BOUNDS, **options)
+    return EnsembleFilter(task(), prior(link), LEVEL, flow, members, lead_in, np.random.default_rng(0), BOUNDS)
 
 
 def observation(seed=5, m=6, variance=0.1):
@@ -118,19 +118,9 @@ def test_many_members_give_the_kalman_filter(monkeypatch):
     np.testing.assert_array_equal(filter_.parameters, 4.5)
 
 
-def test_inflation_widens_what_is_predicted():
-    plain, wide = (ensemble(inflation=inflation) for inflation in (1.0, 1.1))
-    for each in (plain, wide):
-        each.predict()
-    np.testing.assert_allclose(together(wide).mean(axis=1), together(plain).mean(axis=1), rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(together(wide).std(axis=1), 1.1 * together(plain).std(axis=1), rtol=1e-9)
-
-
 def test_mistakes_are_told():
     with pytest.raises(ValueError, match="members must be"):
         ensemble(members=1)
-    with pytest.raises(ValueError, match="inflation must be"):
-        ensemble(inflation=0.9)
     with pytest.raises(ValueError, match="the prior must be of the task's inlet"):
         EnsembleFilter(make_task(TINY), prior("linear"), LEVEL, ensemble().flow, 10, 2, np.random.default_rng(0),
                        BOUNDS)

@@ -55,7 +55,7 @@ def observations(count, slug=2.5):
 def enumerated(filter_, regimes, measured):
     """Probability that the last regime is a slug, mean and variance of the last concentration: every sequence of
     regimes with a textbook Kalman filter of its own, from the same beginning, weighed by its prior and its fit."""
-    quiet, slug = filter_.filters
+    quiet, _ = filter_.filters
     W, r = quiet.mean.shape
     basis, weights = quiet.response()
     # (n, W·r) what the window makes of itself, by the response's own columns
