@@ -22,7 +22,8 @@ register(PIPE_2D_INTERMITTENT, "eitbench/Pipe2DIntermittent-v0", seeds="test:0-1
 The pipe of `eitbench/Pipe2D-v0` when slugs are rare: strong ones come one at a time, at times
 nobody foresees, about three in an episode. Between them what flows in does not change. A Gaussian
 prior of the inflow has to believe in a little of a slug at every moment; who asks whether a slug
-has come at all can be sure of the quiet, and wide awake when it ends.
+has come at all can be sure of the quiet, and wide awake when it ends. The episodes are those of
+`eitbench/Pipe2DInjectionBudget-v0`, with an injection at every step.
 """)
 register(PIPE_2D_BUDGET, "eitbench/Pipe2DInjectionBudget-v0", track="injection",
          seeds="test:0-49", about="""
