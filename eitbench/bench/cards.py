@@ -57,10 +57,11 @@ SHORT: dict[str, dict[str, Any]] = {
     "eitbench/Pipe2DInjectionFlow-v0": {"world": _CHOICE | {
         "flow": {"mean_velocity": 16.0, "velocity_range": [15.0, 17.0]}}, "estimator": "reduced"},
     "eitbench/Pipe2DBiasedVelocity-v0": {"world": {"schedule": {"scored_steps": 5}}},
+    "eitbench/Pipe2DIntermittent-v0": {"world": _FAST},
 }
 """Arguments with which an episode takes a moment, since a fast fluid flushes the pipe in a few
-steps; the last is for what was learned in the real one. A method's card is of the first of these
-environments that it plays."""
+steps; that of the biased velocity is for what was learned in the real one. A method's card is of
+the first of these environments that it plays."""
 
 
 def card_folder() -> Path:

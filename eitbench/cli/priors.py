@@ -24,19 +24,27 @@ def fit_prior(
     kept: Annotated[float, typer.Option(
         min=0.0, max=1.0, help="Modes across the inlet of less than this part of the variance are "
                                "left out; each makes filters slower.")] = 1e-4,
+    quiet: Annotated[float | None, typer.Option(
+        help="Learn how slugs begin and end too: a step is quiet if what is Gaussian is nowhere "
+             "beyond ± this.")] = None,
 ) -> None:
     """Learn what to expect of the inflow from training episodes, which are not simulated for it,
     and write it as a prior for filters (`eitbench.estimation.InflowPrior`)."""
     from eitbench.data.seeds import parse_seeds
     from eitbench.estimation import learned_inflow_prior
     from eitbench.worlds.registry import entry
+    regimes = {} if quiet is None else {"quiet": quiet}
     with options.clear_errors():
         prior = learned_inflow_prior(
             entry(env).world, parse_seeds(seeds), link=link.value, nugget=nugget, kept=kept,
-            source={"environment": env, "seeds": seeds, "nugget": nugget, "kept": kept})
+            quiet=quiet, source={"environment": env, "seeds": seeds, "nugget": nugget,
+                                 "kept": kept, **regimes})
         prior.save(out)
     options.say(f"{out}: {prior.modes.shape[1]} modes across {len(prior.points)} nodes of the "
                 f"inlet, correlated over {prior.memory} steps of {prior.time_step:g} s")
+    if prior.regimes is not None:
+        options.say(f"slugs enter {prior.regimes.share:.0%} of the time and last "
+                    f"{1.0 / prior.regimes.ends:.1f} steps on average")
 
 
 def fit_model(

@@ -2,6 +2,7 @@
 
 from eitbench.estimation.covariance import FreeCovariance
 from eitbench.estimation.dense import DenseKalmanFilter, Filtered
+from eitbench.estimation.ensemble import EnsembleFilter
 from eitbench.estimation.first_frame import FirstFrame
 from eitbench.estimation.gains import GainSequence, gain_sequence
 from eitbench.estimation.gauss_newton import gauss_newton
@@ -12,6 +13,7 @@ from eitbench.estimation.inflow_history import InflowFilter
 from eitbench.estimation.inflow_map import most_probable_inflow, smoothed_inflow
 from eitbench.estimation.inflow_prior import (
     InflowPrior,
+    Regimes,
     fit_inflow_prior,
     learned_inflow_prior,
     suiting_priors,
@@ -38,17 +40,19 @@ from eitbench.estimation.smoother import (
     smoothed_state,
 )
 from eitbench.estimation.smoothness import smoothness_covariance
+from eitbench.estimation.switching_inflow import SwitchingInflowFilter
 from eitbench.estimation.unknown_flow import UnknownFlow, asked_flow, scaled_flow
 
 __all__ = [
-    "DenseKalmanFilter", "FilterStep", "Filtered", "FirstFrame", "FreeCovariance",
-    "GainSequence", "IdentifiedModel", "InflowFilter", "InflowPrior", "InflowSmoother",
-    "InflowTracker", "JointFilter", "JointInflowFilter", "JointStep", "KalmanFilter",
-    "LinearisedObservations", "Observation", "QuadraticVoltages", "Response", "Smoothed",
-    "UnknownFlow", "asked_flow", "best_homogeneous", "changing_responses", "fit_inflow_prior",
-    "fixed_interval_smoother", "gain_sequence", "gauss_newton", "identified_model",
-    "initial_covariance", "kalman_filter", "learned_inflow_prior", "linearised",
-    "most_probable_inflow", "scaled_flow", "smoothed_inflow", "smoothed_means",
-    "smoothed_state", "smoothness_covariance", "starting_filter", "steady_response",
-    "suiting_models", "suiting_priors", "table_5_1", "white_inflow",
+    "DenseKalmanFilter", "EnsembleFilter", "FilterStep", "Filtered", "FirstFrame",
+    "FreeCovariance", "GainSequence", "IdentifiedModel", "InflowFilter", "InflowPrior",
+    "InflowSmoother", "InflowTracker", "JointFilter", "JointInflowFilter", "JointStep",
+    "KalmanFilter", "LinearisedObservations", "Observation", "QuadraticVoltages", "Regimes",
+    "Response", "Smoothed", "SwitchingInflowFilter", "UnknownFlow", "asked_flow",
+    "best_homogeneous", "changing_responses", "fit_inflow_prior", "fixed_interval_smoother",
+    "gain_sequence", "gauss_newton", "identified_model", "initial_covariance", "kalman_filter",
+    "learned_inflow_prior", "linearised", "most_probable_inflow", "scaled_flow",
+    "smoothed_inflow", "smoothed_means", "smoothed_state", "smoothness_covariance",
+    "starting_filter", "steady_response", "suiting_models", "suiting_priors", "table_5_1",
+    "white_inflow",
 ]

@@ -75,10 +75,14 @@ class InflowFilter:
 
     def predict(self) -> None:
         """Move one time step on: a new inflow is expected, the oldest is forgotten."""
-        self._present += 1
         weights, variance = self._regression
-        self.mean, self.covariance = moved(self.mean, self.covariance, weights[:, None],
-                                           np.full(self.mean.shape[1], variance))
+        self.move(weights[:, None], np.full(self.mean.shape[1], variance))
+
+    def move(self, weights: np.ndarray, new_variance: np.ndarray) -> None:
+        """`predict` where each entry of x has a regression of its own: ``weights`` (W, r) or
+        (W, 1), and what they leave open, (r,)."""
+        self._present += 1
+        self.mean, self.covariance = moved(self.mean, self.covariance, weights, new_variance)
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Innovation:
         """Take in a measurement (L,) in V of the present state, for the injection (L,) in A."""

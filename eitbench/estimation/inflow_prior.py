@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +14,7 @@ import numpy as np
 from eitbench import _check
 from eitbench._files import write_atomically
 from eitbench.data.seeds import SPLITS, name_seed
+from eitbench.worlds.registry import entries
 
 if TYPE_CHECKING:
     from eitbench.worlds.task import Task
@@ -25,6 +26,34 @@ NEAR = 1e-6
 """m between nodes that are taken for the same: an obstacle downstream moves them a little."""
 FEWEST = 16
 """Steps that an inflow must have to learn a correlation from."""
+
+
+@dataclass(frozen=True)
+class Regimes:
+    """Where slugs are rare: a Markov chain of two regimes, quiet and slug. ``ValueError`` naming
+    what is out of range."""
+
+    begins: float
+    """probability that a slug begins after a quiet step"""
+    ends: float
+    """probability that quiet begins after a step of a slug"""
+    quiet: float
+    """variance of a quiet inflow, in parts of that within slugs"""
+
+    def __post_init__(self) -> None:
+        _check.number("begins", self.begins, low=0.0, high=1.0, open_low=True)
+        _check.number("ends", self.ends, low=0.0, high=1.0, open_low=True)
+        _check.number("quiet", self.quiet, low=0.0, high=1.0, open_low=True)
+
+    @property
+    def share(self) -> float:
+        """Of the steps in which a slug enters."""
+        return self.begins / (self.begins + self.ends)
+
+    @property
+    def variance(self) -> float:
+        """Of all inflows, in parts of that within slugs."""
+        return self.share + (1.0 - self.share) * self.quiet
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +76,8 @@ class InflowPrior:
     """s"""
     source: Mapping[str, Any] = field(default_factory=dict)
     """where it comes from, fit for JSON"""
+    regimes: Regimes | None = None
+    """for filters that tell slugs from quiet; None: not learned"""
 
     def __post_init__(self) -> None:
         if self.link not in LINKS:
@@ -98,8 +129,10 @@ class InflowPrior:
 
     def save(self, path: Path) -> None:
         """Write a file that `load` reads."""
+        regimes = {} if self.regimes is None else {
+            "regimes": {name: _rounded(value) for name, value in asdict(self.regimes).items()}}
         text = json.dumps({
-            "link": self.link, "time_step": self.time_step, "source": dict(self.source),
+            "link": self.link, "time_step": self.time_step, "source": dict(self.source), **regimes,
             "correlation": _rounded(self.correlation), "points": _rounded(self.points),
             "modes": _rounded(self.modes)})
         write_atomically(path, (text + "\n").encode())
@@ -109,8 +142,9 @@ class InflowPrior:
         """What `save` has written; ``ValueError`` naming the file if it is nothing of the kind."""
         try:
             said = json.loads(path.read_text(encoding="utf-8"))
-            return cls(**said)
-        except (OSError, ValueError, TypeError) as error:
+            regimes = said.pop("regimes", None)
+            return cls(**said, regimes=None if regimes is None else Regimes(**regimes))
+        except (OSError, ValueError, TypeError, AttributeError) as error:
             raise ValueError(f"{path} must be a prior of `eitbench fit-prior`: {error}") from None
 
 
@@ -123,6 +157,7 @@ def white_inflow(task: Task) -> InflowPrior:
 
 def fit_inflow_prior(ratios: np.ndarray, points: np.ndarray, time_step: float, *,
                      link: str = "logarithm", nugget: float = 0.01, kept: float = 1e-4,
+                     quiet: float | None = None,
                      source: Mapping[str, Any] | None = None) -> InflowPrior:
     """The prior that inflows of the past suggest.
 
@@ -140,6 +175,8 @@ def fit_inflow_prior(ratios: np.ndarray, points: np.ndarray, time_step: float, *
         Part of the variance that is white in time: what the model does not know of.
     kept : float
         Modes across the inlet of less than this part of the variance are left out.
+    quiet : float, optional
+        Learn `Regimes` too: a step counts as quiet if |u| is less than this at all nodes.
     """
     ratios = _check.array("ratios", ratios, (None, None, len(points)))
     _check.number("nugget", nugget, low=0.0, high=1.0)
@@ -161,7 +198,22 @@ def fit_inflow_prior(ratios: np.ndarray, points: np.ndarray, time_step: float, *
     taper = (1.0 - lags / len(lags))**4 * (1.0 + 4.0 * lags / len(lags))
     correlation = (1.0 - nugget) * taper * products / products[0]
     correlation[0] = 1.0
-    return InflowPrior(link, points, modes, correlation, time_step, source or {})
+    regimes = None if quiet is None else _fit_regimes(u, quiet)
+    return InflowPrior(link, points, modes, correlation, time_step, source or {}, regimes)
+
+
+def _fit_regimes(u: np.ndarray, quiet: float) -> Regimes:
+    """How often slugs begin and end in u (N, T, n_inlet), and how quiet it is between them."""
+    _check.number("quiet", quiet, low=0.0, open_low=True)
+    slug = np.abs(u).max(axis=2) >= quiet
+    if slug.all() or not slug.any():
+        raise ValueError(f"quiet must be a size that some steps exceed and some do not, got {quiet}"
+                         f" where {slug.mean():.0%} do")
+    before = slug[:, :-1]
+    after = slug[:, 1:]
+    variance = np.square(u).sum(axis=2)
+    return Regimes(begins=float(after[~before].mean()), ends=float((~after[before]).mean()),
+                   quiet=float(variance[~slug].mean() / variance[slug].mean()))
 
 
 def learned_inflow_prior(world: World, seeds: Sequence[int], **how: Any) -> InflowPrior:
@@ -179,9 +231,20 @@ def learned_inflow_prior(world: World, seeds: Sequence[int], **how: Any) -> Infl
 
 
 def suiting_priors(folder: Path, task: Task, link: str) -> list[InflowPrior]:
-    """Those in a folder's files, by name, that are of this link and this task's inlet."""
+    """Those in a folder's files that are of this link and this task's inlet: first those that were
+    learned in the task's own world, then the others, by name.
+
+    Another world may have other slugs: one whose own are not known takes those of the first file.
+    """
     found = map(InflowPrior.load, sorted(folder.glob("*.json")))
-    return [prior for prior in found if prior.link == link and prior.suits(task)]
+    suiting = [prior for prior in found if prior.link == link and prior.suits(task)]
+    return sorted(suiting, key=lambda prior: _world(prior) != task.world)
+
+
+def _world(prior: InflowPrior) -> str | None:
+    """Name of the world that it was learned in."""
+    learned_in = entries().get(prior.source.get("environment", ""))
+    return None if learned_in is None else learned_in.world.name
 
 
 def _rounded(array: np.ndarray) -> Any:

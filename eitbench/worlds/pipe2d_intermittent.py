@@ -1,5 +1,7 @@
 """The thesis' 2D pipe when slugs are rare: most of the time there is nothing to see."""
 
+from dataclasses import replace
+
 from eitbench.worlds.flows import LaminarFlow
 from eitbench.worlds.registry import register
 from eitbench.worlds.schedule import Schedule
@@ -10,10 +12,20 @@ from eitbench.worlds.world import World
 PIPE_2D_INTERMITTENT = World(
     "Pipe2DIntermittent", PlanePipe(), LaminarFlow(),
     Slugs(strength=(0.35, 0.60), arrivals=NowAndThen(interval=0.10, wait=0.20)),
-    schedule=Schedule(scored_steps=180, budget=30))
+    schedule=Schedule(scored_steps=180))
 """Strong slugs, about three in the injections that are scored; all numbers are ours."""
+PIPE_2D_BUDGET = replace(PIPE_2D_INTERMITTENT,
+                         schedule=replace(PIPE_2D_INTERMITTENT.schedule, budget=30))
+"""The same episodes, in which an agent may inject at one step in six only."""
 
-register(PIPE_2D_INTERMITTENT, "eitbench/Pipe2DInjectionBudget-v0", track="injection",
+register(PIPE_2D_INTERMITTENT, "eitbench/Pipe2DIntermittent-v0", seeds="test:0-15", about="""
+The pipe of `eitbench/Pipe2D-v0` when slugs are rare: strong ones come one at a time, at times
+nobody foresees, about three in an episode. Between them what flows in does not change. A Gaussian
+prior of the inflow has to believe in a little of a slug at every moment; who asks whether a slug
+has come at all can be sure of the quiet, and wide awake when it ends. The episodes are those of
+`eitbench/Pipe2DInjectionBudget-v0`, with an injection at every step.
+""")
+register(PIPE_2D_BUDGET, "eitbench/Pipe2DInjectionBudget-v0", track="injection",
          seeds="test:0-49", about="""
 The pipe of `eitbench/Pipe2D-v0` when slugs are rare: strong ones come one at a time, at times
 nobody foresees, about three in an episode. The agent may inject at one step in six only, so it has

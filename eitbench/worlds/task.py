@@ -69,6 +69,8 @@ class Task:
     """how to write the flow if it is asked for too; ``transport`` has the one believed at first"""
     vessel: Vessel | None = None
     """its sizes and electrodes"""
+    world: str = ""
+    """its name, by which what was learned in it is found"""
 
     def _repr_html_(self) -> str:
         """Its numbers, and what is asked for."""
@@ -128,7 +130,7 @@ def make_task(world: World, lag: int | str = 0, **assumed: Any) -> Task:
     currents.setflags(write=False)                                # shared by all who play this task
     return Task(model.transport, model.observation, world.instrument.believed_noise, currents,
                 world.n_steps, world.warm_up, steps, world.expected_concentration,
-                world.calibration, world.prior, world.velocity_model, world.vessel)
+                world.calibration, world.prior, world.velocity_model, world.vessel, world.name)
 
 
 def lag_steps(world: World, lag: int | str) -> int:

@@ -25,16 +25,20 @@ def test_writes_what_filters_read(tmp_path):
     assert source == {"environment": "eitbench/Pipe2D-v0", "seeds": "train:0-9", "nugget": 0.01, "kept": 1e-4}
 
 
-@pytest.mark.parametrize("link", ["linear", "logarithm"])
-def test_shipped_priors_are_what_the_command_writes(tmp_path, link):
+@pytest.mark.parametrize("name", ["pipe2d-linear", "pipe2d-logarithm", "pipe2dintermittent-linear",
+                                  "pipe2dintermittent-logarithm"])
+def test_shipped_priors_are_what_the_command_writes(tmp_path, name):
     """With the source that they name, to nine digits."""
-    shipped = InflowPrior.load(baseline_folder() / "priors" / f"pipe2d-{link}.json")
-    done = told("--env", shipped.source["environment"], "--seeds", shipped.source["seeds"], "--link", link,
-                "--nugget", shipped.source["nugget"], "--out", tmp_path / "again.json")
+    shipped = InflowPrior.load(baseline_folder() / "priors" / f"{name}.json")
+    source = shipped.source
+    quiet = ["--quiet", source["quiet"]] if "quiet" in source else []
+    done = told("--env", source["environment"], "--seeds", source["seeds"], "--link", shipped.link,
+                "--nugget", source["nugget"], *quiet, "--out", tmp_path / "again.json")
     assert done.exit_code == 0, done.output
     again = InflowPrior.load(tmp_path / "again.json")
     np.testing.assert_allclose(again.correlation, shipped.correlation, atol=1e-8)
     np.testing.assert_allclose(again.modes @ again.modes.T, shipped.modes @ shipped.modes.T, atol=1e-8)
+    assert again.regimes == shipped.regimes
 
 
 @pytest.mark.parametrize("arguments, said", [

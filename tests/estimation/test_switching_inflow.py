@@ -1,0 +1,176 @@
+"""The filter of two regimes against exhaustive enumeration of what may have come when; and what is learned of them."""
+
+import itertools
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from eitbench.bench.methods import baseline_folder
+from eitbench.estimation import (
+    InflowPrior,
+    Observation,
+    Regimes,
+    SwitchingInflowFilter,
+    fit_inflow_prior,
+    suiting_priors,
+)
+from eitbench.worlds import entry
+from eitbench.worlds.task import make_task
+from scipy.stats import multivariate_normal
+
+from tiny_worlds import TINY
+
+LEVEL = 29.0
+ROWS = 4
+
+
+@lru_cache(maxsize=1)
+def task():
+    return make_task(TINY)
+
+
+def prior(begins, ends):
+    """Two modes across the inlet, a correlation over four steps; linear, so that enumeration is exact."""
+    points = task().mesh.points[task().transport.inlet]
+    r = points[:, 1] / 0.05
+    return InflowPrior("linear", points, 0.1 * np.stack([np.exp(-r**2), r], axis=1), 0.6**np.arange(5)**2.0,
+                       task().transport.time_step, regimes=Regimes(begins, ends, 1e-3))
+
+
+def switching(begins, ends):
+    return SwitchingInflowFilter(task(), prior(begins, ends), LEVEL, level_std=0.03)
+
+
+def observations(count, slug=2.5):
+    """Averages over parts of the pipe near the inlet, where a slug comes in at the third."""
+    random = np.random.default_rng(2)
+    x = task().mesh.points[:, 0]
+    for t in range(count):
+        H = np.exp(-0.5 * ((x - random.uniform(0.0, 0.2, (ROWS, 1))) / 0.05)**2)
+        H /= H.sum(axis=1, keepdims=True)
+        yield Observation(H, LEVEL + (slug if t >= 2 else 0.0) + 0.5 * random.standard_normal(ROWS),
+                          np.full(ROWS, 0.25))
+
+
+def enumerated(filter_, regimes, measured):
+    """Probability that the last regime is a slug, mean and variance of the last concentration: every sequence of
+    regimes with a textbook Kalman filter of its own, from the same beginning, weighed by its prior and its fit."""
+    quiet, _ = filter_.filters
+    W, r = quiet.mean.shape
+    basis, weights = quiet.response()
+    # (n, W·r) what the window makes of itself, by the response's own columns
+    G = LEVEL * basis @ np.tensordot(weights, quiet.prior.modes, 1).reshape(len(weights), -1)
+    G = np.concatenate([G, np.zeros((len(G), (W - weights.shape[1]) * r))], axis=1)
+    steps = []
+    for move, variance in filter_._moves:
+        A = np.eye(W * r, k=-r)
+        A[:r] = np.concatenate([np.diag(row) for row in np.broadcast_to(move, (W, r))], axis=1)
+        Q = np.zeros((W * r, W * r))
+        Q[:r, :r] = np.diag(variance)
+        steps.append((A, Q))
+    chain = [[1 - regimes.begins, regimes.begins], [regimes.ends, 1 - regimes.ends]]
+    start = [1 - regimes.share, regimes.share]
+    found = []
+    for sequence in itertools.product([0, 1], repeat=len(measured) + 1):
+        log = np.log(start[sequence[0]])
+        m, P = np.zeros(W * r), quiet.covariance
+        for before, now, seen in zip(sequence, sequence[1:], measured, strict=False):
+            A, Q = steps[now]
+            m, P = A @ m, A @ P @ A.T + Q
+            H = seen.matrix @ G
+            S = H @ P @ H.T + np.diag(seen.noise_variance)
+            expected = seen.matrix @ np.full(len(G), LEVEL) + H @ m
+            log += np.log(chain[before][now]) + multivariate_normal.logpdf(seen.value, expected, S)
+            gain = np.linalg.solve(S, H @ P).T
+            m, P = m + gain @ (seen.value - expected), P - gain @ S @ gain.T
+        found.append((log, sequence[-1], LEVEL + G @ m, ((G @ P) * G).sum(axis=1)))
+    logs, last, means, variances = map(np.array, zip(*found, strict=True))
+    weight = np.exp(logs - logs.max())
+    weight /= weight.sum()
+    mean = weight @ means
+    return weight @ last, mean, weight @ (variances + (means - mean)**2)
+
+
+def filtered(filter_, measured):
+    for seen in measured:
+        filter_.predict()
+        filter_.take_in(seen, [each.concentration() for each in filter_.filters])
+    return filter_.probabilities[1], *filter_.state()
+
+
+@pytest.mark.parametrize("begins, ends, steps", [(0.2, 0.3, 1), (1e-13, 2e-13, 5)], ids=["one step", "no change"])
+def test_exact_where_nothing_is_mixed(begins, ends, steps):
+    """After one measurement, and where the regime never changes: probability, mean and variance to 1e-6."""
+    measured = list(observations(steps, slug=1.0))
+    expected = enumerated(switching(begins, ends), Regimes(begins, ends, 1e-3), measured)
+    actual = filtered(switching(begins, ends), measured)
+    assert 0.01 < expected[0] < 0.99
+    np.testing.assert_allclose(actual[0], expected[0], rtol=1e-6)
+    np.testing.assert_allclose(actual[1], expected[1], rtol=1e-6)
+    np.testing.assert_allclose(actual[2], expected[2], rtol=1e-6)
+
+
+def test_near_enumeration_where_regimes_change():
+    """Of 64 sequences: the mean to a fifth of the standard deviation, the probability to 0.1; and it sees the slug."""
+    measured = list(observations(5))
+    slug, mean, variance = enumerated(switching(0.1, 0.2), Regimes(0.1, 0.2, 1e-3), measured)
+    ours = filtered(switching(0.1, 0.2), measured)
+    assert slug > 0.9 and abs(ours[0] - slug) < 0.1
+    assert np.abs((ours[1] - mean) / np.sqrt(variance)).max() < 0.2
+    np.testing.assert_allclose(ours[2], variance, rtol=0.35)
+
+
+def test_innovations_are_those_of_the_mixture():
+    """Mean and covariance of what is read, of both regimes by their probabilities, to 1e-9."""
+    filter_ = switching(0.1, 0.2)
+    first, second = observations(2)
+    filtered(filter_, [first])
+    filter_.predict()
+    p = filter_.probabilities
+    points = [each.concentration() for each in filter_.filters]
+    expected = second.value - second.matrix @ (p[0] * points[0] + p[1] * points[1])
+    slopes = [each.by_inflow(second.matrix) for each in filter_.filters]
+    seen = slopes[0].shape[1]
+    S = sum(q * H @ each.covariance[:seen, :seen] @ H.T for q, H, each in
+            zip(p, slopes, filter_.filters, strict=True))
+    apart = second.matrix @ (points[0] - points[1])
+    S += p[0] * p[1] * np.outer(apart, apart) + np.diag(second.noise_variance)
+    innovation, covariance = filter_.take_in(second, points)
+    np.testing.assert_allclose(innovation, expected, rtol=1e-9)
+    np.testing.assert_allclose(covariance, S, rtol=1e-9)
+
+
+def test_regimes_are_counted():
+    """Four quiet steps, then two of a slug, again and again: of 4 quiet steps 1 is followed by a slug."""
+    u = np.tile([0.0, 0.001, -0.001, 0.0, 0.2, 0.4], 12)[:-1]
+    ratios = np.exp(u)[None, :, None] * np.ones((1, 1, 3))
+    found = fit_inflow_prior(ratios, np.zeros((3, 2)), 0.005, quiet=0.02).regimes
+    assert found.begins == pytest.approx(1 / 4)
+    assert found.ends == pytest.approx(1 / 2)
+    slugs = (12 * 0.2**2 + 11 * 0.4**2) / 23
+    assert found.quiet == pytest.approx(0.5e-6 / slugs)
+    assert found.share == pytest.approx(found.begins / (found.begins + found.ends))
+
+
+@pytest.mark.parametrize("id, environment", [("Pipe2DIntermittent-v0", "eitbench/Pipe2DIntermittent-v0"),
+                                             ("Pipe2D-v0", "eitbench/Pipe2D-v0"),
+                                             ("Pipe2DUnknownVelocity-v0", "eitbench/Pipe2D-v0")])
+def test_a_world_takes_what_was_learned_in_it(id, environment):
+    """Where nothing was, what was learned in the plain pipe."""
+    found = suiting_priors(baseline_folder() / "priors", make_task(entry(f"eitbench/{id}").world), "logarithm")
+    assert found[0].source["environment"] == environment
+    assert len(found) == 2
+
+
+def test_mistakes_are_told(tmp_path):
+    with pytest.raises(ValueError, match="prior must have regimes"):
+        SwitchingInflowFilter(task(), InflowPrior("linear", prior(0.1, 0.1).points, prior(0.1, 0.1).modes, np.ones(1),
+                                                  task().transport.time_step), LEVEL, level_std=0.1)
+    with pytest.raises(ValueError, match="level_std must be"):
+        SwitchingInflowFilter(task(), prior(0.1, 0.1), LEVEL, level_std=0.0)
+    with pytest.raises(ValueError, match="begins must be"):
+        Regimes(0.0, 0.1, 0.1)
+    with pytest.raises(ValueError, match="quiet must be a size that some steps exceed"):
+        fit_inflow_prior(np.full((1, 40, 3), 1.1), np.zeros((3, 2)), 0.005, quiet=0.01)
+    prior(0.1, 0.2).save(tmp_path / "a.json")
+    assert InflowPrior.load(tmp_path / "a.json").regimes == Regimes(0.1, 0.2, 1e-3)
