@@ -7,7 +7,7 @@ lessons. Episodes and what was seen of them are kept in results/learned; the sam
 from there.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -17,6 +17,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 import typer
+from scipy.linalg import block_diag
 from tqdm import tqdm, trange
 
 import eitbench
@@ -78,19 +79,21 @@ class Lesson:
     """of what is off at "nodes" or in "modes\""""
     modes: int = 64
     """of c/ĉ_bh − 1"""
-    hidden: int = 192
+    hidden: int = 64
+    joined: int = 5
+    """Trainings that are played together."""
     noise: float = 0.8
     """on the inputs, in their standard deviations, while it learns"""
 
 
 LESSONS = {
     "biased": Lesson("eitbench/Pipe2DBiasedVelocity-v0", "pipe2d-biased.npz", (100, 300, 1000),
-                     velocity=True, likelihood="modes"),
-    "smoothing": Lesson("eitbench/Pipe2D-v0", "pipe2d-smoothing.npz", (100, 300, 600),
-                        lag=20, both_ways=True, hidden=96),
-    "lag": Lesson("eitbench/Pipe2D-v0", "pipe2d-lag.npz", (100, 300, 600), lag=4),
-    "obstacle": Lesson("eitbench/Pipe2DObstacle-v0", "pipe2d-obstacle.npz", (100, 300, 600)),
-    "voltages": Lesson("eitbench/Pipe2D-v0", "pipe2d-voltages.npz", (100, 300, 600),
+                     velocity=True, likelihood="modes", hidden=192, joined=1),
+    "smoothing": Lesson("eitbench/Pipe2D-v0", "pipe2d-smoothing.npz", (64, 128, 266),
+                        lag=20, both_ways=True, hidden=48),
+    "lag": Lesson("eitbench/Pipe2D-v0", "pipe2d-lag.npz", (64, 128, 266), lag=4),
+    "obstacle": Lesson("eitbench/Pipe2DObstacle-v0", "pipe2d-obstacle.npz", (37, 75, 150)),
+    "voltages": Lesson("eitbench/Pipe2D-v0", "pipe2d-voltages.npz", (64, 128, 266),
                        sees="voltages", noise=0.2),
 }
 LAGS = (4, 20)
@@ -136,14 +139,15 @@ def features(examples: Dataset, example: Example, basis: np.ndarray,
         see = VoltagesSeen(task, first.c_bh, basis)
         inputs, reduced = (np.array(each) for each in zip(*(see(*each) for each in record),
                                                           strict=True))
-        later = []
+        later = {}
     else:
         prior = suiting_priors(ROOT / "baselines" / "priors", task, "logarithm")[0]
         see = FilterSeen(task, prior, first.c_bh, basis, max(LAGS))
-        inputs, (reduced, *later) = see.record(record, 0, *LAGS)
+        inputs, (reduced, *each) = see.record(record, 0, *LAGS)
+        later = {f"reduced {lag}": modes for lag, modes in zip(LAGS, each, strict=True)}
     # in the order of `FEATURES`, in which `store` knows them again
     return {"inputs": inputs.astype(np.float32), "reduced": reduced, "truth": truth, "rest": rest,
-            "weight": weight} | {f"reduced {lag}": each for lag, each in zip(LAGS, later)}
+            "weight": weight} | later
 
 
 def basis_and_rest(lesson: Lesson) -> Mapping[str, np.ndarray]:
@@ -241,6 +245,39 @@ class Correction(torch.nn.Module):
         return {name: each.detach().numpy().astype(np.float16) for name, each in found.items()}
 
 
+def joined(networks: list[Correction]) -> dict[str, np.ndarray]:
+    """One network whose correction and log variance are the means of those of several (deep
+    ensembles: Lakshminarayanan et al. 2017). Their units keep to themselves."""
+    each = [network.arrays() for network in networks]
+    many = len(each)
+    if many == 1:
+        return each[0]
+    whole = {name: each[0][name] for name in ("input_scale", "output_scale")}
+    whole["output_bias"] = np.mean([one["output_bias"] for one in each], axis=0)
+    whole["mixing_bias"] = np.concatenate([one["mixing_bias"] for one in each])
+    whole["mixing_weight"] = beside([one["mixing_weight"] for one in each])
+    whole["maps"] = np.concatenate([one["maps"] for one in each]) / many
+    whole["output_weight"] = np.concatenate([one["output_weight"] for one in each], axis=1) / many
+    gates = [name for name in each[0] if name.endswith(("input_weight", "input_bias",
+                                                        "hidden_weight", "hidden_bias"))]
+    for name in gates:
+        thirds = zip(*(np.split(one[name], 3) for one in each), strict=True)
+        join = beside if name.endswith("hidden_weight") else np.concatenate
+        whole[name] = np.concatenate([join(third) for third in thirds])
+    if networks[0].gru.bidirectional:
+        # the memory is that of all units forward, then that of all backward
+        order = np.arange(whole["output_weight"].shape[1]).reshape(many, 2, -1)
+        order = order.swapaxes(0, 1).ravel()
+        for name in ("output_weight", "mixing_weight"):
+            whole[name] = whole[name][:, order]
+    return {name: one.astype(np.float16) for name, one in whole.items()}
+
+
+def beside(blocks: Sequence[np.ndarray]) -> np.ndarray:
+    """Block-diagonal."""
+    return block_diag(*(block.astype(float) for block in blocks))
+
+
 WAYS = (("", ""), ("backward_", "_reverse"))
 """What names of weights begin with in a network's file, and end with in torch."""
 
@@ -324,7 +361,7 @@ def trained(lesson: Lesson, data: Tensors, dev: Tensors, judge: Judge,
 def main(
     lesson: Annotated[StrEnum("Name", {name: name for name in LESSONS}), typer.Argument()],
     jobs: Annotated[int, typer.Option(help="Processes that simulate and filter.")] = 2,
-    seeds: Annotated[int, typer.Option(help="Trainings of each; the first is kept.")] = 5,
+    seeds: Annotated[int, typer.Option(help="Trainings of each.")] = 5,
 ) -> None:
     torch.set_num_threads(jobs)
     what = LESSONS[lesson]
@@ -346,14 +383,15 @@ def main(
     scores = np.empty((len(what.episodes), seeds))
     for i, many in enumerate(what.episodes):
         first = {name: each[:many] for name, each in data.items()}
+        networks = []
         for seed in range(seeds):
             network, scores[i, seed] = trained(what, first, held, judge, seed)
-            if many == max(what.episodes) and seed == 0:
-                np.savez_compressed(ROOT / "baselines" / "networks" / what.network,
-                                    **network.arrays(), basis=told["basis"].astype(np.float16),
-                                    rest=told["rest"].astype(np.float32),
-                                    task=task_fingerprint(make_task(world)))
+            networks.append(network)
         print(f"{many:5} episodes {scores[i].mean():.5f}, each", np.round(scores[i], 6))
+    np.savez_compressed(ROOT / "baselines" / "networks" / what.network,
+                        **joined(networks[:what.joined]), basis=told["basis"].astype(np.float16),
+                        rest=told["rest"].astype(np.float32),
+                        task=task_fingerprint(make_task(world)))
     draw(lesson, what.episodes, scores, alone)
 
 

@@ -63,7 +63,7 @@ def remember(network: Network, inputs: np.ndarray, memory: np.ndarray,
              way: str = "") -> np.ndarray:
     """The new memory (h,) of a gated recurrent unit (Cho et al. 2014).
 
-    ``inputs`` (d,) are raw; ``way`` is ``"backward_"`` of the unit that reads a record from its end.
+    ``inputs`` (d,) are raw; ``way`` is ``"backward_"`` of the unit that reads from the end.
     """
     inputs = inputs / network["input_scale"]
     seen = network[f"{way}input_weight"] @ inputs + network[f"{way}input_bias"]
@@ -206,6 +206,7 @@ class CorrectedTracker:
         self.network = network
         self.first = FirstFrame(task)
         self._see = see
+        self.seen: FilterSeen | VoltagesSeen
         self._memory = blank(network)
         self._measured = 0
         self._asked_for = -task.lag
