@@ -1,8 +1,8 @@
-"""Recurrent network that corrects the log-inflow filter past an obstacle: learned from training
-episodes, where the flow is not the parabola of the model.
+"""Recurrent network that corrects the filter with the flow that training episodes have shown:
+learned past an obstacle, where the flow is not the parabola of the model.
 
-The network is as in `learned_correction`. `studies/learn.py` trains it; here it needs numpy alone,
-and the network, which is in a checkout only.
+The network is as in `learned_correction`, the filter that of `identified_flow`. `studies/learn.py`
+trains it; here it needs numpy alone, and the network, which is in a checkout only.
 """
 
 from pathlib import Path
@@ -15,6 +15,7 @@ from eitbench.estimation import (
     FilterSeen,
     load_network,
     network_suits,
+    suiting_models,
     suiting_priors,
 )
 
@@ -29,16 +30,18 @@ class Estimator:
     def __init__(self, task: Task) -> None:
         network = load_network(HERE / NETWORK)
         prior = suiting_priors(HERE / "priors", task, "logarithm")[0]
+        model = suiting_models(HERE / "models", task)[0]
         self.tracker = CorrectedTracker(
             task, network,
-            lambda level: FilterSeen(task, prior, level, network["basis"]))
+            lambda level: FilterSeen(task, prior, level, network["basis"], model=model))
 
     @staticmethod
     def suits(task: Task) -> bool:
         """Only the task that it was trained for: that vessel, those injections, that model of the
         flow."""
-        known_inlet = bool(suiting_priors(HERE / "priors", task, "logarithm"))
-        return known_inlet and network_suits(HERE / NETWORK, task)
+        known = (suiting_priors(HERE / "priors", task, "logarithm")
+                 and suiting_models(HERE / "models", task))
+        return bool(known) and network_suits(HERE / NETWORK, task)
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
         return self.tracker.update(voltages, currents)

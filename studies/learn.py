@@ -30,9 +30,10 @@ from eitbench.estimation import (
     FilterSeen,
     FirstFrame,
     VoltagesSeen,
+    suiting_models,
     suiting_priors,
-    task_fingerprint,
 )
+from eitbench.estimation.identified import told as told_of
 from eitbench.worlds.streams import randomness
 from eitbench.worlds.task import make_task
 
@@ -68,7 +69,8 @@ class Lesson:
     episodes: tuple[int, ...]
     """of training: the learning curve"""
     sees: str = "filter"
-    """"filter" or "voltages\""""
+    """What it corrects: the log-inflow "filter", the filter of the "identified" flow, or the
+    homogeneous estimate, from "voltages" alone."""
     lag: int = 0
     """The state that is corrected, in steps before the present one."""
     both_ways: bool = False
@@ -92,7 +94,8 @@ LESSONS = {
     "smoothing": Lesson("eitbench/Pipe2D-v0", "pipe2d-smoothing.npz", (64, 128, 266),
                         lag=20, both_ways=True, hidden=48),
     "lag": Lesson("eitbench/Pipe2D-v0", "pipe2d-lag.npz", (64, 128, 266), lag=4),
-    "obstacle": Lesson("eitbench/Pipe2DObstacle-v0", "pipe2d-obstacle.npz", (37, 75, 150)),
+    "obstacle": Lesson("eitbench/Pipe2DObstacle-v0", "pipe2d-obstacle.npz", (75, 150, 300),
+                       sees="identified"),
     "voltages": Lesson("eitbench/Pipe2D-v0", "pipe2d-voltages.npz", (64, 128, 266),
                        sees="voltages", noise=0.2),
 }
@@ -142,7 +145,9 @@ def features(examples: Dataset, example: Example, basis: np.ndarray,
         later = {}
     else:
         prior = suiting_priors(ROOT / "baselines" / "priors", task, "logarithm")[0]
-        see = FilterSeen(task, prior, first.c_bh, basis, max(LAGS))
+        model = (suiting_models(ROOT / "baselines" / "models", task)[0] if sees == "identified"
+                 else None)
+        see = FilterSeen(task, prior, first.c_bh, basis, max(LAGS), model)
         inputs, (reduced, *each) = see.record(record, 0, *LAGS)
         later = {f"reduced {lag}": modes for lag, modes in zip(LAGS, each, strict=True)}
     # in the order of `FEATURES`, in which `store` knows them again
@@ -161,7 +166,7 @@ def of_episode(lesson: Lesson, seed: int, basis: np.ndarray) -> Mapping[str, np.
         examples = eitbench.dataset(lesson.env, [seed])
         return features(examples, examples[0], basis, lesson.sees)
 
-    later = [f"reduced {lag}" for lag in LAGS] if lesson.sees == "filter" else []
+    later = [f"reduced {lag}" for lag in LAGS] if lesson.sees != "voltages" else []
     return store.kept(place(lesson) / lesson.sees / f"{seed}.npz", (*FEATURES, *later), make,
                       str(seed))
 
@@ -391,7 +396,7 @@ def main(
     np.savez_compressed(ROOT / "baselines" / "networks" / what.network,
                         **joined(networks[:what.joined]), basis=told["basis"].astype(np.float16),
                         rest=told["rest"].astype(np.float32),
-                        task=task_fingerprint(make_task(world)))
+                        task=told_of(make_task(world)))
     draw(lesson, what.episodes, scores, alone)
 
 

@@ -64,8 +64,8 @@ SHORT: tuple[tuple[str, dict[str, Any]], ...] = (
     ("eitbench/Pipe2DIntermittent-v0", {"world": _FAST}),
 )
 """Arguments with which an episode takes a moment, since a fast fluid flushes the pipe in a few
-steps; those of the real ones are for what was learned there. A method's card is of the first of these
-environments that it plays."""
+steps; those of the real ones are for what was learned there. A method's card is of the first of
+these environments that it plays."""
 
 
 def card_folder() -> Path:

@@ -10,7 +10,6 @@ from eitbench.estimation.correction import (
     network_suits,
     remember,
     said,
-    task_fingerprint,
 )
 from eitbench.estimation.covariance import FreeCovariance
 from eitbench.estimation.dense import DenseKalmanFilter, Filtered
@@ -67,5 +66,5 @@ __all__ = [
     "load_network", "most_probable_inflow", "network_suits", "remember", "said", "scaled_flow",
     "smoothed_inflow", "smoothed_means", "smoothed_state", "smoothness_covariance",
     "starting_filter", "steady_response", "suiting_models", "suiting_priors", "table_5_1",
-    "task_fingerprint", "white_inflow",
+    "white_inflow",
 ]

@@ -15,10 +15,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from eitbench.estimation.first_frame import FirstFrame
+from eitbench.estimation.identified import told
 from eitbench.estimation.inflow_history import InflowFilter
 from eitbench.worlds.task import Estimate
 
 if TYPE_CHECKING:
+    from eitbench.estimation.identified import IdentifiedModel
     from eitbench.estimation.inflow_prior import InflowPrior
     from eitbench.worlds.task import Task
 
@@ -40,20 +42,8 @@ def network_suits(path: Path, task: Task) -> bool:
     known = load_network(path)
     if task.velocity is not None or task.mesh.n_nodes != len(known["basis"]):
         return False
-    there = task_fingerprint(task)
+    there = told(task)
     return there.shape == known["task"].shape and np.allclose(there, known["task"], atol=1e-4)
-
-
-def task_fingerprint(task: Task) -> np.ndarray:
-    """Voltages of a homogeneous vessel, and where one time step carries a blob: what a task looks
-    like to a network."""
-    level = task.expected_concentration
-    x = task.mesh.points
-    blob = np.exp(-0.5 * ((x - x.mean(axis=0))**2).sum(axis=1) / 0.02**2)
-    still = np.zeros(len(task.transport.inlet))
-    moved = task.transport.step(blob, still, still)
-    voltages = task.observation.voltages(np.full(len(x), level), task.currents)
-    return np.concatenate([voltages.ravel() / np.abs(voltages).max(), moved @ x / moved.sum()])
 
 
 # -- the network -----------------------------------------------------------------------------------
@@ -124,13 +114,16 @@ class FilterSeen:
         Modes of c/ĉ_bh − 1.
     lag : int
         The oldest state that is asked for, in steps before the present one.
+    model : IdentifiedModel, optional
+        With it, the filter is that of `baselines/identified_flow.py`.
     """
 
     def __init__(self, task: Task, prior: InflowPrior, level: float, basis: np.ndarray,
-                 lag: int = 0) -> None:
+                 lag: int = 0, model: IdentifiedModel | None = None) -> None:
         self.task = task
         self.reduce = np.linalg.pinv(basis)
-        self.filter = InflowFilter(task, prior, level, lag)
+        self.filter = InflowFilter(task, prior, level, lag, model=model)
+        self._update = self.filter.update if model is None else self.filter.update_again
 
     def __call__(self, voltages: np.ndarray, currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Inputs (d,), and what the filter thinks after this measurement (q,): the innovation in
@@ -138,7 +131,7 @@ class FilterSeen:
         is."""
         self.filter.predict()
         before = self.modes()
-        innovation = self.filter.update(voltages, currents).value
+        innovation = self._update(voltages, currents).value
         after = self.modes()
         std = self.task.noise.std(voltages - innovation)
         return np.concatenate([np.arcsinh(innovation / std), after, after - before,
