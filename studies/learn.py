@@ -82,7 +82,7 @@ class Lesson:
     modes: int = 64
     """of c/ĉ_bh − 1"""
     hidden: int = 64
-    joined: int = 5
+    joined: int = 2
     """Trainings that are played together."""
     noise: float = 0.8
     """on the inputs, in their standard deviations, while it learns"""
@@ -91,12 +91,12 @@ class Lesson:
 LESSONS = {
     "biased": Lesson("eitbench/Pipe2DBiasedVelocity-v0", "pipe2d-biased.npz", (100, 300, 1000),
                      velocity=True, likelihood="modes", hidden=192, joined=1),
-    "smoothing": Lesson("eitbench/Pipe2D-v0", "pipe2d-smoothing.npz", (64, 128, 266),
-                        lag=20, both_ways=True, hidden=48),
-    "lag": Lesson("eitbench/Pipe2D-v0", "pipe2d-lag.npz", (64, 128, 266), lag=4),
+    "smoothing": Lesson("eitbench/Pipe2D-v0", "pipe2d-smoothing.npz", (100, 200, 400),
+                        lag=20, both_ways=True, hidden=48, joined=3),
+    "lag": Lesson("eitbench/Pipe2D-v0", "pipe2d-lag.npz", (100, 200, 400), lag=4),
     "obstacle": Lesson("eitbench/Pipe2DObstacle-v0", "pipe2d-obstacle.npz", (75, 150, 300),
                        sees="identified"),
-    "voltages": Lesson("eitbench/Pipe2D-v0", "pipe2d-voltages.npz", (64, 128, 266),
+    "voltages": Lesson("eitbench/Pipe2D-v0", "pipe2d-voltages.npz", (100, 200, 400),
                        sees="voltages", noise=0.2),
 }
 LAGS = (4, 20)
