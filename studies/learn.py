@@ -26,13 +26,7 @@ from eitbench.data.bank import fill
 from eitbench.data.learning.examples import Dataset, Example
 from eitbench.data.parallel import in_parallel
 from eitbench.data.seeds import parse_seeds
-from eitbench.estimation import (
-    FilterSeen,
-    FirstFrame,
-    VoltagesSeen,
-    suiting_models,
-    suiting_priors,
-)
+from eitbench.estimation import FilterSeen, FirstFrame, VoltagesSeen, suiting_models, suiting_priors
 from eitbench.estimation.identified import told as told_of
 from eitbench.worlds.streams import randomness
 from eitbench.worlds.task import make_task
@@ -94,7 +88,7 @@ LESSONS = {
     "smoothing": Lesson("eitbench/Pipe2D-v0", "pipe2d-smoothing.npz", (100, 200, 400),
                         lag=20, both_ways=True, hidden=48, joined=3),
     "lag": Lesson("eitbench/Pipe2D-v0", "pipe2d-lag.npz", (100, 200, 400), lag=4),
-    "obstacle": Lesson("eitbench/Pipe2DObstacle-v0", "pipe2d-obstacle.npz", (75, 150, 300),
+    "obstacle": Lesson("eitbench/Pipe2DObstacle-v0", "pipe2d-obstacle.npz", (24, 48, 96),
                        sees="identified"),
     "voltages": Lesson("eitbench/Pipe2D-v0", "pipe2d-voltages.npz", (100, 200, 400),
                        sees="voltages", noise=0.2),
@@ -102,9 +96,6 @@ LESSONS = {
 LAGS = (4, 20)
 """What the filter thinks so many steps later is kept too."""
 FEATURES = ("inputs", "reduced", "truth", "rest", "weight")
-
-
-# -- what the network sees -------------------------------------------------------------------------
 
 
 def modes(examples: Dataset, q: int) -> dict[str, np.ndarray]:
@@ -202,9 +193,6 @@ def of_episodes(lesson: Lesson, seeds: list[int]) -> Tensors:
     return data | {"velocity": (torch.tensor(drawn, dtype=torch.float32)[:, None] - mean) / std}
 
 
-# -- training --------------------------------------------------------------------------------------
-
-
 class Correction(torch.nn.Module):
     """As `eitbench.estimation.corrected` plays it, for batches of whole episodes."""
 
@@ -293,15 +281,8 @@ def filters_errors(data: Tensors) -> torch.Tensor:
 
 
 class Judge:
-    """The parts of the loss.
-
-    Parameters
-    ----------
-    warm_up : int
-        So many first states do not count.
-    basis, rest : (n, q) and (n,), optional
-        The modes and what they leave: then the likelihood is that of nodes.
-    """
+    """The parts of the loss. So many first states do not count; with the modes (n, q) and what they
+    leave (n,) the likelihood is that of nodes."""
 
     def __init__(self, warm_up: int, basis: np.ndarray | None = None,
                  rest: np.ndarray | None = None) -> None:
@@ -360,9 +341,6 @@ def trained(lesson: Lesson, data: Tensors, dev: Tensors, judge: Judge,
         return network, float(judge.losses(network, dev)[0])
 
 
-# -- all of it -------------------------------------------------------------------------------------
-
-
 def main(
     lesson: Annotated[StrEnum("Name", {name: name for name in LESSONS}), typer.Argument()],
     jobs: Annotated[int, typer.Option(help="Processes that simulate and filter.")] = 2,
@@ -403,17 +381,17 @@ def main(
 def draw(name: str, episodes: tuple[int, ...], scores: np.ndarray, alone: float) -> None:
     """The learning curve."""
     figure, axes = plt.subplots(figsize=(7, 3.4), layout="constrained")
-    axes.loglog(episodes, scores, "o", color="#7f8fa6", markersize=4)
-    axes.loglog(episodes, scores.mean(axis=1), color="#1a5fb4", linewidth=2,
-                label="the network, mean of the trainings")
-    axes.axhline(alone, color="#c01c28", linestyle=":", label="what it corrects")
-    axes.set_xticks(episodes, [str(many) for many in episodes])
-    axes.yaxis.set_major_formatter("{x:.5f}")
+    axes.semilogx(episodes, scores, "o", color="#7f8fa6", markersize=4)
+    axes.semilogx(episodes, scores.mean(axis=1), color="#1a5fb4", linewidth=2,
+                  label="the network, mean of the trainings")
+    axes.axhline(alone, color="#c01c28", linestyle=":",
+                 label=f"what it corrects: {alone:.5f}")
+    axes.set_xticks(episodes, [str(many) for many in episodes], minor=False)
     axes.minorticks_off()
     axes.set(xlabel="training episodes", ylabel="ẽ_c, dev:0-31")
     axes.legend(frameon=False, fontsize=9)
     axes.spines[["top", "right"]].set_visible(False)
-    figure.savefig(ROOT / "docs" / f"learned_{name}.png", dpi=150)
+    figure.savefig(ROOT / "docs" / f"learned_{name}.png", dpi=130)
 
 
 if __name__ == "__main__":
