@@ -1,5 +1,16 @@
 """Floor 4: estimators; matrices in, estimates out."""
 
+from eitbench.estimation.correction import (
+    CorrectedTracker,
+    FilterSeen,
+    VoltagesSeen,
+    blank,
+    corrected,
+    load_network,
+    network_suits,
+    remember,
+    said,
+)
 from eitbench.estimation.covariance import FreeCovariance
 from eitbench.estimation.dense import DenseKalmanFilter, Filtered
 from eitbench.estimation.ensemble import EnsembleFilter
@@ -44,14 +55,15 @@ from eitbench.estimation.switching_inflow import SwitchingInflowFilter
 from eitbench.estimation.unknown_flow import UnknownFlow, asked_flow, scaled_flow
 
 __all__ = [
-    "DenseKalmanFilter", "EnsembleFilter", "FilterStep", "Filtered", "FirstFrame",
-    "FreeCovariance", "GainSequence", "IdentifiedModel", "InflowFilter", "InflowPrior",
-    "InflowSmoother", "InflowTracker", "JointFilter", "JointInflowFilter", "JointStep",
-    "KalmanFilter", "LinearisedObservations", "Observation", "QuadraticVoltages", "Regimes",
-    "Response", "Smoothed", "SwitchingInflowFilter", "UnknownFlow", "asked_flow",
-    "best_homogeneous", "changing_responses", "fit_inflow_prior", "fixed_interval_smoother",
-    "gain_sequence", "gauss_newton", "identified_model", "initial_covariance", "kalman_filter",
-    "learned_inflow_prior", "linearised", "most_probable_inflow", "scaled_flow",
+    "CorrectedTracker", "DenseKalmanFilter", "EnsembleFilter", "FilterSeen", "FilterStep",
+    "Filtered", "FirstFrame", "FreeCovariance", "GainSequence", "IdentifiedModel", "InflowFilter",
+    "InflowPrior", "InflowSmoother", "InflowTracker", "JointFilter", "JointInflowFilter",
+    "JointStep", "KalmanFilter", "LinearisedObservations", "Observation", "QuadraticVoltages",
+    "Regimes", "Response", "Smoothed", "SwitchingInflowFilter", "UnknownFlow", "VoltagesSeen",
+    "asked_flow", "best_homogeneous", "blank", "changing_responses", "corrected",
+    "fit_inflow_prior", "fixed_interval_smoother", "gain_sequence", "gauss_newton",
+    "identified_model", "initial_covariance", "kalman_filter", "learned_inflow_prior", "linearised",
+    "load_network", "most_probable_inflow", "network_suits", "remember", "said", "scaled_flow",
     "smoothed_inflow", "smoothed_means", "smoothed_state", "smoothness_covariance",
     "starting_filter", "steady_response", "suiting_models", "suiting_priors", "table_5_1",
     "white_inflow",

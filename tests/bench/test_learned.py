@@ -1,5 +1,6 @@
 """What is learned is what is played: numpy's network is torch's, and it plays what it was trained for alone."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import eitbench
@@ -7,14 +8,16 @@ import numpy as np
 import pytest
 import torch
 from eitbench.bench.methods import load_method, load_module
-from eitbench.estimation import FirstFrame
+from eitbench.estimation import FirstFrame, InflowFilter, corrected, remember, suiting_priors
 from eitbench.worlds import entry
 from eitbench.worlds.task import make_task
 
 from tiny_worlds import CHANGES
 
-STUDY = Path(__file__).parents[2] / "studies" / "learn_correction.py"
+ROOT = Path(__file__).parents[2]
+STUDY = ROOT / "studies" / "learn.py"
 ID = "eitbench/Pipe2DBiasedVelocity-v0"
+LEARNED = ("learned_correction", "learned_smoother", "learned_fixed_lag", "learned_obstacle", "learned_voltages")
 
 
 @pytest.fixture(scope="module")
@@ -33,50 +36,102 @@ def data():
             "velocity": torch.zeros(3, 1)}
 
 
-def test_numpy_answers_as_torch(study):
-    """Of the same weights, which half precision holds, over an episode."""
+@pytest.mark.parametrize("both_ways, many", [(False, 1), (True, 1), (False, 4), (True, 4)])
+def test_numpy_answers_as_torch(study, both_ways, many):
+    """Of the same weights, which half precision holds, over an episode: corrections, and their variances at nodes.
+    Of several networks that are joined, it is the mean."""
     torch.manual_seed(1)
-    network = study.Correction(0.5 + torch.rand(7), 0.5 + torch.rand(3))
-    torch.nn.init.normal_(network.output.weight, std=0.1)
-    network = network.half().double().eval()
-    arrays = {name: each.astype(float) for name, each in network.arrays().items()}
+    scales = 0.5 + torch.rand(7), 0.5 + torch.rand(3)
+    networks = [study.Correction(*scales, 24, both_ways) for _ in range(many)]
+    for network in networks:
+        torch.nn.init.normal_(network.output.weight, std=0.1)
+        network.half().double().eval()
+    basis = np.random.default_rng(1).normal(size=(5, 3))
+    arrays = {name: each.astype(float) for name, each in study.joined(networks).items()} | {
+        "basis": basis, "rest": np.full(5, 0.1)}
     inputs = np.random.default_rng(0).normal(size=(20, 7))
     with torch.no_grad():
-        correction, log_variance, _ = network(torch.tensor(inputs)[None])
+        correction, log_variance, _ = (torch.stack(each).mean(dim=0) for each in zip(
+            *(network(torch.tensor(inputs)[None]) for network in networks), strict=True))
     scale = network.output_scale
-    memory = np.zeros(study.HIDDEN)
-    for t, seen in enumerate(inputs):
-        memory, said, variance = study.method.step(arrays, seen, memory)
-        np.testing.assert_allclose(said, (scale * correction)[0, t], rtol=1e-6, atol=1e-9)
-        np.testing.assert_allclose(variance, (scale**2 * log_variance.exp())[0, t], rtol=1e-6)
+
+    def memories(inputs, way=""):
+        memory = np.zeros(24 * many)
+        for seen in inputs:
+            memory = remember(arrays, seen, memory, way)
+            yield memory
+
+    ways = [list(memories(inputs))]
+    if both_ways:
+        ways.append(list(memories(inputs[::-1], "backward_"))[::-1])
+    tolerance = 1e-6 if many == 1 else 2e-3  # means of biases are rounded once more
+    for t, memory in enumerate(np.concatenate(ways, axis=1)):
+        mean, variance = corrected(arrays, 2.0, np.ones(3), inputs[t], memory)[:2]
+        expected = 2.0 * (1.0 + basis @ (1.0 + (scale * correction)[0, t].numpy()))
+        spread = 4.0 * (basis**2 @ (scale**2 * log_variance.exp())[0, t].numpy() + 0.1)
+        np.testing.assert_allclose(mean, expected, rtol=tolerance, atol=1e-3 * tolerance)
+        np.testing.assert_allclose(variance, spread, rtol=tolerance)
 
 
-def test_a_seed_repeats_and_something_is_learned(study, data, monkeypatch):
+@pytest.mark.parametrize("likelihood", ["modes", "nodes"])
+def test_a_seed_repeats_and_something_is_learned(study, data, monkeypatch, likelihood):
     monkeypatch.setattr(study, "EPOCHS", 60)
-    monkeypatch.setattr(study, "NOISE", 0.1)
-    first, error = study.trained(data, data, 2, seed=3)
-    again, same = study.trained(data, data, 2, seed=3)
-    _, other = study.trained(data, data, 2, seed=4)
+    lesson = replace(study.LESSONS["obstacle"], noise=0.1)
+    modes = () if likelihood == "modes" else (np.eye(2), np.full(2, 1e-6))
+    judge = study.Judge(2, *modes)
+    first, error = study.trained(lesson, data, data, judge, seed=3)
+    again, same = study.trained(lesson, data, data, judge, seed=3)
+    _, other = study.trained(lesson, data, data, judge, seed=4)
     assert error == same != other
     assert all(torch.equal(a, b) for a, b in zip(first.parameters(), again.parameters(), strict=True))
     assert error < 0.3 * study.filters_errors(data)[:, 2:].mean()
 
 
-def test_scores_in_modes_are_scores(study):
-    """An estimate in the span of the modes scores as the environment would score it."""
+@pytest.fixture(scope="module")
+def short(study):
+    """A short episode, three modes, and what is kept of it."""
     examples = eitbench.dataset("eitbench/Pipe2D-v0", "train:0", world=CHANGES)
     (example,) = examples
     random = np.random.default_rng(0)
     root = np.linalg.cholesky(examples.mass.toarray())
     basis = np.linalg.solve(root.T, np.linalg.qr(random.normal(size=(len(root), 3)))[0])
-    found = study.features(examples, example, basis)
     first = FirstFrame(make_task(examples.world))
     for measurement in zip(example.voltages[:first.length], example.currents, strict=False):
         first.add(*measurement)
-    said = found["truth"] + 1e-3 * random.normal(size=found["truth"].shape)
+    return examples, example, basis, first.c_bh
+
+
+def test_scores_in_modes_are_scores(study, short):
+    """An estimate in the span of the modes scores as the environment would score it."""
+    examples, example, basis, level = short
+    found = study.features(examples, example, basis)
+    said = found["truth"] + 1e-3 * np.random.default_rng(0).normal(size=found["truth"].shape)
     errors = found["weight"] * ((said - found["truth"])**2).sum(axis=1) + found["rest"]
-    expected = examples.errors(example, first.c_bh * (1.0 + said @ basis.T))
+    expected = examples.errors(example, level * (1.0 + said @ basis.T))
     np.testing.assert_allclose(errors, expected, rtol=1e-6)
+
+
+def test_what_is_thought_later_is_of_the_same_state(study, short, monkeypatch):
+    """At each step the modes are those of the filter's state so many steps before, at the record's end too."""
+    examples, example, basis, level = short
+    monkeypatch.setattr(study, "LAGS", (2,))
+    found = study.features(examples, example, basis)
+    task = make_task(examples.world)
+    prior = suiting_priors(ROOT / "baselines" / "priors", task, "logarithm")[0]
+    filter = InflowFilter(task, prior, level, lag=2)
+    modes = np.linalg.pinv(basis)
+    T = len(example.voltages)
+    for t, measurement in enumerate(zip(example.voltages, example.currents, strict=True)):
+        filter.predict()
+        filter.update(*measurement)
+        for state in [t - 2] if t < T - 1 else range(T - 3, T):
+            if state >= 0:
+                np.testing.assert_allclose(found["reduced 2"][state],
+                                           modes @ (filter.concentration(t - state) / level - 1.0), rtol=1e-10)
+    lesson = replace(study.LESSONS["lag"], lag=2)
+    seen = study.asked(lesson, found)
+    np.testing.assert_array_equal(seen["truth"], found["truth"][:-2])
+    np.testing.assert_array_equal(seen["inputs"], np.concatenate([found["inputs"][2:], seen["reduced"]], axis=1))
 
 
 @pytest.mark.parametrize("changes, assumed, plays", [
@@ -90,14 +145,24 @@ def test_it_plays_the_task_that_it_was_trained_for(changes, assumed, plays):
     assert load_method("learned_correction", "estimation").suits(task) == plays
 
 
-def test_it_does_not_play_tanks():
-    task = make_task(entry("eitbench/StationaryTank2D-v0").world)
-    assert not load_method("learned_correction", "estimation").suits(task)
+@pytest.mark.parametrize("id, method", [
+    ("eitbench/Pipe2DSmoothing-v0", "learned_smoother"), ("eitbench/Pipe2DFixedLag-v0", "learned_fixed_lag"),
+    ("eitbench/Pipe2DObstacle-v0", "learned_obstacle"), ("eitbench/Pipe2D-v0", "learned_voltages")])
+def test_each_is_for_its_own_question(id, method):
+    """Its lag and its vessel; the pipe without an obstacle asks for another network, tanks and known flows for none."""
+    task = make_task(entry(id).world, **entry(id).settings)
+    assert load_method(method, "estimation").suits(task)
+    assert not load_method(method, "estimation").suits(make_task(entry("eitbench/StationaryTank2D-v0").world))
+    assert load_method("learned_obstacle", "estimation").suits(task) == (method == "learned_obstacle")
+    other = make_task(entry(id).world, lag=3)
+    assert not load_method("learned_fixed_lag", "estimation").suits(other)
 
 
-def test_the_shipped_network_is_small():
+@pytest.mark.parametrize("name", LEARNED)
+def test_a_shipped_network_is_small(name):
     """Plain arrays, two megabytes at most."""
-    path = Path(load_method("learned_correction", "estimation").path).parent / "networks" / "pipe2d-biased.npz"
+    method = load_method(name, "estimation")
+    path = Path(method.path).parent / method.parameters["network"]
     assert path.stat().st_size < 2e6
     with np.load(path, allow_pickle=False) as file:
         assert all(file[name].dtype.kind == "f" for name in file.files)

@@ -1,0 +1,80 @@
+"""Recurrent network that reads the whole record from both ends, and corrects what the log-inflow
+filter thinks of each state 20 measurements later: learned from training episodes.
+
+A bidirectional GRU (Schuster & Paliwal 1997, Cho et al. 2014) sees how each measurement compares
+with the filter's prediction, what the filter thinks at that time, and what it thinks later, in the
+modes of training concentrations. `studies/learn.py` trains it; here it needs numpy alone, and the
+network, which is in a checkout only.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from eitbench import Estimate, Task
+from eitbench.estimation import (
+    FilterSeen,
+    FirstFrame,
+    blank,
+    corrected,
+    load_network,
+    network_suits,
+    remember,
+    suiting_priors,
+)
+
+HERE = Path(__file__).parent
+NETWORK = "networks/pipe2d-smoothing.npz"
+LAG = 20
+"""Measurements after which the filter learns next to nothing of a state."""
+
+
+class Estimator:
+    boards = ("smoothing",)
+    parameters = {"network": NETWORK, "lag": LAG}  # noqa: RUF012 (as a record has it)
+
+    def __init__(self, task: Task) -> None:
+        self.task = task
+        self.network = load_network(HERE / NETWORK)
+        self.record: list[tuple[np.ndarray, np.ndarray]] = []
+        self.asked_for = 0
+
+    @staticmethod
+    def suits(task: Task) -> bool:
+        """Only the task that it was trained for: that vessel, those injections, that model of the
+        flow."""
+        known_inlet = bool(suiting_priors(HERE / "priors", task, "logarithm"))
+        long_enough = task.n_steps > LAG
+        return long_enough and known_inlet and network_suits(HERE / NETWORK, task)
+
+    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
+        if len(self.record) < self.task.n_steps:
+            self.record.append((voltages, currents))
+            if len(self.record) < self.task.n_steps:
+                return None
+            self.read()
+        self.asked_for += 1
+        t = self.asked_for - 1
+        return corrected(self.network, self.level, self.reduced[t], self.inputs[t], self.memory[t])
+
+    def read(self) -> None:
+        """The record: what is seen of each state, and what the network remembers at each."""
+        first = FirstFrame(self.task)
+        for measurement in self.record[:first.length]:
+            first.add(*measurement)
+        self.level = first.c_bh
+        prior = suiting_priors(HERE / "priors", self.task, "logarithm")[0]
+        see = FilterSeen(self.task, prior, self.level, self.network["basis"], LAG)
+        seen, (self.reduced,) = see.record(self.record, LAG)
+        self.inputs = np.concatenate([seen, self.reduced], axis=1)
+        forward = list(self.memories(self.inputs, ""))
+        backward = list(self.memories(self.inputs[::-1], "backward_"))
+        self.memory = np.concatenate([forward, backward[::-1]], axis=1)
+
+    def memories(self, inputs: np.ndarray, way: str) -> Iterator[np.ndarray]:
+        """(h,) of each step."""
+        memory = blank(self.network)
+        for seen in inputs:
+            memory = remember(self.network, seen, memory, way)
+            yield memory

@@ -1,0 +1,236 @@
+"""Recurrent networks that say by how much an estimate is off (``docs/learn.md``): what plays them,
+in numpy alone.
+
+A network is a file of plain arrays. It works in modes B of c/ĉ_bh − 1: from what is seen of a step
+it says a correction of the modes, and the variance of each.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from eitbench.estimation.first_frame import FirstFrame
+from eitbench.estimation.identified import told
+from eitbench.estimation.inflow_history import InflowFilter
+from eitbench.worlds.task import Estimate
+
+if TYPE_CHECKING:
+    from eitbench.estimation.identified import IdentifiedModel
+    from eitbench.estimation.inflow_prior import InflowPrior
+    from eitbench.worlds.task import Task
+
+Network = Mapping[str, np.ndarray]
+
+
+@lru_cache(maxsize=4)
+def load_network(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of a network, in double precision."""
+    with np.load(path) as file:
+        return {name: file[name].astype(float) for name in file.files}
+
+
+def network_suits(path: Path, task: Task) -> bool:
+    """Whether the network at ``path`` is there and was trained for this vessel, these injections
+    and this model of the flow."""
+    if not path.is_file():
+        return False
+    known = load_network(path)
+    if task.velocity is not None or task.mesh.n_nodes != len(known["basis"]):
+        return False
+    there = told(task)
+    return there.shape == known["task"].shape and np.allclose(there, known["task"], atol=1e-4)
+
+
+# -- the network -----------------------------------------------------------------------------------
+
+
+def remember(network: Network, inputs: np.ndarray, memory: np.ndarray,
+             way: str = "") -> np.ndarray:
+    """The new memory (h,) of a gated recurrent unit (Cho et al. 2014).
+
+    ``inputs`` (d,) are raw; ``way`` is ``"backward_"`` of the unit that reads from the end.
+    """
+    inputs = inputs / network["input_scale"]
+    seen = network[f"{way}input_weight"] @ inputs + network[f"{way}input_bias"]
+    kept = network[f"{way}hidden_weight"] @ memory + network[f"{way}hidden_bias"]
+    seen_reset, seen_keep, seen_new = np.split(seen, 3)
+    kept_reset, kept_keep, kept_new = np.split(kept, 3)
+    reset = _sigmoid(seen_reset + kept_reset)
+    keep = _sigmoid(seen_keep + kept_keep)
+    return (1.0 - keep) * np.tanh(seen_new + reset * kept_new) + keep * memory
+
+
+def said(network: Network, inputs: np.ndarray,
+         memory: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The correction (q,) and its variance (q,): linear in the memory, or in those of both ways one
+    after the other, and linear maps of the inputs (d,) that the memory mixes."""
+    inputs = inputs / network["input_scale"]
+    told = network["output_weight"] @ memory + network["output_bias"]
+    correction, log_variance = np.split(told, 2)
+    mixed = network["mixing_weight"] @ memory + network["mixing_bias"]
+    correction = correction + mixed @ (network["maps"] @ inputs)
+    scale = network["output_scale"]
+    return scale * correction, scale**2 * np.exp(log_variance)
+
+
+def blank(network: Network) -> np.ndarray:
+    """(h,) the memory before anything is seen."""
+    return np.zeros(network["hidden_weight"].shape[1])
+
+
+def corrected(network: Network, level: float, reduced: np.ndarray, inputs: np.ndarray,
+              memory: np.ndarray) -> Estimate:
+    """ĉ_bh (1 + B (a + Δ)) of the modes a = ``reduced`` (q,), and its variance."""
+    basis = network["basis"]
+    correction, variance = said(network, inputs, memory)
+    mean = 1.0 + basis @ (reduced + correction)
+    spread = basis**2 @ variance + network["rest"]
+    return Estimate(level * mean, level**2 * spread)
+
+
+def _sigmoid(x: np.ndarray) -> np.ndarray:
+    return 1.0 / (1.0 + np.exp(-x))
+
+
+# -- what it sees ----------------------------------------------------------------------------------
+
+
+class FilterSeen:
+    """What a network sees of an episode from the `InflowFilter`.
+
+    Parameters
+    ----------
+    task : Task
+    prior : InflowPrior
+        Of the task's inlet.
+    level : float
+        ĉ_bh in mol/m³.
+    basis : (n, q)
+        Modes of c/ĉ_bh − 1.
+    lag : int
+        The oldest state that is asked for, in steps before the present one.
+    model : IdentifiedModel, optional
+        With it, the filter is that of `baselines/identified_flow.py`.
+    """
+
+    def __init__(self, task: Task, prior: InflowPrior, level: float, basis: np.ndarray,
+                 lag: int = 0, model: IdentifiedModel | None = None) -> None:
+        self.task = task
+        self.reduce = np.linalg.pinv(basis)
+        self.filter = InflowFilter(task, prior, level, lag, model=model)
+        self._update = self.filter.update if model is None else self.filter.update_again
+
+    def __call__(self, voltages: np.ndarray, currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Inputs (d,), and what the filter thinks after this measurement (q,): the innovation in
+        parts of the noise, the filter's modes, what has changed in them, and which injection it
+        is."""
+        self.filter.predict()
+        before = self.modes()
+        innovation = self._update(voltages, currents).value
+        after = self.modes()
+        std = self.task.noise.std(voltages - innovation)
+        return np.concatenate([np.arcsinh(innovation / std), after, after - before,
+                               pattern(self.task, currents)]), after
+
+    def modes(self, lag: int = 0) -> np.ndarray:
+        """(q,) of the filter's mean, ``lag`` steps ago."""
+        return self.reduce @ (self.filter.concentration(lag) / self.filter.level - 1.0)
+
+    def record(self, record: Sequence[tuple[np.ndarray, np.ndarray]],
+               *lags: int) -> tuple[np.ndarray, list[np.ndarray]]:
+        """Of T measurements, (L,) in V and in A each: the inputs (T, d), and for each of ``lags``
+        what the filter thinks of each state so many measurements later, or at the end (T, q)."""
+        inputs = []
+        modes: list[list[np.ndarray]] = [[] for _ in lags]
+        for t, (voltages, currents) in enumerate(record):
+            inputs.append(self(voltages, currents)[0])
+            for lag, known in zip(lags, modes, strict=True):
+                if t >= lag:
+                    known.append(self.modes(lag))
+        for known in modes:
+            known += [self.modes(ago) for ago in reversed(range(len(record) - len(known)))]
+        return np.array(inputs), [np.array(known) for known in modes]
+
+
+class VoltagesSeen:
+    """What a network sees of an episode from voltages alone; parameters as of `FilterSeen`."""
+
+    def __init__(self, task: Task, level: float, basis: np.ndarray) -> None:
+        self.task = task
+        homogeneous = np.full(task.mesh.n_nodes, level)
+        self.expected = task.observation.voltages(homogeneous, task.currents)
+        self.none = np.zeros(basis.shape[1])
+
+    def __call__(self, voltages: np.ndarray, currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Inputs (frame·L,), zero but for this injection's: where the voltages lie beside those of
+        homogeneous fluid, in parts of the noise; and modes (q,) of homogeneous fluid, zero."""
+        here = pattern(self.task, currents)
+        expected = here @ self.expected
+        off = (voltages - expected) / self.task.noise.std(expected)
+        return np.outer(here, off).ravel(), self.none
+
+
+# -- from the first measurement to the last --------------------------------------------------------
+
+
+class CorrectedTracker:
+    """Estimates each state ``task.lag`` measurements later, as a network corrects it.
+
+    While the first frame lasts it says what is homogeneous. When the record has ended, and the lag
+    shrinks, the filter stands alone.
+
+    Parameters
+    ----------
+    task : Task
+    network : mapping
+        As `load_network` gives it.
+    see : callable
+        ĉ_bh in mol/m³ -> what is seen, `FilterSeen` or, without a lag, `VoltagesSeen`.
+    """
+
+    def __init__(self, task: Task, network: Network,
+                 see: Callable[[float], FilterSeen | VoltagesSeen]) -> None:
+        self.task = task
+        self.network = network
+        self.first = FirstFrame(task)
+        self._see = see
+        self.seen: FilterSeen | VoltagesSeen
+        self._memory = blank(network)
+        self._measured = 0
+        self._asked_for = -task.lag
+
+    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
+        """The state t − lag after measurement t, (L,) V and A each; None while there is none."""
+        self._asked_for += 1
+        if self._measured == self.task.n_steps:
+            assert isinstance(self.seen, FilterSeen)
+            return Estimate(*self.seen.filter.state(self._measured - self._asked_for))
+        if not self.first.complete:
+            if not self.first.add(voltages, currents):
+                return Estimate(self.first.mean) if self._asked_for > 0 else None
+            self.seen = self._see(self.first.c_bh)
+            for earlier in self.first.measurements[:-1]:
+                self._think(*earlier)
+        return self._think(voltages, currents)
+
+    def _think(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
+        inputs, reduced = self.seen(voltages, currents)
+        self._measured += 1
+        lag = self.task.lag
+        if lag and isinstance(self.seen, FilterSeen):
+            if self._measured <= lag:
+                return None
+            reduced = self.seen.modes(lag)
+            inputs = np.concatenate([inputs, reduced])
+        self._memory = remember(self.network, inputs, self._memory)
+        return corrected(self.network, self.first.c_bh, reduced, inputs, self._memory)
+
+
+def pattern(task: Task, currents: np.ndarray) -> np.ndarray:
+    """(frame,) one for this injection of the task's cycle, zero for the others."""
+    return (task.currents == currents).all(axis=1).astype(float)
