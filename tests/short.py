@@ -28,7 +28,7 @@ TANK = {"vessel": {"n_electrodes": 8}, "schedule": {"warm_up": 1, "scored_steps"
 SHORT = {
     "Pipe2D": PIPE,
     "Pipe2DInjectionFaults": merged(PIPE, {"instrument": {"dead": [0, 1], "failing": [0, 1], "loose": [0, 0]}}),
-    "Pipe2DIntermittent": PIPE,
+    "Pipe2DIntermittent": merged(PIPE, {"target": {"arrivals": {"interval": 0.01, "wait": 0.001}}}),
     "Pipe2DDriftingVelocity": WANDERING,
     "Pipe2DBiasedVelocity": FLOW,
     "Pipe2DUnknownVelocity": FLOW,
