@@ -11,6 +11,7 @@ from eitbench.estimation.covariance import FreeCovariance
 from eitbench.estimation.dense import DenseKalmanFilter
 from eitbench.estimation.kalman import KalmanFilter
 from eitbench.estimation.smoothness import smoothness_covariance
+from eitbench.estimation.walk import RandomWalk
 from eitbench.physics.rest import AtRest
 
 if TYPE_CHECKING:
@@ -40,6 +41,9 @@ def starting_filter(transport: Transport, prior: Prior,
     mean = np.full(transport.mesh.n_nodes, c_bh)
     initial = initial_covariance(transport.mesh, prior)
     noise: np.ndarray | None
+    if isinstance(transport, RandomWalk):
+        noise = (c_bh * prior.nodal_std)**2 * transport.covariance
+        return ClosedVesselFilter(mean, c_bh**2 * initial, None, noise)
     if isinstance(transport, AtRest):
         walk = (c_bh * prior.nodal_std)**2
         noise = walk * np.eye(len(mean)) if walk else None

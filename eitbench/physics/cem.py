@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
+from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -52,8 +53,9 @@ class CompleteElectrodeModel:
         self.n_electrodes = n_electrodes = len(self.electrodes)
         self.contact_impedance = self._checked_contacts(contact_impedance)
 
-        basis = self._basis()
-        contact = self._contact_terms(basis)
+        basis = basis_on(mesh, order, intorder=2 * order - 1)
+        self._walls = _walls(basis, self.electrodes, order)
+        contact = self._contact_terms()
         rows, columns, derivatives = _conduction(basis)
         pattern = sp.coo_array((np.ones(len(rows)), (rows, columns)), shape=contact.shape).tocsc()
         # The last electrode is grounded: without its row and column K is positive definite.
@@ -78,7 +80,7 @@ class CompleteElectrodeModel:
         that a new model takes."""
         made = copy(self)
         made.contact_impedance = self._checked_contacts(contact_impedance)
-        contact = made._contact_terms(self._basis())
+        contact = made._contact_terms()
         made._constant = contact[self._system.rows, self._system.columns]
         return made
 
@@ -133,24 +135,37 @@ class CompleteElectrodeModel:
         fields, grounded = np.split(columns, [-self._system.n_ports])
         return self._centred(grounded), self._sensitivity(fields @ self._centre.T)
 
+    def contact_derivatives(self, conductivity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """𝓡 (L, L) and its derivatives by each electrode's contact impedance, (L, L, L).
+
+        They are in Ω and Ω/(Ω·m²) (2D: Ω·m, and per Ω·m²); the first index of the second is that of
+        z_l. With w_m the field and W_m the electrode potentials of a unit current at m, taken out
+        evenly at all electrodes, ∂𝓡_mk/∂z_l = (1/z_l²) ∫_{e_l} (w_m − W_m)(w_k − W_k).
+        """
+        values = self._assemble(self._checked_conductivity(conductivity))
+        columns = self._system.port_columns(values)
+        fields, grounded = np.split(columns, [-self._system.n_ports])
+        L = self.n_electrodes
+        potentials = np.vstack([grounded, np.zeros((1, L - 1))])     # the last one is grounded
+        derivatives = np.empty((L, L, L))
+        for l, (wall, z) in enumerate(zip(self._walls, self.contact_impedance, strict=True)):
+            U = potentials[l]
+            mixed = np.outer(fields.T @ wall.load, U)
+            inner = fields.T @ (wall.mass @ fields) - mixed - mixed.T
+            inner += wall.load.sum() * np.outer(U, U)
+            derivatives[l] = self._centre @ inner @ self._centre.T / z**2
+        return self._centred(grounded), derivatives
+
     # -- the linear system -------------------------------------------------------------------------
 
-    def _basis(self) -> skfem.CellBasis:
-        return basis_on(self.mesh, self.order, intorder=2 * self.order - 1)
-
-    def _contact_terms(self, basis: skfem.CellBasis) -> sp.csr_array:
+    def _contact_terms(self) -> sp.csr_array:
         """Σ_l (1/z_l)∫_{e_l}(u − U_l)(φ − Φ_l) on all N + L unknowns."""
-        mesh = basis.mesh
-        sides = np.sort(mesh.facets, axis=0).T.tolist()
-        number = {tuple(side): i for i, side in enumerate(sides)}
-        mass = sp.csr_array((basis.N, basis.N))
+        size = self._walls[0].mass.shape
+        mass = sp.csr_array(size)
         loads = []
-        for facets, z in zip(self.electrodes, self.contact_impedance, strict=True):
-            numbers = np.array([number[tuple(facet)] for facet in facets.tolist()])
-            wall = skfem.FacetBasis(mesh, element(self.mesh.dim, self.order),
-                                    intorder=2 * self.order, facets=numbers)
-            mass = mass + sp.csr_array(product.assemble(wall)) / z
-            loads.append(integral.assemble(wall) / z)
+        for wall, z in zip(self._walls, self.contact_impedance, strict=True):
+            mass = mass + wall.mass / z
+            loads.append(wall.load / z)
         load = sp.csr_array(np.stack(loads, axis=1))
         total = sp.diags_array(load.sum(axis=0))
         return sp.block_array([[mass, -load], [-load.T, total]], format="csr")
@@ -188,6 +203,28 @@ class CompleteElectrodeModel:
             raise ValueError(f"currents must sum to zero over the electrodes; pattern {k} sums to "
                              f"{currents[k].sum():g} A")
         return currents
+
+
+class _Wall(NamedTuple):
+    """Integrals over one electrode."""
+
+    mass: sp.csr_array
+    """(N, N) ∫ u φ"""
+    load: np.ndarray
+    """(N,) ∫ φ"""
+
+
+def _walls(basis: skfem.CellBasis, electrodes: Sequence[np.ndarray], order: int) -> list[_Wall]:
+    mesh = basis.mesh
+    sides = np.sort(mesh.facets, axis=0).T.tolist()
+    number = {tuple(side): i for i, side in enumerate(sides)}
+    walls = []
+    for facets in electrodes:
+        numbers = np.array([number[tuple(facet)] for facet in facets.tolist()])
+        wall = skfem.FacetBasis(mesh, element(mesh.dim(), order), intorder=2 * order,
+                                facets=numbers)
+        walls.append(_Wall(sp.csr_array(product.assemble(wall)), integral.assemble(wall)))
+    return walls
 
 
 @skfem.TrilinearForm

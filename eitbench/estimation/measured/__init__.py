@@ -1,0 +1,1 @@
+"""Readings of a real instrument: how they are computed, calibrated, and made into a `Task`."""
