@@ -145,7 +145,7 @@ def _estimates(env: EstimationEnv, estimator: Method, seed: int,
             raise ValueError("Estimator.update must return an Estimate once a state is asked for; "
                              f"at t = {t} it returned None")
         if estimate is not None:
-            _check_estimate(estimate, env.task)
+            _check_estimate(estimate, env.task, len(seen["voltages"]))
             if estimate.variance is not None:
                 env.spread = np.sqrt(estimate.variance)
         observation, _, done, _, _ = env.step(_action(env.task, estimate, silence))
@@ -162,9 +162,8 @@ def _action(task: Task, estimate: Estimate | None, silence: np.ndarray) -> np.nd
     return np.concatenate([mean, task.velocity.nominal if said is None else said])
 
 
-def _check_estimate(estimate: Any, task: Task) -> None:
+def _check_estimate(estimate: Any, task: Task, readings: int) -> None:
     n = task.mesh.n_nodes
-    n_electrodes = task.currents.shape[1]
     if not isinstance(estimate, Estimate):
         raise ValueError("Estimator.update must return an Estimate or None, got "
                          f"{type(estimate).__name__}")
@@ -177,9 +176,9 @@ def _check_estimate(estimate: Any, task: Task) -> None:
                                  f"got {value!r}")
             _check.array(f"Estimate.{name}", value, (task.velocity.size,))
     if innovation is not None:
-        _check.array("Estimate.innovation", innovation, (n_electrodes,), units="V")
+        _check.array("Estimate.innovation", innovation, (readings,), units="V")
     if covariance is not None:
-        _check_covariance(covariance, n_electrodes)
+        _check_covariance(covariance, readings)
     if variance is not None and not (np.shape(variance) == (n,) and np.isfinite(variance).all()
                                      and (np.asarray(variance) >= 0).all()):
         raise ValueError(f"Estimate.variance must be finite, ≥ 0 and of shape ({n},), got shape "

@@ -16,6 +16,10 @@ from eitbench.physics.observation import VoltageNoise
 if TYPE_CHECKING:
     from eitbench.physics.cem import CompleteElectrodeModel
 
+CONTACT_LEVEL = 0.1
+"""z σ before anything is read, in parts of an electrode's length, …"""
+CONTACT_LEVEL_STD = 2.0
+"""… and the standard deviation of its logarithm."""
 CONTACT_SPREAD = 0.5
 """Standard deviation of ln z_l about the mean of all electrodes, before anything is read."""
 ASSUMED_NOISE = VoltageNoise(relative=0.01, of_largest=0.001)
@@ -99,16 +103,18 @@ def calibrate(electrodes: CompleteElectrodeModel, currents: np.ndarray, matrix: 
     mean = np.where(there, readings, 0.0).sum(axis=0) / count
     model = _Homogeneous(electrodes, currents / depth, matrix, tick)
 
-    sizes = 0.1 * lengths(electrodes)
-    start, _ = model(np.concatenate([[0.0, np.log(sizes.mean())], np.zeros(L)]))
+    level = float(np.log(CONTACT_LEVEL * lengths(electrodes).mean()))
+    expected = np.array([0.0, level, *[0.0] * L])
+    start, _ = model(expected)
     weight = seen / ASSUMED_NOISE.std(np.where(seen, mean, 1.0))
     relative = float((weight**2 * start * mean).sum() / (weight**2 * start**2).sum())
     if relative <= 0:
         raise ValueError("readings must have the sign of the model's, got the opposite: turn the "
                          "sign of the currents or of the measurement matrix")
-    x = np.concatenate([[np.log(relative), np.log(sizes.mean())], np.zeros(L)])
+    expected[0] = np.log(relative)
+    x = expected
     for _ in range(2):                                  # the second time weighed by what was left
-        x, jacobian = _fitted(model, x, mean, weight, seen)
+        x, jacobian = _fitted(model, x, expected, mean, weight, seen)
         explained, _ = model(x)
         left = _noise(mean[None], mean, explained, seen, np.ones_like(count))
         weight = seen / left.std(mean)
@@ -147,13 +153,13 @@ class _Homogeneous:
         return slopes[0], slopes
 
 
-def _fitted(model: _Homogeneous, start: np.ndarray, mean: np.ndarray, weight: np.ndarray,
-            seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _fitted(model: _Homogeneous, start: np.ndarray, expected: np.ndarray, mean: np.ndarray,
+            weight: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """x that fits best, and the slopes (·, 2 + L) of what is in standard deviations there."""
-    prior = np.hstack([np.zeros((len(start) - 2, 2)), np.eye(len(start) - 2) / CONTACT_SPREAD])
+    prior = np.diag([0.0, 1.0 / CONTACT_LEVEL_STD, *[1.0 / CONTACT_SPREAD] * (len(start) - 2)])
 
     def residuals(x: np.ndarray) -> np.ndarray:
-        return np.concatenate([(weight * (model(x)[0] - mean))[seen], prior @ x])
+        return np.concatenate([(weight * (model(x)[0] - mean))[seen], prior @ (x - expected)])
 
     def slopes(x: np.ndarray) -> np.ndarray:
         return np.vstack([(weight * model(x)[1])[:, seen].T, prior])

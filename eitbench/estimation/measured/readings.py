@@ -50,6 +50,9 @@ class ReadingModel:
         if self.seen.shape != shape:
             raise ValueError(f"seen must have shape {shape}, got {self.seen.shape}")
         self._number = {row.tobytes(): k for k, row in enumerate(self.currents)}
+        if len(self._number) < len(self.currents):
+            raise ValueError(f"currents must be {len(self.currents)} different injections, got "
+                             f"{len(self._number)}")
 
     @property
     def cem(self) -> CompleteElectrodeModel:

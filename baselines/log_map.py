@@ -1,0 +1,55 @@
+"""Maximum a posteriori for the logarithm of the concentration: nonlinear Gauss–Newton over all
+injections so far.
+
+For targets that stand still and conduct many times better or worse than what is around them, as
+metal and plastic do: nothing falls below zero. The logarithm has the prior that `map_estimate`
+gives the concentration in parts of the best homogeneous estimate.
+"""
+
+import numpy as np
+
+from eitbench import Estimate, Task
+from eitbench.estimation import FirstFrame, gauss_newton, initial_covariance
+from eitbench.physics.rest import AtRest
+
+
+class Estimator:
+    boards = ("filter",)
+
+    def __init__(self, task: Task) -> None:
+        self.task = task
+        self.first = FirstFrame(task)
+        self.measurements: list[tuple[np.ndarray, np.ndarray]] = []
+
+    @staticmethod
+    def suits(task: Task) -> bool:
+        return isinstance(task.transport, AtRest)
+
+    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate:
+        task = self.task
+        self.measurements.append((voltages, currents))
+        if not self.first.complete:
+            if not self.first.add(voltages, currents):
+                return Estimate(self.first.mean)
+            self.penalty = np.linalg.inv(initial_covariance(task.mesh, task.prior))
+            self.logarithm = np.zeros(task.mesh.n_nodes)
+        V, I = (np.array(part) for part in zip(*self.measurements, strict=True))
+        model = OfLogarithm(task.observation, self.first.c_bh)
+        self.logarithm = gauss_newton(model, V, I, task.noise.std(V), self.penalty, self.logarithm)
+        return Estimate(self.first.c_bh * np.exp(self.logarithm))
+
+
+class OfLogarithm:
+    """Voltages by u = ln(c/ĉ_bh)."""
+
+    def __init__(self, observation, level: float) -> None:
+        self.observation = observation
+        self.level = level
+
+    def voltages(self, logarithm: np.ndarray, currents: np.ndarray) -> np.ndarray:
+        return self.observation.voltages(self.level * np.exp(logarithm), currents)
+
+    def linearise(self, logarithm: np.ndarray, currents: np.ndarray):
+        c = self.level * np.exp(logarithm)
+        voltages, slopes = self.observation.linearise(c, currents)
+        return voltages, slopes * c

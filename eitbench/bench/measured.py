@@ -1,0 +1,83 @@
+"""Estimate what a record of a real instrument saw, and judge it without a truth."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+from tqdm import tqdm
+
+from eitbench.bench.methods import load_method
+from eitbench.bench.playing import estimates
+from eitbench.estimation.measured.readings import ReadingModel
+
+if TYPE_CHECKING:
+    from eitbench.envs.measured import MeasuredEnv
+    from eitbench.worlds.task import Estimate
+
+
+@dataclass(frozen=True, eq=False)
+class Played:
+    """What a method says of a record, t = 1 … T."""
+
+    method: str
+    mean: np.ndarray
+    """(T, n) mol/m³ at the nodes of the task's mesh"""
+    variance: np.ndarray | None
+    """(T, n) (mol/m³)², if the method says it of each state after the first frame; NaN within"""
+    nis: np.ndarray
+    """(T,) νᵀS⁻¹ν in parts of the readings shown; NaN where a method says none"""
+    missed: np.ndarray
+    """(T,) root mean square of the withheld readings' distance from what the estimate that they
+    judge predicts, in standard deviations of the noise; NaN where nothing is judged"""
+
+    @property
+    def withheld(self) -> float:
+        """Root mean square of `missed`: 1 is as good as the noise lets one be."""
+        return float(np.sqrt(np.nanmean(self.missed**2)))
+
+
+def play_record(env: MeasuredEnv, method: str, seed: int = 0) -> Played:
+    """Play one of our methods, or the one of a path, on a record; errors as of `estimates`.
+
+    ``seed`` draws the readings that are withheld.
+    """
+    loaded = load_method(method, "estimation")
+    with threadpool_limits(1):
+        said = [estimate for _, estimate in _shown(env, estimates(env, loaded, seed), loaded.name)]
+    T = len(said)
+    missed = np.full(T, np.nan)
+    for last, judged in env.judged.items():
+        for t in judged:
+            off = env.missed(t, np.asarray(said[last - 1].mean))
+            if len(off):
+                missed[t - 1] = np.sqrt(np.mean(off**2))
+    return Played(loaded.name, np.array([each.mean for each in said]), _variance(said),
+                  np.array([_nis(env, t, each) for t, each in enumerate(said, 1)]), missed)
+
+
+def _shown(env: MeasuredEnv, steps: Iterator[tuple[int, Estimate]],
+           name: str) -> Iterator[tuple[int, Estimate]]:
+    return iter(tqdm(steps, total=env.episode_steps, desc=name, unit="reading", disable=None,
+                     leave=False))
+
+
+def _variance(said: list[Estimate]) -> np.ndarray | None:
+    if said[-1].variance is None:
+        return None
+    none = np.full(len(said[-1].mean), np.nan)
+    return np.array([none if each.variance is None else each.variance for each in said])
+
+
+def _nis(env: MeasuredEnv, t: int, estimate: Estimate) -> float:
+    """What is not shown has an innovation of 0 and leaves the sum as it is."""
+    if estimate.innovation is None or estimate.innovation_covariance is None:
+        return float("nan")
+    model = env.task.observation
+    assert isinstance(model, ReadingModel)
+    whitened = np.linalg.solve(estimate.innovation_covariance, estimate.innovation)
+    many = int(model.seen[env.record.injections[t - 1]].sum())
+    return float(estimate.innovation @ whitened) / many if many else float("nan")

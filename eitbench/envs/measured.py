@@ -1,0 +1,130 @@
+"""A record of a real instrument as an environment: ``eitbench/Measured-v0``."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from eitbench import _check
+from eitbench.envs.estimation import RESET_NEEDED, Observation, checked_actions
+from eitbench.envs.spec import KnowsItsLength
+from eitbench.estimation.measured.readings import ReadingModel
+from eitbench.estimation.measured.record import Record, shown_record
+from eitbench.estimation.measured.task import measured_task, readings_there, withheld_readings
+from eitbench.physics.rest import AtRest
+
+if TYPE_CHECKING:
+    from eitbench.estimation.measured.calibration import Calibration
+    from eitbench.estimation.measured.task import MeasuredVessel
+    from eitbench.worlds.task import Task
+
+
+class MeasuredEnv(KnowsItsLength, gym.Env[Observation, np.ndarray]):  # type: ignore[misc]
+    """Estimate what a record of a real instrument saw; the action is the estimate.
+
+    Nobody knows the truth, so an estimate is judged by readings that its maker was not shown: the
+    reward is −mean ((reading − predicted)/std)² over the readings withheld of the injection that
+    was on, zero in the first frame; of a target at rest the last estimate is judged, by all that
+    was withheld. Which they are is drawn by the seed: of each injection a part,
+    the same whenever it comes again. Observations are as in `EstimationEnv`, except that voltages
+    are what the instrument read, (M,), and 0 where it read nothing or nothing is shown; `task` knows
+    which (`ReadingModel`).
+
+    Parameters
+    ----------
+    record : Record
+    vessel : MeasuredVessel
+    calibration : Calibration
+    withheld : float
+        Part of an injection's readings, from 0 to 0.5.
+    believed
+        What is believed of the target; arguments of `measured_task`.
+    """
+
+    metadata = {"render_modes": []}  # noqa: RUF012 (gymnasium's form)
+
+    def __init__(self, record: Record, vessel: MeasuredVessel, calibration: Calibration, *,
+                 withheld: float = 0.1, **believed: Any) -> None:
+        self.record = record
+        self.vessel = vessel
+        self.calibration = calibration
+        self.part = _check.number("withheld", withheld, low=0.0, high=0.5)
+        self._there = readings_there(record)
+        self.episode_steps = len(record.injections)
+        self.spread: np.ndarray | None = None
+        """(n,) standard deviation in mol/m³ of the last estimate, for whoever has one."""
+        self._believed = believed
+        self._task_of = lru_cache(maxsize=1)(self._make_task)
+        self._show(0)
+        n = self.task.mesh.n_nodes
+        voltage = 10.0 * float(np.nanmax(np.abs(record.readings)))
+        current = float(np.abs(record.currents).max())
+        M, L = record.matrix.shape
+        self.observation_space = spaces.Dict({
+            "voltages": spaces.Box(-voltage, voltage, (M,), np.float64),
+            "currents": spaces.Box(-current, current, (L,), np.float64)})
+        limit = np.full(n, 1e4 * self.task.expected_concentration)
+        self.action_space = spaces.Box(-limit, limit, dtype=np.float64)
+        self._step = 0
+
+    def _make_task(self, seed: int) -> Task:
+        hidden = withheld_readings(self._there, self.part, seed)
+        return measured_task(self.vessel, self.calibration, self.record,
+                             seen=self._there & ~hidden, **self._believed)
+
+    def _show(self, seed: int) -> None:
+        self.task: Task = self._task_of(seed)
+        """What the agent may know."""
+        model = self.task.observation
+        assert isinstance(model, ReadingModel)
+        self.hidden = self._there & ~model.seen
+        """(K, M) bool: readings that the agent is not shown."""
+        self._judge = model.showing(self.hidden)
+        T = self.episode_steps
+        self.judged: dict[int, range] = (
+            {T: range(1, T + 1)} if isinstance(self.task.transport, AtRest)
+            else {t: range(t, t + 1) for t in range(self.task.warm_up + 1, T + 1)})
+        """By the withheld readings of which injections an estimate at t is judged."""
+        self._shown = shown_record(self.task, self.record)
+
+    def reset(self, *, seed: int | None = None,
+              options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
+        """Begin the record; the seed says which readings are withheld, by default 0."""
+        super().reset(seed=seed)
+        self._show(seed or 0)
+        self._step = 1
+        self.spread = None
+        return self._observe(), {"step": 1}
+
+    def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Take the estimate (n,) in mol/m³ of the state in which the last readings were taken."""
+        if not 1 <= self._step <= self.episode_steps:
+            raise gym.error.ResetNeeded(RESET_NEEDED)
+        estimate = checked_actions(action, self.action_space, self.task.mesh.n_nodes)
+        reward = 0.0
+        if self._step in self.judged:
+            off = np.concatenate([self.missed(t, estimate) for t in self.judged[self._step]])
+            reward = -float(np.mean(off**2)) if len(off) else 0.0
+        self._step += 1
+        return (self._observe(), reward, self._step > self.episode_steps, False,
+                {"step": self._step})
+
+    def missed(self, t: int, estimate: np.ndarray) -> np.ndarray:
+        """By how much an estimate (n,) misses the readings withheld at t = 1 … T, in standard
+        deviations of their noise."""
+        k = self.record.injections[t - 1]
+        hidden = self.hidden[k]
+        predicted = self._judge.voltages(estimate, self.record.currents[k][None])[0, hidden]
+        reading = self.record.readings[t - 1, hidden]
+        std = self.task.noise.std(np.nan_to_num(self.record.readings[t - 1]))
+        return (reading - predicted) / std[hidden]
+
+    def _observe(self) -> Observation:
+        if self._step > self.episode_steps:
+            return {name: np.zeros(space.shape) for name, space in self.observation_space.items()}
+        voltages, currents = self._shown[self._step - 1]
+        return {"voltages": voltages.copy(), "currents": currents.copy()}

@@ -1,0 +1,91 @@
+"""How much moves, and how noisy readings are: by what a record of them makes likeliest."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.optimize import minimize
+
+from eitbench.estimation.kalman import LinearisedObservations
+from eitbench.estimation.measured.record import Record, shown_record
+from eitbench.estimation.smoothness import smoothness_covariance
+from eitbench.numerics.fem import mass_matrix, stiffness_matrix
+from eitbench.worlds.task import Task
+
+KEPT = 1e-3
+"""Modes that hold less than this part of the strongest one's variance are left out."""
+FRAMES = 3
+STARTS = {"noise": 3.0, "initial": 0.3, "walk": 0.03}
+LIMITS = {"initial": (1e-2, 1.0), "walk": (1e-4, 1.0)}
+"""Standard deviations in parts of the background."""
+NOISE = {True: (1.0, 1e3), False: (1e-2, 10.0)}
+"""Factor of a noise that repeats have told, to which the model's error comes, and of one that holds
+all that the model does not explain."""
+
+
+def likeliest(task: Task, record: Record, *, repeated: bool, initial_is_known: bool,
+              walk_is_known: bool) -> Task:
+    """The task with the noise's factor, the initial and the walk's standard deviation under which
+    a linearised Kalman filter expects its first frames best: the largest marginal likelihood.
+
+    The filter works on the modes of the smoothness prior, which the initial state and each step of
+    the walk share.
+    """
+    free = [name for name, known in (("noise", False), ("initial", initial_is_known),
+                                     ("walk", walk_is_known)) if not known]
+    limits = LIMITS | {"noise": NOISE[repeated]}
+    surprise = _Surprise(task, record)
+    given = {"noise": 1.0, "initial": task.prior.initial_std, "walk": task.prior.nodal_std}
+
+    def numbers(x: np.ndarray) -> dict[str, float]:
+        return given | {name: float(np.exp(value)) for name, value in zip(free, x, strict=True)}
+
+    found = minimize(lambda x: surprise(**numbers(x)), np.log([STARTS[name] for name in free]),
+                     method="Nelder-Mead", bounds=np.log([limits[name] for name in free]),
+                     options={"xatol": 0.03, "fatol": 0.1, "maxfev": 60 * len(free)})
+    best = numbers(found.x)
+    noise = task.noise
+    factor = best["noise"]
+    return replace(
+        task, noise=replace(noise, relative=factor * noise.relative,
+                            of_largest=factor * noise.of_largest, floor=factor * noise.floor),
+        prior=replace(task.prior, initial_std=best["initial"], nodal_std=best["walk"]))
+
+
+class _Surprise:
+    """−2 ln of how likely the first frames are, but for a constant."""
+
+    def __init__(self, task: Task, record: Record) -> None:
+        many = min(FRAMES * task.calibration, task.n_steps)
+        background = task.expected_concentration
+        covariance = smoothness_covariance(mass_matrix(task.mesh), stiffness_matrix(task.mesh),
+                                           task.prior.initial_length, background)
+        values, vectors = np.linalg.eigh(covariance)
+        kept = values > KEPT * values[-1]
+        modes = vectors[:, kept] * np.sqrt(values[kept])
+        point = np.full(task.mesh.n_nodes, background)
+        linear = LinearisedObservations(task.observation, task.noise, point)
+        self._shown = []
+        for voltages, currents in shown_record(task, record)[:many]:
+            H, value, variance = linear(voltages, currents)
+            seen = H.any(axis=1)
+            self._shown.append(((H[seen] @ modes), (value - H @ point)[seen], variance[seen]))
+
+    def __call__(self, noise: float, initial: float, walk: float) -> float:
+        size = self._shown[0][0].shape[1]
+        mean = np.zeros(size)
+        P = initial**2 * np.eye(size)
+        total = 0.0
+        for H, value, variance in self._shown:
+            P[np.diag_indices(size)] += walk**2
+            cross = P @ H.T
+            S = H @ cross + np.diag(noise**2 * variance)
+            innovation = value - H @ mean
+            gain = np.linalg.solve(S, cross.T).T
+            total += float(innovation @ np.linalg.solve(S, innovation))
+            total += float(np.linalg.slogdet(S)[1])
+            mean = mean + gain @ innovation
+            P = P - gain @ cross.T
+            P = 0.5 * (P + P.T)
+        return total
