@@ -7,10 +7,10 @@ from contextlib import contextmanager
 
 EXTRAS = {
     "bench": ("cloudpickle", "jinja2", "jsonschema_rs", "markdown_it", "matplotlib", "orjson",
-              "pandas", "PIL", "typer"),
+              "pandas", "PIL", "typer", "yaml"),
     "export": ("h5py", "pyarrow"),
     "mesh": ("meshio",),
-    "rl": ("torch", "stable_baselines3", "sb3_contrib", "yaml"),
+    "rl": ("torch", "stable_baselines3", "sb3_contrib"),
 }
 """Extra -> modules that playing from Python does not need."""
 

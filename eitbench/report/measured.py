@@ -1,0 +1,223 @@
+"""What methods make of a record of a real instrument, as a page."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from PIL import Image
+
+from eitbench._files import write_atomically
+from eitbench.envs.rendering import draw_electrodes, draw_field
+from eitbench.physics.rest import AtRest
+from eitbench.report.templates import template
+
+if TYPE_CHECKING:
+    from eitbench.bench.measured import Played
+    from eitbench.envs.measured import MeasuredEnv
+    from eitbench.estimation.measured.calibration import Calibration
+
+FRAMES = 60
+"""At most so many pictures in an animation."""
+COLOURS = ("#0b6e75", "#d1495b", "#b8860b", "#7a5195", "#5b6770")
+SHARE = (0.005, 0.995)
+"""Quantiles of all estimates between which the colours lie."""
+
+
+def write_report(path: Path, env: MeasuredEnv, played: Sequence[Played],
+                 source: Mapping[str, Any], doubts: Sequence[str] = ()) -> Path:
+    """An HTML page: the estimates, how well they predict what they were not shown, NIS over time,
+    the calibration, and how each electrode does.
+
+    Parameters
+    ----------
+    path : Path
+        Of the page; its folder is made.
+    env : MeasuredEnv
+    played : sequence of Played
+        The first is drawn.
+    source : mapping
+        Where the record comes from; its "file" is the page's title.
+    doubts : sequence of str
+        What is odd about the record.
+    """
+    calibration = env.calibration
+    page = template("measured.html.j2").render(
+        title=str(source.get("file", "A record")),
+        source={name: value for name, value in source.items() if name != "file"},
+        methods=[_row(env, each) for each in played], doubts=list(doubts),
+        facts=_facts(env), estimate=_estimate(env, played[0]), first=played[0].method,
+        over_time=_figure(_over_time(env, played)), fit=_figure(_fit(calibration)),
+        contacts=_figure(_contacts(env)), at_rest=_is_at_rest(env))
+    write_atomically(path, page.encode())
+    return path
+
+
+def _is_at_rest(env: MeasuredEnv) -> bool:
+    return isinstance(env.task.transport, AtRest)
+
+
+def _row(env: MeasuredEnv, played: Played) -> dict[str, str]:
+    nis = played.nis[env.task.warm_up:]
+    told = np.isfinite(nis)
+    return {"method": played.method, "withheld": f"{played.withheld:.2f}",
+            "nis": f"{nis[told].mean():.2f}" if told.any() else "–"}
+
+
+def _facts(env: MeasuredEnv) -> dict[str, str]:
+    """What was calibrated, in words."""
+    calibration = env.calibration
+    noise = env.task.noise
+    record = env.record
+    told = calibration.noise
+    facts = {
+        "readings": f"{len(record.injections)} times {len(record.matrix)}, of "
+                    f"{len(record.currents)} different injections",
+        "conductivity": f"{calibration.conductivity:.4g} S/m ± "
+                        f"{100 * calibration.conductivity_std:.2g} %",
+        "gain": f"{calibration.gain:.4g}",
+        "contact impedances": f"{1e3 * calibration.contact_impedance.min():.3g} to "
+                              f"{1e3 * calibration.contact_impedance.max():.3g} mΩ·m²",
+        "noise of the instrument" if calibration.repeats > 1 else "not explained by the model":
+            f"{100 * told.relative:.2g} % of the reading and {1e3 * told.floor:.2g} mV",
+        "noise that estimators are told": f"{100 * noise.relative:.2g} % of the reading and "
+                                          f"{1e3 * noise.floor:.2g} mV",
+        "initial state": f"± {100 * env.task.prior.initial_std:.2g} % of the background, smooth "
+                         f"over {100 * env.task.prior.initial_length:.2g} cm"}
+    if not _is_at_rest(env):
+        facts["walk"] = (f"± {100 * env.task.prior.nodal_std:.2g} % of the background a step of "
+                         f"{1e3 * env.task.transport.time_step:.3g} ms")
+    return facts
+
+
+def _estimate(env: MeasuredEnv, played: Played) -> str:
+    """The last estimate of a target at rest, or an animation, as a data URI."""
+    T = len(played.mean)
+    if _is_at_rest(env):
+        return _figure(_picture(env, played, T))
+    first = min(env.task.warm_up + 1, T)
+    at = np.unique(np.linspace(first, T, FRAMES).round().astype(int))
+    frames = [_image(_picture(env, played, int(t))) for t in at]
+    content = io.BytesIO()
+    frames[0].save(content, "webp", save_all=True, append_images=frames[1:], loop=0, duration=125,
+                   quality=40, method=4)
+    return "data:image/webp;base64," + base64.b64encode(content.getvalue()).decode()
+
+
+def _picture(env: MeasuredEnv, played: Played, t: int) -> Figure:
+    """Estimate and its standard deviation at t."""
+    task = env.task
+    conducts = 1e3 * task.observation.observation.conductivity.molar_conductivity
+    shown = conducts * played.mean[min(task.warm_up, len(played.mean) - 1):]
+    low, high = np.quantile(shown, SHARE)
+    spread = None if played.variance is None else conducts * np.sqrt(played.variance[t - 1])
+    panels = 1 if spread is None or not np.isfinite(spread).all() else 2
+    figure = Figure(figsize=(5.2 * panels, 4.4), dpi=100, layout="constrained")
+    axes = figure.subplots(1, panels, squeeze=False)[0]
+    k = env.record.injections[t - 1]
+    fields: list[tuple[np.ndarray, float, float, str, str]] = [
+        (conducts * played.mean[t - 1], low, max(high, low + 1e-12), "viridis",
+         "conductivity / (mS/m)")]
+    if panels == 2:
+        fields.append((spread, 0.0, float(spread.max()), "magma", "standard deviation / (mS/m)"))
+    for ax, (values, least, most, colours, label) in zip(axes, fields, strict=True):
+        mappable = draw_field(ax, task.mesh, values, least, most, colours)
+        draw_electrodes(ax, task, env.record.currents[k], width=4.0)
+        ax.set(xlabel="x / cm")
+        figure.colorbar(mappable, ax=ax, label=label, shrink=0.85)
+    figure.suptitle(f"{played.method}, {env.record.times[t - 1]:.4g} s", fontsize=11)
+    return figure
+
+
+def _over_time(env: MeasuredEnv, played: Sequence[Played]) -> Figure:
+    """Misses of withheld readings, and NIS, of each method."""
+    figure = Figure(figsize=(10.5, 3.4), dpi=100, layout="constrained")
+    missed, nis = figure.subplots(1, 2)
+    times = env.record.times
+    frame = max(env.task.warm_up, 1)
+    for each, colour in zip(played, COLOURS * len(played), strict=False):
+        for ax, values in ((missed, each.missed**2), (nis, each.nis)):
+            if np.isfinite(values).any():
+                smooth = _smooth(values, frame)
+                ax.plot(times, np.sqrt(smooth) if ax is missed else smooth, color=colour,
+                        label=each.method, linewidth=1.6)
+    for ax, title in ((missed, "withheld readings missed by / noise std"), (nis, "NIS/m")):
+        ax.axhline(1.0, color="0.7", linewidth=1)
+        ax.set(xlabel="time / s", ylabel=title, yscale="log")
+        _bare(ax)
+    missed.legend(frameon=False, fontsize=9)
+    return figure
+
+
+def _smooth(values: np.ndarray, frame: int) -> np.ndarray:
+    """Means over a frame, of what is there."""
+    there = np.isfinite(values)
+    weights = np.convolve(there.astype(float), np.ones(frame), "same")
+    total = np.convolve(np.where(there, values, 0.0), np.ones(frame), "same")
+    return np.where(weights > 0, total / np.maximum(weights, 1.0), np.nan)
+
+
+def _fit(calibration: Calibration) -> Figure:
+    """Measured against modelled readings of homogeneous fluid."""
+    figure = Figure(figsize=(10.5, 3.6), dpi=100, layout="constrained")
+    against, left = figure.subplots(1, 2)
+    there = np.isfinite(calibration.measured)
+    measured, computed = 1e3 * calibration.measured[there], 1e3 * calibration.computed[there]
+    ends = [measured.min(), measured.max()]
+    against.plot(ends, ends, color="0.8", linewidth=1)
+    against.plot(computed, measured, ".", color=COLOURS[0], markersize=3)
+    against.set(xlabel="modelled / mV", ylabel="measured / mV")
+    left.plot(computed, measured - computed, ".", color=COLOURS[1], markersize=3)
+    left.axhline(0.0, color="0.8", linewidth=1)
+    left.set(xlabel="modelled / mV", ylabel="measured less modelled / mV")
+    for ax in (against, left):
+        _bare(ax)
+    return figure
+
+
+def _contacts(env: MeasuredEnv) -> Figure:
+    """Contact impedances with their uncertainty, and what readings of each electrode miss."""
+    calibration = env.calibration
+    figure = Figure(figsize=(10.5, 3.2), dpi=100, layout="constrained")
+    impedance, missed = figure.subplots(1, 2)
+    number = np.arange(1, len(calibration.contact_impedance) + 1)
+    z = 1e3 * calibration.contact_impedance
+    factor = np.exp(calibration.contact_impedance_std)
+    impedance.errorbar(number, z, [z - z / factor, z * factor - z], fmt="o", color=COLOURS[0],
+                       markersize=4, linewidth=1)
+    impedance.set(xlabel="electrode", ylabel="contact impedance / (mΩ·m²)", yscale="log")
+    size = np.nanmean(np.abs(calibration.measured))
+    off = np.nan_to_num(calibration.measured - calibration.computed)
+    involved = (env.record.matrix != 0).astype(float)
+    there = np.isfinite(calibration.measured).astype(float)
+    count = np.maximum((there @ involved).sum(axis=0), 1.0)
+    missed.bar(number, 100 * np.sqrt((off**2 @ involved).sum(axis=0) / count) / size,
+               color=COLOURS[1])
+    missed.set(xlabel="electrode", ylabel="misfit of its readings / %\nof the mean reading")
+    for ax in (impedance, missed):
+        _bare(ax)
+    return figure
+
+
+def _bare(axes: Axes) -> None:
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def _image(figure: Figure) -> Image.Image:
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
+
+
+def _figure(figure: Any) -> str:
+    content = io.BytesIO()
+    FigureCanvasAgg(figure)
+    figure.savefig(content, format="png")
+    return "data:image/png;base64," + base64.b64encode(content.getvalue()).decode()
