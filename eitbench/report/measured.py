@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter
 from PIL import Image
 
 from eitbench._files import write_atomically
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 FRAMES = 60
 """At most so many pictures in an animation."""
 COLOURS = ("#0b6e75", "#d1495b", "#b8860b", "#7a5195", "#5b6770")
+DECADES = 5.0
+"""From this ratio of the largest to the smallest estimate on, colours are logarithmic."""
 SHARE = (0.005, 0.995)
 """Quantiles of all estimates between which the colours lie."""
 
@@ -117,21 +120,26 @@ def _picture(env: MeasuredEnv, played: Played, t: int) -> Figure:
     conducts = 1e3 * task.observation.observation.conductivity.molar_conductivity
     shown = conducts * played.mean[min(task.warm_up, len(played.mean) - 1):]
     low, high = np.quantile(shown, SHARE)
+    field = conducts * played.mean[t - 1]
+    in_decades = shown.min() > 0.0 and high > DECADES * low
+    if in_decades:
+        field, low, high = (np.log10(each) for each in (field, low, high))
     spread = None if played.variance is None else conducts * np.sqrt(played.variance[t - 1])
     panels = 1 if spread is None or not np.isfinite(spread).all() else 2
     figure = Figure(figsize=(5.2 * panels, 4.4), dpi=100, layout="constrained")
     axes = figure.subplots(1, panels, squeeze=False)[0]
     k = env.record.injections[t - 1]
     fields: list[tuple[np.ndarray, float, float, str, str]] = [
-        (conducts * played.mean[t - 1], low, max(high, low + 1e-12), "viridis",
-         "conductivity / (mS/m)")]
+        (field, low, max(high, low + 1e-12), "viridis", "conductivity / (mS/m)")]
     if panels == 2:
         fields.append((spread, 0.0, float(spread.max()), "magma", "standard deviation / (mS/m)"))
     for ax, (values, least, most, colours, label) in zip(axes, fields, strict=True):
         mappable = draw_field(ax, task.mesh, values, least, most, colours)
         draw_electrodes(ax, task, env.record.currents[k], width=4.0)
         ax.set(xlabel="x / cm")
-        figure.colorbar(mappable, ax=ax, label=label, shrink=0.85)
+        bar = figure.colorbar(mappable, ax=ax, label=label, shrink=0.85)
+        if in_decades and ax is axes[0]:
+            bar.ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{10**value:.3g}"))
     figure.suptitle(f"{played.method}, {env.record.times[t - 1]:.4g} s", fontsize=11)
     return figure
 

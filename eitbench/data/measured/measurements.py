@@ -1,0 +1,206 @@
+"""`Measurements`: what an instrument injected and read, with units, in one documented file."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from eitbench import _check
+from eitbench._extras import needed_by
+from eitbench._files import write_atomically
+
+FORMAT = "eitbench measurements"
+VERSION = 1
+BALANCE = 1e-6
+"""Part of an injection's largest current that its currents may fail to sum to zero by."""
+
+
+@dataclass(frozen=True, eq=False)
+class Measurements:
+    """A record of T readings, M numbers each, of K different injections by L electrodes.
+
+    ``ValueError`` naming the field that is of the wrong shape, holds no numbers, or contradicts
+    another; currents that fail to sum to zero by rounding are freed of their mean.
+    """
+
+    currents: np.ndarray
+    """(K, L) into each electrode in A, each injection once; rows sum to zero"""
+    injections: np.ndarray
+    """(T,) int, which of them was on"""
+    matrix: np.ndarray
+    """(M, L) from potentials, against the mean of all electrodes, to readings"""
+    readings: np.ndarray
+    """(T, M) V, NaN where nothing was read"""
+    times: np.ndarray
+    """(T,) s, increasing"""
+    reference: np.ndarray | None = None
+    """(F, K, M) V, F records of homogeneous fluid by injection; NaN where nothing was read"""
+    source: Mapping[str, Any] = field(default_factory=dict)
+    """where it comes from, in words and numbers: file, instrument, licence, frequency, and what was
+    assumed about units"""
+
+    def __post_init__(self) -> None:
+        currents = _check.array("currents", self.currents, (None, None), units="A")
+        K, L = currents.shape
+        surplus = np.abs(currents.sum(axis=1))
+        largest = np.abs(currents).max(axis=1)
+        if not largest.all():
+            raise ValueError(f"currents must flow, got none in injection {int(largest.argmin())}")
+        if (wrong := np.flatnonzero(surplus > BALANCE * largest)).size:
+            k = int(wrong[0])
+            raise ValueError("currents must sum to zero over the electrodes, got "
+                             f"{currents[k].sum():g} A in injection {k}")
+        on = currents != 0.0
+        currents = currents - on * (currents.sum(axis=1) / on.sum(axis=1))[:, None]
+        if len(np.unique(currents, axis=0)) < K:
+            raise ValueError(f"currents must be {K} different injections, got some twice; see "
+                             "Measurements.of_sequence")
+        matrix = _check.array("matrix", self.matrix, (None, L))
+        M = len(matrix)
+        readings = _numbers("readings", self.readings, (None, M))
+        T = len(readings)
+        injections = _injections(self.injections, T, K)
+        times = _check.array("times", self.times, (T,), units="s")
+        if (back := np.flatnonzero(np.diff(times) <= 0)).size:
+            t = int(back[0])
+            raise ValueError(f"times must increase, got {times[t]:g} s and then "
+                             f"{times[t + 1]:g} s at reading {t + 1}")
+        reference = None
+        if self.reference is not None:
+            reference = _numbers("reference", self.reference, (None, K, M))
+        json.dumps(dict(self.source), allow_nan=False)
+        for name, value in (("currents", currents), ("injections", injections),
+                            ("matrix", matrix), ("readings", readings), ("times", times),
+                            ("reference", reference)):
+            if value is not None:
+                value = value.copy()
+                value.setflags(write=False)
+            object.__setattr__(self, name, value)
+
+    @classmethod
+    def of_sequence(cls, currents: np.ndarray, matrix: np.ndarray, readings: np.ndarray,
+                    times: np.ndarray, reference: np.ndarray | None = None,
+                    source: Mapping[str, Any] | None = None) -> Measurements:
+        """From ``currents`` (T, L), one row a reading, and a ``reference`` (F, T, M) in the same
+        order: equal injections become one."""
+        currents = _check.array("currents", currents, (None, None), units="A")
+        different, first, which = np.unique(currents, axis=0, return_index=True,
+                                            return_inverse=True)
+        order = np.argsort(first)                              # as they came
+        rank = np.argsort(order)
+        injections = rank[which.reshape(-1)]
+        by_injection = None
+        if reference is not None:
+            reference = np.asarray(reference, dtype=float)
+            if reference.ndim != 3 or reference.shape[1] != len(currents):
+                raise ValueError(f"reference must have shape (F, {len(currents)}, M), got "
+                                 f"{reference.shape}")
+            by_injection = _by_injection(reference, injections, len(different))
+        return cls(different[order], injections, matrix, readings, times, by_injection,
+                   source or {})
+
+    @cached_property
+    def frame(self) -> int:
+        """Readings until each injection has come once."""
+        return 1 + int(np.unique(self.injections, return_index=True)[1].max())
+
+    @cached_property
+    def driven(self) -> np.ndarray:
+        """(T, M) bool: readings in which an electrode takes part that carries current."""
+        carries = self.currents != 0.0
+        return (carries.astype(float) @ (self.matrix != 0.0).T.astype(float) > 0.0)[self.injections]
+
+    def homogeneous(self, frames: int = 1) -> np.ndarray:
+        """(F, K, M) V: the reference, or where there is none the first ``frames`` frames."""
+        if self.reference is not None:
+            return self.reference
+        steps = min(_check.integer("frames", frames, low=1) * self.frame, len(self.readings))
+        return _by_injection(self.readings[None, :steps], self.injections[:steps],
+                             len(self.currents))
+
+    def save(self, path: Path | str) -> Path:
+        """Write one HDF5 file, whole or not at all; extra ``export``."""
+        with needed_by("a file of measurements"):
+            import h5py
+        content = io.BytesIO()
+        with h5py.File(content, "w") as file:
+            file.attrs["format"] = FORMAT
+            file.attrs["version"] = VERSION
+            file.attrs["source"] = json.dumps(dict(self.source))
+            for name in ("currents", "injections", "matrix", "readings", "times", "reference"):
+                value = getattr(self, name)
+                if value is not None:
+                    file.create_dataset(name, data=value)
+        write_atomically(Path(path), content.getvalue())
+        return Path(path)
+
+    @classmethod
+    def load(cls, path: Path | str, steps: slice = slice(None)) -> Measurements:
+        """What `save` has written, or only some of its readings, of which alone is read then;
+        ``ValueError`` naming the file and what is wrong with it."""
+        with needed_by("a file of measurements"):
+            import h5py
+        try:
+            with h5py.File(path, "r") as file:
+                if file.attrs.get("format") != FORMAT or file.attrs.get("version") != VERSION:
+                    raise ValueError(f"format must be {FORMAT!r}, version {VERSION}, got "
+                                     f"{file.attrs.get('format')!r}, version "
+                                     f"{file.attrs.get('version')!r}")
+                along = {name: file[name][steps] for name in ("injections", "readings", "times")}
+                whole = {name: file[name][()] for name in ("currents", "matrix")}
+                reference = file["reference"][()] if "reference" in file else None
+                source = json.loads(file.attrs["source"])
+            return cls(**along, **whole, reference=reference, source=source)
+        except (OSError, KeyError, ValueError, TypeError) as error:
+            raise ValueError(f"{path} must be a file of measurements: {error}") from None
+
+
+def _by_injection(records: np.ndarray, injections: np.ndarray, K: int) -> np.ndarray:
+    """(F′, K, M) from F records (F, T, M): an injection's readings one after another, NaN where
+    another has more."""
+    F, T, M = records.shape
+    turn = np.zeros(T, dtype=int)
+    count = np.zeros(K, dtype=int)
+    for t, k in enumerate(injections):
+        turn[t] = count[k]
+        count[k] += 1
+    most = int(count.max())
+    found = np.full((F, most, K, M), np.nan)
+    found[:, turn, injections] = records
+    return found.reshape(F * most, K, M)
+
+
+def _injections(given: np.ndarray, T: int, K: int) -> np.ndarray:
+    injections = np.asarray(given)
+    if injections.shape != (T,) or not np.issubdtype(injections.dtype, np.integer):
+        raise ValueError(f"injections must be {T} integers, one a reading, got "
+                         f"{injections.dtype} of shape {injections.shape}")
+    if injections.min() < 0 or injections.max() >= K:
+        raise ValueError(f"injections must be numbers from 0 to {K - 1}, got "
+                         f"{injections.min()} to {injections.max()}")
+    return injections.astype(np.int64)
+
+
+def _numbers(name: str, given: np.ndarray, shape: tuple[int | None, ...]) -> np.ndarray:
+    """Numbers of this shape, some of which may be NaN."""
+    value = np.asarray(given)
+    if np.iscomplexobj(value):
+        raise ValueError(f"{name} must be real, got complex ones; say which part is used")
+    value = value.astype(float)
+    fits = value.ndim == len(shape) and all(
+        want in (None, size) for want, size in zip(shape, value.shape, strict=True))
+    if not fits or not value.size:
+        wanted = ", ".join("any" if size is None else str(size) for size in shape)
+        raise ValueError(f"{name} must have shape ({wanted}), got {value.shape}")
+    if np.isinf(value).any():
+        raise ValueError(f"{name} must be finite or NaN, got infinite ones")
+    if np.isnan(value).all():
+        raise ValueError(f"{name} must hold numbers, got NaN only")
+    return value
