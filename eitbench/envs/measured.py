@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import lru_cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -10,17 +12,25 @@ import numpy as np
 from gymnasium import spaces
 
 from eitbench import _check
+from eitbench.data.measured import Measurements, read
 from eitbench.envs.estimation import RESET_NEEDED, Observation, checked_actions
 from eitbench.envs.spec import KnowsItsLength
+from eitbench.estimation.measured.calibration import calibrate
 from eitbench.estimation.measured.readings import ReadingModel
-from eitbench.estimation.measured.record import Record, shown_record
-from eitbench.estimation.measured.task import measured_task, readings_there, withheld_readings
+from eitbench.estimation.measured.record import (
+    readings_there,
+    shown_record,
+    withheld_readings,
+)
+from eitbench.estimation.measured.task import measured_task
+from eitbench.estimation.measured.vessel import RealVessel, read_vessel
 from eitbench.physics.rest import AtRest
 
 if TYPE_CHECKING:
-    from eitbench.estimation.measured.calibration import Calibration
-    from eitbench.estimation.measured.task import MeasuredVessel
     from eitbench.worlds.task import Task
+
+FIRST_GUESS = 1e-4
+"""Ω·m², of the contact impedances."""
 
 
 class MeasuredEnv(KnowsItsLength, gym.Env[Observation, np.ndarray]):  # type: ignore[misc]
@@ -31,28 +41,48 @@ class MeasuredEnv(KnowsItsLength, gym.Env[Observation, np.ndarray]):  # type: ig
     was on, zero in the first frame; of a target at rest the last estimate is judged, by all that
     was withheld. Which they are is drawn by the seed: of each injection a part,
     the same whenever it comes again. Observations are as in `EstimationEnv`, except that voltages
-    are what the instrument read, (M,), and 0 where it read nothing or nothing is shown; `task` knows
-    which (`ReadingModel`).
+    are what the instrument read, (M,), and 0 where it read nothing or nothing is shown; the task's
+    `ReadingModel` knows which.
 
     Parameters
     ----------
-    record : Record
-    vessel : MeasuredVessel
-    calibration : Calibration
+    file : path or Measurements
+        What `eitbench.data.measured.read` reads.
+    vessel : path, mapping or RealVessel
+        What `read_vessel` reads.
     withheld : float
         Part of an injection's readings, from 0 to 0.5.
+    moves : bool, optional
+        Whether the target moves. Default: if there is more than one frame.
+    correction : "offset" or "gain"
+        See `calibrate`.
+    homogeneous_frames : int
+        Where a record has no reference, so many of its first frames are taken for homogeneous.
     believed
-        What is believed of the target; arguments of `measured_task`.
+        What else is believed of the target; arguments of `measured_task`.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012 (gymnasium's form)
 
-    def __init__(self, record: Record, vessel: MeasuredVessel, calibration: Calibration, *,
-                 withheld: float = 0.1, **believed: Any) -> None:
-        self.record = record
-        self.vessel = vessel
-        self.calibration = calibration
+    def __init__(self, file: Path | str | Measurements,
+                 vessel: Path | str | Mapping[str, Any] | RealVessel, *, withheld: float = 0.1,
+                 moves: bool | None = None, correction: str = "offset",
+                 homogeneous_frames: int = 1, **believed: Any) -> None:
+        self.record = file if isinstance(file, Measurements) else read(file)
+        self.vessel = vessel if isinstance(vessel, RealVessel) else read_vessel(vessel)
+        record = self.record
+        n_electrodes = record.currents.shape[1]
+        if n_electrodes != self.vessel.n_electrodes:
+            raise ValueError(f"vessel must have the record's {n_electrodes} electrodes, got "
+                             f"{self.vessel.n_electrodes}")
         self.part = _check.number("withheld", withheld, low=0.0, high=0.5)
+        self.calibration = calibrate(
+            self.vessel.electrode_model(FIRST_GUESS), record.currents, record.matrix,
+            record.homogeneous(homogeneous_frames), depth=self.vessel.depth,
+            conductivity=self.vessel.conductivity, correction=correction)
+        if moves is None:
+            moves = len(record.readings) > record.frame
+        believed = {"moves": moves, **believed}
         self._there = readings_there(record)
         self.episode_steps = len(record.injections)
         self.spread: np.ndarray | None = None
@@ -61,7 +91,7 @@ class MeasuredEnv(KnowsItsLength, gym.Env[Observation, np.ndarray]):  # type: ig
         self._task_of = lru_cache(maxsize=1)(self._make_task)
         self._show(0)
         n = self.task.mesh.n_nodes
-        voltage = 10.0 * float(np.nanmax(np.abs(record.readings)))
+        voltage = 100.0 * float(np.nanmax(np.abs(record.readings)))
         current = float(np.abs(record.currents).max())
         M, L = record.matrix.shape
         self.observation_space = spaces.Dict({

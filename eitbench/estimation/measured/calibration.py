@@ -16,6 +16,8 @@ from eitbench.physics.observation import VoltageNoise
 if TYPE_CHECKING:
     from eitbench.physics.cem import CompleteElectrodeModel
 
+CORRECTIONS = ("offset", "gain")
+"""It is taken off all readings, or each reading is amplified by it."""
 CONTACT_LEVEL = 0.1
 """z σ before anything is read, in parts of an electrode's length, …"""
 CONTACT_LEVEL_STD = 2.0
@@ -49,6 +51,8 @@ class Calibration:
     """(K, M) V, the mean of the repeats; NaN where nothing was read"""
     computed: np.ndarray
     """(K, M) V, of the model with these numbers"""
+    correction: str = "offset"
+    """one of `CORRECTIONS`: what becomes of what the model of homogeneous fluid is off"""
 
     @property
     def residual(self) -> np.ndarray:
@@ -60,11 +64,22 @@ class Calibration:
     def offset(self) -> np.ndarray:
         """(K, M) in V, 0 where nothing was read: what the model of homogeneous fluid is off, which
         is the mean of its approximation error (Kaipio & Somersalo 2005)."""
+        if self.correction == "gain":
+            return np.zeros_like(self.measured)
         return np.nan_to_num(self.measured - self.computed)
+
+    @property
+    def factor(self) -> np.ndarray:
+        """(K, M): by which each reading exceeds the model's, where channels are amplified
+        differently; else 1."""
+        if self.correction == "offset":
+            return np.ones_like(self.measured)
+        return np.nan_to_num(self.measured / self.computed, nan=1.0)
 
 
 def calibrate(electrodes: CompleteElectrodeModel, currents: np.ndarray, matrix: np.ndarray,
               readings: np.ndarray, *, depth: float = 1.0, conductivity: float | None = None,
+              correction: str = "offset",
               tick: Callable[[], object] = lambda: None) -> Calibration:
     """Fit σ and z_l to homogeneous fluid by Gauss–Newton in their logarithms.
 
@@ -85,9 +100,13 @@ def calibrate(electrodes: CompleteElectrodeModel, currents: np.ndarray, matrix: 
         See `ReadingModel`.
     conductivity : float, optional
         σ in S/m if it is known.
+    correction : "offset" or "gain"
+        What becomes of what the model is off; see `Calibration`.
     tick : callable
         Called whenever the model has been computed.
     """
+    if correction not in CORRECTIONS:
+        raise ValueError(f"correction must be one of {', '.join(CORRECTIONS)}, got {correction!r}")
     L = electrodes.n_electrodes
     currents = _check.array("currents", currents, (None, L), units="A")
     matrix = _check.array("matrix", matrix, (None, L))
@@ -127,7 +146,7 @@ def calibrate(electrodes: CompleteElectrodeModel, currents: np.ndarray, matrix: 
     contact_std = np.sqrt(np.einsum("lp,pq,lq->l", of_contacts, spread, of_contacts))
     return Calibration(sigma, float(np.sqrt(spread[0, 0])), np.exp(x[1] + x[2:]) / sigma,
                        contact_std, gain, noise, int(count.max()), np.where(seen, mean, np.nan),
-                       explained)
+                       explained, correction)
 
 
 class _Homogeneous:

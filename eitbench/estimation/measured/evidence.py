@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.optimize import minimize
 
 from eitbench.estimation.kalman import LinearisedObservations
-from eitbench.estimation.measured.record import Record, shown_record
+from eitbench.estimation.measured.record import shown_record
 from eitbench.estimation.smoothness import smoothness_covariance
 from eitbench.numerics.fem import mass_matrix, stiffness_matrix
 from eitbench.worlds.task import Task
+
+if TYPE_CHECKING:
+    from eitbench.data.measured import Measurements
 
 KEPT = 1e-3
 """Modes that hold less than this part of the strongest one's variance are left out."""
@@ -24,7 +28,7 @@ NOISE = {True: (1.0, 1e3), False: (1e-2, 10.0)}
 all that the model does not explain."""
 
 
-def likeliest(task: Task, record: Record, *, repeated: bool, initial_is_known: bool,
+def likeliest(task: Task, record: Measurements, *, repeated: bool, initial_is_known: bool,
               walk_is_known: bool) -> Task:
     """The task with the noise's factor, the initial and the walk's standard deviation under which
     a linearised Kalman filter expects its first frames best: the largest marginal likelihood.
@@ -56,7 +60,7 @@ def likeliest(task: Task, record: Record, *, repeated: bool, initial_is_known: b
 class _Surprise:
     """−2 ln of how likely the first frames are, but for a constant."""
 
-    def __init__(self, task: Task, record: Record) -> None:
+    def __init__(self, task: Task, record: Measurements) -> None:
         many = min(FRAMES * task.calibration, task.n_steps)
         background = task.expected_concentration
         covariance = smoothness_covariance(mass_matrix(task.mesh), stiffness_matrix(task.mesh),

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class ReadingModel:
-    """Readings D U(c) + offset of potentials U = 𝓡(c) I; an `eitbench.physics` `VoltageModel`.
+    """Readings factor · D U(c) + offset of potentials U = 𝓡(c) I; an `eitbench.physics` `VoltageModel`.
 
     What an instrument did not read, or what nobody is to see, is a reading that is 0 whatever the
     concentration: it leaves an innovation of 0 and a derivative of 0, so that a Kalman filter or a
@@ -29,15 +29,16 @@ class ReadingModel:
         D, from potentials to readings; no unit.
     depth : float
         Of the fluid in m where the model is plane, which takes A/m; 1 in 3D.
-    offset : (K, M), optional
-        In V: what readings of homogeneous fluid are off from the model. Default: 0.
+    offset, factor : (K, M), optional
+        In V, and by which each reading exceeds the model's: what homogeneous fluid tells of the
+        model's error, or of channels that are amplified differently. Default: 0 and 1.
     seen : (K, M) bool, optional
         Which readings there are. Default: all.
     """
 
     def __init__(self, observation: ObservationModel, currents: np.ndarray, matrix: np.ndarray,
-                 depth: float = 1.0, offset: np.ndarray | None = None,
-                 seen: np.ndarray | None = None) -> None:
+                 depth: float = 1.0, *, offset: np.ndarray | None = None,
+                 factor: np.ndarray | None = None, seen: np.ndarray | None = None) -> None:
         L = observation.cem.n_electrodes
         self.observation = observation
         self.currents = _check.array("currents", currents, (None, L), units="A")
@@ -46,6 +47,8 @@ class ReadingModel:
         shape = (len(self.currents), len(self.matrix))
         self.offset = (np.zeros(shape) if offset is None
                        else _check.array("offset", offset, shape, units="V"))
+        self.factor = (np.ones(shape) if factor is None
+                       else _check.array("factor", factor, shape))
         self.seen = np.ones(shape, bool) if seen is None else np.asarray(seen, bool)
         if self.seen.shape != shape:
             raise ValueError(f"seen must have shape {shape}, got {self.seen.shape}")
@@ -61,23 +64,24 @@ class ReadingModel:
 
     def showing(self, seen: np.ndarray) -> ReadingModel:
         """The same of other readings (K, M) bool."""
-        return ReadingModel(self.observation, self.currents, self.matrix, self.depth, self.offset,
-                            seen)
+        return ReadingModel(self.observation, self.currents, self.matrix, self.depth,
+                            offset=self.offset, factor=self.factor, seen=seen)
 
     def voltages(self, concentration: np.ndarray, currents: np.ndarray) -> np.ndarray:
         """Readings (J, M) in V for ``concentration`` (n,) in mol/m³ and injections (J, L) in A, of
         those that were made."""
         k = self._numbers(currents)
         potentials = self.observation.voltages(concentration, currents / self.depth)
-        return self.seen[k] * (potentials @ self.matrix.T + self.offset[k])
+        return self.seen[k] * (self.factor[k] * (potentials @ self.matrix.T) + self.offset[k])
 
     def linearise(self, concentration: np.ndarray,
                   currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """`voltages` and their derivatives by c, (J, M, n) in V·m³/mol."""
         k = self._numbers(currents)
         potentials, slopes = self.observation.linearise(concentration, currents / self.depth)
-        return (self.seen[k] * (potentials @ self.matrix.T + self.offset[k]),
-                self.seen[k][..., None] * (self.matrix @ slopes))
+        factor = self.seen[k] * self.factor[k]
+        return (factor * (potentials @ self.matrix.T) + self.seen[k] * self.offset[k],
+                factor[..., None] * (self.matrix @ slopes))
 
     def _numbers(self, currents: np.ndarray) -> list[int]:
         """Which injection each of these is."""

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from eitbench import _check
 from eitbench.estimation.measured.evidence import likeliest
 from eitbench.estimation.measured.readings import ReadingModel
-from eitbench.estimation.measured.record import Record
+from eitbench.estimation.measured.record import readings_there
 from eitbench.estimation.walk import RandomWalk
 from eitbench.physics.observation import LinearConductivity, ObservationModel
 from eitbench.physics.rest import AtRest
@@ -17,59 +17,15 @@ from eitbench.worlds.parts import Prior
 from eitbench.worlds.task import Task
 
 if TYPE_CHECKING:
+    from eitbench.data.measured import Measurements
     from eitbench.estimation.measured.calibration import Calibration
-    from eitbench.numerics.mesh import Mesh
-    from eitbench.physics.cem import CompleteElectrodeModel
+    from eitbench.estimation.measured.vessel import RealVessel
 
 LENGTH = 1 / 8
 """Over which a target is smooth, in parts of the vessel's size."""
 
 
-class MeasuredVessel(Protocol):
-    """What of a vessel is needed."""
-
-    @property
-    def depth(self) -> float:
-        """m of fluid if the model is plane; else 1."""
-
-    def carrier(self) -> Mesh:
-        """Where estimates live."""
-
-    def electrode_model(self, contact_impedance: np.ndarray | float) -> CompleteElectrodeModel:
-        """With z_l in Ω·m², (L,) or one for all."""
-
-
-def readings_there(record: Record) -> np.ndarray:
-    """(K, M) bool: readings that are there whenever an injection is; a reading that is missing once
-    is not used at all. ``ValueError`` if nothing is left."""
-    K, M = len(record.currents), len(record.matrix)
-    there = np.ones((K, M), dtype=bool)
-    for k, read in zip(record.injections, np.isfinite(record.readings), strict=True):
-        there[k] &= read
-    there[np.setdiff1d(np.arange(K), record.injections)] = False
-    if not there.any():
-        raise ValueError("readings must hold some that are there whenever their injection is, got "
-                         "none")
-    return there
-
-
-def withheld_readings(there: np.ndarray, part: float, seed: int) -> np.ndarray:
-    """(K, M) bool: of each injection so many of its readings, at random; at least one where there
-    are two.
-
-    They are the same whenever an injection comes again: what is withheld is never shown.
-    """
-    _check.number("part", part, low=0.0, high=0.5)
-    random = np.random.default_rng(seed)
-    withheld = np.zeros_like(there)
-    for row, hidden in zip(there, withheld, strict=True):
-        places = np.flatnonzero(row)
-        many = max(round(part * len(places)), 1) if part and len(places) > 1 else 0
-        hidden[random.choice(places, many, replace=False)] = True
-    return withheld
-
-
-def measured_task(vessel: MeasuredVessel, calibration: Calibration, record: Record, *,
+def measured_task(vessel: RealVessel, calibration: Calibration, record: Measurements, *,
                   seen: np.ndarray | None = None, moves: bool = True,
                   molar_conductivity: float = 0.01, length: float | None = None,
                   initial_std: float | None = None,
@@ -83,9 +39,9 @@ def measured_task(vessel: MeasuredVessel, calibration: Calibration, record: Reco
 
     Parameters
     ----------
-    vessel : MeasuredVessel
+    vessel : RealVessel
     calibration : Calibration
-    record : Record
+    record : Measurements
     seen : (K, M) bool, optional
         Readings that the estimator is shown. Default: all that are there.
     moves : bool
@@ -109,10 +65,10 @@ def measured_task(vessel: MeasuredVessel, calibration: Calibration, record: Reco
     observation = ReadingModel(
         ObservationModel(cem, mesh.interpolation_to(cem.mesh.points),
                          LinearConductivity(molar_conductivity), 1e-3 * background),
-        record.currents, calibration.gain * record.matrix, vessel.depth, calibration.offset,
-        readings_there(record) if seen is None else seen)
-    first = np.unique(record.injections, return_index=True)[1]
-    frame = 1 + int(first.max())                                # until each injection has come
+        record.currents, calibration.gain * record.matrix, vessel.depth,
+        offset=calibration.offset, factor=calibration.factor,
+        seen=readings_there(record) if seen is None else seen)
+    frame = record.frame
     times = np.diff(record.times)
     step = float(np.median(times)) if len(times) else 1.0
     T = len(record.injections)
