@@ -15,7 +15,7 @@ from eitbench import _check
 from eitbench.data.measured import Measurements, read
 from eitbench.envs.estimation import RESET_NEEDED, Observation, checked_actions
 from eitbench.envs.spec import KnowsItsLength
-from eitbench.estimation.measured.calibration import calibrate
+from eitbench.estimation.measured.calibration import calibrate, noise_of_frames
 from eitbench.estimation.measured.readings import ReadingModel
 from eitbench.estimation.measured.record import (
     readings_there,
@@ -76,10 +76,12 @@ class MeasuredEnv(KnowsItsLength, gym.Env[Observation, np.ndarray]):  # type: ig
             raise ValueError(f"vessel must have the record's {n_electrodes} electrodes, got "
                              f"{self.vessel.n_electrodes}")
         self.part = _check.number("withheld", withheld, low=0.0, high=0.5)
+        homogeneous = record.homogeneous(homogeneous_frames)
         self.calibration = calibrate(
             self.vessel.electrode_model(FIRST_GUESS), record.currents, record.matrix,
-            record.homogeneous(homogeneous_frames), depth=self.vessel.depth,
-            conductivity=self.vessel.conductivity, correction=correction)
+            homogeneous, depth=self.vessel.depth,
+            conductivity=self.vessel.conductivity, correction=correction,
+            noise=None if len(homogeneous) > 1 else noise_of_frames(record.frames()))
         if moves is None:
             moves = len(record.readings) > record.frame
         believed = {"moves": moves, **believed}

@@ -88,7 +88,7 @@ def _facts(env: MeasuredEnv) -> dict[str, str]:
         "gain": f"{calibration.gain:.4g}",
         "contact impedances": f"{1e3 * calibration.contact_impedance.min():.3g} to "
                               f"{1e3 * calibration.contact_impedance.max():.3g} mΩ·m²",
-        "noise of the instrument" if calibration.repeats > 1 else "not explained by the model":
+        "noise of the instrument" if calibration.noise_is_told else "not explained by the model":
             f"{100 * told.relative:.2g} % of the reading and {1e3 * told.floor:.2g} mV",
         "noise that estimators are told": f"{100 * noise.relative:.2g} % of the reading and "
                                           f"{1e3 * noise.floor:.2g} mV",

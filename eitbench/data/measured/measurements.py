@@ -125,6 +125,14 @@ class Measurements:
         return _by_injection(self.readings[None, :steps], self.injections[:steps],
                              len(self.currents))
 
+    def frames(self) -> np.ndarray:
+        """(F, K, M) V: whole frames one after another; NaN where nothing was read."""
+        whole = len(self.readings) - len(self.readings) % self.frame
+        return np.concatenate([
+            _by_injection(self.readings[None, t:t + self.frame],
+                          self.injections[t:t + self.frame], len(self.currents))
+            for t in range(0, max(whole, 1), self.frame)])
+
     def save(self, path: Path | str) -> Path:
         """Write one HDF5 file, whole or not at all; extra ``export``."""
         with needed_by("a file of measurements"):

@@ -26,6 +26,8 @@ CONTACT_SPREAD = 0.5
 """Standard deviation of ln z_l about the mean of all electrodes, before anything is read."""
 ASSUMED_NOISE = VoltageNoise(relative=0.01, of_largest=0.001)
 """Weighs readings against each other in the fit."""
+FEWEST = 8
+"""Frames that tell the noise."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,8 +47,10 @@ class Calibration:
     noise: VoltageNoise
     """of a reading"""
     repeats: int
-    """records that tell the noise by how they differ; with one only, the noise holds all that the
-    model does not explain"""
+    """records of homogeneous fluid that tell the noise by how they differ"""
+    noise_is_told: bool
+    """whether records or frames tell the noise by how they differ; else it holds all that the model
+    does not explain"""
     measured: np.ndarray
     """(K, M) V, the mean of the repeats; NaN where nothing was read"""
     computed: np.ndarray
@@ -79,7 +83,7 @@ class Calibration:
 
 def calibrate(electrodes: CompleteElectrodeModel, currents: np.ndarray, matrix: np.ndarray,
               readings: np.ndarray, *, depth: float = 1.0, conductivity: float | None = None,
-              correction: str = "offset",
+              correction: str = "offset", noise: VoltageNoise | None = None,
               tick: Callable[[], object] = lambda: None) -> Calibration:
     """Fit σ and z_l to homogeneous fluid by Gauss–Newton in their logarithms.
 
@@ -102,6 +106,8 @@ def calibrate(electrodes: CompleteElectrodeModel, currents: np.ndarray, matrix: 
         σ in S/m if it is known.
     correction : "offset" or "gain"
         What becomes of what the model is off; see `Calibration`.
+    noise : VoltageNoise, optional
+        Of a reading, if it is known. Default: what repeats tell, or what the model leaves.
     tick : callable
         Called whenever the model has been computed.
     """
@@ -137,7 +143,9 @@ def calibrate(electrodes: CompleteElectrodeModel, currents: np.ndarray, matrix: 
         explained, _ = model(x)
         left = _noise(mean[None], mean, explained, seen, np.ones_like(count))
         weight = seen / left.std(mean)
-    noise = _noise(readings, mean, explained, seen, count)
+    told_apart = noise is not None or count.max() > 1
+    if noise is None:
+        noise = _noise(readings, mean, explained, seen, count)
     told = float(np.exp(-x[0]))                                     # σ if the gain is 1
     gain = 1.0 if conductivity is None else conductivity / told
     sigma = told if conductivity is None else conductivity
@@ -145,7 +153,7 @@ def calibrate(electrodes: CompleteElectrodeModel, currents: np.ndarray, matrix: 
     of_contacts = np.hstack([np.ones((L, 2)), np.eye(L)])           # ln z = ln ρ + mean + δ
     contact_std = np.sqrt(np.einsum("lp,pq,lq->l", of_contacts, spread, of_contacts))
     return Calibration(sigma, float(np.sqrt(spread[0, 0])), np.exp(x[1] + x[2:]) / sigma,
-                       contact_std, gain, noise, int(count.max()), np.where(seen, mean, np.nan),
+                       contact_std, gain, noise, int(count.max()), told_apart, np.where(seen, mean, np.nan),
                        explained, correction)
 
 
@@ -213,7 +221,24 @@ def _noise(readings: np.ndarray, mean: np.ndarray, computed: np.ndarray, seen: n
         told = seen
         variance = (mean - computed)[told]**2
     size = np.abs(mean[told])
-    # of large and small readings alike: variances count in parts of what they are about
+    return _of_sizes(variance, size)
+
+
+def noise_of_frames(frames: np.ndarray) -> VoltageNoise | None:
+    """What readings of successive frames (F, K, M) in V tell: third differences, in which the noise
+    remains and what changes slowly does not; None if there are fewer than `FEWEST` frames."""
+    if len(frames) < FEWEST:
+        return None
+    there = np.isfinite(frames).all(axis=0)
+    values = frames[:, there]
+    # of fast targets too: the median of squares, of which normal ones have 0.455
+    variance = np.median(np.diff(values, n=3, axis=0)**2, axis=0) / 20 / 0.455
+    return _of_sizes(variance, np.abs(values).mean(axis=0))
+
+
+def _of_sizes(variance: np.ndarray, size: np.ndarray) -> VoltageNoise:
+    """std² = (relative·V)² + floor² that is nearest to these variances of readings of these sizes,
+    the large and the small alike: variances count in parts of what they are about."""
     about = variance.mean() * (0.1 + size**2 / np.mean(size**2))
     terms = np.stack([size**2, np.ones_like(size)], axis=1) / about[:, None]
     (relative, floor), _ = nnls(terms, variance / about)

@@ -23,12 +23,12 @@ FRAMES = 3
 STARTS = {"noise": 3.0, "initial": 0.3, "walk": 0.03}
 LIMITS = {"initial": (1e-2, 1.0), "walk": (1e-4, 1.0)}
 """Standard deviations in parts of the background."""
-NOISE = {True: (1.0, 1e3), False: (1e-2, 10.0)}
+NOISE = {True: (1.0, 1e3), False: (0.1, 10.0)}
 """Factor of a noise that repeats have told, to which the model's error comes, and of one that holds
-all that the model does not explain."""
+all that the model does not explain, of which a correction leaves a tenth at least."""
 
 
-def likeliest(task: Task, record: Measurements, *, repeated: bool, initial_is_known: bool,
+def likeliest(task: Task, record: Measurements, *, noise_is_told: bool, initial_is_known: bool,
               walk_is_known: bool) -> Task:
     """The task with the noise's factor, the initial and the walk's standard deviation under which
     a linearised Kalman filter expects its first frames best: the largest marginal likelihood.
@@ -38,7 +38,7 @@ def likeliest(task: Task, record: Measurements, *, repeated: bool, initial_is_kn
     """
     free = [name for name, known in (("noise", False), ("initial", initial_is_known),
                                      ("walk", walk_is_known)) if not known]
-    limits = LIMITS | {"noise": NOISE[repeated]}
+    limits = LIMITS | {"noise": NOISE[noise_is_told]}
     surprise = _Surprise(task, record)
     given = {"noise": 1.0, "initial": task.prior.initial_std, "walk": task.prior.nodal_std}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,11 +24,13 @@ if TYPE_CHECKING:
 
 LENGTH = 1 / 8
 """Over which a target is smooth, in parts of the vessel's size."""
+MODEL_ERROR = 0.01
+"""What electrodes a millimetre off and a plane model of a tank leave; see `measured_task`."""
 
 
 def measured_task(vessel: RealVessel, calibration: Calibration, record: Measurements, *,
                   seen: np.ndarray | None = None, moves: bool = True,
-                  molar_conductivity: float = 0.01, length: float | None = None,
+                  molar_conductivity: float = 0.01, model_error: float = MODEL_ERROR, length: float | None = None,
                   initial_std: float | None = None,
                   walk_std: float | None = None) -> Task:
     """The task of a record: a target that walks at random, or stands still.
@@ -48,6 +51,9 @@ def measured_task(vessel: RealVessel, calibration: Calibration, record: Measurem
         Whether the target moves.
     molar_conductivity : float
         Λ in S·m²/mol.
+    model_error : float
+        Part of a reading by which the model is off even where it is right of homogeneous fluid;
+        comes to a noise that repeats have told.
     length : float, optional
         m over which the target is smooth. Default: an eighth of the vessel.
     initial_std : float, optional
@@ -57,6 +63,7 @@ def measured_task(vessel: RealVessel, calibration: Calibration, record: Measurem
     """
     _check.number("molar_conductivity", molar_conductivity, low=0.0, open_low=True,
                   units="S·m²/mol")
+    _check.number("model_error", model_error, low=0.0, high=1.0)
     mesh = vessel.carrier()
     if length is None:
         length = LENGTH * float(np.ptp(mesh.points, axis=0).max())
@@ -75,8 +82,11 @@ def measured_task(vessel: RealVessel, calibration: Calibration, record: Measurem
     prior = Prior(expected_concentration=background, nodal_std=walk_std or 0.0,
                   initial_std=initial_std or 0.0, initial_length=length)
     transport = RandomWalk(mesh, step, length) if moves else AtRest(mesh, step)
-    task = Task(transport, observation, calibration.noise, record.currents, T,
+    noise = calibration.noise
+    if calibration.noise_is_told:
+        noise = replace(noise, relative=float(np.hypot(noise.relative, model_error)))
+    task = Task(transport, observation, noise, record.currents, T,
                 min(frame, T - 1), 0, background, min(frame, T), prior)
-    return likeliest(task, record, repeated=calibration.repeats > 1,
+    return likeliest(task, record, noise_is_told=calibration.noise_is_told,
                      walk_is_known=not moves or walk_std is not None,
                      initial_is_known=initial_std is not None)
