@@ -7,6 +7,8 @@ heavy is loaded before something is used.
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+import gymnasium as _gym
+
 from eitbench._extras import needed_by as _needed_by
 from eitbench.worlds import ours as _ours  # noqa: F401 (registers our ids)
 from eitbench.worlds.registry import register, register_installed
@@ -45,4 +47,6 @@ def __getattr__(name: str) -> Any:
     raise AttributeError(f"module 'eitbench' has no attribute {name!r}")
 
 
+# of no world, and on no board of worlds: its record and vessel are the user's
+_gym.register("eitbench/Measured-v0", entry_point="eitbench.envs.measured:MeasuredEnv")
 register_installed()            # last, so that packages may import the public names from here

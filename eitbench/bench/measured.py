@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
+from eitbench._files import write_atomically
 from eitbench.bench.methods import load_method
 from eitbench.bench.playing import estimates
 from eitbench.estimation.measured.readings import ReadingModel
@@ -33,6 +36,18 @@ class Played:
     missed: np.ndarray
     """(T,) root mean square of the withheld readings' distance from what the estimate that they
     judge predicts, in standard deviations of the noise; NaN where nothing is judged"""
+
+    def save(self, path: Path, env: MeasuredEnv) -> None:
+        """Write what is said as npz, whole or not at all: ``mean`` and ``variance`` (T, n), ``nis``
+        and ``missed`` (T,), ``times`` (T,) in s, and the mesh's ``points`` (n, d) in m and
+        ``cells``."""
+        content = io.BytesIO()
+        variance = {} if self.variance is None else {"variance": self.variance}
+        mesh = env.task.mesh
+        np.savez_compressed(content, mean=self.mean, nis=self.nis, missed=self.missed,
+                            times=env.record.times, points=mesh.points, cells=mesh.cells,
+                            **variance)
+        write_atomically(path, content.getvalue())
 
     @property
     def withheld(self) -> float:

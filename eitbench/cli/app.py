@@ -1,6 +1,6 @@
 """The command line: `eitbench list | run | bank | export | train | policies | submit | verify |
-check | season | held-out | migrate | cards | kits | fit-prior | fit-model | leaderboard | compare |
-render | reproduce`."""
+check | season | held-out | migrate | cards | kits | fit-prior | fit-model | estimate | leaderboard |
+compare | render | reproduce`."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import typer
 
 from eitbench import __version__
 from eitbench.cli import options
+from eitbench.cli.estimate import estimate
 from eitbench.cli.export import export
 from eitbench.cli.maintain import cards, held_out, kits, migrate
 from eitbench.cli.play import policies, report, run, typed
@@ -202,6 +203,7 @@ app.command()(cards)
 app.command()(kits)
 app.command("fit-prior")(fit_prior)
 app.command("fit-model")(fit_model)
+app.command()(estimate)
 app.command()(export)
 
 

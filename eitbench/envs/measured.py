@@ -13,9 +13,10 @@ from gymnasium import spaces
 
 from eitbench import _check
 from eitbench.data.measured import Measurements, read
-from eitbench.envs.estimation import RESET_NEEDED, Observation, checked_actions
+from eitbench.envs.estimation import RESET_NEEDED, EstimationEnv, Observation, checked_actions
 from eitbench.envs.spec import KnowsItsLength
 from eitbench.estimation.measured.calibration import calibrate, noise_of_frames
+from eitbench.estimation.measured.plausible import doubts
 from eitbench.estimation.measured.readings import ReadingModel
 from eitbench.estimation.measured.record import (
     readings_there,
@@ -145,6 +146,11 @@ class MeasuredEnv(KnowsItsLength, gym.Env[Observation, np.ndarray]):  # type: ig
         return (self._observe(), reward, self._step > self.episode_steps, False,
                 {"step": self._step})
 
+    def doubts(self) -> list[str]:
+        """What is odd about the record; see `eitbench.estimation.measured.plausible.doubts`."""
+        return doubts(self.record, self.calibration,
+                      self.vessel.electrode_model(self.calibration.contact_impedance))
+
     def missed(self, t: int, estimate: np.ndarray) -> np.ndarray:
         """By how much an estimate (n,) misses the readings withheld at t = 1 … T, in standard
         deviations of their noise."""
@@ -160,3 +166,19 @@ class MeasuredEnv(KnowsItsLength, gym.Env[Observation, np.ndarray]):  # type: ig
             return {name: np.zeros(space.shape) for name, space in self.observation_space.items()}
         voltages, currents = self._shown[self._step - 1]
         return {"voltages": voltages.copy(), "currents": currents.copy()}
+
+
+def simulated_record(env: EstimationEnv, seed: int) -> Measurements:
+    """What an instrument would have written of an episode: currents and readings to the mean of
+    all electrodes, in A and V, or in A/m where the pipe is plane. The truth is no part of it."""
+    observation, _ = env.reset(seed=seed)
+    L = env.task.currents.shape[1]
+    V = np.empty((env.episode_steps - env.lag, L))
+    I = np.empty_like(V)
+    nothing = np.zeros(env.action_space.shape)
+    for t in range(len(V)):
+        V[t], I[t] = observation["voltages"], observation["currents"]
+        observation, *_ = env.step(nothing)
+    return Measurements.of_sequence(
+        I, np.eye(L), V, env.task.transport.time_step * np.arange(1, len(V) + 1),
+        source={"file": f"{env.world.name}, episode {seed}", "assumed": "simulated"})

@@ -42,6 +42,7 @@ COMMANDS = [
     (("kits", "eitbench/StationaryTank2D-v0"), ": same"),
     (("fit-prior", "--env", "eitbench/Pipe2D-v0", "--seeds", "train:0-3", "-o", "prior.json"), "prior.json: "),
     (("fit-model", "--env", "eitbench/Pipe2D-v0", "--seeds", "train:0-1", "-o", "model.npz"), "model.npz: "),
+    (("estimate", "--help"), "instrument"),
     (("migrate", "mine/results"), ""),
     (("held-out", "--help"), "salt"),
 ]

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
+from eitbench._extras import needed_by
 from eitbench.data.measured import eidors, ktc, sciospec, table
 from eitbench.data.measured.matlab import variables
 from eitbench.data.measured.measurements import Measurements
@@ -24,7 +26,8 @@ def read(path: Path | str, format: str | None = None, **how: Any) -> Measurement
     format : str, optional
         One of `READERS`; by default what the ending and the variables of the file tell.
     how
-        Arguments of the reader.
+        Arguments of the reader. Those of a table may also stand in a YAML file beside it of the
+        same name: ``electrodes: 16`` and ``current: 0.001``, a line each.
     """
     path = Path(path)
     if not path.exists():
@@ -33,7 +36,28 @@ def read(path: Path | str, format: str | None = None, **how: Any) -> Measurement
         format = _format(path)
     if format not in READERS:
         raise ValueError(f"format must be one of {', '.join(READERS)}, got {format!r}")
+    if format == "table" and not how:
+        how = _described(path.with_suffix(".yml"))
     return READERS[format](path, **how)
+
+
+def _described(path: Path) -> dict[str, Any]:
+    """Arguments that stand in a YAML file."""
+    if not path.is_file():
+        raise ValueError("a table must be described by a YAML file of entries like 'electrodes: "
+                         f"16' and 'current: 0.001' (A), there is no {path}")
+    with needed_by("a table's description"):
+        import yaml
+    try:
+        said = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ValueError(f"{path} must be a YAML file: {error}") from None
+    known = set(signature(table.read).parameters) - {"path"}
+    if not isinstance(said, dict) or not set(said) <= known:
+        raise ValueError(f"{path} must have entries of {', '.join(sorted(known))}, got {said!r}")
+    if missing := {"electrodes", "current"} - set(said):
+        raise ValueError(f"{path} must have {', '.join(sorted(missing))}")
+    return said
 
 
 def _format(path: Path) -> str:

@@ -90,3 +90,34 @@ def measured_task(vessel: RealVessel, calibration: Calibration, record: Measurem
     return likeliest(task, record, noise_is_told=calibration.noise_is_told,
                      walk_is_known=not moves or walk_std is not None,
                      initial_is_known=initial_std is not None)
+
+
+def known_flow_task(task: Task, record: Measurements, *, depth: float = 1.0,
+                    seen: np.ndarray | None = None) -> Task:
+    """The task of a record of a vessel that one of our worlds describes, with its flow and all that
+    is believed there: convection–diffusion, where the velocity is known or estimated.
+
+    ``ValueError`` if the world has another number of electrodes, or its episodes are longer than
+    the record.
+
+    Parameters
+    ----------
+    task : Task
+        Of the world; `eitbench.make_task`.
+    record : Measurements
+    depth : float
+        m of fluid where the world is plane and the record's currents are in A.
+    seen : (K, M) bool, optional
+        Readings that the estimator is shown. Default: all that are there.
+    """
+    L = task.currents.shape[1]
+    if record.currents.shape[1] != L:
+        raise ValueError(f"record must have the world's {L} electrodes, got "
+                         f"{record.currents.shape[1]}")
+    if len(record.readings) <= task.warm_up:
+        raise ValueError(f"record must have more readings than the {task.warm_up} of the first "
+                         f"estimate, got {len(record.readings)}")
+    model = ReadingModel(task.observation, record.currents, record.matrix, depth,
+                         seen=readings_there(record) if seen is None else seen)
+    return replace(task, observation=model, currents=record.currents,
+                   n_steps=len(record.readings))

@@ -1,0 +1,64 @@
+"""The command `estimate`: what methods make of a record of a real instrument."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from eitbench.cli import options
+
+
+def estimate(
+    file: Annotated[Path, typer.Argument(
+        help="Record: our HDF5, .mat of KTC2023, KIT4 or EIDORS, a folder of Sciospec's .eit, or a "
+             "table.")],
+    vessel: Annotated[Path, typer.Option(help="YAML file that describes the vessel.")],
+    baseline: Annotated[list[str], typer.Option(
+        "--baseline", help="Method, by name or path; may be repeated. The first is drawn.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Page to write.")] = Path("report.html"),
+    arrays: Annotated[Path | None, typer.Option(
+        help="File for the first method's estimates too, npz.")] = None,
+    format: Annotated[str | None, typer.Option(
+        help="hdf5, ktc, eidors, sciospec or table. Default: what the file tells.")] = None,
+    withheld: Annotated[float, typer.Option(
+        min=0.0, max=0.5, help="Part of the readings that methods are not shown and are judged "
+                               "by.")] = 0.1,
+    seed: Annotated[int, typer.Option(min=0, help="Which readings those are.")] = 0,
+    still: Annotated[bool, typer.Option("--still", help="The target does not move.")] = False,
+    correction: Annotated[str, typer.Option(
+        help="What becomes of what the model of homogeneous fluid is off: offset or gain.")]
+    = "offset",
+    homogeneous_frames: Annotated[int, typer.Option(
+        min=1, help="First frames that are homogeneous fluid, where there is no reference.")] = 1,
+) -> None:
+    """Estimate what an instrument saw in a tank or pipe: calibrates the vessel, plays methods, and
+    writes a page with the estimates, how well they predict readings that they were not shown,
+    and what is odd about the record."""
+    from eitbench.bench.measured import play_record
+    from eitbench.data.measured import read
+    from eitbench.envs.measured import MeasuredEnv
+    from eitbench.report.measured import write_report
+    with options.clear_errors():
+        if out.suffix != ".html":
+            raise ValueError(f"--out must end in .html, got {out}")
+        record = read(file, format)
+        options.say(f"{file}: {len(record.readings)} times {len(record.matrix)} readings of "
+                    f"{record.currents.shape[1]} electrodes; a method takes about "
+                    f"{10 + 0.03 * len(record.readings):.0f} s")
+        env = MeasuredEnv(record, vessel, withheld=withheld, moves=False if still else None,
+                          correction=correction, homogeneous_frames=homogeneous_frames)
+        doubts = env.doubts()
+        for doubt in doubts:
+            options.say(f"odd: {doubt}", err=True)
+        played = []
+        for name in baseline:
+            played.append(play_record(env, name, seed))
+            options.say(f"{played[-1].method}: withheld readings missed by "
+                        f"{played[-1].withheld:.2f} noise std")
+        write_report(out, env, played, record.source, doubts)
+        options.say(f"wrote {out}")
+        if arrays is not None:
+            played[0].save(arrays, env)
+            options.say(f"wrote {arrays}")

@@ -1,0 +1,167 @@
+"""Readers, on files of each format written here, and on real ones where there are some."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.io import savemat
+from tanks import instrument
+
+from eitbench.data.measured import read
+
+CURRENTS, MATRIX = instrument()
+VALUES = np.random.default_rng(0).normal(size=(8, 8))
+REAL = os.environ.get("EITBENCH_REAL_FILES")
+
+
+def test_ktc(tmp_path):
+    """Columns are injections and patterns, readings stand injection by injection, in mA and V."""
+    ours = {"Inj": 1e3 * CURRENTS.T, "Mpat": MATRIX.T}
+    savemat(tmp_path / "data1.mat", ours | {"Uel": VALUES.reshape(-1, 1)})
+    empty = {"Injref": ours["Inj"], "Mpat": ours["Mpat"], "Uelref": 2 * VALUES.reshape(-1, 1)}
+    savemat(tmp_path / "ref.mat", empty)
+    record = read(tmp_path / "data1.mat")
+    np.testing.assert_allclose(record.currents, CURRENTS, atol=1e-15)
+    np.testing.assert_array_equal(record.matrix, MATRIX)
+    np.testing.assert_array_equal(record.readings, VALUES)
+    np.testing.assert_array_equal(record.reference, 2 * VALUES[None])
+    assert len(record.source["sha256"]) == 64
+
+
+def test_kit4(tmp_path):
+    """A column of readings an injection."""
+    savemat(tmp_path / "datamat_2_1.mat", {
+        "CurrentPattern": 1e3 * CURRENTS.T, "MeasPattern": MATRIX[:5].T, "Uel": VALUES[:, :5].T})
+    record = read(tmp_path / "datamat_2_1.mat")
+    np.testing.assert_array_equal(record.readings, VALUES[:, :5])
+    assert record.reference is None
+
+
+def test_eidors(tmp_path):
+    """256 numbers a frame; those on electrodes that inject are missing."""
+    frames = np.random.default_rng(1).uniform(1, 2, (256, 3))
+    savemat(tmp_path / "tank.mat", {"v_rotate": frames, "v_reference": frames[:, :1]})
+    record = read(tmp_path / "tank.mat")
+    assert record.readings.shape == (48, 16)
+    assert np.isnan(record.readings[17, [0, 1, 2]]).all()
+    assert record.readings[17, 5] == -frames[16 + 5, 1]
+    assert record.reference.shape == (1, 16, 16)
+
+
+def eit_file(path, potentials, *, second=0.0):
+    """A frame as Sciospec's instrument writes it: peak amplitude 5 mA, neighbours."""
+    L = potentials.shape[1]
+    header = ["18", "2", path.stem, f"2025.02.12. 13:19:{second:06.3f}", "10000.0", "10000.0", "1",
+              "1", "0.005", "20.0", "0.0", "1.0", "1", "1", "1", "1",
+              "MeasurementChannels: " + ",".join(str(each) for each in range(1, L + 1)),
+              "MeasurementChannelsIndependentFromInjectionPattern: 1,2"]
+    body = []
+    for k, row in enumerate(potentials):
+        body += [f"{k + 1} {(k + 1) % L + 1}",
+                 "\t".join(f"{part!r}" for each in row
+                           for part in (float(each.real), float(each.imag)))]
+    path.write_text("\n".join(header + body) + "\n", encoding="utf-8")
+
+
+def test_sciospec(tmp_path):
+    """Real parts against their mean; frames in order."""
+    values = np.random.default_rng(2).normal(size=(3, 8, 8)) * (1 + 0.1j)
+    for f, frame in enumerate(values):
+        eit_file(tmp_path / f"setup_0000{f}.eit", frame, second=0.05 * f)
+    record = read(tmp_path)
+    np.testing.assert_allclose(record.currents, 5 * CURRENTS)
+    expected = values.real - values.real.mean(axis=2, keepdims=True)
+    np.testing.assert_allclose(record.readings, expected.reshape(-1, 8))
+    np.testing.assert_allclose(record.times[[0, 8, 16]], [0.0, 0.05, 0.1], atol=1e-6)
+    one = read(tmp_path / "setup_00001.eit")
+    np.testing.assert_allclose(one.readings, expected[1])
+
+
+def test_truncated_frame_is_named(tmp_path):
+    path = tmp_path / "setup_00001.eit"
+    eit_file(path, np.ones((8, 8)))
+    lines = path.read_text(encoding="utf-8").splitlines()
+    path.write_text("\n".join(lines[:-1]), encoding="utf-8")
+    with pytest.raises(ValueError, match=r"setup_00001\.eit must hold pairs of lines"):
+        read(path)
+    path.write_text("\n".join([*lines[:-1], lines[-1][:40]]), encoding="utf-8")
+    with pytest.raises(ValueError, match=r"line 34 must (have 16 numbers|be two electrodes)"):
+        read(path)
+    path.write_text("", encoding="utf-8")
+    with pytest.raises(ValueError, match="must begin with the header"):
+        read(path)
+
+
+def table(path, *, decimal=".", separator=","):
+    rows = [separator.join([str(k + 1), str((k + 1) % 8 + 1),
+                            *[repr(float(each)).replace(".", decimal) for each in row]])
+            for k, row in enumerate(VALUES)]
+    path.write_text("\n".join(rows), encoding="utf-8")
+
+
+def test_table(tmp_path):
+    """Of potentials in mV, described by two lines beside it, or by arguments."""
+    table(tmp_path / "readings.csv")
+    (tmp_path / "readings.yml").write_text("electrodes: 8\ncurrent: 0.001\nunit: 0.001\n",
+                                           encoding="utf-8")
+    record = read(tmp_path / "readings.csv")
+    np.testing.assert_allclose(record.currents, CURRENTS)
+    np.testing.assert_allclose(record.readings,
+                               1e-3 * (VALUES - VALUES.mean(axis=1, keepdims=True)))
+    table(tmp_path / "comma.csv", decimal=",", separator=";")
+    same = read(tmp_path / "comma.csv", electrodes=8, current=1e-3, unit=1e-3, decimal=",")
+    np.testing.assert_array_equal(same.readings, record.readings)
+
+
+@pytest.mark.parametrize(("how", "said"), [
+    ({}, r"described by a YAML file.*comma\.yml"),
+    ({"electrodes": 8, "current": 1e-3}, "line 1 must hold numbers with the decimal point '.'"),
+    ({"electrodes": 9, "current": 1e-3, "decimal": ","}, "line 1 must have 11 columns"),
+    ({"electrodes": 8, "current": -1.0, "decimal": ","}, "current must be"),
+])
+def test_tables_that_cannot_be_read(tmp_path, how, said):
+    table(tmp_path / "comma.csv", decimal=",", separator=";")
+    with pytest.raises(ValueError, match=said):
+        read(tmp_path / "comma.csv", **how)
+
+
+def test_what_is_no_record(tmp_path):
+    """Each says what it is."""
+    with pytest.raises(ValueError, match="there is none"):
+        read(tmp_path / "none.mat")
+    newer = tmp_path / "newer.mat"
+    newer.write_bytes(b"MATLAB 7.3 MAT-file, Platform: GLNXA64" + bytes(500))
+    with pytest.raises(ValueError, match=r"version 7\.3; save it with `-v7`"):
+        read(newer)
+    whole = tmp_path / "whole.mat"
+    savemat(whole, {"Inj": CURRENTS.T, "Mpat": MATRIX.T, "Uel": VALUES})
+    cut = tmp_path / "cut.mat"
+    cut.write_bytes(whole.read_bytes()[:300])
+    with pytest.raises(ValueError, match=r"cut\.mat must"):
+        read(cut)
+    empty = tmp_path / "empty.mat"
+    empty.write_bytes(b"")
+    with pytest.raises(ValueError, match=r"empty\.mat must"):
+        read(empty)
+    other = tmp_path / "other.mat"
+    savemat(other, {"Inj": CURRENTS.T, "Uel": VALUES})
+    with pytest.raises(ValueError, match="must hold Mpat; there are"):
+        read(other)
+    with pytest.raises(ValueError, match="must end in"):
+        (tmp_path / "a.jpg").write_bytes(b"x")
+        read(tmp_path / "a.jpg")
+    with pytest.raises(ValueError, match="format must be one of"):
+        read(whole, "excel")
+
+
+@pytest.mark.skipif(not REAL, reason="EITBENCH_REAL_FILES names no folder of real files")
+@pytest.mark.parametrize(("path", "shape"), [
+    ("ktc/TrainingData/data1.mat", (76, 31)), ("eidors/iirc_data_2006.mat", (1600, 16)),
+    ("eidors/montreal_data_1995.mat", (1584, 16)),
+    ("sciospec/WaterTankData/20250212 13.19.50/setup", (4080, 16)),
+    ("sciospec/WaterTankData/20250212 13.21.48/setup", (4736, 16))])
+def test_real_files(path, shape):
+    """See docs/measured-data.md on where they are found."""
+    record = read(Path(REAL) / path)
+    assert record.readings.shape == shape
