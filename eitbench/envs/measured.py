@@ -148,8 +148,7 @@ class MeasuredEnv(KnowsItsLength, gym.Env[Observation, np.ndarray]):  # type: ig
 
     def doubts(self) -> list[str]:
         """What is odd about the record; see `eitbench.estimation.measured.plausible.doubts`."""
-        return doubts(self.record, self.calibration,
-                      self.vessel.electrode_model(self.calibration.contact_impedance))
+        return doubts(self.record, self.calibration, self.vessel.electrode_model(FIRST_GUESS))
 
     def missed(self, t: int, estimate: np.ndarray) -> np.ndarray:
         """By how much an estimate (n,) misses the readings withheld at t = 1 … T, in standard

@@ -26,7 +26,7 @@ def homogeneous(noise=0.0, records=1, seed=0):
 
 
 def moving(frames=6, noise=1e-3, seed=1, records=3):
-    """A record of a body that conducts a third, on its way round the tank once in ``frames``."""
+    """A record of a body that conducts a third, on its way half round the tank."""
     currents, matrix = instrument()
     model = RoundTank(radius=0.1, n_electrodes=8, electrode_cover=0.4).electrode_model(True)
     model = model.with_contacts(CONTACTS)
@@ -42,7 +42,7 @@ def moving(frames=6, noise=1e-3, seed=1, records=3):
 
 def angle(t, steps):
     """Where the body is, in rad."""
-    return 2.0 * np.pi * t / steps
+    return np.pi * t / steps
 
 
 def conductivity(points, angle):

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 
 KEPT = 1e-3
 """Modes that hold less than this part of the strongest one's variance are left out."""
-FRAMES = 3
+SPANS, FRAMES = 3, 2
+"""So many times so many frames one after another are looked at, evenly over the record."""
 STARTS = {"noise": 3.0, "initial": 0.3, "walk": 0.03}
 LIMITS = {"initial": (1e-2, 1.0), "walk": (1e-4, 1.0)}
 """Standard deviations in parts of the background."""
@@ -31,7 +32,7 @@ all that the model does not explain, of which a correction leaves a tenth at lea
 def likeliest(task: Task, record: Measurements, *, noise_is_told: bool, initial_is_known: bool,
               walk_is_known: bool) -> Task:
     """The task with the noise's factor, the initial and the walk's standard deviation under which
-    a linearised Kalman filter expects its first frames best: the largest marginal likelihood.
+    a linearised Kalman filter expects some frames best: the largest marginal likelihood.
 
     The filter works on the modes of the smoothness prior, which the initial state and each step of
     the walk share.
@@ -58,10 +59,15 @@ def likeliest(task: Task, record: Measurements, *, noise_is_told: bool, initial_
 
 
 class _Surprise:
-    """−2 ln of how likely the first frames are, but for a constant."""
+    """−2 ln of how likely some frames are, but for a constant."""
 
     def __init__(self, task: Task, record: Measurements) -> None:
-        many = min(FRAMES * task.calibration, task.n_steps)
+        frames = FRAMES * task.calibration
+        begins = np.linspace(0, max(task.n_steps - frames, 0), SPANS).round().astype(int)
+        looked_at = np.unique(np.minimum(begins[:, None] + np.arange(frames), task.n_steps - 1))
+        self._steps = np.diff(looked_at, prepend=-1)
+        """from one to the next"""
+        shown = shown_record(task, record)
         background = task.expected_concentration
         covariance = smoothness_covariance(mass_matrix(task.mesh), stiffness_matrix(task.mesh),
                                            task.prior.initial_length, background)
@@ -71,7 +77,7 @@ class _Surprise:
         point = np.full(task.mesh.n_nodes, background)
         linear = LinearisedObservations(task.observation, task.noise, point)
         self._shown = []
-        for voltages, currents in shown_record(task, record)[:many]:
+        for voltages, currents in (shown[t] for t in looked_at):
             H, value, variance = linear(voltages, currents)
             seen = H.any(axis=1)
             self._shown.append(((H[seen] @ modes), (value - H @ point)[seen], variance[seen]))
@@ -81,8 +87,8 @@ class _Surprise:
         mean = np.zeros(size)
         P = initial**2 * np.eye(size)
         total = 0.0
-        for H, value, variance in self._shown:
-            P[np.diag_indices(size)] += walk**2
+        for steps, (H, value, variance) in zip(self._steps, self._shown, strict=True):
+            P[np.diag_indices(size)] += steps * walk**2
             cross = P @ H.T
             S = H @ cross + np.diag(noise**2 * variance)
             innovation = value - H @ mean

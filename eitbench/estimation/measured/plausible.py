@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from eitbench.estimation.measured.calibration import CONTACT_LEVEL, lengths
+
 if TYPE_CHECKING:
     from eitbench.data.measured import Measurements
     from eitbench.estimation.measured.calibration import Calibration
@@ -41,7 +43,7 @@ def doubts(record: Measurements, calibration: Calibration,
     calibration : Calibration
         Of the record.
     electrodes : CompleteElectrodeModel
-        Of the vessel, with the contact impedances that were calibrated.
+        Of the vessel.
     """
     return [*_of_units(record, calibration), *_of_reciprocity(record, calibration),
             *_of_order(record, calibration, electrodes), *_of_electrodes(record, calibration)]
@@ -96,12 +98,24 @@ def _of_order(record: Measurements, calibration: Calibration,
               electrodes: CompleteElectrodeModel) -> list[str]:
     """Orders of the electrodes that readings are numbered by, while injections keep theirs; and of
     both, two swapped."""
-    missed = _missed(calibration.measured, calibration.computed)
-    if missed <= EXPLAINED:
-        return []
     L = record.currents.shape[1]
-    R = electrodes.transfer_resistance(np.ones(electrodes.mesh.n_nodes))
+    usual = electrodes.with_contacts(CONTACT_LEVEL * lengths(electrodes).mean())
+    R = usual.transfer_resistance(np.ones(usual.mesh.n_nodes))
     numbers = np.arange(L)
+
+    def missed(injects: np.ndarray, reads: np.ndarray) -> float:
+        """Part of the readings off the injecting electrodes that this order misses."""
+        currents, matrix = record.currents[:, injects], record.matrix[:, reads]
+        driven = np.abs(currents) @ np.abs(matrix).T > 0.0
+        there = np.isfinite(calibration.measured)
+        if (there & ~driven).any():
+            there &= ~driven
+        y, x = calibration.measured[there], (currents @ R @ matrix.T)[there]
+        return float(np.linalg.norm(y - (x @ y) / (x @ x) * x) / np.linalg.norm(y))
+
+    described = missed(numbers, numbers)
+    if described <= EXPLAINED:
+        return []
     orders = [("Readings count electrodes the other way round than injections", numbers,
                (first - numbers) % L) for first in range(L)]
     orders += [(f"Readings count electrodes from {turn} further than injections", numbers,
@@ -110,23 +124,13 @@ def _of_order(record: Measurements, calibration: Calibration,
         swapped = numbers.copy()
         swapped[[a, b]] = b, a
         orders.append((f"Electrodes {a + 1} and {b + 1} are swapped", swapped, swapped))
-    fits = [_missed(calibration.measured,
-                    record.currents[:, injects] @ R @ record.matrix[:, reads].T)
-            for _, injects, reads in orders]
+    fits = [missed(injects, reads) for _, injects, reads in orders]
     best = int(np.argmin(fits))
-    if fits[best] > BETTER * missed:
-        return [f"The model of homogeneous fluid misses {100 * missed:.2g} % of the readings: the "
-                "vessel, the electrodes' order or the units are not as described."]
+    if fits[best] > BETTER * described:
+        return [f"The model of homogeneous fluid misses {100 * described:.2g} % of the readings: "
+                "the vessel, the electrodes' order or the units are not as described."]
     return [f"{orders[best][0]}, it seems: so the model of homogeneous fluid misses "
-            f"{100 * fits[best]:.2g} % of the readings, as described {100 * missed:.2g} %."]
-
-
-def _missed(measured: np.ndarray, computed: np.ndarray) -> float:
-    """Part of the readings that the model misses at its best scale."""
-    there = np.isfinite(measured)
-    y, x = measured[there], computed[there]
-    scale = (x @ y) / (x @ x)
-    return float(np.linalg.norm(y - scale * x) / np.linalg.norm(y))
+            f"{100 * fits[best]:.2g} % of the readings, as described {100 * described:.2g} %."]
 
 
 def _of_electrodes(record: Measurements, calibration: Calibration) -> list[str]:
