@@ -1,4 +1,5 @@
-"""Extended Kalman filter of the logarithm of the concentration, for a target that walks at random.
+"""Extended Kalman filter of the logarithm of the concentration, for a target that stands still or
+walks at random.
 
 For records of real instruments, where nobody knows how a target moves, and bodies conduct many
 times better or worse than what is around them: nothing falls below zero. The logarithm walks and
@@ -10,6 +11,7 @@ import numpy as np
 from eitbench import Estimate, Task
 from eitbench.estimation import Filtered, FilterStep, FirstFrame, Observation, starting_filter
 from eitbench.estimation.walk import RandomWalk
+from eitbench.physics.rest import AtRest
 
 
 class Estimator:
@@ -21,7 +23,7 @@ class Estimator:
 
     @staticmethod
     def suits(task: Task) -> bool:
-        return isinstance(task.transport, RandomWalk)
+        return isinstance(task.transport, AtRest | RandomWalk)
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate:
         if not self.first.complete:

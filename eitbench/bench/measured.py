@@ -6,7 +6,7 @@ import io
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -16,6 +16,7 @@ from eitbench._files import write_atomically
 from eitbench.bench.methods import load_method
 from eitbench.bench.playing import estimates
 from eitbench.estimation.measured.readings import ReadingModel
+from eitbench.physics.rest import AtRest
 
 if TYPE_CHECKING:
     from eitbench.envs.measured import MeasuredEnv
@@ -42,11 +43,13 @@ class Played:
         and ``missed`` (T,), ``times`` (T,) in s, and the mesh's ``points`` (n, d) in m and
         ``cells``."""
         content = io.BytesIO()
-        variance = {} if self.variance is None else {"variance": self.variance}
         mesh = env.task.mesh
-        np.savez_compressed(content, mean=self.mean, nis=self.nis, missed=self.missed,
-                            times=env.record.times, points=mesh.points, cells=mesh.cells,
-                            **variance)
+        said: dict[str, Any] = {
+            "mean": self.mean, "nis": self.nis, "missed": self.missed, "times": env.record.times,
+            "points": mesh.points, "cells": mesh.cells}
+        if self.variance is not None:
+            said["variance"] = self.variance
+        np.savez_compressed(content, **said)
         write_atomically(path, content.getvalue())
 
     @property
@@ -61,6 +64,10 @@ def play_record(env: MeasuredEnv, method: str, seed: int = 0) -> Played:
     ``seed`` draws the readings that are withheld.
     """
     loaded = load_method(method, "estimation")
+    if not loaded.suits(env.task):
+        moves = "stands still" if isinstance(env.task.transport, AtRest) else "walks at random"
+        raise ValueError(f"method must suit a record of which the target {moves}, got "
+                         f"{loaded.name}")
     with threadpool_limits(1):
         said = [estimate for _, estimate in _shown(env, estimates(env, loaded, seed), loaded.name)]
     T = len(said)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -21,6 +21,9 @@ from eitbench.worlds.registry import entry
 from eitbench.worlds.streams import in_state, randomness
 from eitbench.worlds.task import Estimate, Task
 from eitbench.worlds.world import World
+
+if TYPE_CHECKING:
+    from eitbench.envs.measured import MeasuredEnv
 
 
 class Episode(NamedTuple):
@@ -114,7 +117,8 @@ def injections(env: InjectionEnv, policy: Method, seed: int,
         begin = time.perf_counter()
 
 
-def estimates(env: EstimationEnv, estimator: Method, seed: int) -> Iterator[tuple[int, Estimate]]:
+def estimates(env: EstimationEnv | MeasuredEnv, estimator: Method,
+              seed: int) -> Iterator[tuple[int, Estimate]]:
     """(t, estimate of the state t ≥ 1) in one episode. The estimator sees the task and the
     measurements; rewards and the environment itself stay here."""
     for t, estimate, _, _ in _estimates(env, estimator, seed):
@@ -122,12 +126,15 @@ def estimates(env: EstimationEnv, estimator: Method, seed: int) -> Iterator[tupl
             yield t, estimate
 
 
-def _estimates(env: EstimationEnv, estimator: Method, seed: int,
+def _estimates(env: EstimationEnv | MeasuredEnv, estimator: Method, seed: int,
                ) -> Iterator[tuple[int, Estimate | None, dict[str, np.ndarray], float]]:
     """(t = i − lag, estimate, measurement i, seconds the estimator took) at each step i."""
     with for_scores():
         observation, _ = env.reset(seed=seed)
-    shown = (env.task, env.reveal()) if estimator.privileged else (env.task,)
+    if estimator.privileged and not isinstance(env, EstimationEnv):
+        raise ValueError(f"{estimator.name} is told the truth, which nobody knows of a record")
+    shown = (env.task, env.reveal()) if isinstance(env, EstimationEnv) and estimator.privileged \
+        else (env.task,)
     begin = time.perf_counter()
     player = estimator.make(*shown)
     setup = time.perf_counter() - begin

@@ -1,6 +1,6 @@
 """The command line: `eitbench list | run | bank | export | train | policies | submit | verify |
-check | season | held-out | migrate | cards | kits | fit-prior | fit-model | estimate | leaderboard |
-compare | render | reproduce`."""
+check | season | held-out | migrate | cards | kits | fit-prior | fit-model | estimate |
+leaderboard | compare | render | reproduce`."""
 
 from __future__ import annotations
 

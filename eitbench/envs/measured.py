@@ -97,11 +97,11 @@ class MeasuredEnv(KnowsItsLength, gym.Env[Observation, np.ndarray]):  # type: ig
         voltage = 100.0 * float(np.nanmax(np.abs(record.readings)))
         current = float(np.abs(record.currents).max())
         M, L = record.matrix.shape
-        self.observation_space = spaces.Dict({
+        self.observation_space: spaces.Dict = spaces.Dict({  # type: ignore[assignment]
             "voltages": spaces.Box(-voltage, voltage, (M,), np.float64),
             "currents": spaces.Box(-current, current, (L,), np.float64)})
         limit = np.full(n, 1e4 * self.task.expected_concentration)
-        self.action_space = spaces.Box(-limit, limit, dtype=np.float64)
+        self.action_space: spaces.Box = spaces.Box(-limit, limit, dtype=np.float64)
         self._step = 0
 
     def _make_task(self, seed: int) -> Task:
@@ -162,7 +162,8 @@ class MeasuredEnv(KnowsItsLength, gym.Env[Observation, np.ndarray]):  # type: ig
 
     def _observe(self) -> Observation:
         if self._step > self.episode_steps:
-            return {name: np.zeros(space.shape) for name, space in self.observation_space.items()}
+            return {name: np.zeros_like(space.low)  # type: ignore[attr-defined]
+                    for name, space in self.observation_space.items()}
         voltages, currents = self._shown[self._step - 1]
         return {"voltages": voltages.copy(), "currents": currents.copy()}
 
@@ -174,7 +175,7 @@ def simulated_record(env: EstimationEnv, seed: int) -> Measurements:
     L = env.task.currents.shape[1]
     V = np.empty((env.episode_steps - env.lag, L))
     I = np.empty_like(V)
-    nothing = np.zeros(env.action_space.shape)
+    nothing = np.zeros_like(env.action_space.low)  # type: ignore[attr-defined]
     for t in range(len(V)):
         V[t], I[t] = observation["voltages"], observation["currents"]
         observation, *_ = env.step(nothing)

@@ -117,15 +117,17 @@ def _estimate(env: MeasuredEnv, played: Played) -> str:
 def _picture(env: MeasuredEnv, played: Played, t: int) -> Figure:
     """Estimate and its standard deviation at t."""
     task = env.task
-    conducts = 1e3 * task.observation.observation.conductivity.molar_conductivity
+    conducts = 1e3 * env.calibration.conductivity / task.expected_concentration
     shown = conducts * played.mean[min(task.warm_up, len(played.mean) - 1):]
     low, high = np.quantile(shown, SHARE)
     field = conducts * played.mean[t - 1]
     in_decades = shown.min() > 0.0 and high > DECADES * low
     if in_decades:
         field, low, high = (np.log10(each) for each in (field, low, high))
-    spread = None if played.variance is None else conducts * np.sqrt(played.variance[t - 1])
-    panels = 1 if spread is None or not np.isfinite(spread).all() else 2
+    spread = np.full(1, np.nan)
+    if played.variance is not None:
+        spread = conducts * np.sqrt(played.variance[t - 1])
+    panels = 2 if np.isfinite(spread).all() else 1
     figure = Figure(figsize=(5.2 * panels, 4.4), dpi=100, layout="constrained")
     axes = figure.subplots(1, panels, squeeze=False)[0]
     k = env.record.injections[t - 1]

@@ -25,7 +25,8 @@ from tiny import git_says
 ROOT = Path(__file__).parents[2]
 PIPE, INJECTION = "eitbench/Pipe2D-v0", "eitbench/Pipe2DInjection-v0"
 COMMANDS = ("list", "run", "bank", "train", "policies", "submit", "verify", "held-out", "migrate", "cards", "kits",
-            "fit-prior", "fit-model", "estimate", "export", "leaderboard", "compare", "render", "reproduce", "check", "season")
+            "fit-prior", "fit-model", "estimate", "export", "leaderboard", "compare", "render", "reproduce", "check",
+            "season")
 TINY = {"flow": {"mean_velocity": 45.0}, "schedule": {"scored_steps": 3, "pattern": {"frame": 2}},
         "vessel": {"electrodes_per_wall": 2}}
 """A fast fluid flushes the pipe in two steps: an episode of five takes a third of a second."""
@@ -254,7 +255,7 @@ def test_an_episode_is_drawn_as_isolated_as_asked(given, isolate, monkeypatch):
 
 def test_a_missing_extra_is_named(monkeypatch, tmp_path):
     """Without what training needs, exit code 1 and the name of what to install."""
-    monkeypatch.setitem(sys.modules, "yaml", None)
+    monkeypatch.setitem(sys.modules, "stable_baselines3", None)
     code, said, complaint = eitbench("train", "--env", INJECTION)
     assert code == 1 and said == "" and "needs the extra rl, pip install 'eitbench[rl]'" in complaint
     assert not (tmp_path / "results").exists()

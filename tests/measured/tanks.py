@@ -1,7 +1,6 @@
 """Records that a simulated instrument took of a round tank, on a mesh of its own."""
 
 import numpy as np
-
 from eitbench.data.measured import Measurements
 from eitbench.worlds.vessels import RoundTank
 

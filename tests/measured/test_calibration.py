@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
-from tanks import CONTACTS, SIGMA, VESSEL, homogeneous, instrument, moving
-
 from eitbench.data.measured import Measurements
 from eitbench.estimation.measured.calibration import calibrate, noise_of_frames
 from eitbench.estimation.measured.plausible import doubts
 from eitbench.estimation.measured.vessel import read_vessel
+from tanks import CONTACTS, SIGMA, VESSEL, homogeneous, instrument, moving
 
 CURRENTS, MATRIX = instrument()
 VESSEL_HERE = read_vessel(VESSEL)

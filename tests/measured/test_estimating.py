@@ -3,9 +3,6 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from tanks import VESSEL, angle, moving
-from typer.testing import CliRunner
-
 from eitbench.bench.measured import play_record
 from eitbench.bench.methods import load_method
 from eitbench.cli.app import app
@@ -14,6 +11,8 @@ from eitbench.envs.measured import MeasuredEnv, simulated_record
 from eitbench.estimation.measured.readings import ReadingModel
 from eitbench.estimation.measured.task import known_flow_task
 from eitbench.estimation.walk import RandomWalk
+from tanks import VESSEL, angle, moving
+from typer.testing import CliRunner
 
 BELIEVED = {"initial_std": 0.2, "walk_std": 0.05}
 """Told, where the choice of these is not what is tested: it takes time."""

@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
-from tanks import moving
-
 from eitbench.data.measured import Measurements
+from tanks import moving
 
 PAIR = np.array([[1.0, -1.0, 0.0], [0.0, 1.0, -1.0]])
 

@@ -5,10 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from eitbench.data.measured import read
 from scipy.io import savemat
 from tanks import instrument
-
-from eitbench.data.measured import read
 
 CURRENTS, MATRIX = instrument()
 VALUES = np.random.default_rng(0).normal(size=(8, 8))

@@ -153,8 +153,8 @@ def calibrate(electrodes: CompleteElectrodeModel, currents: np.ndarray, matrix: 
     of_contacts = np.hstack([np.ones((L, 2)), np.eye(L)])           # ln z = ln ρ + mean + δ
     contact_std = np.sqrt(np.einsum("lp,pq,lq->l", of_contacts, spread, of_contacts))
     return Calibration(sigma, float(np.sqrt(spread[0, 0])), np.exp(x[1] + x[2:]) / sigma,
-                       contact_std, gain, noise, int(count.max()), told_apart, np.where(seen, mean, np.nan),
-                       explained, correction)
+                       contact_std, gain, noise, int(count.max()), told_apart,
+                       np.where(seen, mean, np.nan), explained, correction)
 
 
 class _Homogeneous:

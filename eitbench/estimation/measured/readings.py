@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class ReadingModel:
-    """Readings factor · D U(c) + offset of potentials U = 𝓡(c) I; an `eitbench.physics` `VoltageModel`.
+    """Readings factor · D U(c) + offset of potentials U = 𝓡(c) I; a `VoltageModel`.
 
     What an instrument did not read, or what nobody is to see, is a reading that is 0 whatever the
     concentration: it leaves an innovation of 0 and a derivative of 0, so that a Kalman filter or a

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -30,8 +30,8 @@ MODEL_ERROR = 0.01
 
 def measured_task(vessel: RealVessel, calibration: Calibration, record: Measurements, *,
                   seen: np.ndarray | None = None, moves: bool = True,
-                  molar_conductivity: float = 0.01, model_error: float = MODEL_ERROR, length: float | None = None,
-                  initial_std: float | None = None,
+                  molar_conductivity: float = 0.01, model_error: float = MODEL_ERROR,
+                  length: float | None = None, initial_std: float | None = None,
                   walk_std: float | None = None) -> Task:
     """The task of a record: a target that walks at random, or stands still.
 
@@ -53,7 +53,8 @@ def measured_task(vessel: RealVessel, calibration: Calibration, record: Measurem
         Λ in S·m²/mol.
     model_error : float
         Part of a reading by which the model is off even where it is right of homogeneous fluid;
-        comes to a noise that repeats have told.
+        comes to a noise that repeats have told, where a target moves: a walk takes the model's
+        error for movement.
     length : float, optional
         m over which the target is smooth. Default: an eighth of the vessel.
     initial_std : float, optional
@@ -69,7 +70,7 @@ def measured_task(vessel: RealVessel, calibration: Calibration, record: Measurem
         length = LENGTH * float(np.ptp(mesh.points, axis=0).max())
     cem = vessel.electrode_model(calibration.contact_impedance)
     background = calibration.conductivity / molar_conductivity
-    observation = ReadingModel(
+    observation: Any = ReadingModel(                    # estimators ask for a `VoltageModel` only
         ObservationModel(cem, mesh.interpolation_to(cem.mesh.points),
                          LinearConductivity(molar_conductivity), 1e-3 * background),
         record.currents, calibration.gain * record.matrix, vessel.depth,
@@ -83,7 +84,7 @@ def measured_task(vessel: RealVessel, calibration: Calibration, record: Measurem
                   initial_std=initial_std or 0.0, initial_length=length)
     transport = RandomWalk(mesh, step, length) if moves else AtRest(mesh, step)
     noise = calibration.noise
-    if calibration.noise_is_told:
+    if calibration.noise_is_told and moves:
         noise = replace(noise, relative=float(np.hypot(noise.relative, model_error)))
     task = Task(transport, observation, noise, record.currents, T,
                 min(frame, T - 1), 0, background, min(frame, T), prior)
@@ -117,7 +118,7 @@ def known_flow_task(task: Task, record: Measurements, *, depth: float = 1.0,
     if len(record.readings) <= task.warm_up:
         raise ValueError(f"record must have more readings than the {task.warm_up} of the first "
                          f"estimate, got {len(record.readings)}")
-    model = ReadingModel(task.observation, record.currents, record.matrix, depth,
+    model: Any = ReadingModel(task.observation, record.currents, record.matrix, depth,
                          seen=readings_there(record) if seen is None else seen)
     return replace(task, observation=model, currents=record.currents,
                    n_steps=len(record.readings))
