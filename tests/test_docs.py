@@ -62,4 +62,4 @@ def snippets(page: Path) -> list[str]:
 
 def test_an_estimator_reads_voltages_of_ones_own():
     """The page on measured data: the level of a homogeneous vessel comes out of its voltages."""
-    assert printed(snippets(ROOT / "docs" / "measured-data.md")[0]) == "28.00 mol/m³"
+    assert printed(snippets(ROOT / "docs" / "measured-data.md")[1]) == "28.00 mol/m³"
