@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from eitbench.estimation.covariance import FreeCovariance
-from eitbench.estimation.dense import DenseKalmanFilter
+from eitbench.estimation.dense import DenseKalmanFilter, Transition
 from eitbench.estimation.kalman import KalmanFilter
 from eitbench.estimation.smoothness import smoothness_covariance
 from eitbench.estimation.walk import RandomWalk
@@ -43,7 +43,7 @@ def starting_filter(transport: Transport, prior: Prior,
     noise: np.ndarray | None
     if isinstance(transport, RandomWalk):
         noise = (c_bh * prior.nodal_std)**2 * transport.covariance
-        return ClosedVesselFilter(mean, c_bh**2 * initial, None, noise)
+        return ClosedVesselFilter(mean, c_bh**2 * initial, transport.step, noise)
     if isinstance(transport, AtRest):
         walk = (c_bh * prior.nodal_std)**2
         noise = walk * np.eye(len(mean)) if walk else None
@@ -74,7 +74,7 @@ def table_5_1(transport: Transport, prior: Prior, c_bh: float, *,
 class ClosedVesselFilter(DenseKalmanFilter):
     """The Kalman filter of c⁺ = F c + w where nothing enters; at rest without F and Γ_w."""
 
-    def __init__(self, mean: np.ndarray, covariance: np.ndarray, transition: np.ndarray | None,
+    def __init__(self, mean: np.ndarray, covariance: np.ndarray, transition: Transition | None,
                  noise: np.ndarray | None) -> None:
         super().__init__(mean, covariance)
         self._transition = transition
@@ -85,7 +85,11 @@ class ClosedVesselFilter(DenseKalmanFilter):
     @property
     def transition(self) -> np.ndarray:
         """(n, n) F."""
-        return np.eye(len(self.mean)) if self._transition is None else self._transition
+        if self._transition is None:
+            return np.eye(len(self.mean))
+        if callable(self._transition):
+            return self._transition(np.eye(len(self.mean)))
+        return self._transition
 
     def predict(self) -> None:  # type: ignore[override]
         """Move one time step on."""

@@ -1,4 +1,4 @@
-"""A target of which nobody knows how it moves: each state is the one before, and a little."""
+"""A target of which nobody knows how it moves: each state is much like the one before."""
 
 from __future__ import annotations
 
@@ -17,7 +17,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class RandomWalk:
-    """A `Transport` with c⁺ = c + e, where e is smooth over ``length``: a Matérn field."""
+    """A `Transport` with c⁺ = φ c + (1 − φ) c̄ + e, where c̄ is the mean over the vessel and e smooth
+    over ``length``: a Matérn field.
+
+    With φ < 1 what was there is forgotten, and the variance has a limit: std(e)²/(1 − φ²).
+    """
 
     mesh: Mesh
     """where the concentration lives"""
@@ -25,6 +29,8 @@ class RandomWalk:
     """s between two readings"""
     length: float
     """ℓ in m, > 0, over which what changes is alike; see `smoothness_covariance`"""
+    memory: float = 1.0
+    """φ, from 0 to 1"""
 
     @property
     def inlet(self) -> np.ndarray:
@@ -33,8 +39,16 @@ class RandomWalk:
 
     def step(self, c: np.ndarray, inflow_before: np.ndarray | float = 0.0,
              inflow_after: np.ndarray | float = 0.0) -> np.ndarray:
-        """The same concentration; there is no inlet for an inflow to enter by."""
-        return np.array(c, dtype=float)
+        """φ c + (1 − φ) c̄ for c (n,) or (n, k); there is no inlet for an inflow to enter by."""
+        mean = (1.0 - self.memory) * (self._shares @ c)
+        return self.memory * np.asarray(c, dtype=float) + mean
+
+    @cached_property
+    def _shares(self) -> np.ndarray:
+        """(n,) of the nodes in the mean over the vessel."""
+        from eitbench.numerics.fem import mass_matrix
+        shares = np.asarray(mass_matrix(self.mesh).sum(axis=0)).ravel()
+        return shares / shares.sum()
 
     @cached_property
     def covariance(self) -> np.ndarray:
@@ -45,7 +59,7 @@ class RandomWalk:
                                      self.length, 1.0)
 
     def evolution_model(self) -> EvolutionModel:
-        """F = I without any inlet; H Hᵀ is `covariance`."""
+        """F without any inlet; H Hᵀ is `covariance`."""
         from eitbench.physics.transport import EvolutionModel
         F, Y = self.transition()
         return EvolutionModel(F, Y, np.linalg.cholesky(self.covariance))
@@ -53,4 +67,4 @@ class RandomWalk:
     def transition(self) -> tuple[np.ndarray, np.ndarray]:
         """F and Y of `evolution_model`."""
         n = self.mesh.n_nodes
-        return np.eye(n), np.zeros((n, 0))
+        return self.step(np.eye(n)), np.zeros((n, 0))

@@ -11,6 +11,7 @@ from eitbench.envs.measured import MeasuredEnv, simulated_record
 from eitbench.estimation.measured.readings import ReadingModel
 from eitbench.estimation.measured.task import known_flow_task
 from eitbench.estimation.walk import RandomWalk
+from eitbench.numerics.fem import mass_matrix
 from tanks import VESSEL, angle, moving
 from typer.testing import CliRunner
 
@@ -140,13 +141,21 @@ def test_slopes_are_those_of_finite_differences(env, record):
                                atol=1e-7 * np.abs(J[0] @ way).max())
 
 
-def test_a_walk_keeps_what_there_is_and_spreads(env):
-    """F is the identity; H Hᵀ is smooth, of mean variance 1."""
+def test_a_walk_forgets_all_but_what_there_is_in_all(env):
+    """Homogeneous fluid stays, amounts are conserved, the rest decays by φ; H Hᵀ is smooth, of mean
+    variance 1, and of such a size that the variance stays that of the initial state."""
     walk = env.task.transport
     assert isinstance(walk, RandomWalk)
     model = walk.evolution_model()
-    c = np.arange(env.task.mesh.n_nodes, dtype=float)
-    np.testing.assert_array_equal(walk.step(c), c)
+    n = env.task.mesh.n_nodes
+    c = np.arange(n, dtype=float)
+    np.testing.assert_allclose(model.F @ np.ones(n), np.ones(n))
+    np.testing.assert_allclose(model.F @ c, walk.step(c))
+    shares = mass_matrix(env.task.mesh).sum(axis=0)
+    assert shares @ walk.step(c) == pytest.approx(shares @ c)
+    np.testing.assert_allclose(np.diff(walk.step(c)), walk.memory * np.diff(c))
+    prior = env.task.prior
+    assert prior.nodal_std**2 / (1 - walk.memory**2) == pytest.approx(prior.initial_std**2)
     covariance = model.H @ model.H.T
     np.testing.assert_allclose(covariance, walk.covariance, atol=1e-8)
     assert np.diag(covariance).mean() == pytest.approx(1.0, rel=0.05)

@@ -55,7 +55,13 @@ def likeliest(task: Task, record: Measurements, *, noise_is_told: bool, initial_
     return replace(
         task, noise=replace(noise, relative=factor * noise.relative,
                             of_largest=factor * noise.of_largest, floor=factor * noise.floor),
-        prior=replace(task.prior, initial_std=best["initial"], nodal_std=best["walk"]))
+        prior=replace(task.prior, initial_std=best["initial"],
+                      nodal_std=min(best["walk"], best["initial"])))
+
+
+def remembered(initial: float, walk: float) -> float:
+    """φ with which a walk of this standard deviation keeps the variance of the initial state."""
+    return float(np.sqrt(max(1.0 - (walk / initial)**2, 0.0)))
 
 
 class _Surprise:
@@ -87,8 +93,12 @@ class _Surprise:
         mean = np.zeros(size)
         P = initial**2 * np.eye(size)
         total = 0.0
+        memory = remembered(initial, walk)
         for steps, (H, value, variance) in zip(self._steps, self._shown, strict=True):
-            P[np.diag_indices(size)] += steps * walk**2
+            kept = memory**steps
+            mean *= kept
+            P *= kept**2
+            P[np.diag_indices(size)] += (1.0 - kept**2) * initial**2
             cross = P @ H.T
             S = H @ cross + np.diag(noise**2 * variance)
             innovation = value - H @ mean

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from eitbench import _check
-from eitbench.estimation.measured.evidence import likeliest
+from eitbench.estimation.measured.evidence import likeliest, remembered
 from eitbench.estimation.measured.readings import ReadingModel
 from eitbench.estimation.measured.record import readings_there
 from eitbench.estimation.walk import RandomWalk
@@ -88,9 +88,13 @@ def measured_task(vessel: RealVessel, calibration: Calibration, record: Measurem
         noise = replace(noise, relative=float(np.hypot(noise.relative, model_error)))
     task = Task(transport, observation, noise, record.currents, T,
                 min(frame, T - 1), 0, background, min(frame, T), prior)
-    return likeliest(task, record, noise_is_told=calibration.noise_is_told,
-                     walk_is_known=not moves or walk_std is not None,
-                     initial_is_known=initial_std is not None)
+    found = likeliest(task, record, noise_is_told=calibration.noise_is_told,
+                      walk_is_known=not moves or walk_std is not None,
+                      initial_is_known=initial_std is not None)
+    if not moves:
+        return found
+    memory = remembered(found.prior.initial_std, found.prior.nodal_std)
+    return replace(found, transport=RandomWalk(mesh, step, length, memory))
 
 
 def known_flow_task(task: Task, record: Measurements, *, depth: float = 1.0,
