@@ -254,8 +254,8 @@ def test_an_episode_is_drawn_as_isolated_as_asked(given, isolate, monkeypatch):
 
 
 def test_a_missing_extra_is_named(monkeypatch, tmp_path):
-    """Without what training needs, exit code 1 and the name of what to install."""
-    monkeypatch.setitem(sys.modules, "stable_baselines3", None)
+    """Without what a recipe is read by, exit code 1 and the name of what to install."""
+    monkeypatch.setitem(sys.modules, "yaml", None)
     code, said, complaint = eitbench("train", "--env", INJECTION)
-    assert code == 1 and said == "" and "needs the extra rl, pip install 'eitbench[rl]'" in complaint
+    assert code == 1 and said == "" and "needs the extra bench, pip install 'eitbench[bench]'" in complaint
     assert not (tmp_path / "results").exists()
