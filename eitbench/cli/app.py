@@ -1,6 +1,6 @@
 """The command line: `eitbench list | run | bank | export | train | policies | submit | verify |
 check | season | held-out | migrate | cards | kits | fit-prior | fit-model | estimate |
-leaderboard | compare | render | reproduce`."""
+submit-measured | leaderboard | compare | render | reproduce`."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from eitbench.cli import options
 from eitbench.cli.estimate import estimate
 from eitbench.cli.export import export
 from eitbench.cli.maintain import cards, held_out, kits, migrate
+from eitbench.cli.measured import submit_measured
 from eitbench.cli.play import policies, report, run, typed
 from eitbench.cli.priors import fit_model, fit_prior
 from eitbench.cli.season import app as season_commands
@@ -204,6 +205,7 @@ app.command()(kits)
 app.command("fit-prior")(fit_prior)
 app.command("fit-model")(fit_model)
 app.command()(estimate)
+app.command("submit-measured")(submit_measured)
 app.command()(export)
 
 
@@ -228,13 +230,15 @@ def leaderboard(
     from eitbench._files import write_atomically
     from eitbench.data.seasons import season_numbered
     from eitbench.report.boards import boards, read_for_boards
-    from eitbench.report.site import Beside, render, render_site, write_site
+    from eitbench.report.site import Beside, Measured, render, render_site, write_site
     with options.clear_errors():
         found, complaints = read_for_boards(records, season_numbered(season))
+        measured = Measured.of(records.parent)
+        complaints += measured.complaints
         table = boards(found)
         out = records.parent if season is None else records.parent / f"season-{season}"
-        pages = render_site(found, table, Beside.of(records.parent, out / "site"))
-        texts = render(found, table)
+        pages = render_site(found, table, Beside.of(records.parent, out / "site"), measured)
+        texts = render(found, table, measured)
         write_site(out / "site", pages)
     for name, text in texts.items():
         write_atomically(out / name, text.encode())

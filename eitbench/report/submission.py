@@ -14,6 +14,7 @@ from tqdm import tqdm
 from eitbench._foreign import as_markdown
 from eitbench.bench import held_out
 from eitbench.bench.contradictions import version_number
+from eitbench.bench.measured_records import read_measured_record
 from eitbench.bench.podium import file_of
 from eitbench.bench.records import read_record
 from eitbench.bench.sandbox.host import GuestError
@@ -21,11 +22,11 @@ from eitbench.bench.tracks import ids
 from eitbench.bench.verify import empty_cache, job_of, verify
 from eitbench.data.seasons import current_season
 from eitbench.report.boards import boards, read_for_boards
-from eitbench.report.site import Beside, render, render_site
+from eitbench.report.site import Beside, Measured, render, render_site
 
 RENDERED = ("leaderboard.csv", "leaderboard.md", "site")
 """What `eitbench leaderboard` writes beside the records."""
-ADDED = ("results", "methods", "media")
+ADDED = ("results", "measured", "methods", "media")
 """Folders to which a submission adds files."""
 METHOD = 10_000_000
 """bytes of a method's file, at most"""
@@ -77,11 +78,13 @@ def check(submitted: Path, ours: Path, asked: Asked) -> Iterator[Finding]:
     yield files
     if files.problems:                                # links lead anywhere: nothing more is read
         return
-    changed = sorted(path for path in (submitted / "results").glob("*.json")
-                     if _content(ours / "results" / path.name) != path.read_bytes())
+    changed = [path for path in _changed(submitted / "results", ours / "results")
+               if path.suffix == ".json"]
     with empty_cache():
         for path in tqdm(changed, desc="checking records", unit="record", disable=None):
             yield _record(path, ours / "results" / path.name, submitted / "methods", asked)
+    if measured := _changed(submitted / "measured", ours / "measured"):
+        yield _measured(measured, ours / "measured", asked)
     yield _pages(submitted)
 
 
@@ -161,6 +164,36 @@ def _of_the_record(record: dict[str, Any], asked: Asked) -> Iterator[str]:
         yield "it calls itself official, and its method is none of ours"
 
 
+def _measured(changed: list[Path], ours: Path, asked: Asked) -> Finding:
+    """Records of the measured board, whose data are not here: nothing is played again."""
+    problems = []
+    for path in changed:
+        earlier = ours / path.name
+        if path.suffix != ".json":
+            if earlier.exists():
+                problems.append(f"{path.name} is there already with another content; records are "
+                                "of the case as it was")
+            continue
+        try:
+            record = read_measured_record(path)
+            if record["official"] and not asked.official:
+                problems.append(f"{path.name} calls itself official, which only the maintainers' "
+                                "records are")
+            if earlier.exists() and read_measured_record(earlier)["official"]:
+                problems.append(f"{path.name} replaces an official record")
+        except ValueError as error:
+            problems.append(f"{path.name} {error}")
+    names = "\n".join(f"- {as_markdown(path.name)}" for path in changed)
+    return Finding("Measured data", "Not played again, `eitbench verify RECORD --data FILE` does "
+                                    f"that where the data are:\n\n{names}", problems)
+
+
+def _changed(submitted: Path, ours: Path) -> list[Path]:
+    """Files of a folder that are new or others."""
+    return [path for path in sorted(submitted.glob("*"))
+            if path.is_file() and _content(ours / path.name) != path.read_bytes()]
+
+
 def _lost(record: dict[str, Any], earlier: Path) -> Iterator[str]:
     """What the record that it replaces says and it does not."""
     if not earlier.exists():
@@ -185,8 +218,9 @@ def _pages(submitted: Path) -> Finding:
     try:
         records, complaints = read_for_boards(submitted / "results")
         table = boards(records)
-        texts = {name: text.encode() for name, text in render(records, table).items()}
-        site = render_site(records, table, Beside.of(submitted, submitted / "site"))
+        measured = Measured.of(submitted)
+        texts = {name: text.encode() for name, text in render(records, table, measured).items()}
+        site = render_site(records, table, Beside.of(submitted, submitted / "site"), measured)
     except ValueError as error:
         return Finding("Rendered pages", "", [str(error)])
     made = texts | {f"site/{name}": content for name, content in site.items()}
@@ -194,7 +228,7 @@ def _pages(submitted: Path) -> Finding:
              for path in [submitted / name, *(submitted / name).rglob("*")] if path.is_file()}
     old = sorted(name for name in there | set(made)
                  if _content(submitted / name) != made.get(name))
-    problems = list(complaints)
+    problems = [*complaints, *measured.complaints]
     if old:
         shown = ", ".join(old[:5]) + (f" and {len(old) - 5} more" if len(old) > 5 else "")
         problems.append(f"out of date: {shown}; `eitbench leaderboard --records "

@@ -21,6 +21,7 @@ from eitbench.report.site.beside import Beside
 from eitbench.report.site.collect import about_season, collect
 from eitbench.report.site.environment import environment_pages
 from eitbench.report.site.index import index_pages
+from eitbench.report.site.measured import NOBODY, Measured, measured_pages, measured_text
 from eitbench.report.site.method import method_pages
 from eitbench.report.site.robustness import robustness_pages, robustness_text
 from eitbench.report.site.tables import PAGE, plain_table
@@ -33,7 +34,8 @@ ASSETS = {"style.css": ("../style.css", "site.css"), "script.js": ("script.js",)
 
 
 def render_site(records: list[dict[str, Any]], table: pd.DataFrame,
-                beside: Beside = Beside()) -> dict[str, bytes]:  # noqa: B008 (it is never changed)
+                beside: Beside = Beside(),  # noqa: B008 (it is never changed)
+                measured: Measured = NOBODY) -> dict[str, bytes]:
     """All files of the site, by their path within it.
 
     Parameters
@@ -45,20 +47,25 @@ def render_site(records: list[dict[str, Any]], table: pd.DataFrame,
     beside : Beside
         What lies beside the site's folder: animations of episodes, and what is linked to. Default:
         nothing.
+    measured : Measured
+        Records of real instruments. Default: none.
     """
     site = collect(records, table)
-    files = index_pages(site, beside)
+    files = index_pages(site, beside, measured)
     for board in site.boards:
         if not board.is_aggregate:
             files |= environment_pages(site, board, beside)
-    return files | method_pages(site, beside) | robustness_pages(site, beside) | {
-        name: b"".join((HERE / part).read_bytes() for part in parts)
-        for name, parts in ASSETS.items()}
+    files |= method_pages(site, beside) | robustness_pages(site, beside)
+    files |= measured_pages(measured, beside)
+    return files | {name: b"".join((HERE / part).read_bytes() for part in parts)
+                    for name, parts in ASSETS.items()}
 
 
-def render(records: list[dict[str, Any]], table: pd.DataFrame | None = None) -> dict[str, str]:
-    """The content of ``leaderboard.csv`` and ``leaderboard.md``, by file name, from the records
-    and, if it is made already, their `boards`. The same records give the same text."""
+def render(records: list[dict[str, Any]], table: pd.DataFrame | None = None,
+           measured: Measured = NOBODY) -> dict[str, str]:
+    """The content of ``leaderboard.csv`` and ``leaderboard.md``, by file name, from the records,
+    if it is made already their `boards`, and the records of real instruments, which are in the
+    second alone. The same records give the same text."""
     found = boards(records) if table is None else table
     site = collect(records, found)
     parts = ["# Leaderboards", "*Rendered from the records by `eitbench leaderboard --records "
@@ -78,6 +85,7 @@ def render(records: list[dict[str, Any]], table: pd.DataFrame | None = None) -> 
                 if left := len(board.current) - len(first.rows):
                     parts.append(f"{left:,} more are in leaderboard.csv.")
     parts += robustness_text(site)
+    parts += measured_text(measured)
     if site.boards:
         said = [f"- **{heading}**: {text}" for heading, text in meanings().items()]
         parts += ["## What the columns say", "\n".join(said)]

@@ -15,6 +15,8 @@ from eitbench.report.boards import ALL, boards
 
 ROBUSTNESS = "robustness.html"
 """The page of the robustness board within the site."""
+MEASURED = "measured.html"
+"""The page of the measured board."""
 
 
 class Row(NamedTuple):

@@ -6,8 +6,9 @@ from typing import Any
 
 from eitbench.bench.records import finished
 from eitbench.report.site.beside import HEADLINE, Beside
-from eitbench.report.site.collect import ROBUSTNESS, Site, about_season
+from eitbench.report.site.collect import MEASURED, ROBUSTNESS, Site, about_season
 from eitbench.report.site.headline import headline, numbers
+from eitbench.report.site.measured import Measured
 from eitbench.report.site.robustness import families
 from eitbench.report.site.tables import axes, explanations, more, rows_file, table
 from eitbench.report.templates import template
@@ -22,7 +23,7 @@ ABOUT = {
 """What each class asks for."""
 
 
-def index_pages(site: Site, beside: Beside) -> dict[str, bytes]:
+def index_pages(site: Site, beside: Beside, measured: Measured) -> dict[str, bytes]:
     """The HTML of ``index.html``, and the lines for which it has no room."""
     made = {board.anchor: table(board, "", compact=True) for board in site.boards}
     longer = {anchor: more(each, anchor, "") for anchor, each in made.items()}
@@ -37,6 +38,7 @@ def index_pages(site: Site, beside: Beside) -> dict[str, bytes]:
         n_environments=sum(not board.is_aggregate for board in site.boards),
         n_records=len(site.records), n_methods=len(site.methods), classes=classes,
         season=about_season(site.season), robustness=ROBUSTNESS if families(site) else "",
+        measured=MEASURED if measured.records else "",
         last=max(map(finished, site.records), default="")[:10],
         explanations=explanations(list(made.values())))
     return {"index.html": html.encode()} | {
