@@ -108,11 +108,13 @@ def test_no_number_that_json_lacks_is_written(number, store):
 def test_writers_at_once_lose_nothing(store):
     """Eight threads, sixty-four episodes and a reader that never meets half a file."""
     together = threading.Barrier(9)
-    over = threading.Event()
+    looked, over = threading.Event(), threading.Event()
 
     def write(worker):
         together.wait()
         for seed in range(8):
+            if seed == 4:                                           # a busy machine may let the reader wait till then
+                looked.wait()
             put(store, result(8 * worker + seed, f"baseline{worker % 2}"), {"mean": np.ones((2, 2))})
 
     def read():
@@ -122,6 +124,7 @@ def test_writers_at_once_lose_nothing(store):
         while not is_last:
             is_last = over.is_set()
             yield [len(record["episodes"]) for record in store.write_records()]
+            looked.set()
 
     with warnings.catch_warnings(), ThreadPoolExecutor(9) as pool:
         warnings.simplefilter("error")                                       # "… is left out: it is no result"
