@@ -23,6 +23,7 @@ from eitbench.report.site import render_site, write_site
 from eitbench.report.site.beside import HEADLINE, Beside
 from eitbench.report.site.collect import Row, collect
 from eitbench.report.site.environment import _told, documentation, learning_curves, markdown
+from eitbench.report.site.measured import NOBODY, Measured
 from eitbench.report.site.method import command
 from test_page import Page, svgs
 
@@ -35,8 +36,8 @@ BUDGET = "eitbench-Pipe2DInjectionBudget-v0"
 PICTURES = Beside(media={"eitbench-Pipe2D-v0.webp": 340_000, "elsewhere.webp": 1} | dict.fromkeys(HEADLINE, 1))
 
 
-def rendered(records, beside=PICTURES):
-    return render_site(records, boards(records), beside)
+def rendered(records, beside=PICTURES, measured=NOBODY):
+    return render_site(records, boards(records), beside, measured)
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +57,7 @@ def pages(site):
 def test_the_published_site_is_rendered_from_the_records():
     """`eitbench leaderboard --records leaderboards/results` would change nothing; it is not too large either."""
     folder, records = ROOT / "leaderboards" / "site", read_records(ROOT / "leaderboards" / "results")
-    expected = rendered(records, Beside.of(folder.parent, folder))
+    expected = rendered(records, Beside.of(folder.parent, folder), Measured.of(folder.parent))
     published = {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     differ = sorted(path for path in expected.keys() | published.keys() if expected.get(path) != published.get(path))
     assert not differ, f"{differ} out of date: run `eitbench leaderboard --records leaderboards/results`"
