@@ -54,7 +54,7 @@ class MeasuredEnv(KnowsItsLength, gym.Env[Observation, np.ndarray]):  # type: ig
     withheld : float
         Part of an injection's readings, from 0 to 0.5.
     moves : bool, optional
-        Whether the target moves. Default: if there is more than one frame.
+        Whether the target moves. Default: if there are two whole frames or more.
     correction : "offset" or "gain"
         See `calibrate`.
     homogeneous_frames : int
@@ -84,7 +84,7 @@ class MeasuredEnv(KnowsItsLength, gym.Env[Observation, np.ndarray]):  # type: ig
             conductivity=self.vessel.conductivity, correction=correction,
             noise=None if len(homogeneous) > 1 else noise_of_frames(record.frames()))
         if moves is None:
-            moves = len(record.readings) > record.frame
+            moves = len(record.readings) >= 2 * record.frame
         believed = {"moves": moves, **believed}
         self._there = readings_there(record)
         self.episode_steps = len(record.injections)

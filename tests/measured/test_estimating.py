@@ -6,12 +6,14 @@ import pytest
 from eitbench.bench.measured import play_record
 from eitbench.bench.methods import load_method
 from eitbench.cli.app import app
+from eitbench.data.measured import Measurements
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.measured import MeasuredEnv, simulated_record
 from eitbench.estimation.measured.readings import ReadingModel
 from eitbench.estimation.measured.task import known_flow_task
 from eitbench.estimation.walk import RandomWalk
 from eitbench.numerics.fem import mass_matrix
+from eitbench.physics.rest import AtRest
 from tanks import VESSEL, angle, moving
 from typer.testing import CliRunner
 
@@ -33,6 +35,14 @@ def env(record):
 def played(env):
     return {name: play_record(env, name)
             for name in ("log_walk_filter", "kalman_filter", "homogeneous", "persistence")}
+
+
+def test_injections_that_come_twice_in_a_frame_are_no_movement(record):
+    """KIT4 repeats four of its 75."""
+    twice = [*range(8), 2, 5]
+    once = Measurements(record.currents, record.injections[twice], record.matrix, record.readings[twice],
+                        0.01 * np.arange(10), record.reference)
+    assert isinstance(MeasuredEnv(once, VESSEL, initial_std=0.2).task.transport, AtRest)
 
 
 @pytest.mark.parametrize("name", ["kalman_filter", "log_walk_filter"])

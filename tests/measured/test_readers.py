@@ -156,7 +156,8 @@ def test_what_is_no_record(tmp_path):
 
 @pytest.mark.skipif(not REAL, reason="EITBENCH_REAL_FILES names no folder of real files")
 @pytest.mark.parametrize(("path", "shape"), [
-    ("ktc/TrainingData/data1.mat", (76, 31)), ("eidors/iirc_data_2006.mat", (1600, 16)),
+    ("ktc/TrainingData/data1.mat", (76, 31)), ("kit4/datamat_2_3.mat", (79, 16)),
+    ("eidors/iirc_data_2006.mat", (1600, 16)),
     ("eidors/montreal_data_1995.mat", (1584, 16)),
     ("sciospec/WaterTankData/20250212 13.19.50/setup", (4080, 16)),
     ("sciospec/WaterTankData/20250212 13.21.48/setup", (4736, 16))])
