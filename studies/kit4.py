@@ -43,8 +43,8 @@ class Body(NamedTuple):
 def round_body(x: float, y: float, radius: float, conducts: bool) -> Body:
     """A ring or a disk."""
     angle = np.linspace(0.0, 2.0 * np.pi, 60, endpoint=False)
-    circle = radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    return Body(circle + [x, y], conducts)
+    outline = np.stack([x + radius * np.cos(angle), y + radius * np.sin(angle)], axis=1)
+    return Body(outline, conducts)
 
 
 BODIES = {
