@@ -15,8 +15,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from eitbench._extras import needed_by
+from eitbench.bench.segmentation import read_truth
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from eitbench.envs.measured import MeasuredEnv
 
 WITHHELD = 0.1
@@ -53,6 +56,9 @@ class Case:
     """entries as of `read_vessel`"""
     beside: Mapping[str, str] = field(default_factory=dict)
     """name -> sha256 of files beside the record's that the reader takes too"""
+    truth: Mapping[str, str] | None = None
+    """``file`` and ``sha256`` of a segmentation as of `eitbench.bench.segmentation.read_truth`, if
+    there is one"""
     settings: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -64,17 +70,21 @@ class Case:
             if not isinstance(getattr(self, name), Mapping):
                 raise ValueError(f"case.{name} must be entries like 'name: value', got "
                                  f"{getattr(self, name)!r}")
-        for name, digest in {"sha256": self.sha256, **self.beside}.items():
+        if self.truth is not None and set(self.truth) != {"file", "sha256"}:
+            raise ValueError(f"case.truth must have file and sha256, got {self.truth!r}")
+        truth = {"truth.sha256": self.truth["sha256"]} if self.truth else {}
+        for name, digest in {"sha256": self.sha256, **self.beside, **truth}.items():
             if not isinstance(digest, str) or not _SHA256.fullmatch(digest):
                 raise ValueError(f"case.{name} must be 64 digits from 0 to f, got {digest!r}")
         if unknown := sorted(set(self.settings) - set(_SETTINGS)):
             raise ValueError(f"case has no {', '.join(unknown)}; there are "
-                             f"{', '.join((*_NEEDED, 'beside', *_SETTINGS))}")
+                             f"{', '.join((*_NEEDED, 'beside', 'truth', *_SETTINGS))}")
 
     @cached_property
     def digest(self) -> str:
         """sha256 of all that numbers depend on; words may be mended."""
         content = {"sha256": self.sha256, "beside": dict(self.beside),
+                   "truth": self.truth and self.truth["sha256"],
                    "vessel": dict(self.vessel), "withheld": WITHHELD,
                    "settings": dict(self.settings)}
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
@@ -95,6 +105,19 @@ class Case:
         record = read(file, settings.pop("format", None))
         return MeasuredEnv(record, dict(self.vessel), withheld=WITHHELD, **settings)
 
+    def true_picture(self, file: Path | str | None) -> np.ndarray | None:
+        """The truth in this ``file``, None if the case has none; ``ValueError`` if there is one and
+        the file is another, or not given."""
+        if self.truth is None:
+            if file is not None:
+                raise ValueError(f"truth must not be given: the case {self.name} has none")
+            return None
+        if file is None or (found := file_sha256(Path(file))) != self.truth["sha256"]:
+            got = "none" if file is None else f"{file} with {found}"
+            raise ValueError(f"truth must be {self.truth['file']} of the case {self.name}, with "
+                             f"the sha256 {self.truth['sha256']}, got {got}")
+        return read_truth(file)
+
 
 def read_case(path: Path | str) -> Case:
     """The case that a YAML file describes; its name is that of the file. ``ValueError`` naming the
@@ -111,9 +134,9 @@ def read_case(path: Path | str) -> Case:
     if missing := [name for name in _NEEDED if name not in said]:
         raise ValueError(f"{path}: case must have {', '.join(missing)}")
     own = {name: said.pop(name) for name in _NEEDED}
-    beside = said.pop("beside", {})
+    more = {name: said.pop(name) for name in ("beside", "truth") if name in said}
     try:
-        return Case(path.stem, **own, beside=beside, settings=said)
+        return Case(path.stem, **own, **more, settings=said)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
 

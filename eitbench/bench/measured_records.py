@@ -22,6 +22,7 @@ from eitbench.bench.measured import play_record
 from eitbench.bench.measured_cases import SEEDS, Case
 from eitbench.bench.methods import load_method
 from eitbench.bench.records import sealed
+from eitbench.bench.segmentation import scored_by_truth
 from eitbench.bench.store import machine, provenance
 from eitbench.bench.strict_json import parsed
 
@@ -35,12 +36,12 @@ SCORES = ("withheld", "nis")
 
 
 def submit_measured(case: Case, file: Path, method: str, to: Path, *,
-                    official: bool = False) -> Path:
+                    truth: Path | None = None, official: bool = False) -> Path:
     """Play a method on a case, once for each of `SEEDS`, and write its record into the folder
     ``to``; what an earlier call played of the same method and code is not played again.
 
-    ``ValueError`` if the file is not the case's, the method does not suit the record, or an
-    official record is asked for from a checkout with changes.
+    ``ValueError`` if the file or the ``truth`` is not the case's, the method does not suit the
+    record, or an official record is asked for from a checkout with changes.
     """
     code = provenance()
     if official and (code["commit"] is None or code["dirty"]):
@@ -54,6 +55,7 @@ def submit_measured(case: Case, file: Path, method: str, to: Path, *,
         "method": loaded.name, "title": loaded.title, "parameters": loaded.parameters,
         "role": loaded.role, "official": official, "version": loaded.version,
         "method_sha256": loaded.sha256, "run": {**code, "machine": machine()}}
+    picture = case.true_picture(truth)
     path = to / file_name(record)
     plays = _played_before(path, record)
     if len(plays) == len(SEEDS):
@@ -61,28 +63,31 @@ def submit_measured(case: Case, file: Path, method: str, to: Path, *,
     env = case.env(file)
     for seed in SEEDS:
         if all(play["seed"] != seed for play in plays):
-            plays.append(play_again(env, method, seed))
+            plays.append(play_again(env, method, seed, picture))
             content = record | {"plays": plays,
                                 "finished": datetime.now(UTC).isoformat(timespec="seconds")}
             write_atomically(path, _text(sealed(content)))
     return path
 
 
-def play_again(env: MeasuredEnv, method: str, seed: int) -> dict[str, Any]:
-    """Scores of one play: ``withheld`` in noise std, ``nis`` as NIS/m or None, and ``seconds``."""
+def play_again(env: MeasuredEnv, method: str, seed: int,
+               truth: np.ndarray | None = None) -> dict[str, Any]:
+    """Scores of one play: ``withheld`` in noise std, ``nis`` as NIS/m or None, ``seconds``, and by
+    a ``truth``, if there is one, those of `scored_by_truth`."""
     env.reset(seed=seed)                                # what is told is chosen before the clock
     begin = time.perf_counter()
     played = play_record(env, method, seed)
     seconds = time.perf_counter() - begin
     nis = played.nis[env.task.warm_up:]
     told = np.isfinite(nis)
-    return {"seed": seed, "withheld": played.withheld,
+    said = {"seed": seed, "withheld": played.withheld,
             "nis": float(nis[told].mean()) if told.any() else None,
-            "seconds": seconds, "readings": len(nis) + env.task.warm_up}
+            "seconds": seconds, "readings": len(played.nis)}
+    return said if truth is None else said | {"truth": scored_by_truth(env, played, truth)}
 
 
 def verify_measured(record: dict[str, Any], case: Case, file: Path, method: str,
-                    seed: int = 0) -> list[str]:
+                    seed: int = 0, truth: Path | None = None) -> list[str]:
     """Play one seed of a record again: a sentence for each score that is another.
 
     ``ValueError`` if the record is of another version of the case or of the method.
@@ -94,9 +99,11 @@ def verify_measured(record: dict[str, Any], case: Case, file: Path, method: str,
     said = next((play for play in record["plays"] if play["seed"] == seed), None)
     if said is None:
         raise ValueError(f"seed must be one that the record has played, got {seed}")
-    again = play_again(case.env(file), method, seed)
-    return [f"{name} is {again[name]}, the record says {said[name]}" for name in SCORES
-            if not _same(again[name], said[name])]
+    again = play_again(case.env(file), method, seed, case.true_picture(truth))
+    now, then = ({name: play[name] for name in SCORES} | play.get("truth", {})
+                 for play in (again, said))
+    return [f"{name} is {now.get(name)}, the record says {then.get(name)}"
+            for name in now | then if not _same(now.get(name), then.get(name))]
 
 
 def file_name(record: dict[str, Any]) -> str:

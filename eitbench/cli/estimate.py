@@ -26,6 +26,9 @@ def estimate(
         min=0.0, max=0.5, help="Part of the readings that methods are not shown and are judged "
                                "by.")] = 0.1,
     seed: Annotated[int, typer.Option(min=0, help="Which readings those are.")] = 0,
+    truth: Annotated[Path | None, typer.Option(
+        help="What was in a round tank, as KTC has it: variable truth of a .mat file, 256 × 256 "
+             "pixels 0 (water), 1 (conducts worse), 2 (better).")] = None,
     still: Annotated[bool, typer.Option("--still", help="The target does not move.")] = False,
     correction: Annotated[str, typer.Option(
         help="What becomes of what the model of homogeneous fluid is off: offset or gain.")]
@@ -37,6 +40,13 @@ def estimate(
     writes a page with the estimates, how well they predict readings that they were not shown,
     and what is odd about the record."""
     from eitbench.bench.measured import play_record
+    from eitbench.bench.segmentation import (
+        check_tank,
+        distances,
+        ktc_score,
+        read_truth,
+        segmented,
+    )
     from eitbench.data.measured import read
     from eitbench.envs.measured import MeasuredEnv
     from eitbench.report.measured import write_report
@@ -49,6 +59,9 @@ def estimate(
                     f"{10 + 0.03 * len(record.readings):.0f} s")
         env = MeasuredEnv(record, vessel, withheld=withheld, moves=False if still else None,
                           correction=correction, homogeneous_frames=homogeneous_frames)
+        picture = None if truth is None else read_truth(truth)
+        if picture is not None:
+            check_tank(env)
         doubts = env.doubts()
         for doubt in doubts:
             options.say(f"odd: {doubt}", err=True)
@@ -57,7 +70,12 @@ def estimate(
             played.append(play_record(env, name, seed))
             options.say(f"{played[-1].method}: withheld readings missed by "
                         f"{played[-1].withheld:.2f} noise std")
-        write_report(out, env, played, record.source, doubts)
+            if picture is not None:
+                found = segmented(env, played[-1].mean[-1])
+                off = ", ".join(f"{100 * each:.2f}" for each in distances(env, picture, found))
+                options.say(f"  KTC's score {ktc_score(picture, found):.3f}; its bodies are off by "
+                            f"{off} cm")
+        write_report(out, env, played, record.source, doubts, picture)
         options.say(f"wrote {out}")
         if arrays is not None:
             played[0].save(arrays, env)

@@ -17,6 +17,8 @@ def submit_measured(
         help="The record's file or folder; the case says where it can be had.")],
     baseline: Annotated[list[str], typer.Option(
         help="Name of one of ours, or the path of your own .py file; may be repeated.")],
+    truth: Annotated[Path | None, typer.Option(
+        help="Of a case that has one: the file of the truth.")] = None,
     to: Annotated[Path | None, typer.Option(
         help="Folder of the records. Default: that of the case.")] = None,
     official: Annotated[bool, typer.Option(
@@ -35,7 +37,8 @@ def submit_measured(
         read = read_case(case)
         options.say(f"{read.title}: {len(baseline)} × {len(SEEDS)} plays")
         for name in baseline:
-            path = submit(read, data, name, to or case.parent, official=official)
+            path = submit(read, data, name, to or case.parent, truth=truth,
+                          official=official)
             plays = read_measured_record(path)["plays"]
             missed = sum(play["withheld"] for play in plays) / len(plays)
             options.say(f"wrote {path}: withheld readings missed by {missed:.2f} noise std")

@@ -11,11 +11,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle
 from matplotlib.ticker import FuncFormatter
 from PIL import Image
 
 from eitbench._files import write_atomically
+from eitbench.bench.segmentation import check_tank, ktc_score, segmented
 from eitbench.envs.rendering import draw_electrodes, draw_field
 from eitbench.physics.rest import AtRest
 from eitbench.report.templates import template
@@ -25,6 +28,8 @@ if TYPE_CHECKING:
     from eitbench.envs.measured import MeasuredEnv
     from eitbench.estimation.measured.calibration import Calibration
 
+BODIES = ListedColormap(["#f4f4f2", "#d1495b", "#0b6e75"])
+"""Water, what conducts worse, what conducts better."""
 FRAMES = 60
 """At most so many pictures in an animation."""
 COLOURS = ("#0b6e75", "#d1495b", "#b8860b", "#7a5195", "#5b6770")
@@ -35,7 +40,8 @@ SHARE = (0.005, 0.995)
 
 
 def write_report(path: Path, env: MeasuredEnv, played: Sequence[Played],
-                 source: Mapping[str, Any], doubts: Sequence[str] = ()) -> Path:
+                 source: Mapping[str, Any], doubts: Sequence[str] = (),
+                 truth: np.ndarray | None = None) -> Path:
     """An HTML page: the estimates, how well they predict what they were not shown, NIS over time,
     the calibration, and how each electrode does.
 
@@ -50,6 +56,8 @@ def write_report(path: Path, env: MeasuredEnv, played: Sequence[Played],
         Where the record comes from; its "file" is the page's title.
     doubts : sequence of str
         What is odd about the record.
+    truth : (256, 256), optional
+        Classes of pixels; see `eitbench.bench.segmentation`.
     """
     calibration = env.calibration
     page = template("measured.html.j2").render(
@@ -58,7 +66,8 @@ def write_report(path: Path, env: MeasuredEnv, played: Sequence[Played],
         methods=[_row(env, each) for each in played], doubts=list(doubts),
         facts=_facts(env), estimate=_estimate(env, played[0]), first=played[0].method,
         over_time=_figure(_over_time(env, played)), fit=_figure(_fit(calibration)),
-        contacts=_figure(_contacts(env)), at_rest=_is_at_rest(env))
+        contacts=_figure(_contacts(env)), at_rest=_is_at_rest(env),
+        compared="" if truth is None else _figure(_compared(env, played, truth)))
     write_atomically(path, page.encode())
     return path
 
@@ -143,6 +152,24 @@ def _picture(env: MeasuredEnv, played: Played, t: int) -> Figure:
         if in_decades and ax is axes[0]:
             bar.ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{10**value:.3g}"))
     figure.suptitle(f"{played.method}, {env.record.times[t - 1]:.4g} s", fontsize=11)
+    return figure
+
+
+def _compared(env: MeasuredEnv, played: Sequence[Played], truth: np.ndarray) -> Figure:
+    """Bodies of the truth, and of each method's last estimate."""
+    figure = Figure(figsize=(3.0 * (1 + len(played)), 3.3), dpi=100, layout="constrained")
+    axes = figure.subplots(1, 1 + len(played), squeeze=False)[0]
+    side = 100 * check_tank(env).radius
+    pictures = {"truth": truth}
+    for each in played:
+        found = segmented(env, each.mean[-1])
+        pictures[f"{each.method}: {ktc_score(truth, found):.2f}"] = found
+    for ax, (title, picture) in zip(axes, pictures.items(), strict=True):
+        ax.imshow(picture, cmap=BODIES, vmin=0, vmax=2, extent=(-side, side, -side, side),
+                  interpolation="nearest")
+        ax.add_patch(Circle((0.0, 0.0), side, fill=False, color="0.4"))
+        ax.set(title=title, xlabel="x / cm")
+        _bare(ax)
     return figure
 
 

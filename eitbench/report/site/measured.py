@@ -25,6 +25,8 @@ MEANINGS = {
     "missed": "how far estimates miss readings that the method was not shown, root mean square in "
               "standard deviations of the noise that it was told; 1 is as good as that noise "
               "allows. Mean of the plays, and the least and the largest of them",
+    "ktc": "score of the Kuopio Tomography Challenge 2023: how alike the bodies of the estimate "
+           "and of the truth are, 1 if they are the same",
     "NIS/m": "normalised innovations squared over the number of readings: 1 if the method knows "
              "its error, more if it is too sure of itself",
     "ms/reading": "time of the fastest play over the number of injections, on the machine that "
