@@ -101,7 +101,7 @@ def _facts(env: MeasuredEnv) -> dict[str, str]:
             f"{100 * told.relative:.2g} % of the reading and {1e3 * told.floor:.2g} mV",
         "noise that estimators are told": f"{100 * noise.relative:.2g} % of the reading and "
                                           f"{1e3 * noise.floor:.2g} mV",
-        "initial state": f"± {100 * env.task.prior.initial_std:.2g} % of the background, smooth "
+        "initial state": f"± {100 * env.task.prior.initial_std:.3g} % of the background, smooth "
                          f"over {100 * env.task.prior.initial_length:.2g} cm"}
     if not _is_at_rest(env):
         facts["walk"] = (f"± {100 * env.task.prior.nodal_std:.2g} % of the background a step of "

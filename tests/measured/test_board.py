@@ -75,11 +75,11 @@ def test_an_interrupted_run_resumes(played, case, tmp_path, monkeypatch):
     play = measured_records.play_again
     seeds = []
 
-    def until_the_third(env, method, seed):
+    def until_the_third(env, method, seed, *truth):
         if len(seeds) == 2:
             raise KeyboardInterrupt
         seeds.append(seed)
-        return play(env, method, seed)
+        return play(env, method, seed, *truth)
 
     monkeypatch.setattr(measured_records, "play_again", until_the_third)
     with pytest.raises(KeyboardInterrupt):
