@@ -23,6 +23,10 @@ if TYPE_CHECKING:
     from eitbench.worlds.task import Estimate
 
 
+COLUMNS = 60
+"""frames at which electrodes are looked at, at most"""
+
+
 @dataclass(frozen=True, eq=False)
 class Played:
     """What a method says of a record, t = 1 … T."""
@@ -79,6 +83,44 @@ def play_record(env: MeasuredEnv, method: str, seed: int = 0) -> Played:
                 missed[t - 1] = np.sqrt(np.mean(off**2))
     return Played(loaded.name, np.array([each.mean for each in said]), _variance(said),
                   np.array([_nis(env, t, each) for t, each in enumerate(said, 1)]), missed)
+
+
+def electrode_misfits(env: MeasuredEnv, played: Played,
+                      most: int = COLUMNS) -> tuple[np.ndarray, np.ndarray]:
+    """How well each electrode does over time, of at most so many frames, evenly over the record.
+
+    Returns
+    -------
+    times : (C,)
+        s at which these frames begin.
+    misfits : (C, L)
+        Root mean square of what the readings of a frame in which an electrode takes part are off
+        the estimate before them, in standard deviations of the noise; of a target at rest off the
+        last estimate. Only readings while it carries current, if there are any: they tell of its
+        contact, which the next estimate takes for a change of what is before it. NaN without any.
+    """
+    record = env.record
+    frame = record.frame
+    begins = np.arange(0, len(played.mean) - frame + 1, frame)
+    begins = begins[np.unique(np.linspace(0, len(begins) - 1, most).round().astype(int))]
+    at_rest = isinstance(env.task.transport, AtRest)
+    takes_part = record.matrix != 0.0
+    carries = record.currents != 0.0
+    # (K, M, L) bool
+    tells = env.there[..., None] & takes_part & carries[:, None, :]
+    if not tells.any():
+        tells = env.there[..., None] & takes_part
+    misfits = np.full((len(begins), record.currents.shape[1]), np.nan)
+    for misfit, begin in zip(misfits, begins, strict=True):
+        squares, count = np.zeros(len(misfit)), np.zeros(len(misfit))
+        for t in range(begin, begin + frame):
+            off = env.off(t + 1, played.mean[-1 if at_rest else max(t - 1, 0)])
+            tell = tells[record.injections[t]]
+            squares += np.nan_to_num(off)**2 @ tell
+            count += tell.sum(axis=0)
+        some = count > 0
+        misfit[some] = np.sqrt(squares[some] / count[some])
+    return record.times[begins], misfits
 
 
 def _shown(env: MeasuredEnv, steps: Iterator[tuple[int, Estimate]],

@@ -86,7 +86,8 @@ class MeasuredEnv(KnowsItsLength, gym.Env[Observation, np.ndarray]):  # type: ig
         if moves is None:
             moves = len(record.readings) >= 2 * record.frame
         believed = {"moves": moves, **believed}
-        self._there = readings_there(record)
+        self.there = readings_there(record)
+        """(K, M) bool: readings that are there whenever an injection is."""
         self.episode_steps = len(record.injections)
         self.spread: np.ndarray | None = None
         """(n,) standard deviation in mol/m³ of the last estimate, for whoever has one."""
@@ -105,18 +106,18 @@ class MeasuredEnv(KnowsItsLength, gym.Env[Observation, np.ndarray]):  # type: ig
         self._step = 0
 
     def _make_task(self, seed: int) -> Task:
-        hidden = withheld_readings(self._there, self.part, seed)
+        hidden = withheld_readings(self.there, self.part, seed)
         return measured_task(self.vessel, self.calibration, self.record,
-                             seen=self._there & ~hidden, **self._believed)
+                             seen=self.there & ~hidden, **self._believed)
 
     def _show(self, seed: int) -> None:
         self.task: Task = self._task_of(seed)
         """What the agent may know."""
         model = self.task.observation
         assert isinstance(model, ReadingModel)
-        self.hidden = self._there & ~model.seen
+        self.hidden = self.there & ~model.seen
         """(K, M) bool: readings that the agent is not shown."""
-        self._judge = model.showing(self.hidden)
+        self._judge = model.showing(self.there)
         T = self.episode_steps
         self.judged: dict[int, range] = (
             {T: range(1, T + 1)} if isinstance(self.task.transport, AtRest)
@@ -153,12 +154,16 @@ class MeasuredEnv(KnowsItsLength, gym.Env[Observation, np.ndarray]):  # type: ig
     def missed(self, t: int, estimate: np.ndarray) -> np.ndarray:
         """By how much an estimate (n,) misses the readings withheld at t = 1 … T, in standard
         deviations of their noise."""
+        return self.off(t, estimate)[self.hidden[self.record.injections[t - 1]]]
+
+    def off(self, t: int, estimate: np.ndarray) -> np.ndarray:
+        """(M,) by how much an estimate (n,) misses each reading at t = 1 … T, in standard
+        deviations of its noise; NaN where nothing was read."""
+        reading = self.record.readings[t - 1]
         k = self.record.injections[t - 1]
-        hidden = self.hidden[k]
-        predicted = self._judge.voltages(estimate, self.record.currents[k][None])[0, hidden]
-        reading = self.record.readings[t - 1, hidden]
-        std = self.task.noise.std(np.nan_to_num(self.record.readings[t - 1]))
-        return (reading - predicted) / std[hidden]
+        predicted = self._judge.voltages(estimate, self.record.currents[k][None])[0]
+        off: np.ndarray = (reading - predicted) / self.task.noise.std(np.nan_to_num(reading))
+        return np.where(self.there[k], off, np.nan)
 
     def _observe(self) -> Observation:
         if self._step > self.episode_steps:

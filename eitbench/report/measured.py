@@ -18,6 +18,7 @@ from matplotlib.ticker import FuncFormatter
 from PIL import Image
 
 from eitbench._files import write_atomically
+from eitbench.bench.measured import electrode_misfits
 from eitbench.bench.segmentation import check_tank, ktc_score, segmented
 from eitbench.envs.rendering import draw_electrodes, draw_field
 from eitbench.physics.rest import AtRest
@@ -66,7 +67,8 @@ def write_report(path: Path, env: MeasuredEnv, played: Sequence[Played],
         methods=[_row(env, each) for each in played], doubts=list(doubts),
         facts=_facts(env), estimate=_estimate(env, played[0]), first=played[0].method,
         over_time=_figure(_over_time(env, played)), fit=_figure(_fit(calibration)),
-        contacts=_figure(_contacts(env)), at_rest=_is_at_rest(env),
+        contacts=_figure(_contacts(env)), health=_figure(_health(env, played[0])),
+        at_rest=_is_at_rest(env),
         compared="" if truth is None else _figure(_compared(env, played, truth)))
     write_atomically(path, page.encode())
     return path
@@ -240,6 +242,27 @@ def _contacts(env: MeasuredEnv) -> Figure:
     missed.set(xlabel="electrode", ylabel="misfit of its readings / %\nof the mean reading")
     for ax in (impedance, missed):
         _bare(ax)
+    return figure
+
+
+def _health(env: MeasuredEnv, played: Played) -> Figure:
+    """Misfits of each electrode's readings over time; of a single frame as bars."""
+    times, misfits = electrode_misfits(env, played)
+    L = misfits.shape[1]
+    figure = Figure(figsize=(10.5, 1.6 + 0.09 * L), dpi=100, layout="constrained")
+    axes = figure.subplots()
+    if len(times) == 1:
+        axes.bar(np.arange(1, L + 1), misfits[0], color=COLOURS[1])
+        axes.set(xlabel="electrode", ylabel="misfit of its readings / noise std")
+    else:
+        shown = np.log10(np.maximum(misfits.T, 1e-3))
+        drawn = axes.pcolormesh(times, np.arange(1, L + 1), shown, cmap="magma", shading="nearest",
+                                vmin=0.0, vmax=max(1.0, float(np.nanmax(shown))))
+        axes.set(xlabel="time / s", ylabel="electrode")
+        axes.invert_yaxis()
+        bar = figure.colorbar(drawn, ax=axes, label="misfit / noise std")
+        bar.ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{10**value:.3g}"))
+    _bare(axes)
     return figure
 
 

@@ -3,7 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from eitbench.bench.measured import play_record
+from eitbench.bench.measured import electrode_misfits, play_record
 from eitbench.bench.methods import load_method
 from eitbench.cli.app import app
 from eitbench.data.measured import Measurements
@@ -14,7 +14,7 @@ from eitbench.estimation.measured.task import known_flow_task
 from eitbench.estimation.walk import RandomWalk
 from eitbench.numerics.fem import mass_matrix
 from eitbench.physics.rest import AtRest
-from tanks import VESSEL, angle, moving
+from tanks import CONTACTS, VESSEL, angle, moving
 from typer.testing import CliRunner
 
 BELIEVED = {"initial_std": 0.2, "walk_std": 0.05}
@@ -191,6 +191,30 @@ def test_records_of_our_simulator_are_estimated_as_in_the_environment(tmp_path):
 def test_a_world_must_fit_the_record(record):
     with pytest.raises(ValueError, match="record must have the world's 16 electrodes, got 8"):
         known_flow_task(EstimationEnv("eitbench/Pipe2D-v0").task, record)
+
+
+@pytest.mark.parametrize("name", ["log_walk_filter", "homogeneous"])
+def test_a_contact_that_fails_is_seen_from_then_on(name):
+    """Electrode 4's contact impedance is thirtyfold from the middle of the record on."""
+    sound = moving(frames=10, amplitude=0.0)
+    broken = moving(frames=10, amplitude=0.0, contacts=CONTACTS * np.where(np.arange(8) == 3, 30.0, 1.0))
+    readings = np.where(np.arange(80)[:, None] < 40, sound.readings, broken.readings)
+    record = Measurements(sound.currents, sound.injections, sound.matrix, readings, sound.times, sound.reference)
+    env = MeasuredEnv(record, VESSEL, **BELIEVED)
+    times, misfits = electrode_misfits(env, play_record(env, name))
+    np.testing.assert_allclose(times, 0.08 * np.arange(10))
+    before, after = misfits[1:5].max(axis=0), misfits[6:].min(axis=0)
+    assert after[3] > 3 * before.max()
+    assert np.argmax(misfits[6:].mean(axis=0)) == 3
+
+
+def test_misfits_are_those_of_the_readings_in_which_an_electrode_takes_part(env, played, record):
+    """Reading by reading."""
+    times, misfits = electrode_misfits(env, played["homogeneous"], most=2)
+    np.testing.assert_allclose(times, record.times[[0, 40]])
+    own = [env.off(t + 1, played["homogeneous"].mean[t - 1])[m] for t in range(40, 48) for m in range(8)
+           if record.matrix[m, 2] != 0 and record.currents[t % 8, 2] != 0]
+    assert misfits[1, 2] == pytest.approx(np.sqrt(np.mean(np.square(own))))
 
 
 def test_page_and_arrays(tmp_path, record):
