@@ -32,10 +32,12 @@ class Played:
     """What a method says of a record, t = 1 … T."""
 
     method: str
+    steps: np.ndarray
+    """(S,) t of the estimates that are kept, increasing; of a short record all"""
     mean: np.ndarray
-    """(T, n) mol/m³ at the nodes of the task's mesh"""
+    """(S, n) mol/m³ at the nodes of the task's mesh"""
     variance: np.ndarray | None
-    """(T, n) (mol/m³)², if the method says it of each state after the first frame; NaN within"""
+    """(S, n) (mol/m³)², if the method says it of each state after the first frame; NaN within"""
     nis: np.ndarray
     """(T,) νᵀS⁻¹ν in parts of the readings shown; NaN where a method says none"""
     missed: np.ndarray
@@ -43,18 +45,25 @@ class Played:
     judge predicts, in standard deviations of the noise; NaN where nothing is judged"""
 
     def save(self, path: Path, env: MeasuredEnv) -> None:
-        """Write what is said as npz, whole or not at all: ``mean`` and ``variance`` (T, n), ``nis``
-        and ``missed`` (T,), ``times`` (T,) in s, and the mesh's ``points`` (n, d) in m and
-        ``cells``."""
+        """Write what is said as npz, whole or not at all: ``steps`` (S,), ``mean`` and ``variance``
+        (S, n), ``nis`` and ``missed`` (T,), ``times`` (T,) in s, and the mesh's ``points`` (n, d)
+        in m and ``cells``."""
         content = io.BytesIO()
         mesh = env.task.mesh
         said: dict[str, Any] = {
-            "mean": self.mean, "nis": self.nis, "missed": self.missed, "times": env.record.times,
+            "steps": self.steps, "mean": self.mean, "nis": self.nis, "missed": self.missed, "times": env.record.times,
             "points": mesh.points, "cells": mesh.cells}
         if self.variance is not None:
             said["variance"] = self.variance
         np.savez_compressed(content, **said)
         write_atomically(path, content.getvalue())
+
+    def at(self, t: int) -> int:
+        """The row of the estimate at t; ``ValueError`` if it is not kept."""
+        row = int(np.searchsorted(self.steps, t))
+        if row == len(self.steps) or self.steps[row] != t:
+            raise ValueError(f"t must be a step of which the estimate is kept, got {t}")
+        return row
 
     @property
     def withheld(self) -> float:
@@ -62,27 +71,50 @@ class Played:
         return float(np.sqrt(np.nanmean(self.missed**2)))
 
 
-def play_record(env: MeasuredEnv, method: str, seed: int = 0) -> Played:
+def play_record(env: MeasuredEnv, method: str, seed: int = 0, *,
+                kept: np.ndarray | None = None) -> Played:
     """Play one of our methods, or the one of a path, on a record; errors as of `estimates`.
 
-    ``seed`` draws the readings that are withheld.
+    ``seed`` draws the readings that are withheld. Estimates are kept at the steps ``kept``, by
+    default all.
     """
     loaded = load_method(method, "estimation")
     if not loaded.suits(env.task):
         moves = "stands still" if isinstance(env.task.transport, AtRest) else "walks at random"
         raise ValueError(f"method must suit a record of which the target {moves}, got "
                          f"{loaded.name}")
+    T = env.episode_steps
+    wanted = set(range(1, T + 1) if kept is None else np.asarray(kept).tolist())
+    missed, nis = np.full(T, np.nan), np.full(T, np.nan)
+    said: dict[int, Estimate] = {}
     with threadpool_limits(1):
-        said = [estimate for _, estimate in _shown(env, estimates(env, loaded, seed), loaded.name)]
-    T = len(said)
-    missed = np.full(T, np.nan)
-    for last, judged in env.judged.items():
-        for t in judged:
-            off = env.missed(t, np.asarray(said[last - 1].mean))
-            if len(off):
-                missed[t - 1] = np.sqrt(np.mean(off**2))
-    return Played(loaded.name, np.array([each.mean for each in said]), _variance(said),
-                  np.array([_nis(env, t, each) for t, each in enumerate(said, 1)]), missed)
+        for now, estimate in _shown(env, estimates(env, loaded, seed), loaded.name):
+            nis[now - 1] = _nis(env, now, estimate)
+            for t in env.judged_by(now):
+                off = env.missed(t, np.asarray(estimate.mean))
+                if len(off):
+                    missed[t - 1] = np.sqrt(np.mean(off**2))
+            if now in wanted:
+                said[now] = estimate._replace(innovation=None, innovation_covariance=None)
+    return Played(loaded.name, np.array(list(said)), np.array([e.mean for e in said.values()]),
+                  _variance(list(said.values())), nis, missed)
+
+
+def pages_steps(env: MeasuredEnv) -> np.ndarray:
+    """Of which estimates `electrode_misfits` and the pictures of a page are made: the record's
+    first and last, and those of some frames."""
+    frame = env.record.frame
+    begins = _begins(env, COLUMNS)
+    steps = begins[:, None] + np.arange(frame + 1)
+    return np.unique(np.clip([1, env.episode_steps, *steps.ravel()], 1, env.episode_steps))
+
+
+def _begins(env: MeasuredEnv, most: int) -> np.ndarray:
+    """First readings, 0, 1, …, of at most so many frames, evenly over the record."""
+    begins = np.arange(0, max(env.episode_steps - env.record.frame, 0) + 1, env.record.frame)
+    evenly = np.linspace(0, len(begins) - 1, most).round().astype(int)
+    chosen: np.ndarray = begins[np.unique(evenly)]
+    return chosen
 
 
 def electrode_misfits(env: MeasuredEnv, played: Played,
@@ -101,8 +133,7 @@ def electrode_misfits(env: MeasuredEnv, played: Played,
     """
     record = env.record
     frame = record.frame
-    begins = np.arange(0, len(played.mean) - frame + 1, frame)
-    begins = begins[np.unique(np.linspace(0, len(begins) - 1, most).round().astype(int))]
+    begins = _begins(env, most)
     at_rest = isinstance(env.task.transport, AtRest)
     takes_part = record.matrix != 0.0
     carries = record.currents != 0.0
@@ -114,7 +145,8 @@ def electrode_misfits(env: MeasuredEnv, played: Played,
     for misfit, begin in zip(misfits, begins, strict=True):
         squares, count = np.zeros(len(misfit)), np.zeros(len(misfit))
         for t in range(begin, begin + frame):
-            off = env.off(t + 1, played.mean[-1 if at_rest else max(t - 1, 0)])
+            row = -1 if at_rest else played.at(max(t, 1))
+            off = env.off(t + 1, played.mean[row])
             tell = tells[record.injections[t]]
             squares += np.nan_to_num(off)**2 @ tell
             count += tell.sum(axis=0)
@@ -130,7 +162,7 @@ def _shown(env: MeasuredEnv, steps: Iterator[tuple[int, Estimate]],
 
 
 def _variance(said: list[Estimate]) -> np.ndarray | None:
-    if said[-1].variance is None:
+    if not said or said[-1].variance is None:
         return None
     none = np.full(len(said[-1].mean), np.nan)
     return np.array([none if each.variance is None else each.variance for each in said])

@@ -19,12 +19,15 @@ def estimate(
         "--baseline", help="Method, by name or path; may be repeated. The first is drawn.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Page to write.")] = Path("report.html"),
     arrays: Annotated[Path | None, typer.Option(
-        help="File for the first method's estimates too, npz.")] = None,
+        help="File for all of the first method's estimates too, npz; they are kept in memory till "
+             "then.")] = None,
     format: Annotated[str | None, typer.Option(
         help="hdf5, ktc, eidors, sciospec or table. Default: what the file tells.")] = None,
     withheld: Annotated[float, typer.Option(
         min=0.0, max=0.5, help="Part of the readings that methods are not shown and are judged "
                                "by.")] = 0.1,
+    span: Annotated[str | None, typer.Option(
+        help="Only readings FIRST:LAST, counted from 0, the last not among them.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Which readings those are.")] = 0,
     truth: Annotated[Path | None, typer.Option(
         help="What was in a round tank, as KTC has it: variable truth of a .mat file, 256 × 256 "
@@ -39,7 +42,7 @@ def estimate(
     """Estimate what an instrument saw in a tank or pipe: calibrates the vessel, plays methods, and
     writes a page with the estimates, how well they predict readings that they were not shown,
     and what is odd about the record."""
-    from eitbench.bench.measured import play_record
+    from eitbench.bench.measured import pages_steps, play_record
     from eitbench.bench.segmentation import (
         check_tank,
         distances,
@@ -54,6 +57,8 @@ def estimate(
         if out.suffix != ".html":
             raise ValueError(f"--out must end in .html, got {out}")
         record = read(file, format)
+        if span is not None:
+            record = record.part(_steps(span))
         options.say(f"{file}: {len(record.readings)} times {len(record.matrix)} readings of "
                     f"{record.currents.shape[1]} electrodes; a method takes about "
                     f"{10 + 0.03 * len(record.readings):.0f} s")
@@ -67,7 +72,8 @@ def estimate(
             options.say(f"odd: {doubt}", err=True)
         played = []
         for name in baseline:
-            played.append(play_record(env, name, seed))
+            kept = pages_steps(env) if arrays is None else None
+            played.append(play_record(env, name, seed, kept=kept))
             options.say(f"{played[-1].method}: withheld readings missed by "
                         f"{played[-1].withheld:.2f} noise std")
             if picture is not None:
@@ -80,3 +86,11 @@ def estimate(
         if arrays is not None:
             played[0].save(arrays, env)
             options.say(f"wrote {arrays}")
+
+
+def _steps(span: str) -> slice:
+    """``0:800``"""
+    first, colon, last = span.partition(":")
+    if not (colon and first.isdigit() and (last.isdigit() or not last)):
+        raise ValueError(f"--span must be two numbers such as 0:800, got {span!r}")
+    return slice(int(first), int(last) if last else None)

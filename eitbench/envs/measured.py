@@ -20,7 +20,7 @@ from eitbench.estimation.measured.plausible import doubts
 from eitbench.estimation.measured.readings import ReadingModel
 from eitbench.estimation.measured.record import (
     readings_there,
-    shown_record,
+    shown_reading,
     withheld_readings,
 )
 from eitbench.estimation.measured.task import measured_task
@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 FIRST_GUESS = 1e-4
 """Ω·m², of the contact impedances."""
+NOISE_FRAMES = 1000
+"""The first so many frames tell the noise."""
 
 
 class MeasuredEnv(KnowsItsLength, gym.Env[Observation, np.ndarray]):  # type: ignore[misc]
@@ -82,7 +84,7 @@ class MeasuredEnv(KnowsItsLength, gym.Env[Observation, np.ndarray]):  # type: ig
             self.vessel.electrode_model(FIRST_GUESS), record.currents, record.matrix,
             homogeneous, depth=self.vessel.depth,
             conductivity=self.vessel.conductivity, correction=correction,
-            noise=None if len(homogeneous) > 1 else noise_of_frames(record.frames()))
+            noise=None if len(homogeneous) > 1 else noise_of_frames(record.frames(NOISE_FRAMES)))
         if moves is None:
             moves = len(record.readings) >= 2 * record.frame
         believed = {"moves": moves, **believed}
@@ -95,7 +97,7 @@ class MeasuredEnv(KnowsItsLength, gym.Env[Observation, np.ndarray]):  # type: ig
         self._task_of = lru_cache(maxsize=1)(self._make_task)
         self._show(0)
         n = self.task.mesh.n_nodes
-        voltage = 100.0 * float(np.nanmax(np.abs(record.readings)))
+        voltage = 100.0 * record.largest
         current = float(np.abs(record.currents).max())
         M, L = record.matrix.shape
         self.observation_space: spaces.Dict = spaces.Dict({  # type: ignore[assignment]
@@ -118,12 +120,6 @@ class MeasuredEnv(KnowsItsLength, gym.Env[Observation, np.ndarray]):  # type: ig
         self.hidden = self.there & ~model.seen
         """(K, M) bool: readings that the agent is not shown."""
         self._judge = model.showing(self.there)
-        T = self.episode_steps
-        self.judged: dict[int, range] = (
-            {T: range(1, T + 1)} if isinstance(self.task.transport, AtRest)
-            else {t: range(t, t + 1) for t in range(self.task.warm_up + 1, T + 1)})
-        """By the withheld readings of which injections an estimate at t is judged."""
-        self._shown = shown_record(self.task, self.record)
 
     def reset(self, *, seed: int | None = None,
               options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
@@ -140,8 +136,8 @@ class MeasuredEnv(KnowsItsLength, gym.Env[Observation, np.ndarray]):  # type: ig
             raise gym.error.ResetNeeded(RESET_NEEDED)
         estimate = checked_actions(action, self.action_space, self.task.mesh.n_nodes)
         reward = 0.0
-        if self._step in self.judged:
-            off = np.concatenate([self.missed(t, estimate) for t in self.judged[self._step]])
+        if judged := self.judged_by(self._step):
+            off = np.concatenate([self.missed(t, estimate) for t in judged])
             reward = -float(np.mean(off**2)) if len(off) else 0.0
         self._step += 1
         return (self._observe(), reward, self._step > self.episode_steps, False,
@@ -150,6 +146,13 @@ class MeasuredEnv(KnowsItsLength, gym.Env[Observation, np.ndarray]):  # type: ig
     def doubts(self) -> list[str]:
         """What is odd about the record; see `eitbench.estimation.measured.plausible.doubts`."""
         return doubts(self.record, self.calibration, self.vessel.electrode_model(FIRST_GUESS))
+
+    def judged_by(self, t: int) -> range:
+        """By the withheld readings of which injections 1 … T an estimate at t is judged."""
+        T = self.episode_steps
+        if isinstance(self.task.transport, AtRest):
+            return range(1, T + 1) if t == T else range(0)
+        return range(t, t + 1) if t > self.task.warm_up else range(0)
 
     def missed(self, t: int, estimate: np.ndarray) -> np.ndarray:
         """By how much an estimate (n,) misses the readings withheld at t = 1 … T, in standard
@@ -169,8 +172,8 @@ class MeasuredEnv(KnowsItsLength, gym.Env[Observation, np.ndarray]):  # type: ig
         if self._step > self.episode_steps:
             return {name: np.zeros_like(space.low)  # type: ignore[attr-defined]
                     for name, space in self.observation_space.items()}
-        voltages, currents = self._shown[self._step - 1]
-        return {"voltages": voltages.copy(), "currents": currents.copy()}
+        voltages, currents = shown_reading(self.task, self.record, self._step - 1)
+        return {"voltages": voltages, "currents": currents.copy()}
 
 
 def simulated_record(env: EstimationEnv, seed: int) -> Measurements:

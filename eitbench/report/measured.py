@@ -113,11 +113,11 @@ def _facts(env: MeasuredEnv) -> dict[str, str]:
 
 def _estimate(env: MeasuredEnv, played: Played) -> str:
     """The last estimate of a target at rest, or an animation, as a data URI."""
-    T = len(played.mean)
+    T = env.episode_steps
     if _is_at_rest(env):
         return _figure(_picture(env, played, T))
-    first = min(env.task.warm_up + 1, T)
-    at = np.unique(np.linspace(first, T, FRAMES).round().astype(int))
+    after = played.steps[played.steps > min(env.task.warm_up, T - 1)]
+    at = after[np.unique(np.linspace(0, len(after) - 1, FRAMES).round().astype(int))]
     frames = [_image(_picture(env, played, int(t))) for t in at]
     content = io.BytesIO()
     frames[0].save(content, "webp", save_all=True, append_images=frames[1:], loop=0, duration=125,
@@ -129,15 +129,17 @@ def _picture(env: MeasuredEnv, played: Played, t: int) -> Figure:
     """Estimate and its standard deviation at t."""
     task = env.task
     conducts = 1e3 * env.calibration.conductivity / task.expected_concentration
-    shown = conducts * played.mean[min(task.warm_up, len(played.mean) - 1):]
+    row = played.at(t)
+    after = played.steps > min(task.warm_up, env.episode_steps - 1)
+    shown = conducts * played.mean[after]
     low, high = np.quantile(shown, SHARE)
-    field = conducts * played.mean[t - 1]
+    field = conducts * played.mean[row]
     in_decades = shown.min() > 0.0 and high > DECADES * low
     if in_decades:
         field, low, high = (np.log10(each) for each in (field, low, high))
     spread = np.full(1, np.nan)
     if played.variance is not None:
-        spread = conducts * np.sqrt(played.variance[t - 1])
+        spread = conducts * np.sqrt(played.variance[row])
     panels = 2 if np.isfinite(spread).all() else 1
     figure = Figure(figsize=(5.2 * panels, 4.4), dpi=100, layout="constrained")
     axes = figure.subplots(1, panels, squeeze=False)[0]

@@ -3,7 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from eitbench.bench.measured import electrode_misfits, play_record
+from eitbench.bench.measured import electrode_misfits, pages_steps, play_record
 from eitbench.bench.methods import load_method
 from eitbench.cli.app import app
 from eitbench.data.measured import Measurements
@@ -14,6 +14,7 @@ from eitbench.estimation.measured.task import known_flow_task
 from eitbench.estimation.walk import RandomWalk
 from eitbench.numerics.fem import mass_matrix
 from eitbench.physics.rest import AtRest
+from eitbench.report.measured import write_report
 from tanks import CONTACTS, VESSEL, angle, moving
 from typer.testing import CliRunner
 
@@ -215,6 +216,20 @@ def test_misfits_are_those_of_the_readings_in_which_an_electrode_takes_part(env,
     own = [env.off(t + 1, played["homogeneous"].mean[t - 1])[m] for t in range(40, 48) for m in range(8)
            if record.matrix[m, 2] != 0 and record.currents[t % 8, 2] != 0]
     assert misfits[1, 2] == pytest.approx(np.sqrt(np.mean(np.square(own))))
+
+
+def test_a_page_needs_few_estimates(env, played, record, tmp_path):
+    """Those of some frames; scores are those of all, and so are misfits and the page."""
+    steps = pages_steps(env)
+    some = play_record(env, "homogeneous", kept=steps)
+    np.testing.assert_array_equal(some.steps, steps)
+    np.testing.assert_array_equal(some.missed, played["homogeneous"].missed)
+    np.testing.assert_array_equal(some.mean, played["homogeneous"].mean[steps - 1])
+    np.testing.assert_array_equal(electrode_misfits(env, some)[1], electrode_misfits(env, played["homogeneous"])[1])
+    write_report(tmp_path / "page.html", env, [some], {})
+    few = play_record(env, "homogeneous", kept=np.array([1, 20]))
+    with pytest.raises(ValueError, match="t must be a step of which the estimate is kept, got 8"):
+        electrode_misfits(env, few)
 
 
 def test_page_and_arrays(tmp_path, record):

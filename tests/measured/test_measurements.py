@@ -1,9 +1,13 @@
 """The container of measured records."""
 
+import tracemalloc
+
+import h5py
 import numpy as np
 import pytest
 from eitbench.data.measured import Measurements
-from tanks import moving
+from eitbench.envs.measured import MeasuredEnv
+from tanks import VESSEL, moving
 
 PAIR = np.array([[1.0, -1.0, 0.0], [0.0, 1.0, -1.0]])
 
@@ -82,3 +86,53 @@ def test_frames_follow_each_other():
     frames = record.frames()
     assert frames.shape == (3, 8, 8)
     np.testing.assert_array_equal(frames[1, 3], record.readings[11])
+
+
+def test_a_large_record_stays_on_the_disk(tmp_path):
+    """To read it, calibrate and play a little of it takes more memory than a short one does by less than half of its
+    readings, and nothing of it is another number."""
+    sound = moving(frames=8, records=1)
+    times = 18_000
+    large = Measurements(sound.currents, np.tile(sound.injections, times), sound.matrix,
+                         np.tile(sound.readings, (times, 1)), 0.01 * np.arange(64 * times), sound.reference)
+    size = large.readings.nbytes
+    assert size > 1 << 26
+    paths = large.part(slice(0, 640)).save(tmp_path / "short.h5"), large.save(tmp_path / "large.h5")
+    del large
+
+    def first_step(path):
+        tracemalloc.start()
+        env = MeasuredEnv(path, VESSEL, initial_std=0.2, walk_std=0.05)
+        observation, _ = env.reset(seed=0)
+        env.step(np.full(env.task.mesh.n_nodes, env.task.expected_concentration))
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return env.record, observation["voltages"], peak
+
+    (short, seen, usual), (long, same, peak) = map(first_step, paths)
+    assert peak - usual < size / 2
+    assert not long.readings.flags.writeable
+    np.testing.assert_array_equal(seen, same)
+    np.testing.assert_array_equal(long.readings[640_000:640_640], short.readings)
+
+
+def test_parts_of_a_record():
+    """Of injections that came alone; the reference with them."""
+    sound = moving(frames=3)
+    part = sound.part(slice(9, 12))
+    np.testing.assert_array_equal(part.readings, sound.readings[9:12])
+    np.testing.assert_array_equal(part.currents[part.injections], sound.currents[sound.injections[9:12]])
+    np.testing.assert_array_equal(part.reference, sound.reference[:, 1:4])
+    with pytest.raises(ValueError, match="steps must hold readings of the 24, got"):
+        sound.part(slice(30, 40))
+
+
+def test_what_could_not_be_written_leaves_what_was_there(tmp_path, monkeypatch):
+    """And no half of it beside."""
+    path = moving(frames=1).save(tmp_path / "a.h5")
+    before = path.read_bytes()
+    monkeypatch.setattr(h5py.File, "create_dataset", lambda *_, **__: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        moving(frames=2).save(path)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]

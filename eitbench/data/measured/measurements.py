@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import io
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -14,10 +13,14 @@ import numpy as np
 
 from eitbench import _check
 from eitbench._extras import needed_by
-from eitbench._files import write_atomically
+from eitbench._files import replacing
 
 FORMAT = "eitbench measurements"
 VERSION = 1
+IN_MEMORY = 1 << 26
+"""bytes of readings"""
+BLOCK = 1 << 20
+"""numbers that are looked at at once"""
 BALANCE = 1e-6
 """Part of an injection's largest current that its currents may fail to sum to zero by."""
 
@@ -26,8 +29,10 @@ BALANCE = 1e-6
 class Measurements:
     """A record of T readings, M numbers each, of K different injections by L electrodes.
 
-    ``ValueError`` naming the field that is of the wrong shape, holds no numbers, or contradicts
-    another; currents that fail to sum to zero by rounding are freed of their mean.
+    Arrays are copied, but for those that are read-only, such as the readings of a large file, which
+    stay on the disk (`load`). ``ValueError`` naming the field that is of the wrong shape, holds no
+    numbers, or contradicts another; currents that fail to sum to zero by rounding are freed of
+    their mean.
     """
 
     currents: np.ndarray
@@ -79,7 +84,7 @@ class Measurements:
         for name, value in (("currents", currents), ("injections", injections),
                             ("matrix", matrix), ("readings", readings), ("times", times),
                             ("reference", reference)):
-            if value is not None:
+            if value is not None and value.flags.writeable:
                 value = value.copy()
                 value.setflags(write=False)
             object.__setattr__(self, name, value)
@@ -125,9 +130,28 @@ class Measurements:
         return _by_injection(self.readings[None, :steps], self.injections[:steps],
                              len(self.currents))
 
-    def frames(self) -> np.ndarray:
-        """(F, K, M) V: whole frames one after another; NaN where nothing was read."""
+    @cached_property
+    def largest(self) -> float:
+        """V, of all readings."""
+        return max(float(np.abs(block[np.isfinite(block)]).max(initial=0.0))
+                   for block in _blocks(self.readings))
+
+    def part(self, steps: slice) -> Measurements:
+        """The record of some readings one after another, of those injections that came."""
+        injections = self.injections[steps]
+        if not injections.size:
+            raise ValueError(f"steps must hold readings of the {len(self.injections)}, got {steps}")
+        came = np.unique(injections)
+        reference = None if self.reference is None else self.reference[:, came]
+        return Measurements(self.currents[came], np.searchsorted(came, injections), self.matrix,
+                            self.readings[steps], self.times[steps], reference, self.source)
+
+    def frames(self, most: int | None = None) -> np.ndarray:
+        """(F, K, M) V: whole frames one after another, the first so many of them; NaN where nothing
+        was read."""
         whole = len(self.readings) - len(self.readings) % self.frame
+        if most is not None:
+            whole = min(whole, most * self.frame)
         return np.concatenate([
             _by_injection(self.readings[None, t:t + self.frame],
                           self.injections[t:t + self.frame], len(self.currents))
@@ -137,8 +161,8 @@ class Measurements:
         """Write one HDF5 file, whole or not at all; extra ``export``."""
         with needed_by("a file of measurements"):
             import h5py
-        content = io.BytesIO()
-        with h5py.File(content, "w") as file:
+        path = Path(path)
+        with replacing(path) as temporary, h5py.File(temporary, "w") as file:
             file.attrs["format"] = FORMAT
             file.attrs["version"] = VERSION
             file.attrs["source"] = json.dumps(dict(self.source))
@@ -146,13 +170,16 @@ class Measurements:
                 value = getattr(self, name)
                 if value is not None:
                     file.create_dataset(name, data=value)
-        write_atomically(Path(path), content.getvalue())
-        return Path(path)
+        return path
 
     @classmethod
     def load(cls, path: Path | str, steps: slice = slice(None)) -> Measurements:
-        """What `save` has written, or only some of its readings, of which alone is read then;
-        ``ValueError`` naming the file and what is wrong with it."""
+        """What `save` has written, or only some of its readings, of which alone is read then.
+
+        Readings of more than `IN_MEMORY` bytes stay in the file, which must not change, and are
+        read from there where they are needed. ``ValueError`` naming the file and what is wrong
+        with it.
+        """
         with needed_by("a file of measurements"):
             import h5py
         try:
@@ -161,13 +188,31 @@ class Measurements:
                     raise ValueError(f"format must be {FORMAT!r}, version {VERSION}, got "
                                      f"{file.attrs.get('format')!r}, version "
                                      f"{file.attrs.get('version')!r}")
-                along = {name: file[name][steps] for name in ("injections", "readings", "times")}
+                along = {name: file[name][steps] for name in ("injections", "times")}
+                along["readings"] = _mapped(Path(path), file["readings"], steps)
                 whole = {name: file[name][()] for name in ("currents", "matrix")}
                 reference = file["reference"][()] if "reference" in file else None
                 source = json.loads(file.attrs["source"])
             return cls(**along, **whole, reference=reference, source=source)
         except (OSError, KeyError, ValueError, TypeError) as error:
             raise ValueError(f"{path} must be a file of measurements: {error}") from None
+
+
+def _mapped(path: Path, dataset: Any, steps: slice) -> np.ndarray:
+    """Some rows of a data set, in the file where they are large and lie there as they are."""
+    large = dataset.size * dataset.dtype.itemsize > IN_MEMORY
+    begin = dataset.id.get_offset()                 # None if it is compressed or in chunks
+    if not large or begin is None or dataset.dtype != np.float64:
+        rows: np.ndarray = dataset[steps]
+        return rows
+    return np.memmap(path, dataset.dtype, "r", begin, dataset.shape)[steps]
+
+
+def _blocks(values: np.ndarray) -> Iterator[np.ndarray]:
+    """Of rows, so many at once that they take little memory."""
+    rows = max(BLOCK // max(values[0].size, 1), 1)
+    for begin in range(0, len(values), rows):
+        yield values[begin:begin + rows]
 
 
 def _by_injection(records: np.ndarray, injections: np.ndarray, K: int) -> np.ndarray:
@@ -201,14 +246,14 @@ def _numbers(name: str, given: np.ndarray, shape: tuple[int | None, ...]) -> np.
     value = np.asarray(given)
     if np.iscomplexobj(value):
         raise ValueError(f"{name} must be real, got complex ones; say which part is used")
-    value = value.astype(float)
+    value = value.astype(float, copy=False)
     fits = value.ndim == len(shape) and all(
         want in (None, size) for want, size in zip(shape, value.shape, strict=True))
     if not fits or not value.size:
         wanted = ", ".join("any" if size is None else str(size) for size in shape)
         raise ValueError(f"{name} must have shape ({wanted}), got {value.shape}")
-    if np.isinf(value).any():
+    if any(np.isinf(block).any() for block in _blocks(value)):
         raise ValueError(f"{name} must be finite or NaN, got infinite ones")
-    if np.isnan(value).all():
+    if all(np.isnan(block).all() for block in _blocks(value)):
         raise ValueError(f"{name} must hold numbers, got NaN only")
     return value

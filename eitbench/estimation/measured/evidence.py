@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from eitbench.estimation.kalman import LinearisedObservations
-from eitbench.estimation.measured.record import shown_record
+from eitbench.estimation.measured.record import shown_reading
 from eitbench.estimation.smoothness import smoothness_covariance
 from eitbench.numerics.fem import mass_matrix, stiffness_matrix
 from eitbench.worlds.task import Task
@@ -73,7 +73,6 @@ class _Surprise:
         looked_at = np.unique(np.minimum(begins[:, None] + np.arange(frames), task.n_steps - 1))
         self._steps = np.diff(looked_at, prepend=-1)
         """from one to the next"""
-        shown = shown_record(task, record)
         background = task.expected_concentration
         covariance = smoothness_covariance(mass_matrix(task.mesh), stiffness_matrix(task.mesh),
                                            task.prior.initial_length, background)
@@ -83,7 +82,7 @@ class _Surprise:
         point = np.full(task.mesh.n_nodes, background)
         linear = LinearisedObservations(task.observation, task.noise, point)
         self._shown = []
-        for voltages, currents in (shown[t] for t in looked_at):
+        for voltages, currents in (shown_reading(task, record, t) for t in looked_at):
             H, value, variance = linear(voltages, currents)
             seen = H.any(axis=1)
             self._shown.append(((H[seen] @ modes), (value - H @ point)[seen], variance[seen]))

@@ -12,13 +12,15 @@ if TYPE_CHECKING:
     from eitbench.data.measured import Measurements
     from eitbench.worlds.task import Task
 
+ROWS = 10_000
+"""readings that are looked at at once"""
 
-def shown_record(task: Task, record: Measurements) -> list[tuple[np.ndarray, np.ndarray]]:
-    """(readings (M,), currents (L,)) of each step; what an estimator is not shown is 0."""
+
+def shown_reading(task: Task, record: Measurements, t: int) -> tuple[np.ndarray, np.ndarray]:
+    """Readings (M,) and currents (L,) of step t = 0, 1, …; what an estimator is not shown is 0."""
     assert isinstance(task.observation, ReadingModel)
-    seen = task.observation.seen[record.injections]
-    return [(np.where(here, reading, 0.0), record.currents[k])
-            for here, reading, k in zip(seen, record.readings, record.injections, strict=True)]
+    k = record.injections[t]
+    return np.where(task.observation.seen[k], record.readings[t], 0.0), record.currents[k]
 
 
 def readings_there(record: Measurements) -> np.ndarray:
@@ -26,8 +28,11 @@ def readings_there(record: Measurements) -> np.ndarray:
     is not used at all. ``ValueError`` if nothing is left."""
     K, M = len(record.currents), len(record.matrix)
     there = np.ones((K, M), dtype=bool)
-    for k, read in zip(record.injections, np.isfinite(record.readings), strict=True):
-        there[k] &= read
+    for begin in range(0, len(record.readings), ROWS):
+        injections = record.injections[begin:begin + ROWS]
+        finite = np.isfinite(record.readings[begin:begin + ROWS])
+        for k in np.unique(injections):
+            there[k] &= finite[injections == k].all(axis=0)
     there[np.setdiff1d(np.arange(K), record.injections)] = False
     if not there.any():
         raise ValueError("readings must hold some that are there whenever their injection is, got "
