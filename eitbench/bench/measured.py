@@ -51,8 +51,8 @@ class Played:
         content = io.BytesIO()
         mesh = env.task.mesh
         said: dict[str, Any] = {
-            "steps": self.steps, "mean": self.mean, "nis": self.nis, "missed": self.missed, "times": env.record.times,
-            "points": mesh.points, "cells": mesh.cells}
+            "steps": self.steps, "mean": self.mean, "nis": self.nis, "missed": self.missed,
+            "times": env.record.times, "points": mesh.points, "cells": mesh.cells}
         if self.variance is not None:
             said["variance"] = self.variance
         np.savez_compressed(content, **said)
