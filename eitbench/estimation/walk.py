@@ -14,6 +14,29 @@ if TYPE_CHECKING:
     from eitbench.numerics.mesh import Mesh
     from eitbench.physics.transport import EvolutionModel
 
+KEPT = 1e-3
+"""Modes that hold less than this part of the strongest one's variance are left out."""
+
+
+def steady(phase: float) -> tuple[np.ndarray, np.ndarray]:
+    """A and Q (2, 2) of a number of variance 1 that moves steadily, and of its change in 1/λ, after
+    ``phase`` = λτ: a second-order walk that forgets, a Matérn process of order 3/2 in time with the
+    correlation (1 + λτ) e^−λτ (Hartikainen & Särkkä 2010, "Kalman filtering and smoothing solutions
+    to temporal Gaussian process regression models")."""
+    A = np.exp(-phase) * np.array([[1.0 + phase, phase], [-phase, 1.0 - phase]])
+    return A, np.eye(2) - A @ A.T
+
+
+def smooth_modes(mesh: Mesh, length: float) -> np.ndarray:
+    """(n, K) modes of a Matérn field over ``length`` in m, of mean variance 1: what is smooth is
+    their sum with independent standard normal weights."""
+    from eitbench.numerics.fem import mass_matrix, stiffness_matrix
+    covariance = smoothness_covariance(mass_matrix(mesh), stiffness_matrix(mesh), length, 1.0)
+    values, vectors = np.linalg.eigh(covariance)
+    kept = values > KEPT * values[-1]
+    modes: np.ndarray = vectors[:, kept] * np.sqrt(values[kept])
+    return modes
+
 
 @dataclass(frozen=True, eq=False)
 class RandomWalk:
@@ -31,6 +54,8 @@ class RandomWalk:
     """ℓ in m, > 0, over which what changes is alike; see `smoothness_covariance`"""
     memory: float = 1.0
     """φ, from 0 to 1"""
+    rate: float = 0.0
+    """λ in 1/s of `steady` motion that is as likely, for those who believe in it; 0: not known"""
 
     @property
     def inlet(self) -> np.ndarray:

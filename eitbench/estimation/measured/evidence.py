@@ -2,28 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.optimize import minimize
+from scipy.optimize import minimize, minimize_scalar
 
 from eitbench.estimation.kalman import LinearisedObservations
 from eitbench.estimation.measured.record import shown_reading
-from eitbench.estimation.smoothness import smoothness_covariance
-from eitbench.numerics.fem import mass_matrix, stiffness_matrix
+from eitbench.estimation.modes import ModesFilter
+from eitbench.estimation.walk import smooth_modes, steady
 from eitbench.worlds.task import Task
 
 if TYPE_CHECKING:
     from eitbench.data.measured import Measurements
 
-KEPT = 1e-3
-"""Modes that hold less than this part of the strongest one's variance are left out."""
 SPANS, FRAMES = 3, 2
 """So many times so many frames one after another are looked at, evenly over the record."""
 STARTS = {"noise": 3.0, "initial": 0.3, "walk": 0.03}
 LIMITS = {"initial": (1e-2, 1.0), "walk": (1e-4, 1.0)}
 """Standard deviations in parts of the background."""
+RATES = (1e-2, 3.0)
+"""1/λ over the duration of a frame, from the least to the largest that is looked at."""
 NOISE = {True: (1.0, 1e3), False: (0.1, 10.0)}
 """Factor of a noise that repeats have told, to which the model's error comes, and of one that holds
 all that the model does not explain, of which a correction leaves a tenth at least."""
@@ -46,7 +48,12 @@ def likeliest(task: Task, record: Measurements, *, noise_is_told: bool, initial_
     def numbers(x: np.ndarray) -> dict[str, float]:
         return given | {name: float(np.exp(value)) for name, value in zip(free, x, strict=True)}
 
-    found = minimize(lambda x: surprise(**numbers(x)), np.log([STARTS[name] for name in free]),
+    def surprised(x: np.ndarray) -> float:
+        said = numbers(x)
+        memory = remembered(said["initial"], said["walk"])
+        return surprise(said["noise"], said["initial"], partial(_forgetting, memory))
+
+    found = minimize(surprised, np.log([STARTS[name] for name in free]),
                      method="Nelder-Mead", bounds=np.log([limits[name] for name in free]),
                      options={"xatol": 0.03, "fatol": 0.1, "maxfev": 60 * len(free)})
     best = numbers(found.x)
@@ -57,6 +64,23 @@ def likeliest(task: Task, record: Measurements, *, noise_is_told: bool, initial_
                             of_largest=factor * noise.of_largest, floor=factor * noise.floor),
         prior=replace(task.prior, initial_std=best["initial"],
                       nodal_std=min(best["walk"], best["initial"])))
+
+
+def likeliest_rate(task: Task, record: Measurements) -> float:
+    """λ in 1/s of `steady` motion under which the same frames are likeliest, with the task's noise
+    and initial standard deviation."""
+    surprise = _Surprise(task, record)
+    frame = max(task.warm_up, 1)
+    found = minimize_scalar(
+        lambda x: surprise(1.0, task.prior.initial_std, lambda steps: steady(np.exp(x) * steps)),
+        bounds=np.log([each / frame for each in RATES]), method="bounded", options={"xatol": 0.05})
+    return float(np.exp(found.x)) / task.transport.time_step
+
+
+def _forgetting(memory: float, steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """As `steady`, of a walk that forgets."""
+    kept = memory**steps
+    return np.array([[kept]]), np.array([[1.0 - kept**2]])
 
 
 def remembered(initial: float, walk: float) -> float:
@@ -74,11 +98,7 @@ class _Surprise:
         self._steps = np.diff(looked_at, prepend=-1)
         """from one to the next"""
         background = task.expected_concentration
-        covariance = smoothness_covariance(mass_matrix(task.mesh), stiffness_matrix(task.mesh),
-                                           task.prior.initial_length, background)
-        values, vectors = np.linalg.eigh(covariance)
-        kept = values > KEPT * values[-1]
-        modes = vectors[:, kept] * np.sqrt(values[kept])
+        modes = background * smooth_modes(task.mesh, task.prior.initial_length)
         point = np.full(task.mesh.n_nodes, background)
         linear = LinearisedObservations(task.observation, task.noise, point)
         self._shown = []
@@ -87,24 +107,13 @@ class _Surprise:
             seen = H.any(axis=1)
             self._shown.append(((H[seen] @ modes), (value - H @ point)[seen], variance[seen]))
 
-    def __call__(self, noise: float, initial: float, walk: float) -> float:
-        size = self._shown[0][0].shape[1]
-        mean = np.zeros(size)
-        P = initial**2 * np.eye(size)
+    def __call__(self, noise: float, initial: float,
+                 motion: Callable[[int], tuple[np.ndarray, np.ndarray]]) -> float:
+        filter = ModesFilter(self._shown[0][0].shape[1], initial, len(motion(1)[0]))
         total = 0.0
-        memory = remembered(initial, walk)
         for steps, (H, value, variance) in zip(self._steps, self._shown, strict=True):
-            kept = memory**steps
-            mean *= kept
-            P *= kept**2
-            P[np.diag_indices(size)] += (1.0 - kept**2) * initial**2
-            cross = P @ H.T
-            S = H @ cross + np.diag(noise**2 * variance)
-            innovation = value - H @ mean
-            gain = np.linalg.solve(S, cross.T).T
+            filter.predict(*motion(int(steps)))
+            innovation, S = filter.update(H, value - H @ filter.mean, noise**2 * variance)
             total += float(innovation @ np.linalg.solve(S, innovation))
             total += float(np.linalg.slogdet(S)[1])
-            mean = mean + gain @ innovation
-            P = P - gain @ cross.T
-            P = 0.5 * (P + P.T)
         return total

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from eitbench import _check
-from eitbench.estimation.measured.evidence import likeliest, remembered
+from eitbench.estimation.measured.evidence import likeliest, likeliest_rate, remembered
 from eitbench.estimation.measured.readings import ReadingModel
 from eitbench.estimation.measured.record import readings_there
 from eitbench.estimation.walk import RandomWalk
@@ -94,7 +94,8 @@ def measured_task(vessel: RealVessel, calibration: Calibration, record: Measurem
     if not moves:
         return found
     memory = remembered(found.prior.initial_std, found.prior.nodal_std)
-    return replace(found, transport=RandomWalk(mesh, step, length, memory))
+    rate = likeliest_rate(found, record)
+    return replace(found, transport=RandomWalk(mesh, step, length, memory, rate))
 
 
 def known_flow_task(task: Task, record: Measurements, *, depth: float = 1.0,
