@@ -30,7 +30,12 @@ from eitbench.estimation.inflow_prior import (
     suiting_priors,
     white_inflow,
 )
-from eitbench.estimation.inflow_response import Response, changing_responses, steady_response
+from eitbench.estimation.inflow_response import (
+    Response,
+    changing_responses,
+    reduced_response,
+    steady_response,
+)
 from eitbench.estimation.inflow_tracker import InflowSmoother, InflowTracker
 from eitbench.estimation.joint import JointFilter, JointStep
 from eitbench.estimation.joint_inflow import JointInflowFilter
@@ -43,7 +48,7 @@ from eitbench.estimation.kalman import (
     linearised,
 )
 from eitbench.estimation.parameters import initial_covariance, starting_filter, table_5_1
-from eitbench.estimation.quadratic_voltages import QuadraticVoltages
+from eitbench.estimation.quadratic_voltages import QuadraticVoltages, ScaledVoltages
 from eitbench.estimation.smoother import (
     Smoothed,
     fixed_interval_smoother,
@@ -59,12 +64,12 @@ __all__ = [
     "Filtered", "FirstFrame", "FreeCovariance", "GainSequence", "IdentifiedModel", "InflowFilter",
     "InflowPrior", "InflowSmoother", "InflowTracker", "JointFilter", "JointInflowFilter",
     "JointStep", "KalmanFilter", "LinearisedObservations", "Observation", "QuadraticVoltages",
-    "Regimes", "Response", "Smoothed", "SwitchingInflowFilter", "UnknownFlow", "VoltagesSeen",
-    "asked_flow", "best_homogeneous", "blank", "changing_responses", "corrected",
+    "Regimes", "Response", "ScaledVoltages", "Smoothed", "SwitchingInflowFilter", "UnknownFlow",
+    "VoltagesSeen", "asked_flow", "best_homogeneous", "blank", "changing_responses", "corrected",
     "fit_inflow_prior", "fixed_interval_smoother", "gain_sequence", "gauss_newton",
     "identified_model", "initial_covariance", "kalman_filter", "learned_inflow_prior", "linearised",
-    "load_network", "most_probable_inflow", "network_suits", "remember", "said", "scaled_flow",
-    "smoothed_inflow", "smoothed_means", "smoothed_state", "smoothness_covariance",
+    "load_network", "most_probable_inflow", "network_suits", "reduced_response", "remember", "said",
+    "scaled_flow", "smoothed_inflow", "smoothed_means", "smoothed_state", "smoothness_covariance",
     "starting_filter", "steady_response", "suiting_models", "suiting_priors", "table_5_1",
     "white_inflow",
 ]

@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -236,9 +237,15 @@ def suiting_priors(folder: Path, task: Task, link: str) -> list[InflowPrior]:
 
     Another world may have other slugs: one whose own are not known takes those of the first file.
     """
-    found = map(InflowPrior.load, sorted(folder.glob("*.json")))
+    found = map(_loaded, sorted(folder.glob("*.json")))
     suiting = [prior for prior in found if prior.link == link and prior.suits(task)]
     return sorted(suiting, key=lambda prior: _world(prior) != task.world)
+
+
+@lru_cache(maxsize=16)
+def _loaded(path: Path) -> InflowPrior:
+    """Once a process, so that what is derived from it can be kept with it."""
+    return InflowPrior.load(path)
 
 
 def _world(prior: InflowPrior) -> str | None:

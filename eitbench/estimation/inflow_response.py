@@ -7,8 +7,10 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from scipy.linalg import svd, toeplitz
 
 if TYPE_CHECKING:
+    from eitbench.estimation.inflow_prior import InflowPrior
     from eitbench.physics.transport import Transport
 
 FORGOTTEN = 0.01
@@ -58,6 +60,21 @@ def changing_responses(transport_at: Callable[[int], Transport], n_steps: int) -
     basis = _leading(squared)
     # twice the same, since all of them would need gigabytes
     return [_projected(parts, basis) for parts in _changing(transport_at, n_steps)]
+
+
+def reduced_response(response: Response, prior: InflowPrior, modes: int) -> Response:
+    """The same in so many directions, or all if there are fewer: those in which inflows of the
+    prior move the concentration most, strongest first.
+
+    Those are the eigenvectors of B Γ_c Bᵀ with Γ_c the covariance of Σ_k W_k E x_{t−k}: that of the
+    concentration as far as it is linear in x.
+    """
+    q, K, _ = response.weights.shape
+    root = np.linalg.cholesky(toeplitz(prior.time_covariance(K)))
+    by_x = response.weights @ prior.modes                                            # (q, K, r)
+    moves = np.tensordot(by_x, root, (1, 0)).reshape(q, -1)
+    directions = svd(moves, full_matrices=False)[0][:, :modes]
+    return Response(response.basis @ directions, np.tensordot(directions.T, response.weights, 1))
 
 
 def newest_inflow(transport: Transport) -> np.ndarray:

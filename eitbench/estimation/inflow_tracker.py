@@ -3,6 +3,7 @@ estimators."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,6 +16,7 @@ from eitbench.worlds.task import Estimate
 if TYPE_CHECKING:
     from eitbench.estimation.identified import IdentifiedModel
     from eitbench.estimation.inflow_prior import InflowPrior
+    from eitbench.estimation.inflow_response import Response
     from eitbench.estimation.moving_window import Innovation
     from eitbench.worlds.task import Task
 
@@ -31,15 +33,18 @@ class InflowTracker:
         Of the task's inlet.
     model : IdentifiedModel, optional
         As in `InflowFilter`.
+    responses : sequence of Response, optional
+        As in `InflowFilter`.
     iterated : bool
         Whether each measurement is linearised once more, about what it has taught.
     """
 
     def __init__(self, task: Task, prior: InflowPrior, model: IdentifiedModel | None = None, *,
-                 iterated: bool = False) -> None:
+                 responses: Sequence[Response] | None = None, iterated: bool = False) -> None:
         self.task = task
         self.prior = prior
         self.model = model
+        self.responses = responses
         self.iterated = iterated
         self.first = FirstFrame(task)
         self._measured = 0
@@ -56,7 +61,7 @@ class InflowTracker:
                 if not self.first.add(voltages, currents):
                     return Estimate(self.first.mean) if self._asked_for > 0 else None
                 self.filter = InflowFilter(self.task, self.prior, self.first.c_bh, self.task.lag,
-                                           model=self.model)
+                                           self.responses, self.model)
                 for earlier in self.first.measurements[:-1]:
                     self._take_in(*earlier)
             innovation, covariance = self._take_in(voltages, currents)

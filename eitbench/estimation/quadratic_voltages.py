@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import Protocol
 
 import numpy as np
 
 from eitbench import _check
-from eitbench.physics.observation import ObservationModel
 
 STEP = 0.1
 """By how much a mode raises the logarithm, root mean square, where differences are taken."""
+
+
+class Resistances(Protocol):
+    """What the quadratic is of; such as `ObservationModel`."""
+
+    smallest_concentration: float
+    """mol/m³, as which what is below counts"""
+
+    def resistance_derivatives(self, concentration: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Transfer resistances (L, L) in Ω (Ω·m in 2D), and by each node's c (n, L, L)."""
 
 
 class QuadraticVoltages:
@@ -22,14 +32,14 @@ class QuadraticVoltages:
 
     Parameters
     ----------
-    model : ObservationModel
+    model : Resistances
     level : float
         c_0 in mol/m³.
     modes : (n, q)
         Of u, linearly independent; what they leave of u enters linearly.
     """
 
-    def __init__(self, model: ObservationModel, level: float, modes: np.ndarray) -> None:
+    def __init__(self, model: Resistances, level: float, modes: np.ndarray) -> None:
         self.level = _check.number("level", level, low=0.0, open_low=True, units="mol/m³")
         self.smallest = model.smallest_concentration
         modes = _check.array("modes", modes, (None, None))
@@ -45,7 +55,7 @@ class QuadraticVoltages:
         self._curvature = 0.5 * (self._curvature + self._curvature.swapaxes(0, 1))
         self._of_injection = lru_cache(maxsize=64)(self._contracted)
 
-    def _by_mode(self, model: ObservationModel, modes: np.ndarray, u: np.ndarray) -> np.ndarray:
+    def _by_mode(self, model: Resistances, modes: np.ndarray, u: np.ndarray) -> np.ndarray:
         """(q, L·L) derivatives by the modes at ln(c/c_0) = u."""
         c = self.level * np.exp(u)
         table = model.resistance_derivatives(c)[1]
@@ -92,3 +102,52 @@ class QuadraticVoltages:
         c = np.maximum(concentration, self.smallest)
         u = np.log(c / self.level)
         return u, self._to_modes @ u, c
+
+
+class ScaledVoltages:
+    """Voltages that are quadratic at any level: 𝓡(c) = e^−ū 𝓖(u), with u = ln(c/c_0), ū its mean
+    over the nodes, and 𝓖 = e^ū 𝓡 as in `QuadraticVoltages`.
+
+    Were it not for the contacts, 𝓖 would be the same at all levels. It is a `VoltageModel`;
+    arguments and ``ValueError`` as there.
+    """
+
+    def __init__(self, model: Resistances, level: float, modes: np.ndarray) -> None:
+        self.level = _check.number("level", level, low=0.0, open_low=True, units="mol/m³")
+        self.smallest = model.smallest_concentration
+        modes = _check.array("modes", modes, (None, None))
+        with_level, _ = np.linalg.qr(np.column_stack([np.ones(len(modes)), modes]))
+        self._quadratic = QuadraticVoltages(_Scaled(model, level), level, with_level)
+
+    def voltages(self, concentration: np.ndarray, currents: np.ndarray) -> np.ndarray:
+        """(K, L) V for currents (K, L) in A (A/m in 2D) and a concentration (n,) in mol/m³."""
+        c = np.maximum(concentration, self.smallest)
+        return self._quadratic.voltages(c, currents) / _scale(c, self.level)
+
+    def linearise(self, concentration: np.ndarray,
+                  currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Voltages (K, L) in V and their derivatives by c, (K, L, n) in V·m³/mol."""
+        c = np.maximum(concentration, self.smallest)
+        scaled, by_c = self._quadratic.linearise(c, currents)
+        scale = _scale(c, self.level)
+        return scaled / scale, (by_c - scaled[..., None] / (len(c) * c)) / scale
+
+
+class _Scaled:
+    """𝓖 and its derivatives."""
+
+    def __init__(self, model: Resistances, level: float) -> None:
+        self.model = model
+        self.level = level
+        self.smallest_concentration = model.smallest_concentration
+
+    def resistance_derivatives(self, concentration: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        R, by_c = self.model.resistance_derivatives(concentration)
+        scale = _scale(concentration, self.level)
+        of_scale = R / (len(concentration) * concentration)[:, None, None]
+        return scale * R, scale * (by_c + of_scale)
+
+
+def _scale(c: np.ndarray, level: float) -> float:
+    """e^ū"""
+    return float(np.exp(np.log(c / level).mean()))
