@@ -13,6 +13,7 @@ import numpy as np
 
 from eitbench import _check
 from eitbench._extras import needed_by
+from eitbench.estimation.measured.ktc_mesh import MeshTank, read_ktc_mesh
 from eitbench.numerics.mesh import Mesh
 from eitbench.worlds.mesh_vessel import MeshVessel
 from eitbench.worlds.vessels import PlanePipe, RoundPipe, RoundTank
@@ -31,7 +32,7 @@ class RealVessel:
     instrument counts.
     """
 
-    shape: RoundTank | PlanePipe | RoundPipe | MeshVessel
+    shape: RoundTank | PlanePipe | RoundPipe | MeshVessel | MeshTank
     first: float = 0.0
     """angle in degrees of the first electrode's middle, round a wall"""
     direction: str = "counter-clockwise"
@@ -100,7 +101,8 @@ def read_vessel(source: Path | str | Mapping[str, Any]) -> RealVessel:
       ``electrodes`` (how many in all), ``electrode_width`` or ``cover``, [``depth``]
     - cylinder, a pipe with rings of electrodes: ``length``, ``radius``, ``rings``, ``electrodes``
       (how many a ring), ``height`` of one, ``cover``, [``first``, ``direction``]
-    - mesh: ``file``, ``electrodes`` (how many), [``scale``, ``depth``]; see `MeshVessel`
+    - mesh: ``file``, ``electrodes`` (how many), [``scale``, ``depth``]; see `MeshVessel`, and
+      `read_ktc_mesh` of a .mat file
 
     and for all [``conductivity``] in S/m, if it is known. ``ValueError`` naming what is wrong.
     """
@@ -161,10 +163,20 @@ def _vessel(said: dict[str, Any], folder: Path) -> RealVessel:
         path = folder / str(said["file"])
         if not path.is_file():
             raise ValueError(f"vessel.file must be a mesh file, got {path}")
-        digest = hashlib.sha256(path.read_bytes()).hexdigest()
-        shape = MeshVessel(str(path), digest, str(path), digest, count,
-                           scale=said.get("scale", 1.0))
+        shape = _from_file(path, count, said.get("scale", 1.0))
     return RealVessel(shape, **placed)
+
+
+def _from_file(path: Path, count: int, scale: float) -> MeshVessel | MeshTank:
+    """With so many electrodes."""
+    if path.suffix == ".mat":
+        tank = read_ktc_mesh(path, scale)
+        if tank.n_electrodes != count:
+            raise ValueError(f"vessel.electrodes must be as many as in {path}, "
+                             f"{tank.n_electrodes}, got {count}")
+        return tank
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    return MeshVessel(str(path), digest, str(path), digest, count, scale=scale)
 
 
 def _cover(said: Mapping[str, Any], width: str, count: int, wall: float) -> float:
