@@ -1,5 +1,4 @@
-"""Extended Kalman filter of the logarithm of the concentration, for a target that stands still or
-walks at random.
+"""Extended Kalman filter of the logarithm, for a target that stands still or walks at random.
 
 For records of real instruments, where nobody knows how a target moves, and bodies conduct many
 times better or worse than what is around them: nothing falls below zero. The logarithm walks and

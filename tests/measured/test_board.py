@@ -201,7 +201,7 @@ def test_boards_are_those_worked_out_by_hand():
     assert [[cell.plain for cell in row.cells] for row in case_table(measured, "a").rows] == [
         ["good good@v1", "2 1 to 3", "10"], ["floor floor@v1 (floor)", "8 8 to 8", "10"]]
     rows = [[cell.plain for cell in row.cells] for row in all_cases_table(measured).rows]
-    assert [row[0].split()[0] for row in rows] == ["good", "floor", "late"]
+    assert [row[0].split("@")[0] for row in rows] == ["good", "floor", "late"]
     assert [float(row[-1]) for row in rows] == [0.25, 1.0, 0.75]
     assert math.isclose(0.25, math.sqrt(2 / 8 * 1 / 4))
     assert rows[2][1] == "–"

@@ -97,7 +97,7 @@ def all_cases_table(measured: Measured) -> Table:
                               for name, record in own.items()))
 
     order = sorted(methods.values(), key=lambda own: (-len(own), over_floor(own)))
-    rows = [{"method": _method(next(iter(own.values()))),
+    rows = [{"method": _method(next(iter(own.values())), short=True),
              **{name: Cell(number(missed(own[name])), missed(own[name])) if name in own
                 else Cell(NOTHING) for name in measured.records},
              "of the floor": number_cell(over_floor(own))} for own in order]
@@ -138,10 +138,12 @@ def _latest(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return list(found.values())
 
 
-def _method(record: dict[str, Any]) -> Cell:
+def _method(record: dict[str, Any], *, short: bool = False) -> Cell:
     badges = [*filter(None, [record["role"]]), *["self-reported"] * (not record["official"])]
-    return Cell(record["title"], record["title"].casefold(),
-                small=f"{record['method']}@{record['version']}", badges=tuple(badges))
+    label = f"{record['method']}@{record['version']}"
+    if short:
+        return Cell(label, label.casefold(), badges=tuple(badges))
+    return Cell(record["title"], record["title"].casefold(), small=label, badges=tuple(badges))
 
 
 def _missed(record: dict[str, Any]) -> Cell:
