@@ -53,6 +53,9 @@ def fit_model(
     seeds: Annotated[str, typer.Option(help="Episodes of the split train.")] = "train:0-199",
     modes: Annotated[int, typer.Option(
         min=1, help="Of the concentration; more of them make filters slower.")] = 64,
+    correct: Annotated[bool, typer.Option(
+        "--correct", help="Believe the flow as told, and learn only what that is off: needs fewer "
+                          "episodes.")] = False,
 ) -> None:
     """Learn from training episodes what an inflow leaves in the pipe, and by how much that and the
     voltages are off, and write it for filters (`eitbench.estimation.IdentifiedModel`). Episodes
@@ -64,9 +67,10 @@ def fit_model(
     with options.clear_errors():
         examples = eitbench.dataset(env, seeds)
         model = identified_model(
-            examples, modes=modes,
+            examples, modes=modes, correct=correct,
             progress=lambda each: tqdm(each, desc="learning", unit="episode", disable=None),
-            source={"environment": env, "seeds": seeds, "modes": modes})
+            source={"environment": env, "seeds": seeds, "modes": modes}
+            | ({"correct": True} if correct else {}))
         model.save(out)
     left = float(model.spread.trace() / examples.mass.sum())
     options.say(f"{out}: {modes} modes of the concentration, which remembers "

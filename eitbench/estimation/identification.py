@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,26 +20,36 @@ KEPT = 1e-4
 """Modes across the inlet of less than this part of the inflow's variance are left out."""
 RIDGE = 1e-6
 """of the mean square of what an inflow is known by: keeps apart what never came apart."""
+RIDGES = 10.0**np.arange(-6, 3)
+"""The same, of which cross-validation chooses where the flow as told is corrected."""
+FOLDS = 4
+"""of the episodes, each left out in turn"""
 EVERY = 3
 """Voltages are compared at each third step only: neighbours say much the same, and three turns pass
 all injections of a cycle that is no multiple of it."""
 
 
 class Moments(NamedTuple):
-    """Sums over all states of training episodes, s being past inflows and d = c/c_0 − 1."""
+    """Sums over states of training episodes, s being past inflows and d = c/c_0 − 1, of which l is
+    what the flow that is told does not explain, or all."""
 
     states: int
     inflow: np.ndarray
     """(K·r, K·r) Σ s sᵀ"""
     cross: np.ndarray
-    """(K·r, n) Σ s dᵀ"""
+    """(K·r, n) Σ s lᵀ"""
+    left: np.ndarray
+    """(n, n) Σ l lᵀ"""
     state: np.ndarray
     """(n, n) Σ d dᵀ"""
-    bias: np.ndarray
-    """(P, L) mean error of readings, in standard deviations of their noise"""
+    off: np.ndarray
+    """(P, L) Σ of errors of readings, in standard deviations of their noise"""
+    compared: np.ndarray
+    """(P, 1) so many times"""
 
 
-def identified_model(examples: Dataset, *, modes: int = 64, progress: Any = iter,
+def identified_model(examples: Dataset, *, modes: int = 64, correct: bool = False,
+                     progress: Any = iter,
                      source: Mapping[str, Any] | None = None) -> IdentifiedModel:
     """What an inflow leaves in the pipe, by ridge regression of the true states on the inflows
     before them; and by how much that, and the voltages that the task's model computes, are off.
@@ -52,6 +63,10 @@ def identified_model(examples: Dataset, *, modes: int = 64, progress: Any = iter
         Episodes of the split train.
     modes : int
         q.
+    correct : bool
+        Take what the flow as told leaves for granted, and regress only what that is off, with the
+        ridge that predicts episodes best which it has not seen: where the flow is known and only
+        its mesh is coarse, or episodes are few.
     progress : callable
         Wraps the iteration over the examples; such as ``tqdm``.
     source
@@ -60,8 +75,8 @@ def identified_model(examples: Dataset, *, modes: int = 64, progress: Any = iter
     Raises
     ------
     ValueError
-        If an episode is of another split, the world has no inflow, or there are more modes than
-        states to learn from.
+        If an episode is of another split, the world has no inflow, there are more modes than
+        states to learn from, or too few episodes to leave some out.
     """
     if others := [seed for seed in examples.seeds if seed not in SPLITS["train"]]:
         raise ValueError("examples' seeds must be of the split train, from which alone is learned; "
@@ -71,26 +86,67 @@ def identified_model(examples: Dataset, *, modes: int = 64, progress: Any = iter
     if len(examples) * world.n_steps <= q:
         raise ValueError(f"examples must have more states than modes, {q}; got "
                          f"{len(examples) * world.n_steps}")
+    if correct and len(examples) < FOLDS:
+        raise ValueError(f"examples must be at least {FOLDS} episodes to correct the flow as told, "
+                         f"got {len(examples)}")
     task = make_task(world)
     across = _across(world, examples.seeds)
-    memory = steady_response(task.transport).weights.shape[1]
-    moments = _moments(progress(examples), world, task, across, memory)
+    told_response = steady_response(task.transport)
+    memory = told_response.weights.shape[1]
+    known = np.zeros((examples.mesh.n_nodes, memory * across.shape[1]))
+    folds = 1
+    if correct:
+        known = told_response.basis @ (told_response.weights @ across).reshape(-1, known.shape[1])
+        folds = FOLDS
+    parts = [_moments(progress(replace(examples, seeds=examples.seeds[fold::folds])), world, task,
+                      across, known) for fold in range(folds)]
+    moments = _together(parts)
     mass = examples.mass.toarray()
     root = np.linalg.cholesky(mass)
     _, vectors = np.linalg.eigh(root.T @ moments.state @ root)
     basis = np.linalg.solve(root.T, vectors[:, :-q - 1:-1])
-    cross = moments.cross @ (mass @ basis)
-    size = len(moments.inflow)
-    ridge = RIDGE * np.trace(moments.inflow) / size
-    ridged = moments.inflow + ridge * np.eye(size)
-    weights = np.linalg.solve(ridged, cross)
-    free = moments.states - np.trace(np.linalg.solve(ridged, moments.inflow))
+    to_modes = mass @ basis
+    weights, cross, free = _regressed(moments, to_modes, _ridge(parts, to_modes))
     explained = weights.T @ cross
-    left = (basis.T @ mass @ moments.state @ mass @ basis - explained - explained.T
+    left = (to_modes.T @ moments.left @ to_modes - explained - explained.T
             + weights.T @ moments.inflow @ weights)
+    weights = weights + known.T @ to_modes
     return IdentifiedModel(basis, weights.T.reshape(q, memory, -1), across,
-                           0.5 * (left + left.T) / free, task.currents, moments.bias,
-                           told(task), world.background, source or {})
+                           0.5 * (left + left.T) / free, task.currents,
+                           moments.off / np.maximum(moments.compared, 1), told(task),
+                           world.background, source or {})
+
+
+def _together(parts: list[Moments]) -> Moments:
+    return Moments(*(sum(each) for each in zip(*parts, strict=True)))  # type: ignore[arg-type]
+
+
+def _regressed(moments: Moments, to_modes: np.ndarray,
+               ridge: float) -> tuple[np.ndarray, np.ndarray, float]:
+    """What is left (K·r, q) for each inflow, Σ s lᵀ in modes, and how many states are free."""
+    cross = moments.cross @ to_modes
+    ridged = moments.inflow + ridge * _mean_square(moments) * np.eye(len(cross))
+    free = moments.states - np.trace(np.linalg.solve(ridged, moments.inflow))
+    return np.linalg.solve(ridged, cross), cross, float(free)
+
+
+def _mean_square(moments: Moments) -> float:
+    return float(np.trace(moments.inflow) / len(moments.inflow))
+
+
+def _ridge(parts: list[Moments], to_modes: np.ndarray) -> float:
+    """The one that predicts each part best from the others; `RIDGE` if there is only one."""
+    if len(parts) == 1:
+        return RIDGE
+    losses = np.zeros(len(RIDGES))
+    for part in parts:
+        others = _together([each for each in parts if each is not part])
+        for k, ridge in enumerate(RIDGES):
+            weights, *_ = _regressed(others, to_modes, ridge)
+            # the squared error of the part, but for what does not depend on the weights
+            losses[k] += ((weights.T @ part.inflow) * weights.T).sum()
+            losses[k] -= 2.0 * ((part.cross @ to_modes) * weights).sum()
+    return float(RIDGES[losses.argmin()])
 
 
 def _across(world: World, seeds: Iterable[int]) -> np.ndarray:
@@ -101,20 +157,23 @@ def _across(world: World, seeds: Iterable[int]) -> np.ndarray:
 
 
 def _moments(examples: Iterable[Example], world: World, task: Task, across: np.ndarray,
-             memory: int) -> Moments:
-    n = task.mesh.n_nodes
-    size = memory * across.shape[1]
+             known: np.ndarray) -> Moments:
+    """Where past inflows are known (n, K·r) to leave something."""
+    n, size = known.shape
     count = 0
-    inflow, cross, state = np.zeros((size, size)), np.zeros((size, n)), np.zeros((n, n))
+    inflow, cross = np.zeros((size, size)), np.zeros((size, n))
+    left, state = np.zeros((n, n)), np.zeros((n, n))
     cycle = task.currents
     off = np.zeros((len(cycle), cycle.shape[1]))
-    compared = np.zeros(len(cycle))
+    compared = np.zeros((len(cycle), 1))
     for example in examples:
         s = _past(world.sample_inflow(example.seed) / world.background - 1.0, across,
-                  len(example.truth), memory)
+                  len(example.truth), size // across.shape[1])
         d = example.truth / world.background - 1.0
+        l = d - s @ known.T
         inflow += s.T @ s
-        cross += s.T @ d
+        cross += s.T @ l
+        left += l.T @ l
         state += d.T @ d
         count += len(d)
         for t in range(0, len(d), EVERY):
@@ -123,7 +182,7 @@ def _moments(examples: Iterable[Example], world: World, task: Task, across: np.n
             pattern = t % len(cycle)
             off[pattern] += (example.voltages[t] - computed) / task.noise.std(computed)
             compared[pattern] += 1
-    return Moments(count, inflow, cross, state, off / np.maximum(compared, 1)[:, None])
+    return Moments(count, inflow, cross, left, state, off, compared)
 
 
 def _past(s: np.ndarray, across: np.ndarray, steps: int, memory: int) -> np.ndarray:
