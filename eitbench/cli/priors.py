@@ -56,6 +56,9 @@ def fit_model(
     correct: Annotated[bool, typer.Option(
         "--correct", help="Believe the flow as told, and learn only what that is off: needs fewer "
                           "episodes.")] = False,
+    linearised: Annotated[bool, typer.Option(
+        "--linearised", help="Linearise voltages once, about the homogeneous estimate, and learn "
+                             "how readings scatter about that.")] = False,
 ) -> None:
     """Learn from training episodes what an inflow leaves in the pipe, and by how much that and the
     voltages are off, and write it for filters (`eitbench.estimation.IdentifiedModel`). Episodes
@@ -67,10 +70,11 @@ def fit_model(
     with options.clear_errors():
         examples = eitbench.dataset(env, seeds)
         model = identified_model(
-            examples, modes=modes, correct=correct,
+            examples, modes=modes, correct=correct, linearised=linearised,
             progress=lambda each: tqdm(each, desc="learning", unit="episode", disable=None),
             source={"environment": env, "seeds": seeds, "modes": modes}
-            | ({"correct": True} if correct else {}))
+            | {name: True for name, said in (("correct", correct), ("linearised", linearised))
+               if said})
         model.save(out)
     left = float(model.spread.trace() / examples.mass.sum())
     options.say(f"{out}: {modes} modes of the concentration, which remembers "

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -11,8 +11,10 @@ import numpy as np
 from eitbench import _check
 from eitbench.data.learning.examples import Dataset, Example
 from eitbench.data.seeds import SPLITS, name_seed
+from eitbench.estimation.first_frame import FirstFrame
 from eitbench.estimation.identified import IdentifiedModel, told
 from eitbench.estimation.inflow_response import steady_response
+from eitbench.estimation.kalman import LinearisedObservations
 from eitbench.worlds.task import Task, make_task
 from eitbench.worlds.world import World
 
@@ -44,12 +46,14 @@ class Moments(NamedTuple):
     """(n, n) Σ d dᵀ"""
     off: np.ndarray
     """(P, L) Σ of errors of readings, in standard deviations of their noise"""
+    scatter: np.ndarray
+    """(P, L, L) Σ of their products"""
     compared: np.ndarray
-    """(P, 1) so many times"""
+    """(P,) of so many readings"""
 
 
 def identified_model(examples: Dataset, *, modes: int = 64, correct: bool = False,
-                     progress: Any = iter,
+                     linearised: bool = False, progress: Any = iter,
                      source: Mapping[str, Any] | None = None) -> IdentifiedModel:
     """What an inflow leaves in the pipe, by ridge regression of the true states on the inflows
     before them; and by how much that, and the voltages that the task's model computes, are off.
@@ -67,6 +71,9 @@ def identified_model(examples: Dataset, *, modes: int = 64, correct: bool = Fals
         Take what the flow as told leaves for granted, and regress only what that is off, with the
         ridge that predicts episodes best which it has not seen: where the flow is known and only
         its mesh is coarse, or episodes are few.
+    linearised : bool
+        Compare readings with voltages that are linearised once, about ĉ_bh, and learn how they
+        scatter about these (`IdentifiedModel.scatter`).
     progress : callable
         Wraps the iteration over the examples; such as ``tqdm``.
     source
@@ -99,7 +106,7 @@ def identified_model(examples: Dataset, *, modes: int = 64, correct: bool = Fals
         known = told_response.basis @ (told_response.weights @ across).reshape(-1, known.shape[1])
         folds = FOLDS
     parts = [_moments(progress(replace(examples, seeds=examples.seeds[fold::folds])), world, task,
-                      across, known) for fold in range(folds)]
+                      across, known, linearised) for fold in range(folds)]
     moments = _together(parts)
     mass = examples.mass.toarray()
     root = np.linalg.cholesky(mass)
@@ -111,10 +118,12 @@ def identified_model(examples: Dataset, *, modes: int = 64, correct: bool = Fals
     left = (to_modes.T @ moments.left @ to_modes - explained - explained.T
             + weights.T @ moments.inflow @ weights)
     weights = weights + known.T @ to_modes
+    compared = np.maximum(moments.compared, 1)
+    bias = moments.off / compared[:, None]
+    scatter = moments.scatter / compared[:, None, None] - bias[:, :, None] * bias[:, None]
     return IdentifiedModel(basis, weights.T.reshape(q, memory, -1), across,
-                           0.5 * (left + left.T) / free, task.currents,
-                           moments.off / np.maximum(moments.compared, 1), told(task),
-                           world.background, source or {})
+                           0.5 * (left + left.T) / free, task.currents, bias, told(task),
+                           world.background, source or {}, scatter if linearised else None)
 
 
 def _together(parts: list[Moments]) -> Moments:
@@ -157,15 +166,15 @@ def _across(world: World, seeds: Iterable[int]) -> np.ndarray:
 
 
 def _moments(examples: Iterable[Example], world: World, task: Task, across: np.ndarray,
-             known: np.ndarray) -> Moments:
+             known: np.ndarray, linearised: bool) -> Moments:
     """Where past inflows are known (n, K·r) to leave something."""
     n, size = known.shape
     count = 0
     inflow, cross = np.zeros((size, size)), np.zeros((size, n))
     left, state = np.zeros((n, n)), np.zeros((n, n))
-    cycle = task.currents
-    off = np.zeros((len(cycle), cycle.shape[1]))
-    compared = np.zeros((len(cycle), 1))
+    P, L = task.currents.shape
+    off, scatter = np.zeros((P, L)), np.zeros((P, L, L))
+    compared = np.zeros(P)
     for example in examples:
         s = _past(world.sample_inflow(example.seed) / world.background - 1.0, across,
                   len(example.truth), size // across.shape[1])
@@ -176,13 +185,29 @@ def _moments(examples: Iterable[Example], world: World, task: Task, across: np.n
         left += l.T @ l
         state += d.T @ d
         count += len(d)
-        for t in range(0, len(d), EVERY):
-            computed = task.observation.voltages(example.truth[t].astype(float),
-                                                 example.currents[t:t + 1])[0]
-            pattern = t % len(cycle)
-            off[pattern] += (example.voltages[t] - computed) / task.noise.std(computed)
-            compared[pattern] += 1
-    return Moments(count, inflow, cross, left, state, off, compared)
+        for t, error in _errors(task, example, linearised):
+            off[t % P] += error
+            scatter[t % P] += np.outer(error, error)
+            compared[t % P] += 1
+    return Moments(count, inflow, cross, left, state, off, scatter, compared)
+
+
+def _errors(task: Task, example: Example, linearised: bool) -> Iterator[tuple[int, np.ndarray]]:
+    """By how much readings (L,) exceed what is computed from the true states t + 1, in standard
+    deviations of their noise."""
+    truth = example.truth.astype(float)
+    if linearised:
+        first = FirstFrame(task)
+        for t in range(first.length):
+            first.add(example.voltages[t], example.currents[t])
+        observe = LinearisedObservations(task.observation, task.noise, first.mean)
+        for t, c in enumerate(truth):
+            seen = observe(example.voltages[t], example.currents[t])
+            yield t, (seen.value - seen.matrix @ c) / np.sqrt(seen.noise_variance)
+        return
+    for t in range(0, len(truth), EVERY):
+        computed = task.observation.voltages(truth[t], example.currents[t:t + 1])[0]
+        yield t, (example.voltages[t] - computed) / task.noise.std(computed)
 
 
 def _past(s: np.ndarray, across: np.ndarray, steps: int, memory: int) -> np.ndarray:

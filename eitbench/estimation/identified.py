@@ -15,12 +15,14 @@ import numpy as np
 
 from eitbench import _check
 from eitbench._files import write_atomically
+from eitbench.estimation.inflow_prior import learned_in
 from eitbench.estimation.inflow_response import Response
 
 if TYPE_CHECKING:
     from eitbench.worlds.task import Task
 
 ARRAYS = ("basis", "weights", "across", "spread", "patterns", "bias", "told")
+"""What every file holds; `scatter` is there if voltages are linearised once."""
 CLOSE = 1e-4
 """Tasks whose `told` differ by less are the same."""
 SPOT = 0.02
@@ -33,7 +35,8 @@ class IdentifiedModel:
 
     e_t ~ N(0, Γ_e) is taken for white. Where a model is wrong in the same way each time, its mean
     error b, and the response W that takes in what is wrong with the flow, correct it; Γ_e says how
-    much is left (Kaipio & Somersalo 2007). ``ValueError`` naming what is of the wrong shape.
+    much is left (Kaipio & Somersalo 2007). With a `scatter`, R is linearised once, about ĉ_bh, and
+    v is what is off then, noise and all. ``ValueError`` naming what is of the wrong shape.
     """
 
     basis: np.ndarray
@@ -55,6 +58,9 @@ class IdentifiedModel:
     """mol/m³ with which the pipe was filled"""
     source: Mapping[str, Any] = field(default_factory=dict)
     """where it comes from, fit for JSON"""
+    scatter: np.ndarray | None = None
+    """(P, L, L) covariance of v where R is linearised once, in products of noise standard
+    deviations; None: R is not, and v is the noise"""
 
     def __post_init__(self) -> None:
         q = _check.array("basis", self.basis, (None, None)).shape[1]
@@ -63,6 +69,8 @@ class IdentifiedModel:
         _check.array("spread", self.spread, (q, q))
         P, L = _check.array("patterns", self.patterns, (None, None)).shape
         _check.array("bias", self.bias, (P, L))
+        if self.scatter is not None:
+            _check.array("scatter", self.scatter, (P, L, L))
         _check.array("told", self.told, (None,))
         _check.number("level", self.level, low=0.0, open_low=True, units="mol/m³")
 
@@ -81,8 +89,22 @@ class IdentifiedModel:
     def mean_error(self, currents: np.ndarray, std: np.ndarray) -> np.ndarray:
         """(L,) V by which readings of an injection (L,) exceed R(c), with ``std`` (L,) V of their
         noise; zero if that injection never was seen."""
+        number = self._number(currents)
+        return np.zeros_like(std) if number is None else self.bias[number] * std
+
+    def error_root(self, currents: np.ndarray, std: np.ndarray) -> np.ndarray:
+        """(L, L) V: N with N Nᵀ the covariance of v for an injection (L,), with ``std`` (L,) V of
+        the noise alone; that of the noise if the injection never was seen, or without `scatter`."""
+        number = self._number(currents)
+        if self.scatter is None or number is None:
+            return np.diag(std)
+        root: np.ndarray = std[:, None] * np.linalg.cholesky(self.scatter[number])
+        return root
+
+    def _number(self, currents: np.ndarray) -> int | None:
+        """Of the injection among the `patterns`."""
         seen = np.flatnonzero(np.isclose(self.patterns, currents).all(axis=1))
-        return self.bias[seen[0]] * std if len(seen) else np.zeros_like(std)
+        return int(seen[0]) if len(seen) else None
 
     def suits(self, task: Task) -> bool:
         """Whether it was made for a task with this mesh, these injections and this told flow."""
@@ -95,6 +117,8 @@ class IdentifiedModel:
         """Write a file that `load` reads, in single precision."""
         buffer = io.BytesIO()
         arrays = {name: getattr(self, name).astype(np.float32) for name in ARRAYS}
+        if self.scatter is not None:
+            arrays["scatter"] = self.scatter.astype(np.float32)
         np.savez_compressed(buffer, source=np.array(json.dumps(dict(self.source))),
                             level=self.level, **arrays)
         write_atomically(path, buffer.getvalue())
@@ -104,7 +128,8 @@ class IdentifiedModel:
         """What `save` has written; ``ValueError`` naming the file if it is nothing of the kind."""
         try:
             with np.load(path, allow_pickle=False) as file:
-                arrays = {name: file[name].astype(float) for name in ARRAYS}
+                there = [*ARRAYS, "scatter"] if "scatter" in file else ARRAYS
+                arrays = {name: file[name].astype(float) for name in there}
                 return cls(**arrays, level=float(file["level"]),
                            source=json.loads(str(file["source"])))
         except (OSError, ValueError, KeyError, EOFError) as error:
@@ -124,8 +149,10 @@ def told(task: Task) -> np.ndarray:
 
 
 def suiting_models(folder: Path, task: Task) -> list[IdentifiedModel]:
-    """Those in a folder's files, by name, that are of this task."""
-    return [model for model in map(_loaded, sorted(folder.glob("*.npz"))) if model.suits(task)]
+    """Those in a folder's files that are of this task: first those that were learned in the task's
+    own world, then the others, by name."""
+    suiting = [model for model in map(_loaded, sorted(folder.glob("*.npz"))) if model.suits(task)]
+    return sorted(suiting, key=lambda model: learned_in(model.source) != task.world)
 
 
 @lru_cache(maxsize=8)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from eitbench.estimation.inflow_response import Response, steady_response
-from eitbench.estimation.kalman import Observation, linearised
+from eitbench.estimation.kalman import LinearisedObservations, Observation, linearised
 from eitbench.estimation.moving_window import Innovation, conditioned, moved, stationary
 
 if TYPE_CHECKING:
@@ -47,7 +47,8 @@ class InflowFilter:
         Of the states t = 1, 2, …, where the last holds from then on; default: that of the task's
         flow for all.
     model : IdentifiedModel, optional
-        Whose response and errors take the place of the task's flow.
+        Whose response and errors take the place of the task's flow; if it says so, voltages are
+        linearised once, about the level.
     """
 
     def __init__(self, task: Task, prior: InflowPrior, level: float, lag: int = 0,
@@ -58,8 +59,12 @@ class InflowFilter:
         self.prior = prior
         self.level = level
         self.model = model
+        self._once: LinearisedObservations | None = None
         if model is not None:
             responses = [model.response]
+            if model.scatter is not None:
+                self._once = LinearisedObservations(task.observation, task.noise,
+                                                    np.full(task.mesh.n_nodes, level))
         self.responses = responses or [steady_response(task.transport)]
         self._present = 0
         """t"""
@@ -86,7 +91,10 @@ class InflowFilter:
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Innovation:
         """Take in a measurement (L,) in V of the present state, for the injection (L,) in A."""
-        return self.take_in(self._linearised(voltages, currents), self.concentration())
+        observation = self._linearised(voltages, currents)
+        innovation = observation.value - observation.matrix @ self.concentration()
+        return self._condition(observation, self.by_inflow(observation.matrix), innovation,
+                               currents)
 
     def update_again(self, voltages: np.ndarray, currents: np.ndarray) -> Innovation:
         """`update`, and once more linearised about what that finds (the iterated filter); the
@@ -99,14 +107,18 @@ class InflowFilter:
         away = (self.mean - expected)[:self.memory].ravel()
         innovation = observation.value - observation.matrix @ self.concentration() + slope @ away
         self.mean, self.covariance = expected, covariance
-        self._condition(observation, slope, innovation)
+        self._condition(observation, slope, innovation, currents)
         return first
 
     def _linearised(self, voltages: np.ndarray, currents: np.ndarray) -> Observation:
-        """About the present mean, with readings less what the model says of their error."""
+        """About the present mean, or the level if once is enough, with readings less what the model
+        says of their error."""
         task = self.task
-        observation = linearised(task.observation, task.noise, self.concentration(), voltages,
-                                 currents)
+        if self._once is not None:
+            observation = self._once(voltages, currents)
+        else:
+            observation = linearised(task.observation, task.noise, self.concentration(), voltages,
+                                     currents)
         if self.model is None:
             return observation
         error = self.model.mean_error(currents, np.sqrt(observation.noise_variance))
@@ -118,12 +130,18 @@ class InflowFilter:
         return self._condition(observation, self.by_inflow(observation.matrix),
                                observation.value - observation.matrix @ point)
 
-    def _condition(self, observation: Observation, slope: np.ndarray,
-                   innovation: np.ndarray) -> Innovation:
-        shared = (None if self.model is None
-                  else self.level * (observation.matrix @ self.model.root))
-        self.mean, self.covariance, told = conditioned(
-            self.mean, self.covariance, slope, innovation, observation.noise_variance, shared)
+    def _condition(self, observation: Observation, slope: np.ndarray, innovation: np.ndarray,
+                   currents: np.ndarray | None = None) -> Innovation:
+        noise_variance = observation.noise_variance
+        shared = None
+        if self.model is not None:
+            shared = self.level * (observation.matrix @ self.model.root)
+            if self._once is not None and currents is not None:
+                scatter = self.model.error_root(currents, np.sqrt(noise_variance))
+                shared = np.concatenate([shared, scatter], axis=1)
+                noise_variance = np.zeros_like(noise_variance)
+        self.mean, self.covariance, told = conditioned(self.mean, self.covariance, slope,
+                                                       innovation, noise_variance, shared)
         return told
 
     def response(self, lag: int = 0) -> Response:

@@ -40,8 +40,12 @@ def most_probable_inflow(smoother: InflowFilter,
 
     With x = L z, z ~ N(0, I), it is the least of ‖z‖² + Σ_t ‖A_t (V_t − R(c_t(x)))‖², found by
     Gauss–Newton with halved steps where one leads up. A_t whitens the readings' errors; the noise
-    is that of the voltages computed from the smoothed states.
+    is that of the voltages computed from the smoothed states. ``ValueError`` if the smoother has a
+    model with voltages that are linearised once: there is nothing to linearise anew.
     """
+    if smoother.model is not None and smoother.model.scatter is not None:
+        raise ValueError("smoother must have a model whose voltages are linearised anew, got one "
+                         "whose voltages are linearised once")
     whole = _Record(smoother, record)
     z = whole.whitened(smoother.mean)
     value = whole.value(z)

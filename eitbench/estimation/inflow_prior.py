@@ -239,7 +239,7 @@ def suiting_priors(folder: Path, task: Task, link: str) -> list[InflowPrior]:
     """
     found = map(_loaded, sorted(folder.glob("*.json")))
     suiting = [prior for prior in found if prior.link == link and prior.suits(task)]
-    return sorted(suiting, key=lambda prior: _world(prior) != task.world)
+    return sorted(suiting, key=lambda prior: learned_in(prior.source) != task.world)
 
 
 @lru_cache(maxsize=16)
@@ -248,10 +248,10 @@ def _loaded(path: Path) -> InflowPrior:
     return InflowPrior.load(path)
 
 
-def _world(prior: InflowPrior) -> str | None:
-    """Name of the world that it was learned in."""
-    learned_in = entries().get(prior.source.get("environment", ""))
-    return None if learned_in is None else learned_in.world.name
+def learned_in(source: Mapping[str, Any]) -> str | None:
+    """Name of the world in which something was learned that comes from there."""
+    where = entries().get(source.get("environment", ""))
+    return None if where is None else where.world.name
 
 
 def _rounded(array: np.ndarray) -> Any:

@@ -10,6 +10,7 @@ from eitbench.bench.methods import baseline_folder
 from eitbench.data.learning.examples import Dataset
 from eitbench.data.seeds import parse_seeds
 from eitbench.estimation import (
+    FirstFrame,
     IdentifiedModel,
     InflowFilter,
     InflowPrior,
@@ -123,6 +124,58 @@ def test_mean_error_is_that_of_the_readings():
     assert not model().mean_error(strange, np.ones(4)).any()
 
 
+@lru_cache(maxsize=1)
+def once():
+    """The model whose voltages are linearised once."""
+    return identified_model(examples("train:0-23"), modes=24, linearised=True)
+
+
+def test_scatter_is_that_of_linearised_readings():
+    """Readings of episodes that it never saw, less the voltages linearised about ĉ_bh at the true states, have no mean
+    left, and the covariance that it says: whitened, their mean square is 1 to a tenth. That of the noise is less."""
+    whitened, in_noise = [], []
+    for seed in parse_seeds("train:40-55"):
+        (example,) = Dataset("tiny", TINY, (seed,))
+        first = FirstFrame(task())
+        for t in range(first.length):
+            first.add(example.voltages[t], example.currents[t])
+        for voltages, currents, truth in zip(example.voltages, example.currents, example.truth, strict=True):
+            at = linearised(task().observation, task().noise, first.mean, voltages, currents)
+            std = np.sqrt(at.noise_variance)
+            off = at.value - at.matrix @ truth.astype(float) - once().mean_error(currents, std)
+            whitened.append(np.linalg.solve(once().error_root(currents, std), off))
+            in_noise.append(off / std)
+    assert np.abs(np.mean(whitened, axis=0)).max() < 4.5 / np.sqrt(len(whitened))
+    assert 0.8 < np.mean(np.square(whitened)) < 1.25
+    assert np.mean(np.square(in_noise)) > np.mean(np.square(whitened))
+    strange = np.arange(4.0)
+    np.testing.assert_array_equal(once().error_root(strange, np.arange(1.0, 5.0)), np.diag(np.arange(1.0, 5.0)))
+
+
+def test_filter_linearises_once_if_the_model_says_so():
+    """Two measurements: the innovations and their covariance are those of voltages linearised about the level, with the
+    model's error in place of the noise."""
+    (example,) = examples("train:0")
+    filter_ = InflowFilter(task(), prior(), LEVEL, model=once())
+    level = np.full(task().mesh.n_nodes, LEVEL)
+    for voltages, currents in zip(example.voltages[:2], example.currents[:2], strict=True):
+        filter_.predict()
+        at = linearised(task().observation, task().noise, level, voltages, currents)
+        std = np.sqrt(at.noise_variance)
+        slope = filter_.by_inflow(at.matrix)
+        known = filter_.covariance[:slope.shape[1], :slope.shape[1]]
+        flow = LEVEL * at.matrix @ once().basis
+        number = int(np.flatnonzero(np.isclose(once().patterns, currents).all(axis=1))[0])
+        S = (slope @ known @ slope.T + flow @ once().spread @ flow.T
+             + std[:, None] * once().scatter[number] * std)
+        expected = at.value - at.matrix @ filter_.concentration() - std * once().bias[number]
+        told = filter_.update(voltages, currents)
+        np.testing.assert_allclose(told.covariance, S, rtol=1e-9, atol=1e-12 * S.max())
+        np.testing.assert_allclose(told.value, expected, atol=1e-12)
+    with pytest.raises(ValueError, match="smoother must have a model whose voltages are linearised anew"):
+        most_probable_inflow(filter_, [])
+
+
 def test_learns_from_train_alone():
     with pytest.raises(ValueError, match=r"seeds must be of the split train.*dev:0"):
         identified_model(examples("dev:0"))
@@ -224,6 +277,9 @@ def test_a_file_says_all(tmp_path):
     np.testing.assert_allclose(again.spread, model().spread, atol=1e-7 * model().spread.max())
     np.testing.assert_allclose(again.mean_error(task().currents[0], np.ones(4)),
                                model().mean_error(task().currents[0], np.ones(4)), atol=1e-6)
+    assert again.scatter is None
+    once().save(tmp_path / "a.npz")
+    np.testing.assert_allclose(IdentifiedModel.load(tmp_path / "a.npz").scatter, once().scatter, atol=1e-6)
     assert suiting_models(tmp_path, task())
     assert not suiting_models(tmp_path, make_task(PIPE_2D))
 
@@ -235,6 +291,8 @@ def test_other_files_are_told(tmp_path):
             IdentifiedModel.load(tmp_path / "b.npz")
     with pytest.raises(ValueError, match=r"spread must have shape \(24, 24\)"):
         replace(model(), spread=np.eye(3))
+    with pytest.raises(ValueError, match=r"scatter must have shape"):
+        replace(model(), scatter=np.eye(4))
 
 
 def test_ours_are_of_the_boards_they_name():

@@ -1,0 +1,32 @@
+"""Filter with voltages that are linearised once, and an approximation error: mean and covariance of
+what linearised model, coarse mesh and a velocity that is told wrong are off in training episodes.
+
+The inflow's logarithm is Gaussian and coloured as there. With a lag it looks back over as many.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from eitbench import Estimate, Task
+from eitbench.estimation import InflowTracker, suiting_models, suiting_priors
+
+HERE = Path(__file__).parent
+LINK = "logarithm"
+MODELS = HERE / "models" / "linearised"
+
+
+class Estimator:
+    boards = ("filter", "fixed-lag")
+
+    def __init__(self, task: Task) -> None:
+        prior = suiting_priors(HERE / "priors", task, LINK)[0]
+        self.tracker = InflowTracker(task, prior, suiting_models(MODELS, task)[0])
+
+    @staticmethod
+    def suits(task: Task) -> bool:
+        known_inlet = bool(suiting_priors(HERE / "priors", task, LINK))
+        return task.velocity is None and known_inlet and bool(suiting_models(MODELS, task))
+
+    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
+        return self.tracker.update(voltages, currents)
