@@ -135,8 +135,9 @@ def _regressed(moments: Moments, to_modes: np.ndarray,
     """What is left (K·r, q) for each inflow, Σ s lᵀ in modes, and how many states are free."""
     cross = moments.cross @ to_modes
     ridged = moments.inflow + ridge * _mean_square(moments) * np.eye(len(cross))
-    free = moments.states - np.trace(np.linalg.solve(ridged, moments.inflow))
-    return np.linalg.solve(ridged, cross), cross, float(free)
+    solved = np.linalg.solve(ridged, np.concatenate([cross, moments.inflow], axis=1))
+    q = cross.shape[1]
+    return solved[:, :q], cross, float(moments.states - np.trace(solved[:, q:]))
 
 
 def _mean_square(moments: Moments) -> float:
@@ -150,11 +151,14 @@ def _ridge(parts: list[Moments], to_modes: np.ndarray) -> float:
     losses = np.zeros(len(RIDGES))
     for part in parts:
         others = _together([each for each in parts if each is not part])
+        values, directions = np.linalg.eigh(others.inflow)
+        theirs = directions.T @ others.cross @ to_modes
+        ours = directions.T @ part.cross @ to_modes
+        inflow = directions.T @ part.inflow @ directions
         for k, ridge in enumerate(RIDGES):
-            weights, *_ = _regressed(others, to_modes, ridge)
+            weights = theirs / (values + ridge * _mean_square(others))[:, None]
             # the squared error of the part, but for what does not depend on the weights
-            losses[k] += ((weights.T @ part.inflow) * weights.T).sum()
-            losses[k] -= 2.0 * ((part.cross @ to_modes) * weights).sum()
+            losses[k] += (weights * (inflow @ weights)).sum() - 2.0 * (ours * weights).sum()
     return float(RIDGES[losses.argmin()])
 
 

@@ -117,7 +117,7 @@ def test_suites():
     plain = set(PLAIN) & set(ids("estimation"))
     assert {job.environment.id for job in quick} == plain and len(plain) == 3
     assert {job.environment.id for job in full} == set(ids("estimation"))
-    real_only = {"identified_flow", "real_time_filter"}
+    real_only = {"approximation_error_filter", "identified_flow", "real_time_filter"}
     real_only |= {name for name in own_methods("estimation") if name.startswith("learned_")}
     missing = {job for job in full if job.environment.id in plain} - set(quick)
     assert missing == {suites.Job(suites.Environment(PIPE), "gauss_newton", 1)} and set(quick) < set(full)

@@ -23,7 +23,9 @@ from eitbench.estimation import (
 )
 from eitbench.estimation.kalman import Observation, linearised
 from eitbench.worlds.pipe2d import PIPE_2D
+from eitbench.worlds.pipe2d_biased import PIPE_2D_BIASED
 from eitbench.worlds.pipe2d_obstacle import PIPE_2D_OBSTACLE
+from eitbench.worlds.pipe3d import PIPE_3D
 from eitbench.worlds.task import make_task
 from scipy.linalg import toeplitz
 
@@ -295,13 +297,22 @@ def test_other_files_are_told(tmp_path):
         replace(model(), scatter=np.eye(4))
 
 
-def test_ours_are_of_the_boards_they_name():
-    """And of a task that is told another flow they are not."""
-    folder = baseline_folder() / "models"
-    for world, name in ((PIPE_2D, "Pipe2D"), (PIPE_2D_OBSTACLE, "Pipe2DObstacle")):
-        (ours,) = suiting_models(folder, make_task(world))
-        assert ours.source == {"environment": f"eitbench/{name}-v0", "seeds": "train:0-199", "modes": 64}
-    assert not suiting_models(folder, make_task(PIPE_2D, mean_velocity=4.0))
+@pytest.mark.parametrize("world, env, folder, learned", [
+    (PIPE_2D, "Pipe2D", "models", {"seeds": "train:0-199", "modes": 64}),
+    (PIPE_2D_OBSTACLE, "Pipe2DObstacle", "models", {"seeds": "train:0-199", "modes": 64}),
+    (PIPE_3D, "Pipe3D", "models", {"seeds": "train:0-31", "modes": 112, "correct": True}),
+    (PIPE_2D, "Pipe2D", "models/linearised",
+     {"seeds": "train:0-39", "modes": 64, "correct": True, "linearised": True}),
+    (PIPE_2D_BIASED, "Pipe2DBiasedVelocity", "models/linearised",
+     {"seeds": "train:0-39", "modes": 64, "correct": True, "linearised": True})])
+def test_ours_are_of_the_boards_they_name(world, env, folder, learned):
+    """Those of the task's own world come first; of a task that is told another flow they are not."""
+    models = baseline_folder() / folder
+    ours = suiting_models(models, make_task(world))[0]
+    assert ours.source == {"environment": f"eitbench/{env}-v0"} | learned
+    assert (ours.scatter is not None) == ("linearised" in learned)
+    if world is PIPE_2D:
+        assert not suiting_models(models, make_task(world, mean_velocity=4.0))
 
 
 # -- voltages in no time ----------------------------------------------------------------------------------------------
