@@ -15,6 +15,7 @@ from eitbench.estimation.walk import RandomWalk
 from eitbench.numerics.fem import mass_matrix
 from eitbench.physics.rest import AtRest
 from eitbench.report.measured import write_report
+from gymnasium.utils.env_checker import check_env
 from tanks import CONTACTS, VESSEL, angle, moving
 from typer.testing import CliRunner
 
@@ -89,6 +90,21 @@ def test_seeds_withhold_other_readings(env):
     env.reset(seed=1)
     assert (one != other).any()
     np.testing.assert_array_equal(env.hidden, one)
+
+
+def test_checkers_accept_it(record):
+    """Gymnasium's, and that of stable-baselines3."""
+    env = gym.make("eitbench/Measured-v0", file=record, vessel=VESSEL, **BELIEVED).unwrapped
+    check_env(env, skip_render_check=True)
+    pytest.importorskip("stable_baselines3.common.env_checker").check_env(env)
+
+
+@pytest.mark.parametrize("block", [3, 100])
+def test_a_frame_ends_where_the_last_injection_comes_first(record, monkeypatch, block):
+    monkeypatch.setattr("eitbench.data.measured.measurements.BLOCK", block)
+    order = [0, 1, 0, 2, 1, 4, 0]
+    some = Measurements(record.currents, np.array(order), record.matrix, record.readings[:7], np.arange(7.0))
+    assert some.frame == 6
 
 
 def test_gymnasium_makes_it(record):

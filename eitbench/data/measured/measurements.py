@@ -114,7 +114,15 @@ class Measurements:
     @cached_property
     def frame(self) -> int:
         """Readings until each injection has come once."""
-        return 1 + int(np.unique(self.injections, return_index=True)[1].max())
+        first = np.full(len(self.currents), -1)
+        for begin in range(0, len(self.injections), BLOCK):
+            block = self.injections[begin:begin + BLOCK]
+            came, where = np.unique(block, return_index=True)
+            new = first[came] < 0
+            first[came[new]] = begin + where[new]
+            if (first >= 0).all():
+                break
+        return 1 + int(first.max())
 
     @cached_property
     def driven(self) -> np.ndarray:

@@ -138,8 +138,8 @@ def read_vessel(source: Path | str | Mapping[str, Any]) -> RealVessel:
       `read_ktc_mesh` of a .mat file
 
     and for all [``conductivity``] in S/m, if it is known. ``flow`` has entries of its own:
-    ``mean_velocity`` in m/s, [``diffusivity``, ``velocity_std``, ``velocity_walk``]; see `RealFlow`.
-    ``ValueError`` naming what is wrong.
+    ``mean_velocity`` in m/s, [``diffusivity``, ``velocity_std``, ``velocity_walk``]; see
+    `RealFlow`. ``ValueError`` naming what is wrong.
     """
     if isinstance(source, Mapping):
         return _vessel(dict(source), Path())
@@ -175,8 +175,9 @@ def _vessel(said: dict[str, Any], folder: Path) -> RealVessel:
     if unknown := sorted(set(said) - needed - others - {"conductivity"}):
         raise ValueError(f"vessel of kind {kind} has no {', '.join(unknown)}; there are "
                          f"{', '.join(sorted(needed | others))} and conductivity")
-    placed = {name: said[name] for name in ("first", "direction", "depth", "conductivity")
-              if name in said}
+    placed: dict[str, Any] = {
+        name: said[name] for name in ("first", "direction", "depth", "conductivity")
+        if name in said}
     if "flow" in said:
         placed["flow"] = _flow(said["flow"])
     count = _check.integer("vessel.electrodes", said["electrodes"], low=2)
