@@ -16,11 +16,12 @@ from eitbench._files import write_atomically
 from eitbench.bench.methods import load_method
 from eitbench.bench.playing import estimates
 from eitbench.estimation.measured.readings import ReadingModel
+from eitbench.estimation.walk import RandomWalk
 from eitbench.physics.rest import AtRest
 
 if TYPE_CHECKING:
     from eitbench.envs.measured import MeasuredEnv
-    from eitbench.worlds.task import Estimate
+    from eitbench.worlds.task import Estimate, Task
 
 
 COLUMNS = 60
@@ -43,18 +44,21 @@ class Played:
     missed: np.ndarray
     """(T,) root mean square of the withheld readings' distance from what the estimate that they
     judge predicts, in standard deviations of the noise; NaN where nothing is judged"""
+    velocity: np.ndarray | None = None
+    """(T, k) m/s, the flow's parameters if they are asked for; as believed at first where a method
+    says nothing of them"""
 
     def save(self, path: Path, env: MeasuredEnv) -> None:
         """Write what is said as npz, whole or not at all: ``steps`` (S,), ``mean`` and ``variance``
-        (S, n), ``nis`` and ``missed`` (T,), ``times`` (T,) in s, and the mesh's ``points`` (n, d)
-        in m and ``cells``."""
+        (S, n), ``nis`` and ``missed`` (T,), ``velocity`` (T, k) if it is asked for, ``times`` (T,)
+        in s, and the mesh's ``points`` (n, d) in m and ``cells``."""
         content = io.BytesIO()
         mesh = env.task.mesh
         said: dict[str, Any] = {
             "steps": self.steps, "mean": self.mean, "nis": self.nis, "missed": self.missed,
             "times": env.record.times, "points": mesh.points, "cells": mesh.cells}
-        if self.variance is not None:
-            said["variance"] = self.variance
+        said |= {name: value for name, value in (("variance", self.variance),
+                                                 ("velocity", self.velocity)) if value is not None}
         np.savez_compressed(content, **said)
         write_atomically(path, content.getvalue())
 
@@ -80,16 +84,19 @@ def play_record(env: MeasuredEnv, method: str, seed: int = 0, *,
     """
     loaded = load_method(method, "estimation")
     if not loaded.suits(env.task):
-        moves = "stands still" if isinstance(env.task.transport, AtRest) else "walks at random"
-        raise ValueError(f"method must suit a record of which the target {moves}, got "
+        raise ValueError(f"method must suit a record of which the target {_motion(env.task)}, got "
                          f"{loaded.name}")
     T = env.episode_steps
     wanted = set(range(1, T + 1) if kept is None else np.asarray(kept).tolist())
     missed, nis = np.full(T, np.nan), np.full(T, np.nan)
+    asked = env.task.velocity
+    velocity = None if asked is None else np.tile(asked.nominal, (T, 1))
     said: dict[int, Estimate] = {}
     with threadpool_limits(1):
         for now, estimate in _shown(env, estimates(env, loaded, seed), loaded.name):
             nis[now - 1] = _nis(env, now, estimate)
+            if velocity is not None and estimate.velocity is not None:
+                velocity[now - 1] = estimate.velocity
             for t in env.judged_by(now):
                 off = env.missed(t, np.asarray(estimate.mean))
                 if len(off):
@@ -97,7 +104,16 @@ def play_record(env: MeasuredEnv, method: str, seed: int = 0, *,
             if now in wanted:
                 said[now] = estimate._replace(innovation=None, innovation_covariance=None)
     return Played(loaded.name, np.array(list(said)), np.array([e.mean for e in said.values()]),
-                  _variance(list(said.values())), nis, missed)
+                  _variance(list(said.values())), nis, missed, velocity)
+
+
+def _motion(task: Task) -> str:
+    if isinstance(task.transport, AtRest):
+        return "stands still"
+    if isinstance(task.transport, RandomWalk):
+        return "walks at random"
+    known = "is known" if task.velocity is None else "is asked for"
+    return f"is carried by a flow that {known}"
 
 
 def pages_steps(env: MeasuredEnv) -> np.ndarray:

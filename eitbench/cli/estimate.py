@@ -76,6 +76,9 @@ def estimate(
             played.append(play_record(env, name, seed, kept=kept))
             options.say(f"{played[-1].method}: withheld readings missed by "
                         f"{played[-1].withheld:.2f} noise std")
+            if played[-1].velocity is not None:
+                said = ", ".join(f"{each:.3g}" for each in played[-1].velocity[-1])
+                options.say(f"  mean velocity at the end {said} m/s")
             if picture is not None:
                 found = segmented(env, played[-1].mean[-1])
                 off = ", ".join(f"{100 * each:.2f}" for each in distances(env, picture, found))

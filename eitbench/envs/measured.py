@@ -56,7 +56,8 @@ class MeasuredEnv(KnowsItsLength, gym.Env[Observation, np.ndarray]):  # type: ig
     withheld : float
         Part of an injection's readings, from 0 to 0.5.
     moves : bool, optional
-        Whether the target moves. Default: if there are two whole frames or more.
+        Whether the target moves. Default: if there are two whole frames or more, or the vessel
+        has a flow.
     correction : "offset" or "gain"
         See `calibrate`.
     homogeneous_frames : int
@@ -86,7 +87,8 @@ class MeasuredEnv(KnowsItsLength, gym.Env[Observation, np.ndarray]):  # type: ig
             conductivity=self.vessel.conductivity, correction=correction,
             noise=None if len(homogeneous) > 1 else noise_of_frames(record.frames(NOISE_FRAMES)))
         if moves is None:
-            moves = len(record.readings) >= 2 * record.frame
+            flows = self.vessel.flow is not None
+            moves = flows or len(record.readings) >= 2 * record.frame
         believed = {"moves": moves, **believed}
         self.there = readings_there(record)
         """(K, M) bool: readings that are there whenever an injection is."""
@@ -104,6 +106,8 @@ class MeasuredEnv(KnowsItsLength, gym.Env[Observation, np.ndarray]):  # type: ig
             "voltages": spaces.Box(-voltage, voltage, (M,), np.float64),
             "currents": spaces.Box(-current, current, (L,), np.float64)})
         limit = np.full(n, 1e4 * self.task.expected_concentration)
+        if self.task.velocity is not None:
+            limit = np.append(limit, 1e2 * np.abs(self.task.velocity.nominal))
         self.action_space: spaces.Box = spaces.Box(-limit, limit, dtype=np.float64)
         self._step = 0
 
@@ -131,10 +135,12 @@ class MeasuredEnv(KnowsItsLength, gym.Env[Observation, np.ndarray]):  # type: ig
         return self._observe(), {"step": 1}
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Take the estimate (n,) in mol/m³ of the state in which the last readings were taken."""
+        """Take the estimate (n,) in mol/m³ of the state in which the last readings were taken, and
+        after it the flow's parameters in m/s if the vessel's flow is asked for."""
         if not 1 <= self._step <= self.episode_steps:
             raise gym.error.ResetNeeded(RESET_NEEDED)
-        estimate = checked_actions(action, self.action_space, self.task.mesh.n_nodes)
+        n = self.task.mesh.n_nodes
+        estimate = checked_actions(action, self.action_space, n)[:n]
         reward = 0.0
         if judged := self.judged_by(self._step):
             off = np.concatenate([self.missed(t, estimate) for t in judged])

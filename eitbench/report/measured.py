@@ -66,7 +66,8 @@ def write_report(path: Path, env: MeasuredEnv, played: Sequence[Played],
         source={name: value for name, value in source.items() if name != "file"},
         methods=[_row(env, each) for each in played], doubts=list(doubts),
         facts=_facts(env), estimate=_estimate(env, played[0]), first=played[0].method,
-        over_time=_figure(_over_time(env, played)), fit=_figure(_fit(calibration)),
+        over_time=_figure(_over_time(env, played)), velocity=_velocity(env, played),
+        fit=_figure(_fit(calibration)),
         contacts=_figure(_contacts(env)), health=_figure(_health(env, played[0])),
         at_rest=_is_at_rest(env),
         compared="" if truth is None else _figure(_compared(env, played, truth)))
@@ -105,7 +106,12 @@ def _facts(env: MeasuredEnv) -> dict[str, str]:
                                           f"{1e3 * noise.floor:.2g} mV",
         "initial state": f"± {100 * env.task.prior.initial_std:.3g} % of the background, smooth "
                          f"over {100 * env.task.prior.initial_length:.2g} cm"}
-    if not _is_at_rest(env):
+    if env.vessel.flow is not None and not _is_at_rest(env):
+        flow = env.vessel.flow
+        del facts["initial state"]
+        facts["flow"] = (f"{flow.mean_velocity:.3g} m/s on average, "
+                         + (f"± {flow.velocity_std:.2g} m/s" if flow.is_asked else "known"))
+    elif not _is_at_rest(env):
         facts["walk"] = (f"± {100 * env.task.prior.nodal_std:.2g} % of the background a step of "
                          f"{1e3 * env.task.transport.time_step:.3g} ms")
     return facts
@@ -181,6 +187,8 @@ def _over_time(env: MeasuredEnv, played: Sequence[Played]) -> Figure:
     """Misses of withheld readings, and NIS, of each method."""
     figure = Figure(figsize=(10.5, 3.4), dpi=100, layout="constrained")
     missed, nis = figure.subplots(1, 2)
+    if not any(np.isfinite(each.nis).any() for each in played):
+        nis.set_axis_off()
     times = env.record.times
     frame = max(env.task.warm_up, 1)
     for each, colour in zip(played, COLOURS * len(played), strict=False):
@@ -195,6 +203,21 @@ def _over_time(env: MeasuredEnv, played: Sequence[Played]) -> Figure:
         _bare(ax)
     missed.legend(frameon=False, fontsize=9)
     return figure
+
+
+def _velocity(env: MeasuredEnv, played: Sequence[Played]) -> str:
+    """What each method says of the flow, as a data URI; empty if it is not asked for."""
+    if env.task.velocity is None:
+        return ""
+    figure = Figure(figsize=(10.5, 2.8), dpi=100, layout="constrained")
+    axes = figure.subplots()
+    for each, colour in zip(played, COLOURS * len(played), strict=False):
+        if each.velocity is not None:
+            axes.plot(env.record.times, each.velocity[:, 0], color=colour, label=each.method)
+    axes.set(xlabel="time / s", ylabel="mean velocity / (m/s)")
+    axes.legend(frameon=False, fontsize=9)
+    _bare(axes)
+    return _figure(figure)
 
 
 def _smooth(values: np.ndarray, frame: int) -> np.ndarray:

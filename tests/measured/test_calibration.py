@@ -62,6 +62,7 @@ def test_gain_is_told_from_a_conductivity_that_is_known():
 @pytest.mark.parametrize(("readings", "said"), [
     (-homogeneous(), "readings must have the sign of the model's"),
     (np.full((1, 8, 8), np.nan), "NaN only"),
+    (np.zeros((1, 8, 8)), "readings must differ from each other, got 0 V everywhere"),
     (np.ones((1, 8, 7)), r"readings must have shape \(F, K, M\)"),
 ])
 def test_bad_readings_are_said(readings, said):
@@ -104,6 +105,7 @@ def test_channels_that_amplify_differently_break_reciprocity():
 
 def test_units_that_are_wrong_are_named():
     assert "other units" in doubts_about(1e6 * homogeneous())
+    assert "other units" in doubts_about(homogeneous(), 1e3 * CURRENTS)
     assert "not in volts" in doubts_about(1e3 * homogeneous(), conductivity=SIGMA)
 
 

@@ -15,6 +15,7 @@ from eitbench.estimation.walk import RandomWalk
 from eitbench.numerics.fem import mass_matrix
 from eitbench.physics.rest import AtRest
 from eitbench.report.measured import write_report
+from gymnasium.utils.env_checker import check_env
 from tanks import CONTACTS, VESSEL, angle, moving
 from typer.testing import CliRunner
 
@@ -89,6 +90,21 @@ def test_seeds_withhold_other_readings(env):
     env.reset(seed=1)
     assert (one != other).any()
     np.testing.assert_array_equal(env.hidden, one)
+
+
+def test_checkers_accept_it(record):
+    """Gymnasium's, and that of stable-baselines3."""
+    env = gym.make("eitbench/Measured-v0", file=record, vessel=VESSEL, **BELIEVED).unwrapped
+    check_env(env, skip_render_check=True)
+    pytest.importorskip("stable_baselines3.common.env_checker").check_env(env)
+
+
+@pytest.mark.parametrize("block", [3, 100])
+def test_a_frame_ends_where_the_last_injection_comes_first(record, monkeypatch, block):
+    monkeypatch.setattr("eitbench.data.measured.measurements.BLOCK", block)
+    order = [0, 1, 0, 2, 1, 4, 0]
+    some = Measurements(record.currents, np.array(order), record.matrix, record.readings[:7], np.arange(7.0))
+    assert some.frame == 6
 
 
 def test_gymnasium_makes_it(record):
@@ -172,21 +188,34 @@ def test_a_walk_forgets_all_but_what_there_is_in_all(env):
     assert np.diag(covariance).mean() == pytest.approx(1.0, rel=0.05)
 
 
-def test_records_of_our_simulator_are_estimated_as_in_the_environment(tmp_path):
-    """Kalman filter, in a pipe with its flow: from the file as from the environment, to rounding."""
-    env = EstimationEnv("eitbench/Pipe2D-v0", world={"schedule": {"scored_steps": 4}})
+@pytest.mark.parametrize(("name", "world"), [
+    ("kalman_filter", "Pipe2D"), ("extended_kalman_filter", "Pipe2D"), ("log_inflow_filter", "Pipe2D"),
+    ("fixed_lag_smoother", "Pipe2DFixedLag"), ("inflow_smoother", "Pipe2DSmoothing"),
+    ("identified_flow", "Pipe2DObstacle"), ("joint_inflow_filter", "Pipe2DUnknownVelocity")])
+def test_records_of_our_simulator_are_estimated_as_in_the_environment(tmp_path, name, world):
+    """In a pipe with its flow, known or asked for: from the file as from the environment, to rounding."""
+    env = EstimationEnv(f"eitbench/{world}-v0", world={"schedule": {"scored_steps": 4}})
     seed = 0
     record = simulated_record(env, seed)
     record = type(record).load(record.save(tmp_path / "episode.h5"))
     of_file = known_flow_task(env.task, record)
-    method = load_method("kalman_filter", "estimation")
+    method = load_method(name, "estimation")
+    assert method.suits(of_file)
     ours, theirs = method.make(env.task), method.make(of_file)
     observation, _ = env.reset(seed=seed)
-    for k, reading in zip(record.injections, record.readings, strict=True):
-        here = ours.update(observation["voltages"], observation["currents"])
-        there = theirs.update(reading, record.currents[k])
-        np.testing.assert_allclose(there.mean, here.mean, rtol=1e-9, atol=1e-9)
+    said = 0
+    for t in range(env.episode_steps):
+        shown = observation["voltages"], observation["currents"]
+        read = shown                                        # silence: the record has ended
+        if t < len(record.readings):
+            read = record.readings[t], record.currents[record.injections[t]]
+        here, there = ours.update(*shown), theirs.update(*read)
+        assert (here is None) == (there is None)
+        if here is not None:
+            said += 1
+            np.testing.assert_allclose(there.mean, here.mean, rtol=1e-8, atol=1e-8)
         observation, *_ = env.step(np.zeros(env.action_space.shape))
+    assert said > env.task.warm_up
 
 
 def test_a_world_must_fit_the_record(record):

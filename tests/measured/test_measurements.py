@@ -28,6 +28,7 @@ def small(**changed):
     ({"readings": np.ones((3, 2))}, r"readings must have shape \(any, 3\), got \(3, 2\)"),
     ({"readings": np.full((3, 3), np.nan)}, "readings must hold numbers, got NaN only"),
     ({"readings": np.ones((3, 3)) * 1j}, "readings must be real"),
+    ({"readings": np.full((3, 3), b"a")}, "readings must hold numbers, got"),
     ({"readings": np.full((3, 3), np.inf)}, "readings must be finite or NaN"),
     ({"readings": np.ones((0, 3))}, "readings must have shape"),
     ({"injections": np.array([0, 1, 2])}, "injections must be numbers from 0 to 1, got 0 to 2"),

@@ -147,6 +147,10 @@ def test_what_is_no_record(tmp_path):
     savemat(other, {"Inj": CURRENTS.T, "Uel": VALUES})
     with pytest.raises(ValueError, match="must hold Mpat; there are"):
         read(other)
+    nothing = tmp_path / "nothing.mat"
+    savemat(nothing, {"Inj": CURRENTS.T, "Mpat": MATRIX.T, "Uel": np.full_like(VALUES, np.nan)})
+    with pytest.raises(ValueError, match=r"nothing\.mat: readings must hold numbers, got NaN only"):
+        read(nothing)
     with pytest.raises(ValueError, match="must end in"):
         (tmp_path / "a.jpg").write_bytes(b"x")
         read(tmp_path / "a.jpg")

@@ -114,7 +114,15 @@ class Measurements:
     @cached_property
     def frame(self) -> int:
         """Readings until each injection has come once."""
-        return 1 + int(np.unique(self.injections, return_index=True)[1].max())
+        first = np.full(len(self.currents), -1)
+        for begin in range(0, len(self.injections), BLOCK):
+            block = self.injections[begin:begin + BLOCK]
+            came, where = np.unique(block, return_index=True)
+            new = first[came] < 0
+            first[came[new]] = begin + where[new]
+            if (first >= 0).all():
+                break
+        return 1 + int(first.max())
 
     @cached_property
     def driven(self) -> np.ndarray:
@@ -189,6 +197,8 @@ class Measurements:
                                      f"{file.attrs.get('format')!r}, version "
                                      f"{file.attrs.get('version')!r}")
                 along = {name: file[name][steps] for name in ("injections", "times")}
+                for value in along.values():
+                    value.setflags(write=False)                 # long ones are not copied
                 along["readings"] = _mapped(Path(path), file["readings"], steps)
                 whole = {name: file[name][()] for name in ("currents", "matrix")}
                 reference = file["reference"][()] if "reference" in file else None
@@ -238,7 +248,7 @@ def _injections(given: np.ndarray, T: int, K: int) -> np.ndarray:
     if injections.min() < 0 or injections.max() >= K:
         raise ValueError(f"injections must be numbers from 0 to {K - 1}, got "
                          f"{injections.min()} to {injections.max()}")
-    return injections.astype(np.int64)
+    return injections.astype(np.int64, copy=False)
 
 
 def _numbers(name: str, given: np.ndarray, shape: tuple[int | None, ...]) -> np.ndarray:
@@ -246,7 +256,10 @@ def _numbers(name: str, given: np.ndarray, shape: tuple[int | None, ...]) -> np.
     value = np.asarray(given)
     if np.iscomplexobj(value):
         raise ValueError(f"{name} must be real, got complex ones; say which part is used")
-    value = value.astype(float, copy=False)
+    try:
+        value = value.astype(float, copy=False)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} must hold numbers, got {value.dtype}") from None
     fits = value.ndim == len(shape) and all(
         want in (None, size) for want, size in zip(shape, value.shape, strict=True))
     if not fits or not value.size:

@@ -28,6 +28,8 @@ def read(path: Path | str, format: str | None = None, **how: Any) -> Measurement
     how
         Arguments of the reader. Those of a table may also stand in a YAML file beside it of the
         same name: ``electrodes: 16`` and ``current: 0.001``, a line each.
+
+    ``ValueError`` naming the file and what is wrong with it.
     """
     path = Path(path)
     if not path.exists():
@@ -38,7 +40,12 @@ def read(path: Path | str, format: str | None = None, **how: Any) -> Measurement
         raise ValueError(f"format must be one of {', '.join(READERS)}, got {format!r}")
     if format == "table" and not how:
         how = _described(path.with_suffix(".yml"))
-    return READERS[format](path, **how)
+    try:
+        return READERS[format](path, **how)
+    except ValueError as error:
+        if str(path) in str(error):
+            raise
+        raise ValueError(f"{path}: {error}") from None
 
 
 def _described(path: Path) -> dict[str, Any]:

@@ -72,7 +72,9 @@ def read(path: Path | str, *, electrodes: int, current: float, time_step: float 
     if "-" in titles:
         matrix = matrix - np.roll(matrix, 1, axis=1)
     else:
-        readings = readings - np.nanmean(readings, axis=1, keepdims=True)
+        there = np.isfinite(readings)
+        count = np.maximum(there.sum(axis=1, keepdims=True), 1)
+        readings = readings - np.where(there, readings, 0.0).sum(axis=1, keepdims=True) / count
     source = {"file": path.name, "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
               "assumed": f"{current:g} A, readings in {unit:g} V"}
     keep = slice(reference_rows, None)

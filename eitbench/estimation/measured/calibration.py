@@ -126,6 +126,8 @@ def calibrate(electrodes: CompleteElectrodeModel, currents: np.ndarray, matrix: 
         raise ValueError("readings must hold numbers, got NaN only")
     count = np.maximum(there.sum(axis=0), 1)
     mean = np.where(there, readings, 0.0).sum(axis=0) / count
+    if not mean.any():
+        raise ValueError("readings must differ from each other, got 0 V everywhere")
     model = _Homogeneous(electrodes, currents / depth, matrix, tick)
 
     level = float(np.log(CONTACT_LEVEL * lengths(electrodes).mean()))
@@ -135,7 +137,8 @@ def calibrate(electrodes: CompleteElectrodeModel, currents: np.ndarray, matrix: 
     relative = float((weight**2 * start * mean).sum() / (weight**2 * start**2).sum())
     if relative <= 0:
         raise ValueError("readings must have the sign of the model's, got the opposite: turn the "
-                         "sign of the currents or of the measurement matrix")
+                         "sign of the currents or of the measurement matrix, or the order in which "
+                         "readings count electrodes")
     expected[0] = np.log(relative)
     x = expected
     for _ in range(2):                                  # the second time weighed by what was left

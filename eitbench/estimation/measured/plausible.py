@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from eitbench.estimation.measured.calibration import Calibration
     from eitbench.physics.cem import CompleteElectrodeModel
 
-CONDUCTS = (1e-4, 1e2)
-"""S/m between which fluids in vessels conduct."""
+CONDUCTS = (1e-4, 10.0)
+"""S/m between which fluids in vessels conduct; sea water has 5."""
 GAIN = (0.5, 2.0)
 """Between which an instrument that reads volts and amperes is off."""
 RECIPROCAL = 0.05

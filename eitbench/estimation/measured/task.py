@@ -13,14 +13,17 @@ from eitbench.estimation.measured.readings import ReadingModel
 from eitbench.estimation.measured.record import readings_there
 from eitbench.estimation.walk import RandomWalk
 from eitbench.physics.observation import LinearConductivity, ObservationModel
+from eitbench.physics.profiles import parabola
 from eitbench.physics.rest import AtRest
+from eitbench.physics.transport import ConvectionDiffusion
 from eitbench.worlds.parts import Prior
 from eitbench.worlds.task import Task
+from eitbench.worlds.vessels import PlanePipe, RoundPipe
 
 if TYPE_CHECKING:
     from eitbench.data.measured import Measurements
     from eitbench.estimation.measured.calibration import Calibration
-    from eitbench.estimation.measured.vessel import RealVessel
+    from eitbench.estimation.measured.vessel import RealFlow, RealVessel
 
 LENGTH = 1 / 8
 """Over which a target is smooth, in parts of the vessel's size."""
@@ -33,12 +36,13 @@ def measured_task(vessel: RealVessel, calibration: Calibration, record: Measurem
                   molar_conductivity: float = 0.01, model_error: float = MODEL_ERROR,
                   length: float | None = None, initial_std: float | None = None,
                   walk_std: float | None = None) -> Task:
-    """The task of a record: a target that walks at random, or stands still.
+    """The task of a record: a target that walks at random, stands still, or is carried by the flow
+    that the vessel has.
 
     Estimates are concentrations c of what conducts σ = Λ c. How much is in the vessel, how far it
     walks, and by which factor the calibration's noise is too small or too large, are chosen as in
-    `likeliest` if they are not given. ``ValueError`` naming the argument that is out
-    of range.
+    `likeliest` if they are not given. Of a target that the flow carries is believed what `Prior`
+    believes. ``ValueError`` naming the argument that is out of range.
 
     Parameters
     ----------
@@ -80,14 +84,17 @@ def measured_task(vessel: RealVessel, calibration: Calibration, record: Measurem
     times = np.diff(record.times)
     step = float(np.median(times)) if len(times) else 1.0
     T = len(record.injections)
-    prior = Prior(expected_concentration=background, nodal_std=walk_std or 0.0,
-                  initial_std=initial_std or 0.0, initial_length=length)
-    transport = RandomWalk(mesh, step, length) if moves else AtRest(mesh, step)
     noise = calibration.noise
     if calibration.noise_is_told and moves:
         noise = replace(noise, relative=float(np.hypot(noise.relative, model_error)))
-    task = Task(transport, observation, noise, record.currents, T,
-                min(frame, T - 1), 0, background, min(frame, T), prior)
+    task = Task(AtRest(mesh, step), observation, noise, record.currents, T,
+                min(frame, T - 1), 0, background, min(frame, T), Prior(background))
+    if moves and vessel.flow is not None:
+        return _carried(task, vessel, vessel.flow)
+    prior = Prior(expected_concentration=background, nodal_std=walk_std or 0.0,
+                  initial_std=initial_std or 0.0, initial_length=length)
+    transport = RandomWalk(mesh, step, length) if moves else task.transport
+    task = replace(task, transport=transport, prior=prior)
     found = likeliest(task, record, noise_is_told=calibration.noise_is_told,
                       walk_is_known=not moves or walk_std is not None,
                       initial_is_known=initial_std is not None)
@@ -96,6 +103,22 @@ def measured_task(vessel: RealVessel, calibration: Calibration, record: Measurem
     memory = remembered(found.prior.initial_std, found.prior.nodal_std)
     rate = likeliest_rate(found, record)
     return replace(found, transport=RandomWalk(mesh, step, length, memory, rate))
+
+
+def _carried(task: Task, vessel: RealVessel, flow: RealFlow) -> Task:
+    """The task with convection–diffusion for its transport, and its flow asked for if it is not
+    known."""
+    shape = vessel.shape
+    assert isinstance(shape, PlanePipe | RoundPipe)
+    _, inlet = shape.carrier(fine=False)
+    transport = ConvectionDiffusion(
+        task.mesh, shape.laminar(flow.mean_velocity), flow.diffusivity, task.transport.time_step,
+        substeps=shape.substeps(fine=False), inlet=inlet)
+    if not flow.is_asked:
+        return replace(task, transport=transport)
+    assert isinstance(shape, PlanePipe)
+    return replace(task, transport=transport, velocity=parabola(
+        shape.half_width, flow.mean_velocity, flow.velocity_std, flow.velocity_walk))
 
 
 def known_flow_task(task: Task, record: Measurements, *, depth: float = 1.0,

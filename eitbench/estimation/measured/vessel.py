@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,6 +24,31 @@ if TYPE_CHECKING:
 DIRECTIONS = ("counter-clockwise", "clockwise")
 
 
+@dataclass(frozen=True)
+class RealFlow:
+    """Laminar flow along a pipe, as far as it is known."""
+
+    mean_velocity: float
+    """m/s, along the pipe"""
+    diffusivity: float = 5e-4
+    """κ in m²/s"""
+    velocity_std: float = 0.0
+    """m/s, of the mean velocity; if it is not 0, estimators are asked for the velocity too"""
+    velocity_walk: float = 0.0
+    """m/s a reading, by which the mean velocity is believed to walk"""
+
+    def __post_init__(self) -> None:
+        for name, units in (("mean_velocity", "m/s"), ("diffusivity", "m²/s")):
+            _check.number(f"flow.{name}", getattr(self, name), low=0.0, open_low=True, units=units)
+        for name in ("velocity_std", "velocity_walk"):
+            _check.number(f"flow.{name}", getattr(self, name), low=0.0, units="m/s")
+
+    @property
+    def is_asked(self) -> bool:
+        """Whether it is to be estimated."""
+        return self.velocity_std > 0.0
+
+
 @dataclass(frozen=True, eq=False)
 class RealVessel:
     """One of our vessels, turned so that its electrodes stand where those of the instrument do.
@@ -41,6 +66,8 @@ class RealVessel:
     """m of fluid where the model is plane; 1 in 3D"""
     conductivity: float | None = None
     """S/m if it was measured otherwise; then the instrument's gain is calibrated"""
+    flow: RealFlow | None = None
+    """of the fluid through a pipe; None where nobody knows how the target moves"""
 
     def __post_init__(self) -> None:
         _check.number("first", self.first, units="degrees")
@@ -50,6 +77,12 @@ class RealVessel:
                              f"got {self.direction!r}")
         if self.conductivity is not None:
             _check.number("conductivity", self.conductivity, low=0.0, open_low=True, units="S/m")
+        if self.flow is not None and not isinstance(self.shape, PlanePipe | RoundPipe):
+            raise ValueError("flow must be left out where the vessel is no rectangle or cylinder, "
+                             f"got one in a {type(self.shape).__name__}")
+        if self.flow is not None and self.flow.is_asked and not isinstance(self.shape, PlanePipe):
+            raise ValueError("flow.velocity_std must be 0 in a cylinder, whose flow is not "
+                             f"estimated, got {self.flow.velocity_std:g}")
 
     @property
     def n_electrodes(self) -> int:
@@ -100,11 +133,13 @@ def read_vessel(source: Path | str | Mapping[str, Any]) -> RealVessel:
     - rectangle, a pipe with electrodes on both walls along the flow: ``length``, ``width``,
       ``electrodes`` (how many in all), ``electrode_width`` or ``cover``, [``depth``]
     - cylinder, a pipe with rings of electrodes: ``length``, ``radius``, ``rings``, ``electrodes``
-      (how many a ring), ``height`` of one, ``cover``, [``first``, ``direction``]
+      (how many a ring), ``height`` of one, ``cover``, [``first``, ``direction``, ``flow``]
     - mesh: ``file``, ``electrodes`` (how many), [``scale``, ``depth``]; see `MeshVessel`, and
       `read_ktc_mesh` of a .mat file
 
-    and for all [``conductivity``] in S/m, if it is known. ``ValueError`` naming what is wrong.
+    and for all [``conductivity``] in S/m, if it is known. ``flow`` has entries of its own:
+    ``mean_velocity`` in m/s, [``diffusivity``, ``velocity_std``, ``velocity_walk``]; see
+    `RealFlow`. ``ValueError`` naming what is wrong.
     """
     if isinstance(source, Mapping):
         return _vessel(dict(source), Path())
@@ -122,9 +157,9 @@ def read_vessel(source: Path | str | Mapping[str, Any]) -> RealVessel:
 
 _ENTRIES = {
     "circle": ({"radius", "electrodes"}, {"width", "cover", "first", "direction", "depth"}),
-    "rectangle": ({"length", "width", "electrodes"}, {"electrode_width", "cover", "depth"}),
+    "rectangle": ({"length", "width", "electrodes"}, {"electrode_width", "cover", "depth", "flow"}),
     "cylinder": ({"length", "radius", "rings", "electrodes", "height", "cover"},
-                 {"first", "direction"}),
+                 {"first", "direction", "flow"}),
     "mesh": ({"file", "electrodes"}, {"scale", "depth"}),
 }
 """Entries that are needed, and others."""
@@ -140,8 +175,11 @@ def _vessel(said: dict[str, Any], folder: Path) -> RealVessel:
     if unknown := sorted(set(said) - needed - others - {"conductivity"}):
         raise ValueError(f"vessel of kind {kind} has no {', '.join(unknown)}; there are "
                          f"{', '.join(sorted(needed | others))} and conductivity")
-    placed = {name: said[name] for name in ("first", "direction", "depth", "conductivity")
-              if name in said}
+    placed: dict[str, Any] = {
+        name: said[name] for name in ("first", "direction", "depth", "conductivity")
+        if name in said}
+    if "flow" in said:
+        placed["flow"] = _flow(said["flow"])
     count = _check.integer("vessel.electrodes", said["electrodes"], low=2)
     if kind == "circle":
         wall = 2.0 * np.pi * _check.number("vessel.radius", said["radius"], low=0.0, open_low=True,
@@ -165,6 +203,14 @@ def _vessel(said: dict[str, Any], folder: Path) -> RealVessel:
             raise ValueError(f"vessel.file must be a mesh file, got {path}")
         shape = _from_file(path, count, said.get("scale", 1.0))
     return RealVessel(shape, **placed)
+
+
+def _flow(said: Any) -> RealFlow:
+    known = [each.name for each in fields(RealFlow)]
+    if not isinstance(said, Mapping) or not {"mean_velocity"} <= set(said) <= set(known):
+        raise ValueError("vessel.flow must have mean_velocity (m/s), and of "
+                         f"{', '.join(known[1:])} what is known, got {said!r}")
+    return RealFlow(**said)
 
 
 def _from_file(path: Path, count: int, scale: float) -> MeshVessel | MeshTank:
