@@ -32,8 +32,9 @@ _WORDS = ("title", "file", "sha256", "licence", "source")
 _NEEDED = (*_WORDS, "vessel")
 """Entries that every case has."""
 _SHA256 = re.compile("[0-9a-f]{64}")
-_SETTINGS = ("format", "correction", "homogeneous_frames", "moves", "model_error")
-"""Arguments of `eitbench.data.measured.read` and `MeasuredEnv` that it may have."""
+_SETTINGS = ("format", "span", "correction", "homogeneous_frames", "moves", "model_error")
+"""Arguments of `eitbench.data.measured.read` and `MeasuredEnv` that it may have, and ``span``: the
+first reading, from 0, and the one after the last, where a part of a record is enough."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +77,11 @@ class Case:
         for name, digest in {"sha256": self.sha256, **self.beside, **truth}.items():
             if not isinstance(digest, str) or not _SHA256.fullmatch(digest):
                 raise ValueError(f"case.{name} must be 64 digits from 0 to f, got {digest!r}")
+        span = self.settings.get("span", [0, 1])
+        if (not isinstance(span, list) or len(span) != 2
+                or not all(isinstance(end, int) for end in span) or not 0 <= span[0] < span[1]):
+            raise ValueError("case.span must be two numbers such as [0, 800], the first not "
+                             f"negative and the second larger, got {span!r}")
         if unknown := sorted(set(self.settings) - set(_SETTINGS)):
             raise ValueError(f"case has no {', '.join(unknown)}; there are "
                              f"{', '.join((*_NEEDED, 'beside', 'truth', *_SETTINGS))}")
@@ -103,6 +109,8 @@ class Case:
                                  f"{path} must be {digest}, got {found}")
         settings = dict(self.settings)
         record = read(file, settings.pop("format", None))
+        if "span" in settings:
+            record = record.part(slice(*settings.pop("span")))
         return MeasuredEnv(record, dict(self.vessel), withheld=WITHHELD, **settings)
 
     def true_picture(self, file: Path | str | None) -> np.ndarray | None:

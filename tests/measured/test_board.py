@@ -52,6 +52,21 @@ def of(played, method):
     return path
 
 
+def test_a_part_of_a_record_is_a_case(played, tmp_path):
+    """It is the record's part, and another case than the whole."""
+    data = played.parent / "moving.h5"
+    whole = read_case(played / "measured" / "moving.yml")
+    frame = whole.env(data).record.frame
+    write_case(tmp_path / "moving.yml", data, span=[frame, 3 * frame])
+    part = read_case(tmp_path / "moving.yml")
+    assert part.digest != whole.digest
+    np.testing.assert_array_equal(part.env(data).record.readings, whole.env(data).record.readings[frame:3 * frame])
+    for wrong in ("0:800", [5, 5], [-1, 4], [0.5, 2]):
+        write_case(tmp_path / "moving.yml", data, span=wrong)
+        with pytest.raises(ValueError, match=r"case\.span must be two numbers such as \[0, 800\]"):
+            read_case(tmp_path / "moving.yml")
+
+
 def test_record_says_what_was_played(played, case):
     """Its numbers are those of the plays, and the data are known by sha256 and licence alone."""
     said = read_measured_record(of(played, "homogeneous"))
