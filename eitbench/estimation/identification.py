@@ -110,8 +110,8 @@ def _moments(examples: Iterable[Example], world: World, task: Task, across: np.n
     off = np.zeros((len(cycle), cycle.shape[1]))
     compared = np.zeros(len(cycle))
     for example in examples:
-        s = _past(world.sample_inflow(example.seed) / world.background - 1.0, across,
-                  len(example.truth), memory)
+        s = recent_inflows(world.sample_inflow(example.seed) / world.background - 1.0, across,
+                           len(example.truth), memory)
         d = example.truth / world.background - 1.0
         inflow += s.T @ s
         cross += s.T @ d
@@ -126,7 +126,7 @@ def _moments(examples: Iterable[Example], world: World, task: Task, across: np.n
     return Moments(count, inflow, cross, state, off / np.maximum(compared, 1)[:, None])
 
 
-def _past(s: np.ndarray, across: np.ndarray, steps: int, memory: int) -> np.ndarray:
+def recent_inflows(s: np.ndarray, across: np.ndarray, steps: int, memory: int) -> np.ndarray:
     """(T, K·r) of each of the last T states: its K last inflows, in modes; nothing deviates before
     the record of inflows (·, n_inlet) begins."""
     reduced = s @ across
