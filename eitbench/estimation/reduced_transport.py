@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 NODES = 8
 """Flows of the family along each parameter, between which a step is interpolated."""
-EVERY = 4
+EVERY = 8
 """States this many steps apart show the directions."""
 CARRIED_ON = 2
 """So many times the directions that are asked for are kept while flows are looked at in turn."""
