@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 
 NODES = 8
 """Flows of the family along each parameter, between which a step is interpolated."""
-EVERY = 8
-"""States this many steps apart show the directions."""
+SHOWN = 16
+"""States of each episode show the directions, or all if there are fewer."""
 CARRIED_ON = 2
 """So many times the directions that are asked for are kept while flows are looked at in turn."""
 
@@ -113,11 +113,12 @@ def _strongest(transports: Sequence[Transport], inflows: np.ndarray, q: int) -> 
 
 
 def _carried(transport: Transport, inflows: np.ndarray) -> list[np.ndarray]:
-    """States (n, N) of N episodes."""
+    """States (n, N) of N episodes, some steps apart."""
     c = np.zeros((transport.mesh.n_nodes, inflows.shape[2]))
+    every = max(1, (len(inflows) - 1) // SHOWN)
     states = []
     for t in range(1, len(inflows)):
         c = transport.step(c, inflows[t - 1], inflows[t])
-        if t % EVERY == 0:
+        if t % every == 0:
             states.append(c)
     return states

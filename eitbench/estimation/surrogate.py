@@ -86,7 +86,8 @@ class Surrogate:
         currents = cycle_currents(world)
         clean = self.voltages(c, currents)
         # the instrument takes transfer resistances: such as give these voltages
-        resistance = clean[:, :, None] * (currents / (currents**2).sum(axis=1, keepdims=True))[:, None]
+        unit = currents / (currents**2).sum(axis=1, keepdims=True)
+        resistance = clean[:, :, None] * unit[:, None]
         noise = randomness(seed).noise.standard_normal(clean.shape)
         measured = world.instrument.measure(faults_of(world, seed), np.arange(1, len(c) + 1),
                                             resistance, currents, noise)

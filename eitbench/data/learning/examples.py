@@ -143,7 +143,11 @@ def dataset(env: str, seeds: str | Sequence[int], *,
     ValueError
         If there is no such environment, number or seed, or a test episode is not asked for by name.
     """
-    played = entry(env).world.changed(world)
+    return Dataset(env, entry(env).world.changed(world), asked_seeds(seeds))
+
+
+def asked_seeds(seeds: str | Sequence[int]) -> tuple[int, ...]:
+    """Each once; ``ValueError`` if there is none, or a test episode is not asked for by name."""
     numbers = parse_seeds(seeds) if isinstance(seeds, str) else [
         _check.integer("seeds", seed, low=0) for seed in seeds]
     if not numbers:
@@ -152,7 +156,7 @@ def dataset(env: str, seeds: str | Sequence[int], *,
     if not named and (tests := [seed for seed in numbers if is_test(seed)]):
         raise ValueError("seeds must name the split of test episodes, on which methods are scored: "
                          f"'{name_seed(tests[0])}', got {tests[0]}")
-    return Dataset(env, played, tuple(dict.fromkeys(numbers)))
+    return tuple(dict.fromkeys(numbers))
 
 
 def example(world: World, seed: int) -> Example:
