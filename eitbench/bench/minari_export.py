@@ -66,14 +66,14 @@ def export_minari(name: str, env: str, policy: str, seeds: str | Sequence[int], 
     numbers = asked_seeds(seeds)
     player = load_method(policy, "injection")
     made = gym.make(env)
-    played = made.unwrapped
-    assert isinstance(played, InjectionEnv)
-    if not player.suits(played.rules):
+    inner = _inner(made)
+    if not player.suits(inner.rules):
         raise ValueError(f"policy must suit env, got {policy!r}, which does not")
-    fill(played.world, numbers, n_jobs=n_jobs, backend=backend)
-    episodes = [_played(played, player, seed, k) for k, seed in enumerate(
+    fill(inner.world, numbers, n_jobs=n_jobs, backend=backend)
+    episodes = [_played(made, player, seed, k) for k, seed in enumerate(
         tqdm(numbers, desc="playing", unit="episode", disable=None))]
-    create_dataset_from_buffers(name, episodes, env=made, algorithm_name=player.name,
+    # by its id: the spec of one that is made knows its length, and would be truncated there too
+    create_dataset_from_buffers(name, episodes, env=env, algorithm_name=player.name,
                                 author="eitbench", requirements=["eitbench"],
                                 description=_card(env, player, numbers))
     return len(episodes)
@@ -92,20 +92,28 @@ def _check_name(name: str) -> None:
                          f"`minari delete {name}` removes")
 
 
-def _played(env: InjectionEnv, policy: Method, seed: int, number: int) -> EpisodeBuffer:
+def _inner(env: gym.Env[Any, Any]) -> InjectionEnv:
+    inner = env.unwrapped
+    assert isinstance(inner, InjectionEnv)
+    return inner
+
+
+def _played(env: gym.Env[Any, Any], policy: Method, seed: int, number: int) -> EpisodeBuffer:
     from minari.data_collector import EpisodeBuffer
+    inner = _inner(env)
     with for_scores():
         seen = [env.reset(seed=seed)[0]]
-    player = policy.make(env.rules, policys_random(seed), *[env.core] * policy.privileged)
+    player = policy.make(inner.rules, policys_random(seed), *[inner.core] * policy.privileged)
     told: list[tuple[Any, ...]] = []
-    while not told or not told[-1][2]:  # terminated
-        raw = {name: array[0] for name, array in env.core.observe().items()}
+    ended = False
+    while not ended:
+        raw = {name: array[0] for name, array in inner.core.observe().items()}
         action = player.act(raw)
-        observation, *outcome, _ = env.step(action)
+        observation, reward, terminated, truncated, _ = env.step(action)
         seen.append(observation)
-        told.append((action, *outcome))
-    # actions, rewards, terminated and truncated
-    columns = map(np.array, zip(*told, strict=True))
+        told.append((action, reward, terminated, truncated))
+        ended = terminated or truncated
+    columns = map(np.array, zip(*told, strict=True))  # in the buffer's order
     return EpisodeBuffer(number, seed, None, np.array(seen), *columns, infos={})
 
 

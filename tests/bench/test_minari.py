@@ -50,14 +50,13 @@ def test_its_policy_is_the_one_that_is_scored():
     env = gym.make(ENV, estimator="full", observation="raw").unwrapped
     played = [observation["currents"] for _, observation, _ in
               injections(env, load_method("random_pair", "injection"), 100_003)]
-    pairs = env.rules.amplitude * np.array(env.rules.patterns)[episode.actions]
-    np.testing.assert_allclose(played, pairs)
+    np.testing.assert_allclose(played, env.rules.currents(episode.actions))
 
 
 def test_card_says_what_is_in_it():
-    export_minari(NAME, ENV, "best_pair", "test:0")
+    export_minari(NAME, ENV, "transverse", "test:0")
     metadata = minari.load_dataset(NAME).storage.metadata
-    assert metadata["algorithm_name"] == "best_pair" and metadata["requirements"] == ["eitbench"]
+    assert metadata["algorithm_name"] == "transverse" and metadata["requirements"] == ["eitbench"]
     for words in (ENV, "Episodes test:0", "Test episodes are among them", "no measured data"):
         assert words in metadata["description"]
 

@@ -24,10 +24,10 @@ def prior(task, link):
 
 
 def readings(task, seed=0):
-    """(STEPS, B, L) V of fluids that are nowhere near what is expected, and the currents (STEPS, L)."""
+    """(STEPS, B, L) V of fluids that jump from step to step, and the currents (STEPS, L)."""
     random = np.random.default_rng(seed)
     currents = task.currents[np.arange(STEPS) % len(task.currents)]
-    states = LEVELS * np.exp(0.2 * random.normal(size=(STEPS, len(LEVELS))))
+    states = LEVELS * np.exp(0.03 * random.normal(size=(STEPS, len(LEVELS))))
     n = task.mesh.n_nodes
     return np.array([[task.observation.voltages(np.full(n, c), each[None])[0] for c in row]
                      for row, each in zip(states, currents, strict=True)]), currents

@@ -87,9 +87,9 @@ def test_what_is_broken_is_broken_here_too():
 def test_what_a_model_leaves_is_drawn():
     """The states differ from those of the response alone by draws of Γ_e, the same ones each time."""
     exact = replace(model(), spread=0.0 * model().spread)
-    seeds = range(24)
-    left = np.concatenate([Surrogate(PIPE_2D, model()).concentration(seed) - Surrogate(PIPE_2D, exact).concentration(seed)
-                           for seed in seeds]) / PIPE_2D.background
+    drawn, alone = (Surrogate(PIPE_2D, each) for each in (model(), exact))
+    left = np.concatenate([drawn.concentration(seed) - alone.concentration(seed) for seed in range(24)])
+    left /= PIPE_2D.background
     mass = whole(PIPE).mass
     modes = left @ (mass @ model().basis)
     covariance = modes.T @ modes / len(modes)
