@@ -10,6 +10,7 @@ goes on from there.
 
 from dataclasses import replace
 from functools import lru_cache
+from itertools import product
 from typing import Annotated
 
 import matplotlib.pyplot as plt
@@ -22,6 +23,7 @@ from learn import (
     KEPT,
     LESSONS,
     ROOT,
+    Correction,
     Judge,
     Tensors,
     features,
@@ -142,6 +144,15 @@ def true_dev(basis: np.ndarray) -> Tensors:
     return data | {"velocity": velocities(examples.world, examples.seeds)}
 
 
+def errors(network: Correction, data: Tensors, warm_up: int) -> np.ndarray:
+    """(N,) ẽ_c of each episode."""
+    with torch.no_grad():
+        correction = network(data["inputs"])[0]
+    off = data["reduced"] + network.output_scale * correction - data["truth"]
+    each = data["weight"] * (off**2).sum(dim=-1) + data["rest"]
+    return each[:, warm_up:].mean(dim=1).numpy()
+
+
 def main(episodes: Annotated[int, typer.Option(help="Most to learn from.")] = max(EPISODES),
          seeds: Annotated[int, typer.Option(help="Trainings of each.")] = 3) -> None:
     torch.set_num_threads(1)
@@ -155,14 +166,17 @@ def main(episodes: Annotated[int, typer.Option(help="Most to learn from.")] = ma
     print(f"without the network {float(filters_errors(dev)[:, judge.warm_up:].mean()):.5f}")
     sizes = [many for many in EPISODES if many <= episodes]
     scores = np.empty((len(STEPS), len(sizes), seeds))
-    for k, steps in enumerate(STEPS):
-        for i, many in enumerate(sizes):
-            some = {name: each[:many] for name, each in data.items()}
-            epochs = round(steps / -(-many // BATCH))
-            for seed in range(seeds):
-                scores[k, i, seed] = trained(LESSON, some, dev, judge, seed, epochs)[1]
-            print(f"{steps} steps, {many:5} episodes, {epochs} epochs: {scores[k, i].mean():.5f}, "
-                  f"each {np.round(scores[k, i], 6)}", flush=True)
+    for (k, steps), (i, many), seed in product(enumerate(STEPS), enumerate(sizes), range(seeds)):
+        def train() -> dict[str, np.ndarray]:
+            some = {name: each[:many] for name, each in data.items()}  # noqa: B023
+            epochs = round(steps / -(-many // BATCH))  # noqa: B023
+            network, _ = trained(LESSON, some, dev, judge, seed, epochs)  # noqa: B023
+            return {"errors": errors(network, dev, judge.warm_up)}
+
+        kept = store.kept(PLACE / f"{steps}-steps-of-{many}-{seed}.npz", ("errors",), train)
+        scores[k, i, seed] = kept["errors"].mean()
+        print(f"{steps} steps, {many:5} episodes, training {seed}: {scores[k, i, seed]:.6f}",
+              flush=True)
     draw(sizes, scores)
 
 
