@@ -39,8 +39,7 @@ BATCH = 16
 RATE = 4e-3
 DECAY = 0.1
 MAPS = 4
-DROPPED = 0.2
-"""of the memory, while it learns"""
+DROPPED = 0.2  # of the memory, while it learns
 SURPRISE = 0.02
 """weight of the likelihood, beside ẽ_c in parts of the filter's"""
 NODES = 256
