@@ -10,6 +10,7 @@ EXTRAS = {
               "pandas", "PIL", "typer", "yaml"),
     "export": ("h5py", "pyarrow"),
     "mesh": ("meshio",),
+    "minari": ("minari",),
     "rl": ("torch", "stable_baselines3", "sb3_contrib"),
 }
 """Extra -> modules that playing from Python does not need."""

@@ -2,9 +2,8 @@
 
 `python studies/learn.py LESSON` (extra rl) looks at training episodes as the method will, trains
 networks from a few of them, from more and from all, writes the network of all to
-baselines/networks, and draws docs/learned_LESSON.png with scores on dev:0-31. `LESSONS` are the
-lessons. Episodes and what was seen of them are kept in results/learned; the same command goes on
-from there.
+baselines/networks, and draws docs/learned_LESSON.png with scores on dev:0-31. Episodes and what was
+seen of them are kept in results/learned; the same command goes on from there.
 """
 
 from collections.abc import Mapping, Sequence
@@ -30,6 +29,7 @@ from eitbench.estimation import FilterSeen, FirstFrame, VoltagesSeen, suiting_mo
 from eitbench.estimation.identified import told as told_of
 from eitbench.worlds.streams import randomness
 from eitbench.worlds.task import make_task
+from eitbench.worlds.world import World
 
 ROOT = Path(__file__).parents[1]
 KEPT = Path("results/learned")
@@ -39,8 +39,7 @@ BATCH = 16
 RATE = 4e-3
 DECAY = 0.1
 MAPS = 4
-DROPPED = 0.2
-"""of the memory, while it learns"""
+DROPPED = 0.2  # of the memory, while it learns
 SURPRISE = 0.02
 """weight of the likelihood, beside ẽ_c in parts of the filter's"""
 NODES = 256
@@ -157,7 +156,7 @@ def of_episode(lesson: Lesson, seed: int, basis: np.ndarray) -> Mapping[str, np.
         examples = eitbench.dataset(lesson.env, [seed])
         return features(examples, examples[0], basis, lesson.sees)
 
-    later = [f"reduced {lag}" for lag in LAGS] if lesson.sees != "voltages" else []
+    later = [] if lesson.sees == "voltages" else [f"reduced {lag}" for lag in LAGS]
     return store.kept(place(lesson) / lesson.sees / f"{seed}.npz", (*FEATURES, *later), make,
                       str(seed))
 
@@ -187,10 +186,15 @@ def of_episodes(lesson: Lesson, seeds: list[int]) -> Tensors:
     files = [asked(lesson, of_episode(lesson, seed, basis)) for seed in seeds]
     data = {name: torch.tensor(np.array([file[name] for file in files]), dtype=torch.float32)
             for name in FEATURES}
+    told = velocities(world, seeds) if lesson.velocity else torch.zeros(len(seeds), 1)
+    return data | {"velocity": told}
+
+
+def velocities(world: World, seeds: Sequence[int]) -> torch.Tensor:
+    """(N, 1) of the episodes' flows, as the memory must tell them."""
     mean, std = USUAL
-    drawn = [world.flow.draw(world, randomness(seed).flow)(1).mean_velocity if lesson.velocity
-             else mean for seed in seeds]
-    return data | {"velocity": (torch.tensor(drawn, dtype=torch.float32)[:, None] - mean) / std}
+    drawn = [world.flow.draw(world, randomness(seed).flow)(1).mean_velocity for seed in seeds]
+    return (torch.tensor(drawn, dtype=torch.float32)[:, None] - mean) / std
 
 
 class Correction(torch.nn.Module):
@@ -316,7 +320,7 @@ class Judge:
 
 
 def trained(lesson: Lesson, data: Tensors, dev: Tensors, judge: Judge,
-            seed: int) -> tuple[Correction, float]:
+            seed: int, epochs: int = EPOCHS) -> tuple[Correction, float]:
     """The network after all epochs, and its ẽ_c on ``dev``."""
     torch.manual_seed(seed)
     off = (data["reduced"] - data["truth"])[:, judge.warm_up:]
@@ -325,9 +329,9 @@ def trained(lesson: Lesson, data: Tensors, dev: Tensors, judge: Judge,
     optimiser = torch.optim.AdamW(network.parameters(), lr=RATE, weight_decay=DECAY)
     episodes = len(data["inputs"])
     rates = torch.optim.lr_scheduler.OneCycleLR(
-        optimiser, RATE, total_steps=EPOCHS * -(-episodes // BATCH), pct_start=0.1)
+        optimiser, RATE, total_steps=epochs * -(-episodes // BATCH), pct_start=0.1)
     filters = filters_errors(data)[:, judge.warm_up:].mean()
-    for _ in trange(EPOCHS, desc=f"{episodes} episodes, seed {seed}", unit="epoch", disable=None):
+    for _ in trange(epochs, desc=f"{episodes} episodes, seed {seed}", unit="epoch", disable=None):
         for some in torch.randperm(episodes).split(BATCH):
             batch = {name: each[some] for name, each in data.items()}
             error, surprise, told = judge.losses(network, batch)
@@ -354,9 +358,8 @@ def main(
     fill(world, train + dev, n_jobs=jobs)
     told = basis_and_rest(what)
     todo = [(what, seed, told["basis"]) for seed in train + dev]
-    for _ in tqdm(in_parallel(of_episode, todo, jobs), total=len(todo), desc="looking",
-                  unit="episode", disable=None):
-        pass
+    looking = in_parallel(of_episode, todo, jobs)
+    list(tqdm(looking, total=len(todo), desc="looking", unit="episode", disable=None))
     data = of_episodes(what, train)
     held = of_episodes(what, dev)
     judge = Judge(world.warm_up, *(told[name] for name in ("basis", "rest")
@@ -373,8 +376,7 @@ def main(
         print(f"{many:5} episodes {scores[i].mean():.5f}, each", np.round(scores[i], 6))
     np.savez_compressed(ROOT / "baselines" / "networks" / what.network,
                         **joined(networks[:what.joined]), basis=told["basis"].astype(np.float16),
-                        rest=told["rest"].astype(np.float32),
-                        task=told_of(make_task(world)))
+                        rest=told["rest"].astype(np.float32), task=told_of(make_task(world)))
     draw(lesson, what.episodes, scores, alone)
 
 
@@ -384,8 +386,7 @@ def draw(name: str, episodes: tuple[int, ...], scores: np.ndarray, alone: float)
     axes.semilogx(episodes, scores, "o", color="#7f8fa6", markersize=4)
     axes.semilogx(episodes, scores.mean(axis=1), color="#1a5fb4", linewidth=2,
                   label="the network, mean of the trainings")
-    axes.axhline(alone, color="#c01c28", linestyle=":",
-                 label=f"what it corrects: {alone:.5f}")
+    axes.axhline(alone, color="#c01c28", linestyle=":", label=f"what it corrects: {alone:.5f}")
     axes.set_xticks(episodes, [str(many) for many in episodes], minor=False)
     axes.minorticks_off()
     axes.set(xlabel="training episodes", ylabel="ẽ_c, dev:0-31")

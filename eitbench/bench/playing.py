@@ -102,9 +102,7 @@ def injections(env: InjectionEnv, policy: Method, seed: int,
     with for_scores():
         observation, _ = env.reset(seed=seed)
     t = env.core.first
-    # A generator knows what it was seeded with, so the policy's is given its state only.
-    drawn = np.random.default_rng(int(randomness(seed).policy.integers(2**63)))
-    random = in_state(drawn.bit_generator.state)
+    random = policys_random(seed)
     begin = time.perf_counter()
     player = policy.make(env.rules, random, *[env.core] * policy.privileged)
     done = False
@@ -115,6 +113,13 @@ def injections(env: InjectionEnv, policy: Method, seed: int,
         t += 1
         yield t, observation, seconds
         begin = time.perf_counter()
+
+
+def policys_random(seed: int) -> np.random.Generator:
+    """What a policy draws from in the episode of this seed."""
+    # A generator knows what it was seeded with, so the policy's is given its state only.
+    drawn = np.random.default_rng(int(randomness(seed).policy.integers(2**63)))
+    return in_state(drawn.bit_generator.state)
 
 
 def estimates(env: EstimationEnv | MeasuredEnv, estimator: Method,

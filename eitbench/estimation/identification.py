@@ -180,8 +180,8 @@ def _moments(examples: Iterable[Example], world: World, task: Task, across: np.n
     off, scatter = np.zeros((P, L)), np.zeros((P, L, L))
     compared = np.zeros(P)
     for example in examples:
-        s = _past(world.sample_inflow(example.seed) / world.background - 1.0, across,
-                  len(example.truth), size // across.shape[1])
+        s = recent_inflows(world.sample_inflow(example.seed) / world.background - 1.0, across,
+                           len(example.truth), size // across.shape[1])
         d = example.truth / world.background - 1.0
         l = d - s @ known.T
         inflow += s.T @ s
@@ -214,7 +214,7 @@ def _errors(task: Task, example: Example, linearised: bool) -> Iterator[tuple[in
         yield t, (example.voltages[t] - computed) / task.noise.std(computed)
 
 
-def _past(s: np.ndarray, across: np.ndarray, steps: int, memory: int) -> np.ndarray:
+def recent_inflows(s: np.ndarray, across: np.ndarray, steps: int, memory: int) -> np.ndarray:
     """(T, K·r) of each of the last T states: its K last inflows, in modes; nothing deviates before
     the record of inflows (·, n_inlet) begins."""
     reduced = s @ across

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from eitbench.data.seeds import is_test, parse_seeds
@@ -22,12 +22,22 @@ FIELDS = """\
 | `seed` | | | of the episode |
 | `voltages` | ({T}, {L}) | {voltages} | noisy readings at t = 1 … {T}, {ms:g} ms apart |
 | `currents` | ({T}, {L}) | {currents} | injected |
-| `truth` | ({T}, {n}) | {truth} | concentration at the nodes of `mesh.npz`: the projection p_t of \
-what was simulated, c_t on a finer mesh |
+| `truth` | ({T}, {n}) | {truth} | concentration at the nodes of `mesh.npz`{which} |
 | `unresolved` | ({T},) | {unresolved} | ∫(p_t − c_t)² |
 | `square` | ({T},) | {square} | ∫c_t² |
 | `velocity` | ({T}, {k}) | {velocity} | parameters of the flow{asked} |
 """
+
+TRUE = ": the projection p_t of what was simulated, c_t on a finer mesh"
+SURROGATE = """
+**These episodes are surrogates**, to learn from only. What flows in, how the fluid moves, noise and
+faults are those of the true episode of the same seed. The concentration is carried in few
+directions of a coarse mesh, voltages are quadratic in its logarithm, and nothing is beneath the
+nodes, so that `unresolved` is zero. Choose and report on true episodes. Made of: `{source}`.
+"""
+EXACT = ("Errors are those of the leaderboards, exactly, although the finer mesh of the truth is "
+         "not here:")
+OF_SURROGATE = "Errors as on the leaderboards, but beside the surrogate's concentration:"
 
 SCORE = """\
 ```python
@@ -51,20 +61,23 @@ def card(examples: Dataset, identity: dict[str, Any], files: Iterable[str]) -> b
              "k": 0 if flow is None else flow.size, "warm_up": world.warm_up,
              "ms": 1e3 * world.time_step,
              "asked": "; none here" if flow is None else " that fit the true flow best"}
-    held = _ranges(files)
+    held = ranges(files)
     reserved = ("\nTest episodes are among them: report on them, and neither learn nor choose.\n"
                 if any(is_test(parse_seeds(each)[0]) for each in held) else "")
+    surrogate = examples.surrogate
+    sizes["which"] = TRUE if surrogate is None else ", of the surrogate"
+    marked = "" if surrogate is None else SURROGATE.format(source=json.dumps(surrogate.source))
     command = (f"eitbench export --env {examples.env} --format {identity['format']} --out FOLDER "
-               "--seeds ")
+               f"{'' if surrogate is None else _options(surrogate.source)}--seeds ")
     again = "\n".join(command + each for each in held)
     return f"""\
-# {examples.env}: episodes to learn from
+# {examples.env}: {'' if surrogate is None else 'surrogate '}episodes to learn from
 
 Process tomography, simulated: currents injected through electrodes on a vessel's wall, the voltages
 there, and the true concentration. One file an episode (`{identity['format']}`).
 
 Episodes: {'; '.join(held) or 'none yet'}. Learn on `train`, choose on `dev`, report on `test`.
-{reserved}
+{reserved}{marked}
 ## Fields
 
 {FIELDS.format(**sizes, **UNITS)}
@@ -72,7 +85,7 @@ Episodes: {'; '.join(held) or 'none yet'}. Learn on `train`, choose on `dev`, re
 
 ## Score
 
-Errors are those of the leaderboards, exactly, although the finer mesh of the truth is not here:
+{EXACT if surrogate is None else OF_SURROGATE}
 
 {SCORE.format(**sizes)}
 ## Where it comes from
@@ -92,7 +105,12 @@ Licence: MIT, as eitbench. All numbers of the world:
 """.encode()
 
 
-def _ranges(files: Iterable[str]) -> list[str]:
+def _options(source: Mapping[str, Any]) -> str:
+    """Of the command, for such surrogate episodes."""
+    return "--surrogate " + ("--model MODEL " if source.get("model") else "")
+
+
+def ranges(files: Iterable[str]) -> list[str]:
     """``train:0-99,200`` and so on, of ``train-0``, ``train-1`` …"""
     numbers: dict[str, set[int]] = {}
     for name in files:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
     from eitbench.data.learning.torch_dataset import TorchDataset
     from eitbench.numerics.mesh import Mesh
+    from eitbench.physics.profiles import VelocityModel
 
 
 class Example(NamedTuple):
@@ -50,6 +51,17 @@ class Example(NamedTuple):
     """(T, k) m/s, the flow's parameters that fit the true flow best; k = 0 where nobody asks"""
 
 
+class Surrogate(Protocol):
+    """What makes examples without a simulation, such as `eitbench.estimation.Surrogate`."""
+
+    def example(self, seed: int) -> Example:
+        """The example of one episode."""
+
+    @property
+    def source(self) -> Mapping[str, Any]:
+        """What it is made of, fit for JSON."""
+
+
 @dataclass(frozen=True)
 class Dataset:
     """Examples of a world, in the order of their seeds; `dataset` makes it.
@@ -62,6 +74,8 @@ class Dataset:
     """the environment's id"""
     world: World
     seeds: tuple[int, ...]
+    surrogate: Surrogate | None = None
+    """what makes them in place of the simulation; see `eitbench.surrogate_dataset`"""
 
     def __len__(self) -> int:
         return len(self.seeds)
@@ -69,12 +83,17 @@ class Dataset:
     def __iter__(self) -> Iterator[Example]:
         for k in range(0, len(self.seeds), TOGETHER):
             group = self.seeds[k:k + TOGETHER]
-            fill_here(self.world, group)
+            if self.surrogate is None:
+                fill_here(self.world, group)
             for seed in group:
-                yield example(self.world, seed)
+                yield self.example(seed)
 
     def __getitem__(self, index: int) -> Example:
-        return example(self.world, self.seeds[index])
+        return self.example(self.seeds[index])
+
+    def example(self, seed: int) -> Example:
+        """That of one of the seeds."""
+        return example(self.world, seed) if self.surrogate is None else self.surrogate.example(seed)
 
     @property
     def mesh(self) -> Mesh:
@@ -124,7 +143,11 @@ def dataset(env: str, seeds: str | Sequence[int], *,
     ValueError
         If there is no such environment, number or seed, or a test episode is not asked for by name.
     """
-    played = entry(env).world.changed(world)
+    return Dataset(env, entry(env).world.changed(world), asked_seeds(seeds))
+
+
+def asked_seeds(seeds: str | Sequence[int]) -> tuple[int, ...]:
+    """Each once; ``ValueError`` if there is none, or a test episode is not asked for by name."""
     numbers = parse_seeds(seeds) if isinstance(seeds, str) else [
         _check.integer("seeds", seed, low=0) for seed in seeds]
     if not numbers:
@@ -133,22 +156,31 @@ def dataset(env: str, seeds: str | Sequence[int], *,
     if not named and (tests := [seed for seed in numbers if is_test(seed)]):
         raise ValueError("seeds must name the split of test episodes, on which methods are scored: "
                          f"'{name_seed(tests[0])}', got {tests[0]}")
-    return Dataset(env, played, tuple(dict.fromkeys(numbers)))
+    return tuple(dict.fromkeys(numbers))
 
 
 def example(world: World, seed: int) -> Example:
     """The example of one episode, from the cache if it is there; else it is simulated."""
     entries = recording(world, seed)
-    cycle = world.currents
     truth, unresolved, square = _projected(world, seed, entries)
     velocity = world.velocity_model
     flow = np.empty((len(entries), 0))
     if velocity is not None:
-        gram = velocity.profiles.T @ (velocity.weights[:, None] * velocity.profiles)
-        flow = np.linalg.solve(gram, entries["velocity_moment"].T).T
-    return Example(seed, cycle_voltages(world, seed, entries),
-                   cycle[np.arange(len(entries)) % len(cycle)],
+        flow = fitted(velocity, entries["velocity_moment"])
+    return Example(seed, cycle_voltages(world, seed, entries), cycle_currents(world),
                    (world.background + truth).astype(np.float32), unresolved, square, flow)
+
+
+def cycle_currents(world: World) -> np.ndarray:
+    """(T, L) A (A/m in 2D), injected at t = 1 … T."""
+    cycle = world.currents
+    return cycle[np.arange(world.n_steps) % len(cycle)]
+
+
+def fitted(velocity: VelocityModel, moment: np.ndarray) -> np.ndarray:
+    """(T, k) m/s: the parameters whose flow has these ``moment`` (T, k) ∫φ_k v_t."""
+    gram = velocity.profiles.T @ (velocity.weights[:, None] * velocity.profiles)
+    return np.linalg.solve(gram, moment.T).T
 
 
 def _projected(world: World, seed: int,

@@ -17,7 +17,6 @@ from eitbench._files import write_atomically
 from eitbench.data import store
 from eitbench.data.bank import fill
 from eitbench.data.learning.card import UNITS, card
-from eitbench.data.learning.examples import example
 from eitbench.data.recordings import SPARSE
 from eitbench.data.seeds import name_seed
 
@@ -45,7 +44,8 @@ def export(examples: Dataset, folder: Path, format: str = "npz", *, n_jobs: int 
     ----------
     examples : Dataset
     folder : Path
-        New, empty, or of an export of the same world in the same format.
+        New, empty, or of an export of the same world in the same format, both true or both of
+        the same surrogate.
     format : "npz", "parquet" or "hdf5"
         The last two need the extra ``export``.
     n_jobs, backend
@@ -66,11 +66,12 @@ def export(examples: Dataset, folder: Path, format: str = "npz", *, n_jobs: int 
     paths = {seed: folder / f"{name_seed(seed).replace(':', '-')}.{SUFFIXES[format]}"
              for seed in examples.seeds}
     missing = [seed for seed, path in paths.items() if not path.exists()]
-    fill(examples.world, missing, n_jobs=n_jobs, backend=backend)
+    if examples.surrogate is None:
+        fill(examples.world, missing, n_jobs=n_jobs, backend=backend)
     write_atomically(folder / MESH, _npz(_mesh(examples)))
     write_atomically(folder / "README.md", card(examples, identity, _there(folder, format)))
     for seed in tqdm(missing, desc="writing", unit="episode", disable=None):
-        fields = example(examples.world, seed)._asdict()
+        fields = examples.example(seed)._asdict()
         fields["seed"] = np.array(seed)
         write_atomically(paths[seed], encode(fields))
     write_atomically(folder / "README.md", card(examples, identity, _there(folder, format)))
@@ -83,7 +84,8 @@ def _identity(examples: Dataset, format: str) -> dict[str, Any]:
     world = examples.world
     return {"environment": examples.env, "format": format, "eitbench": __version__,
             "digest": store.world_digest(world), "steps": world.n_steps, "warm_up": world.warm_up,
-            "time_step": world.time_step, "world": store.described(world)}
+            "time_step": world.time_step, "world": store.described(world)} | (
+                {} if examples.surrogate is None else {"surrogate": examples.surrogate.source})
 
 
 def _claim(folder: Path, identity: dict[str, Any]) -> None:
@@ -93,7 +95,7 @@ def _claim(folder: Path, identity: dict[str, Any]) -> None:
     if path.exists():
         if path.read_text(encoding="utf-8") != text:
             raise ValueError(f"out must be another folder: {path} is of another environment, "
-                             "format or version of eitbench")
+                             "format, surrogate or version of eitbench")
     elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ValueError(f"out must be a new or empty folder, or one of an export; got {folder}")
     else:

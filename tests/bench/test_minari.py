@@ -1,0 +1,84 @@
+"""Injections as a Minari data set: what it holds is what the environment shows and pays."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from eitbench.bench.minari_export import export_minari
+from eitbench.cli.app import app
+from typer.testing import CliRunner
+
+from short import SHORT, shorten
+
+minari = pytest.importorskip("minari", reason="needs the extra minari")
+
+ENV = "eitbench/Pipe2DInjection-v0"
+NAME = "eitbench/tiny/random-pair-v0"
+
+
+@pytest.fixture(autouse=True)
+def _short(monkeypatch, tmp_path):
+    shorten(monkeypatch, {ENV: SHORT["Pipe2D"]})
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+
+
+def test_replaying_gives_the_same_again():
+    """By the seed in an episode's metadata and its actions, in the environment that the data set recovers."""
+    assert export_minari(NAME, ENV, "random_pair", "train:0-2") == 3
+    dataset = minari.load_dataset(NAME)
+    env = dataset.recover_environment()
+    told = list(dataset.storage.get_episode_metadata(range(3)))
+    actions = set()
+    for episode, metadata in zip(dataset.iterate_episodes(), told, strict=True):
+        observation, _ = env.reset(seed=metadata["seed"])
+        np.testing.assert_array_equal(observation, episode.observations[0])
+        for t, action in enumerate(episode.actions):
+            observation, reward, terminated, truncated, _ = env.step(action)
+            np.testing.assert_array_equal(observation, episode.observations[t + 1])
+            assert (reward, terminated, truncated) == (
+                episode.rewards[t], episode.terminations[t], episode.truncations[t])
+        assert terminated
+        actions.update(episode.actions.tolist())
+    assert [each["seed"] for each in told] == [0, 1, 2] and len(actions) > 2
+
+
+def test_its_policy_is_the_one_that_is_scored():
+    """The same draws: injections are those of `eitbench policies`."""
+    from eitbench.bench.methods import load_method
+    from eitbench.bench.playing import injections
+    export_minari(NAME, ENV, "random_pair", "dev:3")
+    (episode,) = minari.load_dataset(NAME).iterate_episodes()
+    env = gym.make(ENV, estimator="full", observation="raw").unwrapped
+    played = [observation["currents"] for _, observation, _ in
+              injections(env, load_method("random_pair", "injection"), 100_003)]
+    np.testing.assert_allclose(played, env.rules.currents(episode.actions))
+
+
+def test_card_says_what_is_in_it():
+    export_minari(NAME, ENV, "transverse", "test:0")
+    metadata = minari.load_dataset(NAME).storage.metadata
+    assert metadata["algorithm_name"] == "transverse" and metadata["requirements"] == ["eitbench"]
+    for words in (ENV, "Episodes test:0", "Test episodes are among them", "no measured data"):
+        assert words in metadata["description"]
+
+
+@pytest.mark.parametrize(("given", "said"), [
+    ({"name": "a b"}, "out must be the name of a Minari data set"),
+    ({"env": "eitbench/Pipe2D-v0"}, "does not ask for injections"),
+    ({"policy": "nobody"}, "nobody"),
+    ({"seeds": "200003"}, "must name the split of test episodes"),
+])
+def test_mistakes(given, said, tmp_path):
+    with pytest.raises(ValueError, match=said):
+        export_minari(**{"name": NAME, "env": ENV, "policy": "random_pair", "seeds": "train:0"} | given)
+    assert not list(tmp_path.iterdir())
+
+
+def test_command_and_a_name_that_is_taken():
+    line = ["export", "--format", "minari", "--env", ENV, "--seeds", "train:0", "--out", NAME, "-j", "1"]
+    told = CliRunner().invoke(app, line)
+    assert told.exit_code != 0 and "policy must be given with format minari" in told.output
+    line += ["--policy", "random_pair"]
+    told = CliRunner().invoke(app, line)
+    assert told.exit_code == 0 and "1 episodes written" in told.output, told.output
+    told = CliRunner().invoke(app, line)
+    assert told.exit_code != 0 and "out must be the name of a new data set" in told.output
