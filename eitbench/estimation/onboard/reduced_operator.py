@@ -80,6 +80,19 @@ class ReducedOperator:
         return [Innovation.of(*each) for each in zip(innovation, S, std, used, strict=True)]
 
     @property
+    def linearised(self) -> Linearisation:
+        """What the first episode's next measurement is linearised about."""
+        return self.levels[0]
+
+    def relinearised(self) -> np.ndarray:
+        """(L, L, r) of 𝓡 by the first episode's reduced concentration, about its present
+        estimate."""
+        level = self.concentration[0]
+        positive = np.maximum(self.means()[0], 0.1 * level)              # a conductivity is
+        _, table = self._shared.levels.task.observation.resistance_derivatives(positive)
+        return np.asarray(level * np.tensordot(table, self.basis, axes=(0, 0)))
+
+    @property
     def basis(self) -> np.ndarray:
         """(n, r) Φ, in double precision."""
         return self._shared.model.basis
