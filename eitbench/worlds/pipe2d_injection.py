@@ -20,7 +20,7 @@ This is the reference case, not a competition: one pair near the inlet, injected
 good as anything (what is known at the inlet the flow carries through the whole pipe), and what to
 inject does not depend on what is measured. The adaptivity gap is none (`docs/injection.md`).
 """)
-register(PIPE_2D, "eitbench/Pipe2DInjection-v1", track="injection", inflow="learned",
+register(PIPE_2D, "eitbench/Pipe2DInjectionInflow-v0", track="injection", inflow="learned",
          about=f"""{ABOUT}
 Here the filter has learned from training inflows how slugs last and how wide they are
 (`docs/methods.md`, 10), and linearises about each prediction; in `eitbench/Pipe2DInjection-v0` it

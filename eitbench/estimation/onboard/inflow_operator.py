@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from eitbench._notice import say
 from eitbench.data.seeds import SPLITS
 from eitbench.estimation.gate import believable
 from eitbench.estimation.inflow_history import InflowFilter
@@ -131,7 +132,8 @@ class InflowOperator(ReducedOperator):
         """About what is predicted of the first episode."""
         point = self._ahead.concentration()
         L = self._shared.world.currents.shape[1]
-        resistance, by_c = self._shared.voltages.linearise(point, np.eye(L))
+        each = np.eye(L) - 1.0 / L  # a potential that all share does not count
+        resistance, by_c = self._shared.voltages.linearise(point, each)
         by_state = self._ahead.by_inflow(by_c.reshape(L * L, -1))
         return Linearisation(float(self.concentration[0]), resistance, by_state.reshape(L, L, -1))
 
@@ -225,5 +227,6 @@ class InflowFullShared(InflowShared):
 @lru_cache(maxsize=4)
 def prior_of(world: World) -> InflowPrior:
     """What training inflows of a world show."""
+    say(f"learning what flows in in {world.name}, some seconds once a process")
     longer = replace(world, schedule=replace(world.schedule, scored_steps=STEPS))
     return learned_inflow_prior(longer, SPLITS["train"][:EPISODES])
