@@ -10,11 +10,6 @@ PIPE_2D_FAULTS = World(
     Instrument(noise_floor=1e-4, interference=0.5, dead=(2, 4), failing=(1, 2), loose=(0, 2)))
 """A bad contact has 0.5 to 2 Ω·m more (a sound one: 0.08) and five times the noise [all ours]."""
 
-register(PIPE_2D_FAULTS, "eitbench/Pipe2DInjectionInflowFaults-v0", track="injection",
-         seeds="test:0-49", gate=8.0, inflow="learned", about="""
-The failing instrument of `eitbench/Pipe2DInjectionFaults-v0`, with the filter of
-`eitbench/Pipe2DInjectionInflow-v0`, which has learned from training inflows what flows in.
-""")
 register(PIPE_2D_FAULTS, "eitbench/Pipe2DInjectionFaults-v0", track="injection",
          seeds="test:0-49", gate=8.0, about="""
 `eitbench/Pipe2DInjection-v0` with an instrument that is falling apart. In every episode other

@@ -23,7 +23,7 @@ from eitbench.estimation.inflow_prior import InflowPrior, learned_inflow_prior
 from eitbench.estimation.inflow_response import Response, reduced_response, steady_response
 from eitbench.estimation.kalman import Observation
 from eitbench.estimation.moving_window import stationary
-from eitbench.estimation.onboard.operator import BROKEN, Innovation, Linearisation
+from eitbench.estimation.onboard.operator import BROKEN, Innovation, Linearisation, spread
 from eitbench.estimation.onboard.reduced_operator import ReducedOperator, Shared
 from eitbench.estimation.quadratic_voltages import ScaledVoltages
 from eitbench.worlds.task import make_task
@@ -154,6 +154,16 @@ class InflowOperator(ReducedOperator):
     @property
     def covariance(self) -> np.ndarray:
         return np.array([each.covariance for each in self._filters])
+
+    def grid(self) -> tuple[np.ndarray, np.ndarray]:
+        patches = self._shared.patches
+        mean = 1.0 + (patches @ self.state[..., None])[..., 0]
+        variance = []
+        for each in self._filters:
+            by_state = patches @ each.slope() / each.level
+            variance.append(((by_state @ each.covariance) * by_state).sum(axis=1))
+        level = self.concentration[:, None]
+        return level * mean, level * spread(np.array(variance))
 
     def steps(self, count: int,
               along: np.ndarray | None = None) -> list[tuple[np.ndarray, np.ndarray]]:
