@@ -138,7 +138,8 @@ def place_of_world(name: str) -> tuple[int, str]:
 def _beliefs(record: dict[str, Any]) -> dict[str, Any]:
     """Arguments that change the task's model and leave the truth as it is."""
     return {key: value for key, value in record["environment"]["kwargs"].items()
-            if (key in ("assume", "gate", "inflow") and value) or (key, value) == ("estimator", "reduced")}
+            if (key in ("assume", "gate", "inflow") and value)
+            or (key, value) == ("estimator", "reduced")}
 
 
 def _arguments(arguments: dict[str, Any]) -> str:

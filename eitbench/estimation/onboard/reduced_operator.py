@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -188,9 +188,10 @@ class Shared:
         return self.of, (self.world,)
 
     @classmethod
-    def of(cls, world: World) -> Shared:
+    def of(cls, world: World) -> Self:
         """That of a world; made once a process."""
-        return _made(cls, world.sound)  # type: ignore[arg-type]  # a class can be hashed
+        made: Any = _made(cls, world.sound)  # type: ignore[arg-type]  # a class can be hashed
+        return made  # type: ignore[no-any-return]
 
     @staticmethod
     def _make(world: World) -> Any:
