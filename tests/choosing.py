@@ -11,7 +11,7 @@ from eitbench.bench.tracks import Environment
 
 from short import merged
 
-NAME = "eitbench/Pipe2DInjection-v0"
+NAME, INFLOW = "eitbench/Pipe2DInjection-v0", "eitbench/Pipe2DInjectionInflow-v0"
 CURRENTS, FAULTS, BUDGET = (f"eitbench/Pipe2DInjection{kind}-v0" for kind in ("Currents", "Faults", "Budget"))
 TANK, FLOW = "eitbench/RotatingTankInjection-v0", "eitbench/Pipe2DInjectionFlow-v0"
 # Sixteen electrodes and a short record; fewer electrodes would leave too little to learn from.

@@ -2,7 +2,7 @@
 
 Greedy first, then, step by step, exchange for a better one; where there is a budget injections move
 in time, too. The variances of the model do not depend on what will be measured; where the flow is
-unknown they do.
+unknown, or voltages are linearised anew about each prediction, they do.
 """
 
 from functools import lru_cache
@@ -27,7 +27,7 @@ class Policy:
 
     @classmethod
     def suits(cls, rules: Rules) -> bool:
-        return rules.world.velocity_model is None
+        return rules.world.velocity_model is None and rules.inflow == "white"
 
     def __init__(self, rules: Rules, random: np.random.Generator) -> None:
         self.rules = rules

@@ -31,7 +31,8 @@ FLOORS = {"estimation": "homogeneous", "injection": "random_pair"}
 """Whose episodes are the board's, and from whose error the gain is counted."""
 ARGUMENTS = {
     "estimation": ("world", "lag", "assume", "episodes", "render_mode"),
-    "injection": ("world", "estimator", "observation", "gate", "episodes", "render_mode")}
+    "injection": ("world", "estimator", "observation", "gate", "inflow", "episodes",
+                  "render_mode")}
 """What may be given to an environment of each track, beside its name."""
 ESTIMATORS = ("full", "reduced")
 """What may stand inside an injection environment: the exact filter, for scores, or that of

@@ -40,7 +40,7 @@ class InjectionEnv(KnowsItsLength, gym.Env[Any, Any]):  # type: ignore[misc]
     name, world, episodes, render_mode
         As in `EstimationEnv`.
     estimator : "reduced", "full" or "none"
-        "reduced": a Kalman filter of reduced order, for training. "full": the exact one, for
+        "reduced": a filter of reduced order, for training. "full": the exact one, for
         scores. The first frame is measured with the world's own cycle, from which ĉ_bh and the
         filter's parameters follow; the agent takes over after it. "none": the agent chooses all
         injections, sees noisy voltages, and is paid nothing: for estimators and rewards of one's
@@ -50,20 +50,23 @@ class InjectionEnv(KnowsItsLength, gym.Env[Any, Any]):  # type: ignore[misc]
     gate : float, optional
         The filter leaves out readings further from its prediction than so many standard deviations;
         default: as the id says, or none.
+    inflow : "white" or "learned", optional
+        What the estimator believes of the inflow: white noise (Table 5.1), or what training
+        episodes show of it; default: as the id says, or "white".
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 8}  # noqa: RUF012 (gymnasium's form)
 
     def __init__(self, name: str, *, world: dict[str, Any] | None = None,
                  estimator: str = "reduced", observation: str = "scaled",
-                 gate: float | None = None, episodes: int | None = None,
-                 render_mode: str | None = None) -> None:
+                 gate: float | None = None, inflow: str | None = None,
+                 episodes: int | None = None, render_mode: str | None = None) -> None:
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be 'rgb_array' or None, got {render_mode!r}")
         self.render_mode = render_mode
         self.pool = Pool(episodes)
         """What unseeded resets draw from."""
-        self.rules = asked_for(name, world, gate, estimator)
+        self.rules = asked_for(name, world, gate, inflow, estimator)
         self.world = self.rules.world
         self._core = InjectionCore(self.rules, estimator)
         self.episode_steps = self._core.length
@@ -153,13 +156,15 @@ class InjectionEnv(KnowsItsLength, gym.Env[Any, Any]):  # type: ignore[misc]
         return scaled(self.rules, seen) if self._scaled else seen
 
 
-def asked_for(name: str, changes: dict[str, Any] | None, gate: float | None,
+def asked_for(name: str, changes: dict[str, Any] | None, gate: float | None, inflow: str | None,
               estimator: str) -> Rules:
     """The rules of an id and its arguments; ``ValueError`` if one of them is not allowed."""
     registered = entry(name)
     if gate is None:
         gate = registered.settings.get("gate", np.inf)
-    return Rules(registered.world.changed(changes), gate, has_frame=estimator != "none")
+    if inflow is None:
+        inflow = registered.settings.get("inflow", "white")
+    return Rules(registered.world.changed(changes), gate, estimator != "none", inflow)
 
 
 def check_observation(observation: str, estimator: str) -> bool:
@@ -192,11 +197,11 @@ class InjectionVectorEnv(LockstepVectorEnv):
 
     def __init__(self, name: str, *, num_envs: int = 1, world: dict[str, Any] | None = None,
                  estimator: str = "reduced", observation: str = "scaled", gate: float | None = None,
-                 episodes: int | None = None, threads: int = 1,
+                 inflow: str | None = None, episodes: int | None = None, threads: int = 1,
                  max_episode_steps: int | None = None) -> None:
         super().__init__(num_envs, episodes)
         threads = _check.integer("threads", threads, low=1)
-        self.rules = rules = asked_for(name, world, gate, estimator)
+        self.rules = rules = asked_for(name, world, gate, inflow, estimator)
         self.world = rules.world
         # The covariances of sixteen filters stay within a core's own memory.
         size = num_envs if estimator == "none" else max(1, min(16, -(-num_envs // threads)))

@@ -11,10 +11,9 @@ from gymnasium import spaces
 from eitbench.data.beginnings import Script, script, script_so_far
 from eitbench.data.recordings import faults_of, outline
 from eitbench.data.regions import score_mass
+from eitbench.estimation.onboard.choice import operator_type
 from eitbench.estimation.onboard.console import Console
-from eitbench.estimation.onboard.joint_operator import JointFullOperator, JointReducedOperator
-from eitbench.estimation.onboard.operator import FullOperator, Innovation, Operator
-from eitbench.estimation.onboard.reduced_operator import ReducedOperator
+from eitbench.estimation.onboard.operator import Innovation
 from eitbench.estimation.onboard.rules import Rules
 from eitbench.worlds.instrument import Faults
 
@@ -24,20 +23,8 @@ if TYPE_CHECKING:
 
 FURTHEST = 5.0
 """Largest entry of a scaled observation."""
-OPERATORS: dict[str, tuple[type[Operator], type[Operator]] | None] = {
-    "reduced": (ReducedOperator, JointReducedOperator), "full": (FullOperator, JointFullOperator),
-    "none": None}
-"""Estimators by name: where the flow is known, and where its mean is to be estimated too."""
 RECENT = 4
 """Injections that an observation remembers."""
-
-
-def operator_type(world: World, estimator: str) -> type[Operator] | None:
-    """The estimator of this name for a world; ``ValueError`` if there is none."""
-    if estimator not in OPERATORS:
-        raise ValueError(f"estimator must be one of {', '.join(OPERATORS)}, got {estimator!r}")
-    known = OPERATORS[estimator]
-    return None if known is None else known[world.velocity_model is not None]
 
 
 def scaled(rules: Rules, observation: Observation) -> np.ndarray:
@@ -73,13 +60,13 @@ class InjectionCore:
     ----------
     rules : Rules
     estimator : str
-        One of `OPERATORS`.
+        One of `eitbench.estimation.onboard.choice.ESTIMATORS`.
     """
 
     def __init__(self, rules: Rules, estimator: str) -> None:
         self.rules = rules
         self.world = rules.world
-        self._operator_type = operator_type(rules.world, estimator)
+        self._operator_type = operator_type(rules, estimator)
         self._table = rules.table if rules.limit is None else None
         self.first = len(self.world.currents) if self._operator_type else 0
         """Injections of the world's cycle before the agent's first."""

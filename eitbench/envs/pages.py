@@ -47,6 +47,7 @@ INJECTION_ARGUMENTS = """
 | `estimator` | "reduced" | a filter with few states, for training; "full": the exact one; "none" |
 | `observation` | "scaled" | or "raw" |
 | `gate` | {gate} | standard deviations beyond which no reading is believed; None: all are |
+| `inflow` | "{inflow}" | what the filter believes flows in: "white" noise, or as "learned" |
 | `world` | None | dict of numbers to change, as in `{{"schedule": {{"budget": 20}}}}`; see below |
 | `episodes` | None | training episodes of unseeded resets; None: 1, soon 8, more, up to 1000 |
 | `render_mode` | None | "rgb_array": truth, estimate, spread, injection |
@@ -121,7 +122,7 @@ def _injection(env: InjectionEnv) -> dict[str, str]:
                           "it chooses from the first one on.",
         "Episode end": f"Terminated after {env.core.length} steps ({world.n_steps} with "
                        "`estimator=\"none\"`). Never truncated.",
-        "Arguments": INJECTION_ARGUMENTS.format(gate=gate)}
+        "Arguments": INJECTION_ARGUMENTS.format(gate=gate, inflow=rules.inflow)}
 
 
 def _flowing(world: World) -> str:

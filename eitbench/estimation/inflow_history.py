@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -124,14 +125,15 @@ class InflowFilter:
         error = self.model.mean_error(currents, np.sqrt(observation.noise_variance))
         return observation._replace(value=observation.value - error)
 
-    def take_in(self, observation: Observation, point: np.ndarray) -> Innovation:
+    def take_in(self, observation: Observation, point: np.ndarray,
+                gate: float = math.inf) -> Innovation:
         """Take in a measurement that is linear in the concentration near ``point`` (n,), which is
-        `concentration`."""
+        `concentration`; readings that are not `believable` with this ``gate`` are left out."""
         return self._condition(observation, self.by_inflow(observation.matrix),
-                               observation.value - observation.matrix @ point)
+                               observation.value - observation.matrix @ point, gate=gate)
 
     def _condition(self, observation: Observation, slope: np.ndarray, innovation: np.ndarray,
-                   currents: np.ndarray | None = None) -> Innovation:
+                   currents: np.ndarray | None = None, gate: float = math.inf) -> Innovation:
         noise_variance = observation.noise_variance
         shared = None
         if self.model is not None:
@@ -140,8 +142,8 @@ class InflowFilter:
                 scatter = self.model.error_root(currents, np.sqrt(noise_variance))
                 shared = np.concatenate([shared, scatter], axis=1)
                 noise_variance = np.zeros_like(noise_variance)
-        self.mean, self.covariance, told = conditioned(self.mean, self.covariance, slope,
-                                                       innovation, noise_variance, shared)
+        self.mean, self.covariance, told = conditioned(
+            self.mean, self.covariance, slope, innovation, noise_variance, shared, gate)
         return told
 
     def response(self, lag: int = 0) -> Response:
@@ -151,14 +153,17 @@ class InflowFilter:
 
     def concentration(self, lag: int = 0) -> np.ndarray:
         """(n,) mol/m³, ``lag`` steps ago, of the expected inflows."""
+        return self.level * (1.0 + self.response(lag).basis @ self.coordinates(lag))
+
+    def coordinates(self, lag: int = 0) -> np.ndarray:
+        """(q,) of that in the response's basis, less the level and in parts of it."""
         recent = self.mean[lag:lag + self.memory]
         deviation = self.prior.inflow(recent @ self.prior.modes.T) - 1.0
-        basis, weights = self.response(lag)
-        return self.level * (1.0 + basis @ np.tensordot(weights, deviation, 2))
+        return np.tensordot(self.response(lag).weights, deviation, 2)
 
     def state(self, lag: int = 0) -> State:
         """What is known of the state ``lag`` steps ago."""
-        slope = self._slope(lag)
+        slope = self.slope(lag)
         r = self.mean.shape[1]
         here = slice(lag * r, (lag + self.memory) * r)
         reduced = slope @ self.covariance[here, here] @ slope.T
@@ -173,7 +178,7 @@ class InflowFilter:
         basis, weights = self.response(lag)
         return self._by_x(np.tensordot(matrix @ basis, weights, 1), lag)
 
-    def _slope(self, lag: int) -> np.ndarray:
+    def slope(self, lag: int = 0) -> np.ndarray:
         """(q, K·r) derivatives of the concentration in the basis by x."""
         return self._by_x(self.response(lag).weights, lag)
 

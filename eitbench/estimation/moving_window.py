@@ -5,10 +5,13 @@ The mean is (W, d) for d numbers at a time, the newest first; the covariance (W�
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_factor, solve_triangular, toeplitz
+
+from eitbench.estimation.gate import believable
 
 
 class Innovation(NamedTuple):
@@ -55,18 +58,23 @@ def moved(mean: np.ndarray, covariance: np.ndarray, weights: np.ndarray,
 
 def conditioned(mean: np.ndarray, covariance: np.ndarray, matrix: np.ndarray,
                 innovation: np.ndarray, noise_variance: np.ndarray,
-                shared: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, Innovation]:
+                shared: np.ndarray | None = None, gate: float = math.inf,
+                ) -> tuple[np.ndarray, np.ndarray, Innovation]:
     """Mean and covariance given readings that are ``innovation`` (m,) above what was predicted, and
     whose derivatives by the newest K values are ``matrix`` (m, K·d). Their errors are independent,
-    of ``noise_variance`` (m,), but for what they have in common, N ``shared`` (m, s): N Nᵀ."""
+    of ``noise_variance`` (m,), but for what they have in common, N ``shared`` (m, s): N Nᵀ. Those
+    that are not `believable` with this ``gate`` teach nothing; the innovation is of all."""
     seen = matrix.shape[1]
     cross = covariance[:, :seen] @ matrix.T
     S = matrix @ cross[:seen] + np.diag(noise_variance)
     if shared is not None:
         S += shared @ shared.T
     S = 0.5 * (S + S.T)
+    told = Innovation(innovation, S)
+    if math.isfinite(gate):
+        kept = believable(innovation, S.diagonal(), gate)
+        cross, innovation, S = cross[:, kept], innovation[kept], S[np.ix_(kept, kept)]
     factor = cho_factor(S, lower=True)[0]
     gained = solve_triangular(factor, cross.T, lower=True)                           # L⁻¹ H Γ
     change = solve_triangular(factor, innovation, lower=True) @ gained
-    return (mean + change.reshape(mean.shape), covariance - gained.T @ gained,
-            Innovation(innovation, S))
+    return mean + change.reshape(mean.shape), covariance - gained.T @ gained, told

@@ -30,7 +30,8 @@ SKILL = ("skill", "0 for the homogeneous estimate, 1 for the fixed-interval smoo
 episode."""
 SPLITS = ["dev", "train", "own"]
 """In the order in which boards are shown, after the reported seeds."""
-_NOT_THE_WORLD = ("lag", "assume", "gate", "episodes", "render_mode", "observation", "estimator")
+_NOT_THE_WORLD = ("lag", "assume", "gate", "inflow", "episodes", "render_mode", "observation",
+                  "estimator")
 """Arguments of an environment that its episodes do not depend on."""
 
 ANCHORS = ("homogeneous", "true_model_smoother")
@@ -137,7 +138,8 @@ def place_of_world(name: str) -> tuple[int, str]:
 def _beliefs(record: dict[str, Any]) -> dict[str, Any]:
     """Arguments that change the task's model and leave the truth as it is."""
     return {key: value for key, value in record["environment"]["kwargs"].items()
-            if (key in ("assume", "gate") and value) or (key, value) == ("estimator", "reduced")}
+            if (key in ("assume", "gate", "inflow") and value)
+            or (key, value) == ("estimator", "reduced")}
 
 
 def _arguments(arguments: dict[str, Any]) -> str:

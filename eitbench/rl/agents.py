@@ -12,7 +12,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from eitbench.bench.methods import baseline_folder
-from eitbench.envs.injection_core import InjectionCore, operator_type, scaled
+from eitbench.envs.injection_core import InjectionCore, scaled
+from eitbench.estimation.onboard.choice import operator_type
 from eitbench.estimation.onboard.console import Console
 from eitbench.estimation.onboard.rules import Rules
 
@@ -43,7 +44,7 @@ class Agent:
     def act(self, observation: dict[str, np.ndarray]) -> Any:
         begins = self.console is None
         if self.console is None:
-            kind = operator_type(self.rules.world, "reduced")
+            kind = operator_type(self.rules, "reduced")
             assert kind is not None
             self.console = Console(kind, self.rules, observation["frame"][None])
         else:

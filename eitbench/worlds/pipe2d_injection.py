@@ -20,6 +20,13 @@ This is the reference case, not a competition: one pair near the inlet, injected
 good as anything (what is known at the inlet the flow carries through the whole pipe), and what to
 inject does not depend on what is measured. The adaptivity gap is none (`docs/injection.md`).
 """)
+register(PIPE_2D, "eitbench/Pipe2DInjectionInflow-v0", track="injection", inflow="learned",
+         about=f"""{ABOUT}
+Here the filter has learned from training inflows how slugs last and how wide they are
+(`docs/methods.md`, 10), and linearises about each prediction; in `eitbench/Pipe2DInjection-v0` it
+takes them for white noise, Table 5.1. With the best pair at the inlet the error is a seventh of
+what it is there, and this is as much a reference: the adaptivity gap is none (`docs/injection.md`).
+""")
 register(PIPE_2D_CURRENTS, "eitbench/Pipe2DInjectionCurrents-v0", track="injection",
          about=f"""{ABOUT}
 This is the same world with a current of its own for each electrode, and as much a reference: the

@@ -25,6 +25,13 @@ prior of the inflow has to believe in a little of a slug at every moment; who as
 has come at all can be sure of the quiet, and wide awake when it ends. The episodes are those of
 `eitbench/Pipe2DInjectionBudget-v0`, with an injection at every step.
 """)
+register(PIPE_2D_BUDGET, "eitbench/Pipe2DInjectionInflowBudget-v0", track="injection",
+         seeds="test:0-49", inflow="learned", about="""
+The rare slugs and the budget of `eitbench/Pipe2DInjectionBudget-v0`, with the filter of
+`eitbench/Pipe2DInjectionInflow-v0`, which has learned from training inflows what flows in. On the
+episodes dev:0-7 the adaptivity gap is 0.45, with a 95 % interval from 0.34 to 0.62
+(`docs/injection.md`).
+""")
 register(PIPE_2D_BUDGET, "eitbench/Pipe2DInjectionBudget-v0", track="injection",
          seeds="test:0-49", about="""
 The pipe of `eitbench/Pipe2D-v0` when slugs are rare: strong ones come one at a time, at times

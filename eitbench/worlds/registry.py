@@ -23,7 +23,7 @@ CLASSES = {
     "injection": ("eitbench.envs.injection:InjectionEnv",
                   "eitbench.envs.injection:InjectionVectorEnv")}
 """Track -> its environment, one at a time and vectorised."""
-SETTINGS = {"estimation": ("lag", "assume"), "injection": ("gate",)}
+SETTINGS = {"estimation": ("lag", "assume"), "injection": ("gate", "inflow")}
 """Track -> what an id may fix of its environment, beside the world."""
 
 
@@ -73,7 +73,8 @@ def register(world: World, id: str, *, track: str = "estimation", about: str = "
         Of a shift: the registered id whose task estimators get here too, though the truth is
         another. The robustness board compares the two, and quotes the first paragraph of ``about``.
     settings
-        Of the environment: ``lag`` and ``assume`` for estimates, ``gate`` for injections.
+        Of the environment: ``lag`` and ``assume`` for estimates, ``gate`` and ``inflow`` for
+        injections.
     """
     if not re.fullmatch(r"[\w.-]+/[\w.-]+-v\d+", id):
         raise ValueError(f"id must look like 'namespace/Name-v0', got {id!r}")

@@ -22,12 +22,12 @@ from scipy.stats import t as student
 from choosing import filter_of, injected
 from short import merged
 
-NAME = "eitbench/Pipe2DInjection-v0"
+NAME, INFLOW = "eitbench/Pipe2DInjection-v0", "eitbench/Pipe2DInjectionInflow-v0"
 CURRENTS, FAULTS, BUDGET = (f"eitbench/Pipe2DInjection{kind}-v0" for kind in ("Currents", "Faults", "Budget"))
 FLOW = "eitbench/Pipe2DInjectionFlow-v0"
 SHORT = {"world": {"flow": {"mean_velocity": 16.0}, "schedule": {"scored_steps": 4}}}
 """Sixteen electrodes and a short record."""
-KWARGS = {NAME: SHORT, CURRENTS: SHORT, FAULTS: SHORT,
+KWARGS = {NAME: SHORT, INFLOW: SHORT, CURRENTS: SHORT, FAULTS: SHORT,
           BUDGET: merged(SHORT, {"world": {"schedule": {"budget": 3}}}),
           FLOW: {"world": merged(SHORT["world"], {"flow": {"velocity_range": [15.0, 17.0]}})},
           "eitbench/RotatingTankInjection-v0": {"world": {"schedule": {"warm_up": 2, "scored_steps": 3}}}}
@@ -64,7 +64,7 @@ def write_policy(folder, body: str = "def act(self, observation): return 7", nam
 # -- what a policy may believe ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", [NAME, FAULTS, BUDGET, FLOW])
+@pytest.mark.parametrize("name", [NAME, INFLOW, FAULTS, BUDGET, FLOW])
 def test_belief_is_the_filter_inside(name):
     """Followed from outside, the reduced filter is that of the environment, to the bit."""
     env = environment(name)

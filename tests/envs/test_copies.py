@@ -13,11 +13,12 @@ from short import short
 
 PIPE, SKEWED, TANK = "eitbench/Pipe2D-v0", "eitbench/Pipe2DSkewedVelocity-v0", "eitbench/RotatingTank2D-v0"
 INJECTION, FLOW = "eitbench/Pipe2DInjection-v0", "eitbench/Pipe2DInjectionFlow-v0"
+INFLOW = "eitbench/Pipe2DInjectionInflow-v0"
 FAULTS, CURRENTS = "eitbench/Pipe2DInjectionFaults-v0", "eitbench/Pipe2DInjectionCurrents-v0"
 KINDS = [(PIPE, {}), ("eitbench/Pipe2DFixedLag-v0", {"lag": 2}), (SKEWED, {}), (TANK, {}),
          (INJECTION, {}), (INJECTION, {"estimator": "full", "observation": "raw"}), (INJECTION, {"estimator": "none"}),
          ("eitbench/Pipe2DInjectionBudget-v0", {}), (FAULTS, {}), (CURRENTS, {}), (FLOW, {}),
-         (FLOW, {"estimator": "full"})]
+         (FLOW, {"estimator": "full"}), (INFLOW, {}), (INFLOW, {"estimator": "full"})]
 COPIES = {"deepcopy": copy.deepcopy, "pickle": lambda env: pickle.loads(pickle.dumps(env))}
 every = pytest.mark.parametrize(("name", "given"), KINDS)
 copied = pytest.mark.parametrize("how", COPIES)
@@ -78,7 +79,8 @@ def test_two_actions_can_be_tried(name, given):
 
 
 @copied
-@pytest.mark.parametrize(("name", "given"), [(PIPE, {}), (INJECTION, {}), (INJECTION, {"threads": 2}), (FLOW, {})])
+@pytest.mark.parametrize(("name", "given"), [(PIPE, {}), (INJECTION, {}), (INJECTION, {"threads": 2}), (FLOW, {}),
+                                             (INFLOW, {"threads": 2})])
 def test_many_at_once(name, given, how):
     """Vector environments too, with or without threads, also beyond the episode's end."""
     envs = gym.make_vec(name, num_envs=3, vectorization_mode="vector_entry_point", **short(name) | given)

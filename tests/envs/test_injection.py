@@ -18,6 +18,7 @@ from choosing import (
     CURRENTS,
     FAULTS,
     FLOW,
+    INFLOW,
     NAME,
     SHORT,
     arrays_of,
@@ -119,11 +120,12 @@ def test_first_frame_is_the_worlds_own():
     np.testing.assert_array_equal(observation["currents"], played.currents[15])
 
 
+@pytest.mark.parametrize("name", [NAME, INFLOW])
 @pytest.mark.parametrize("estimator", ["reduced", "full"])
-def test_reward_is_the_decrease_of_the_error(estimator):
+def test_reward_is_the_decrease_of_the_error(estimator, name):
     """The pay equals ∫(ĉ_bh − c)²/∫c² − ∫(ĉ − c)²/∫c², both of nodal values integrated on the
     truth's mesh."""
-    env = make(estimator)
+    env = make(estimator, name)
     base = env.unwrapped
     actions = some_pairs()
     env.reset(seed=3)
@@ -176,7 +178,7 @@ def test_side_by_side_as_one_by_one(name, estimator, observation):
     assert begun >= 2                                                 # another episode was begun
 
 
-@pytest.mark.parametrize("name", [FAULTS, FLOW])
+@pytest.mark.parametrize("name", [FAULTS, FLOW, INFLOW])
 def test_with_the_exact_filter_too_others_beside_change_nothing(name):
     """An episode is the same to the bit whether it is played alone or beside two others."""
     alone, beside = (make_many(name, n, estimator="full") for n in (1, 3))

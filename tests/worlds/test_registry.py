@@ -147,7 +147,7 @@ def test_ids_of_another_form_are_refused(id):
 
 @pytest.mark.parametrize(("settings", "message"), [
     ({"gate": 3.0}, "settings of the track estimation are lag, assume; got gate"),
-    ({"track": "injection", "lag": 3, "assume": {}}, "injection are gate; got assume, lag"),
+    ({"track": "injection", "lag": 3, "assume": {}}, "injection are gate, inflow; got assume, lag"),
     ({"track": "guessing"}, "track must be one of estimation, injection, got 'guessing'"),
 ])
 def test_settings_of_another_track_are_refused(settings, message):

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from eitbench.estimation.design import pair_gains
-from eitbench.estimation.onboard.joint_operator import JointReducedOperator
+from eitbench.estimation.onboard.choice import operator_type
 from eitbench.estimation.onboard.operator import levels_of
 from eitbench.estimation.onboard.reduced_operator import ReducedOperator
 
@@ -43,7 +43,9 @@ class Belief:
 
     def __init__(self, rules: Rules, observation: dict[str, np.ndarray]) -> None:
         self.rules = rules
-        kind = JointReducedOperator if rules.world.velocity_model is not None else ReducedOperator
+        kind = operator_type(rules, "reduced")
+        assert kind is not None
+        assert issubclass(kind, ReducedOperator)
         self._operator = kind(rules.world, observation["frame"][None], gate=rules.gate,
                               noise_floor=rules.instrument.noise_floor)
         self._along: np.ndarray | None = None
@@ -209,16 +211,13 @@ class Belief:
 
     @property
     def derivative(self) -> np.ndarray:
-        """(L, L, s) of 𝓡 by the state, about the level."""
-        return self._with_flow(self._operator.levels[0].derivative.astype(float))
+        """(L, L, s) of 𝓡 by the state, about which the filter linearises the next measurement:
+        the level, or where the inflow's prior is learned what it predicts."""
+        return self._with_flow(self._operator.linearised.derivative.astype(float))
 
     def relinearised(self) -> np.ndarray:
         """(L, L, s) of 𝓡 by the state, about the present estimate; some 10 ms."""
-        levels = levels_of(self.rules.world)
-        positive = np.maximum(self.mean, 0.1 * self._operator.concentration[0])  # a conductivity is
-        _, table = levels.task.observation.resistance_derivatives(positive)
-        by_state = np.tensordot(table, self._operator.basis, axes=(0, 0))
-        return self._with_flow(self._operator.concentration[0] * by_state)
+        return self._with_flow(self._operator.relinearised())
 
     def _with_flow(self, derivative: np.ndarray) -> np.ndarray:
         """Derivatives by the whole state: a velocity itself is not seen."""
@@ -227,12 +226,11 @@ class Belief:
 
     @property
     def _noise_variance(self) -> np.ndarray:
-        level = self._operator.levels[0]
-        return _noise_variance(self.rules, level.concentration, level.resistance.tobytes())
+        return _noise_variance(self.rules, self._operator.linearised.resistance.tobytes())
 
 
 @lru_cache(maxsize=64)
-def _noise_variance(rules: Rules, concentration: float, resistance: bytes) -> np.ndarray:
+def _noise_variance(rules: Rules, resistance: bytes) -> np.ndarray:
     """(pairs, L) of the voltages of each pair, per current squared."""
     i, j = rules.pairs.T
     R = np.frombuffer(resistance).reshape(rules.pairs.max() + 1, -1)

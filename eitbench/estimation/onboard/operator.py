@@ -181,8 +181,12 @@ class Levels:
         least = 1e-3 * np.abs(computed).max()
         return np.hypot(np.maximum(self.world.noise.std(computed), least), floor)
 
+    def concentration(self, number: int) -> float:
+        """mol/m³ of the level of this number."""
+        return self.world.expected_concentration * float(np.exp(LEVEL_STEP * number))
+
     def _linearised(self, number: int) -> Linearisation:
-        c = self.world.expected_concentration * float(np.exp(LEVEL_STEP * number))
+        c = self.concentration(number)
         level = np.full(self.task.mesh.n_nodes, c)
         resistance, table = self.task.observation.resistance_derivatives(level)
         return Linearisation(c, resistance, c * np.ascontiguousarray(np.moveaxis(table, 0, 2)))

@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -78,6 +78,19 @@ class ReducedOperator:
         used = kept & currents.any(axis=1, keepdims=True)
         S = self._filter.innovation_covariance
         return [Innovation.of(*each) for each in zip(innovation, S, std, used, strict=True)]
+
+    @property
+    def linearised(self) -> Linearisation:
+        """What the first episode's next measurement is linearised about."""
+        return self.levels[0]
+
+    def relinearised(self) -> np.ndarray:
+        """(L, L, r) of 𝓡 by the first episode's reduced concentration, about its present
+        estimate."""
+        level = self.concentration[0]
+        positive = np.maximum(self.means()[0], 0.1 * level)              # a conductivity is
+        _, table = self._shared.levels.task.observation.resistance_derivatives(positive)
+        return np.asarray(level * np.tensordot(table, self.basis, axes=(0, 0)))
 
     @property
     def basis(self) -> np.ndarray:
@@ -175,9 +188,10 @@ class Shared:
         return self.of, (self.world,)
 
     @classmethod
-    def of(cls, world: World) -> Shared:
+    def of(cls, world: World) -> Self:
         """That of a world; made once a process."""
-        return _made(cls, world.sound)  # type: ignore[arg-type]  # a class can be hashed
+        made: Any = _made(cls, world.sound)  # type: ignore[arg-type]  # a class can be hashed
+        return made  # type: ignore[no-any-return]
 
     @staticmethod
     def _make(world: World) -> Any:

@@ -15,6 +15,10 @@ if TYPE_CHECKING:
     from eitbench.worlds.instrument import Instrument
     from eitbench.worlds.world import World
 
+INFLOWS = ("white", "learned")
+"""What may be believed of the inflow: white noise (Table 5.1), or its logarithm as coloured as in
+training episodes (``docs/methods.md``, 10)."""
+
 
 @dataclass(frozen=True)
 class Rules:
@@ -33,14 +37,19 @@ class Rules:
         deviations.
     has_frame : bool
         Whether the first frame is measured before the agent's first injection.
+    inflow : "white" or "learned"
+        What the estimator believes of the inflow: Table 5.1, or what training episodes show.
     """
 
     world: World
     gate: float = np.inf
     has_frame: bool = True
+    inflow: str = "white"
 
     def __post_init__(self) -> None:
         _check.number("gate", min(self.gate, 1e300), low=0.0, open_low=True)
+        if self.inflow not in INFLOWS:
+            raise ValueError(f"inflow must be one of {', '.join(INFLOWS)}, got {self.inflow!r}")
 
     @property
     def instrument(self) -> Instrument:

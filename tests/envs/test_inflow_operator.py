@@ -1,0 +1,209 @@
+"""The filters inside injection environments that have learned what flows in."""
+
+import numpy as np
+import pytest
+from eitbench.bench.methods import baseline_folder
+from eitbench.data.regions import score_mass
+from eitbench.data.seeds import parse_seeds
+from eitbench.estimation import InflowFilter, suiting_priors
+from eitbench.estimation.onboard.belief import Belief
+from eitbench.estimation.onboard.inflow_operator import InflowOperator, prior_of
+from eitbench.worlds import entry
+from eitbench.worlds.pipe2d import PIPE_2D
+from eitbench.worlds.task import make_task
+from scipy.linalg import toeplitz
+
+from choosing import BUDGET, FAULTS, FLOW, INFLOW, TANK, filter_of, make, some_pairs
+
+KINDS = pytest.mark.parametrize("estimator", ["reduced", "full"])
+
+
+def begun(estimator: str, seed: int = 3):
+    env = make(estimator, INFLOW)
+    return env, env.reset(seed=seed)[0]
+
+
+def test_full_one_is_that_of_the_baseline():
+    """Step by step what `InflowFilter`, as in log_inflow_filter, makes of the same voltages."""
+    env, observation = begun("full")
+    world, task = env.unwrapped.world, env.unwrapped.task
+    core = env.unwrapped.core
+    ours = InflowFilter(task, prior_of(world), float(filter_of(env).concentration[0]))
+    for voltages, currents in zip(observation["frame"], world.currents, strict=True):
+        ours.predict()
+        ours.update(voltages, currents)
+    for action in some_pairs()[:world.n_steps - 16]:
+        observation = env.step(int(action))[0]
+        ours.predict()
+        told = ours.update(observation["voltages"], observation["currents"])
+        means, spreads = core.estimate()
+        state = ours.state()
+        np.testing.assert_allclose(means[0], state.mean, rtol=1e-9)
+        np.testing.assert_allclose(spreads[0], np.sqrt(state.variance), rtol=1e-6)
+        (innovation,) = core.innovations()
+        np.testing.assert_allclose(innovation.value, told.value, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(innovation.covariance, told.covariance, rtol=1e-9, atol=1e-15)
+
+
+def test_reduced_one_is_close_to_the_full_one():
+    """Means differ by a tenth of the filter's own standard deviation at most, root mean square."""
+    (full, _), (reduced, _) = begun("full"), begun("reduced")
+    for action in some_pairs()[:full.unwrapped.world.n_steps - 16]:
+        for env in (full, reduced):
+            env.step(int(action))
+        mean, spread = full.unwrapped.core.estimate()
+        other, _ = reduced.unwrapped.core.estimate()
+        assert 0.0 < np.sqrt(((other - mean)**2).mean()) < 0.1 * np.sqrt((spread**2).mean())
+
+
+@KINDS
+def test_covariance_is_gaussian_conditioning(estimator):
+    """What is known of the window after all injections is one Gaussian of the whole history,
+    conditioned at once on what was linearised; and tells of the state what its slope says."""
+    env, _ = begun(estimator)
+    operator, world = filter_of(env), env.unwrapped.world
+    known, W = [], operator._filters[0].window
+    start = operator.covariance[0]
+    prior = prior_of(world)
+    r = prior.modes.shape[1]
+    steps = world.n_steps - 16
+    for action in some_pairs()[:steps]:
+        about, currents = operator.linearised, env.unwrapped.rules.table[action]
+        std = operator._shared.levels.noise_std(currents @ about.resistance, 0.0)
+        known.append(np.tensordot(currents, about.derivative, 1) / std[:, None])
+        env.step(int(action))
+    # the first frame's information, as a measurement of its own at the beginning
+    before = toeplitz(prior.time_covariance(W + steps))
+    whole = np.kron(before, np.eye(r))                                          # the newest first
+    old = slice(steps * r, None)
+    gain = whole[:, old] @ np.linalg.inv(whole[old, old])
+    whole = whole + gain @ (start - whole[old, old]) @ gain.T
+    H = np.zeros((16 * steps, len(whole)))
+    for k, matrix in enumerate(known):
+        first = (steps - 1 - k) * r
+        H[16 * k:16 * (k + 1), first:first + W * r] = matrix
+    S = H @ whole @ H.T + np.eye(len(H))
+    rest = whole - whole @ H.T @ np.linalg.solve(S, H @ whole)
+    # what the filter forgets would still tell it a little of what it has not
+    expected = rest[:W * r, :W * r]
+    np.testing.assert_allclose(operator.covariance[0], expected, atol=2e-3)
+    slope = operator._filters[0].slope() / operator.concentration[0]
+    np.testing.assert_allclose(operator.state_covariance[0], slope @ expected @ slope.T,
+                               atol=1e-3 * (slope @ slope.T).max())
+
+
+def test_slope_is_that_of_the_state():
+    """Central differences of the reduced concentration by the window's entries."""
+    env, _ = begun("reduced")
+    operator = filter_of(env)
+    (filter_,) = operator._filters
+    slope, mean = filter_.slope() / filter_.level, filter_.mean.copy()
+    for k in (0, 9, 20):
+        sides = []
+        for sign in (1.0, -1.0):
+            filter_.mean = mean.copy()
+            filter_.mean.ravel()[k] += sign * 1e-4
+            sides.append(operator.state[0])
+        np.testing.assert_allclose(slope[:, k], (sides[0] - sides[1]) / 2e-4, rtol=1e-5, atol=1e-7)
+
+
+def test_what_a_pair_teaches_is_foretold():
+    """The criterion's variance is what the filter then has, as long as no reading is left out; and
+    gains are by how much the expected error falls."""
+    env, observation = begun("reduced")
+    belief = Belief(env.unwrapped.rules, observation)
+    for pair in (7, 100, 3):
+        predicted = belief.predicted()
+        after, expected = belief.after(predicted, pair), belief.expected_error(predicted)
+        gain = belief.gains(predicted)[0][pair]
+        assert gain == pytest.approx(expected - belief.expected_error(after), rel=1e-6)
+        np.testing.assert_allclose(belief.relinearised(), belief.derivative)
+        observation = env.step(pair)[0]
+        inside = filter_of(env).covariance[0]
+        np.testing.assert_allclose(after, inside, atol=1e-9)
+        assert gain < expected
+        belief.see(observation)
+
+
+def test_expected_error_is_that_of_the_spread():
+    """Integrated over the pipe, the variances shown are the expected squared error of the state
+    that is predicted without a measurement."""
+    env, observation = begun("reduced")
+    belief = Belief(env.unwrapped.rules, observation)
+    operator = filter_of(belief)
+    expected = belief.expected_error(belief.predicted())
+    silent = np.zeros((1, 16))
+    operator.assimilate(silent, silent)
+    basis = operator.basis
+    covariance = basis @ operator.state_covariance[0] @ basis.T
+    mass = score_mass(env.unwrapped.world).toarray()
+    assert expected == pytest.approx((mass * covariance).sum(), rel=1e-6)
+
+
+def test_readings_that_are_not_believed_teach_nothing():
+    """Whatever a reading beyond the gate says, the filter knows the same; all others are used."""
+    env = make("reduced", INFLOW, gate=6.0)
+    first = env.reset(seed=3)[0]
+    voltages = env.step(7)[0]["voltages"]
+    rules = env.unwrapped.rules
+    told = []
+    for wrong in (0.5, -3.0):
+        belief = Belief(rules, first)
+        false = voltages.copy()
+        false[11] += wrong
+        operator = filter_of(belief)
+        _, kept = operator.assimilate(false[None], rules.table[7][None])
+        assert np.flatnonzero(~kept[0]).tolist() == [11]
+        assert len(operator.innovations()[0].value) == 15
+        told.append((operator.means(), operator.covariance))
+    np.testing.assert_array_equal(told[0][0], told[1][0])
+    np.testing.assert_array_equal(told[0][1], told[1][1])
+    belief = Belief(rules, first)
+    operator = filter_of(belief)
+    before = belief.predicted()
+    _, kept = operator.assimilate(voltages[None] + np.linspace(-3.0, 3.0, 16), rules.table[7][None])
+    assert not kept.any()
+    assert operator.innovations() == [None]
+    np.testing.assert_allclose(operator.covariance[0], before, atol=1e-12)
+
+
+def test_prior_is_that_of_the_baselines():
+    """The same episodes, the same prior, to the digits of its file; short records change nothing."""
+    task = make_task(PIPE_2D)
+    kept = suiting_priors(baseline_folder() / "priors", task, "logarithm")[0]
+    learned = prior_of(PIPE_2D.sound)
+    assert kept.source["seeds"] == "train:0-199"
+    assert parse_seeds("train:0-199") == list(range(200))
+    np.testing.assert_allclose(learned.correlation, kept.correlation, atol=1e-8)
+    np.testing.assert_allclose(learned.modes @ learned.modes.T, kept.modes @ kept.modes.T, atol=1e-8)
+    shorter = prior_of(PIPE_2D.changed({"schedule": {"scored_steps": 3}}))
+    np.testing.assert_array_equal(shorter.correlation, learned.correlation)
+
+
+@pytest.mark.parametrize("name", [FAULTS, BUDGET])
+def test_other_worlds_may_know_the_inflow_too(name):
+    """By an argument; what is believed is no part of the world, nor of its episodes."""
+    env = make("reduced", name, inflow="learned")
+    assert env.unwrapped.world == make("none", name).unwrapped.world
+    env.reset(seed=1)
+    assert isinstance(filter_of(env), InflowOperator)
+    for action in some_pairs()[:4]:
+        assert np.isfinite(env.step(int(action))[1])
+
+
+@pytest.mark.parametrize(("name", "inflow", "message"), [
+    (INFLOW, "pink", "inflow must be one of white, learned, got 'pink'"),
+    (FLOW, "learned", "inflow must be 'white' where the flow is to be estimated too"),
+    (TANK, "learned", "inflow must be 'white' where nothing flows in"),
+])
+def test_wrong_inflows_are_named(name, inflow, message):
+    """Before anything is computed."""
+    with pytest.raises(ValueError, match=message):
+        make("reduced", name, inflow=inflow)
+
+
+def test_ids_say_what_the_filter_believes():
+    """Registered as a setting, white where none is."""
+    for name, believed in ((INFLOW, "learned"), (FAULTS, "white")):
+        assert entry(name).settings.get("inflow", "white") == believed
+        assert make("reduced", name).unwrapped.rules.inflow == believed
