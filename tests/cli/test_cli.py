@@ -205,7 +205,7 @@ def test_documented_commands_are_commands():
     (["run", "--seeds", "0-3"], "seeds must say of which split: train:0-3, dev:0-3 or test:0-3; got '0-3'"),
     (["run", "--seeds", "", "--baseline", "mine.py", "-j", "1"], "seeds must look like"),
     (["run", "--env", "eitbench/Pipe4D-v0"], "env must be one of eitbench/Pipe2D-v0"),
-    (["run", "--baseline", "kalman"], "one of coloured_extended_kalman_filter"),
+    (["run", "--baseline", "kalman"], "one of approximation_error_filter"),
     (["run", "--env", "eitbench/pip2D-v0"], "Did you mean eitbench/Pipe2D-v0?"),
     (["run", "--baseline", "kalman_fliter"], "Did you mean kalman_filter?"),
     (["run", "--set", "instrument.noise_relativ=0.1"], "Did you mean noise_relative?"),
