@@ -16,13 +16,14 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 import typer
-from scipy.linalg import block_diag
+from networks import Correction, joined
 from tqdm import tqdm, trange
 
 import eitbench
 from eitbench.data import store
 from eitbench.data.bank import fill
 from eitbench.data.learning.examples import Dataset, Example
+from eitbench.data.learning.reduced import strongest
 from eitbench.data.parallel import in_parallel
 from eitbench.data.seeds import parse_seeds
 from eitbench.estimation import FilterSeen, FirstFrame, VoltagesSeen, suiting_models, suiting_priors
@@ -38,8 +39,6 @@ EPOCHS = 24
 BATCH = 16
 RATE = 4e-3
 DECAY = 0.1
-MAPS = 4
-DROPPED = 0.2  # of the memory, while it learns
 SURPRISE = 0.02
 """weight of the likelihood, beside ẽ_c in parts of the filter's"""
 NODES = 256
@@ -99,17 +98,9 @@ FEATURES = ("inputs", "reduced", "truth", "rest", "weight")
 
 def modes(examples: Dataset, q: int) -> dict[str, np.ndarray]:
     """``basis`` (n, q), orthonormal in M̃: the strongest modes of the scored states; ``rest`` (n,):
-    the mean square of what they leave."""
-    n = examples.mesh.n_nodes
-    second = np.zeros((n, n))
-    for example in tqdm(examples, desc="modes", unit="episode", disable=None):
-        states = example.truth[examples.warm_up::2] / examples.world.background - 1.0
-        second += states.T @ states / (len(examples) * len(states))
-    root = np.linalg.cholesky(examples.mass.toarray())
-    values, vectors = np.linalg.eigh(root.T @ second @ root)
-    basis = np.linalg.solve(root.T, vectors[:, :-q - 1:-1])
-    rest = np.diag(second) - basis**2 @ values[:-q - 1:-1]
-    return {"basis": basis, "rest": np.maximum(rest, 0.0)}
+    the mean square of what they leave of c/c_0 − 1."""
+    basis, left = strongest(examples, q)
+    return {"basis": basis, "rest": left / examples.world.background**2}
 
 
 def features(examples: Dataset, example: Example, basis: np.ndarray,
@@ -122,27 +113,35 @@ def features(examples: Dataset, example: Example, basis: np.ndarray,
     record = list(zip(example.voltages, example.currents, strict=True))
     for measurement in record[:first.length]:
         first.add(*measurement)
-    deviation = example.truth / first.c_bh - 1.0
-    truth = deviation @ (examples.mass @ basis)
-    left = deviation - truth @ basis.T
-    rest = first.c_bh**2 * np.einsum("tn,nt->t", left, examples.mass @ left.T)
-    weight = first.c_bh**2 / example.square
-    rest = (rest + example.unresolved) / example.square
+    truth, weight, rest = in_modes(examples, example, basis, first.c_bh)
     if sees == "voltages":
         see = VoltagesSeen(task, first.c_bh, basis)
-        inputs, reduced = (np.array(each) for each in zip(*(see(*each) for each in record),
-                                                          strict=True))
+        seen = [see(*measurement) for measurement in record]
+        inputs, reduced = (np.array(each) for each in zip(*seen, strict=True))
         later = {}
     else:
         prior = suiting_priors(ROOT / "baselines" / "priors", task, "logarithm")[0]
-        model = (suiting_models(ROOT / "baselines" / "models", task)[0] if sees == "identified"
-                 else None)
+        model = None
+        if sees == "identified":
+            model = suiting_models(ROOT / "baselines" / "models", task)[0]
         see = FilterSeen(task, prior, first.c_bh, basis, max(LAGS), model)
         inputs, (reduced, *each) = see.record(record, 0, *LAGS)
         later = {f"reduced {lag}": modes for lag, modes in zip(LAGS, each, strict=True)}
     # in the order of `FEATURES`, in which `store` knows them again
-    return {"inputs": inputs.astype(np.float32), "reduced": reduced, "truth": truth, "rest": rest,
-            "weight": weight} | later
+    return {
+        "inputs": inputs.astype(np.float32),
+        "reduced": reduced,
+        "truth": truth,
+        "rest": rest,
+        "weight": weight,
+    } | later
+
+
+def in_modes(examples: Dataset, example: Example, basis: np.ndarray,
+             level: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """True modes (T, q) of c/level − 1, and two numbers a step as of `features`."""
+    found = examples.reduced(level * basis, level).of(example)
+    return found.truth, level**2 / found.square, found.unresolved / found.square
 
 
 def basis_and_rest(lesson: Lesson) -> Mapping[str, np.ndarray]:
@@ -157,8 +156,8 @@ def of_episode(lesson: Lesson, seed: int, basis: np.ndarray) -> Mapping[str, np.
         return features(examples, examples[0], basis, lesson.sees)
 
     later = [] if lesson.sees == "voltages" else [f"reduced {lag}" for lag in LAGS]
-    return store.kept(place(lesson) / lesson.sees / f"{seed}.npz", (*FEATURES, *later), make,
-                      str(seed))
+    path = place(lesson) / lesson.sees / f"{seed}.npz"
+    return store.kept(path, (*FEATURES, *later), make, str(seed))
 
 
 def place(lesson: Lesson) -> Path:
@@ -175,8 +174,8 @@ def asked(lesson: Lesson, seen: Mapping[str, np.ndarray]) -> dict[str, np.ndarra
     answered = slice(len(found["truth"]) - wait)
     later = seen[f"reduced {lesson.lag}"][answered]
     inputs = np.concatenate([found["inputs"][wait:], later], axis=1)
-    return {name: each[answered] for name, each in found.items()} | {
-        "inputs": inputs, "reduced": later}
+    answers = {name: each[answered] for name, each in found.items()}
+    return answers | {"inputs": inputs, "reduced": later}
 
 
 def of_episodes(lesson: Lesson, seeds: list[int]) -> Tensors:
@@ -195,88 +194,6 @@ def velocities(world: World, seeds: Sequence[int]) -> torch.Tensor:
     mean, std = USUAL
     drawn = [world.flow.draw(world, randomness(seed).flow)(1).mean_velocity for seed in seeds]
     return (torch.tensor(drawn, dtype=torch.float32)[:, None] - mean) / std
-
-
-class Correction(torch.nn.Module):
-    """As `eitbench.estimation.corrected` plays it, for batches of whole episodes."""
-
-    def __init__(self, input_scale: torch.Tensor, output_scale: torch.Tensor, hidden: int,
-                 both_ways: bool = False, noise: float = 0.0) -> None:
-        super().__init__()
-        self.register_buffer("input_scale", input_scale)
-        self.register_buffer("output_scale", output_scale)
-        self.noise = noise
-        d = len(input_scale)
-        q = len(output_scale)
-        width = 2 * hidden if both_ways else hidden
-        self.gru = torch.nn.GRU(d, hidden, batch_first=True, bidirectional=both_ways)
-        self.output = torch.nn.Linear(width, 2 * q)
-        self.mixing = torch.nn.Linear(width, MAPS)
-        self.maps = torch.nn.Linear(d, MAPS * q, bias=False)
-        self.velocity = torch.nn.Linear(width, 1)
-        torch.nn.init.zeros_(self.output.weight)
-
-    def forward(self, inputs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Corrections and log variances (B, T, q) in units of ``output_scale``, and velocities
-        (B, T)."""
-        inputs = inputs / self.input_scale
-        if self.training:
-            inputs = inputs + self.noise * torch.randn_like(inputs)
-        memory, _ = self.gru(inputs)
-        memory = torch.nn.functional.dropout(memory, DROPPED, self.training)
-        correction, log_variance = self.output(memory).chunk(2, dim=-1)
-        maps = self.maps(inputs).unflatten(-1, (MAPS, -1))
-        mixed = (self.mixing(memory).unsqueeze(-1) * maps).sum(dim=-2)
-        return correction + mixed, log_variance, self.velocity(memory).squeeze(-1)
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """As `eitbench.estimation.remember` and `said` take them, in half precision."""
-        found = {"input_scale": self.input_scale, "output_scale": self.output_scale,
-                 "output_weight": self.output.weight, "output_bias": self.output.bias,
-                 "mixing_weight": self.mixing.weight, "mixing_bias": self.mixing.bias,
-                 "maps": self.maps.weight.unflatten(0, (MAPS, -1))}
-        for way, end in WAYS[:1 + self.gru.bidirectional]:
-            for name, short in (("input", "ih"), ("hidden", "hh")):
-                found[f"{way}{name}_weight"] = getattr(self.gru, f"weight_{short}_l0{end}")
-                found[f"{way}{name}_bias"] = getattr(self.gru, f"bias_{short}_l0{end}")
-        return {name: each.detach().numpy().astype(np.float16) for name, each in found.items()}
-
-
-def joined(networks: list[Correction]) -> dict[str, np.ndarray]:
-    """One network whose correction and log variance are the means of those of several (deep
-    ensembles: Lakshminarayanan et al. 2017). Their units keep to themselves."""
-    each = [network.arrays() for network in networks]
-    many = len(each)
-    if many == 1:
-        return each[0]
-    whole = {name: each[0][name] for name in ("input_scale", "output_scale")}
-    whole["output_bias"] = np.mean([one["output_bias"] for one in each], axis=0)
-    whole["mixing_bias"] = np.concatenate([one["mixing_bias"] for one in each])
-    whole["mixing_weight"] = beside([one["mixing_weight"] for one in each])
-    whole["maps"] = np.concatenate([one["maps"] for one in each]) / many
-    whole["output_weight"] = np.concatenate([one["output_weight"] for one in each], axis=1) / many
-    gates = [name for name in each[0] if name.endswith(("input_weight", "input_bias",
-                                                        "hidden_weight", "hidden_bias"))]
-    for name in gates:
-        thirds = zip(*(np.split(one[name], 3) for one in each), strict=True)
-        join = beside if name.endswith("hidden_weight") else np.concatenate
-        whole[name] = np.concatenate([join(third) for third in thirds])
-    if networks[0].gru.bidirectional:
-        # the memory is that of all units forward, then that of all backward
-        order = np.arange(whole["output_weight"].shape[1]).reshape(many, 2, -1)
-        order = order.swapaxes(0, 1).ravel()
-        for name in ("output_weight", "mixing_weight"):
-            whole[name] = whole[name][:, order]
-    return {name: one.astype(np.float16) for name, one in whole.items()}
-
-
-def beside(blocks: Sequence[np.ndarray]) -> np.ndarray:
-    """Block-diagonal."""
-    return block_diag(*(block.astype(float) for block in blocks))
-
-
-WAYS = (("", ""), ("backward_", "_reverse"))
-"""What names of weights begin with in a network's file, and end with in torch."""
 
 
 def filters_errors(data: Tensors) -> torch.Tensor:
@@ -357,13 +274,13 @@ def main(
     world = eitbench.dataset(what.env, train).world
     fill(world, train + dev, n_jobs=jobs)
     told = basis_and_rest(what)
+    nodes = (told["basis"], told["rest"]) if what.likelihood == "nodes" else ()
     todo = [(what, seed, told["basis"]) for seed in train + dev]
     looking = in_parallel(of_episode, todo, jobs)
     list(tqdm(looking, total=len(todo), desc="looking", unit="episode", disable=None))
     data = of_episodes(what, train)
     held = of_episodes(what, dev)
-    judge = Judge(world.warm_up, *(told[name] for name in ("basis", "rest")
-                                   if what.likelihood == "nodes"))
+    judge = Judge(world.warm_up, *nodes)
     alone = float(filters_errors(held)[:, world.warm_up:].mean())
     print(f"without the network {alone:.5f}")
     scores = np.empty((len(what.episodes), seeds))
@@ -374,9 +291,13 @@ def main(
             network, scores[i, seed] = trained(what, first, held, judge, seed)
             networks.append(network)
         print(f"{many:5} episodes {scores[i].mean():.5f}, each", np.round(scores[i], 6))
-    np.savez_compressed(ROOT / "baselines" / "networks" / what.network,
-                        **joined(networks[:what.joined]), basis=told["basis"].astype(np.float16),
-                        rest=told["rest"].astype(np.float32), task=told_of(make_task(world)))
+    np.savez_compressed(
+        ROOT / "baselines" / "networks" / what.network,
+        **joined(networks[:what.joined]),
+        basis=told["basis"].astype(np.float16),
+        rest=told["rest"].astype(np.float32),
+        task=told_of(make_task(world)),
+    )
     draw(lesson, what.episodes, scores, alone)
 
 

@@ -24,15 +24,16 @@ from learn import (
     KEPT,
     LESSONS,
     ROOT,
-    Correction,
     Judge,
     Tensors,
     features,
     filters_errors,
+    in_modes,
     modes,
     trained,
     velocities,
 )
+from networks import Correction
 from tqdm import tqdm
 
 import eitbench
@@ -82,25 +83,18 @@ class Looker:
         """`FEATURES` of several episodes, (N, T, ·) each."""
         seen = [self.examples.example(seed) for seed in seeds]
         levels = np.array([self._level(each) for each in seen])
-        truths = [self._truth(*each) for each in zip(seen, levels, strict=True)]
+        truths = [in_modes(self.examples, example, self.basis, level)
+                  for example, level in zip(seen, levels, strict=True)]
+        truth, weight, rest = map(np.array, zip(*truths, strict=True))
         inputs, reduced = self._filtered(seen, levels)
-        found = {"inputs": inputs, "reduced": reduced} | {
-            name: np.array([truth[name] for truth in truths]) for name in FEATURES[2:]}
-        return {name: each.astype(np.float32) for name, each in found.items()}
+        found = (inputs, reduced, truth, rest, weight)
+        return {name: each.astype(np.float32) for name, each in zip(FEATURES, found, strict=True)}
 
     def _level(self, example: Example) -> float:
         first = FirstFrame(self.task)
         for measurement in zip(example.voltages[:first.length], example.currents, strict=False):
             first.add(*measurement)
         return first.c_bh
-
-    def _truth(self, example: Example, level: float) -> dict[str, np.ndarray]:
-        mass = self.examples.mass
-        deviation = example.truth / level - 1.0
-        truth = deviation @ (mass @ self.basis)
-        left = deviation - truth @ self.basis.T
-        rest = level**2 * np.einsum("tn,nt->t", left, mass @ left.T)
-        return {"truth": truth, "rest": rest / example.square, "weight": level**2 / example.square}
 
     def _filtered(self, seen: list[Example],
                   levels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

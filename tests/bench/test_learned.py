@@ -1,5 +1,6 @@
 """What is learned is what is played: numpy's network is torch's, and it plays what it was trained for alone."""
 
+import importlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,7 +8,7 @@ import eitbench
 import numpy as np
 import pytest
 import torch
-from eitbench.bench.methods import load_method, load_module
+from eitbench.bench.methods import load_method
 from eitbench.estimation import FirstFrame, InflowFilter, corrected, remember, suiting_priors
 from eitbench.worlds import entry
 from eitbench.worlds.task import make_task
@@ -15,14 +16,16 @@ from eitbench.worlds.task import make_task
 from tiny_worlds import CHANGES
 
 ROOT = Path(__file__).parents[2]
-STUDY = ROOT / "studies" / "learn.py"
 ID = "eitbench/Pipe2DBiasedVelocity-v0"
 LEARNED = ("learned_correction", "learned_smoother", "learned_fixed_lag", "learned_obstacle", "learned_voltages")
 
 
 @pytest.fixture(scope="module")
 def study():
-    return load_module("study", STUDY, STUDY.read_bytes())
+    """`studies/learn.py`, which finds what lies beside it as when it is run."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(ROOT / "studies")
+        return importlib.import_module("learn")
 
 
 @pytest.fixture

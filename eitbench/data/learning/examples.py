@@ -27,6 +27,7 @@ from eitbench.worlds.world import World
 if TYPE_CHECKING:
     import scipy.sparse as sp
 
+    from eitbench.data.learning.reduced import ReducedDataset
     from eitbench.data.learning.torch_dataset import TorchDataset
     from eitbench.numerics.mesh import Mesh
     from eitbench.physics.profiles import VelocityModel
@@ -117,11 +118,37 @@ class Dataset:
         off = estimate - example.truth
         return (np.einsum("tn,nt->t", off, self.mass @ off.T) + example.unresolved) / example.square
 
+    def modes(self, q: int) -> np.ndarray:
+        """(n, q) the strongest modes of what these examples' true states, from the first that is
+        scored on, are off the world's background: the best basis for them in the norm of the
+        score, and orthonormal in it. ``ValueError`` if there are fewer than q."""
+        from eitbench.data.learning.reduced import strongest
+        return strongest(self, q)[0]
+
+    def reduced(self, basis: np.ndarray,
+                mean: float | np.ndarray | None = None) -> ReducedDataset:
+        """The same examples in coordinates a, c = mean + basis a, in which scores are exact too.
+
+        Parameters
+        ----------
+        basis : (n, q) array, mol/m³
+            Such as `modes`. ``ValueError`` if its columns depend on each other.
+        mean : float or (n,) array, mol/m³
+            Default: the world's background.
+        """
+        from eitbench.data.learning.reduced import reduced
+        return reduced(self, basis, mean)
+
     def torch(self) -> TorchDataset:
         """The same as a dataset for torch. ``ModuleNotFoundError`` if torch is not installed."""
-        with needed_by("a dataset for torch"):
-            from eitbench.data.learning.torch_dataset import TorchDataset
-        return TorchDataset(self)
+        return as_torch(self)
+
+
+def as_torch(examples: Dataset | ReducedDataset) -> TorchDataset:
+    """As `Dataset.torch`."""
+    with needed_by("a dataset for torch"):
+        from eitbench.data.learning.torch_dataset import TorchDataset
+    return TorchDataset(examples)
 
 
 def dataset(env: str, seeds: str | Sequence[int], *,

@@ -10,6 +10,7 @@ from torch.utils.data import Dataset as OfTorch
 
 if TYPE_CHECKING:
     from eitbench.data.learning.examples import Dataset
+    from eitbench.data.learning.reduced import ReducedDataset
 
 
 class TorchDataset(OfTorch[dict[str, torch.Tensor]]):
@@ -19,7 +20,7 @@ class TorchDataset(OfTorch[dict[str, torch.Tensor]]):
     does so sooner and faster.
     """
 
-    def __init__(self, examples: Dataset) -> None:
+    def __init__(self, examples: Dataset | ReducedDataset) -> None:
         self.examples = examples
 
     def __len__(self) -> int:
