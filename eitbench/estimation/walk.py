@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,14 +27,17 @@ def steady(phase: float) -> tuple[np.ndarray, np.ndarray]:
     return A, np.eye(2) - A @ A.T
 
 
+@lru_cache(maxsize=4)
 def smooth_modes(mesh: Mesh, length: float) -> np.ndarray:
     """(n, K) modes of a Matérn field over ``length`` in m, of mean variance 1: what is smooth is
-    their sum with independent standard normal weights."""
+    their sum with independent standard normal weights. Read-only: whoever asks again is given the
+    same."""
     from eitbench.numerics.fem import mass_matrix, stiffness_matrix
     covariance = smoothness_covariance(mass_matrix(mesh), stiffness_matrix(mesh), length, 1.0)
     values, vectors = np.linalg.eigh(covariance)
     kept = values > KEPT * values[-1]
     modes: np.ndarray = vectors[:, kept] * np.sqrt(values[kept])
+    modes.flags.writeable = False
     return modes
 
 

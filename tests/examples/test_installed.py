@@ -36,7 +36,7 @@ COMMANDS = [
     (("compare", "kalman_filter", "extended_kalman_filter"), "extended_kalman_filter"),
     (("compare", RECORD, RECORD.replace("homogeneous", "kalman_filter")), "kalman_filter"),
     (("render", *TANK, "--baseline", "homogeneous", "--step", "3", "-o", "it.png"), "wrote it.png"),
-    (("reproduce", "fig7.3", "--seeds", "dev:0", "-j", "1"), "wrote results/figures"),
+    (("reproduce", "fig7.4", "--seeds", "dev:0", "-j", "1"), "wrote results/figures"),
     ("season", "season 1"),
     (("cards", "eitbench/StationaryTank2D-v0", "homogeneous"), "homogeneous: same"),
     (("kits", "eitbench/StationaryTank2D-v0"), ": same"),

@@ -138,6 +138,7 @@ def test_skewed_profile_comes_close_though_it_is_not_in_the_basis():
     error("Pipe2DSkewedVelocity", "joint_extended_kalman_filter")
 
 
+@pytest.mark.slow
 @coarse_and_ours
 def test_wrong_mean_velocity_costs_and_the_estimate_is_still_of_use(whose):
     """Thesis 5.1.2: filters that assume 2 or 7 m/s instead of 4.5 are worse than the right one,
