@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import isfinite
 from pathlib import Path
 from typing import Annotated
 
@@ -81,9 +82,8 @@ def estimate(
                 options.say(f"  mean velocity at the end {said} m/s")
             if picture is not None:
                 found = segmented(env, played[-1].mean[-1])
-                off = ", ".join(f"{100 * each:.2f}" for each in distances(env, picture, found))
-                options.say(f"  KTC's score {ktc_score(picture, found):.3f}; its bodies are off by "
-                            f"{off} cm")
+                options.say(f"  KTC's score {ktc_score(picture, found):.3f}; "
+                            f"{_said_of(distances(env, picture, found))}")
         write_report(out, env, played, record.source, doubts, picture)
         options.say(f"wrote {out}")
         if arrays is not None:
@@ -97,3 +97,13 @@ def _steps(span: str) -> slice:
     if not (colon and first.isdigit() and (last.isdigit() or not last)):
         raise ValueError(f"--span must be two numbers such as 0:800, got {span!r}")
     return slice(int(first), int(last) if last else None)
+
+
+def _said_of(distances: list[float]) -> str:
+    """How far a picture's bodies are off, in m, infinite of one that it does not show."""
+    shown = [f"{100 * each:.2f}" for each in distances if isfinite(each)]
+    missing = len(distances) - len(shown)
+    if not shown:
+        return "it shows none of the bodies"
+    said = f"its bodies are off by {', '.join(shown)} cm"
+    return f"{said}; of {missing} it shows nothing" if missing else said
