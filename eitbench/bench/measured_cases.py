@@ -108,9 +108,8 @@ class Case:
                 raise ValueError(f"data must be {self.file} of the case {self.name}: the sha256 of "
                                  f"{path} must be {digest}, got {found}")
         settings = dict(self.settings)
-        record = read(file, settings.pop("format", None))
-        if "span" in settings:
-            record = record.part(slice(*settings.pop("span")))
+        span = settings.pop("span", None)
+        record = read(file, settings.pop("format", None), None if span is None else slice(*span))
         return MeasuredEnv(record, dict(self.vessel), withheld=WITHHELD, **settings)
 
     def true_picture(self, file: Path | str | None) -> np.ndarray | None:

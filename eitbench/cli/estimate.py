@@ -57,9 +57,7 @@ def estimate(
     with options.clear_errors():
         if out.suffix != ".html":
             raise ValueError(f"--out must end in .html, got {out}")
-        record = read(file, format)
-        if span is not None:
-            record = record.part(_steps(span))
+        record = read(file, format, None if span is None else _steps(span))
         options.say(f"{file}: {len(record.readings)} times {len(record.matrix)} readings of "
                     f"{record.currents.shape[1]} electrodes; a method takes about "
                     f"{10 + 0.03 * len(record.readings):.0f} s")

@@ -62,6 +62,7 @@ def test_truth_is_the_best_there_is_on_these_nodes(env, changes):
     assert np.abs(interpolation.T @ (mass @ off)).max() < 1e-5 * weights.max() * np.abs(off).max()
     np.testing.assert_allclose(example.unresolved, (off * (mass @ off)).sum(axis=0), rtol=1e-4)
     np.testing.assert_allclose(example.square, (truth.T * (mass @ truth.T)).sum(axis=0), rtol=1e-9)
+    assert np.abs(example.truth - 28.0).max() < 3.0 * np.abs(truth - 28.0).max()       # beyond a region's edge too
 
 
 def test_errors_over_a_region_are_those_of_its_scores():
@@ -71,6 +72,53 @@ def test_errors_over_a_region_are_those_of_its_scores():
     counted = integrals(world, 0, recording(world, 0))
     expected = step_error(score_mass(world), estimate - world.background, *counted)
     np.testing.assert_allclose(examples.errors(example, estimate), expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("env, changes", [(PIPE, CHANGES), (REGION, WANDERING)])
+def test_scores_are_the_same_in_few_coordinates(env, changes):
+    """Of any estimate in the span of a basis, which need not be orthonormal, about any mean."""
+    examples = eitbench.dataset(env, "train:0", world=changes)
+    random = np.random.default_rng(2)
+    basis = random.normal(size=(examples.mesh.n_nodes, 3))
+    for mean in (25.0, 30.0 + random.normal(size=len(basis))):
+        reduced = examples.reduced(basis, mean)
+        (example,) = reduced
+        said = random.normal(size=example.truth.shape)
+        estimate = reduced.concentration(said)
+        np.testing.assert_allclose(estimate, mean + said @ basis.T)
+        np.testing.assert_allclose(reduced.errors(example, said), examples.errors(examples[0], estimate), rtol=1e-9)
+        best = reduced.errors(example, example.truth)
+        for nudge in 1e-3 * np.eye(3):
+            assert (reduced.errors(example, example.truth + nudge) > best).all()
+    assert reduced[0].truth.shape == (len(example.voltages), 3)
+
+
+@pytest.mark.parametrize("env, changes", [(PIPE, CHANGES), (REGION, WANDERING)])
+def test_modes_are_the_best_basis(env, changes):
+    """Orthonormal over what is scored; they leave what the singular values that they leave say, and all of them
+    nothing."""
+    examples = eitbench.dataset(env, "train:0-1", world=changes)
+    squares, vectors = np.linalg.eigh(examples.mass.toarray())
+    root = vectors * np.sqrt(np.maximum(squares, 0.0))
+    states = np.concatenate([each.truth[examples.warm_up::2] for each in examples]) - examples.world.background
+    values = np.linalg.svd(states @ root, compute_uv=False)
+    for q in (1, len(states)):
+        reduced = examples.reduced(examples.modes(q))
+        np.testing.assert_allclose(reduced.mass, np.eye(q), atol=1e-9)
+        left = sum((reduced.of(each).unresolved - each.unresolved)[examples.warm_up::2].sum() for each in examples)
+        assert left == pytest.approx((values[q:]**2).sum(), rel=1e-5, abs=1e-9 * (values**2).sum())
+    with pytest.raises(ValueError, match=f"q must be at most {len(states)}, .* got {len(states) + 1}"):
+        examples.modes(len(states) + 1)
+
+
+@pytest.mark.parametrize("basis, mean, said", [
+    (np.ones((3, 2)), None, "basis"), (np.ones((1, 2)), None, "some of these 2 depend"),
+    (np.full((1, 1), np.nan), None, "basis"), (None, np.zeros(3), "mean"), (None, "much", "mean must be a number")])
+def test_bases_that_are_none_are_explained(tiny, basis, mean, said):
+    n = tiny.mesh.n_nodes
+    basis = np.ones((n, 1)) if basis is None else np.repeat(basis, n, axis=0) if len(basis) == 1 else basis
+    with pytest.raises(ValueError, match=said):
+        tiny.reduced(basis, mean)
 
 
 def test_the_flow_is_told_where_it_is_asked_for():

@@ -5,7 +5,7 @@ import tracemalloc
 import h5py
 import numpy as np
 import pytest
-from eitbench.data.measured import Measurements
+from eitbench.data.measured import Measurements, read
 from eitbench.envs.measured import MeasuredEnv
 from tanks import VESSEL, moving
 
@@ -115,6 +115,11 @@ def test_a_large_record_stays_on_the_disk(tmp_path):
     assert not long.readings.flags.writeable
     np.testing.assert_array_equal(seen, same)
     np.testing.assert_array_equal(long.readings[640_000:640_640], short.readings)
+    part = read(paths[1], steps=slice(640_000, 640_640))
+    np.testing.assert_array_equal(part.readings, short.readings)
+    assert part.times[0] == 6400.0
+    with pytest.raises(ValueError, match="large.h5.*steps must hold readings of the 1152000, got slice"):
+        read(paths[1], steps=slice(2_000_000, None))
 
 
 def test_parts_of_a_record():

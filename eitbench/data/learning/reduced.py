@@ -51,7 +51,7 @@ class ReducedDataset:
 
     def of(self, example: Example) -> Example:
         """An example of ``examples`` in the coordinates."""
-        deviation = example.truth - self.mean
+        deviation = example.truth.astype(float) - self.mean
         a = np.linalg.solve(self.mass, self._weighted.T @ deviation.T).T
         left = deviation - a @ self.basis.T
         square = np.einsum("tn,nt->t", left, self.examples.mass @ left.T)
@@ -116,7 +116,8 @@ def strongest(examples: Dataset, q: int) -> tuple[np.ndarray, np.ndarray]:
     second = np.zeros((n, n))
     states = 0
     for example in tqdm(examples, desc="modes", unit="episode", disable=None):
-        deviation = example.truth[examples.warm_up::EVERY] - examples.world.background
+        truth = example.truth[examples.warm_up::EVERY].astype(float)
+        deviation = truth - examples.world.background
         second += deviation.T @ deviation
         states += len(deviation)
     second /= states

@@ -73,10 +73,7 @@ class Measurements:
         T = len(readings)
         injections = _injections(self.injections, T, K)
         times = _check.array("times", self.times, (T,), units="s")
-        if (back := np.flatnonzero(np.diff(times) <= 0)).size:
-            t = int(back[0])
-            raise ValueError(f"times must increase, got {times[t]:g} s and then "
-                             f"{times[t + 1]:g} s at reading {t + 1}")
+        _increase(times)
         reference = None
         if self.reference is not None:
             reference = _numbers("reference", self.reference, (None, K, M))
@@ -184,8 +181,8 @@ class Measurements:
     def load(cls, path: Path | str, steps: slice = slice(None)) -> Measurements:
         """What `save` has written, or only some of its readings, of which alone is read then.
 
-        Readings of more than `IN_MEMORY` bytes stay in the file, which must not change, and are
-        read from there where they are needed. ``ValueError`` naming the file and what is wrong
+        What takes more than `IN_MEMORY` bytes stays in the file, which must not change, and is
+        read from there where it is needed. ``ValueError`` naming the file and what is wrong
         with it.
         """
         with needed_by("a file of measurements"):
@@ -196,10 +193,11 @@ class Measurements:
                     raise ValueError(f"format must be {FORMAT!r}, version {VERSION}, got "
                                      f"{file.attrs.get('format')!r}, version "
                                      f"{file.attrs.get('version')!r}")
-                along = {name: file[name][steps] for name in ("injections", "times")}
-                for value in along.values():
-                    value.setflags(write=False)                 # long ones are not copied
-                along["readings"] = _mapped(Path(path), file["readings"], steps)
+                along = {name: _mapped(Path(path), file[name], steps)
+                         for name in ("injections", "times", "readings")}
+                if not along["injections"].size:
+                    raise ValueError("steps must hold readings of the "
+                                     f"{len(file['injections'])}, got {steps}")
                 whole = {name: file[name][()] for name in ("currents", "matrix")}
                 reference = file["reference"][()] if "reference" in file else None
                 source = json.loads(file.attrs["source"])
@@ -212,8 +210,9 @@ def _mapped(path: Path, dataset: Any, steps: slice) -> np.ndarray:
     """Some rows of a data set, in the file where they are large and lie there as they are."""
     large = dataset.size * dataset.dtype.itemsize > IN_MEMORY
     begin = dataset.id.get_offset()                 # None if it is compressed or in chunks
-    if not large or begin is None or dataset.dtype != np.float64:
+    if not large or begin is None or dataset.dtype not in (np.float64, np.int64):
         rows: np.ndarray = dataset[steps]
+        rows.setflags(write=False)                              # long ones are not copied
         return rows
     return np.memmap(path, dataset.dtype, "r", begin, dataset.shape)[steps]
 
@@ -238,6 +237,16 @@ def _by_injection(records: np.ndarray, injections: np.ndarray, K: int) -> np.nda
     found = np.full((F, most, K, M), np.nan)
     found[:, turn, injections] = records
     return found.reshape(F * most, K, M)
+
+
+def _increase(times: np.ndarray) -> None:
+    """``ValueError`` if they do not."""
+    for begin in range(0, len(times), BLOCK):
+        block = times[begin:begin + BLOCK + 1]
+        if (back := np.flatnonzero(np.diff(block) <= 0)).size:
+            t = begin + int(back[0])
+            raise ValueError(f"times must increase, got {times[t]:g} s and then "
+                             f"{times[t + 1]:g} s at reading {t + 1}")
 
 
 def _injections(given: np.ndarray, T: int, K: int) -> np.ndarray:

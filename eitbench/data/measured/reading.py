@@ -17,7 +17,8 @@ READERS: dict[str, Callable[..., Measurements]] = {
     "table": table.read}
 
 
-def read(path: Path | str, format: str | None = None, **how: Any) -> Measurements:
+def read(path: Path | str, format: str | None = None, steps: slice | None = None,
+         **how: Any) -> Measurements:
     """A record from a file or a folder.
 
     Parameters
@@ -25,6 +26,8 @@ def read(path: Path | str, format: str | None = None, **how: Any) -> Measurement
     path : path
     format : str, optional
         One of `READERS`; by default what the ending and the variables of the file tell.
+    steps : slice, optional
+        Only these readings, as of `Measurements.part`. Of our own files they alone are read.
     how
         Arguments of the reader. Those of a table may also stand in a YAML file beside it of the
         same name: ``electrodes: 16`` and ``current: 0.001``, a line each.
@@ -41,7 +44,11 @@ def read(path: Path | str, format: str | None = None, **how: Any) -> Measurement
     if format == "table" and not how:
         how = _described(path.with_suffix(".yml"))
     try:
-        return READERS[format](path, **how)
+        if steps is None:
+            return READERS[format](path, **how)
+        if format == "hdf5":
+            return Measurements.load(path, steps).part(slice(None))
+        return READERS[format](path, **how).part(steps)
     except ValueError as error:
         if str(path) in str(error):
             raise
