@@ -34,6 +34,8 @@ BODIES = ListedColormap(["#f4f4f2", "#d1495b", "#0b6e75"])
 FRAMES = 60
 """At most so many pictures in an animation."""
 COLOURS = ("#0b6e75", "#d1495b", "#b8860b", "#7a5195", "#5b6770")
+CORRECTED = {"offset": "What is left is taken off all readings.",
+             "gain": "Each reading is divided by the factor that it is off by."}
 DECADES = 5.0
 """From this ratio of the largest to the smallest estimate on, colours are logarithmic."""
 SHARE = (0.005, 0.995)
@@ -67,7 +69,7 @@ def write_report(path: Path, env: MeasuredEnv, played: Sequence[Played],
         methods=[_row(env, each) for each in played], doubts=list(doubts),
         facts=_facts(env), estimate=_estimate(env, played[0]), first=played[0].method,
         over_time=_figure(_over_time(env, played)), velocity=_velocity(env, played),
-        fit=_figure(_fit(calibration)),
+        fit=_figure(_fit(calibration)), corrected=CORRECTED[calibration.correction],
         contacts=_figure(_contacts(env)), health=_figure(_health(env, played[0])),
         at_rest=_is_at_rest(env),
         compared="" if truth is None else _figure(_compared(env, played, truth)))

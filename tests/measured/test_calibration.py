@@ -101,6 +101,14 @@ def test_channels_that_amplify_differently_break_reciprocity():
     """By what they differ."""
     gains = 1.0 + 0.3 * np.random.default_rng(1).uniform(-1, 1, size=8)
     assert "Exchanging injection and reading" in doubts_about(homogeneous() * gains)
+    assert doubts_about(homogeneous() * gains, correction="gain") == ""
+
+
+def test_gains_excuse_no_swapped_electrodes():
+    order = np.arange(8)
+    order[[1, 5]] = 5, 1
+    assert "Electrodes 2 and 6 are swapped" in doubts_about(
+        homogeneous(), CURRENTS[:, order], MATRIX[:, order], correction="gain")
 
 
 def test_units_that_are_wrong_are_named():

@@ -35,7 +35,8 @@ def doubts(record: Measurements, calibration: Calibration,
 
     Checks the conductivity or gain that was calibrated, reciprocity (exchanging injection and
     reading leaves a reading as it is), whether another order of the electrodes fits far better,
-    and electrodes whose readings fit far worse than all others'.
+    and electrodes whose readings fit far worse than all others'. Where channels are corrected by a
+    gain each, reciprocity and a bad fit in every order are not odd.
 
     Parameters
     ----------
@@ -74,11 +75,11 @@ def _of_reciprocity(record: Measurements, calibration: Calibration) -> list[str]
         return []
     size = np.sqrt(np.mean(exchanged[known]**2))
     part = float(np.sqrt(np.mean(off[known]**2)) / (np.sqrt(2) * size))
-    if part <= RECIPROCAL:
+    if part <= RECIPROCAL or calibration.correction == "gain":
         return []
     return [f"Exchanging injection and reading changes readings by {100 * part:.2g} %, where it "
             "should leave them as they are: the order of injections or of readings is wrong, or "
-            "channels are amplified differently."]
+            "channels are amplified differently (then --correction gain helps)."]
 
 
 def _which_reads(record: Measurements) -> np.ndarray:
@@ -127,6 +128,8 @@ def _of_order(record: Measurements, calibration: Calibration,
     fits = [missed(injects, reads) for _, injects, reads in orders]
     best = int(np.argmin(fits))
     if fits[best] > BETTER * described:
+        if calibration.correction == "gain":
+            return []
         return [f"The model of homogeneous fluid misses {100 * described:.2g} % of the readings: "
                 "the vessel, the electrodes' order or the units are not as described."]
     return [f"{orders[best][0]}, it seems: so the model of homogeneous fluid misses "
