@@ -83,6 +83,9 @@ def play_record(env: MeasuredEnv, method: str, seed: int = 0, *,
     default all.
     """
     loaded = load_method(method, "estimation")
+    if "filter" not in loaded.boards:
+        raise ValueError("method must say a state after each reading, as on filter boards, got "
+                         f"{loaded.name} of {', '.join(loaded.boards)} boards")
     if not loaded.suits(env.task):
         raise ValueError(f"method must suit a record of which the target {_motion(env.task)}, got "
                          f"{loaded.name}")

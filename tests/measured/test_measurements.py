@@ -118,7 +118,7 @@ def test_a_large_record_stays_on_the_disk(tmp_path):
     part = read(paths[1], steps=slice(640_000, 640_640))
     np.testing.assert_array_equal(part.readings, short.readings)
     assert part.times[0] == 6400.0
-    with pytest.raises(ValueError, match="large.h5.*steps must hold readings of the 1152000, got slice"):
+    with pytest.raises(ValueError, match=r"large.h5.*steps must hold some of its 1152000 readings, got slice"):
         read(paths[1], steps=slice(2_000_000, None))
 
 

@@ -17,6 +17,8 @@ from eitbench._files import replacing
 
 FORMAT = "eitbench measurements"
 VERSION = 1
+PARTS = frozenset({"currents", "injections", "matrix", "readings", "times"})
+"""Data sets of a file; a reference may come to them."""
 IN_MEMORY = 1 << 26
 """bytes of readings"""
 BLOCK = 1 << 20
@@ -187,17 +189,20 @@ class Measurements:
         """
         with needed_by("a file of measurements"):
             import h5py
+        path = Path(path)
         try:
             with h5py.File(path, "r") as file:
                 if file.attrs.get("format") != FORMAT or file.attrs.get("version") != VERSION:
                     raise ValueError(f"format must be {FORMAT!r}, version {VERSION}, got "
                                      f"{file.attrs.get('format')!r}, version "
                                      f"{file.attrs.get('version')!r}")
-                along = {name: _mapped(Path(path), file[name], steps)
+                if missing := PARTS - set(file):
+                    raise ValueError(f"there is no {', '.join(sorted(missing))} in it")
+                along = {name: _mapped(path, file[name], steps)
                          for name in ("injections", "times", "readings")}
                 if not along["injections"].size:
-                    raise ValueError("steps must hold readings of the "
-                                     f"{len(file['injections'])}, got {steps}")
+                    raise ValueError("steps must hold some of its "
+                                     f"{len(file['injections'])} readings, got {steps}")
                 whole = {name: file[name][()] for name in ("currents", "matrix")}
                 reference = file["reference"][()] if "reference" in file else None
                 source = json.loads(file.attrs["source"])

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from eitbench.physics.cem import CompleteElectrodeModel
 
 DIRECTIONS = ("counter-clockwise", "clockwise")
+COVER = 0.95
+"""Most of a wall that electrodes cover."""
 
 
 @dataclass(frozen=True)
@@ -231,6 +233,6 @@ def _cover(said: Mapping[str, Any], width: str, count: int, wall: float) -> floa
         raise ValueError(f"vessel must have either {width} or cover, got "
                          f"{'both' if width in said else 'neither'}")
     if "cover" in said:
-        return float(said["cover"])
-    return count * _check.number(f"vessel.{width}", said[width], low=0.0, open_low=True,
-                                 units="m") / wall
+        return _check.number("vessel.cover", said["cover"], low=0.0, high=COVER, open_low=True)
+    return count / wall * _check.number(f"vessel.{width}", said[width], low=0.0,
+                                        high=COVER * wall / count, open_low=True, units="m")
