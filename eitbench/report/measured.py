@@ -36,6 +36,9 @@ FRAMES = 60
 COLOURS = ("#0b6e75", "#d1495b", "#b8860b", "#7a5195", "#5b6770")
 CORRECTED = {"offset": "What is left is taken off all readings.",
              "gain": "Each reading is divided by the factor that it is off by."}
+LEAST = 1e-2
+"""Misses and NIS are drawn from here on; in the frame that is homogeneous by definition there are
+none."""
 DECADES = 5.0
 """From this ratio of the largest to the smallest estimate on, colours are logarithmic."""
 SHARE = (0.005, 0.995)
@@ -202,6 +205,7 @@ def _over_time(env: MeasuredEnv, played: Sequence[Played]) -> Figure:
     for ax, title in ((missed, "withheld readings missed by / noise std"), (nis, "NIS/m")):
         ax.axhline(1.0, color="0.7", linewidth=1)
         ax.set(xlabel="time / s", ylabel=title, yscale="log")
+        ax.set_ylim(bottom=max(ax.get_ylim()[0], LEAST))
         _bare(ax)
     missed.legend(frameon=False, fontsize=9)
     return figure

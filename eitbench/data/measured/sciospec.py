@@ -60,10 +60,12 @@ def read(path: Path | str, reference_frames: int = 0) -> Measurements:
     lasts = float(np.median(np.diff(begins))) if len(frames) > 1 else 1.0
     times = begins[reference_frames:, None] - begins[0] + lasts / K * np.arange(K)
     digest = hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
+    # every record's folder is called setup; the one around it tells them apart
+    name = f"{path.resolve().parent.name}/{path.name}" if path.is_dir() else path.name
     return Measurements(
         currents, np.tile(np.arange(K), F), np.eye(L), readings[reference_frames:].reshape(-1, L),
         times.ravel(), readings[:reference_frames] if reference_frames else None,
-        {"file": path.name, "sha256": digest, "frames": F, "frequency": first.frequency,
+        {"file": name, "sha256": digest, "frames": F, "frequency": first.frequency,
          "assumed": "real parts, against the mean of all electrodes; amplitude in A"})
 
 
