@@ -22,6 +22,8 @@ from pathlib import Path
 import generated
 from check_site import problems
 
+from eitbench.worlds import entries
+
 ROOT = Path(__file__).resolve().parent.parent
 BUILD = ROOT / "build" / "docs"
 PAGES = BUILD / "pages"
@@ -36,6 +38,7 @@ ELSEWHERE = {
     "examples/bubble_tank": "worlds.md",
     "leaderboards/README.md": "leaderboards.md",
     "leaderboards/leaderboard.md": "boards-as-text.md",
+    "leaderboards/measured": "measured-data.md",
     "leaderboards/site": "boards",
     "studies/README.md": "studies.md",
 }
@@ -107,8 +110,13 @@ def staged_boards(source: Path) -> str:
 
 
 def with_environments(line: re.Match[str]) -> str:
-    """A line in which the ids of our environments, where they are no links, lead to their pages."""
-    return re.sub(r"(?<!\[)`(eitbench/(\w+-v\d+))`", r"[`\1`](environments/\2.md)", line[1])
+    """A line in which the ids of our environments, where they are no links, lead to their pages;
+    that of measured records has none."""
+    def linked(match: re.Match[str]) -> str:
+        known = match[1] in entries()
+        return f"[{match[0]}](environments/{match[2]}.md)" if known else match[0]
+
+    return re.sub(r"(?<!\[)`(eitbench/(\w+-v\d+))`", linked, line[1])
 
 
 def write(name: str, content: str | bytes) -> None:

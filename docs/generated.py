@@ -69,8 +69,11 @@ def environments() -> Files:
         parts.append(f'```python\nenv = gym.make("{id}")\n```')
         parts.append(linked(eitbench.page(id)))
         board = [row for row in rows if row["environment"] == slug]
-        parts.append(f"## Scores\n\n{table(board, 'method')}\n\n[The whole board, with intervals "
-                     f"and pictures](../boards/environments/{slug}.html)")
+        if board:
+            parts.append(f"## Scores\n\n{table(board, 'method')}\n\n[The whole board, with "
+                         f"intervals and pictures](../boards/environments/{slug}.html)")
+        else:
+            parts.append("## Scores\n\nNobody has official records here yet.")
         files[f"environments/{name}.md"] = "\n\n".join(parts) + "\n"
     return files
 
