@@ -178,6 +178,13 @@ def test_torch_loads_batches(tiny):
         np.testing.assert_allclose(batch[name].numpy(), expected, rtol=1e-6)
 
 
+def test_torch_in_few_coordinates(tiny):
+    reduced = tiny.reduced(tiny.modes(2))
+    (item, _) = reduced.torch()
+    np.testing.assert_array_equal(item["truth"], reduced[0].truth.astype(np.float32))
+    assert item["truth"].shape == (5, 2)
+
+
 def test_without_torch_it_says_what_to_install(tiny, monkeypatch):
     monkeypatch.setitem(sys.modules, "torch", None)
     monkeypatch.delitem(sys.modules, "eitbench.data.learning.torch_dataset", raising=False)

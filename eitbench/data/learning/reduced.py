@@ -28,7 +28,7 @@ NULL = 1e-12
 """Directions whose share of the strongest one's square is smaller are none."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ReducedDataset:
     """Examples whose ``truth`` is (T, q): the coordinates a_t, in parts of the basis. Their
     ``unresolved`` is ∫(c̄ + B a_t − c_t)². `Dataset.reduced` makes it.
