@@ -32,7 +32,7 @@ COMMANDS = [
     (("leaderboard", "--records", "mine/results"), "wrote mine/site/index.html"),
     (("check", "mine", "--against", "mine"), "Nothing speaks against it"),
     (("verify", RECORD, "--episodes", "1"), "what was played again is as it says"),
-    (("verify", "--all", *TANK, "--episodes", "1", "-j", "1"), "StationaryTank2D"),
+    (("verify", "--all", "--records", "two", "--episodes", "1", "-j", "1"), "StationaryTank2D"),
     (("compare", "kalman_filter", "extended_kalman_filter"), "extended_kalman_filter"),
     (("compare", RECORD, RECORD.replace("homogeneous", "kalman_filter")), "kalman_filter"),
     (("render", *TANK, "--baseline", "homogeneous", "--step", "3", "-o", "it.png"), "wrote it.png"),
@@ -56,6 +56,9 @@ def empty(installed):
     folder = installed.folder / "empty"
     folder.mkdir()
     (folder / "tiny.yml").write_text(TINY)
+    (folder / "two").mkdir()
+    for record in (RECORD, RECORD.replace("homogeneous", "kalman_filter")):
+        shutil.copy(ROOT / record, folder / "two")
     return folder
 
 

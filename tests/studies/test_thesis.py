@@ -171,6 +171,7 @@ def test_three_dimensions(whose):
     assert error(f"{whose}Pipe3DSmoothing", "fixed_interval_smoother") < 0.8 * filtered
 
 
+@pytest.mark.slow
 def test_ball_is_followed_from_one_pair_of_electrodes():
     """Thesis 7.1: the filter is off by less than a ball's radius, a stationary image of one
     injection by far more."""
