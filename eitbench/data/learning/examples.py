@@ -141,8 +141,8 @@ class Dataset:
         mean : float or (n,) array, mol/m³
             Default: the world's background.
         """
-        from eitbench.data.learning.reduced import reduced
-        return reduced(self, basis, mean)
+        from eitbench.data.learning.reduced import ReducedDataset
+        return ReducedDataset(self, basis, self.world.background if mean is None else mean)
 
     def torch(self) -> TorchDataset:
         """The same as a dataset for torch. ``ModuleNotFoundError`` if torch is not installed."""

@@ -31,7 +31,7 @@ NULL = 1e-12
 @dataclass(frozen=True, eq=False)
 class ReducedDataset:
     """Examples whose ``truth`` is (T, q): the coordinates a_t, in parts of the basis. Their
-    ``unresolved`` is ∫(c̄ + B a_t − c_t)². `Dataset.reduced` makes it.
+    ``unresolved`` is ∫(c̄ + B a_t − c_t)². `Dataset.reduced` makes it, and says what is refused.
     """
 
     examples: Dataset
@@ -39,6 +39,19 @@ class ReducedDataset:
     """(n, q) B in mol/m³"""
     mean: float | np.ndarray
     """c̄ in mol/m³, one or (n,)"""
+
+    def __post_init__(self) -> None:
+        n = self.examples.mesh.n_nodes
+        basis = _check.array("basis", self.basis, (n, None), units="mol/m³")
+        object.__setattr__(self, "basis", basis)
+        if np.ndim(self.mean):
+            _check.array("mean", self.mean, (n,), units="mol/m³")
+        else:
+            _check.number("mean", self.mean, units="mol/m³")
+        squares = np.linalg.eigvalsh(self.mass)
+        if not squares[0] > NULL * squares[-1]:
+            raise ValueError("basis must have independent columns over what is scored; some of "
+                             f"these {len(squares)} depend on others")
 
     def __len__(self) -> int:
         return len(self.examples)
@@ -87,25 +100,6 @@ class ReducedDataset:
     def _weighted(self) -> np.ndarray:
         weighted: np.ndarray = self.examples.mass @ self.basis
         return weighted
-
-
-def reduced(examples: Dataset, basis: np.ndarray,
-            mean: float | np.ndarray | None) -> ReducedDataset:
-    """As `Dataset.reduced`."""
-    n = examples.mesh.n_nodes
-    basis = _check.array("basis", basis, (n, None), units="mol/m³")
-    if mean is None:
-        mean = examples.world.background
-    elif np.ndim(mean):
-        mean = _check.array("mean", mean, (n,), units="mol/m³")
-    else:
-        mean = _check.number("mean", mean, units="mol/m³")
-    found = ReducedDataset(examples, basis, mean)
-    squares = np.linalg.eigvalsh(found.mass)
-    if not squares[0] > NULL * squares[-1]:
-        raise ValueError("basis must have independent columns over what is scored; some of these "
-                         f"{len(squares)} depend on others")
-    return found
 
 
 def strongest(examples: Dataset, q: int) -> tuple[np.ndarray, np.ndarray]:

@@ -17,7 +17,7 @@ from eitbench._files import replacing
 
 FORMAT = "eitbench measurements"
 VERSION = 1
-PARTS = frozenset({"currents", "injections", "matrix", "readings", "times"})
+PARTS = ("currents", "injections", "matrix", "readings", "times")
 """Data sets of a file; a reference may come to them."""
 IN_MEMORY = 1 << 26
 """bytes of readings"""
@@ -173,7 +173,7 @@ class Measurements:
             file.attrs["format"] = FORMAT
             file.attrs["version"] = VERSION
             file.attrs["source"] = json.dumps(dict(self.source))
-            for name in ("currents", "injections", "matrix", "readings", "times", "reference"):
+            for name in (*PARTS, "reference"):
                 value = getattr(self, name)
                 if value is not None:
                     file.create_dataset(name, data=value)
@@ -196,8 +196,8 @@ class Measurements:
                     raise ValueError(f"format must be {FORMAT!r}, version {VERSION}, got "
                                      f"{file.attrs.get('format')!r}, version "
                                      f"{file.attrs.get('version')!r}")
-                if missing := PARTS - set(file):
-                    raise ValueError(f"there is no {', '.join(sorted(missing))} in it")
+                if missing := [name for name in PARTS if name not in file]:
+                    raise ValueError(f"there is no {', '.join(missing)} in it")
                 along = {name: _mapped(path, file[name], steps)
                          for name in ("injections", "times", "readings")}
                 if not along["injections"].size:
