@@ -133,7 +133,7 @@ def read_vessel(source: Path | str | Mapping[str, Any]) -> RealVessel:
     - circle: ``radius``, ``electrodes`` (how many), ``width`` of one or ``cover`` (their part of
       the wall), [``first``, ``direction``, ``depth``]
     - rectangle, a pipe with electrodes on both walls along the flow: ``length``, ``width``,
-      ``electrodes`` (how many in all), ``electrode_width`` or ``cover``, [``depth``]
+      ``electrodes`` (how many in all), ``electrode_width`` or ``cover``, [``depth``, ``flow``]
     - cylinder, a pipe with rings of electrodes: ``length``, ``radius``, ``rings``, ``electrodes``
       (how many a ring), ``height`` of one, ``cover``, [``first``, ``direction``, ``flow``]
     - mesh: ``file``, ``electrodes`` (how many), [``scale``, ``depth``]; see `MeshVessel`, and
