@@ -8,6 +8,7 @@ docs/learned_surrogate.png; what was looked at is kept in results/learned, and t
 goes on from there.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from itertools import product
@@ -37,8 +38,10 @@ from networks import Correction
 from tqdm import tqdm
 
 import eitbench
+from eitbench.bench.statistics import paired_difference
 from eitbench.data import store
 from eitbench.data.learning.examples import Dataset, Example
+from eitbench.data.seeds import parse_seeds
 from eitbench.estimation import (
     FirstFrame,
     InflowBatch,
@@ -60,6 +63,7 @@ EPISODES = (100, 300, 1000, 3000)
 STEPS = 1500
 """of the optimiser, in one curve; the other is of 24 epochs"""
 PLACE = KEPT / "surrogate"
+DEV = "dev:0-31"
 TRUE = {100: 0.0024, 300: 0.0022, 1000: 0.0020}
 """What `learn.py biased` gives from true episodes after 24 epochs."""
 
@@ -129,7 +133,7 @@ def looked_at(examples: Dataset, basis: np.ndarray) -> Tensors:
 
 def true_dev(basis: np.ndarray) -> Tensors:
     """Features of true episodes as the method sees them, dev:0-31."""
-    examples = eitbench.dataset(LESSON.env, "dev:0-31")
+    examples = eitbench.dataset(LESSON.env, DEV)
     parts = [store.kept(PLACE / f"dev-{example.seed}.npz", FEATURES,
                         lambda: {name: features(examples, example, basis)[name]  # noqa: B023
                                  for name in FEATURES}, str(example.seed))
@@ -157,6 +161,7 @@ def main(episodes: Annotated[int, typer.Option(help="Most to learn from.")] = ma
                        lambda: modes(first, LESSON.modes))["basis"]
     data = looked_at(examples, basis)
     dev = true_dev(basis)
+    dev_seeds = parse_seeds(DEV)
     judge = Judge(examples.world.warm_up)
     print(f"without the network {float(filters_errors(dev)[:, judge.warm_up:].mean()):.5f}")
     sizes = [many for many in EPISODES if many <= episodes]
@@ -173,7 +178,21 @@ def main(episodes: Annotated[int, typer.Option(help="Most to learn from.")] = ma
         scores[k, i, seed] = kept["errors"].mean()
         print(f"{epochs:3} epochs of {many:4} episodes, training {seed}: "
               f"{scores[k, i, seed]:.6f}", flush=True)
+        if k == 0:
+            compare(dev_seeds, kept["errors"])
     draw(sizes, scores)
+
+
+def compare(seeds: Sequence[int], errors: np.ndarray) -> None:
+    """With the shipped network, which has learned from 1000 true episodes."""
+    def play() -> dict[str, np.ndarray]:
+        played = eitbench.evaluate("learned_correction", LESSON.env, seeds)
+        return {"errors": played["error"].to_numpy()}
+
+    theirs = store.kept(PLACE / "shipped.npz", ("errors",), play)["errors"]
+    ours, shipped = ({LESSON.env: dict(zip(seeds, each, strict=True))} for each in (errors, theirs))
+    value, low, high = paired_difference(ours, shipped)
+    print(f"    beside the shipped network {value:+.6f} [{low:+.6f}, {high:+.6f}]", flush=True)
 
 
 def draw(episodes: list[int], scores: np.ndarray) -> None:
