@@ -1,4 +1,4 @@
-"""The commands `cards`, `kits`, `migrate` and `held-out`, for maintainers."""
+"""The commands `cards`, `migrate` and `held-out`, for maintainers."""
 
 from __future__ import annotations
 
@@ -41,26 +41,6 @@ def cards(
     if anything_moved:
         options.say("numbers have moved: find out why; or give the world the next -vN, or write a "
                     "method's new version with --new-version and play its records again", err=True)
-        raise typer.Exit(1)
-
-
-def kits(
-    names: Annotated[list[str] | None, typer.Argument(
-        help="Ids of worlds of ours. Default: all.")] = None,
-) -> None:
-    """For maintainers: make what is shipped for playing our worlds (eitbench/data/kits) anew, and
-    say whether it is still the same: exit status 0 if so, 1 if not. Missing kits are written; five
-    minutes for all."""
-    from eitbench.bench import kits as shipped
-    from eitbench.bench.tracks import own_ids
-    moved = False
-    with options.clear_errors():
-        for name, what in shipped.update(names or own_ids()):
-            moved |= what not in ("new", "same")
-            options.say(f"{name}: {what}")
-    if moved:
-        options.say("kits have moved: find out why; delete them and run this again, or give the "
-                    "world the next -vN", err=True)
         raise typer.Exit(1)
 
 
