@@ -22,8 +22,7 @@ from threadpoolctl import threadpool_limits
 from eitbench._code import code_digest, package_files
 from eitbench._files import PACKAGE, write_atomically
 from eitbench._foreign import cleaned
-from eitbench.bench.contradictions import split_of
-from eitbench.bench.records import SCHEMA, SHARED, read_records, sealed, write_record
+from eitbench.bench.records import SCHEMA, SHARED, read_records, sealed, split_of, write_record
 from eitbench.bench.strict_json import parsed
 from eitbench.data.seeds import name_seed
 

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from eitbench.bench import suites, tracks
-from eitbench.bench.contradictions import split_of
-from eitbench.bench.records import read_record, write_record
+from eitbench.bench.records import read_record, split_of, write_record
 from eitbench.bench.run import Job, run_jobs, unplayed
 from eitbench.bench.store import EpisodeStore, provenance, results_of
 from eitbench.bench.text import seed_ranges
@@ -84,12 +83,8 @@ def submit(method: str | None, environments: list[str], seeds: list[int] | None,
         for record, there in made:
             for path, earlier in there:
                 _check_nothing_is_lost(path, earlier, official, record["seeds"])
-        for record, there in made:
-            written = write_record(to, record)
-            for path, _ in there:
-                if path != written:                        # of an older format, under another name
-                    path.unlink()
-            yield written
+        for record, _ in made:
+            yield write_record(to, record)
 
 
 def _jobs(method: str | None, id: str, policy: bool, seeds: list[int] | None,

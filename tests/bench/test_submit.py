@@ -1,12 +1,11 @@
 """Submitting: test episodes are played, and their records written, failures and all; `eitbench` does it by command."""
 
-import json
 import re
 
 import pytest
 from eitbench.bench import load, methods, run, suites
 from eitbench.bench import store as store_module
-from eitbench.bench.records import newest, read_record, read_records, sealed, write_record
+from eitbench.bench.records import newest, read_record, read_records, write_record
 from eitbench.bench.store import EpisodeStore, provenance
 from eitbench.bench.submit import submit
 from eitbench.data import bank
@@ -191,22 +190,6 @@ def test_a_record_of_other_code_is_extended(tmp_path, monkeypatch):
     assert [path.name for path in (tmp_path / "b").glob("episodes/*/*/*.json")] == ["test-1.json"]
 
 
-def test_a_record_of_the_format_before_is_extended(tmp_path):
-    """And replaced by one of today, under its new name, once that is written."""
-    (path,) = submit("homogeneous", [FILTER.id], TEST[:1], EpisodeStore(tmp_path / "a"), tmp_path / "to", official=True)
-    first = read_record(path)
-    kept = {key: value for key, value in first.items() if key not in ("version", "sha256")}
-    runs = [{key: value for key, value in run.items() if key != "source"} for run in first["runs"]]
-    before = sealed(kept | {"schema": 2, "source": first["runs"][0]["source"], "runs": runs})
-    path.unlink()
-    older = path.with_name(path.name.replace("v1", first["method_sha256"][:8]))
-    older.write_text(json.dumps(before))
-    assert list(submit("homogeneous", [FILTER.id], TEST, EpisodeStore(tmp_path / "b"), tmp_path / "to",
-                       official=True)) == [path]
-    assert not older.exists() and read_record(path)["episodes"][0] == first["episodes"][0]
-    assert read_record(path)["seeds"] == ["test:0", "test:1"]
-
-
 @pytest.mark.parametrize("official", [False, True])
 def test_a_record_is_extended(official, tmp_path):
     """By what another folder's run plays beside it: what is in the record is neither played again nor lost."""
@@ -288,7 +271,7 @@ def test_from_a_file_to_the_boards_by_command(tmp_path):
     assert eitbench("submit", "--policy", "random_pair", "--env", INJECTION, "--seeds", "test:0", "-j", "1")[0] == 0
     code, said, _ = eitbench("leaderboard", "--records", "leaderboards/results")
     assert said.splitlines() == [f"wrote leaderboards/{name}" for name in (
-        "leaderboard.csv", "leaderboard.md", "site/index.html")]
+        "leaderboard.csv", "leaderboard.md", "site/index.html", "episodes.csv.gz")]
     assert "Mine" in (tmp_path / "leaderboards" / "site" / "methods" / "mine.html").read_text(encoding="utf-8")
     text = (tmp_path / "leaderboards" / "leaderboard.md").read_text(encoding="utf-8")
     assert re.search(r"\| +1 +\| Mine mine@\w{8} +\|.*\| self-reported \|", text)
