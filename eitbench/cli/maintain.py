@@ -1,4 +1,4 @@
-"""The commands `golden`, `kits`, `migrate` and `held-out`, for maintainers."""
+"""The commands `golden`, `kits` and `held-out`, for maintainers."""
 
 from __future__ import annotations
 
@@ -61,18 +61,6 @@ def kits(
         options.say("kits have moved: find out why; delete them and run this again, or give the "
                     "world the next -vN", err=True)
         raise typer.Exit(1)
-
-
-def migrate(
-    folder: Annotated[Path, typer.Argument(
-        exists=True, file_okay=False, help="Folder of records.")],
-) -> None:
-    """For maintainers: rewrite records of an older format in that of today; no episode, score or
-    run is lost."""
-    from eitbench.bench.migrate import migrate as rewritten
-    with options.clear_errors():
-        for old, new in rewritten(folder):
-            options.say(f"{old.name} -> {new.name}")
 
 
 def held_out(
