@@ -21,6 +21,7 @@ PLACES = {
     "bench/test_checkpoints.py": "study",      # plays every trained agent
     "bench/test_replay.py": "study",           # plays records again
     "bench/test_verify.py": "study",           # plays records again, and false ones
+    "test_docs.py::test_documentation_builds": "study",
     "report/test_boards.py::test_published_files_are_rendered_from_the_records": "study",
     "report/test_site.py::test_the_published_site_is_rendered_from_the_records": "study",
     "report/test_site_browser.py": "browser",

@@ -1,6 +1,4 @@
-"""The command line: `eitbench list | run | bank | export | train | policies | submit | verify |
-check | season | held-out | migrate | golden | fit-prior | fit-model | estimate |
-submit-measured | leaderboard | compare | render | reproduce`."""
+"""The command line of eitbench."""
 
 from __future__ import annotations
 
@@ -15,7 +13,7 @@ from eitbench import __version__
 from eitbench.cli import options
 from eitbench.cli.estimate import estimate
 from eitbench.cli.export import export
-from eitbench.cli.maintain import golden, held_out, migrate
+from eitbench.cli.maintain import golden, held_out
 from eitbench.cli.measured import submit_measured
 from eitbench.cli.play import policies, report, run, typed
 from eitbench.cli.priors import fit_model, fit_prior
@@ -199,7 +197,6 @@ app.command()(verify)
 app.command()(check)
 app.add_typer(season_commands, name="season")
 app.command("held-out")(held_out)
-app.command()(migrate)
 app.command()(golden)
 app.command("fit-prior")(fit_prior)
 app.command("fit-model")(fit_model)
@@ -213,7 +210,8 @@ def leaderboard(
     out: options.Out = Path("results"),
     records: Annotated[Path | None, typer.Option(
         help="Folder of the leaderboards' records, such as leaderboards/results: render "
-             "leaderboard.csv, leaderboard.md and the pages site/ beside it instead.")] = None,
+             "leaderboard.csv, leaderboard.md, episodes.csv.gz and the pages site/ beside it "
+             "instead.")] = None,
     season: Annotated[int | None, typer.Option(
         min=1, help="With --records: the boards of an earlier season, in a folder season-N/ beside "
                     "them. Default: the current one.")] = None,
@@ -227,6 +225,7 @@ def leaderboard(
         with options.clear_errors():
             return report(out)
     from eitbench._files import write_atomically
+    from eitbench.bench.records import write_episode_table_of
     from eitbench.data.seasons import season_numbered
     from eitbench.report.boards import boards, read_for_boards
     from eitbench.report.site import Beside, Measured, render, render_site, write_site
@@ -243,6 +242,8 @@ def leaderboard(
         write_atomically(out / name, text.encode())
         options.say(f"wrote {out / name}")
     options.say(f"wrote {out / 'site' / 'index.html'}")
+    if season is None:
+        options.say(f"wrote {write_episode_table_of(records)}")
     for complaint in complaints:
         options.say(f"left out: {complaint}", err=True)
     raise typer.Exit(bool(complaints))

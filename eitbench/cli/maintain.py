@@ -1,4 +1,4 @@
-"""The commands `golden`, `migrate` and `held-out`, for maintainers."""
+"""The commands `golden` and `held-out`, for maintainers."""
 
 from __future__ import annotations
 
@@ -41,18 +41,6 @@ def golden(
                     "the method's next version with --new-version and run its records again",
                     err=True)
         raise typer.Exit(1)
-
-
-def migrate(
-    folder: Annotated[Path, typer.Argument(
-        exists=True, file_okay=False, help="Folder of records.")],
-) -> None:
-    """For maintainers: rewrite records of an older format in that of today; no episode, score or
-    run is lost."""
-    from eitbench.bench.migrate import migrate as rewritten
-    with options.clear_errors():
-        for old, new in rewritten(folder):
-            options.say(f"{old.name} -> {new.name}")
 
 
 def held_out(
