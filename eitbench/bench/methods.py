@@ -201,7 +201,7 @@ def card_name(path: Path) -> str:
 @lru_cache(maxsize=256)
 def card_version(name: str) -> int:
     """The number of the version that a card describes; 1 where there is no card."""
-    path = baseline_folder() / "cards" / f"{name}.json"
+    path = baseline_folder() / "golden" / f"{name}.json"
     if not path.is_file():
         return 1
     return int(json.loads(path.read_text(encoding="utf-8"))["version"])

@@ -1,5 +1,5 @@
 """The command line: `eitbench list | run | bank | export | train | policies | submit | verify |
-check | season | held-out | cards | kits | fit-prior | fit-model | estimate |
+check | season | held-out | golden | kits | fit-prior | fit-model | estimate |
 submit-measured | leaderboard | compare | render | reproduce`."""
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from eitbench import __version__
 from eitbench.cli import options
 from eitbench.cli.estimate import estimate
 from eitbench.cli.export import export
-from eitbench.cli.maintain import cards, held_out, kits
+from eitbench.cli.maintain import golden, held_out, kits
 from eitbench.cli.measured import submit_measured
 from eitbench.cli.play import policies, report, run, typed
 from eitbench.cli.priors import fit_model, fit_prior
@@ -199,7 +199,7 @@ app.command()(verify)
 app.command()(check)
 app.add_typer(season_commands, name="season")
 app.command("held-out")(held_out)
-app.command()(cards)
+app.command()(golden)
 app.command()(kits)
 app.command("fit-prior")(fit_prior)
 app.command("fit-model")(fit_model)
