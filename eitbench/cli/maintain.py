@@ -1,4 +1,4 @@
-"""The commands `golden`, `kits` and `held-out`, for maintainers."""
+"""The commands `golden` and `held-out`, for maintainers."""
 
 from __future__ import annotations
 
@@ -40,26 +40,6 @@ def golden(
         options.say("numbers have moved: find the cause; or give the world the next -vN, or write "
                     "the method's next version with --new-version and run its records again",
                     err=True)
-        raise typer.Exit(1)
-
-
-def kits(
-    names: Annotated[list[str] | None, typer.Argument(
-        help="Ids of worlds of ours. Default: all.")] = None,
-) -> None:
-    """For maintainers: make what is shipped for playing our worlds (eitbench/data/kits) anew, and
-    say whether it is still the same: exit status 0 if so, 1 if not. Missing kits are written; five
-    minutes for all."""
-    from eitbench.bench import kits as shipped
-    from eitbench.bench.tracks import own_ids
-    moved = False
-    with options.clear_errors():
-        for name, what in shipped.update(names or own_ids()):
-            moved |= what not in ("new", "same")
-            options.say(f"{name}: {what}")
-    if moved:
-        options.say("kits have moved: find out why; delete them and run this again, or give the "
-                    "world the next -vN", err=True)
         raise typer.Exit(1)
 
 

@@ -10,7 +10,7 @@ from eitbench.bench.store import EpisodeStore, provenance
 from eitbench.bench.submit import submit
 from eitbench.data import bank
 from eitbench.data.seeds import parse_seeds
-from eitbench.data.store import CACHE_VARIABLE
+from eitbench.data.cache import CACHE_VARIABLE
 
 from commands import eitbench
 from short import PIPE, shorten
