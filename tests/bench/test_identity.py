@@ -11,7 +11,7 @@ from eitbench.bench import methods, run, tracks
 from eitbench.bench.run import Job, run_jobs
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.tracks import Environment
-from eitbench.data.store import CACHE_VARIABLE
+from eitbench.data.cache import CACHE_VARIABLE
 from eitbench.worlds import entry, register, registry
 
 from short import register_apart
