@@ -56,7 +56,7 @@ def run_cache(pytestconfig, tmp_path_factory):
     kept = getattr(pytestconfig, "cache", None)
     if not kept:
         return str(tmp_path_factory.mktemp("episodes"))
-    import eitbench                                  # not before BLAS has been told how many threads
+    import eitbench  # not before BLAS has been told how many threads
     code = hashlib.sha256()
     for package in ("numerics", "physics", "worlds", "data"):
         for file in sorted(Path(eitbench.__file__).parent.joinpath(package).glob("*.py")):

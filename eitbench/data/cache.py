@@ -29,7 +29,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from eitbench._files import PACKAGE, write_atomically
-from eitbench.worlds.parts import LATER
+from eitbench.worlds.fields import LATER
 from eitbench.worlds.world import World
 
 CACHE_VARIABLE = "EITBENCH_CACHE"

@@ -10,7 +10,7 @@ from eitbench.data import cache
 from eitbench.data.bank import TOGETHER, fill_here
 from eitbench.data.recordings import is_recorded
 from eitbench.data.regions import outline
-from eitbench.worlds.parts import Flow
+from eitbench.worlds.world import Flow
 
 if TYPE_CHECKING:
     import numpy as np

@@ -28,7 +28,7 @@ from eitbench.bench.store import EpisodeStore
 from eitbench.bench.tracks import Environment
 from eitbench.worlds import register
 from eitbench.worlds.flows import LaminarFlow
-from eitbench.worlds.pipe2d import PIPE_2D
+from eitbench.worlds.catalogue import PIPE_2D
 
 
 @dataclass(frozen=True)
