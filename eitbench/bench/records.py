@@ -126,6 +126,8 @@ def read_sound_files(folder: Path, *, keep: Callable[[dict[str, Any]], Any] = di
     complaints = []
     known = set(tracks.ids())
     for path in sorted(Path(folder).glob("*.json")):
+        if path.name.startswith(tracks.MEASURED_FILES):         # see `read_measured_files`
+            continue
         try:
             record = read_record(path)
         except ValueError as error:
@@ -141,6 +143,21 @@ def read_sound_files(folder: Path, *, keep: Callable[[dict[str, Any]], Any] = di
     clashing = _clashing(standing)
     complaints += [f"record {cleaned(str(path))} {what}" for path, what in clashing.items()]
     return {path: each for path, each in kept.items() if path not in clashing}, complaints
+
+
+def read_measured_files(folder: Path) -> tuple[dict[Path, dict[str, Any]], list[str]]:
+    """Valid records of measured cases in a folder by path, and a sentence for each invalid one."""
+    found, errors = {}, []
+    for path in sorted(Path(folder).glob(f"{tracks.MEASURED_FILES}*.json")):
+        try:
+            record = read_record(path)
+            if not tracks.is_measured(record["environment"]["id"]):
+                raise ValueError(f"record {cleaned(str(path))} refers to an unknown case")
+        except ValueError as error:
+            errors.append(str(error))
+        else:
+            found[path] = record
+    return found, errors
 
 
 class _Standing(NamedTuple):

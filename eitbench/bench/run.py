@@ -27,11 +27,12 @@ from eitbench.bench.sandbox.host import GuestError
 from eitbench.bench.sandbox.wall import landlock_version
 from eitbench.bench.scores import scored
 from eitbench.bench.store import EpisodeStore, machine, provenance, source_digest
-from eitbench.bench.tracks import Environment, board_of
+from eitbench.bench.tracks import Environment, board_of, is_measured, registered
 from eitbench.data.episodes import simulate
 from eitbench.data.parallel import in_parallel
 from eitbench.data.seeds import name_seed
 from eitbench.data.store import world_digest
+from eitbench.measured.cases import read_case
 from eitbench.worlds.registry import entry
 
 _LASTING = ("environment", "method", *SHARED)
@@ -67,12 +68,19 @@ class Job(NamedTuple):
         loaded. ``ValueError`` if there is no such method or environment."""
         path = find_method(self.method, self.environment.track)
         sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
-        asked = entry(self.environment.id)
-        world = asked.world.changed(json.loads(self.environment.kwargs).get("world"))
-        parts = [*self.environment, json.dumps(dict(asked.settings), sort_keys=True),
-                 world_digest(world), sha256, version_of(path, sha256), str(self.seed),
-                 source_digest(), np.__version__, scipy.__version__]
+        parts = [*self.environment, *_what_is_played(self.environment), sha256,
+                 version_of(path, sha256), str(self.seed), source_digest(), np.__version__,
+                 scipy.__version__]
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
+
+
+def _what_is_played(environment: Environment) -> list[str]:
+    """Settings and digest of an environment's world, or of its measured case."""
+    if is_measured(environment.id):
+        return [read_case(registered(environment.id)["case"]).digest]
+    asked = entry(environment.id)
+    world = asked.world.changed(json.loads(environment.kwargs).get("world"))
+    return [json.dumps(dict(asked.settings), sort_keys=True), world_digest(world)]
 
 
 def run_episode(job: Job) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -158,7 +166,7 @@ def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1, backend: 
     if not todo:
         return
     truths: dict[Any, Job] = {}  # each once, before several methods want it at once
-    for job in todo:
+    for job in (job for job in todo if not is_measured(job.environment.id)):
         truths.setdefault((environment(job.environment).world, job.seed), job)
     run = {"command": command, **provenance(), "machine": machine()}
     home = platform.node()

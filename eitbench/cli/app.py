@@ -1,6 +1,6 @@
 """The command line: `eitbench list | run | bank | export | train | policies | submit | verify |
 check | season | held-out | migrate | cards | kits | fit-prior | fit-model | estimate |
-submit-measured | leaderboard | compare | render | reproduce`."""
+leaderboard | compare | render | reproduce`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from eitbench.cli import options
 from eitbench.cli.estimate import estimate
 from eitbench.cli.export import export
 from eitbench.cli.maintain import cards, held_out, kits, migrate
-from eitbench.cli.measured import submit_measured
 from eitbench.cli.play import policies, report, run, typed
 from eitbench.cli.priors import fit_model, fit_prior
 from eitbench.cli.season import app as season_commands
@@ -205,7 +204,6 @@ app.command()(kits)
 app.command("fit-prior")(fit_prior)
 app.command("fit-model")(fit_model)
 app.command()(estimate)
-app.command("submit-measured")(submit_measured)
 app.command()(export)
 
 
