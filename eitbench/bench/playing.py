@@ -38,8 +38,8 @@ class Episode(NamedTuple):
     currents: np.ndarray
     """(steps, L) A (A/m in 2D), injected in each step"""
     fields: dict[str, np.ndarray]
-    """Means and standard deviations of an estimator's estimates as float32, for pictures; of a
-    policy none."""
+    """Means and standard deviations of an estimator's estimates as float32, for pictures; none of a
+    policy, or on measurements."""
 
 
 def environment(asked: Environment) -> Any:
@@ -74,12 +74,9 @@ def play(asked: Environment, method: Method, seed: int) -> Episode:
     if isinstance(env, InjectionEnv):
         return _injected(env, method, seed)
     if is_measured(asked.id):
-        run = run_on_measurements(env, method, seed)
-        fields = {"mean": run.mean.astype(np.float32)}
-        if run.variance is not None:
-            fields["std"] = np.sqrt(run.variance).astype(np.float32)
+        run = run_on_measurements(env, method, seed, kept={env.episode_steps})
         measurements = env.measurements
-        return Episode(run.outcome(env), measurements.currents[measurements.injections], fields)
+        return Episode(run.outcome(env), measurements.currents[measurements.injections], {})
     return estimated(env, method, seed)
 
 
