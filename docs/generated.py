@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parent.parent
 REFERENCE = {
     "eitbench": [f"eitbench.{name}" for name in (
         "evaluate", "Task", "Estimate", "make_task", "simulate", "Episode", "World", "Rules",
-        "register", "page", "report.plot", "data.learning.examples")],
+        "register", "page", "report.plot", "data.dataset")],
     "eitbench.envs": ["eitbench.envs.estimation.EstimationEnv",
                       "eitbench.envs.injection.InjectionEnv"],
     "eitbench.estimation": ["eitbench.estimation"],

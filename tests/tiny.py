@@ -5,8 +5,7 @@ import json
 from pathlib import Path
 
 from eitbench.bench import store
-from eitbench.bench.contradictions import split_of
-from eitbench.bench.records import SCHEMA, sealed
+from eitbench.bench.records import SCHEMA, sealed, split_of
 from eitbench.bench.sandbox import keeper
 from eitbench.bench.tracks import Environment
 

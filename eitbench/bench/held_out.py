@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from eitbench.bench.contradictions import version_number
 from eitbench.bench.methods import is_ours
+from eitbench.bench.records import version_number
 from eitbench.bench.run import Job, run_episode
 from eitbench.bench.statistics import FEWEST
 from eitbench.bench.table import Cell, Table

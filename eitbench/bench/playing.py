@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Collection, Iterator
 from functools import lru_cache
@@ -45,12 +46,15 @@ class Episode(NamedTuple):
 def environment(asked: Environment) -> Any:
     """Made once a process, so that its models, and what methods derive from them, are shared by all
     its episodes; errors as `Environment.make`."""
-    return _made(asked, None if is_measured(asked.id) else entry(asked.id).world)
+    if is_measured(asked.id):
+        return _made(asked, None, "")
+    registered = entry(asked.id)
+    return _made(asked, registered.world, json.dumps(dict(registered.settings)))
 
 
 @lru_cache(maxsize=4)
-def _made(asked: Environment, world: World | None) -> Any:
-    """Whose ``world`` is that of the id: another process may have told this one of another."""
+def _made(asked: Environment, world: World | None, settings: str) -> Any:
+    """Make it with the ``world`` and the ``settings`` of the id, which may be registered anew."""
     return asked.make()
 
 

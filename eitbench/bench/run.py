@@ -13,20 +13,19 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from eitbench._foreign import traceback_of, where_of
-from eitbench.bench.methods import Method, find_method, load_method, version_of
+from eitbench.bench.methods import Method, find_method, load_method, loader_of, version_of
 from eitbench.bench.playing import environment, play
 from eitbench.bench.prints import passed_on
 from eitbench.bench.records import SHARED
 from eitbench.bench.sandbox import guests
 from eitbench.bench.sandbox.host import GuestError
 from eitbench.bench.sandbox.wall import landlock_version
-from eitbench.bench.scores import scored
-from eitbench.bench.store import EpisodeStore, machine, provenance, source_digest
+from eitbench.bench.scores import SCORING, scored
+from eitbench.bench.store import EpisodeStore, machine, portable_command, provenance
 from eitbench.bench.tracks import Environment, board_of, is_measured, registered
 from eitbench.data.episodes import simulate
 from eitbench.data.parallel import in_parallel
@@ -64,23 +63,28 @@ class Job(NamedTuple):
         return "none" if not self.isolated else "landlock" if landlock_version() else "process"
 
     def identity(self) -> str:
-        """What the outcome depends on; a stored result counts only for the very same. Nothing is
-        loaded. ``ValueError`` if there is no such method or environment."""
+        """Return a digest of the configuration and declared versions that the outcome depends on; a
+        stored result counts only for the very same. The method is not loaded. ``ValueError`` if
+        there is no such method or environment."""
         path = find_method(self.method, self.environment.track)
-        sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
-        parts = [*self.environment, *_what_is_played(self.environment), sha256,
-                 version_of(path, sha256), str(self.seed), source_digest(), np.__version__,
-                 scipy.__version__]
-        return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
+        files = {each.name: hashlib.sha256(each.read_bytes()).hexdigest()
+                 for each in (path, path.with_name("config.json"))
+                 if each == path or (path.suffix != ".py" and each.is_file())}
+        arguments = self.environment.arguments
+        world = arguments.pop("world", None)
+        parts = {"environment": self.environment.id, "arguments": arguments,
+                 "world": _content_digest(self.environment.id, world), "files": files,
+                 "loader": loader_of(path),
+                 "version": version_of(path, files[path.name]), "seed": self.seed,
+                 "scoring": SCORING}
+        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def _what_is_played(environment: Environment) -> list[str]:
-    """Settings and digest of an environment's world, or of its measured case."""
-    if is_measured(environment.id):
-        return [read_case(registered(environment.id)["case"]).digest]
-    asked = entry(environment.id)
-    world = asked.world.changed(json.loads(environment.kwargs).get("world"))
-    return [json.dumps(dict(asked.settings), sort_keys=True), world_digest(world)]
+def _content_digest(id: str, changes: dict[str, Any] | None) -> str:
+    """Return the digest of an environment's world with ``changes``, or of its measured case."""
+    if is_measured(id):
+        return read_case(registered(id)["case"]).digest
+    return world_digest(entry(id).world.changed(changes))
 
 
 def run_episode(job: Job) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -156,8 +160,8 @@ def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1, backend: 
 
     Each process stores an episode the moment it is done. ``backend`` is one of
     `eitbench.data.parallel.BACKENDS`, of which those of a cluster need the folders of ``store`` and
-    cache on all its machines; ``command`` is what the results will name as the command that made
-    them. Errors as `eitbench.data.parallel.in_parallel`.
+    cache on all its machines; the results name ``command``, without folders, as the command that
+    made them. Errors as `eitbench.data.parallel.in_parallel`.
     """
     todo = [job for job in jobs
             if not store.holds(job.environment.name, job.load().name, job.seed, job.identity())]
@@ -168,7 +172,7 @@ def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1, backend: 
     truths: dict[Any, Job] = {}  # each once, before several methods want it at once
     for job in (job for job in todo if not is_measured(job.environment.id)):
         truths.setdefault((environment(job.environment).world, job.seed), job)
-    run = {"command": command, **provenance(), "machine": machine()}
+    run = {"command": portable_command(command), **provenance(), "machine": machine()}
     home = platform.node()
     guests.close()                                  # that of `Job.load`; the workers have their own
     try:

@@ -13,9 +13,8 @@ from typing import Any
 import numpy as np
 
 from eitbench import _check
-from eitbench.bench.contradictions import version_number
 from eitbench.bench.methods import find_method, installed_methods, is_ours, own_files, own_sha256
-from eitbench.bench.records import SHARED
+from eitbench.bench.records import SHARED, version_number
 from eitbench.bench.run import Job, run_episode
 from eitbench.bench.sandbox import guests
 from eitbench.bench.scores import scores

@@ -1,6 +1,4 @@
-"""The command line: `eitbench list | run | bank | export | train | policies | submit | verify |
-check | season | held-out | migrate | cards | kits | fit-prior | fit-model | estimate |
-leaderboard | compare | render | reproduce`."""
+"""The command line of eitbench."""
 
 from __future__ import annotations
 
@@ -15,7 +13,7 @@ from eitbench import __version__
 from eitbench.cli import options
 from eitbench.cli.estimate import estimate
 from eitbench.cli.export import export
-from eitbench.cli.maintain import cards, held_out, kits, migrate
+from eitbench.cli.maintain import golden, held_out
 from eitbench.cli.play import policies, report, run, typed
 from eitbench.cli.priors import fit_model, fit_prior
 from eitbench.cli.season import app as season_commands
@@ -54,7 +52,7 @@ def list_() -> None:
     """Show the environments, the baselines and policies, and which boards they play on."""
     from eitbench.bench.methods import load_method, own_methods
     from eitbench.bench.tracks import boards_of, ids
-    from eitbench.data.recordings import outline
+    from eitbench.data.regions import outline
     from eitbench.worlds.registry import entry
     from eitbench.worlds.task import lag_steps
     # Nothing is built: what takes long to make is shipped, the rest are numbers of the world.
@@ -101,8 +99,8 @@ def bank(
     import shutil
 
     from eitbench.data.bank import fill, missing_seeds, recording_bytes
+    from eitbench.data.cache import folder
     from eitbench.data.seeds import parse_seeds
-    from eitbench.data.store import folder
     from eitbench.worlds.registry import entry
     with options.clear_errors():
         numbers = parse_seeds(seeds)
@@ -198,9 +196,7 @@ app.command()(verify)
 app.command()(check)
 app.add_typer(season_commands, name="season")
 app.command("held-out")(held_out)
-app.command()(migrate)
-app.command()(cards)
-app.command()(kits)
+app.command()(golden)
 app.command("fit-prior")(fit_prior)
 app.command("fit-model")(fit_model)
 app.command()(estimate)
@@ -212,7 +208,8 @@ def leaderboard(
     out: options.Out = Path("results"),
     records: Annotated[Path | None, typer.Option(
         help="Folder of the leaderboards' records, such as leaderboards/results: render "
-             "leaderboard.csv, leaderboard.md and the pages site/ beside it instead.")] = None,
+             "leaderboard.csv, leaderboard.md, episodes.csv.gz and the pages site/ beside it "
+             "instead.")] = None,
     season: Annotated[int | None, typer.Option(
         min=1, help="With --records: the boards of an earlier season, in a folder season-N/ beside "
                     "them. Default: the current one.")] = None,
@@ -226,6 +223,7 @@ def leaderboard(
         with options.clear_errors():
             return report(out)
     from eitbench._files import write_atomically
+    from eitbench.bench.records import write_episode_table_of
     from eitbench.data.seasons import season_numbered
     from eitbench.report.boards import boards, read_for_boards
     from eitbench.report.site import Beside, Measured, render, render_site, write_site
@@ -242,6 +240,8 @@ def leaderboard(
         write_atomically(out / name, text.encode())
         options.say(f"wrote {out / name}")
     options.say(f"wrote {out / 'site' / 'index.html'}")
+    if season is None:
+        options.say(f"wrote {write_episode_table_of(records)}")
     for complaint in complaints:
         options.say(f"left out: {complaint}", err=True)
     raise typer.Exit(bool(complaints))

@@ -6,9 +6,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from eitbench import _check
-from eitbench.data import store
+from eitbench.data import cache
 from eitbench.data.bank import TOGETHER, fill_here
-from eitbench.data.recordings import is_recorded, outline
+from eitbench.data.recordings import is_recorded
+from eitbench.data.regions import outline
 from eitbench.worlds.parts import Flow
 
 if TYPE_CHECKING:
@@ -84,7 +85,7 @@ class Pool:
             fill_here(world, range(many))
         except OSError as error:
             self._can_be_kept = False
-            store.warn_not_kept(store.folder(world), error)
+            cache.warn_not_kept(cache.folder(world), error)
 
 
 def _is_cheap(world: World) -> bool:

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from eitbench._check import nearest
-from eitbench.data.store import cache_folder
+from eitbench.data.cache import cache_folder
 from eitbench.measured.measurements import Measurements
 from eitbench.measured.readers import load_yaml, read
 from eitbench.measured.segmentation import read_truth

@@ -10,9 +10,8 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
-from eitbench.bench.contradictions import version_number
 from eitbench.bench.ranking import shared_ranks
-from eitbench.bench.records import file_name, finished, newest, read_sound_records
+from eitbench.bench.records import file_name, finished, newest, read_sound_records, version_number
 from eitbench.bench.statistics import (
     interquartile_mean,
     mean_over_environments,

@@ -13,9 +13,8 @@ from tqdm import tqdm
 
 from eitbench._foreign import as_markdown
 from eitbench.bench import held_out
-from eitbench.bench.contradictions import version_number
 from eitbench.bench.podium import file_of
-from eitbench.bench.records import read_record
+from eitbench.bench.records import read_record, version_number
 from eitbench.bench.sandbox.host import GuestError
 from eitbench.bench.tracks import ids, is_measured, measured_ids
 from eitbench.bench.verify import empty_cache, job_of, verify

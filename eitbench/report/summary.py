@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from eitbench.bench.contradictions import version_number
-from eitbench.bench.records import BOARDS, finished
+from eitbench.bench.records import BOARDS, finished, version_number
 from eitbench.bench.scores import scores
 from eitbench.bench.table import NOTHING, Cell, Table
 from eitbench.bench.text import mean_and_interval, number, rounded, scores_by_seed, seed_ranges

@@ -9,7 +9,7 @@ from typing import Any
 import pandas as pd
 
 from eitbench._files import shipped
-from eitbench.bench.records import read_record
+from eitbench.bench.episode_table import read_episode_table, table_beside
 from eitbench.bench.run import Job
 from eitbench.bench.table import Cell, Table
 from eitbench.bench.tracks import ids
@@ -57,9 +57,9 @@ def shipped_anchors(records: Iterable[dict[str, Any]]) -> Anchors:
     package."""
     kinds = {kind_of(record["environment"]["id"]) for record in records}
     known = [id.replace("/", "-") for id in ids("estimation") if kind_of(id) in kinds]
-    folder = shipped("leaderboards") / "results"
-    return anchors([read_record(path) for name in known for method in ANCHORS
-                    for path in folder.glob(f"{name}--{method}--*.json")])
+    published = read_episode_table(table_beside(shipped("leaderboards") / "results"))
+    return anchors([record for record in published if record["method"] in ANCHORS
+                    and record["environment"]["name"] in known])
 
 
 def tables(records: list[dict[str, Any]], known: Anchors, letters: int) -> str:

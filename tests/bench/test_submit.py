@@ -1,12 +1,11 @@
 """Submitting: test episodes are played, and their records written, failures and all; `eitbench` does it by command."""
 
-import json
 import re
 
 import pytest
 from eitbench.bench import load, methods, run, suites
 from eitbench.bench import store as store_module
-from eitbench.bench.records import newest, read_record, read_records, sealed, write_record
+from eitbench.bench.records import newest, read_record, read_records, write_record
 from eitbench.bench.store import EpisodeStore, provenance
 from eitbench.bench.submit import submit
 from eitbench.data import bank
@@ -125,9 +124,9 @@ def test_policies_in_records_are_not_played_again(tmp_path):
     (["eitbench/Pipe4D-v0"], "test:0", "env must be one of"),
 ])
 def test_what_cannot_be_submitted(environments, seeds, message, tmp_path):
-    """Nothing is played, and nothing written."""
+    """The call says so, before it is iterated; nothing is run, and nothing written."""
     with pytest.raises(ValueError, match=message):
-        next(submit("kalman_filter", environments, parse_seeds(seeds), EpisodeStore(tmp_path / "r"), tmp_path / "to"))
+        submit("kalman_filter", environments, parse_seeds(seeds), EpisodeStore(tmp_path / "r"), tmp_path / "to")
     assert not (tmp_path / "r").exists() and not (tmp_path / "to").exists()
 
 
@@ -166,7 +165,7 @@ def test_what_says_more_is_not_replaced(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match=r"to must not hold a record that says more; .* lose its being official$"):
         submitted("c", TEST)
     assert read_records(to) == [first] and not (tmp_path / "c").exists()               # it is said before it is played
-    path = write_record(to, first | {"runs": [run | {"source": "0" * 64} for run in first["runs"]]})
+    path = write_record(to, first | {"runs": [run | {"commit": "decaf"} for run in first["runs"]]})
     with pytest.raises(ValueError, match="would lose its being official"):
         submitted("b", TEST[:1])
     with monkeypatch.context() as patch:
@@ -176,35 +175,19 @@ def test_what_says_more_is_not_replaced(tmp_path, monkeypatch):
     assert newest(read_records(to)) == ([read_record(path), newer], [])         # only an official one makes it outdated
 
 
-def test_a_record_of_other_code_is_extended(tmp_path, monkeypatch):
-    """Its episodes are neither played again nor lost, and each run names its own source."""
+def test_a_record_of_another_scoring_is_extended(tmp_path, monkeypatch):
+    """Its episodes are neither run again nor lost, and each run names its own version of scoring."""
     to = tmp_path / "to"
     (path,) = submit("homogeneous", [FILTER.id], TEST[:1], EpisodeStore(tmp_path / "a"), to)
     first = read_record(path)
-    monkeypatch.setattr(store_module, "source_digest", lambda: "0" * 64)
+    monkeypatch.setattr(store_module, "SCORING", 99)
     provenance.cache_clear()
     (path,) = submit("homogeneous", [FILTER.id], TEST, EpisodeStore(tmp_path / "b"), to)
     both = read_record(path)
     assert both["seeds"] == ["test:0", "test:1"] and both["episodes"][0]["scores"] == first["episodes"][0]["scores"]
-    assert [both["runs"][episode["run"]]["source"] for episode in both["episodes"]] == [
-        first["runs"][0]["source"], "0" * 64]
+    assert [both["runs"][episode["run"]]["versions"]["scoring"] for episode in both["episodes"]] == [
+        first["runs"][0]["versions"]["scoring"], "99"]
     assert [path.name for path in (tmp_path / "b").glob("episodes/*/*/*.json")] == ["test-1.json"]
-
-
-def test_a_record_of_the_format_before_is_extended(tmp_path):
-    """And replaced by one of today, under its new name, once that is written."""
-    (path,) = submit("homogeneous", [FILTER.id], TEST[:1], EpisodeStore(tmp_path / "a"), tmp_path / "to", official=True)
-    first = read_record(path)
-    kept = {key: value for key, value in first.items() if key not in ("version", "sha256")}
-    runs = [{key: value for key, value in run.items() if key != "source"} for run in first["runs"]]
-    before = sealed(kept | {"schema": 2, "source": first["runs"][0]["source"], "runs": runs})
-    path.unlink()
-    older = path.with_name(path.name.replace("v1", first["method_sha256"][:8]))
-    older.write_text(json.dumps(before))
-    assert list(submit("homogeneous", [FILTER.id], TEST, EpisodeStore(tmp_path / "b"), tmp_path / "to",
-                       official=True)) == [path]
-    assert not older.exists() and read_record(path)["episodes"][0] == first["episodes"][0]
-    assert read_record(path)["seeds"] == ["test:0", "test:1"]
 
 
 @pytest.mark.parametrize("official", [False, True])
@@ -230,11 +213,13 @@ def test_an_invalid_record_is_in_nobody_s_way(tmp_path, monkeypatch):
     """What another method claimed, and no schema allows, is left out of the table and the page."""
     monkeypatch.setattr(run, "scored", lambda *asked, scored=run.scored: scored(*asked) | {"seconds_per_step": -1.0})
     submitted = ("--env", FILTER.id, "--seeds", "test:0", "-j", "1")
-    with pytest.warns(UserWarning, match=r"left out: .*homogeneous.* is not valid: .*seconds_per_step"):
+    with pytest.warns(UserWarning, match=r"homogeneous/test-0\.json is left out: it is not valid: .*seconds_per_step"):
         code, _, complaint = eitbench("run", "--baseline", "homogeneous", *submitted)
     assert code == 2 and "no results in results" in complaint
-    code, _, complaint = eitbench("submit", "--baseline", "homogeneous", *submitted)
-    assert code == 2 and "is not valid" in complaint and not (tmp_path / "leaderboards").exists()
+    with pytest.warns(UserWarning, match="left out"):
+        code, _, complaint = eitbench("submit", "--baseline", "homogeneous", *submitted)
+    assert code == 2 and "holds no valid result of homogeneous" in complaint
+    assert not (tmp_path / "leaderboards").exists()
     monkeypatch.undo()
     monkeypatch.chdir(tmp_path)
     shorten(monkeypatch, {FILTER.id: SCENARIO})
@@ -288,7 +273,7 @@ def test_from_a_file_to_the_boards_by_command(tmp_path):
     assert eitbench("submit", "--policy", "random_pair", "--env", INJECTION, "--seeds", "test:0", "-j", "1")[0] == 0
     code, said, _ = eitbench("leaderboard", "--records", "leaderboards/results")
     assert said.splitlines() == [f"wrote leaderboards/{name}" for name in (
-        "leaderboard.csv", "leaderboard.md", "site/index.html")]
+        "leaderboard.csv", "leaderboard.md", "site/index.html", "episodes.csv.gz")]
     assert "Mine" in (tmp_path / "leaderboards" / "site" / "methods" / "mine.html").read_text(encoding="utf-8")
     text = (tmp_path / "leaderboards" / "leaderboard.md").read_text(encoding="utf-8")
     assert re.search(r"\| +1 +\| Mine mine@\w{8} +\|.*\| self-reported \|", text)

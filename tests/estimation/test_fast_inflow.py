@@ -78,6 +78,22 @@ def test_slopes_are_those_of_the_voltages():
         np.testing.assert_allclose(slopes @ way, expected, atol=1e-6 * np.abs(expected).max())
 
 
+def test_every_pair_of_electrodes_is_contracted_once(monkeypatch):
+    """An agent that injects all 120 pairs in turn finds each again."""
+    calls = []
+    real = QuadraticVoltages._contracted
+    monkeypatch.setattr(QuadraticVoltages, "_contracted",
+                        lambda self, currents: calls.append(1) or real(self, currents))
+    task, basis, _ = fast()
+    model = QuadraticVoltages(task.observation, task.expected_concentration, basis[:, :4])
+    pairs = np.eye(16)[:, None] - np.eye(16)
+    pairs = pairs[np.triu_indices(16, 1)]
+    c = np.full(task.mesh.n_nodes, task.expected_concentration)
+    first, again = (model.voltages(c, pairs) for _ in range(2))
+    np.testing.assert_array_equal(first, again)
+    assert len(pairs) == len(calls) == 120
+
+
 def test_slugs_have_their_voltages():
     """Of slugs as the prior draws them, to half the noise, root mean square."""
     task, _, scaled = fast()

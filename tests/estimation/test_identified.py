@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 import pytest
 from eitbench.bench.methods import baseline_folder
-from eitbench.data.learning.examples import Dataset
+from eitbench.data.dataset import Dataset
 from eitbench.data.seeds import parse_seeds
 from eitbench.estimation import (
     FirstFrame,

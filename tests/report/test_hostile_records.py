@@ -174,7 +174,8 @@ def test_an_interrupted_render_leaves_the_old_site(broken, error, site, monkeypa
     with pytest.raises(error, match="stop"):
         _files.replace_folder(site / "site", {"index.html": b"new", "style.css": b"new"})
     assert content(site / "site") == before
-    assert {path.name for path in site.iterdir()} == {"site", "results", "leaderboard.md", "leaderboard.csv"}
+    assert {path.name for path in site.iterdir()} == {"site", "results", "leaderboard.md", "leaderboard.csv",
+                                                      "episodes.csv.gz"}
 
 
 def test_the_next_call_puts_back_what_a_killed_one_has_left(site):
