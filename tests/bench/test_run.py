@@ -15,8 +15,8 @@ from eitbench.bench.playing import estimated
 from eitbench.bench.run import Job, run_episode, run_jobs
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.tracks import Environment, board_of
-from eitbench.data.episodes import simulate, truth_discretisation
 from eitbench.data.cache import CACHE_VARIABLE
+from eitbench.data.episodes import simulate, truth_discretisation
 from eitbench.worlds.pipe2d import PIPE_2D
 from eitbench.worlds.task import Estimate, Task
 from scipy.optimize import minimize_scalar
