@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as _gym
 
 from eitbench._extras import needed_by as _needed_by
-from eitbench.worlds import ours as _ours  # noqa: F401 (registers our ids)
+from eitbench.worlds import catalogue as _catalogue  # noqa: F401 (registers our ids)
 from eitbench.worlds.registry import register, register_installed
 
 if TYPE_CHECKING:

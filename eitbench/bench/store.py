@@ -33,6 +33,7 @@ from eitbench.bench.records import (
 )
 from eitbench.bench.scores import SCORING
 from eitbench.bench.strict_json import parsed
+from eitbench.data import cache
 from eitbench.data.seeds import name_seed
 
 PACKAGES = ("eitbench", "numpy", "scipy", "gymnasium", "scikit-fem", "numba", "stable-baselines3",
@@ -233,7 +234,7 @@ def read_json(path: Path) -> dict[str, Any] | None:
 
 def declared_versions() -> dict[str, str]:
     """Return the numbers that are raised when the same episode has other scores."""
-    return {"scoring": str(SCORING)}
+    return {"simulation": str(cache.SIMULATION), "scoring": str(SCORING)}
 
 
 @lru_cache(maxsize=1)

@@ -87,7 +87,7 @@ def jobs(track: str, environments: list[str], methods: list[str], seeds: list[in
         # method.
         for method in methods or [*own_methods(track), *own_agents(id)]:
             skipped = suite == "quick" and not methods and (board, method) in TOO_SLOW_FOR_QUICK
-            job = Job(asked, _absolute(method), 0, is_isolated(asked, method, isolate))
+            job = isolated_job(asked, method, isolate)
             loaded = job.load()
             names[method] = loaded.name
             if not skipped and can_play(loaded, env):
@@ -98,6 +98,11 @@ def jobs(track: str, environments: list[str], methods: list[str], seeds: list[in
         raise ValueError(f"{FORMS[track].kind} {', '.join(missing)} plays none of the environments "
                          f"{', '.join(environments)}; see `eitbench list`")
     return todo
+
+
+def isolated_job(environment: Environment, method: str, isolate: str) -> Job:
+    """Return the job of a method, by name or path, isolated as asked for."""
+    return Job(environment, _absolute(method), 0, is_isolated(environment, method, isolate))
 
 
 def is_isolated(environment: Environment, method: str, isolate: str) -> bool:

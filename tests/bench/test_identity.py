@@ -11,7 +11,7 @@ from eitbench.bench import methods, run, tracks
 from eitbench.bench.run import Job, run_jobs
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.tracks import Environment
-from eitbench.data.store import CACHE_VARIABLE
+from eitbench.data.cache import CACHE_VARIABLE
 from eitbench.worlds import entry, register, registry
 
 from short import register_apart
@@ -28,7 +28,7 @@ from eitbench.bench.store import EpisodeStore
 from eitbench.bench.tracks import Environment
 from eitbench.worlds import register
 from eitbench.worlds.flows import LaminarFlow
-from eitbench.worlds.pipe2d import PIPE_2D
+from eitbench.worlds.catalogue import PIPE_2D
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,8 @@ from eitbench.bench.run import Job, run_jobs
 from eitbench.bench.scores import SCORING
 from eitbench.bench.store import EpisodeStore, machine, portable_command, provenance, results_of
 from eitbench.bench.tracks import Environment
+from eitbench.data.cache import CACHE_VARIABLE
 from eitbench.data.seeds import name_seed
-from eitbench.data.store import CACHE_VARIABLE
 
 from tiny import FILTER, FIXED_LAG, RUN, SCENARIO, git_says, sha, strict, write_baseline
 

@@ -9,8 +9,8 @@ from eitbench.bench.records import newest, read_record, read_records, write_reco
 from eitbench.bench.store import EpisodeStore, provenance
 from eitbench.bench.submit import submit
 from eitbench.data import bank
+from eitbench.data.cache import CACHE_VARIABLE
 from eitbench.data.seeds import parse_seeds
-from eitbench.data.store import CACHE_VARIABLE
 
 from commands import eitbench
 from short import PIPE, shorten
