@@ -27,10 +27,10 @@ from eitbench.bench.sandbox.wall import landlock_version
 from eitbench.bench.scores import SCORING, scored
 from eitbench.bench.store import EpisodeStore, machine, portable_command, provenance
 from eitbench.bench.tracks import Environment, board_of, is_measured, registered
+from eitbench.data.cache import world_digest
 from eitbench.data.episodes import simulate
 from eitbench.data.parallel import in_parallel
 from eitbench.data.seeds import name_seed
-from eitbench.data.store import world_digest
 from eitbench.measured.cases import read_case
 from eitbench.worlds.registry import entry
 
