@@ -19,7 +19,6 @@ PLACES = {
     "examples": "study",                       # installs two packages and plays with them
     "bench/test_cards.py": "study",            # plays every method of ours
     "bench/test_checkpoints.py": "study",      # plays every trained agent
-    "bench/test_replay.py": "study",           # plays records again
     "bench/test_verify.py": "study",           # plays records again, and false ones
     "bench/test_world_cards.py": "study",      # simulates every world of ours
     "report/test_boards.py::test_published_files_are_rendered_from_the_records": "study",

@@ -12,13 +12,12 @@ from eitbench.bench.records import read_record, split_of, write_record
 from eitbench.bench.run import Job, run_jobs, unplayed
 from eitbench.bench.store import EpisodeStore, provenance, results_of
 from eitbench.bench.text import seed_ranges
-from eitbench.data.seasons import current_season
 from eitbench.data.seeds import name_seed
 
 
 def submit(method: str | None, environments: list[str], seeds: list[int] | None,
            store: EpisodeStore, to: Path, *, policy: bool = False, official: bool = False,
-           isolate: str = "others", n_jobs: int = 1, backend: str = "loky",
+           isolate: str = "auto", n_jobs: int = 1, backend: str = "loky",
            command: str = "") -> Iterator[Path]:
     """Play what neither ``store`` nor a record holds yet, and write one record for each environment
     into the folder ``to``, one after the other: what was done before an interruption has its own.
@@ -31,11 +30,11 @@ def submit(method: str | None, environments: list[str], seeds: list[int] | None,
         With a method at least one, and all of them must be such that it plays them; without, by
         default all.
     seeds : list of int
-        Of the season's test split; default: those of the full suite.
+        Of the test split; default: those of the full suite.
     official : bool
         Whether a maintainer runs it; else the records say that they are self-reported.
     isolate : str
-        Whether the method runs in a process of its own; one of `suites.ISOLATE`.
+        As of `isolation.choose_isolation`, strict for official runs.
     n_jobs, backend, command
         As in `run.run_jobs`.
 
@@ -57,14 +56,15 @@ def submit(method: str | None, environments: list[str], seeds: list[int] | None,
         where = f"and changes to {code['commit'][:8]}" if code["commit"] else "outside a checkout"
         raise ValueError("official must be False unless this is a commit without changes, got "
                          f"official=True {where}")
-    split = current_season().split
+    split = "test"
     outside = [name_seed(seed) for seed in seeds or [] if split_of(name_seed(seed)) != split]
     if outside:
-        raise ValueError(f"seeds of a submission must be of the season's split {split}, got "
+        raise ValueError(f"seeds of a submission must be of the split {split}, got "
                          f"{', '.join(outside)}")
     if method is not None and not environments:
         raise ValueError("env must name at least one environment to submit for")
-    asked = (_jobs(method, id, policy, seeds, isolate) for id in environments or tracks.ids())
+    asked = (_jobs(method, id, policy, seeds, isolate, official)
+             for id in environments or tracks.ids())
     # what does not fit is said before anything is played
     for jobs in asked if method is None else list(asked):
         before = list[dict[str, Any]]()
@@ -88,12 +88,12 @@ def submit(method: str | None, environments: list[str], seeds: list[int] | None,
 
 
 def _jobs(method: str | None, id: str, policy: bool, seeds: list[int] | None,
-          isolate: str) -> list[Job]:
+          isolate: str, official: bool) -> list[Job]:
     """What is to be played in one environment."""
     methods = [] if method is None else [method]
     asked = "injection" if policy else "estimation"
     track = tracks.track_of(id) if method is None else asked
-    return suites.jobs(track, [id], methods, seeds, isolate=isolate)
+    return suites.jobs(track, [id], methods, seeds, isolate=isolate, strict=official)
 
 
 def _earlier(to: Path, environment: str, method: str, version: str,
