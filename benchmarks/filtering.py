@@ -14,7 +14,6 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 
-import gains
 import numpy as np
 from common import Row, compare, in_fresh_process, of_flops, peak_growth, peer, quantity
 from pipe_record import CELLS, RECORD, STEPS, WARM_UP, Problem, problem, same, textbook
@@ -50,7 +49,6 @@ def rows() -> Iterator[Row]:
         yield against_textbook(settled)
         yield from against_filterpy(settled)
         yield from against_dynamax(settled)
-    yield from gains.rows()
     yield memory(CELLS[0], measured=True)
     yield memory(CELLS[-1], measured=False)
 

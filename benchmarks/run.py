@@ -22,7 +22,7 @@ from eitbench._files import write_atomically
 HERE = Path(__file__).parent
 SECTIONS = {"first_hour": "The first hour, with an empty cache",
             "forward": "Complete electrode model", "kernels": "What the compiled kernels buy",
-            "filtering": "Kalman filter and smoother", "greedy": "Choosing the injection",
+            "filtering": "Kalman filter and smoother",
             "stepping": "Environments",
             "simulation": "Simulation of new episodes", "scaling": "Growth with size"}
 """name of a module here, with `rows()` or `curves()` → heading"""

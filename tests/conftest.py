@@ -17,10 +17,10 @@ PLACES = {
     "studies": "study",                        # the statements and figures of the thesis
     "rl": "study",                             # trains agents
     "examples": "study",                       # installs two packages and plays with them
-    "bench/test_cards.py": "study",            # plays every method of ours
+    "bench/test_golden.py": "study",           # simulates every world, runs every method
     "bench/test_checkpoints.py": "study",      # plays every trained agent
     "bench/test_verify.py": "study",           # plays records again, and false ones
-    "bench/test_world_cards.py": "study",      # simulates every world of ours
+    "test_docs.py::test_documentation_builds": "study",
     "report/test_boards.py::test_published_files_are_rendered_from_the_records": "study",
     "report/test_site.py::test_the_published_site_is_rendered_from_the_records": "study",
     "report/test_site_browser.py": "browser",

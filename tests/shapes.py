@@ -7,6 +7,7 @@ from itertools import combinations, pairwise, permutations
 from math import factorial
 from typing import NamedTuple
 
+import meshio
 import numpy as np
 from eitbench.numerics.mesh import Mesh, graded, rectangle_mesh
 from scipy.integrate import solve_ivp
@@ -219,3 +220,27 @@ def lagrange(bary: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
     value += [4 * bary[:, i] * bary[:, j] for i, j in edges]
     slope += [4 * (bary[:, i:i + 1] * unit[j] + bary[:, j:j + 1] * unit[i]) for i, j in edges]
     return np.stack(value, axis=1), np.stack(slope, axis=1)
+
+
+def write_mesh(path, mesh: Mesh, groups: dict | None = None) -> None:
+    """Write a mesh and groups of boundary facets as text, in gmsh's format 2.2."""
+    names = {2: ("triangle", "line"), 3: ("tetra", "triangle")}[mesh.dim]
+    cells = [(names[0], mesh.cells)] + [(names[1], np.asarray(facets)) for facets in (groups or {}).values()]
+    tags = [np.full(len(data), tag) for tag, (_, data) in enumerate(cells)]
+    meshio.Mesh(
+        np.pad(mesh.points, ((0, 0), (0, 3 - mesh.dim))), cells,
+        cell_data={"gmsh:physical": tags, "gmsh:geometrical": [tag + 1 for tag in tags]},
+        field_data={name: np.array([1 + k, mesh.dim - 1]) for k, name in enumerate(groups or {})},
+    ).write(path, file_format="gmsh22", binary=False)
+
+
+class RootLaw:
+    """σ = (a − b√c) c: a nonlinear conductivity law."""
+
+    a, b = 0.0126, 2.8e-4
+
+    def __call__(self, concentration):
+        return (self.a - self.b * np.sqrt(concentration)) * concentration
+
+    def derivative(self, concentration):
+        return self.a - 1.5 * self.b * np.sqrt(concentration)

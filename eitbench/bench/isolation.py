@@ -28,6 +28,7 @@ import tempfile
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import fields, is_dataclass
 from functools import cache, partial
 from importlib.metadata import entry_points
 from importlib.util import find_spec
@@ -54,7 +55,7 @@ from eitbench.bench.methods import (
     own_sha256,
 )
 from eitbench.bench.tracks import BOARDS
-from eitbench.data.store import CACHE_VARIABLE, cache_folder, folder, kinds
+from eitbench.data.cache import CACHE_VARIABLE, cache_folder, model_key
 from eitbench.worlds import streams
 from eitbench.worlds.registry import entry, registered_by_hand, take_over
 
@@ -71,8 +72,6 @@ MAX_ARRAY_BYTES = 1 << 28
 MAX_OUTPUT_CHARS = 10_000
 """of printed text that is shown for one episode"""
 METHOD_NAME = re.compile(r"[^./\\][^/\\]{0,99}")
-MODELS = ("outline.npz", "region.npz", "reduced-*.npz", "joint-*.npz")
-"""Cached files of a world that hold no episode."""
 NUMERIC_ENV = ("OPENBLAS_", "MKL_", "OMP_", "NPY_", "NUMBA_CPU")
 """Prefixes of environment variables that change the last bits of results."""
 ETC = ("alternatives", "group", "ld.so.cache", "localtime", "nsswitch.conf", "passwd")
@@ -373,12 +372,14 @@ class Worker:
         command = [sys.executable, "-P", "-c", _START, json.dumps(self._limits)]
         if self._is_confined:
             check_out_of_reach(cache_folder(), "the cache folder")
-            command = [*bubblewrap(self._limits, _cached_models(id, kwargs)), *command]
+            command = [*bubblewrap(self._limits, {"/tmp/cache/models": _models_folder()}), *command]
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
             start_new_session=True, env=self._environment(), cwd="/")
         try:
-            os.set_blocking(self._pipe(self._process.stdin), False)
+            assert self._process.stdin is not None and self._process.stdout is not None
+            self._input, self._output = self._process.stdin.fileno(), self._process.stdout.fileno()
+            os.set_blocking(self._input, False)
             self.about = self._ask({"do": "load", "track": track, "id": id, "kwargs": kwargs},
                                    self._files(id, method))[0]
             """What the method's class reports about itself, unchecked."""
@@ -428,12 +429,6 @@ class Worker:
                 pipe.close()
         if not self._is_confined:
             shutil.rmtree(self._home, ignore_errors=True)
-
-    def __enter__(self) -> Worker:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
 
     def _environment(self) -> dict[str, str]:
         """Return the worker's environment variables, which tell nothing about this process."""
@@ -491,25 +486,23 @@ class Worker:
         self._left_chars -= len(printed)
 
     def _send(self, message: bytes) -> None:
-        pipe = self._pipe(self._process.stdin)
         deadline = time.monotonic() + self.reply_timeout
         left = memoryview(message)
         while left:  # a worker that does not read leaves the pipe full
-            self._wait([], [pipe], deadline)
+            self._wait([], [self._input], deadline)
             try:
-                left = left[os.write(pipe, left):]
+                left = left[os.write(self._input, left):]
             except BrokenPipeError:
                 raise self._ended() from None
 
     def _receive(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-        pipe = self._pipe(self._process.stdout)
         deadline = time.monotonic() + self.reply_timeout
 
         def read(n: int) -> bytes:
             parts = bytearray()
             while len(parts) < n:
-                self._wait([pipe], [], deadline)
-                part = os.read(pipe, min(n - len(parts), 1 << 20))
+                self._wait([self._output], [], deadline)
+                part = os.read(self._output, min(n - len(parts), 1 << 20))
                 if not part:
                     raise self._ended()
                 parts += part
@@ -571,10 +564,6 @@ class Worker:
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
 
-    @staticmethod
-    def _pipe(stream: Any) -> int:
-        return int(stream.fileno())
-
 
 def _status(pid: int, field: str) -> int:
     """Return a number of /proc/PID/status, bytes if it is a size; 0 if it is missing."""
@@ -586,18 +575,23 @@ def _status(pid: int, field: str) -> int:
     return int(found[1]) * (1024 if found[2] else 1) if found else 0
 
 
-def _cached_models(id: str, kwargs: dict[str, Any]) -> dict[str, str]:
-    """Return path inside the sandbox -> cached file of each model of the world."""
-    models = folder(entry(id).world.changed(kwargs.get("world")))
-    return {f"/tmp/cache/{models.name}/{path.name}": str(path.absolute())
-            for pattern in MODELS for path in models.glob(pattern)}
+def _models_folder() -> str:
+    """Return the part of the cache that holds no episode."""
+    return str((cache_folder() / model_key("", None, 0).folder).absolute())
+
+
+def _classes(part: Any) -> list[type]:
+    """Return the classes of a world's parts, and their ancestors."""
+    parts = [getattr(part, each.name) for each in fields(part)]
+    return [*type(part).__mro__,
+            *(kind for inner in parts if is_dataclass(inner) for kind in _classes(inner))]
 
 
 def _pickled_entry(id: str) -> bytes:
     """Return an entry that a script has registered, with the code of its parts; else nothing."""
     if id not in [each.id for each in registered_by_hand()]:
         return b""
-    names = {kind.__module__ for kind in kinds(entry(id).world)} & set(sys.modules)
+    names = {kind.__module__ for kind in _classes(entry(id).world)} & set(sys.modules)
     modules = [sys.modules[name] for name in sorted(names)
                if name.partition(".")[0] not in {"eitbench", *sys.stdlib_module_names}]
     for module in modules:  # a worker cannot import them
@@ -703,8 +697,8 @@ class _MethodServer:
         env: Any = gym.make(header["id"], disable_env_checker=True, **header["kwargs"]).unwrapped
         self._method = load_method(str(self._file) if self._file.name else method, header["track"])
         self._known = env.task if header["track"] == "estimation" else env.rules
-        fields = ("name", "title", "boards", "parameters", "role", "privileged")
-        about = {field: getattr(self._method, field) for field in fields}
+        attributes = ("name", "title", "boards", "parameters", "role", "privileged")
+        about = {name: getattr(self._method, name) for name in attributes}
         return about | {"suits": self._method.suits(self._known)}, {}
 
     def begin(self, header: dict[str, Any], arrays: Arrays) -> tuple[dict[str, Any], Arrays]:
@@ -719,9 +713,8 @@ class _MethodServer:
         estimate = self._instance.update(arrays["voltages"], arrays["currents"])
         if not hasattr(estimate, "_asdict"):
             return {"estimate": None if estimate is None else type(estimate).__name__}, {}
-        fields = estimate._asdict().items()
-        return {"estimate": "Estimate"}, {name: np.asarray(value) for name, value in fields
-                                          if value is not None}
+        given = {name: value for name, value in estimate._asdict().items() if value is not None}
+        return {"estimate": "Estimate"}, {name: np.asarray(value) for name, value in given.items()}
 
     def act(self, header: dict[str, Any], arrays: Arrays) -> tuple[dict[str, Any], Arrays]:
         """Return the policy's action."""

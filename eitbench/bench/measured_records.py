@@ -165,7 +165,7 @@ def _played_before(path: Path, record: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _code(record: dict[str, Any]) -> str:
-    return str(record["run"]["source"])
+    return json.dumps(record["run"]["versions"], sort_keys=True)
 
 
 def _same(a: float | None, b: float | None) -> bool:

@@ -179,6 +179,12 @@ def _loaders() -> dict[str, EntryPoint]:
     return {f".{point.name}": point for point in entry_points(group=LOADERS)}
 
 
+def loader_of(path: Path) -> str:
+    """Return the module and function that load a method's file; empty for a .py file."""
+    point = _loaders().get(path.suffix)
+    return "" if point is None else point.value
+
+
 def version_of(path: Path, sha256: str) -> str:
     """What a method's records say of its version: of ours that of its card, v1 where there is none;
     of all others eight digits of their file's sha256."""
@@ -195,7 +201,7 @@ def card_name(path: Path) -> str:
 @lru_cache(maxsize=256)
 def card_version(name: str) -> int:
     """The number of the version that a card describes; 1 where there is no card."""
-    path = baseline_folder() / "cards" / f"{name}.json"
+    path = baseline_folder() / "golden" / f"{name}.json"
     if not path.is_file():
         return 1
     return int(json.loads(path.read_text(encoding="utf-8"))["version"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Iterator
 from functools import lru_cache
@@ -42,12 +43,13 @@ class Episode(NamedTuple):
 def environment(asked: Environment) -> EstimationEnv | InjectionEnv:
     """Made once a process, so that its models, and what methods derive from them, are shared by all
     its episodes; errors as `Environment.make`."""
-    return _made(asked, entry(asked.id).world)
+    registered = entry(asked.id)
+    return _made(asked, registered.world, json.dumps(dict(registered.settings)))
 
 
 @lru_cache(maxsize=4)
-def _made(asked: Environment, world: World) -> EstimationEnv | InjectionEnv:
-    """Whose ``world`` is that of the id: another process may have told this one of another."""
+def _made(asked: Environment, world: World, settings: str) -> EstimationEnv | InjectionEnv:
+    """Make it with the ``world`` and the ``settings`` of the id, which may be registered anew."""
     return asked.make()
 
 

@@ -54,7 +54,7 @@ def write_record(folder: Path, record: dict[str, Any]) -> Path:
     record = sealed(record)
     path = Path(folder) / _name_if_any(record)
     try:
-        _check(record)
+        check_record(record)
     except ValueError as error:
         raise ValueError(f"record {cleaned(str(path))} {cleaned(str(error))}") from None
     write_atomically(path, _text(record).encode())
@@ -69,7 +69,7 @@ def read_record(path: Path) -> dict[str, Any]:
     """
     try:
         record = parsed(path)
-        _check(record)
+        check_record(record)
         if record["sha256"] != _digest(record):
             raise ValueError("was changed since it was written: its sha256 is not that of its "
                              "content")
@@ -250,7 +250,7 @@ def _validator() -> Any:
     return jsonschema_rs.validator_for(json.loads(schema_text()))
 
 
-def _check(record: Any) -> None:
+def check_record(record: Any) -> None:
     """Raise ``ValueError``, naming fields, if a record breaks the schema or contradicts itself."""
     if not _validator().is_valid(record):
         errors = islice(_validator().iter_errors(record), 20)

@@ -15,23 +15,22 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from eitbench._foreign import traceback_of, where_of
 from eitbench.bench import isolation
 from eitbench.bench.isolation import WorkerError, load_isolated
-from eitbench.bench.methods import Method, find_method, load_method, version_of
+from eitbench.bench.methods import Method, find_method, load_method, loader_of, version_of
 from eitbench.bench.playing import environment, play
 from eitbench.bench.records import SHARED
-from eitbench.bench.scores import scored
-from eitbench.bench.store import EpisodeStore, machine, provenance, source_digest
+from eitbench.bench.scores import SCORING, scored
+from eitbench.bench.store import EpisodeStore, machine, portable_command, provenance
 from eitbench.bench.tracks import Environment, board_of
+from eitbench.data.cache import world_digest
 from eitbench.data.episodes import simulate
 from eitbench.data.parallel import in_parallel
 from eitbench.data.seeds import name_seed
-from eitbench.data.store import world_digest
 from eitbench.worlds.registry import entry
 
 _LASTING = ("environment", "method", *SHARED)
@@ -59,16 +58,20 @@ class Job(NamedTuple):
             return load_method(self.method, track)
 
     def identity(self) -> str:
-        """What the outcome depends on; a stored result counts only for the very same. Nothing is
-        loaded. ``ValueError`` if there is no such method or environment."""
+        """Return a digest of the configuration and declared versions that the outcome depends on; a
+        stored result counts only for the very same. The method is not loaded. ``ValueError`` if
+        there is no such method or environment."""
         path = find_method(self.method, self.environment.track)
-        sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
-        asked = entry(self.environment.id)
-        world = asked.world.changed(json.loads(self.environment.kwargs).get("world"))
-        parts = [*self.environment, json.dumps(dict(asked.settings), sort_keys=True),
-                 world_digest(world), sha256, version_of(path, sha256), str(self.seed),
-                 source_digest(), np.__version__, scipy.__version__]
-        return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
+        files = {each.name: hashlib.sha256(each.read_bytes()).hexdigest()
+                 for each in (path, path.with_name("config.json"))
+                 if each == path or (path.suffix != ".py" and each.is_file())}
+        arguments = self.environment.arguments
+        world = entry(self.environment.id).world.changed(arguments.pop("world"))
+        parts = {"environment": self.environment.id, "arguments": arguments,
+                 "world": world_digest(world), "files": files, "loader": loader_of(path),
+                 "version": version_of(path, files[path.name]), "seed": self.seed,
+                 "scoring": SCORING}
+        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def run_episode(job: Job) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -146,8 +149,8 @@ def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1, backend: 
 
     Each process stores an episode the moment it is done. ``backend`` is one of
     `eitbench.data.parallel.BACKENDS`, of which those of a cluster need the folders of ``store`` and
-    cache on all its machines; ``command`` is what the results will name as the command that made
-    them. Errors as `eitbench.data.parallel.in_parallel`.
+    cache on all its machines; the results name ``command``, without folders, as the command that
+    made them. Errors as `eitbench.data.parallel.in_parallel`.
     """
     todo = [job for job in jobs
             if not store.holds(job.environment.name, job.load().name, job.seed, job.identity())]
@@ -158,7 +161,7 @@ def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1, backend: 
     truths: dict[Any, Job] = {}  # each once, before several methods want it at once
     for job in todo:
         truths.setdefault((environment(job.environment).world, job.seed), job)
-    run = {"command": command, **provenance(), "machine": machine()}
+    run = {"command": portable_command(command), **provenance(), "machine": machine()}
     home = platform.node()
     isolation.close()                               # that of `Job.load`; the workers have their own
     try:

@@ -18,6 +18,9 @@ from eitbench import _check, scoring
 from eitbench.bench.tracks import TRACKS
 from eitbench.worlds.world import World
 
+SCORING = 1
+"""Version of how an episode is run and scored; raise it when the same method on the same episode
+gets other scores. Results of another version are not reused."""
 GROUP = "eitbench.scores"
 """Entry points of installed packages: each names a module that registers scores."""
 BETTER = ("lower", "higher", "nominal", "none")

@@ -1,9 +1,8 @@
-"""Play the test episodes with one method, or all of ours, and write leaderboard records of them."""
+"""Run the test episodes with one method, or all built-in ones, and write leaderboard records."""
 
 from __future__ import annotations
 
-import glob
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,15 +18,16 @@ def submit(method: str | None, environments: list[str], seeds: list[int] | None,
            store: EpisodeStore, to: Path, *, policy: bool = False, official: bool = False,
            isolate: str = "auto", n_jobs: int = 1, backend: str = "loky",
            command: str = "") -> Iterator[Path]:
-    """Play what neither ``store`` nor a record holds yet, and write one record for each environment
-    into the folder ``to``, one after the other: what was done before an interruption has its own.
+    """Check what is asked for, then return an iterator that runs the episodes that neither
+    ``store`` nor a record holds and writes one record for each environment into the folder ``to``,
+    one after the other: after an interruption, finished environments have their records.
 
     Parameters
     ----------
     method : str or None
-        Name or path of a baseline, or of a ``policy``. None: all of ours.
+        Name or path of a baseline, or of a ``policy``. None: all built-in methods.
     environments : list of str
-        With a method at least one, and all of them must be such that it plays them; without, by
+        With a method at least one, and all of them must be such that it runs in them; without, by
         default all.
     seeds : list of int
         Of the test split; default: those of the full suite.
@@ -38,18 +38,19 @@ def submit(method: str | None, environments: list[str], seeds: list[int] | None,
     n_jobs, backend, command
         As in `run.run_jobs`.
 
-    Yields
-    ------
-    path
-        Of a record. All test episodes that the store, or a record there before, holds of this
-        version of the method are in them, those that failed too.
+    Returns
+    -------
+    iterator of path
+        Of the records. All test episodes that the store, or an earlier record, holds of this
+        version of the method are in them, failed ones too.
 
     Raises
     ------
     ValueError
-        If a seed is not of the test split, the method does not play one of the environments, an
-        official one is asked for from a checkout with changes, or a record is not valid or would
-        replace one that says more.
+        By the call itself, if a seed is not of the test split, the method does not run in one of
+        the environments, an official record is asked for from a checkout with changes, or a record
+        would lose its being official; by the iterator, if a record is not valid or would lose
+        episodes.
     """
     code = provenance()
     if official and (code["commit"] is None or code["dirty"]):
@@ -63,55 +64,69 @@ def submit(method: str | None, environments: list[str], seeds: list[int] | None,
                          f"{', '.join(outside)}")
     if method is not None and not environments:
         raise ValueError("env must name at least one environment to submit for")
-    asked = (_jobs(method, id, policy, seeds, isolate, official)
-             for id in environments or tracks.ids())
-    # what does not fit is said before anything is played
-    for jobs in asked if method is None else list(asked):
-        before = list[dict[str, Any]]()
-        played = {(job.environment.name, job.load().name): job.load().version for job in jobs}
-        for (environment, name), version in played.items():
-            for path, earlier in _earlier(Path(to), environment, name, version, split):
-                _check_nothing_is_lost(path, earlier, official)
-                before += results_of(earlier) if earlier["official"] == official else []
-        run_jobs(unplayed(jobs, before), store, n_jobs=n_jobs, backend=backend, command=command)
-        made = []
-        for record in store.records(also=before):
-            key = record["environment"]["name"], record["method"]
-            if key in played and record["split"] == split:
-                there = _earlier(Path(to), *key, record["version"], split)
-                made.append((record | {"official": official}, there))
-        for record, there in made:
-            for path, earlier in there:
-                _check_nothing_is_lost(path, earlier, official, record["seeds"])
-        for record, _ in made:
-            yield write_record(to, record)
+    asked: Iterable[list[Job]] = (_jobs(method, id, policy, seeds, isolate, official)
+                                  for id in environments or tracks.ids())
+    if method is not None:
+        asked = list(asked)
+        for jobs in asked:
+            _earlier(Path(to), jobs, split, official)
+    else:
+        for id in environments:
+            tracks.track_of(id)
+    return (path for jobs in asked
+            for path in _submitted(jobs, store, Path(to), split, official, n_jobs, backend,
+                                   command))
+
+
+def _submitted(jobs: list[Job], store: EpisodeStore, to: Path, split: str, official: bool,
+               n_jobs: int, backend: str, command: str) -> Iterator[Path]:
+    """Run the jobs of one environment and write their records."""
+    earlier = _earlier(to, jobs, split, official)
+    before = [result for record in earlier.values() if record["official"] == official
+              for result in results_of(record)]
+    run_jobs(unplayed(jobs, before), store, n_jobs=n_jobs, backend=backend, command=command)
+    asked = _versions(jobs)
+    made = [record | {"official": official} for record in store.records(also=before)
+            if (record["environment"]["name"], record["method"], record["version"]) in asked
+            and record["split"] == split]
+    found = {(record["environment"]["name"], record["method"]) for record in made}
+    for environment, method, _ in asked:
+        if (environment, method) not in found:
+            raise ValueError(f"{store.folder} holds no valid result of {method} in {environment}")
+    for record in made:
+        for path, old in earlier.items():
+            missing = [seed for seed in old["seeds"] if seed not in record["seeds"]]
+            if missing and all(old[key] == record[key] for key in ("method", "version")):
+                raise ValueError("to must not hold a record that says more; "
+                                 f"{path} would lose its episodes {seed_ranges(missing)}")
+    for record in made:
+        yield write_record(to, record)
 
 
 def _jobs(method: str | None, id: str, policy: bool, seeds: list[int] | None,
           isolate: str, official: bool) -> list[Job]:
-    """What is to be played in one environment."""
+    """Return what is to be run in one environment."""
     methods = [] if method is None else [method]
     asked = "injection" if policy else "estimation"
     track = tracks.track_of(id) if method is None else asked
     return suites.jobs(track, [id], methods, seeds, isolate=isolate, strict=official)
 
 
-def _earlier(to: Path, environment: str, method: str, version: str,
-             split: str) -> list[tuple[Path, dict[str, Any]]]:
-    """Records there of this version's episodes of a split; at most one, unless of several
-    formats."""
-    paths = sorted(to.glob(f"{environment}--{glob.escape(method)}--*.json"))
-    return [(path, record) for path, record in zip(paths, map(read_record, paths), strict=True)
-            if (record["method"], record["version"], record["split"]) == (method, version, split)]
+def _versions(jobs: list[Job]) -> list[tuple[str, str, str]]:
+    """Return environment, method and version of the jobs, each once."""
+    return list(dict.fromkeys((job.environment.name, job.load().name, job.load().version)
+                              for job in jobs))
 
 
-def _check_nothing_is_lost(path: Path, earlier: dict[str, Any], official: bool,
-                           seeds: list[str] | None = None) -> None:
-    """``ValueError`` if the record at ``path`` would lose what makes it worth more; before anything
-    is played, without ``seeds``, as far as is known then."""
-    missing = [] if seeds is None else [seed for seed in earlier["seeds"] if seed not in seeds]
-    lost = [*["its being official"] * (earlier["official"] and not official),
-            *([f"its episodes {seed_ranges(missing)}"] if missing else [])]
-    if lost:
-        raise ValueError("to must not hold a record that says more; "
-                         f"{path} would lose {' and '.join(lost)}")
+def _earlier(to: Path, jobs: list[Job], split: str, official: bool) -> dict[Path, dict[str, Any]]:
+    """Read the records in ``to`` of these versions of methods. ``ValueError`` if one is official
+    and the new one would not be."""
+    found = {}
+    for environment, method, version in _versions(jobs):
+        name = tracks.record_name(environment, method, version, split)
+        if (path := to / name).exists():
+            found[path] = read_record(path)
+            if found[path]["official"] and not official:
+                raise ValueError("to must not hold a record that says more; "
+                                 f"{path} would lose its being official")
+    return found

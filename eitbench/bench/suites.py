@@ -83,8 +83,7 @@ def jobs(track: str, environments: list[str], methods: list[str], seeds: list[in
         # serves one method.
         for method in methods or [*own_methods(track), *own_agents(id)]:
             skipped = suite == "quick" and not methods and (board, method) in TOO_SLOW_FOR_QUICK
-            chosen = choose_isolation(method, track, isolate, strict=strict)
-            job = Job(asked, _absolute(method), 0, chosen)
+            job = isolated_job(asked, method, isolate, strict)
             loaded = job.load()
             names[method] = loaded.name
             if not skipped and can_play(loaded, env):
@@ -95,6 +94,13 @@ def jobs(track: str, environments: list[str], methods: list[str], seeds: list[in
         raise ValueError(f"{FORMS[track].kind} {', '.join(missing)} plays none of the environments "
                          f"{', '.join(environments)}; see `eitbench list`")
     return todo
+
+
+def isolated_job(environment: Environment, method: str, isolate: str,
+                 strict: bool = False) -> Job:
+    """Return the job of a method, by name or path, isolated as `isolation.choose_isolation`."""
+    kind = choose_isolation(method, environment.track, isolate, strict=strict)
+    return Job(environment, _absolute(method), 0, kind)
 
 
 def _to_look_at(asked: Environment) -> Any:

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+from inspect import Parameter, signature
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium as gym
+from gymnasium.envs.registration import load_env_creator
 
 from eitbench.data.seeds import parse_seeds
 from eitbench.worlds.registry import entries, entry
@@ -42,6 +44,11 @@ QUICK = ("eitbench/Pipe2D-v0", "eitbench/Pipe2DFixedLag-v0", "eitbench/Pipe2DSmo
 QUICK_SEEDS = "test:0-3"
 
 
+SCORED = {"estimation": {}, "injection": {"estimator": "full", "observation": "raw"}}
+"""Arguments of each track's environments in runs, unless others are given: with the exact filter,
+and what policies are shown as it is. In training, registered ids have other defaults."""
+
+
 class Environment(NamedTuple):
     """A registered id with keyword arguments: what is made, and what a record names."""
 
@@ -64,6 +71,15 @@ class Environment(NamedTuple):
         """One of `TRACKS`; ``ValueError`` if there is no such environment."""
         return track_of(self.id)
 
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """All arguments with which it is made, defaults included."""
+        creator = load_env_creator(str(gym.spec(self.id).entry_point))
+        defaults = {name: each.default for name, each in signature(creator).parameters.items()
+                    if each.default is not Parameter.empty}
+        return (defaults | dict(entry(self.id).settings) | SCORED[self.track]
+                | json.loads(self.kwargs))
+
     def make(self, **extra: Any) -> EstimationEnv | InjectionEnv:
         """A fresh environment as it is played, without gymnasium's wrappers.
 
@@ -72,13 +88,11 @@ class Environment(NamedTuple):
         ValueError
             If there is none of this id, or its arguments are wrong.
         """
-        arguments = json.loads(self.kwargs)
-        if self.track == "injection":
-            arguments = {"estimator": "full", "observation": "raw"} | arguments | extra
-            if arguments["estimator"] not in ESTIMATORS:
-                raise ValueError(f"estimator must be one of {', '.join(ESTIMATORS)}, got "
-                                 f"{arguments['estimator']!r}")
-        made: Any = gym.make(self.id, disable_env_checker=True, **(arguments | extra)).unwrapped
+        arguments = SCORED[self.track] | json.loads(self.kwargs) | extra
+        if arguments.get("estimator", "full") not in ESTIMATORS:
+            raise ValueError(f"estimator must be one of {', '.join(ESTIMATORS)}, got "
+                             f"{arguments['estimator']!r}")
+        made: Any = gym.make(self.id, disable_env_checker=True, **arguments).unwrapped
         return made
 
 
@@ -115,8 +129,7 @@ def registered(id: str) -> dict[str, Any]:
     each = entries().get(id)
     if each is None:
         return {}
-    played = {"estimator": "full", "observation": "raw"} if each.track == "injection" else {}
-    return played | dict(each.settings)
+    return SCORED[each.track] | dict(each.settings)
 
 
 def changed(id: str, kwargs: dict[str, Any]) -> dict[str, Any]:

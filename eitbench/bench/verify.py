@@ -32,9 +32,9 @@ from eitbench.bench.scores import scored, scores
 from eitbench.bench.table import Cell, Table
 from eitbench.bench.text import scores_by_seed
 from eitbench.bench.tracks import Environment
+from eitbench.data.cache import cache_in
 from eitbench.data.parallel import in_parallel
 from eitbench.data.seeds import parse_seeds
-from eitbench.data.store import cache_in
 
 BUILTIN_FIELDS = ("method", "board", "role", "privileged")
 """What a rerun of a built-in method must repeat besides scores; its title may have changed."""

@@ -1,6 +1,4 @@
-"""The command line: `eitbench list | run | bank | export | train | policies | submit | verify |
-cards | kits | fit-prior | fit-model | estimate |
-submit-measured | leaderboard | compare | render | reproduce`."""
+"""The command line of eitbench."""
 
 from __future__ import annotations
 
@@ -15,7 +13,7 @@ from eitbench import __version__
 from eitbench.cli import options
 from eitbench.cli.estimate import estimate
 from eitbench.cli.export import export
-from eitbench.cli.maintain import cards, kits
+from eitbench.cli.maintain import golden
 from eitbench.cli.measured import submit_measured
 from eitbench.cli.play import policies, report, run, typed
 from eitbench.cli.priors import fit_model, fit_prior
@@ -54,7 +52,7 @@ def list_() -> None:
     """Show the environments, the baselines and policies, and which boards they play on."""
     from eitbench.bench.methods import load_method, own_methods
     from eitbench.bench.tracks import boards_of, ids
-    from eitbench.data.recordings import outline
+    from eitbench.data.regions import outline
     from eitbench.worlds.registry import entry
     from eitbench.worlds.task import lag_steps
     # Nothing is built: what takes long to make is shipped, the rest are numbers of the world.
@@ -101,8 +99,8 @@ def bank(
     import shutil
 
     from eitbench.data.bank import fill, missing_seeds, recording_bytes
+    from eitbench.data.cache import folder
     from eitbench.data.seeds import parse_seeds
-    from eitbench.data.store import folder
     from eitbench.worlds.registry import entry
     with options.clear_errors():
         numbers = parse_seeds(seeds)
@@ -195,8 +193,7 @@ def submit(
 
 
 app.command()(verify)
-app.command()(cards)
-app.command()(kits)
+app.command()(golden)
 app.command("fit-prior")(fit_prior)
 app.command("fit-model")(fit_model)
 app.command()(estimate)

@@ -118,7 +118,7 @@ def _held_out(paths: list[Path], folder: Path, method: str | None, isolate: str,
     from eitbench.bench.records import read_record
     from eitbench.bench.table import Table
     from eitbench.bench.verify import job_of
-    from eitbench.data.store import cache_in
+    from eitbench.data.cache import cache_in
     rows: list[dict[str, Any]] = []
     problems: list[str] = []
     with cache_in(folder / "held-out"):

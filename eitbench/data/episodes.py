@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache, wraps
-from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -16,11 +15,10 @@ from tqdm import tqdm
 
 from eitbench import _check
 from eitbench._notice import Wait
-from eitbench.data import store
+from eitbench.data.cache import Key, cached, episode_key
 from eitbench.worlds.instrument import Faults
-from eitbench.worlds.parts import Discretisation
 from eitbench.worlds.streams import randomness
-from eitbench.worlds.world import World
+from eitbench.worlds.world import Discretisation, World
 
 Made = TypeVar("Made")
 BEFOREHAND = "`eitbench bank --env ID --seeds train:0-99` makes episodes beforehand"
@@ -65,21 +63,21 @@ def simulate(world: World, seed: int, *, cache: bool = True, progress: bool = Tr
     """
     seed = _check.integer("seed", seed, low=0)
 
-    def make() -> dict[str, Any]:
+    def build() -> dict[str, Any]:
         return next(simulate_together(world, [seed], progress))._asdict()
 
     if not cache:
-        return Episode(**make())
-    return Episode(**store.kept(_path(world, seed), Episode._fields, make, str(seed), small=True))
+        return Episode(**build())
+    return Episode(**cached(_key(world, seed), build))
 
 
 def is_simulated(world: World, seed: int) -> bool:
     """Whether the truth is in the cache."""
-    return _path(world, seed).is_file()
+    return _key(world, seed).path.is_file()
 
 
-def _path(world: World, seed: int) -> Path:
-    return store.folder(world) / f"{seed}.truth.npz"
+def _key(world: World, seed: int) -> Key:
+    return episode_key(world, f"{seed}.truth")
 
 
 def once(many: int) -> Callable[[Callable[[World], Made]], Callable[[World], Made]]:

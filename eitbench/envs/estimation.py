@@ -18,11 +18,10 @@ from eitbench.data.recordings import cycle_voltages, outline, step_error, veloci
 from eitbench.data.regions import score_mass
 from eitbench.data.seeds import warn_of_reserved
 from eitbench.envs.spec import KnowsItsLength
-from eitbench.worlds.parts import Discretisation
 from eitbench.worlds.registry import entry
 from eitbench.worlds.streams import randomness
 from eitbench.worlds.task import Task, lag_steps, make_task
-from eitbench.worlds.world import World
+from eitbench.worlds.world import Discretisation, World
 
 if TYPE_CHECKING:
     from eitbench.data.episodes import Episode
@@ -47,31 +46,44 @@ class Revealed(NamedTuple):
 
 
 class EstimationEnv(KnowsItsLength, gym.Env[Observation, np.ndarray]):  # type: ignore[misc]
-    """One episode of a world, seen through its voltages; the action is the estimate.
+    """Estimate the concentration of one episode of a world from voltages.
 
-    At step i = 1, 2, … the agent has seen the measurements up to min(i, T) and says what it thinks
-    of the state t = i − lag. Steps with t < 1 ask for nothing (the action is ignored); after the
-    T-th measurement voltages and currents are zero until every state has been asked for. The reward
-    is −∫(ĉ_t − c_t)² / ∫c_t² for scored states, zero otherwise, so that minus its mean over the
-    scored states is ẽ_c (thesis 5.12). Where the flow is asked for too (`Task.velocity`), its k
-    parameters follow the nodal estimate in the action, and −∫(v̂_t − v_t)² / ∫v_t² across the pipe
-    is added to the reward.
+    ## Action Space
 
-    Parameters
-    ----------
-    name : str
-        A registered id; `eitbench.worlds.register`.
-    world : dict, optional
-        Numbers of the world's parts to change, as in ``{"instrument": {"noise_relative": 0.02}}``;
-        see `World.changed`.
-    lag : int or "all", optional
-        See `Task`; default: that of the id.
-    assume : dict, optional
-        What the task's model wrongly believes of the flow; see `World.model`.
-    episodes : int, optional
-        How many training episodes an unseeded ``reset`` draws from. Default: 1 for four resets,
-        then 8, then more as resets go on, up to 1000; see `eitbench.data.pool.Pool`.
-    render_mode : None or "rgb_array"
+    At step i = 1, 2, … the action is the estimate of the state t = i − lag: the concentration at
+    the nodes of `task.mesh` in mol/m³. Where the flow is estimated too (`task.velocity`), its k
+    parameters θ in m/s follow. The action is ignored while t < 1.
+
+    ## Observation Space
+
+    A `Dict` with the voltages and currents of injection min(i, T); zeros after the T-th injection,
+    until every state has been estimated.
+
+    ## Rewards
+
+    −∫(ĉ_t − c_t)² dΩ / ∫c_t² dΩ for each scored state t, 0 for the others: minus the mean over the
+    scored states is the relative error ẽ_c (thesis 5.12). Where the flow is estimated too,
+    −∫(v̂_t − v_t)² dy / ∫v_t² dy across the pipe is added.
+
+    ## Starting State
+
+    `reset(seed=s)` starts episode s; the splits train, dev and test have separate ranges of seeds.
+    Without a seed, a random training episode is drawn, from few at first. The first use of a seed
+    simulates its truth and stores it in the cache; `eitbench bank` does so in advance.
+
+    ## Episode End
+
+    Terminated after T + lag steps. Never truncated.
+
+    ## Arguments
+
+    | name | default | meaning |
+    |---|---|---|
+    | `lag` | that of the id | integer from 0 to T − 1, or "all" (= T − 1): the whole record first |
+    | `assume` | that of the id | dict of wrong assumptions on the flow in the task's model |
+    | `world` | None | numbers to change, as in `{"instrument": {"noise_relative": 0.02}}` |
+    | `episodes` | None | training episodes of unseeded resets; None: 1, 8, … up to 1000 |
+    | `render_mode` | None | "rgb_array": truth, estimate, standard deviation, active pair |
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 8}  # noqa: RUF012 (gymnasium's form)

@@ -29,30 +29,52 @@ OBSERVATIONS = ("scaled", "raw")
 
 
 class InjectionEnv(KnowsItsLength, gym.Env[Any, Any]):  # type: ignore[misc]
-    """One episode in which the agent chooses every injection.
+    """Choose the current injections of one episode; a Kalman filter inside makes the estimate.
 
-    The reward is, for scored states, by how much the estimate's relative error ∫(ĉ_t − c_t)² /
-    ∫c_t² lies below that of ĉ_bh; its sum over an episode is greatest where ẽ_c (thesis 5.12), the
-    mean of these errors, is least.
+    ## Action Space
 
-    Parameters
-    ----------
-    name, world, episodes, render_mode
-        As in `EstimationEnv`.
-    estimator : "reduced", "full" or "none"
-        "reduced": a filter of reduced order, for training. "full": the exact one, for
-        scores. The first frame is measured with the world's own cycle, from which ĉ_bh and the
-        filter's parameters follow; the agent takes over after it. "none": the agent chooses all
-        injections, sees noisy voltages, and is paid nothing: for estimators and rewards of one's
-        own.
-    observation : "scaled" or "raw"
-        One array with entries of about −1 to 1 (`scaled`), or a dict in SI units.
-    gate : float, optional
-        The filter leaves out readings further from its prediction than so many standard deviations;
-        default: as the id says, or none.
-    inflow : "white" or "learned", optional
-        What the estimator believes of the inflow: white noise (Table 5.1), or what training
-        episodes show of it; default: as the id says, or "white".
+    `Discrete(n)`: the number of an electrode pair (0, 1), (0, 2), … (`Rules.pairs`); the
+    current enters at the first electrode and leaves at the second. With a budget, the last action
+    is no injection. With `instrument.limit`, `Box`: a current for each electrode relative to the
+    instrument's current, see `Rules`.
+
+    ## Observation Space
+
+    By default one array with entries of about −1 to 1, limited to ±5 (`scaled`). With
+    `observation="raw"` a `Dict` in SI units, `float64`, with the keys below; with
+    `estimator="none"` only `voltages`, `currents` and `left`, raw.
+
+    ## Rewards
+
+    For each scored state the difference ∫(ĉ_bh − c_t)² dΩ / ∫c_t² dΩ − ∫(ĉ_t − c_t)² dΩ / ∫c_t² dΩ
+    between the error of the homogeneous estimate, which no injection changes, and that of the
+    filter; 0 for the other states. The score is ẽ_c (thesis 5.12), the mean of the second term;
+    where the world has a `region`, both integrals are over the region. With `estimator="none"` the
+    reward is 0.
+
+    ## Starting State
+
+    `reset(seed=s)` starts episode s; the splits train, dev and test have separate ranges of seeds.
+    Without a seed, a random training episode is drawn, from few at first. The first frame is
+    measured with the world's cycle of injections; from it follow ĉ_bh and the parameters of the
+    filter. The agent injects after it; with `estimator="none"` it makes all injections.
+
+    ## Episode End
+
+    Terminated after the last injection. Never truncated.
+
+    ## Arguments
+
+    | name | default | meaning |
+    |---|---|---|
+    | `estimator` | "reduced" | reduced filter for training; "full": exact, for scores; "none" |
+    | `observation` | "scaled" | or "raw" |
+    | `gate` | that of the id | the filter rejects readings beyond this many standard deviations |
+    | `inflow` | that of the id | inflow prior: "white" noise (Table 5.1), or "learned" |
+    | `world` | None | numbers to change, as in `{"schedule": {"budget": 20}}` |
+    | `episodes` | None | training episodes of unseeded resets; None: 1, 8, … up to 1000 |
+    | `render_mode` | None | "rgb_array": truth, estimate, standard deviation, injection |
+    | `threads` | 1 | vector form only: threads of the filters; give BLAS one thread then |
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 8}  # noqa: RUF012 (gymnasium's form)

@@ -6,13 +6,7 @@ products of the covariance serves every pair (``docs/methods.md``, 8).
 
 from __future__ import annotations
 
-import math
-from typing import TYPE_CHECKING
-
 import numpy as np
-
-if TYPE_CHECKING:
-    import scipy.sparse as sp
 
 
 def pair_gains(covariance_of: np.ndarray, weighted: np.ndarray, pairs: np.ndarray,
@@ -48,38 +42,3 @@ def pair_gains(covariance_of: np.ndarray, weighted: np.ndarray, pairs: np.ndarra
     learnt = between(weighted) * root[:, :, None] * root[:, None, :]
     gains = np.linalg.solve(S, learnt).trace(axis1=1, axis2=2)
     return gains, np.log(factor.diagonal(axis1=1, axis2=2)).sum(axis=1)
-
-
-def independent_rows(derivative: np.ndarray) -> np.ndarray:
-    """(L(L−1)/2, n) of the derivatives (L, L, n) of 𝓡; 𝓡 = 𝓡ᵀ and 𝓡1 = 0 give the others."""
-    return np.asarray(derivative[np.triu_indices(len(derivative), 1)])
-
-
-def pair_tables(rows: np.ndarray, cross: np.ndarray,
-                mass: np.ndarray | sp.csr_array) -> tuple[np.ndarray, np.ndarray]:
-    """D P Dᵀ and D P W P Dᵀ, (L, L, L, L) each, that `pair_gains` wants, where n is large.
-
-    Parameters
-    ----------
-    rows : (L(L−1)/2, n)
-        What `independent_rows` leaves of D.
-    cross : (n, L(L−1)/2)
-        P rowsᵀ, such as `KalmanFilter.apply_covariance` gives once it has predicted.
-    mass : (n, n), dense or sparse
-        W.
-    """
-    return _all_rows(rows @ cross), _all_rows(cross.T @ (mass @ cross))
-
-
-def _all_rows(table: np.ndarray) -> np.ndarray:
-    """(L, L, L, L) from a table (L(L−1)/2, L(L−1)/2) of the independent rows."""
-    L = (1 + math.isqrt(1 + 8 * len(table))) // 2
-    i, j = np.triu_indices(L, 1)
-
-    def one_side(part: np.ndarray) -> np.ndarray:
-        full = np.zeros((L, L, part.shape[1]))
-        full[i, j] = full[j, i] = part
-        full[np.arange(L), np.arange(L)] = -full.sum(axis=1)
-        return full.reshape(L * L, -1)
-
-    return one_side(one_side(table).T).T.reshape(L, L, L, L)

@@ -15,7 +15,7 @@ import numpy as np
 
 from eitbench import _check
 from eitbench._files import write_atomically
-from eitbench.estimation.inflow_prior import learned_in
+from eitbench.estimation.inflow_prior import learned_in, nominal_worlds
 from eitbench.estimation.inflow_response import Response
 
 if TYPE_CHECKING:
@@ -152,7 +152,8 @@ def suiting_models(folder: Path, task: Task) -> list[IdentifiedModel]:
     """Those in a folder's files that are of this task: first those that were learned in the task's
     own world, then the others, by name."""
     suiting = [model for model in map(_loaded, sorted(folder.glob("*.npz"))) if model.suits(task)]
-    return sorted(suiting, key=lambda model: learned_in(model.source) != task.world)
+    return sorted(suiting, key=lambda model: learned_in(model.source) not in
+                  nominal_worlds(task.world))
 
 
 @lru_cache(maxsize=8)

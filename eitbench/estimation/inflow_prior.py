@@ -14,6 +14,7 @@ import numpy as np
 
 from eitbench import _check
 from eitbench._files import write_atomically
+from eitbench._notice import say
 from eitbench.data.seeds import SPLITS, name_seed
 from eitbench.worlds.registry import entries
 
@@ -149,13 +150,6 @@ class InflowPrior:
             raise ValueError(f"{path} must be a prior of `eitbench fit-prior`: {error}") from None
 
 
-def white_inflow(task: Task) -> InflowPrior:
-    """That of Table 5.1: every node and every step is independent of all others."""
-    points = task.mesh.points[task.transport.inlet]
-    return InflowPrior("linear", points, task.prior.inflow_std * np.eye(len(points)),
-                       np.ones(1), task.transport.time_step)
-
-
 def fit_inflow_prior(ratios: np.ndarray, points: np.ndarray, time_step: float, *,
                      link: str = "logarithm", nugget: float = 0.01, kept: float = 1e-4,
                      quiet: float | None = None,
@@ -232,14 +226,32 @@ def learned_inflow_prior(world: World, seeds: Sequence[int], **how: Any) -> Infl
 
 
 def suiting_priors(folder: Path, task: Task, link: str) -> list[InflowPrior]:
-    """Those in a folder's files that are of this link and this task's inlet: first those that were
-    learned in the task's own world, then the others, by name.
+    """Return the priors in a folder's files with this link, for this task's inlet and time step.
 
-    Another world may have other slugs: one whose own are not known takes those of the first file.
+    Priors learned in the task's own world come first, the others by file name. If several worlds
+    have such an inlet and none of them is the task's, a line names the world whose prior comes
+    first, since the inflow may differ from the task's.
     """
-    found = map(_loaded, sorted(folder.glob("*.json")))
-    suiting = [prior for prior in found if prior.link == link and prior.suits(task)]
-    return sorted(suiting, key=lambda prior: learned_in(prior.source) != task.world)
+    priors = map(_loaded, sorted(folder.glob("*.json")))
+    suiting = [prior for prior in priors if prior.link == link and prior.suits(task)]
+    worlds = {learned_in(prior.source) for prior in suiting}
+    if len(worlds) > 1 and not worlds & nominal_worlds(task.world):
+        _say_other_world(task.world, str(learned_in(suiting[0].source)))
+    return sorted(suiting, key=lambda prior: learned_in(prior.source) not in
+                  nominal_worlds(task.world))
+
+
+@lru_cache
+def _say_other_world(world: str, learned: str) -> None:
+    """Report once a process which prior stands in for a missing one."""
+    say(f"no inflow prior was learned in {world!r}: that of {learned} is used; "
+        "make one by `eitbench fit-prior`")
+
+
+def nominal_worlds(name: str) -> set[str]:
+    """Return the name of a world and of the world that its estimators are told of."""
+    homes = {each.home for each in entries().values() if each.home and each.world.name == name}
+    return {name} | {entries()[home].world.name for home in homes}
 
 
 @lru_cache(maxsize=16)

@@ -42,34 +42,6 @@ class LinearConductivity:
 
 
 @dataclass(frozen=True)
-class KohlrauschConductivity:
-    """σ = (Λ₀ − K√c) c, Kohlrausch's law of strong electrolytes; rises up to c = (2Λ₀/3K)².
-
-    The defaults are sodium chloride in water at 25 °C by Onsager's limiting law, Λ₀ = 126.45 and
-    K = 89.1 in S·cm²/mol with c in mol/l (Robinson & Stokes, *Electrolyte Solutions*, 1959).
-    """
-
-    limiting_molar_conductivity: float = 0.012645
-    """Λ₀ in S·m²/mol, > 0"""
-    kohlrausch_coefficient: float = 89.1e-4 / np.sqrt(1000.0)
-    """K in S·m²/mol per √(mol/m³), ≥ 0"""
-
-    def __post_init__(self) -> None:
-        _check.number("limiting_molar_conductivity", self.limiting_molar_conductivity, low=0.0,
-                      open_low=True, units="S·m²/mol")
-        _check.number("kohlrausch_coefficient", self.kohlrausch_coefficient, low=0.0,
-                      units="S·m²/mol per √(mol/m³)")
-
-    def __call__(self, concentration: np.ndarray) -> np.ndarray:
-        lost = self.kohlrausch_coefficient * np.sqrt(concentration)
-        return (self.limiting_molar_conductivity - lost) * concentration
-
-    def derivative(self, concentration: np.ndarray) -> np.ndarray:
-        lost = 1.5 * self.kohlrausch_coefficient * np.sqrt(concentration)
-        return self.limiting_molar_conductivity - lost
-
-
-@dataclass(frozen=True)
 class VoltageNoise:
     """Independent Gaussian noise (thesis 5.1.1), largest being that of the same injection.
 

@@ -18,7 +18,8 @@ import io
 import json
 import time
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -125,8 +126,19 @@ def read_config(path: str | Path) -> Config:
             f"config {str(path)!r} must hold what `Config` asks for: {error}") from None
 
 
-# with more, rounding and so what is learnt depends on how many there are
-@threadpool_limits.wrap(limits=1)
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Limit BLAS and torch to one thread: with more, rounding depends on their number."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with threadpool_limits(1):
+            yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@_one_thread()
 def train(env: str, algo: str, config: Config, seed: int, folder: Path,
           kwargs: dict[str, Any] | None = None) -> Path:
     """Train an agent; returns the path of its model.
@@ -389,5 +401,3 @@ class _Checkpoints(BaseCallback):
         self._rows.clear()
         _save(self.model, self.folder / "latest.zip")
 
-
-torch.set_num_threads(1)

@@ -10,7 +10,7 @@ import socket
 import subprocess
 import sys
 import time
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 
 import numpy as np
@@ -31,9 +31,9 @@ from eitbench.bench.isolation import (
 from eitbench.bench.run import Job, run_episode, run_jobs
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.tracks import Environment
+from eitbench.data.cache import CACHE_VARIABLE
 from eitbench.data.episodes import simulate
-from eitbench.data.store import CACHE_VARIABLE
-from eitbench.worlds.pipe2d import PIPE_2D
+from eitbench.worlds.catalogue import PIPE_2D
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -74,7 +74,7 @@ def write_policy(folder, act="return int(self.random.integers(self.rules.action_
 
 
 def worker(path, kind="bubblewrap", **how):
-    return Worker("estimation", FILTER.id, json.loads(FILTER.kwargs), path, kind, **how)
+    return closing(Worker("estimation", FILTER.id, json.loads(FILTER.kwargs), path, kind, **how))
 
 
 def ask(path, kind="bubblewrap", *, reply_timeout=60.0, **how):

@@ -9,8 +9,8 @@ from eitbench.bench.records import newest, read_record, read_records, write_reco
 from eitbench.bench.store import EpisodeStore, provenance
 from eitbench.bench.submit import submit
 from eitbench.data import bank
+from eitbench.data.cache import CACHE_VARIABLE
 from eitbench.data.seeds import parse_seeds
-from eitbench.data.store import CACHE_VARIABLE
 
 from commands import eitbench
 from short import PIPE, shorten
@@ -124,9 +124,9 @@ def test_policies_in_records_are_not_played_again(tmp_path):
     (["eitbench/Pipe4D-v0"], "test:0", "env must be one of"),
 ])
 def test_what_cannot_be_submitted(environments, seeds, message, tmp_path):
-    """Nothing is played, and nothing written."""
+    """The call says so, before it is iterated; nothing is run, and nothing written."""
     with pytest.raises(ValueError, match=message):
-        next(submit("kalman_filter", environments, parse_seeds(seeds), EpisodeStore(tmp_path / "r"), tmp_path / "to"))
+        submit("kalman_filter", environments, parse_seeds(seeds), EpisodeStore(tmp_path / "r"), tmp_path / "to")
     assert not (tmp_path / "r").exists() and not (tmp_path / "to").exists()
 
 
@@ -165,7 +165,7 @@ def test_what_says_more_is_not_replaced(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match=r"to must not hold a record that says more; .* lose its being official$"):
         submitted("c", TEST)
     assert read_records(to) == [first] and not (tmp_path / "c").exists()               # it is said before it is played
-    path = write_record(to, first | {"runs": [run | {"source": "0" * 64} for run in first["runs"]]})
+    path = write_record(to, first | {"runs": [run | {"commit": "decaf"} for run in first["runs"]]})
     with pytest.raises(ValueError, match="would lose its being official"):
         submitted("b", TEST[:1])
     with monkeypatch.context() as patch:
@@ -175,18 +175,18 @@ def test_what_says_more_is_not_replaced(tmp_path, monkeypatch):
     assert newest(read_records(to)) == ([read_record(path), newer], [])         # only an official one makes it outdated
 
 
-def test_a_record_of_other_code_is_extended(tmp_path, monkeypatch):
-    """Its episodes are neither played again nor lost, and each run names its own source."""
+def test_a_record_of_another_scoring_is_extended(tmp_path, monkeypatch):
+    """Its episodes are neither run again nor lost, and each run names its own version of scoring."""
     to = tmp_path / "to"
     (path,) = submit("homogeneous", [FILTER.id], TEST[:1], EpisodeStore(tmp_path / "a"), to)
     first = read_record(path)
-    monkeypatch.setattr(store_module, "source_digest", lambda: "0" * 64)
+    monkeypatch.setattr(store_module, "SCORING", 99)
     provenance.cache_clear()
     (path,) = submit("homogeneous", [FILTER.id], TEST, EpisodeStore(tmp_path / "b"), to)
     both = read_record(path)
     assert both["seeds"] == ["test:0", "test:1"] and both["episodes"][0]["scores"] == first["episodes"][0]["scores"]
-    assert [both["runs"][episode["run"]]["source"] for episode in both["episodes"]] == [
-        first["runs"][0]["source"], "0" * 64]
+    assert [both["runs"][episode["run"]]["versions"]["scoring"] for episode in both["episodes"]] == [
+        first["runs"][0]["versions"]["scoring"], "99"]
     assert [path.name for path in (tmp_path / "b").glob("episodes/*/*/*.json")] == ["test-1.json"]
 
 
@@ -213,11 +213,13 @@ def test_an_invalid_record_is_in_nobody_s_way(tmp_path, monkeypatch):
     """What another method claimed, and no schema allows, is left out of the table and the page."""
     monkeypatch.setattr(run, "scored", lambda *asked, scored=run.scored: scored(*asked) | {"seconds_per_step": -1.0})
     submitted = ("--env", FILTER.id, "--seeds", "test:0", "-j", "1")
-    with pytest.warns(UserWarning, match=r"left out: .*homogeneous.* is not valid: .*seconds_per_step"):
+    with pytest.warns(UserWarning, match=r"homogeneous/test-0\.json is left out: it is not valid: .*seconds_per_step"):
         code, _, complaint = eitbench("run", "--baseline", "homogeneous", *submitted)
     assert code == 2 and "no results in results" in complaint
-    code, _, complaint = eitbench("submit", "--baseline", "homogeneous", *submitted)
-    assert code == 2 and "is not valid" in complaint and not (tmp_path / "leaderboards").exists()
+    with pytest.warns(UserWarning, match="left out"):
+        code, _, complaint = eitbench("submit", "--baseline", "homogeneous", *submitted)
+    assert code == 2 and "holds no valid result of homogeneous" in complaint
+    assert not (tmp_path / "leaderboards").exists()
     monkeypatch.undo()
     monkeypatch.chdir(tmp_path)
     shorten(monkeypatch, {FILTER.id: SCENARIO})

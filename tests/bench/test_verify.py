@@ -15,10 +15,10 @@ from eitbench.bench.held_out import held_out_seeds, p_value, read_secret
 from eitbench.bench.isolation import bubblewrap_problem
 from eitbench.bench.records import read_record, write_record
 from eitbench.bench.run import Job, run_episode
+from eitbench.data.cache import CACHE_VARIABLE, cache_folder, folder
 from eitbench.data.episodes import simulate
 from eitbench.data.seeds import SPLITS, parse_seeds
-from eitbench.data.store import CACHE_VARIABLE, cache_folder, folder
-from eitbench.worlds.pipe2d import PIPE_2D
+from eitbench.worlds.catalogue import PIPE_2D
 
 from commands import eitbench
 from short import PIPE, shorten
@@ -214,7 +214,7 @@ def test_the_cache_is_not_used(mine, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr("eitbench.data.episodes.simulate_together", lambda *_: iter([flat]))
         path = submitted(mine)
-    assert list(folder(world).glob("*.truth.npz"))
+    assert list(folder(world).glob("*.truth.npy"))
     assert eitbench("verify", path, "--method", mine, *HERE)[0] == 1
     assert cache_folder() == tmp_path / "cache"
 

@@ -3,7 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from eitbench.data import beginnings, store
+from eitbench.data import beginnings, cache
 from eitbench.data.bank import fill
 from eitbench.data.beginnings import MARGIN, concentration_at, script, script_so_far
 from eitbench.data.episodes import simulate
@@ -21,7 +21,7 @@ IDS = ["eitbench/Pipe2D-v0", "eitbench/Pipe2DFixedLag-v0", "eitbench/Pipe2DInjec
 @pytest.fixture(autouse=True)
 def place(tmp_path, monkeypatch):
     """A cache folder of its own for each test, and a process that has simulated nothing."""
-    monkeypatch.setenv(store.CACHE_VARIABLE, str(tmp_path / "cache"))
+    monkeypatch.setenv(cache.CACHE_VARIABLE, str(tmp_path / "cache"))
     forget()
     forget_made(beginnings)
     yield
@@ -42,7 +42,7 @@ def test_its_bits_are_those_of_the_whole(id):
     begun = script_so_far(world, 3, 1)
     assert len(begun.entries) == 1 + MARGIN and not is_recorded(world, 3)
     states = [concentration_at(world, 3, t, 1) for t in (0, 1 + MARGIN)]
-    assert not list(store.folder(world).glob("3.*"))                       # nothing is left behind
+    assert not list(cache.folder(world).glob("3.*"))                       # nothing is left behind
     whole = script(world, 3)
     assert begun.entries.tobytes() == whole.entries[:1 + MARGIN].tobytes()
     for part, all_of_it in zip(begun.integrals, whole.integrals, strict=True):

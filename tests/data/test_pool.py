@@ -3,7 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from eitbench.data import bank, pool, store
+from eitbench.data import bank, cache, pool
 from eitbench.data.bank import fill
 from eitbench.data.pool import MOST, Pool
 from eitbench.worlds import entry
@@ -21,7 +21,7 @@ ENVIRONMENTS = {"eitbench/Pipe2D-v0": {}, "eitbench/Pipe2DInjection-v0": {"estim
 @pytest.fixture(autouse=True)
 def place(tmp_path, monkeypatch):
     """A cache folder of its own for each test."""
-    monkeypatch.setenv(store.CACHE_VARIABLE, str(tmp_path / "cache"))
+    monkeypatch.setenv(cache.CACHE_VARIABLE, str(tmp_path / "cache"))
     forget()
     yield tmp_path / "cache"
     forget()

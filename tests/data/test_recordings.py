@@ -5,25 +5,28 @@ import subprocess
 import sys
 
 import eitbench  # noqa: F401 (registers)
+import gymnasium as gym
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from eitbench.data import episodes, recordings
+from eitbench.data import episodes, recordings, regions
+from eitbench.data.cache import CACHE_VARIABLE
 from eitbench.data.episodes import truth_discretisation
 from eitbench.data.recordings import (
     cycle_voltages,
     faults_of,
-    outline,
+    is_recorded,
     recording,
     recording_path,
     step_error,
 )
-from eitbench.data.store import CACHE_VARIABLE
+from eitbench.data.regions import outline
+from eitbench.worlds.catalogue import PIPE_2D
 
 from recorded import bits, digest, forget, outline_bits
 from tiny_worlds import CHANGES, TINY
 
-pytestmark = pytest.mark.usefixtures("cache")
+pytestmark = pytest.mark.usefixtures("place")
 
 
 # -- independent integrals -------------------------------------------------------------------------
@@ -145,8 +148,8 @@ def test_cycle_voltages_have_the_faults_of_the_episode():
 
 def test_stored_truth_fresh_truth_and_other_process_give_the_same_bits(episode, monkeypatch,
                                                                        tmp_path):
-    """A recording does not depend on where its truth came from, nor does an outline; both are kept
-    as computed."""
+    """Recordings and outlines do not depend on where their truth came from, or whether they were
+    cached."""
     fresh, stage = recording(TINY, 7), outline(TINY)
     assert bits(fresh) == bits(recordings.make_recording(TINY, 7, episode))
     before = bits(fresh), outline_bits(stage)
@@ -156,20 +159,20 @@ def test_stored_truth_fresh_truth_and_other_process_give_the_same_bits(episode, 
     # from the stored truth
     assert (bits(recording(TINY, 7)), outline_bits(outline(TINY))) == before
     monkeypatch.setattr(recordings, "simulate", None)
-    monkeypatch.setattr(recordings, "score_operators", None)
+    monkeypatch.setattr(regions, "score_operators", None)
     forget()
     assert (bits(recording(TINY, 7)), outline_bits(outline(TINY))) == before         # from the disk
     here = os.path.dirname(__file__)
     program = (f"import sys; sys.path[:0] = [{here!r}, {os.path.dirname(here)!r}]\n"
                "from test_recordings import *\n"
                "print(digest(recording(TINY, 7), outline(TINY)))")
-    for place in (tmp_path / "elsewhere", tmp_path / "cache"):            # anew, and from our files
+    for place in (tmp_path / "elsewhere", tmp_path / "cache"):           # built, and from our files
         done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True,
                               check=True, env=os.environ | {CACHE_VARIABLE: str(place)})
         assert done.stdout.strip() == digest(fresh, stage)
 
 
-def test_playing_what_is_stored_needs_no_finite_elements(counted):
+def test_playing_what_is_stored_needs_no_finite_elements(episode):
     """With recording and outline on disk, making, resetting and stepping an environment builds no
     mesh."""
     recording(TINY, 7), outline(TINY)
@@ -184,8 +187,30 @@ def test_playing_what_is_stored_needs_no_finite_elements(counted):
     assert done.stdout == "True []\n"
 
 
+def test_is_recorded():
+    """False before, true after; false for another seed or world."""
+    assert not is_recorded(TINY, 7)
+    recording(TINY, 7)
+    assert is_recorded(TINY, 7) and not is_recorded(TINY, 8) and not is_recorded(PIPE_2D, 7)
+
+
 @pytest.mark.parametrize("seed", [-1, 1.0, True, "7", None])
 def test_seed_must_be_a_whole_number(seed):
-    """Seeds that would be rounded or cast are refused by name."""
+    """Seeds that would be rounded or cast are rejected by name."""
     with pytest.raises(ValueError, match="seed must be an integer of at least 0"):
         recording(TINY, seed)
+
+
+def test_an_unwritable_cache_still_plays(monkeypatch):
+    """The numbers are those of any other machine."""
+    entries = recording(TINY, 7)
+    monkeypatch.setenv(CACHE_VARIABLE, "/dev/null/cache")
+    forget()
+    with pytest.warns(UserWarning, match="cannot be kept"):
+        env = gym.make("eitbench/Pipe2D-v0", world=CHANGES).unwrapped
+        observation, _ = env.reset(seed=7)
+    np.testing.assert_array_equal(observation["voltages"], cycle_voltages(TINY, 7, entries)[0])
+    rewards = [env.step(np.full(1701, TINY.background))[1] for _ in range(5)]
+    np.testing.assert_allclose(rewards[2:], -(entries["deviation"] / entries["square"])[2:],
+                               rtol=1e-12)
+    assert rewards[:2] == [0.0, 0.0]

@@ -7,12 +7,13 @@ from typing import NamedTuple
 import numpy as np
 from eitbench.estimation import (
     FreeCovariance,
+    InflowPrior,
     KalmanFilter,
     LinearisedObservations,
     Observation,
     table_5_1,
 )
-from eitbench.worlds.pipe2d import PIPE_2D
+from eitbench.worlds.catalogue import PIPE_2D
 
 
 class LinearGaussian(NamedTuple):
@@ -177,3 +178,10 @@ class QuadraticModel:
         self.calls += 1
         return (self.voltages(concentration, currents),
                 np.einsum("j,jlm,km->klj", 2 * concentration, self.T, currents))
+
+
+def white_inflow(task):
+    """The prior of Table 5.1: every node and every step is independent of all others."""
+    points = task.mesh.points[task.transport.inlet]
+    return InflowPrior("linear", points, task.prior.inflow_std * np.eye(len(points)), np.ones(1),
+                       task.transport.time_step)

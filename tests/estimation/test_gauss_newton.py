@@ -7,8 +7,10 @@ import scipy.sparse as sp
 from eitbench.estimation import best_homogeneous, gauss_newton
 from eitbench.numerics.mesh import rectangle_mesh
 from eitbench.physics.cem import CompleteElectrodeModel
-from eitbench.physics.observation import KohlrauschConductivity, ObservationModel, VoltageNoise
+from eitbench.physics.observation import ObservationModel, VoltageNoise
 from models import QuadraticModel
+
+from shapes import RootLaw
 
 
 class Linear:
@@ -35,13 +37,13 @@ class Arctangent:
 
 
 def small_tank():
-    """A real observation model with four electrodes, 45 nodes and Kohlrausch's nonlinear conductivity."""
+    """A real observation model with four electrodes, 45 nodes and a nonlinear conductivity."""
     eit = rectangle_mesh(np.linspace(0.0, 0.2, 9), np.linspace(-0.05, 0.05, 5))
     electrodes = [eit.facets_where(lambda p, a=a, y=y: (p[:, 1] == y) & (np.abs(p[:, 0] - a) < 0.026))
                   for y in (-0.05, 0.05) for a in (0.05, 0.15)]
     cd = rectangle_mesh(np.linspace(0.0, 0.2, 6), np.linspace(-0.05, 0.05, 4))
     return cd.n_nodes, ObservationModel(CompleteElectrodeModel(eit, electrodes, 2e-3),
-                                        cd.interpolation_to(eit.points), KohlrauschConductivity(), 0.1)
+                                        cd.interpolation_to(eit.points), RootLaw(), 0.1)
 
 
 # -- Gauss–Newton -----------------------------------------------------------------------------------------------------

@@ -16,13 +16,12 @@ from eitbench.estimation import (
     asked_flow,
     inflow_response,
     scaled_flow,
-    white_inflow,
 )
 from eitbench.numerics.mesh import rectangle_mesh
 from eitbench.physics.transport import ConvectionDiffusion
-from eitbench.worlds.pipe2d_skewed import PIPE_2D_SKEWED
-from eitbench.worlds.stationary_tank import STATIONARY_TANK_2D
+from eitbench.worlds.catalogue import PIPE_2D_SKEWED, STATIONARY_TANK_2D
 from eitbench.worlds.task import make_task
+from models import white_inflow
 
 from tiny_worlds import TINY
 

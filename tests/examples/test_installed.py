@@ -38,7 +38,6 @@ COMMANDS = [
     (("render", *TANK, "--baseline", "homogeneous", "--step", "3", "-o", "it.png"), "wrote it.png"),
     (("reproduce", "fig7.4", "--seeds", "dev:0", "-j", "1"), "wrote results/figures"),
     (("cards", "eitbench/StationaryTank2D-v0", "homogeneous"), "homogeneous: same"),
-    (("kits", "eitbench/StationaryTank2D-v0"), ": same"),
     (("fit-prior", "--env", "eitbench/Pipe2D-v0", "--seeds", "train:0-3", "-o", "prior.json"), "prior.json: "),
     (("fit-model", "--env", "eitbench/Pipe2D-v0", "--seeds", "train:0-1", "-o", "model.npz"), "model.npz: "),
     (("estimate", "--help"), "instrument"),

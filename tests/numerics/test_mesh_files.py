@@ -9,12 +9,12 @@ import meshio
 import numpy as np
 import pytest
 from eitbench.numerics.mesh import Mesh
-from eitbench.numerics.mesh_files import read_mesh, write_mesh
+from eitbench.numerics.mesh_files import read_mesh
 from eitbench.physics.cem import CompleteElectrodeModel
 from eitbench.physics.transport import inlet_nodes
 from numpy.testing import assert_allclose, assert_array_equal
 
-from shapes import end_facets, shaken_box, shaken_rectangle
+from shapes import end_facets, shaken_box, shaken_rectangle, write_mesh
 
 SIZE = np.array([1.0, 0.8, 0.6])
 MESHES = {2: shaken_rectangle(*SIZE[:2], (6, 5), np.random.default_rng(11)),
@@ -244,20 +244,15 @@ def with_elements(*elements: str) -> str:
 
 
 @pytest.mark.parametrize(("text", "match"), [
-    (with_elements(), "must hold triangles or tetrahedra, got line, vertex"),
-    (with_elements("3 2 3 1 20 30 40 50"), "must hold triangles or tetrahedra, got line, quad"),
-    (with_elements("2 2 3 1 20 30 40", "3 2 3 1 20 40 50 10"),
-     "nothing but triangles.* got line, quad"),
-    (with_elements("4 2 3 1 20 30 50 60", "5 2 3 1 20 30 40 50 20 30 40 50"),
-     "nothing but triangles.* got hexahedron, line, tetra"),
-    (with_elements("9 2 3 1 20 30 40 10 10 10"), "first order, with straight sides, got triangle6"),
-    (with_elements("2 2 3 1 20 30 40", "8 2 1 1 20 30 10"), "first order, .* got line3"),
-    (with_elements("2 2 3 1 20 30 40", "2 2 3 1 20 40 60"),
-     "in the plane z = 0, got z from 0 to 7"),
+    (with_elements(), "must hold only straight triangles, .* got line, vertex"),
+    (with_elements("3 2 3 1 20 30 40 50"), "got line, quad"),
+    (with_elements("4 2 3 1 20 30 50 60", "5 2 3 1 20 30 40 50 20 30 40 50"), "got hexahedron, line, tetra"),
+    (with_elements("9 2 3 1 20 30 40 10 10 10"), "got line, triangle6"),
+    (with_elements("2 2 3 1 20 30 40", "8 2 1 1 20 30 10"), "got line, line3, triangle"),
+    (with_elements("2 2 3 1 20 30 40", "2 2 3 1 20 40 60"), "in the plane z = 0"),
     (with_elements("2 2 3 1 20 30 30"), "cells must have a positive volume"),
     (with_elements("2 2 3 1 20 30 40"),
-     r"group 'electrode 1' must lie on the boundary, got 1 of 2 facets that do not, "
-     r"the first with its nodes at \[\[2.0, 1.0\], \[0.0, 1.0\]\] m"),
+     "group 'electrode 1' must lie on the boundary, got 1 of 2 facets that do not"),
     (SQUARE.replace("3 1 2 2 2 40 30", "3 1 2 2 2 40 20"),
      "group 'walls' must lie on the boundary, got 1 of 2"),
     (SQUARE.replace('1 2 "walls"\n', "").replace("Names\n4", "Names\n3"),
@@ -291,27 +286,6 @@ def test_files_that_are_not_there(name, tmp_path):
 def test_scales_that_are_refused(scale, tmp_path):
     with pytest.raises(ValueError, match="scale must be a"):
         read_mesh(written(tmp_path, SQUARE), scale=scale)
-
-
-@pytest.mark.parametrize(("name", "facets", "match"), [
-    ("", [[0, 1]], "groups must have names of printable characters"),
-    ('my "inlet"', [[0, 1]], "groups must have names of printable characters"),
-    ("two\nlines", [[0, 1]], "groups must have names of printable characters"),
-    (3, [[0, 1]], "groups must have names of printable characters"),
-    ("wall", np.zeros((0, 2), int), r"group 'wall' must be integers of shape \(n_facets ≥ 1, 2\)"),
-    ("wall", [[0.0, 1.0]], "group 'wall' must be integers"),
-    ("wall", [0, 1], "group 'wall' must be integers"),
-    ("wall", [[0, 1], [8, 7]], r"must lie on the mesh's boundary, got facet \(7, 8\)"),
-])
-def test_groups_that_cannot_be_written(name, facets, match, tmp_path):
-    with pytest.raises(ValueError, match=match):
-        write_mesh(tmp_path / "box.msh", MESHES[2], {name: facets})
-    assert not list(tmp_path.iterdir())
-
-
-def test_only_gmsh_is_written(tmp_path):
-    with pytest.raises(ValueError, match=r"box\.vtu: the name of the file must end with \.msh"):
-        write_mesh(tmp_path / "box.vtu", MESHES[2])
 
 
 def test_without_meshio_the_extra_is_named(tmp_path, monkeypatch):

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from eitbench.numerics.mesh import rectangle_mesh
 from eitbench.physics.cem import CompleteElectrodeModel
-from eitbench.physics.observation import KohlrauschConductivity, LinearConductivity, ObservationModel, VoltageNoise
+from eitbench.physics.observation import LinearConductivity, ObservationModel, VoltageNoise
 from numpy.testing import assert_allclose, assert_array_equal
 
-LAWS = [LinearConductivity(0.011), KohlrauschConductivity()]
+from shapes import RootLaw
+
+LAWS = [LinearConductivity(0.011), RootLaw()]
 PATTERNS = np.array([[1.0, -1.0, 0.0, 0.0], [0.0, 0.5, -1.5, 1.0], [0.3, 0.3, 0.3, -0.9]])
 FLOOR = 2.0
 
@@ -51,28 +53,9 @@ def test_linear_law():
     assert_allclose(LinearConductivity(0.011)(np.array([0.0, 10.0, 30.0])), [0.0, 0.11, 0.33])
 
 
-def test_kohlrausch_law_is_sodium_chloride():
-    """Within 1 % of the molar conductivity tabulated for NaCl at 25 °C up to 0.01 mol/l."""
-    c = np.array([0.5, 1.0, 5.0, 10.0])                                        # mol/m³
-    tabulated = np.array([124.44, 123.68, 120.59, 118.45]) * 1e-4              # S·m²/mol
-    assert_allclose(KohlrauschConductivity()(c) / c, tabulated, rtol=1e-2)
-
-
-def test_kohlrausch_law_without_its_root_is_linear():
-    """K = 0 leaves σ = Λ₀c; with K the conductivity peaks at c = (2Λ₀/3K)²."""
-    c = np.array([1.0, 30.0])
-    assert_allclose(KohlrauschConductivity(0.012, 0.0)(c), LinearConductivity(0.012)(c))
-    law = KohlrauschConductivity(0.012, 3e-4)
-    peak = np.array([(2 * 0.012 / (3 * 3e-4))**2])
-    assert law.derivative(peak) == pytest.approx(0.0, abs=1e-15)
-    assert (law.derivative(0.9 * peak) > 0).all() and (law.derivative(1.1 * peak) < 0).all()
-
-
 @pytest.mark.parametrize(("make", "match"), [
     (lambda: LinearConductivity(0.0), "molar_conductivity"),
     (lambda: LinearConductivity(np.nan), "molar_conductivity"),
-    (lambda: KohlrauschConductivity(-0.01), "limiting_molar_conductivity"),
-    (lambda: KohlrauschConductivity(0.01, -1.0), "kohlrausch_coefficient"),
     (lambda: VoltageNoise(relative=-0.01), "relative"),
     (lambda: VoltageNoise(of_largest=np.inf), "of_largest"),
     (lambda: VoltageNoise(floor="low"), "floor")])

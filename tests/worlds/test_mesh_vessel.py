@@ -5,7 +5,6 @@ import hashlib
 import gymnasium as gym
 import numpy as np
 import pytest
-from eitbench.numerics.mesh_files import write_mesh
 from eitbench.numerics.round import electrode_disc
 from eitbench.physics.cem import CompleteElectrodeModel
 from eitbench.worlds import World, register
@@ -15,6 +14,7 @@ from eitbench.worlds.mesh_vessel import MeshVessel
 from eitbench.worlds.schedule import AroundTheTank, Schedule
 from eitbench.worlds.vessels import RoundTank
 
+from shapes import write_mesh
 from short import register_apart
 
 TANK = RoundTank(n_electrodes=8)

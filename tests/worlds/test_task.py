@@ -10,7 +10,7 @@ import pytest
 from eitbench.data.episodes import Episode, simulate, truth_discretisation
 from eitbench.data.store import CACHE_VARIABLE
 from eitbench.envs.estimation import EstimationEnv
-from eitbench.worlds.pipe2d import PIPE_2D
+from eitbench.worlds.catalogue import PIPE_2D
 from eitbench.worlds.task import make_task
 from eitbench.worlds.world import World
 

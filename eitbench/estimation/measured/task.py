@@ -16,9 +16,9 @@ from eitbench.physics.observation import LinearConductivity, ObservationModel
 from eitbench.physics.profiles import parabola
 from eitbench.physics.rest import AtRest
 from eitbench.physics.transport import ConvectionDiffusion
-from eitbench.worlds.parts import Prior
 from eitbench.worlds.task import Task
 from eitbench.worlds.vessels import PlanePipe, RoundPipe
+from eitbench.worlds.world import Prior
 
 if TYPE_CHECKING:
     from eitbench.data.measured import Measurements

@@ -47,7 +47,8 @@ class Rules:
     inflow: str = "white"
 
     def __post_init__(self) -> None:
-        _check.number("gate", min(self.gate, 1e300), low=0.0, open_low=True)
+        if self.gate != np.inf:
+            _check.number("gate", self.gate, low=0.0, open_low=True)
         if self.inflow not in INFLOWS:
             raise ValueError(f"inflow must be one of {', '.join(INFLOWS)}, got {self.inflow!r}")
 
