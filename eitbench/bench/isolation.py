@@ -54,7 +54,7 @@ from eitbench.bench.methods import (
     own_files,
     own_sha256,
 )
-from eitbench.bench.tracks import BOARDS
+from eitbench.bench.tracks import BOARDS, Environment, is_measured
 from eitbench.data.cache import CACHE_VARIABLE, cache_folder, model_key
 from eitbench.worlds import streams
 from eitbench.worlds.registry import entry, registered_by_hand, take_over
@@ -102,24 +102,30 @@ class Limits(NamedTuple):
     """bytes of one file, and of the private /tmp under bubblewrap"""
 
 
-def choose_isolation(method: str, track: str, isolate: str = "auto", *,
+def choose_isolation(environment: Environment, method: str, isolate: str = "auto", *,
                      strict: bool = False) -> str:
     """Return ``none``, ``process`` or ``bubblewrap`` for a method, given by name or path.
 
     ``auto`` runs built-in methods in this process, and third-party files in a plain process, or
     under bubblewrap if ``strict``. Other values hold for built-in methods too, except privileged
-    ones. ``ValueError`` if there is no such value, bubblewrap is required and does not work, or a
-    third-party file would run in this process where that is ``strict``.
+    ones. On measurements every method runs in this process, since a worker would read the file with
+    the withheld ones too. ``ValueError`` if there is no such value, bubblewrap is required and does
+    not work, or a third-party file would run in this process where that is ``strict``.
     """
     if isolate not in ISOLATE:
         raise ValueError(f"isolate must be one of {', '.join(ISOLATE)}, got {isolate!r}")
     if is_ours(method):
-        is_plain = isolate in ("auto", "none") or load_method(method, track).privileged
+        is_plain = isolate in ("auto", "none") or load_method(method, environment.track).privileged
         kind = "none" if is_plain else isolate
     elif isolate == "auto":
         kind = "bubblewrap" if strict else "process"
     else:
         kind = isolate
+    if is_measured(environment.id):
+        if strict and isolate != "none" and not is_ours(method):
+            raise ValueError(f"{method} would run on measurements in this process, which only "
+                             "--isolate none permits")
+        return "none"
     if strict and kind == "none" and not is_ours(method):
         raise ValueError(f"isolate must be bubblewrap or process for the third-party file {method}")
     if kind == "bubblewrap" and (reason := bubblewrap_problem()):

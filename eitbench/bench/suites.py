@@ -99,7 +99,7 @@ def jobs(track: str, environments: list[str], methods: list[str], seeds: list[in
 def isolated_job(environment: Environment, method: str, isolate: str,
                  strict: bool = False) -> Job:
     """Return the job of a method, by name or path, isolated as `isolation.choose_isolation`."""
-    kind = choose_isolation(method, environment.track, isolate, strict=strict)
+    kind = choose_isolation(environment, method, isolate, strict=strict)
     return Job(environment, _absolute(method), 0, kind)
 
 

@@ -31,7 +31,7 @@ from eitbench.bench.run import Job, run_episode
 from eitbench.bench.scores import scored, scores
 from eitbench.bench.table import Cell, Table
 from eitbench.bench.text import scores_by_seed
-from eitbench.bench.tracks import Environment
+from eitbench.bench.tracks import Environment, ids, is_measured
 from eitbench.data.cache import cache_in
 from eitbench.data.parallel import in_parallel
 from eitbench.data.seeds import parse_seeds
@@ -116,8 +116,9 @@ def verify(paths: Sequence[Path], folder: Path, options: Options = DEFAULT, *,
 
 
 def official_records(folder: Path, environments: Sequence[str] = ()) -> list[Path]:
-    """Return the paths of the current official records of a folder, of these environments or all.
-    ``ValueError`` if there are none, or naming all files that are not valid."""
+    """Return the paths of the current official records of a folder, of these environments or of
+    all that are simulated. ``ValueError`` if there are none, or naming all files that are not
+    valid."""
     return [path for path, record in _current(folder, environments) if record["official"]] \
         or _none(folder, environments)
 
@@ -141,8 +142,10 @@ def _current(folder: Path, environments: Sequence[str]) -> list[tuple[Path, dict
     if complaints:
         raise ValueError("; ".join(complaints))
     current = {id(record) for record in newest(list(read.values()))[0]}
-    return [(path, record) for path, record in read.items() if id(record) in current
-            and (not environments or record["environment"]["id"] in environments)]
+    # Files of measurements are rarely there.
+    asked = set(environments) or {name for name in ids() if not is_measured(name)}
+    return [(path, record) for path, record in read.items()
+            if id(record) in current and record["environment"]["id"] in asked]
 
 
 def _none(folder: Path, environments: Sequence[str]) -> list[Path]:
@@ -180,7 +183,7 @@ def job_of(record: dict[str, Any], file: str | None = None, isolate: str = "auto
     if sha256 != record["method_sha256"] and not is_ours(method):
         raise ValueError(f"the sha256 of {path.name} is {sha256}, but that of the record "
                          f"{record['method_sha256']}")
-    isolation = choose_isolation(method, environment.track, isolate, strict=True)
+    isolation = choose_isolation(environment, method, isolate, strict=True)
     return Job(environment, method, 0, isolation)
 
 

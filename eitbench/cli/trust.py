@@ -43,10 +43,6 @@ def verify(
     out: Annotated[Path | None, typer.Option(
         "--out", "-o", help="Folder of results, with which the same command resumes. Default: "
                             "results/verify with --all, else none is kept.")] = None,
-    data: Annotated[Path | None, typer.Option(
-        help="For a record of measured data: the instrument's file.")] = None,
-    truth: Annotated[Path | None, typer.Option(
-        help="With --data: the ground truth, if the case has one.")] = None,
 ) -> None:
     """Rerun episodes of records, and compare every score.
 
@@ -54,12 +50,12 @@ def verify(
     again; the cache is not used. A third-party method's file must have the record's sha256, and
     runs under bubblewrap unless --isolate process is given. Standard output is Markdown.
     """
-    if data is not None:
-        return _verify_measured(paths or [], data, method, seed or 0, truth)
+    import os
     import secrets
 
     from eitbench.bench.held_out import read_secret
     from eitbench.bench.verify import official_records, top_records
+    from eitbench.measured.cases import FOLDER_VARIABLE, measured_folder
     with options.clear_errors():
         _check_arguments(paths or [], every, top, episodes, held_out, secret, method)
         key = read_secret(secret) if secret else b""
@@ -68,6 +64,8 @@ def verify(
             chosen = official_records(records, env or [])
         elif top:
             chosen = top_records(records, top, env or [])
+    # their folder is by default in the cache, which reruns do not use
+    os.environ.setdefault(FOLDER_VARIABLE, str(measured_folder().absolute()))
     if every and out is None:
         out = Path("results/verify")
     drawn = 0 if every and seed is None else secrets.randbelow(2**32) if seed is None else seed
@@ -138,15 +136,3 @@ def _held_out(paths: list[Path], folder: Path, method: str | None, isolate: str,
     return problems
 
 
-def _verify_measured(paths: list[Path], data: Path, method: str | None, seed: int,
-                     truth: Path | None) -> None:
-    if len(paths) != 1:
-        raise typer.BadParameter("one record's file must be given with --data")
-    from eitbench.bench.measured_cases import read_case
-    from eitbench.bench.measured_records import read_measured_record, verify_measured
-    with options.clear_errors():
-        record = read_measured_record(paths[0])
-        case = read_case(paths[0].with_name(f"{record['case']}.yml"))
-        differences = verify_measured(record, case, data, method or record["method"], seed, truth)
-    options.say_differences(differences)
-    options.say(f"{paths[0].name}: the rerun agrees with the record")

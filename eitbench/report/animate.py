@@ -53,7 +53,7 @@ def animate(environment: str, methods: Sequence[str], seed: str, step: int | Non
     if played.track == "injection" and len(methods) > 1:
         raise ValueError(f"policy must be one for {environment}, got {', '.join(methods)}")
     with threadpool_limits(1):
-        kinds = [choose_isolation(method, played.track, isolate) for method in methods]
+        kinds = [choose_isolation(played, method, isolate) for method in methods]
         loaded = [Job(played, method, seeds[0], kind).load()
                   for method, kind in zip(methods, kinds, strict=True)]
         env: Any = played.make(render_mode="rgb_array")

@@ -157,7 +157,7 @@ def test_nothing_of_the_file_runs_in_the_host(tmp_path):
 ])
 def test_isolation_depends_on_method_and_option(method, isolate, strict, expected):
     """Built-in files run here by default, third-party files never do where that is strict."""
-    assert choose_isolation(method, "estimation", isolate, strict=strict) == expected
+    assert choose_isolation(FILTER, method, isolate, strict=strict) == expected
 
 
 def test_third_party_files_need_bubblewrap_where_strict(monkeypatch):
@@ -166,9 +166,9 @@ def test_third_party_files_need_bubblewrap_where_strict(monkeypatch):
     for asked in ({"strict": True}, {"isolate": "bubblewrap"}):
         with pytest.raises(ValueError, match=r"is not installed; install bubblewrap \(apt-get install bubblewrap\), "
                                              r"or .* --isolate process"):
-            choose_isolation("mine.py", "estimation", **asked)
+            choose_isolation(FILTER, "mine.py", **asked)
     with pytest.raises(ValueError, match="isolate must be bubblewrap or process"):
-        choose_isolation("mine.py", "estimation", "none", strict=True)
+        choose_isolation(FILTER, "mine.py", "none", strict=True)
     with pytest.raises(ValueError, match="isolate must be one of auto, none, process, bubblewrap, got 'never'"):
         suites.jobs("estimation", [FILTER.id], ["homogeneous"], [1], isolate="never")
 
