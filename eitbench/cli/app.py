@@ -13,13 +13,11 @@ from eitbench import __version__
 from eitbench.cli import options
 from eitbench.cli.estimate import estimate
 from eitbench.cli.export import export
-from eitbench.cli.maintain import golden, held_out
-from eitbench.cli.measured import submit_measured
+from eitbench.cli.maintain import golden
 from eitbench.cli.play import policies, report, run, typed
 from eitbench.cli.priors import fit_model, fit_prior
-from eitbench.cli.season import app as season_commands
 from eitbench.cli.studies import thesis
-from eitbench.cli.trust import check, verify
+from eitbench.cli.trust import verify
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
                   context_settings={"help_option_names": ["-h", "--help"]}, help="""
@@ -166,7 +164,7 @@ def submit(
         help="Test episodes, as in test:0-9. Default: those of the boards.")] = None,
     official: Annotated[bool, typer.Option(
         "--official", help="For maintainers: a run of theirs.")] = False,
-    isolate: options.Isolate = options.Isolation.others,
+    isolate: options.Isolate = options.Isolation.auto,
     jobs: options.Jobs = options.CORES,
     backend: options.Backends = options.Backend.loky,
     out: options.Out = Path("results"),
@@ -194,14 +192,10 @@ def submit(
 
 
 app.command()(verify)
-app.command()(check)
-app.add_typer(season_commands, name="season")
-app.command("held-out")(held_out)
 app.command()(golden)
 app.command("fit-prior")(fit_prior)
 app.command("fit-model")(fit_model)
 app.command()(estimate)
-app.command("submit-measured")(submit_measured)
 app.command()(export)
 
 
@@ -287,7 +281,7 @@ def render(
     out: Annotated[Path, typer.Option(
         "--out", "-o", help="An animation .gif or .webp, or a .png with --step.",
     )] = Path("results/episode.gif"),
-    isolate: options.Isolate = options.Isolation.others,
+    isolate: options.Isolate = options.Isolation.auto,
 ) -> None:
     """Draw an episode: truth, estimate, its spread, electrodes; of several baselines estimates."""
     from eitbench.bench.tracks import track_of
@@ -315,6 +309,26 @@ def reproduce(
         path, remark = thesis().FIGURES[name.value](options.numbers(seeds), jobs, out)
     options.say(f"wrote {path}\n{remark}")
 
+
+REPLACED = {
+    "check": "`eitbench verify RECORDS…` verifies the records of a submission",
+    "held-out": "docs/trust.md says how to draw the secret of held-out episodes",
+    "season": "`eitbench verify --top 3 --held-out 20 --secret FILE` verifies the first records; "
+              "there is one public test split",
+}
+"""Removed command -> what replaces it."""
+
+
+def _removed(name: str) -> None:
+    @app.command(name, hidden=True, add_help_option=False, context_settings={
+        "allow_extra_args": True, "ignore_unknown_options": True})
+    def removed() -> None:
+        options.say(f"`eitbench {name}` was removed: {REPLACED[name]}", err=True)
+        raise typer.Exit(2)
+
+
+for _name in REPLACED:
+    _removed(_name)
 
 if __name__ == "__main__":
     app()
