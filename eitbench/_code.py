@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import hashlib
-import inspect
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -26,14 +25,6 @@ def package_files(*patterns: str) -> list[Path]:
             raise FileNotFoundError(f"there is no file {pattern} in {PACKAGE}")
         found += files
     return sorted(found)
-
-
-def file_of(kind: type) -> Path | None:
-    """Where a class is written; a class typed into a session is nowhere."""
-    try:
-        return Path(inspect.getfile(kind))
-    except (OSError, TypeError):
-        return None
 
 
 def _without_docstrings(file: Path) -> bytes:

@@ -15,7 +15,7 @@ from eitbench.bench.playing import policys_random
 from eitbench.bench.tracks import check_track
 from eitbench.data.bank import fill
 from eitbench.data.dataset import asked_seeds
-from eitbench.data.export import seed_ranges
+from eitbench.data.export import WARNING, seed_ranges
 from eitbench.data.seeds import for_scores, is_test, name_seed
 
 if TYPE_CHECKING:
@@ -28,7 +28,6 @@ gives the same observations and rewards again. Observations are scaled, as \
 eitbench.envs.injection_core.scaled says; rewards are the difference between the relative squared \
 errors of the best constant and of the estimate, zero in states that are not scored. Simulated by \
 eitbench {version}; no measured data, no personal data. Licence: MIT. {warning}"""
-WARNING = "Test episodes are among them: report on them, and neither learn nor choose."
 
 
 def export_minari(name: str, env: str, policy: str, seeds: str | Sequence[int], *,

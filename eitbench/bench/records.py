@@ -113,6 +113,8 @@ def read_sound_files(folder: Path, *, keep: Callable[[dict[str, Any]], Any] = di
     complaints = []
     known = set(tracks.ids())
     for path in sorted(Path(folder).glob("*.json")):
+        if path.name.startswith(tracks.MEASURED_FILES):         # see `read_measured_files`
+            continue
         try:
             record = read_record(path)
         except ValueError as error:
@@ -125,6 +127,21 @@ def read_sound_files(folder: Path, *, keep: Callable[[dict[str, Any]], Any] = di
             warnings.warn(f"record {cleaned(str(path))} is left out: there is no environment "
                           f"{cleaned(id)}", stacklevel=4)
     return kept, complaints
+
+
+def read_measured_files(folder: Path) -> tuple[dict[Path, dict[str, Any]], list[str]]:
+    """Valid records of measured cases in a folder by path, and a sentence for each invalid one."""
+    found, errors = {}, []
+    for path in sorted(Path(folder).glob(f"{tracks.MEASURED_FILES}*.json")):
+        try:
+            record = read_record(path)
+            if not tracks.is_measured(record["environment"]["id"]):
+                raise ValueError(f"record {cleaned(str(path))} refers to an unknown case")
+        except ValueError as error:
+            errors.append(str(error))
+        else:
+            found[path] = record
+    return found, errors
 
 
 def write_episode_table_of(folder: Path) -> Path:

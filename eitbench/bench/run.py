@@ -26,11 +26,12 @@ from eitbench.bench.sandbox.host import GuestError
 from eitbench.bench.sandbox.wall import landlock_version
 from eitbench.bench.scores import SCORING, scored
 from eitbench.bench.store import EpisodeStore, machine, portable_command, provenance
-from eitbench.bench.tracks import Environment, board_of
+from eitbench.bench.tracks import Environment, board_of, is_measured, registered
 from eitbench.data.cache import world_digest
 from eitbench.data.episodes import simulate
 from eitbench.data.parallel import in_parallel
 from eitbench.data.seeds import name_seed
+from eitbench.measured.cases import read_case
 from eitbench.worlds.registry import entry
 
 _LASTING = ("environment", "method", *SHARED)
@@ -70,12 +71,20 @@ class Job(NamedTuple):
                  for each in (path, path.with_name("config.json"))
                  if each == path or (path.suffix != ".py" and each.is_file())}
         arguments = self.environment.arguments
-        world = entry(self.environment.id).world.changed(arguments.pop("world"))
+        world = arguments.pop("world", None)
         parts = {"environment": self.environment.id, "arguments": arguments,
-                 "world": world_digest(world), "files": files, "loader": loader_of(path),
+                 "world": _content_digest(self.environment.id, world), "files": files,
+                 "loader": loader_of(path),
                  "version": version_of(path, files[path.name]), "seed": self.seed,
                  "scoring": SCORING}
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _content_digest(id: str, changes: dict[str, Any] | None) -> str:
+    """Return the digest of an environment's world with ``changes``, or of its measured case."""
+    if is_measured(id):
+        return read_case(registered(id)["case"]).digest
+    return world_digest(entry(id).world.changed(changes))
 
 
 def run_episode(job: Job) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -161,7 +170,7 @@ def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1, backend: 
     if not todo:
         return
     truths: dict[Any, Job] = {}  # each once, before several methods want it at once
-    for job in todo:
+    for job in (job for job in todo if not is_measured(job.environment.id)):
         truths.setdefault((environment(job.environment).world, job.seed), job)
     run = {"command": portable_command(command), **provenance(), "machine": machine()}
     home = platform.node()

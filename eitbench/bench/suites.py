@@ -29,6 +29,7 @@ from eitbench.bench.tracks import (
     check_track,
     default_seeds,
     ids,
+    is_measured,
 )
 
 TOO_SLOW_FOR_QUICK = {("filter", "gauss_newton")}
@@ -105,9 +106,12 @@ def isolated_job(environment: Environment, method: str, isolate: str) -> Job:
 
 
 def is_isolated(environment: Environment, method: str, isolate: str) -> bool:
-    """Whether a method plays in a process of its own; ours that are shown the truth never do."""
+    """Whether a method plays in a process of its own; ours that are shown the truth never do, nor
+    does any on measurements, whose withheld readings lie in the file that is read there too."""
     if isolate not in ISOLATE:
         raise ValueError(f"isolate must be one of {', '.join(ISOLATE)}, got {isolate!r}")
+    if is_measured(environment.id):
+        return False
     if isolate != "always" or not is_ours(method):
         return isolate != "never" and not is_ours(method)
     return not load_method(method, environment.track).privileged

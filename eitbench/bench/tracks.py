@@ -40,6 +40,12 @@ ESTIMATORS = ("full", "reduced")
 """What may stand inside an injection environment: the exact filter, for scores, or that of
 training."""
 
+MEASURED = "eitbench.envs.measured:case_env"
+"""Entry point of the ids of measured cases."""
+MEASURED_FILES = "eitbench-Measured-"
+"""Beginning of the names of their records."""
+MEASURED_SEEDS = "test:0-4"
+"""Each withholds other readings of the same measurements."""
 QUICK = ("eitbench/Pipe2D-v0", "eitbench/Pipe2DFixedLag-v0", "eitbench/Pipe2DSmoothing-v0")
 """What the quick suite runs; the full one runs all that ask for estimates."""
 QUICK_SEEDS = "test:0-3"
@@ -78,8 +84,7 @@ class Environment(NamedTuple):
         creator = load_env_creator(str(gym.spec(self.id).entry_point))
         defaults = {name: each.default for name, each in signature(creator).parameters.items()
                     if each.default is not Parameter.empty}
-        return (defaults | dict(entry(self.id).settings) | SCORED[self.track]
-                | json.loads(self.kwargs))
+        return defaults | registered(self.id) | SCORED[self.track] | json.loads(self.kwargs)
 
     def make(self, **extra: Any) -> EstimationEnv | InjectionEnv:
         """A fresh environment as it is played, without gymnasium's wrappers.
@@ -102,6 +107,16 @@ def ids(track: str | None = None) -> list[str]:
     return [id for id, each in entries().items() if track in (None, each.track)]
 
 
+def measured_ids() -> list[str]:
+    """Ids of measured cases, which no default suite contains."""
+    return [id for id in gym.registry if is_measured(id)]
+
+
+def is_measured(id: str) -> bool:
+    """Whether an id is a measured case: its data have no simulated truth."""
+    return id in gym.registry and gym.registry[id].entry_point == MEASURED
+
+
 def own_ids() -> list[str]:
     """Those of ours."""
     return [id for id in ids() if id.startswith("eitbench/")]
@@ -109,12 +124,12 @@ def own_ids() -> list[str]:
 
 def track_of(id: str) -> str:
     """One of `TRACKS`; ``ValueError`` if there is no environment of this id."""
-    return entry(id).track
+    return "estimation" if is_measured(id) else entry(id).track
 
 
 def home_of(id: str) -> str:
     """The id whose task estimators get in this one too, though the truth is another; else empty."""
-    return entry(id).home
+    return "" if is_measured(id) else entry(id).home
 
 
 def check_track(id: str, track: str) -> None:
@@ -129,7 +144,7 @@ def registered(id: str) -> dict[str, Any]:
     """Arguments that an id was registered with; none for one that is not registered."""
     each = entries().get(id)
     if each is None:
-        return {}
+        return dict(gym.registry[id].kwargs) if is_measured(id) else {}
     return SCORED[each.track] | dict(each.settings)
 
 
@@ -203,7 +218,9 @@ def track_of_board(board: str) -> str:
 
 
 def class_of(id: str, board: str) -> str:
-    """Which of `CLASSES` a board of an environment belongs to."""
+    """Which of `CLASSES` a board of an environment belongs to; ``measured`` of a case."""
+    if is_measured(id):
+        return "measured"
     each = entries().get(id)
     at_rest = each is not None and getattr(each.world.target, "stands_still", False)
     return "stationary" if at_rest else board
@@ -212,4 +229,6 @@ def class_of(id: str, board: str) -> str:
 def default_seeds(id: str, suite: str = "full") -> list[int]:
     """Seeds that are played in an environment when nobody says which: of the season's test
     episodes."""
+    if is_measured(id):
+        return parse_seeds(in_season(MEASURED_SEEDS))
     return parse_seeds(in_season(QUICK_SEEDS if suite == "quick" else entry(id).seeds))

@@ -14,7 +14,6 @@ from eitbench.cli import options
 from eitbench.cli.estimate import estimate
 from eitbench.cli.export import export
 from eitbench.cli.maintain import golden, held_out
-from eitbench.cli.measured import submit_measured
 from eitbench.cli.play import policies, report, run, typed
 from eitbench.cli.priors import fit_model, fit_prior
 from eitbench.cli.season import app as season_commands
@@ -201,7 +200,6 @@ app.command()(golden)
 app.command("fit-prior")(fit_prior)
 app.command("fit-model")(fit_model)
 app.command()(estimate)
-app.command("submit-measured")(submit_measured)
 app.command()(export)
 
 

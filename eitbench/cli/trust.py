@@ -36,11 +36,6 @@ def verify(
     backend: options.Backends = options.Backend.loky,
     out: Annotated[Path, typer.Option(
         "--out", "-o", help="With --all: where what came out is kept.")] = Path("results/verify"),
-    data: Annotated[Path | None, typer.Option(
-        help="Of a record of the measured board: the instrument's file. One play is made again, "
-             "that of --seed, by default 0.")] = None,
-    truth: Annotated[Path | None, typer.Option(
-        help="With --data: the truth, if the case has one.")] = None,
 ) -> None:
     """Play episodes of a record again and say whether it is true: exit status 0 if so, 1 if not.
 
@@ -51,8 +46,6 @@ def verify(
     With --all, episodes of every official record of a folder, cheap environments first; the same
     command again goes on where it was interrupted.
     """
-    if data is not None:
-        return _verify_measured(record, data, baseline, seed or 0, truth)
     if every:
         if record or baseline or policy or held_out or salt_file:
             raise typer.BadParameter("--all takes neither a record's file nor --baseline, "
@@ -109,21 +102,6 @@ def _verify_all(folder: Path, environments: list[str], out: Path, tolerance: flo
         rows = verify_all(official_records(folder, environments), out, **how)
     options.say(by_environment(rows, tolerance))
     options.say_differences(differing(rows, tolerance))
-
-
-def _verify_measured(record: Path | None, data: Path, baseline: str | None, seed: int,
-                     truth: Path | None) -> None:
-    if record is None:
-        raise typer.BadParameter("a record's file must be given with --data")
-    from eitbench.bench.measured_cases import read_case
-    from eitbench.bench.measured_records import read_measured_record, verify_measured
-    with options.clear_errors():
-        claimed = read_measured_record(record)
-        case = read_case(record.with_name(f"{claimed['case']}.yml"))
-        differences = verify_measured(claimed, case, data, baseline or claimed["method"], seed,
-                                      truth)
-    options.say_differences(differences)
-    options.say(f"{record.name}: what was played again is as it says")
 
 
 def check(

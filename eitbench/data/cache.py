@@ -29,7 +29,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from eitbench._files import PACKAGE, write_atomically
-from eitbench.worlds.parts import LATER
+from eitbench.worlds.fields import LATER
 from eitbench.worlds.world import World
 
 CACHE_VARIABLE = "EITBENCH_CACHE"
@@ -37,12 +37,11 @@ PACKAGE_DATA = PACKAGE / "data" / "package_data"
 """Folder of the files that the package ships; `eitbench.bench.package_data` writes them."""
 SIMULATION = 3
 """Version of the simulation and of what is kept of an episode."""
-CHECKSUM_BYTES = 4
 TRANSPOSED = ".T"
-"""End of the names of fields that hold a transposed array: what BLAS rounds depends on the order in
-memory, and computations must not depend on whether an array was built or read."""
-STRIDES = (1, 4, 8)
-"""Sizes in bytes of the numbers whose bytes are regrouped before compression; the best is taken."""
+"""End of the name of a field that holds a transposed array. The order in memory is kept because
+rounding in BLAS depends on it."""
+WORD = 8
+"""Bytes of a checksum; the length of a file is a multiple."""
 
 Arrays = Mapping[str, np.ndarray]
 
@@ -107,9 +106,21 @@ def is_cached(key: Key) -> bool:
 def ship(key: Key, arrays: Arrays) -> None:
     """Write the arrays of a key into the package, atomically."""
     content = np.frombuffer(_encode(key, arrays), np.uint8)
-    packed = (bytes([stride]) + lzma.compress(content.reshape(-1, stride).T.tobytes(), preset=9)
-              for stride in STRIDES if len(content) % stride == 0)
+    # Bytes of like significance may compress better together: of 4-byte or 8-byte numbers.
+    packed = (bytes([size]) + lzma.compress(content.reshape(-1, size).T.tobytes(), preset=9)
+              for size in (1, 4, 8))
     write_atomically(key.shipped_path, min(packed, key=len))
+
+
+def load_shipped(key: Key) -> dict[str, np.ndarray] | None:
+    """Return the arrays that the package ships for a key; None without a sound file."""
+    try:
+        packed = key.shipped_path.read_bytes()
+        regrouped = np.frombuffer(lzma.decompress(packed[1:]), np.uint8)
+        content = regrouped.reshape(packed[0], -1).T.tobytes()
+    except (FileNotFoundError, lzma.LZMAError, ValueError, IndexError):
+        return None
+    return _fields(np.load(io.BytesIO(content))) if _is_sound(key, content) else None
 
 
 def warn_not_kept(place: Path, error: OSError) -> None:
@@ -190,7 +201,17 @@ def _digest(configuration: Any) -> str:
 def _encode(key: Key, arrays: Arrays) -> bytes:
     """Return the content of a file."""
     content = npy(_record(arrays))
+    content += bytes(-len(content) % WORD)
     return content + _checksum(key, content)
+
+
+def _checksum(key: Key, content: bytes) -> bytes:
+    """Return a checksum that holds for this content under this key only."""
+    return zlib.crc32(content, zlib.crc32("/".join(key).encode())).to_bytes(WORD, "little")
+
+
+def _is_sound(key: Key, content: bytes) -> bool:
+    return _checksum(key, content[:-WORD]) == content[-WORD:]
 
 
 def _record(arrays: Arrays) -> np.ndarray:
@@ -217,16 +238,6 @@ def _fields(record: np.ndarray) -> dict[str, np.ndarray]:
             for name, array in fields.items()}
 
 
-def _checksum(key: Key, content: bytes) -> bytes:
-    """Return a checksum of a file's content, which holds under the file's key only."""
-    checksum = zlib.crc32(content, zlib.crc32("/".join(key).encode()))
-    return checksum.to_bytes(CHECKSUM_BYTES, "little")
-
-
-def _is_sound(key: Key, content: bytes) -> bool:
-    return _checksum(key, content[:-CHECKSUM_BYTES]) == content[-CHECKSUM_BYTES:]
-
-
 _sound: dict[Path, tuple[int, int]] = {}
 """Size and modification time of the files whose checksum this process has verified."""
 
@@ -244,14 +255,3 @@ def _load(key: Key) -> dict[str, np.ndarray] | None:
         return _fields(np.load(path, mmap_mode="r"))
     except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
         return None
-
-
-def load_shipped(key: Key) -> dict[str, np.ndarray] | None:
-    """Return the arrays that the package ships for a key; None without a sound file."""
-    try:
-        packed = key.shipped_path.read_bytes()
-        content = np.frombuffer(lzma.decompress(packed[1:]), np.uint8)
-        plain = content.reshape(packed[0], -1).T.tobytes()
-    except (FileNotFoundError, lzma.LZMAError, ValueError, IndexError):
-        return None
-    return _fields(np.load(io.BytesIO(plain))) if _is_sound(key, plain) else None

@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     import scipy.sparse as sp
 
     from eitbench.numerics.mesh import Mesh
-    from eitbench.physics.profiles import VelocityModel
 
 MIN_MASS = 1e-9
 """Fraction of the largest diagonal mass below which a node only touches a region by rounding."""
@@ -61,26 +60,116 @@ class Example(NamedTuple):
     """(T, k) m/s, the flow parameters that fit the true flow best; k = 0 where the flow is known"""
 
 
-class _Scored:
-    """Examples with a mass matrix that scores estimates."""
+@dataclass(frozen=True, eq=False)
+class Dataset:
+    """Examples of a world, in the order of their seeds; `dataset` makes it.
 
-    mass: Any
-    warm_up: int
+    Iterating holds one example at a time. Missing episodes are simulated, eight together, and kept
+    in the cache; `eitbench bank` does so beforehand, in several processes.
+    """
+
+    env: str
+    """the environment's id"""
+    world: World
+    seeds: tuple[int, ...]
+    basis: np.ndarray | None = None
+    """(n, q) B in mol/m³ of reduced coordinates, or None: nodes"""
+    mean: float | np.ndarray = 0.0
+    """c̄ in mol/m³, one or (n,)"""
 
     def __len__(self) -> int:
-        raise NotImplementedError
+        return len(self.seeds)
+
+    def __iter__(self) -> Iterator[Example]:
+        for k in range(0, len(self.seeds), TOGETHER):
+            group = self.seeds[k:k + TOGETHER]
+            fill_here(self.world, group)
+            yield from map(self.example, group)
 
     def __getitem__(self, index: int) -> Example:
-        raise NotImplementedError
+        return self.example(self.seeds[index])
+
+    def example(self, seed: int) -> Example:
+        """Return the example of one episode, which is simulated if the cache does not hold it."""
+        world = self.world
+        entries = recording(world, seed)
+        truth, unresolved, square = _projected(world, seed, entries)
+        cycle = world.currents
+        nodal = Example(seed, cycle_voltages(world, seed, entries),
+                        cycle[np.arange(world.n_steps) % len(cycle)],
+                        (world.background + truth).astype(np.float32), unresolved, square,
+                        _fitted_flow(world, entries))
+        return nodal if self.basis is None else self.of(nodal)
+
+    def of(self, example: Example) -> Example:
+        """Return an example on the nodes in these coordinates."""
+        deviation = example.truth.astype(float) - self.mean
+        a = np.linalg.solve(self.mass, self._weighted.T @ deviation.T).T
+        left = deviation - a @ self._columns.T
+        square = np.einsum("tn,nt->t", left, self._nodal_mass @ left.T)
+        return example._replace(truth=a, unresolved=example.unresolved + square)
+
+    @property
+    def mesh(self) -> Mesh:
+        """Mesh of the nodes."""
+        return self.world.vessel.carrier(fine=False)[0]  # type: ignore[no-any-return]
+
+    @property
+    def warm_up(self) -> int:
+        """Number of first states that are not scored."""
+        return self.world.warm_up
+
+    @cached_property
+    def mass(self) -> Any:
+        """Sparse M̃ (n, n) in m² (m³ in 3D): ∫f² = fᵀ M̃ f of nodal values f, over what counts; or
+        G (q, q) in (mol/m³)²·m², the identity for a basis of `modes`."""
+        if self.basis is None:
+            return self._nodal_mass
+        gram = self._columns.T @ self._weighted
+        return 0.5 * (gram + gram.T)
 
     def errors(self, example: Example, estimate: np.ndarray) -> np.ndarray:
-        """Return ∫(ĉ_t − c_t)²/∫c_t² (T,) of an ``estimate`` of the shape of `Example.truth`.
-
-        ẽ_c (thesis 5.12) is the mean over t > warm_up, as the environment scores it.
-        """
+        """Return ∫(ĉ_t − c_t)²/∫c_t² (T,) of an ``estimate`` of the shape of `Example.truth`; ẽ_c
+        (thesis 5.12) is the mean over t > warm_up, as the environment scores it."""
         estimate = _check.array("estimate", estimate, example.truth.shape)
         off = estimate - example.truth
         return (np.einsum("tn,nt->t", off, self.mass @ off.T) + example.unresolved) / example.square
+
+    def modes(self, q: int) -> np.ndarray:
+        """Return the q strongest modes (n, q) of the scored states of these examples relative to
+        the background: the best basis in the norm of the score, and orthonormal in it.
+        ``ValueError`` if there are fewer than q."""
+        return strongest(self, q)[0]
+
+    def reduced(self, basis: np.ndarray, mean: float | np.ndarray | None = None) -> Dataset:
+        """Return the same examples in coordinates a, c = mean + basis a, with exact scores.
+
+        Parameters
+        ----------
+        basis : (n, q) array, mol/m³
+            Such as `modes`. ``ValueError`` if its columns depend on each other.
+        mean : float or (n,) array, mol/m³
+            Default: the world's background.
+        """
+        n = self.mesh.n_nodes
+        basis = _check.array("basis", basis, (n, None), units="mol/m³")
+        if mean is None:
+            mean = self.world.background
+        elif np.ndim(mean):
+            mean = _check.array("mean", mean, (n,), units="mol/m³")
+        else:
+            _check.number("mean", mean, units="mol/m³")
+        reduced = Dataset(self.env, self.world, self.seeds, basis, mean)
+        squares = np.linalg.eigvalsh(reduced.mass)
+        if not squares[0] > RANK_TOLERANCE * squares[-1]:
+            raise ValueError("basis must have independent columns over what is scored; some of "
+                             f"these {len(squares)} depend on others")
+        return reduced
+
+    def concentration(self, coordinates: np.ndarray) -> np.ndarray:
+        """Return mol/m³ (..., n) of coordinates (..., q)."""
+        found: np.ndarray = self.mean + coordinates @ self._columns.T
+        return found
 
     def torch(self) -> TorchDataset:
         """Return the same as a map-style dataset for torch. ``ModuleNotFoundError`` without torch.
@@ -92,11 +181,26 @@ class _Scored:
             import torch  # noqa: F401
         return TorchDataset(self)
 
+    @cached_property
+    def _nodal_mass(self) -> sp.csr_array:
+        return _symmetric(score_mass(self.world))
+
+    @property
+    def _columns(self) -> np.ndarray:
+        if self.basis is None:
+            raise ValueError("coordinates are those of `Dataset.reduced`, which has a basis")
+        return self.basis
+
+    @cached_property
+    def _weighted(self) -> np.ndarray:
+        weighted: np.ndarray = self._nodal_mass @ self._columns
+        return weighted
+
 
 class TorchDataset:
     """A dataset whose items hold the fields of an `Example` as tensors in single precision."""
 
-    def __init__(self, examples: _Scored) -> None:
+    def __init__(self, examples: Dataset) -> None:
         self.examples = examples
 
     def __len__(self) -> int:
@@ -108,144 +212,6 @@ class TorchDataset:
         seed = torch.tensor(fields.pop("seed"))
         return {"seed": seed} | {name: torch.from_numpy(np.array(field, dtype=np.float32))
                                  for name, field in fields.items()}
-
-
-@dataclass(frozen=True)
-class Dataset(_Scored):
-    """Examples of a world, in the order of their seeds; `dataset` makes it.
-
-    Iterating holds one example at a time. Missing episodes are simulated, eight together, and kept
-    in the cache; `eitbench bank` does so beforehand, in several processes.
-    """
-
-    env: str
-    """the environment's id"""
-    world: World
-    seeds: tuple[int, ...]
-
-    def __len__(self) -> int:
-        return len(self.seeds)
-
-    def __iter__(self) -> Iterator[Example]:
-        for k in range(0, len(self.seeds), TOGETHER):
-            group = self.seeds[k:k + TOGETHER]
-            fill_here(self.world, group)
-            for seed in group:
-                yield self.example(seed)
-
-    def __getitem__(self, index: int) -> Example:
-        return self.example(self.seeds[index])
-
-    def example(self, seed: int) -> Example:
-        """Return the example of one episode, which is simulated if the cache does not hold it."""
-        world = self.world
-        entries = recording(world, seed)
-        truth, unresolved, square = _projected(world, seed, entries)
-        velocity = world.velocity_model
-        flow = np.empty((len(entries), 0))
-        if velocity is not None:
-            flow = _fitted(velocity, entries["velocity_moment"])
-        cycle = world.currents
-        return Example(seed, cycle_voltages(world, seed, entries),
-                       cycle[np.arange(world.n_steps) % len(cycle)],
-                       (world.background + truth).astype(np.float32), unresolved, square, flow)
-
-    @property
-    def mesh(self) -> Mesh:
-        """Mesh of `Example.truth`."""
-        return self.world.vessel.carrier(fine=False)[0]  # type: ignore[no-any-return]
-
-    @property
-    def mass(self) -> sp.csr_array:  # type: ignore[override]
-        """(n, n) M̃ in m² (m³ in 3D): ∫f² = fᵀ M̃ f of nodal values f, over what counts."""
-        return _symmetric(score_mass(self.world))
-
-    @property
-    def warm_up(self) -> int:  # type: ignore[override]
-        """Number of first states that are not scored."""
-        return self.world.warm_up
-
-    def modes(self, q: int) -> np.ndarray:
-        """Return the q strongest modes (n, q) of the scored states of these examples relative to
-        the background: the best basis in the norm of the score, and orthonormal in it.
-        ``ValueError`` if there are fewer than q."""
-        return strongest(self, q)[0]
-
-    def reduced(self, basis: np.ndarray,
-                mean: float | np.ndarray | None = None) -> ReducedDataset:
-        """Return the same examples in coordinates a, c = mean + basis a, with exact scores.
-
-        Parameters
-        ----------
-        basis : (n, q) array, mol/m³
-            Such as `modes`. ``ValueError`` if its columns depend on each other.
-        mean : float or (n,) array, mol/m³
-            Default: the world's background.
-        """
-        return ReducedDataset(self, basis, self.world.background if mean is None else mean)
-
-
-@dataclass(frozen=True, eq=False)
-class ReducedDataset(_Scored):
-    """Examples whose ``truth`` is (T, q), the coordinates a_t, and whose ``unresolved`` is
-    ∫(c̄ + B a_t − c_t)². `Dataset.reduced` makes it."""
-
-    examples: Dataset
-    basis: np.ndarray
-    """(n, q) B in mol/m³"""
-    mean: float | np.ndarray
-    """c̄ in mol/m³, one or (n,)"""
-
-    def __post_init__(self) -> None:
-        n = self.examples.mesh.n_nodes
-        basis = _check.array("basis", self.basis, (n, None), units="mol/m³")
-        object.__setattr__(self, "basis", basis)
-        if np.ndim(self.mean):
-            _check.array("mean", self.mean, (n,), units="mol/m³")
-        else:
-            _check.number("mean", self.mean, units="mol/m³")
-        squares = np.linalg.eigvalsh(self.mass)
-        if not squares[0] > RANK_TOLERANCE * squares[-1]:
-            raise ValueError("basis must have independent columns over what is scored; some of "
-                             f"these {len(squares)} depend on others")
-
-    def __len__(self) -> int:
-        return len(self.examples)
-
-    def __iter__(self) -> Iterator[Example]:
-        return map(self.of, self.examples)
-
-    def __getitem__(self, index: int) -> Example:
-        return self.of(self.examples[index])
-
-    def of(self, example: Example) -> Example:
-        """Return an example of ``examples`` in the coordinates."""
-        deviation = example.truth.astype(float) - self.mean
-        a = np.linalg.solve(self.mass, self._weighted.T @ deviation.T).T
-        left = deviation - a @ self.basis.T
-        square = np.einsum("tn,nt->t", left, self.examples.mass @ left.T)
-        return example._replace(truth=a, unresolved=example.unresolved + square)
-
-    @cached_property
-    def mass(self) -> np.ndarray:  # type: ignore[override]
-        """(q, q) G in (mol/m³)²·m² (m³ in 3D), the identity for a basis of `modes`."""
-        gram: np.ndarray = self.basis.T @ self._weighted
-        return 0.5 * (gram + gram.T)
-
-    @property
-    def warm_up(self) -> int:  # type: ignore[override]
-        """Number of first states that are not scored."""
-        return self.examples.warm_up
-
-    def concentration(self, coordinates: np.ndarray) -> np.ndarray:
-        """Return mol/m³ (..., n) of coordinates (..., q)."""
-        found: np.ndarray = self.mean + coordinates @ self.basis.T
-        return found
-
-    @cached_property
-    def _weighted(self) -> np.ndarray:
-        weighted: np.ndarray = self.examples.mass @ self.basis
-        return weighted
 
 
 def dataset(env: str, seeds: str | Sequence[int], *,
@@ -309,10 +275,13 @@ def strongest(examples: Dataset, q: int) -> tuple[np.ndarray, np.ndarray]:
     return basis, np.maximum(left, 0.0)
 
 
-def _fitted(velocity: VelocityModel, moment: np.ndarray) -> np.ndarray:
-    """Return the parameters (T, k) in m/s whose flow has this ``moment`` (T, k) ∫φ_k v_t."""
+def _fitted_flow(world: World, entries: np.ndarray) -> np.ndarray:
+    """Return the flow parameters (T, k) in m/s that fit a recording best."""
+    velocity = world.velocity_model
+    if velocity is None:
+        return np.empty((len(entries), 0))
     gram = velocity.profiles.T @ (velocity.weights[:, None] * velocity.profiles)
-    return np.linalg.solve(gram, moment.T).T
+    return np.linalg.solve(gram, entries["velocity_moment"].T).T
 
 
 def _projected(world: World, seed: int,

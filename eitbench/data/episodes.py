@@ -17,9 +17,8 @@ from eitbench import _check
 from eitbench._notice import Wait
 from eitbench.data.cache import Key, cached, episode_key
 from eitbench.worlds.instrument import Faults
-from eitbench.worlds.parts import Discretisation
 from eitbench.worlds.streams import randomness
-from eitbench.worlds.world import World
+from eitbench.worlds.world import Discretisation, World
 
 Made = TypeVar("Made")
 BEFOREHAND = "`eitbench bank --env ID --seeds train:0-99` makes episodes beforehand"

@@ -32,32 +32,26 @@ UNITS = {"seed": "", "voltages": "V", "currents": "A (A/m in 2D)", "truth": "mol
          "unresolved": INTEGRAL, "square": INTEGRAL, "velocity": "m/s"}
 """Unit of each field."""
 README = """\
-# {env}: episodes to learn from
+# {environment}: episodes to learn from
 
 Process tomography, simulated: currents injected through electrodes on a vessel's wall, the voltages
-there, and the true concentration. One file an episode (`{format}`).
-
-Episodes: {episodes}. Learn on `train`, choose on `dev`, report on `test`.
-{warning}
-## Fields
+there, and the true concentration. One file per episode (`{format}`): {held}.
+Learn on `train`, choose on `dev`, report on `test`. {warning}
 
 | field | shape | unit | |
 | --- | --- | --- | --- |
 | `seed` | | | of the episode |
-| `voltages` | ({T}, {L}) | {voltages} | noisy readings at t = 1 … {T}, {ms:g} ms apart |
-| `currents` | ({T}, {L}) | {currents} | injected |
-| `truth` | ({T}, {n}) | {truth} | concentration at the nodes of `mesh.npz`: the projection p_t \
-of the simulated one, c_t on a finer mesh |
-| `unresolved` | ({T},) | {unresolved} | ∫(p_t − c_t)² |
-| `square` | ({T},) | {square} | ∫c_t² |
-| `velocity` | ({T}, {k}) | {velocity} | flow parameters that fit the true flow best; none where \
-the flow is known |
+| `voltages` | ({steps}, {electrodes}) | {units[voltages]} | noisy readings, {ms:g} ms apart |
+| `currents` | ({steps}, {electrodes}) | {units[currents]} | injected |
+| `truth` | ({steps}, {nodes}) | {units[truth]} | concentration at the nodes of `mesh.npz`: the \
+projection p_t of the simulated one, c_t on a finer mesh |
+| `unresolved` | ({steps},) | {units[unresolved]} | ∫(p_t − c_t)² |
+| `square` | ({steps},) | {units[square]} | ∫c_t² |
+| `velocity` | ({steps}, {velocity}) | {units[velocity]} | flow parameters that fit the true flow \
+best; none where the flow is known |
 
-`mesh.npz` holds the nodes (`points`, m), the cells, and the mass matrix M̃ in CSR form.
-
-## Score
-
-Errors are those of the leaderboards, exactly, although the finer mesh of the truth is not here:
+`mesh.npz` holds the nodes (`points`, m), the cells, and the mass matrix M̃ in CSR form. Scores are
+those of the leaderboards, exactly, although the finer mesh of the truth is not here:
 
 ```python
 import numpy as np
@@ -65,26 +59,20 @@ import scipy.sparse as sp
 
 mesh = np.load("mesh.npz")
 mass = sp.csr_array((mesh["mass_data"], mesh["mass_indices"], mesh["mass_indptr"]))
-off = estimate - truth              # ({T}, {n})
+off = estimate - truth              # ({steps}, {nodes})
 errors = (np.einsum("tn,nt->t", off, mass @ off.T) + unresolved) / square
 score = errors[{warm_up}:].mean()         # ẽ_c: the first {warm_up} states do not count
 ```
 
-## Source
-
-eitbench {version}, environment `{env}`, configuration of digest `{digest}`; no measured data, no
-personal data. Made by
-
-```sh
-{commands}
-```
-
-Licence: MIT, as eitbench. All numbers of the world:
+Made by `eitbench export --env {environment} --format {format} --seeds …`, eitbench {eitbench},
+configuration of digest `{digest}`; no measured data, no personal data. Licence: MIT, as eitbench.
+All numbers of the world:
 
 ```json
-{world}
+{numbers}
 ```
 """
+WARNING = "Test episodes are among them: report on them, and neither learn nor choose."
 
 
 def export(examples: Dataset, folder: Path, format: str = "npz", *, n_jobs: int = 1,
@@ -113,9 +101,12 @@ def export(examples: Dataset, folder: Path, format: str = "npz", *, n_jobs: int 
     """
     if format not in SUFFIXES:
         raise ValueError(f"format must be one of {', '.join(SUFFIXES)}, got {format!r}")
+    if examples.basis is not None:
+        raise ValueError("examples must have their truth on the nodes, got reduced coordinates")
     with needed_by(f"format {format}"):
         encode = {"npz": lambda: _npz, "hdf5": _hdf5}[format]()
-    _claim(folder, _manifest(examples, format))
+    about = _about(examples, format)
+    _claim(folder, json.dumps(about, indent=1) + "\n")
     paths = {seed: folder / f"{name_seed(seed).replace(':', '-')}.{SUFFIXES[format]}"
              for seed in examples.seeds}
     missing = [seed for seed, path in paths.items() if not path.exists()]
@@ -124,22 +115,23 @@ def export(examples: Dataset, folder: Path, format: str = "npz", *, n_jobs: int 
     write_atomically(folder / MESH, _npz(
         {"points": examples.mesh.points, "cells": examples.mesh.cells}
         | {f"mass_{name}": getattr(mass, name) for name in SPARSE}))
-    _write_readme(examples, folder, format)
     for seed in tqdm(missing, desc="writing", unit="episode", disable=None):
         fields = examples.example(seed)._asdict()
         write_atomically(paths[seed], encode(fields | {"seed": np.array(seed)}))
-    _write_readme(examples, folder, format)
+    write_atomically(folder / "README.md", _readme(folder, about).encode())
     return len(missing)
 
 
-def _manifest(examples: Dataset, format: str) -> str:
-    """Return a text that all files of a folder have in common."""
+def _about(examples: Dataset, format: str) -> dict[str, Any]:
+    """Return what all files of a folder have in common, as JSON."""
     from eitbench import __version__
     world = examples.world
-    return json.dumps({"environment": examples.env, "format": format, "eitbench": __version__,
-                       "digest": world_digest(world), "steps": world.n_steps,
-                       "warm_up": world.warm_up, "time_step": world.time_step,
-                       "world": described(world)}, indent=1) + "\n"
+    flow = world.velocity_model
+    return {"environment": examples.env, "format": format, "eitbench": __version__,
+            "digest": world_digest(world), "steps": world.n_steps, "warm_up": world.warm_up,
+            "time_step": world.time_step, "electrodes": world.vessel.n_electrodes,
+            "nodes": examples.mesh.n_nodes, "velocity": 0 if flow is None else flow.size,
+            "world": described(world)}
 
 
 def _claim(folder: Path, manifest: str) -> None:
@@ -155,23 +147,14 @@ def _claim(folder: Path, manifest: str) -> None:
         write_atomically(path, manifest.encode())
 
 
-def _write_readme(examples: Dataset, folder: Path, format: str) -> None:
-    """Write a README of the files that the folder holds."""
-    from eitbench import __version__
-    world = examples.world
-    flow = world.velocity_model
-    held = seed_ranges(path.stem for path in folder.glob(f"[!.]*.{SUFFIXES[format]}")
+def _readme(folder: Path, about: dict[str, Any]) -> str:
+    """Return a description of the files that the folder holds."""
+    held = seed_ranges(path.stem for path in folder.glob(f"[!.]*.{SUFFIXES[about['format']]}")
                        if path.name != MESH)
     tests = any(is_test(parse_seeds(each)[0]) for each in held)
-    write_atomically(folder / "README.md", README.format(
-        env=examples.env, format=format, episodes="; ".join(held) or "none yet",
-        warning="\nTest episodes are among them: report on them, and neither learn nor choose.\n"
-        if tests else "", T=world.n_steps, L=world.vessel.n_electrodes, n=examples.mesh.n_nodes,
-        k=0 if flow is None else flow.size, ms=1e3 * world.time_step, warm_up=world.warm_up,
-        version=__version__, digest=world_digest(world)[:16],
-        world=json.dumps(described(world), indent=1), commands="\n".join(
-            f"eitbench export --env {examples.env} --format {format} --out FOLDER --seeds {each}"
-            for each in held), **UNITS).encode())
+    return README.format(
+        held="; ".join(held), warning=WARNING if tests else "", ms=1e3 * about["time_step"],
+        numbers=json.dumps(about["world"], indent=1), units=UNITS, **about)
 
 
 def seed_ranges(names: Iterable[str]) -> list[str]:

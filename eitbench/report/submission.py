@@ -13,11 +13,10 @@ from tqdm import tqdm
 
 from eitbench._foreign import as_markdown
 from eitbench.bench import held_out
-from eitbench.bench.measured_records import read_measured_record
 from eitbench.bench.podium import file_of
 from eitbench.bench.records import read_record, version_number
 from eitbench.bench.sandbox.host import GuestError
-from eitbench.bench.tracks import ids
+from eitbench.bench.tracks import ids, is_measured, measured_ids
 from eitbench.bench.verify import empty_cache, job_of, verify
 from eitbench.data.seasons import current_season
 from eitbench.report.boards import boards, read_for_boards
@@ -25,7 +24,7 @@ from eitbench.report.site import Beside, Measured, render, render_site
 
 RENDERED = ("leaderboard.csv", "leaderboard.md", "site")
 """What `eitbench leaderboard` writes beside the records."""
-ADDED = ("results", "measured", "methods", "media")
+ADDED = ("results", "methods", "media")
 """Folders to which a submission adds files."""
 METHOD = 10_000_000
 """bytes of a method's file, at most"""
@@ -82,8 +81,6 @@ def check(submitted: Path, ours: Path, asked: Asked) -> Iterator[Finding]:
     with empty_cache():
         for path in tqdm(changed, desc="checking records", unit="record", disable=None):
             yield _record(path, ours / "results" / path.name, submitted / "methods", asked)
-    if measured := _changed(submitted / "measured", ours / "measured"):
-        yield _measured(measured, ours / "measured", asked)
     yield _pages(submitted)
 
 
@@ -137,6 +134,9 @@ def _record(path: Path, earlier: Path, methods: Path, asked: Asked) -> Finding:
     try:
         record = read_record(path)
         problems = [*_of_the_record(record, asked), *_lost(record, earlier)]
+        if is_measured(record["environment"]["id"]):
+            return Finding(path.name, "Not played again: its data are not here. `eitbench verify` "
+                                      "does that where they are.", problems)
         job = job_of(record, file_of(record, methods), "always")
         table, differences = verify(record, job, episodes=asked.episodes, seed=asked.seed)
         said = [f"Isolation: {job.isolation}. Played again:", table]
@@ -153,7 +153,7 @@ def _record(path: Path, earlier: Path, methods: Path, asked: Asked) -> Finding:
 
 def _of_the_record(record: dict[str, Any], asked: Asked) -> Iterator[str]:
     split = current_season().split
-    if record["environment"]["id"] not in ids():
+    if record["environment"]["id"] not in (*ids(), *measured_ids()):
         yield f"there is no environment {record['environment']['id']} here"
     if record["split"] != split:
         yield f"its seeds must be of the season's split {split}, got {record['split']}"
@@ -161,30 +161,6 @@ def _of_the_record(record: dict[str, Any], asked: Asked) -> Iterator[str]:
         yield "it calls itself official, which only the maintainers' records are"
     if record["official"] and version_number(record["version"]) is None:
         yield "it calls itself official, and its method is none of ours"
-
-
-def _measured(changed: list[Path], ours: Path, asked: Asked) -> Finding:
-    """Records of the measured board, whose data are not here: nothing is played again."""
-    problems = []
-    for path in changed:
-        earlier = ours / path.name
-        if path.suffix != ".json":
-            if earlier.exists():
-                problems.append(f"{path.name} is there already with another content; records are "
-                                "of the case as it was")
-            continue
-        try:
-            record = read_measured_record(path)
-            if record["official"] and not asked.official:
-                problems.append(f"{path.name} calls itself official, which only the maintainers' "
-                                "records are")
-            if earlier.exists() and read_measured_record(earlier)["official"]:
-                problems.append(f"{path.name} replaces an official record")
-        except ValueError as error:
-            problems.append(f"{path.name} {error}")
-    names = "\n".join(f"- {as_markdown(path.name)}" for path in changed)
-    return Finding("Measured data", "Not played again, `eitbench verify RECORD --data FILE` does "
-                                    f"that where the data are:\n\n{names}", problems)
 
 
 def _changed(submitted: Path, ours: Path) -> list[Path]:

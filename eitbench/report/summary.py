@@ -39,10 +39,11 @@ Anchors = Mapping[tuple[str, str, str], Mapping[str, float]]
 """Method, world, split -> seed -> ẽ_c."""
 
 
-def columns() -> dict[str, tuple[str, str]]:
+def columns(measured: bool = False) -> dict[str, tuple[str, str]]:
     """Name -> heading and explanation of each column of numbers: every registered score, and the
-    skill."""
-    each = {name: (score.heading, score.explanation) for name, score in scores().items()}
+    skill; with ``measured`` also the scores of measurements."""
+    known = scores() | (scores("measured") if measured else {})
+    each = {name: (score.heading, score.explanation) for name, score in known.items()}
     heading, text = each.pop("error")
     text += ", ± half the 95 % confidence interval over seeds; lower is better"
     return {"error": (heading, text), "skill": SKILL} | each
@@ -91,7 +92,7 @@ def summary_row(record: dict[str, Any], known: Anchors) -> dict[str, Any]:
         "name": _believing(record, record["method"]),
         "seeds": seed_ranges(record["seeds"]),
         "episodes": len(status), "failed": sum(s != "ok" for s in status)}
-    for name in columns():
+    for name in columns(measured=True):
         skills = name == "skill"
         found = _skills(record, known) if skills else scores_by_seed(record, name)
         values = list(found.values())
@@ -163,7 +164,7 @@ def _skills(record: dict[str, Any], known: Anchors) -> dict[str, float]:
 def shown(table: pd.DataFrame, *, grouped: bool = False) -> Table:
     """The summary as a reader sees it: the environment where there are several worlds, scores that
     are shown everywhere or that anybody has; the board as a column, or ``grouped`` by it."""
-    known = scores()
+    known = scores() | scores("measured")
     several = table["world"].nunique() > 1
     rows = []
     for _, row in table.iterrows():
@@ -174,7 +175,7 @@ def shown(table: pd.DataFrame, *, grouped: bool = False) -> Table:
         cells |= {"method": row["method"], "seeds": row["seeds"] + failed}
         cells |= scores_shown(row)
         rows.append(cells)
-    keep = [heading for name, (heading, _) in columns().items()
+    keep = [heading for name, (heading, _) in columns(measured=True).items()
             if name == "skill" or known[name].everywhere]
     return Table.of(rows, label="Scores", keep=keep,
                     groups=[board_label(row) for _, row in table.iterrows()] if grouped else ())
@@ -195,7 +196,8 @@ def _place_of_split(split: str) -> int:
 def scores_shown(row: Any) -> dict[str, Cell | str]:
     """Heading -> cell of each column of numbers of a summary's row."""
     cells: dict[str, Cell | str] = {
-        heading: _cell(name, row[name]) for name, (heading, _) in columns().items()}
+        heading: _cell(name, row[name])
+        for name, (heading, _) in columns(measured=True).items()}
     if row["skill"] is None and row["contrast_error"] is not None:
         skill = 1.0 - row["contrast_error"][0]
         cells[SKILL[0]] = Cell(f"{number(skill)}†", skill)

@@ -13,15 +13,9 @@ import numpy as np
 from eitbench import _check
 from eitbench.physics.flow import PlaneChannelFlow, PlugFlow, PowerLawFlow
 from eitbench.physics.profiles import SkewedChannelFlow, VelocityModel, parabola
-from eitbench.worlds.parts import (
-    Discretisation,
-    Flow,
-    check_positive,
-    check_range,
-    refuse_assumptions,
-)
+from eitbench.worlds.fields import check_positive, check_range
 from eitbench.worlds.vessels import Bulge, PlanePipe
-from eitbench.worlds.world import World
+from eitbench.worlds.world import Discretisation, Flow, World, refuse_assumptions
 
 if TYPE_CHECKING:
     from eitbench.physics.navier_stokes import SteadyFlow

@@ -16,7 +16,7 @@ from eitbench.estimation.onboard.belief import Belief
 from eitbench.estimation.onboard.rules import Rules
 from eitbench.report import policy_table
 from eitbench.report.policy_table import adaptivity_gap, policy_rows
-from eitbench.worlds.pipe2d import PIPE_2D
+from eitbench.worlds.catalogue import PIPE_2D
 from scipy.stats import t as student
 
 from choosing import filter_of, injected

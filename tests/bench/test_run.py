@@ -17,7 +17,7 @@ from eitbench.bench.store import EpisodeStore
 from eitbench.bench.tracks import Environment, board_of
 from eitbench.data.cache import CACHE_VARIABLE
 from eitbench.data.episodes import simulate, truth_discretisation
-from eitbench.worlds.pipe2d import PIPE_2D
+from eitbench.worlds.catalogue import PIPE_2D
 from eitbench.worlds.task import Estimate, Task
 from scipy.optimize import minimize_scalar
 

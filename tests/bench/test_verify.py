@@ -20,7 +20,7 @@ from eitbench.data.episodes import simulate
 from eitbench.data.seasons import drawn_seeds
 from eitbench.data.seeds import SPLITS, parse_seeds
 from eitbench.data.store import CACHE_VARIABLE, cache_folder, folder
-from eitbench.worlds.pipe2d import PIPE_2D
+from eitbench.worlds.catalogue import PIPE_2D
 
 from commands import eitbench
 from short import PIPE, merged, shorten

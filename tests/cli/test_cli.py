@@ -25,7 +25,7 @@ from tiny import git_says
 ROOT = Path(__file__).parents[2]
 PIPE, INJECTION = "eitbench/Pipe2D-v0", "eitbench/Pipe2DInjection-v0"
 COMMANDS = ("list", "run", "bank", "train", "policies", "submit", "verify", "held-out", "golden",
-            "fit-prior", "fit-model", "estimate", "submit-measured", "export", "leaderboard", "compare", "render",
+            "fit-prior", "fit-model", "estimate", "export", "leaderboard", "compare", "render",
             "reproduce", "check", "season")
 TINY = {"flow": {"mean_velocity": 45.0}, "schedule": {"scored_steps": 3, "pattern": {"frame": 2}},
         "vessel": {"electrodes_per_wall": 2}}

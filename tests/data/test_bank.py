@@ -12,8 +12,7 @@ from eitbench.data.bank import fill, recording_bytes
 from eitbench.data.cache import CACHE_VARIABLE, folder
 from eitbench.data.episodes import simulate, simulate_together
 from eitbench.data.recordings import is_recorded, make_recording, recording, recording_path
-from eitbench.worlds.pipe2d import PIPE_2D
-from eitbench.worlds.pipe2d_drifting import PIPE_2D_DRIFTING
+from eitbench.worlds.catalogue import PIPE_2D, PIPE_2D_DRIFTING
 from joblib.externals.loky import get_reusable_executor
 
 from commands import eitbench as command

@@ -17,7 +17,7 @@ from eitbench.data.cache import CACHE_VARIABLE, Key, cache_folder, cached, descr
 from eitbench.worlds import flows
 from eitbench.worlds.flows import LaminarFlow
 from eitbench.worlds.instrument import Instrument
-from eitbench.worlds.parts import Prior
+from eitbench.worlds.world import Prior
 
 from recorded import forget
 from tiny_worlds import TINY
@@ -278,8 +278,8 @@ def test_keys_depend_on_the_declared_version_and_not_on_the_code(monkeypatch):
 
 def test_another_process_finds_the_files(place):
     """Digests do not depend on the process."""
-    program = ("from eitbench.data.cache import folder\nfrom eitbench.worlds.pipe2d import PIPE_2D\n"
+    program = ("from eitbench.data.cache import folder\nfrom eitbench.worlds.catalogue import PIPE_2D\n"
                "print(folder(PIPE_2D).name)")
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    from eitbench.worlds.pipe2d import PIPE_2D
+    from eitbench.worlds.catalogue import PIPE_2D
     assert done.stdout.strip() == folder(PIPE_2D).name

@@ -12,8 +12,8 @@ import pytest
 from eitbench.data import episodes
 from eitbench.data.cache import CACHE_VARIABLE
 from eitbench.data.episodes import Episode, simulate, truth_discretisation
-from eitbench.worlds.parts import Discretisation
-from eitbench.worlds.pipe2d import PIPE_2D
+from eitbench.worlds.catalogue import PIPE_2D
+from eitbench.worlds.world import Discretisation
 from scipy.stats import kstest
 
 from recorded import forget
@@ -81,7 +81,7 @@ def test_same_process_same_bits(fresh):
 def test_other_processes_same_bits_and_share_one_file(fresh, cache):
     """Two processes that simulate and store one episode at once leave a single valid file with the
     bits made here."""
-    program = ("from eitbench.worlds.pipe2d import PIPE_2D\n"
+    program = ("from eitbench.worlds.catalogue import PIPE_2D\n"
                "from eitbench.data.episodes import simulate\n"
                "import hashlib\n"
                f"episode = simulate(PIPE_2D.changed({CHANGES!r}), 7)\n"

@@ -21,7 +21,7 @@ from eitbench.data.recordings import (
     step_error,
 )
 from eitbench.data.regions import outline
-from eitbench.worlds.pipe2d import PIPE_2D
+from eitbench.worlds.catalogue import PIPE_2D
 
 from recorded import bits, digest, forget, outline_bits
 from tiny_worlds import CHANGES, TINY

@@ -24,7 +24,7 @@ from eitbench.estimation.onboard.belief import Belief
 from eitbench.estimation.onboard.operator import electrode_pairs
 from eitbench.estimation.reduced_joint import JointTables, joint_step
 from eitbench.numerics.fem import mass_matrix
-from eitbench.worlds.pipe2d_drifting import PIPE_2D_DRIFTING
+from eitbench.worlds.catalogue import PIPE_2D_DRIFTING
 from eitbench.worlds.task import make_task
 
 from choosing import FLOW, NAME, filter_of, make, some_pairs

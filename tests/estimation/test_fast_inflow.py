@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from eitbench.bench.methods import baseline_folder
 from eitbench.estimation import QuadraticVoltages, ScaledVoltages, reduced_response, steady_response, suiting_priors
-from eitbench.worlds.pipe2d import PIPE_2D
-from eitbench.worlds.pipe3d import PIPE_3D
+from eitbench.worlds.catalogue import PIPE_2D, PIPE_3D
 from eitbench.worlds.task import make_task
 from scipy.linalg import toeplitz
 

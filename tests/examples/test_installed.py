@@ -43,7 +43,6 @@ COMMANDS = [
     (("fit-prior", "--env", "eitbench/Pipe2D-v0", "--seeds", "train:0-3", "-o", "prior.json"), "prior.json: "),
     (("fit-model", "--env", "eitbench/Pipe2D-v0", "--seeds", "train:0-1", "-o", "model.npz"), "model.npz: "),
     (("estimate", "--help"), "instrument"),
-    (("submit-measured", "--help"), "measured board"),
     (("held-out", "--help"), "salt"),
 ]
 """Words, and what is said when it has worked."""

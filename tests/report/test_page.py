@@ -17,7 +17,7 @@ from eitbench.data.store import CACHE_VARIABLE
 from eitbench.numerics.round import extrude, uniform_disc
 from eitbench.report import charts, page
 from eitbench.report.summary import explanations, shown, summary
-from eitbench.worlds.pipe3d import PIPE_3D
+from eitbench.worlds.catalogue import PIPE_3D
 from PIL import Image
 
 from short import short, shorten

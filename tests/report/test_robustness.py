@@ -7,7 +7,7 @@ from eitbench.report.site import render, render_site
 from eitbench.report.site.collect import ROBUSTNESS, collect
 from eitbench.report.site.robustness import families, heading, robustness_table
 from eitbench.worlds import register
-from eitbench.worlds.pipe2d import PIPE_2D
+from eitbench.worlds.catalogue import PIPE_2D
 
 from short import register_apart
 from tables import said

@@ -12,7 +12,7 @@ from eitbench.bench.sandbox import guests, keeper
 from eitbench.bench.sandbox.host import Guest
 from eitbench.bench.store import EpisodeStore, machine, provenance
 from eitbench.data.store import CACHE_VARIABLE, folder
-from eitbench.worlds.pipe2d import PIPE_2D
+from eitbench.worlds.catalogue import PIPE_2D
 
 from tiny import FILTER, SCENARIO, write_baseline
 

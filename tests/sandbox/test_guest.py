@@ -23,7 +23,7 @@ from eitbench.data.episodes import simulate
 from eitbench.data.recordings import cycle_voltages, recording
 from eitbench.data.store import CACHE_VARIABLE
 from eitbench.worlds import registry
-from eitbench.worlds.pipe2d import PIPE_2D
+from eitbench.worlds.catalogue import PIPE_2D
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp

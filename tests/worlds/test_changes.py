@@ -7,11 +7,7 @@ import numpy as np
 import pytest
 from eitbench.data import cache
 from eitbench.worlds import entries
-from eitbench.worlds.pipe2d import PIPE_2D
-from eitbench.worlds.pipe2d_drifting import PIPE_2D_DRIFTING
-from eitbench.worlds.pipe2d_faults import PIPE_2D_FAULTS
-from eitbench.worlds.pipe2d_injection import PIPE_2D_CURRENTS
-from eitbench.worlds.stationary_tank import STATIONARY_TANK_2D
+from eitbench.worlds.catalogue import PIPE_2D, PIPE_2D_CURRENTS, PIPE_2D_DRIFTING, PIPE_2D_FAULTS, STATIONARY_TANK_2D
 
 
 def test_only_what_is_named_changes():

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from eitbench.data import cache
 from eitbench.worlds import entries, entry, register, registry
-from eitbench.worlds.pipe2d import PIPE_2D
+from eitbench.worlds.catalogue import PIPE_2D
 from eitbench.worlds.slugs import Slugs
 
 from short import PIPE, register_apart
