@@ -16,7 +16,7 @@ _COLUMNS = ("environment", "board", "method", "version", "title", "role", "privi
             "outdated", "split", "seed", "status", "metric", "value")
 
 
-def load(folder: Path | str | None = None) -> pd.DataFrame:
+def load(folder: Path | str | None = None, *, measured: bool = False) -> pd.DataFrame:
     """Load all records of a folder as a tidy table: one row for each score of each episode.
 
     Parameters
@@ -24,6 +24,8 @@ def load(folder: Path | str | None = None) -> pd.DataFrame:
     folder : path
         Default: the published records, ``leaderboards/results``, or the table of their episodes
         where only that is installed.
+    measured : bool
+        Whether to include records of measured cases, which are in a checkout only.
 
     Returns
     -------
@@ -43,9 +45,12 @@ def load(folder: Path | str | None = None) -> pd.DataFrame:
         import pandas as pd
 
         from eitbench._files import shipped
-        from eitbench.bench.records import newest, read_records
+        from eitbench.bench.records import newest, read_measured_files, read_records
     path = Path(folder or shipped("leaderboards") / "results")
-    groups = newest(read_records(path, keep=_without_steps))
+    records = read_records(path, keep=_without_steps)
+    if measured:
+        records += read_measured_files(path)[0].values()
+    groups = newest(records)
     rows = [row for group, outdated in zip(groups, (False, True), strict=True)
             for record in group for row in _rows(record, outdated)]
     types = dict.fromkeys(("privileged", "official", "outdated"), bool) | {"value": float}

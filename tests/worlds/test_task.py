@@ -7,8 +7,8 @@ from dataclasses import FrozenInstanceError, replace
 import eitbench  # noqa: F401 (registers)
 import numpy as np
 import pytest
+from eitbench.data.cache import CACHE_VARIABLE
 from eitbench.data.episodes import Episode, simulate, truth_discretisation
-from eitbench.data.store import CACHE_VARIABLE
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.worlds.catalogue import PIPE_2D
 from eitbench.worlds.task import make_task
