@@ -202,13 +202,6 @@ def has_enough_episodes(strata: Sequence[np.ndarray]) -> bool:
     return min(sizes) >= 2 and sum(sizes) >= FEWEST
 
 
-def check_environments(a: Mapping[str, Any], b: Mapping[str, Any]) -> None:
-    """Raise ``ValueError`` unless both have the same environments."""
-    if set(a) != set(b):
-        raise ValueError("environments must be the same for both, got "
-                         f"{', '.join(a)} and {', '.join(b)}")
-
-
 def _check_strata(name: str, strata: Sequence[np.ndarray]) -> None:
     if not strata or not all(stratum.ndim == 1 and stratum.size and np.isfinite(stratum).all()
                              for stratum in strata):
@@ -218,7 +211,9 @@ def _check_strata(name: str, strata: Sequence[np.ndarray]) -> None:
 
 def _shared(a: Scores, b: Scores) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Return the scores (n_e,) of a and of b in each environment on their shared seeds, by name."""
-    check_environments(a, b)
+    if set(a) != set(b):
+        raise ValueError("environments must be the same for both, got "
+                         f"{', '.join(a)} and {', '.join(b)}")
     seeds = {environment: sorted(a[environment].keys() & b[environment].keys())
              for environment in sorted(a)}
     for environment, shared in seeds.items():

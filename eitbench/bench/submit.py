@@ -19,37 +19,19 @@ def submit(method: str | None, environments: list[str], seeds: list[int] | None,
            store: EpisodeStore, to: Path, *, policy: bool = False, official: bool = False,
            isolate: str = "others", n_jobs: int = 1, backend: str = "loky",
            command: str = "") -> Iterator[Path]:
-    """Check what is asked for, then return an iterator that runs the episodes that neither
-    ``store`` nor a record holds and writes one record for each environment into the folder ``to``,
-    one after the other: after an interruption, finished environments have their records.
+    """Check what is asked for, then return an iterator over the paths of records: it runs what
+    neither ``store`` nor an earlier record holds, environment after environment, and writes each
+    record into the folder ``to`` when its environment is finished.
 
-    Parameters
-    ----------
-    method : str or None
-        Name or path of a baseline, or of a ``policy``. None: all built-in methods.
-    environments : list of str
-        With a method at least one, and all of them must be such that it runs in them; without, by
-        default all.
-    seeds : list of int
-        Of the season's test split; default: those of the full suite.
-    official : bool
-        Whether a maintainer runs it; else the records say that they are self-reported.
-    isolate : str
-        Whether the method runs in a separate process; one of `suites.ISOLATE`.
-    n_jobs, backend, command
-        As in `run.run_jobs`.
-
-    Returns
-    -------
-    iterator of path
-        Of the records. All test episodes that the store, or an earlier record, holds of this
-        version of the method are in them, failed ones too.
+    A record holds all test episodes, failed ones too, that the store or an earlier record has of
+    this version of the method. Without a ``method`` all built-in ones are run, by default in all
+    environments. ``official`` records are a maintainer's, from a commit without changes.
 
     Raises
     ------
     ValueError
-        By the call itself, if a seed is not of the test split, the method does not run in one of
-        the environments, an official record is asked for from a checkout with changes, or a record
+        By the call, if a seed is not of the test split, the method does not run in one of the
+        environments, an official record is asked for from a checkout with changes, or a record
         would lose its being official; by the iterator, if a record is not valid or would lose
         episodes.
     """

@@ -1,4 +1,4 @@
-"""Work spread over processes, each with one BLAS thread: more get into each other's way."""
+"""Parallel execution in processes with one BLAS thread each."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tqdm import tqdm
 from eitbench.worlds.registry import Entry, registered_by_hand, take_over
 
 BACKENDS = ("loky", "ray", "dask")
-"""Who starts the processes: joblib on this machine, or a cluster."""
+"""Joblib on this machine, or a cluster."""
 
 Result = TypeVar("Result")
 

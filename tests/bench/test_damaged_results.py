@@ -39,13 +39,15 @@ def played(two_methods, monkeypatch, tmp_path):
 @pytest.mark.parametrize(("field", "value"), [
     ("finished", None), ("scores", None), ("scores", {"error": "x"}), ("step_errors", 7), ("step_errors", ["a"]),
     ("environment", "Pipe2D"), ("environment", {"id": 5, "name": "a", "kwargs": {}}), ("run", {}), ("run", None),
-    ("method", ["mine"]), ("seed", 7), ("version", None), ("scores", {"error": 10**400})])
+    ("method", ["mine"]), ("seed", 7), ("version", None), ("scores", {"error": 10**400}),
+    ("scores", {"error": 0.1, "seconds_per_step": -1.0}), *((None, text) for text in ("", "{", "[]", "{}", "3"))])
 def test_a_damaged_result_is_named_and_the_others_are_kept(field, value, played):
-    """Whatever is in the place of a text, a number, an object."""
+    """Whatever is in the place of a text, a number, an object, or of the whole."""
     path = played / "dev-0.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | {field: value}))
+    path.write_text(json.dumps(json.loads(path.read_text()) | {field: value}) if field else value)
     with pytest.warns(UserWarning, match=r"mine/dev-0\.json is left out: it (cannot be read|is no|is not valid)"):
         records = EpisodeStore(played.parents[2]).write_records()
+        assert not EpisodeStore(played.parents[2]).holds("eitbench-Pipe2D-v0", "mine", 100_000, "any")
     assert {record["method"]: record["seeds"] for record in records} == {
         "homogeneous": ["dev:0", "dev:1"], "mine": ["dev:1"]}
 

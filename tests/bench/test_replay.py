@@ -9,7 +9,7 @@ from eitbench.bench import methods, replay, run
 from eitbench.bench import store as store_module
 from eitbench.bench.records import write_record
 from eitbench.bench.replay import by_environment, differing, official_records, verify_all
-from eitbench.data.store import cache_folder
+from eitbench.data.cache import cache_folder
 
 from commands import eitbench
 from short import PIPE, shorten

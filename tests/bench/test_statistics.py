@@ -253,65 +253,38 @@ def board(**methods):
     return {method: {"pipe": seeded(scores)} for method, scores in methods.items()}
 
 
-def test_clear_ranks():
-    """Each worse than the one before on every episode: 1, 2, 3, best first. Higher may be better."""
-    scores = board(c=NOISE + 3, a=NOISE + 1, b=NOISE + 2)
-    assert list(shared_ranks(scores).items()) == [("a", 1), ("b", 2), ("c", 3)]
-    assert list(shared_ranks(scores, higher_is_better=True).items()) == [("c", 1), ("b", 2), ("a", 3)]
+ONE = np.ones(12)
+PIPE_AND_TANK = {"b": {"pipe": seeded(np.ones(6)), "tank": seeded(np.zeros(60))},
+                 "a": {"pipe": seeded(np.zeros(6)), "tank": seeded(np.full(60, 0.5))}}
 
 
-def test_shared_ranks():
-    """Two that cannot be told apart share rank 1, and the one that both beat is third; equal scores share."""
-    scores = board(last=10 + 0 * NOISE, a=0.1 * NOISE, b=0.01 - 0.1 * NOISE)
-    assert list(shared_ranks(scores).items()) == [("a", 1), ("b", 1), ("last", 3)]
-    assert list(shared_ranks(board(c=NOISE + 1, b=NOISE, a=NOISE)).items()) == [("a", 1), ("b", 1), ("c", 3)]
-    assert shared_ranks(board(a=NOISE)) == {"a": 1} and shared_ranks({}) == {}
-
-
-def test_pairs_decide_and_not_overlap():
-    """The intervals of the scores overlap widely, but one is better by a little on every episode."""
-    assert shared_ranks(board(a=100 * NOISE, b=100 * NOISE + 0.5)) == {"a": 1, "b": 2}
-
-
-def test_not_transitive():
-    """a and b cannot be told apart, nor b and c, but a is better than c: ranks 1, 1, 2."""
-    scores = board(a=0 * NOISE, b=0.5 + 1.5 * NOISE, c=1 + 0 * NOISE)
-    for one, other in (("a", "b"), ("b", "c")):
-        _, low, high = paired_difference(scores[one], scores[other])
-        assert low < 0 < high
-    assert list(shared_ranks(scores).items()) == [("a", 1), ("b", 1), ("c", 2)]
-
-
-def test_ranks_need_not_rise_along_the_means():
-    """A scattered method stands below one of rank 2, and nobody was shown to be better than it."""
-    scores = board(a=0 * NOISE, b=0.1 + 0 * NOISE, c=0.5 + 3 * NOISE)
-    assert list(shared_ranks(scores).items()) == [("a", 1), ("b", 2), ("c", 1)]
-
-
-def test_ranks_by_another_statistic():
-    """A single disaster decides the mean, and not the interquartile mean; the order follows."""
-    scores = board(a=np.zeros(24), b=np.r_[np.full(23, -1.0), 100.0])
-    assert list(shared_ranks(scores)) == ["a", "b"]
-    assert list(shared_ranks(scores, statistic=interquartile_mean).items()) == [("b", 1), ("a", 2)]
-
-
-def test_the_unranked_cost_nobody_a_rank():
-    """A clairvoyant is shown in its place, without a rank; the next one is first. So is a floor."""
-    scores = board(clairvoyant=NOISE, a=NOISE + 1, floor=NOISE + 2, b=NOISE + 3)
-    ranks = shared_ranks(scores, {"clairvoyant", "floor"})
-    assert list(ranks.items()) == [("clairvoyant", None), ("a", 1), ("floor", None), ("b", 2)]
-
-
-def test_environments_weigh_the_same():
-    """Better by 1 in 6 episodes and worse by 0.5 in 60: better, though the sum over episodes says otherwise."""
-    a = {"pipe": seeded(np.zeros(6)), "tank": seeded(np.full(60, 0.5))}
-    b = {"pipe": seeded(np.ones(6)), "tank": seeded(np.zeros(60))}
-    assert list(shared_ranks({"b": b, "a": a}).items()) == [("a", 1), ("b", 2)]
-
-
-def test_four_episodes_rank_nobody():
-    """Better on all of four episodes is no evidence: one of two equal methods is, in one board of eight."""
-    assert shared_ranks(board(a=NOISE[:4], b=NOISE[:4] + 1)) == {"a": 1, "b": 1}
+@pytest.mark.parametrize(("scores", "how", "expected"), [
+    # each worse than the one before on every episode, best first; higher may be better
+    (board(c=NOISE + 3, a=NOISE + 1, b=NOISE + 2), {}, {"a": 1, "b": 2, "c": 3}),
+    (board(c=NOISE + 3, a=NOISE + 1, b=NOISE + 2), {"higher_is_better": True}, {"c": 1, "b": 2, "a": 3}),
+    # two that cannot be told apart share a rank, and the one that both beat is third; equal scores share
+    (board(last=10 * ONE, a=0.1 * NOISE, b=0.01 - 0.1 * NOISE), {}, {"a": 1, "b": 1, "last": 3}),
+    (board(c=NOISE + 1, b=NOISE, a=NOISE), {}, {"a": 1, "b": 1, "c": 3}),
+    (board(a=NOISE), {}, {"a": 1}), ({}, {}, {}),
+    # intervals of the scores overlap widely, but one is better by a little on every episode
+    (board(a=100 * NOISE, b=100 * NOISE + 0.5), {}, {"a": 1, "b": 2}),
+    # not transitive: a and b cannot be told apart, nor b and c, but a is better than c
+    (board(a=0 * NOISE, b=0.5 + 1.5 * NOISE, c=ONE), {}, {"a": 1, "b": 1, "c": 2}),
+    # a scattered method has a worse mean than one of rank 2, and nothing was shown to be better
+    (board(a=0 * NOISE, b=0.1 * ONE, c=0.5 + 3 * NOISE), {}, {"a": 1, "b": 2, "c": 1}),
+    # a single disaster decides the mean, and not the interquartile mean
+    (board(a=np.zeros(24), b=np.r_[np.full(23, -1.0), 100.0]), {}, {"a": 1, "b": 1}),
+    (board(a=np.zeros(24), b=np.r_[np.full(23, -1.0), 100.0]), {"statistic": interquartile_mean}, {"b": 1, "a": 2}),
+    # without a rank, and without a say
+    (board(seer=NOISE, a=NOISE + 1, floor=NOISE + 2, b=NOISE + 3), {"unranked": {"seer", "floor"}},
+     {"seer": None, "a": 1, "floor": None, "b": 2}),
+    # environments weigh the same: better by 1 in 6 episodes, worse by 0.5 in 60
+    (PIPE_AND_TANK, {}, {"a": 1, "b": 2}),
+    # better on all of four episodes is no evidence: one of two equal methods is, in one board of eight
+    (board(a=NOISE[:4], b=NOISE[:4] + 1), {}, {"a": 1, "b": 1})])
+def test_shared_ranks(scores, how, expected):
+    """Rank and order of each method."""
+    assert list(shared_ranks(scores, **how).items()) == list(expected.items())
 
 
 def by_the_definition(scores, unranked, statistic, higher):

@@ -293,10 +293,7 @@ def test_from_a_file_to_the_boards_by_command(tmp_path):
 
 @pytest.mark.parametrize(("arguments", "message"), [
     (["submit", "--env", FILTER.id, "--baseline", "homogeneous", "--policy", "adjacent"], "may be given, got both"),
-    (["submit", "--baseline", "homogeneous"], "env must name at least one environment"),
     (["submit", "--env", INJECTION, "--baseline", "homogeneous"], "does not ask for estimates"),
-    (["submit", "--env", FILTER.id, "--policy", "adjacent"], "env must be one of eitbench/Pipe2DInjection-v0"),
-    (["submit", "--env", FILTER.id, "--baseline", "homogeneous", "--seeds", "dev:0"], "of the season's split test"),
     (["compare", "mine", "yours"], "there is no record of mine in"),
     (["compare", "mine.json", "yours"], "record mine.json cannot be read"),
 ])

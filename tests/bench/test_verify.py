@@ -16,10 +16,10 @@ from eitbench.bench.records import read_record, write_record
 from eitbench.bench.sandbox import guests, host, wire
 from eitbench.bench.sandbox.wall import landlock_version
 from eitbench.bench.tracks import named
+from eitbench.data.cache import CACHE_VARIABLE, cache_folder, folder
 from eitbench.data.episodes import simulate
 from eitbench.data.seasons import drawn_seeds
 from eitbench.data.seeds import SPLITS, parse_seeds
-from eitbench.data.store import CACHE_VARIABLE, cache_folder, folder
 from eitbench.worlds.catalogue import PIPE_2D
 
 from commands import eitbench

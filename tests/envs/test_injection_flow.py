@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from eitbench.data.bank import fill
+from eitbench.data.cache import CACHE_VARIABLE
 from eitbench.data.recordings import cycle_voltages, outline, recording
 from eitbench.data.regions import (
     integrals,
@@ -16,7 +17,6 @@ from eitbench.data.regions import (
     mass_between,
     score_mass,
 )
-from eitbench.data.store import CACHE_VARIABLE
 from eitbench.envs.injection_core import scaled
 from eitbench.estimation import LinearisedObservations
 from eitbench.estimation.onboard import joint_operator

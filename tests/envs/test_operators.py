@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from eitbench import make_task
 from eitbench.data import cache
+from eitbench.data.cache import CACHE_VARIABLE
 from eitbench.data.recordings import cycle_voltages, recording
-from eitbench.data.store import CACHE_VARIABLE
 from eitbench.estimation import FirstFrame, LinearisedObservations, kalman_filter, table_5_1
 from eitbench.estimation.onboard import reduced_operator
 from eitbench.estimation.onboard.operator import electrode_pairs
