@@ -50,7 +50,7 @@ def _main(
 def list_() -> None:
     """Show the environments, the baselines and policies, and which boards they play on."""
     from eitbench.bench.methods import load_method, own_methods
-    from eitbench.bench.tracks import boards_of, ids
+    from eitbench.bench.tracks import boards_of, ids, measured_ids
     from eitbench.data.regions import outline
     from eitbench.worlds.registry import entry
     from eitbench.worlds.task import lag_steps
@@ -73,6 +73,8 @@ def list_() -> None:
         allowed = "" if budget is None else f", {budget} of them allowed"
         options.say(f"  {name:40} injection   {what}, {world.n_steps - len(world.currents)} "
                     f"injections{allowed}")
+    for name in measured_ids():
+        options.say(f"  {name:40} measured    data are downloaded separately")
     for track, heading in (("estimation", "baselines"), ("injection", "policies")):
         options.say(heading)
         for name in own_methods(track):
