@@ -21,8 +21,8 @@ from eitbench.bench.sandbox.host import GuestError
 from eitbench.bench.tracks import ids
 from eitbench.bench.verify import empty_cache, job_of, verify
 from eitbench.data.seasons import current_season
-from eitbench.report.boards import boards, read_for_boards
-from eitbench.report.site import Beside, Measured, render, render_site
+from eitbench.report.boards import read_for_boards
+from eitbench.report.site import Beside, Measured, collect, render, render_site
 
 RENDERED = ("leaderboard.csv", "leaderboard.md", "site")
 """What `eitbench leaderboard` writes beside the records."""
@@ -217,13 +217,13 @@ def _pages(submitted: Path) -> Finding:
     """Whether the rendered files are those of the records."""
     try:
         records, complaints = read_for_boards(submitted / "results")
-        table = boards(records)
+        site = collect(records)
         measured = Measured.of(submitted)
-        texts = {name: text.encode() for name, text in render(records, table, measured).items()}
-        site = render_site(records, table, Beside.of(submitted, submitted / "site"), measured)
+        texts = {name: text.encode() for name, text in render(site, measured).items()}
+        pages = render_site(site, Beside.of(submitted, submitted / "site"), measured)
     except ValueError as error:
         return Finding("Rendered pages", "", [str(error)])
-    made = texts | {f"site/{name}": content for name, content in site.items()}
+    made = texts | {f"site/{name}": content for name, content in pages.items()}
     there = {path.relative_to(submitted).as_posix() for name in RENDERED
              for path in [submitted / name, *(submitted / name).rglob("*")] if path.is_file()}
     old = sorted(name for name in there | set(made)
