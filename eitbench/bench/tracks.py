@@ -83,7 +83,7 @@ class Environment(NamedTuple):
         creator = load_env_creator(str(gym.spec(self.id).entry_point))
         defaults = {name: each.default for name, each in signature(creator).parameters.items()
                     if each.default is not Parameter.empty}
-        return defaults | registered(self.id) | json.loads(self.kwargs)
+        return defaults | registered(self.id) | SCORED[self.track] | json.loads(self.kwargs)
 
     def make(self, **extra: Any) -> EstimationEnv | InjectionEnv:
         """A fresh environment as it is played, without gymnasium's wrappers.

@@ -85,13 +85,12 @@ def test_a_changed_default_is_another_identity(monkeypatch):
     stored results of before are not reused. What is given as it is by default changes nothing."""
     before = injection_identity()
     assert injection_identity(estimator="full", gate=None) == before != injection_identity(estimator="reduced")
-    mine = entry("eitbench/Pipe2DInjection-v0")
 
     def changed_class(name, *, world=None, estimator="reduced", observation="scaled", gate=9.0): ...
 
     changes = [lambda patch: patch.setitem(tracks.SCORED, "injection", {"estimator": "reduced", "observation": "raw"}),
                lambda patch: patch.setattr(tracks, "load_env_creator", lambda name: changed_class),
-               lambda patch: patch.setattr(tracks, "entry", lambda id: replace(mine, settings={"gate": 4.0})),
+               lambda patch: patch.setattr(tracks, "registered", lambda id: {"gate": 4.0}),
                lambda patch: patch.setattr(run, "SCORING", 99)]
     found = {before}
     for change in changes:
