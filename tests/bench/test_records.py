@@ -18,8 +18,6 @@ from eitbench.bench.records import (
     read_records,
     schema_text,
     sealed,
-    split_of,
-    version_number,
     write_record,
 )
 from eitbench.bench.strict_json import MAX_BYTES, MAX_DEPTH
@@ -376,12 +374,6 @@ def test_names_of_files_are_spelt_out_in_messages(tmp_path):
     with pytest.raises(ValueError, match="must have the name") as caught:
         read_record(path)
     assert "\\x1b[31m\\u202e.json" in str(caught.value) and "\x1b" not in str(caught.value)
-
-
-@pytest.mark.parametrize(("text", "split", "number"), [("test:4", "test", None), ("7", "own", None), ("v3", "own", 3)])
-def test_names_of_splits_and_versions(text, split, number):
-    """Seeds name their split, versions of built-in methods their number."""
-    assert split_of(text) == split and version_number(text) == number
 
 
 def test_another_validator_agrees():
