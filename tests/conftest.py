@@ -20,7 +20,6 @@ PLACES = {
     "examples": "study",                       # installs two packages and plays with them
     "bench/test_golden.py": "study",           # simulates every world, runs every method
     "bench/test_checkpoints.py": "study",      # plays every trained agent
-    "bench/test_replay.py": "study",           # plays records again
     "bench/test_verify.py": "study",           # plays records again, and false ones
     "test_docs.py::test_documentation_builds": "study",
     "report/test_boards.py::test_published_files_are_rendered_from_the_records": "study",

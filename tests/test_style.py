@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "eitbench"
 BUDGETS = {"numerics": 1620, "scoring": 130, "physics": 1480, "worlds": 2600, "data": 1300, "estimation": 5600,
-           "measured": 1300, "envs": 1700, "bench": 4000, "report": 2000, "rl": 810, "cli": 900}
+           "measured": 1900, "envs": 1700, "bench": 4000, "report": 2000, "rl": 810, "cli": 900}
 """Package (or module) -> lines of Python allowed, blank lines and docstrings included. Each imports only from those
 before it."""
 TOP = 600

@@ -41,6 +41,8 @@ class Episode(NamedTuple):
     fields: dict[str, np.ndarray]
     """Means and standard deviations of an estimator's estimates as float32, for pictures; none of a
     policy, or on measurements."""
+    actions: list[Any] | None = None
+    """of a policy, JSON-ready"""
 
 
 def environment(asked: Environment) -> Any:
@@ -123,8 +125,9 @@ def _injected(env: InjectionEnv, policy: Method, seed: int) -> Episode:
     seconds = 0.0
     currents = list[np.ndarray]()
     claims = list[Claim]()
+    actions = list[Any]()
     # the clock of `injections` stands still while the filter is asked
-    for t, observation, elapsed in injections(env, policy, seed):
+    for t, observation, elapsed in injections(env, policy, seed, actions):
         seconds += elapsed
         currents.append(observation["currents"])
         if (error := env.error) is not None:
@@ -132,13 +135,14 @@ def _injected(env: InjectionEnv, policy: Method, seed: int) -> Episode:
             claims.append(Claim(t, error, means[0], stds[0], env.core.innovations()[0]))
     spent = sum(bool(each.any()) for each in currents)
     outcome = outcome_of_claims(env.core.world, seed, claims, seconds / env.core.length, spent)
-    return Episode(outcome, np.array(currents), {})
+    return Episode(outcome, np.array(currents), {}, actions)
 
 
-def injections(env: InjectionEnv, policy: Method, seed: int,
+def injections(env: InjectionEnv, policy: Method, seed: int, actions: list[Any] | None = None,
                ) -> Iterator[tuple[int, dict[str, np.ndarray], float]]:
     """(t of the state now seen, observation, seconds the policy took) after each of its injections
-    in one episode, the first with what it took to prepare; errors as `play`."""
+    in one episode, the first with what it took to prepare; errors as `play`. ``actions`` receives
+    what the policy returned."""
     if not policy.suits(env.rules):
         raise ValueError(f"policy {policy.name} does not suit {env.spec.id if env.spec else env}")
     with for_scores():
@@ -152,6 +156,8 @@ def injections(env: InjectionEnv, policy: Method, seed: int,
         action = player.act(observation)
         seconds = time.perf_counter() - begin
         observation, _, done, _, _ = env.step(action)
+        if actions is not None:
+            actions.append(np.asarray(action).tolist())
         t += 1
         yield t, observation, seconds
         begin = time.perf_counter()

@@ -6,8 +6,10 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
+import sys
 import time
 from collections.abc import Iterable, Sequence
+from contextlib import redirect_stdout
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,13 +19,11 @@ from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from eitbench._foreign import traceback_of, where_of
+from eitbench.bench import isolation
+from eitbench.bench.isolation import WorkerError, load_isolated
 from eitbench.bench.methods import Method, find_method, load_method, loader_of, version_of
 from eitbench.bench.playing import environment, play
-from eitbench.bench.prints import passed_on
 from eitbench.bench.records import SHARED
-from eitbench.bench.sandbox import guests
-from eitbench.bench.sandbox.host import GuestError
-from eitbench.bench.sandbox.wall import landlock_version
 from eitbench.bench.scores import SCORING, scored
 from eitbench.bench.store import EpisodeStore, machine, portable_command, provenance
 from eitbench.bench.tracks import Environment, board_of, is_measured, registered
@@ -45,22 +45,18 @@ class Job(NamedTuple):
     method: str
     """Name or path."""
     seed: int
-    isolated: bool = False
-    """Whether the method runs in a process of its own, which is all that ever executes its file."""
+    isolation: str = "none"
+    """``none``, or the kind of worker in which alone the method's file is executed: ``process`` or
+    ``bubblewrap``."""
 
     def load(self) -> Method:
         """The method's file."""
         track = self.environment.track
-        if self.isolated:
-            return guests.load(track, self.environment.id, self.environment.kwargs, self.method)
-        with passed_on(self.method):
+        if self.isolation != "none":
+            return load_isolated(track, self.environment.id, self.environment.kwargs, self.method,
+                                 self.isolation)
+        with redirect_stdout(sys.stderr):
             return load_method(self.method, track)
-
-    @property
-    def isolation(self) -> str:
-        """What keeps the method from what it should not see: ``none``, a ``process``, or
-        ``landlock`` around it."""
-        return "none" if not self.isolated else "landlock" if landlock_version() else "process"
 
     def identity(self) -> str:
         """Return a digest of the configuration and declared versions that the outcome depends on; a
@@ -104,18 +100,20 @@ def run_episode(job: Job) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     fields: dict[str, np.ndarray] = {}
     begin = time.perf_counter()
     try:
-        with threadpool_limits(1), passed_on(method.name):
+        with threadpool_limits(1), redirect_stdout(sys.stderr):  # standard output is for tables
             played = play(job.environment, method, job.seed)
             numbers = scored(method.track, played.outcome)
         said = {"scores": numbers, "step_errors": played.outcome.errors.tolist()}
+        if played.actions is not None:
+            said["actions"] = played.actions
         json.dumps(said, allow_nan=False)  # what cannot be kept is the method's failure too
         result |= {"status": "ok"} | said
         fields = played.fields
     # whatever a method does wrong is its result, not our crash
     except (Exception, SystemExit) as error:
         result |= _failure(error, method.path)
-    if job.isolated:
-        result["peak_memory"] = guests.peak_memory()
+    if job.isolation != "none":
+        result["peak_memory"] = isolation.peak_memory()
     result["finished"] = datetime.now(UTC).isoformat(timespec="microseconds")
     result["seconds"] = time.perf_counter() - begin
     return result, fields
@@ -146,7 +144,7 @@ def _beginning(job: Job, method: Method) -> dict[str, Any]:
 
 def _failure(error: BaseException, own: Path) -> dict[str, Any]:
     """What a result says of it; ``own`` is the method's file."""
-    if isinstance(error, GuestError):
+    if isinstance(error, WorkerError):
         return {"status": "failed", "message": str(error), "where": error.where,
                 "traceback": error.traceback}
     return {"status": "failed", "message": f"{type(error).__name__}: {error}",
@@ -174,7 +172,7 @@ def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1, backend: 
         truths.setdefault((environment(job.environment).world, job.seed), job)
     run = {"command": portable_command(command), **provenance(), "machine": machine()}
     home = platform.node()
-    guests.close()                                  # that of `Job.load`; the workers have their own
+    isolation.close()                               # that of `Job.load`; the workers have their own
     try:
         for function, work, label in (
             (_simulate_job, [(job,) for job in truths.values()], "simulating truths"),
@@ -185,7 +183,7 @@ def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1, backend: 
             for _ in tqdm(done, total=len(work), desc=label, unit="episode", disable=None):
                 pass
     finally:
-        guests.close()
+        isolation.close()
 
 
 def successful(
@@ -231,10 +229,9 @@ def _run_job(job: Job, store: EpisodeStore, run: dict[str, Any], home: str,
         result, fields = beginning | _failure(error, Path(job.method)), {}
     # whose times these are, not who asked
     elsewhere = {} if platform.node() == home else {"machine": machine()}
-    walls = {"walls": guests.walls()} if job.isolated else {}
-    result["run"] = run | elsewhere | {"isolation": job.isolation} | walls
+    result["run"] = run | elsewhere | {"isolation": job.isolation}
     try:
         store.put(job.environment.name, result["method"], job.seed, result, fields)
     except OSError:
-        guests.close()  # its folder may be what fills the disk
+        isolation.close()  # its folder may be what fills the disk
         store.put(job.environment.name, result["method"], job.seed, result, fields)

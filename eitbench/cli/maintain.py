@@ -1,9 +1,8 @@
-"""The commands `golden` and `held-out`, for maintainers."""
+"""The command `golden`, for maintainers."""
 
 from __future__ import annotations
 
 from itertools import chain
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -41,15 +40,3 @@ def golden(
                     "the method's next version with --new-version and run its records again",
                     err=True)
         raise typer.Exit(1)
-
-
-def held_out(
-    new: Annotated[Path, typer.Option(
-        help="Where to write a new salt; keep it secret, and keep it.")],
-) -> None:
-    """For maintainers: draw the salt of held-out episodes, and publish its hash in
-    leaderboards/held_out.json, once."""
-    from eitbench.bench import salts
-    with options.clear_errors():
-        digest = salts.publish_new_salt(new)
-    options.say(f"wrote {new}, sha256 {digest}, and {salts.PUBLISHED}")

@@ -23,8 +23,14 @@ TOGETHER = 8
 
 
 def recording_bytes(world: World) -> int:
-    """Return the size of a recording on disk without headers of some 100 bytes."""
+    """Return the size of a recording on disk without its header."""
     return world.n_steps * recording_type(world, outline(world).mass.shape[0]).itemsize
+
+
+def missing_seeds(world: World, seeds: Sequence[int]) -> list[int]:
+    """Return those of ``seeds`` without a sound recording."""
+    checked = dict.fromkeys(_check.integer("seeds", seed, low=0) for seed in seeds)
+    return [seed for seed in checked if not is_recorded(world, seed)]
 
 
 def fill(world: World, seeds: Sequence[int], *, n_jobs: int = 1, backend: str = "loky") -> int:
@@ -36,7 +42,10 @@ def fill(world: World, seeds: Sequence[int], *, n_jobs: int = 1, backend: str = 
     """
     n_jobs = _check.integer("n_jobs", n_jobs, low=1)
     missing = missing_seeds(world, seeds)
-    groups = _groups(world, missing, max(1, min(TOGETHER, -(-len(missing) // n_jobs))))
+    size = max(1, min(TOGETHER, -(-len(missing) // n_jobs)))
+    # The folder is determined here: a worker may have started under another environment.
+    place = cache.cache_folder().absolute()
+    groups = [(world, missing[k:k + size], place) for k in range(0, len(missing), size)]
     with tqdm(total=len(missing), desc="recording", unit="episode", disable=None) as bar:
         for done in in_parallel(_record, groups, n_jobs, backend):
             bar.update(done)
@@ -45,28 +54,15 @@ def fill(world: World, seeds: Sequence[int], *, n_jobs: int = 1, backend: str = 
 
 def fill_here(world: World, seeds: Sequence[int]) -> None:
     """Simulate the missing recordings in this process, and report the progress."""
-    for group in _groups(world, missing_seeds(world, seeds), TOGETHER):
-        _record(*group, progress=True)
-
-
-def missing_seeds(world: World, seeds: Sequence[int]) -> list[int]:
-    """Return those of ``seeds`` without a sound recording."""
-    checked = dict.fromkeys(_check.integer("seeds", seed, low=0) for seed in seeds)
-    return [seed for seed in checked if not is_recorded(world, seed)]
-
-
-def _groups(world: World, seeds: Sequence[int],
-            size: int) -> list[tuple[World, Sequence[int], Path]]:
-    """Return the arguments of `_record` for ``size`` seeds at a time."""
-    # The folder is determined here: a worker may have started under another environment.
-    place = cache.cache_folder().absolute()
-    return [(world, seeds[k:k + size], place) for k in range(0, len(seeds), size)]
+    missing = missing_seeds(world, seeds)
+    for k in range(0, len(missing), TOGETHER):
+        _record(world, missing[k:k + TOGETHER], cache.cache_folder(), progress=True)
 
 
 def _record(world: World, seeds: Sequence[int], place: Path, progress: bool = False) -> int:
     """Simulate and store recordings, and return their number."""
     with cache.cache_in(place):
         for seed, episode in zip(seeds, simulate_together(world, seeds, progress), strict=True):
-            cache.store(recording_key(world, seed),
-                        {"steps": make_recording(world, seed, episode)})
+            entries = make_recording(world, seed, episode)
+            cache.store(recording_key(world, seed), {"steps": entries})
     return len(seeds)

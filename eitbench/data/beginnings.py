@@ -1,8 +1,5 @@
 """The first steps of an episode, simulated alone in a quarter of the time, for the first
-observations.
-
-The package ships what the first observations need of the first training episode of built-in worlds.
-"""
+observations. For the first training episode of built-in worlds the package ships them."""
 
 from __future__ import annotations
 
@@ -39,24 +36,33 @@ class Script(NamedTuple):
 
 def script(world: World, seed: int) -> Script:
     """Return the script of a whole episode, which is simulated if necessary."""
-    return _script(world, seed, recording(world, seed))
+    entries = recording(world, seed)
+    return Script(entries, integrals(world, seed, entries))
 
 
 def script_so_far(world: World, seed: int, needed: int) -> Script:
-    """Return the script of the whole episode if it is recorded, else of its ``needed`` first steps
+    """Return the script of the whole episode if it is recorded, else of the ``needed`` first steps
     and some more."""
     last = needed + MARGIN
     if last >= world.n_steps or is_recorded(world, seed):
         return script(world, seed)
-    if seed == SHIPPED_SEED:
-        shipped = _shipped(world.fluid)
-        if shipped is not None and len(shipped) >= needed:
-            return _script(world, seed, shipped)
-    return _script(world, seed, make_recording(world, seed, _beginning(world.fluid, seed, last)))
-
-
-def _script(world: World, seed: int, entries: np.ndarray) -> Script:
+    entries = _shipped(world.fluid) if seed == SHIPPED_SEED else None
+    if entries is None or len(entries) < needed:
+        entries = make_recording(world, seed, _beginning(world.fluid, seed, last))
     return Script(entries, integrals(world, seed, entries))
+
+
+def concentration_at(world: World, seed: int, t: int, needed: int) -> np.ndarray:
+    """Return c_t (n_truth,) in mol/m³ on the truth's mesh; ``needed`` as in `script_so_far`."""
+    last = needed + MARGIN
+    is_early = t <= last < world.n_steps and not is_simulated(world, seed)
+    episode = _beginning(world.fluid, seed, last) if is_early else simulate(world, seed)
+    return episode.concentration[t].astype(float)
+
+
+@lru_cache(maxsize=KEPT)
+def _beginning(fluid: World, seed: int, last: int) -> Episode:
+    return next(simulate_together(fluid, [seed], last=last))
 
 
 def shipped_key(world: World) -> cache.Key:
@@ -74,8 +80,8 @@ def make_beginning(world: World, needed: int) -> dict[str, np.ndarray]:
 
 @once(4)
 def _shipped(world: World) -> np.ndarray | None:
-    """Return the shipped first steps as entries of a recording, without integrals of the truth:
-    these steps are not scored."""
+    """Return the shipped steps as entries of a recording; their integrals, which no score needs,
+    are not those of the truth."""
     arrays = cache.load_shipped(shipped_key(world))
     if arrays is None:
         return None
@@ -89,16 +95,3 @@ def _shipped(world: World) -> np.ndarray | None:
             entries[name] = 1.0  # relative errors divide by it
     entries.setflags(write=False)
     return entries
-
-
-def concentration_at(world: World, seed: int, t: int, needed: int) -> np.ndarray:
-    """Return c_t (n_truth,) in mol/m³ on the truth's mesh; ``needed`` as in `script_so_far`."""
-    last = needed + MARGIN
-    if t <= last < world.n_steps and not is_simulated(world, seed):
-        return _beginning(world.fluid, seed, last).concentration[t].astype(float)
-    return simulate(world, seed).concentration[t].astype(float)
-
-
-@lru_cache(maxsize=KEPT)
-def _beginning(fluid: World, seed: int, last: int) -> Episode:
-    return next(simulate_together(fluid, [seed], last=last))

@@ -1,13 +1,10 @@
-"""A cache on disk for arrays that take long to compute.
+"""A cache on disk for arrays that take long to compute: `cached(key, build)`.
 
-`cached(key, build)` returns the arrays of a key and builds them where no sound file holds them. A
-key names a configuration and the version of the code that computes from it; the text of the code
-takes no part. Raise the version (`SIMULATION` and its like) when the numbers or the names of the
-arrays change.
+A key names a configuration and the version of the code that computes from it; the text of the code
+takes no part. Raise the version (`SIMULATION` and its like) when numbers or names of arrays change.
 
-A file is a .npy of one record with a field for each array, so that arrays are read where they lie,
-followed by a checksum of the key and all bytes. Files that the package ships are the same,
-compressed.
+A file is a .npy of one record with a field for each array, which is memory-mapped, followed by a
+checksum of the key and all bytes. Files that the package ships are the same, compressed.
 """
 
 from __future__ import annotations
@@ -64,13 +61,12 @@ class Key(NamedTuple):
 
 
 def episode_key(world: World, name: str) -> Key:
-    """Return the key of arrays that depend on all of `World.fluid` and, by ``name``, on a seed."""
+    """Return the key of arrays that depend on `World.fluid` and, by ``name``, on a seed."""
     return Key(_episode_folder(world.fluid), name)
 
 
 def model_key(name: str, configuration: Any, version: int) -> Key:
-    """Return the key of arrays that depend on ``configuration``, fit for JSON, and hold no truth of
-    an episode."""
+    """Return the key of arrays that depend on a JSON-ready ``configuration``, not on an episode."""
     return Key("models", f"{name}-{_digest([configuration, version])[:16]}")
 
 
@@ -80,11 +76,9 @@ def cached(key: Key, build: Callable[[], Arrays]) -> dict[str, np.ndarray]:
     A file that is missing, damaged or of another key is built again and replaced. A cache that
     cannot be written is a warning.
     """
-    found = load_shipped(key)
-    if found is None:
-        found = _load(key)
-    if found is not None:
-        return found
+    for load in (load_shipped, _load):
+        if (found := load(key)) is not None:
+            return found
     built = build()
     try:
         store(key, built)
@@ -150,10 +144,8 @@ def cache_in(folder: Path) -> Iterator[None]:
 
 
 def folder(world: World) -> Path:
-    """Return the folder of a world's episodes.
-
-    Worlds that differ only in noise and faults of the instrument or in the prior share it.
-    """
+    """Return the folder of a world's episodes; worlds that differ only in noise and faults of the
+    instrument or in the prior share it."""
     return episode_key(world, "").path.parent
 
 
@@ -182,13 +174,6 @@ def world_digest(world: World) -> str:
     return _digest([described(world), SIMULATION])
 
 
-def npy(array: np.ndarray) -> bytes:
-    """Return an array as the content of a .npy file."""
-    content = io.BytesIO()
-    np.save(content, array)
-    return content.getvalue()
-
-
 @lru_cache(maxsize=64)
 def _episode_folder(world: World) -> str:
     return f"{world.name}-{world_digest(world)[:16]}"
@@ -196,6 +181,13 @@ def _episode_folder(world: World) -> str:
 
 def _digest(configuration: Any) -> str:
     return hashlib.sha256(json.dumps(configuration, sort_keys=True).encode()).hexdigest()
+
+
+def npy(array: np.ndarray) -> bytes:
+    """Return an array as the content of a .npy file."""
+    content = io.BytesIO()
+    np.save(content, array)
+    return content.getvalue()
 
 
 def _encode(key: Key, arrays: Arrays) -> bytes:
@@ -206,7 +198,6 @@ def _encode(key: Key, arrays: Arrays) -> bytes:
 
 
 def _checksum(key: Key, content: bytes) -> bytes:
-    """Return a checksum that holds for this content under this key only."""
     return zlib.crc32(content, zlib.crc32("/".join(key).encode())).to_bytes(WORD, "little")
 
 
@@ -215,9 +206,11 @@ def _is_sound(key: Key, content: bytes) -> bool:
 
 
 def _record(arrays: Arrays) -> np.ndarray:
-    """Return one record (1,) with a field for each array, whose order in memory it preserves."""
-    held = {name + TRANSPOSED * _is_by_columns(array): array.T if _is_by_columns(array) else array
-            for name, array in arrays.items()}
+    """Return one record (1,) with a field for each array, whose order in memory it keeps."""
+    held = {}
+    for name, array in arrays.items():
+        by_columns = array.flags.f_contiguous and not array.flags.c_contiguous
+        held[name + TRANSPOSED * by_columns] = array.T if by_columns else array
     layout = [(name, array.dtype, array.shape) for name, array in held.items()]
     record = np.zeros(1, np.dtype(layout, align=True))
     for name, array in held.items():
@@ -226,16 +219,12 @@ def _record(arrays: Arrays) -> np.ndarray:
     return record
 
 
-def _is_by_columns(array: np.ndarray) -> bool:
-    return array.flags.f_contiguous and not array.flags.c_contiguous
-
-
 def _fields(record: np.ndarray) -> dict[str, np.ndarray]:
     """Return the arrays of a record."""
     plain = np.asarray(record)
-    fields = {name: plain[name][0] for name in plain.dtype.names or ()}
-    return {name.removesuffix(TRANSPOSED): array.T if name.endswith(TRANSPOSED) else array
-            for name, array in fields.items()}
+    return {name.removesuffix(TRANSPOSED):
+            plain[name][0].T if name.endswith(TRANSPOSED) else plain[name][0]
+            for name in plain.dtype.names or ()}
 
 
 _sound: dict[Path, tuple[int, int]] = {}

@@ -47,7 +47,7 @@ class Episode(NamedTuple):
 
 
 def simulate(world: World, seed: int, *, cache: bool = True, progress: bool = True) -> Episode:
-    """The episode of ``world`` with this seed, from the cache if it is there.
+    """Return the episode of ``world`` with this seed, from the cache or simulated.
 
     Parameters
     ----------
@@ -56,10 +56,9 @@ def simulate(world: World, seed: int, *, cache: bool = True, progress: bool = Tr
         ≥ 0; see `eitbench.data.seeds` for the public ranges.
     cache : bool
         Read from and write to the cache folder ($EITBENCH_CACHE, by default in the user's cache
-        folder). A file that is damaged or of another seed is replaced; files of other versions stay
-        beside it.
+        folder).
     progress : bool
-        Show a progress bar, on a terminal only, and say what takes longer than two seconds.
+        Show a progress bar, on a terminal only, and report what takes longer than two seconds.
     """
     seed = _check.integer("seed", seed, low=0)
 
@@ -72,7 +71,7 @@ def simulate(world: World, seed: int, *, cache: bool = True, progress: bool = Tr
 
 
 def is_simulated(world: World, seed: int) -> bool:
-    """Whether the truth is in the cache."""
+    """Return whether the cache holds the truth."""
     return _key(world, seed).path.is_file()
 
 
@@ -81,8 +80,8 @@ def _key(world: World, seed: int) -> Key:
 
 
 def once(many: int) -> Callable[[Callable[[World], Made]], Callable[[World], Made]]:
-    """What a function makes of a world is made once a process for all with the same `World.fluid`,
-    and kept for so ``many``."""
+    """Decorate a function of a world: it runs once a process for all worlds with the same
+    `World.fluid`, and results of ``many`` are kept."""
     def decorated(make: Callable[[World], Made]) -> Callable[[World], Made]:
         kept = lru_cache(maxsize=many)(make)
         return wraps(make)(lambda world: kept(world.fluid))
@@ -98,11 +97,9 @@ def truth_discretisation(world: World) -> Discretisation:
 
 def simulate_together(world: World, seeds: Sequence[int], progress: bool = True,
                       last: int | None = None) -> Iterator[Episode]:
-    """The episodes of several seeds, bit for bit as `simulate` gives them and without the cache; up
-    to the state ``last`` (default: all).
+    """Simulate several seeds, with the bits of `simulate`, up to the state ``last`` (default: all).
 
-    Eight concentrations in one flow are carried on together in the time of two, and eight
-    conductivities are solved for at once.
+    In one flow eight episodes take the time of two.
     """
     truth = truth_discretisation(world)
     label = f"simulating {world.name}, seed {', '.join(map(str, seeds))}"

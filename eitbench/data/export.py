@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +12,7 @@ import numpy as np
 from tqdm import tqdm
 
 from eitbench._extras import needed_by
-from eitbench._files import write_atomically
+from eitbench._files import PACKAGE, write_atomically
 from eitbench.data.bank import fill
 from eitbench.data.cache import described, world_digest
 from eitbench.data.regions import SPARSE
@@ -31,47 +31,8 @@ INTEGRAL = "(mol/m³)²·m² (m³ in 3D)"
 UNITS = {"seed": "", "voltages": "V", "currents": "A (A/m in 2D)", "truth": "mol/m³",
          "unresolved": INTEGRAL, "square": INTEGRAL, "velocity": "m/s"}
 """Unit of each field."""
-README = """\
-# {environment}: episodes to learn from
-
-Process tomography, simulated: currents injected through electrodes on a vessel's wall, the voltages
-there, and the true concentration. One file per episode (`{format}`): {held}.
-Learn on `train`, choose on `dev`, report on `test`. {warning}
-
-| field | shape | unit | |
-| --- | --- | --- | --- |
-| `seed` | | | of the episode |
-| `voltages` | ({steps}, {electrodes}) | {units[voltages]} | noisy readings, {ms:g} ms apart |
-| `currents` | ({steps}, {electrodes}) | {units[currents]} | injected |
-| `truth` | ({steps}, {nodes}) | {units[truth]} | concentration at the nodes of `mesh.npz`: the \
-projection p_t of the simulated one, c_t on a finer mesh |
-| `unresolved` | ({steps},) | {units[unresolved]} | ∫(p_t − c_t)² |
-| `square` | ({steps},) | {units[square]} | ∫c_t² |
-| `velocity` | ({steps}, {velocity}) | {units[velocity]} | flow parameters that fit the true flow \
-best; none where the flow is known |
-
-`mesh.npz` holds the nodes (`points`, m), the cells, and the mass matrix M̃ in CSR form. Scores are
-those of the leaderboards, exactly, although the finer mesh of the truth is not here:
-
-```python
-import numpy as np
-import scipy.sparse as sp
-
-mesh = np.load("mesh.npz")
-mass = sp.csr_array((mesh["mass_data"], mesh["mass_indices"], mesh["mass_indptr"]))
-off = estimate - truth              # ({steps}, {nodes})
-errors = (np.einsum("tn,nt->t", off, mass @ off.T) + unresolved) / square
-score = errors[{warm_up}:].mean()         # ẽ_c: the first {warm_up} states do not count
-```
-
-Made by `eitbench export --env {environment} --format {format} --seeds …`, eitbench {eitbench},
-configuration of digest `{digest}`; no measured data, no personal data. Licence: MIT, as eitbench.
-All numbers of the world:
-
-```json
-{numbers}
-```
-"""
+README = PACKAGE / "data" / "export_readme.md"
+"""Template of the description of an export."""
 WARNING = "Test episodes are among them: report on them, and neither learn nor choose."
 
 
@@ -104,7 +65,9 @@ def export(examples: Dataset, folder: Path, format: str = "npz", *, n_jobs: int 
     if examples.basis is not None:
         raise ValueError("examples must have their truth on the nodes, got reduced coordinates")
     with needed_by(f"format {format}"):
-        encode = {"npz": lambda: _npz, "hdf5": _hdf5}[format]()
+        if format == "hdf5":
+            import h5py  # noqa: F401
+    encode = _hdf5 if format == "hdf5" else _npz
     about = _about(examples, format)
     _claim(folder, json.dumps(about, indent=1) + "\n")
     paths = {seed: folder / f"{name_seed(seed).replace(':', '-')}.{SUFFIXES[format]}"
@@ -117,7 +80,7 @@ def export(examples: Dataset, folder: Path, format: str = "npz", *, n_jobs: int 
         | {f"mass_{name}": getattr(mass, name) for name in SPARSE}))
     for seed in tqdm(missing, desc="writing", unit="episode", disable=None):
         fields = examples.example(seed)._asdict()
-        write_atomically(paths[seed], encode(fields | {"seed": np.array(seed)}))
+        write_atomically(paths[seed], encode(fields))
     write_atomically(folder / "README.md", _readme(folder, about).encode())
     return len(missing)
 
@@ -152,7 +115,7 @@ def _readme(folder: Path, about: dict[str, Any]) -> str:
     held = seed_ranges(path.stem for path in folder.glob(f"[!.]*.{SUFFIXES[about['format']]}")
                        if path.name != MESH)
     tests = any(is_test(parse_seeds(each)[0]) for each in held)
-    return README.format(
+    return README.read_text(encoding="utf-8").format(
         held="; ".join(held), warning=WARNING if tests else "", ms=1e3 * about["time_step"],
         numbers=json.dumps(about["world"], indent=1), units=UNITS, **about)
 
@@ -173,23 +136,16 @@ def _runs(numbers: set[int]) -> str:
     return ",".join(str(a) if a == b else f"{a}-{b}" for a, b in zip(begins, ends, strict=True))
 
 
-Encoder = Callable[[dict[str, np.ndarray]], bytes]
-
-
-def _npz(arrays: dict[str, np.ndarray]) -> bytes:
+def _npz(arrays: Mapping[str, Any]) -> bytes:
     content = io.BytesIO()
-    np.savez(content, **arrays)  # type: ignore[arg-type]
+    np.savez(content, **arrays)
     return content.getvalue()
 
 
-def _hdf5() -> Encoder:
+def _hdf5(arrays: Mapping[str, Any]) -> bytes:
     import h5py
-
-    def encode(arrays: dict[str, Any]) -> bytes:
-        content = io.BytesIO()
-        with h5py.File(content, "w") as file:
-            for name, array in arrays.items():
-                file.create_dataset(name, data=array).attrs["units"] = UNITS[name]
-        return content.getvalue()
-
-    return encode
+    content = io.BytesIO()
+    with h5py.File(content, "w") as file:
+        for name, array in arrays.items():
+            file.create_dataset(name, data=array).attrs["units"] = UNITS[name]
+    return content.getvalue()

@@ -34,31 +34,46 @@ WITHHOLDING_SEEDS = 100_000
 
 
 class MeasuredEnv(KnowsItsLength, gym.Env[Observation, np.ndarray]):  # type: ignore[misc]
-    """Estimate the concentration in a real vessel from measurements; the action is the estimate.
+    """Estimate the concentration in a real vessel from measurements, without ground truth.
 
-    There is no ground truth, so withheld readings score an estimate: the reward is
-    −mean ((reading − predicted)/std)² over the withheld readings of the active injection, zero in
-    the first frame; for a target at rest, the last estimate is scored by all withheld readings.
-    The seed draws a fraction of the readings of each injection, the same at each of its uses.
-    Observations are those of `EstimationEnv`, but voltages are readings of the instrument, (M,), 0
-    where nothing was measured or shown; the mask of the task's `MeasurementModel` tells which.
+    ## Action Space
 
-    Parameters
-    ----------
-    file : path or Measurements
-        A file for `eitbench.measured.read`.
-    vessel : path, mapping or VesselConfig
-        A file for `read_vessel`.
-    withheld : float
-        Withheld fraction of an injection's readings, from 0 to 0.5.
-    moves : bool, optional
-        Whether the target moves. Default: with two complete frames or more, or a flow.
-    correction : "offset" or "gain"
-        See `calibrate`.
-    homogeneous_frames : int
-        Number of first frames that replace a missing reference.
-    options
-        Further arguments of `task_from_measurements`.
+    At step t = 1 … T the action is the estimate of the state at the t-th reading: the concentration
+    at the nodes of `task.mesh` in mol/m³. Where the velocity is estimated too (`task.velocity`),
+    its parameters in m/s follow.
+
+    ## Observation Space
+
+    A `Dict` with the readings, (M,) V, and currents, (L,) A, of the active injection. Readings that
+    are withheld or missing are 0; the mask of the task's `MeasurementModel` tells which.
+
+    ## Rewards
+
+    −mean ((reading − predicted)/std)² over the withheld readings of the active injection, 0 in the
+    first frame. For a target at rest, all withheld readings score the last estimate.
+
+    ## Starting State
+
+    `reset(seed=s)` draws the withheld fraction of the readings of each injection, the same at each
+    of its uses; without a seed, the random generator of the environment draws s.
+
+    ## Episode End
+
+    Terminated after T steps. Never truncated.
+
+    ## Arguments
+
+    | name | default | meaning |
+    |---|---|---|
+    | `file` | | a file for `eitbench.measured.read`, or `Measurements` |
+    | `vessel` | | a file or mapping for `read_vessel`, or a `VesselConfig` |
+    | `withheld` | 0.1 | withheld fraction of the readings, from 0 to 0.5 |
+    | `moves` | None | whether the target moves; None: with two complete frames or more, or a flow |
+    | `correction` | "offset" | of the misfit on homogeneous fluid; or "gain", see `calibrate` |
+    | `homogeneous_frames` | 1 | number of first frames that replace a missing reference |
+
+    and those of `task_from_measurements`. A case, such as `eitbench/Measured-iirc-v0`, fixes all
+    but `file`.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012 (gymnasium's form)

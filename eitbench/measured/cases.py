@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 
 from eitbench._check import nearest
-from eitbench.data.cache import cache_folder
 from eitbench.measured.measurements import Measurements
 from eitbench.measured.readers import load_yaml, read
 from eitbench.measured.segmentation import read_truth
@@ -127,8 +126,12 @@ class MeasuredCase:
 
 
 def measured_folder() -> Path:
-    """$EITBENCH_MEASURED, or the folder ``measured`` of the cache."""
-    return Path(os.environ.get(FOLDER_VARIABLE) or cache_folder() / "measured")
+    """$EITBENCH_MEASURED, else $XDG_DATA_HOME/eitbench/measured, else
+    ~/.local/share/eitbench/measured."""
+    if folder := os.environ.get(FOLDER_VARIABLE):
+        return Path(folder)
+    data = os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share"
+    return Path(data) / "eitbench" / "measured"
 
 
 def case_id(name: str) -> str:

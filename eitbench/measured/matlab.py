@@ -55,9 +55,9 @@ def provenance(path: Path, **more: Any) -> dict[str, Any]:
     return {"file": path.name, "sha256": hashlib.sha256(path.read_bytes()).hexdigest(), **more}
 
 
-def read_ktc(path: Path | str, reference: Path | str | None = None) -> Measurements:
-    """Read KTC's ``data*.mat`` or KIT4's ``datamat_*.mat``, with the file of the empty tank,
-    which is by default searched in the same folder.
+def read_ktc(path: Path | str) -> Measurements:
+    """Read KTC's ``data*.mat`` or KIT4's ``datamat_*.mat``, with the file of the empty tank if it
+    is in the same folder.
 
     The files state no units: currents are taken as mA (KTC: about 1.5 mA at 77 kHz) and readings
     as V, with which a tank of tap water has 0.01 S/m, and a second passes between injections.
@@ -65,12 +65,11 @@ def read_ktc(path: Path | str, reference: Path | str | None = None) -> Measureme
     """
     path = Path(path)
     currents, matrix, readings = _ktc_arrays(path)
-    if reference is None:
-        candidates = [path.with_name(name) for name in KTC_REFERENCES]
-        reference = next((each for each in candidates if each.is_file() and each != path), None)
+    candidates = [path.with_name(name) for name in KTC_REFERENCES]
+    reference = next((each for each in candidates if each.is_file() and each != path), None)
     empty = None
     if reference is not None:
-        currents_0, matrix_0, readings_0 = _ktc_arrays(Path(reference))
+        currents_0, matrix_0, readings_0 = _ktc_arrays(reference)
         if (currents_0.shape != currents.shape or not np.allclose(currents_0, currents)
                 or not np.array_equal(matrix_0, matrix)):
             raise ValueError(f"{reference} must have the injections and patterns of {path}")
@@ -96,8 +95,7 @@ def _ktc_arrays(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return currents, matrix, readings.reshape(T, M)
 
 
-def read_eidors(path: Path | str, name: str | None = None,
-                reference: str | None = None) -> Measurements:
+def read_eidors(path: Path | str, name: str | None = None) -> Measurements:
     """Read the frames (256, F) of the variable ``name``, by default the first known one, such as
     ``v_rotate`` of iirc_data_2006.mat or ``zc_demo3`` of montreal_data_1995.mat.
 
@@ -110,7 +108,7 @@ def read_eidors(path: Path | str, name: str | None = None,
     if name is None:
         found = load_variables(path)
         name = next((each for each in EIDORS_REFERENCES if each in found), "v_rotate")
-    reference = reference or EIDORS_REFERENCES.get(name)
+    reference = EIDORS_REFERENCES.get(name)
     found = load_variables(path, name, *filter(None, [reference]))
     readings = _eidors_frames(path, name, found[name])
     L, F = EIDORS_ELECTRODES, len(readings)

@@ -83,13 +83,13 @@ class _Frame(NamedTuple):
     """(K, L) complex, V"""
 
 
-def read_sciospec(path: Path | str, reference_frames: int = 0) -> Measurements:
+def read_sciospec(path: Path | str) -> Measurements:
     """Read one ``.eit`` file, or all of a folder in the order of their names.
 
     Potentials refer to the instrument's ground; their real parts, relative to their mean, are
     used. The current enters at the first electrode of a pair with the header's amplitude in A.
-    The first ``reference_frames`` become the reference. The injections of a frame are spaced
-    evenly until the next frame. ``ValueError`` names the file and the fault.
+    The injections of a frame are spaced evenly until the next frame. ``ValueError`` names the file
+    and the fault.
     """
     path = Path(path)
     files = sorted(path.glob("*.eit")) if path.is_dir() else [path]
@@ -100,24 +100,20 @@ def read_sciospec(path: Path | str, reference_frames: int = 0) -> Measurements:
     for file, frame in zip(files, frames, strict=True):
         if frame.pairs != first.pairs or frame.amplitude != first.amplitude:
             raise ValueError(f"{file} must have the injections of {files[0]}")
-    if not 0 <= reference_frames < len(frames):
-        raise ValueError(f"reference_frames must be from 0 to {len(frames) - 1}, got "
-                         f"{reference_frames}")
     K, L = first.potentials.shape
     readings = np.array([frame.potentials.real for frame in frames])
     readings -= readings.mean(axis=2, keepdims=True)
     begins = np.array([frame.time for frame in frames])
     frame_time = float(np.median(np.diff(begins))) if len(frames) > 1 else 1.0
-    times = begins[reference_frames:, None] - begins[0] + frame_time / K * np.arange(K)
+    times = begins[:, None] - begins[0] + frame_time / K * np.arange(K)
     digest = hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
     # every folder of frames is called setup, so its parent's name tells them apart
     name = f"{path.resolve().parent.name}/{path.name}" if path.is_dir() else path.name
     return Measurements(
         _pair_currents(np.array(first.pairs), first.amplitude, L),
-        np.tile(np.arange(K), len(times)), np.eye(L), readings[reference_frames:].reshape(-1, L),
-        times.ravel(), readings[:reference_frames] if reference_frames else None,
-        {"file": name, "sha256": digest, "frames": len(times), "frequency": first.frequency,
-         "assumed": "real parts, relative to the mean of all electrodes; amplitude in A"})
+        np.tile(np.arange(K), len(times)), np.eye(L), readings.reshape(-1, L), times.ravel(),
+        source={"file": name, "sha256": digest, "frames": len(times), "frequency": first.frequency,
+                "assumed": "real parts, relative to the mean of all electrodes; amplitude in A"})
 
 
 def _pair_currents(pairs: np.ndarray, current: float, L: int) -> np.ndarray:

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from eitbench import _check
-from eitbench.measured.matlab import load_variables
 from eitbench.measured.readers import load_yaml
 from eitbench.numerics.mesh import Mesh
 from eitbench.physics.cem import CompleteElectrodeModel
@@ -60,35 +59,13 @@ class FlowConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class MeshTank:
-    """A vessel of fluid at rest on one mesh, for concentration and potential alike."""
-
-    mesh: Mesh
-    electrodes: tuple[np.ndarray, ...]
-    """L times (k, 2) node numbers of boundary facets"""
-
-    @property
-    def n_electrodes(self) -> int:
-        """L"""
-        return len(self.electrodes)
-
-    def carrier(self, fine: bool) -> tuple[Mesh, np.ndarray]:
-        """Return the mesh, and no inlet nodes."""
-        return self.mesh, np.empty(0, dtype=int)
-
-    def electrode_model(self, fine: bool) -> CompleteElectrodeModel:
-        """Return a model with quadratic potentials."""
-        return CompleteElectrodeModel(self.mesh, self.electrodes, INITIAL_CONTACT_IMPEDANCE)
-
-
-@dataclass(frozen=True, eq=False)
 class VesselConfig:
     """A vessel, rotated or mirrored so that its electrodes are at those of the instrument.
 
     Angles are those of a picture: 0° to the right, 90° at the top.
     """
 
-    shape: RoundTank | PlanePipe | RoundPipe | MeshVessel | MeshTank
+    shape: RoundTank | PlanePipe | RoundPipe | MeshVessel
     first: float = 0.0
     """angle of the middle of the first electrode in degrees"""
     direction: str = "counter-clockwise"
@@ -161,8 +138,7 @@ def read_vessel(source: Path | str | Mapping[str, Any]) -> VesselConfig:
       ``electrodes`` (total number), ``electrode_width`` or ``cover``, [``depth``, ``flow``]
     - cylinder, a pipe with rings of electrodes: ``length``, ``radius``, ``rings``, ``electrodes``
       (number per ring), ``height`` of one, ``cover``, [``first``, ``direction``, ``flow``]
-    - mesh: ``file``, ``electrodes`` (number), [``scale``, ``depth``]; see `MeshVessel`, and
-      `read_ktc_mesh` for a .mat file
+    - mesh: ``file``, ``electrodes`` (number), [``scale``, ``depth``]; see `MeshVessel`
 
     and for all [``conductivity``] in S/m, if known. ``flow`` has the entries of `FlowConfig`.
     ``ValueError`` names the entry and the fault.
@@ -210,15 +186,8 @@ def _shape(kind: str, entries: dict[str, Any], folder: Path) -> Any:
     path = folder / str(entries["file"])
     if not path.is_file():
         raise ValueError(f"vessel.file must be a mesh file, got {path}")
-    scale = entries.get("scale", 1.0)
-    if path.suffix != ".mat":
-        digest = hashlib.sha256(path.read_bytes()).hexdigest()
-        return MeshVessel(str(path), digest, str(path), digest, count, scale=scale)
-    tank = read_ktc_mesh(path, scale)
-    if tank.n_electrodes != count:
-        raise ValueError(f"vessel.electrodes must be {tank.n_electrodes}, as in {path}, got "
-                         f"{count}")
-    return tank
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    return MeshVessel(str(path), digest, str(path), digest, count, scale=entries.get("scale", 1.0))
 
 
 def _flow(entries: Any) -> FlowConfig:
@@ -243,25 +212,3 @@ def _cover(entries: Mapping[str, Any], width: str, count: int, wall: float) -> f
                              open_low=True)
     return count / wall * _check.number(f"vessel.{width}", entries[width], low=0.0, open_low=True,
                                         high=MAX_COVERAGE * wall / count, units="m")
-
-
-def read_ktc_mesh(path: Path, scale: float = 1.0) -> MeshTank:
-    """Read ``Mesh_sparse.mat`` or ``Mesh_dense.mat`` of KTC 2023 (doi:10.5281/zenodo.8252370):
-    nodes ``g`` (n, 2), triangles ``H`` (m, 3) and facets ``elfaces`` (L cells of (k, 2)), numbered
-    from 0 or 1.
-
-    ``scale`` is the unit of the nodes in m. ``ValueError`` names the file and the fault.
-    """
-    scale = _check.number("scale", scale, low=0.0, open_low=True, units="m")
-    found = load_variables(path, "g", "H", "elfaces")
-    try:
-        cells = found["H"].astype(np.int64)
-        first = int(cells.min())
-        electrodes = tuple(np.asarray(each, dtype=np.int64) - first
-                           for each in found["elfaces"].ravel())
-        tank = MeshTank(Mesh(scale * found["g"], cells - first), electrodes)
-        tank.electrode_model(fine=True)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{path} must hold a mesh of triangles with electrodes on its wall: "
-                         f"{error}") from None
-    return tank

@@ -85,16 +85,16 @@ def test_a_file_is_isolated_if_asked_for(tmp_path):
     path = write_baseline(tmp_path, update="return Estimate(self.level + voltages.sum())")
     spy = write_baseline(tmp_path, "spy", init=init, update="return Estimate(self.level + voltages.sum())")
     here, apart = (eitbench.evaluate(path, FILTER.id, "dev:0-1", world=SCENARIO, isolate=isolate)
-                   for isolate in (None, "others"))
+                   for isolate in (None, "process"))
     assert without_time(apart).equals(without_time(here))
     eitbench.evaluate(spy, FILTER.id, "dev:0", world=SCENARIO)
     assert int(log.read_text()) == os.getpid()
     log.unlink()
     with contextlib.suppress(RuntimeError):                       # where it may not write, that is its failure
-        eitbench.evaluate(spy, FILTER.id, "dev:0", world=SCENARIO, isolate="others")
+        eitbench.evaluate(spy, FILTER.id, "dev:0", world=SCENARIO, isolate="process")
     assert not log.exists() or int(log.read_text()) != os.getpid()
     with pytest.raises(ValueError, match="method must be a name or a path to be isolated, got type"):
-        eitbench.evaluate(Level, FILTER.id, "dev:0", isolate="others")
+        eitbench.evaluate(Level, FILTER.id, "dev:0", isolate="process")
 
 
 @pytest.mark.parametrize(("arguments", "message"), [

@@ -35,7 +35,7 @@ def test_a_submission_is_a_record_an_environment(tmp_path):
     """Self-reported unless said otherwise; the same again plays nothing, and official is a matter of the flag."""
     log = tmp_path / "log"
     mine, store, to = write_baseline(tmp_path, init=counting(log)), EpisodeStore(tmp_path / "results"), tmp_path / "to"
-    paths = list(submit(mine, [FILTER.id, SMOOTHING.id], TEST, store, to, isolate="never",
+    paths = list(submit(mine, [FILTER.id, SMOOTHING.id], TEST, store, to, isolate="none",
                         command="eitbench submit"))
     first, second = (read_record(path) for path in paths)
     assert (first["board"], second["board"]) == ("filter", "smoothing") and count(log) == 4
@@ -43,7 +43,7 @@ def test_a_submission_is_a_record_an_environment(tmp_path):
     assert first["runs"][0]["command"] == "eitbench submit"
     assert first["runs"][0]["machine"]["matmul_seconds"] == store_module.matmul_seconds() > 0
     assert sorted(path.name for path in to.iterdir()) == sorted(path.name for path in paths)
-    again = list(submit(mine, [FILTER.id], TEST, store, to, official=True, isolate="never"))
+    again = list(submit(mine, [FILTER.id], TEST, store, to, official=True, isolate="process"))
     assert again == paths[:1] and count(log) == 4 and read_record(again[0])["official"]
     assert [record["official"] for record in read_records(to)] == [True, False]
 
@@ -63,7 +63,7 @@ def test_all_of_ours_by_one_command(tmp_path, monkeypatch):
 def test_failures_are_submitted_too(tmp_path):
     """Nothing is dropped: who fails in one episode has a record that says so."""
     fails = write_baseline(tmp_path, update="assert self.calls < 2, 'dry'\n        return Estimate(self.level)")
-    (path,) = submit(fails, [FILTER.id], TEST, EpisodeStore(tmp_path), tmp_path / "to", isolate="never")
+    (path,) = submit(fails, [FILTER.id], TEST, EpisodeStore(tmp_path), tmp_path / "to", isolate="none")
     episodes = read_record(path)["episodes"]
     assert [(e["status"], e["message"]) for e in episodes] == 2 * [("failed", "AssertionError: dry")]
     assert load(tmp_path / "to")["value"].isna().all() and len(load(tmp_path / "to")) == 2
@@ -114,9 +114,9 @@ def test_policies_in_records_are_not_played_again(tmp_path):
 
 
 @pytest.mark.parametrize(("environments", "seeds", "message"), [
-    ([FILTER.id], "dev:0", "seeds of a submission must be of the season's split test, got dev:0"),
-    ([FILTER.id], "7", "must be of the season's split test, got train:7"),
-    ([FILTER.id], "400000", "must be of the season's split test, got 400000"),
+    ([FILTER.id], "dev:0", "seeds of a submission must be of the split test, got dev:0"),
+    ([FILTER.id], "7", "must be of the split test, got train:7"),
+    ([FILTER.id], "400000", "must be of the split test, got 400000"),
     ([], "test:0", "env must name at least one environment"),
     ([FILTER.id, SMOOTHING.id], "test:0", f"baseline kalman_filter plays none of the environments {SMOOTHING.id}"),
     (["eitbench/Pipe4D-v0"], "test:0", "env must be one of"),
@@ -195,7 +195,7 @@ def test_a_record_is_extended(official, tmp_path):
     mine = write_baseline(tmp_path, init=counting(log))
 
     def submitted(results, seeds):
-        (path,) = submit(mine, [FILTER.id], parse_seeds(seeds), EpisodeStore(tmp_path / results), to, isolate="never",
+        (path,) = submit(mine, [FILTER.id], parse_seeds(seeds), EpisodeStore(tmp_path / results), to, isolate="none",
                          official=official, command=f"submit {seeds}")
         return read_record(path)
 

@@ -140,10 +140,6 @@ def test_mistakes(env, seeds, said):
         eitbench.dataset(env, seeds)
 
 
-def test_test_episodes_are_given_by_name():
-    assert eitbench.dataset(PIPE, "test:0-1").seeds == (200_000, 200_001)
-
-
 def test_an_estimate_of_another_shape_is_refused(tiny):
     with pytest.raises(ValueError, match="estimate must have shape"):
         tiny.errors(tiny[0], tiny[0].truth[:-1])
@@ -177,13 +173,6 @@ def test_torch_loads_batches(tiny):
         np.testing.assert_allclose(batch[name].numpy(), expected, rtol=1e-6)
 
 
-def test_torch_in_few_coordinates(tiny):
-    reduced = tiny.reduced(tiny.modes(2))
-    (item, _) = reduced.torch()
-    np.testing.assert_array_equal(item["truth"], reduced[0].truth.astype(np.float32))
-    assert item["truth"].shape == (5, 2)
-
-
 def test_without_torch_it_says_what_to_install(tiny, monkeypatch):
     monkeypatch.setitem(sys.modules, "torch", None)
     with pytest.raises(ModuleNotFoundError, match=r"a dataset for torch needs the extra rl"):
@@ -215,13 +204,10 @@ def test_files_hold_the_same_and_more_can_be_added(tiny, tmp_path, format, suffi
         for name in ("voltages", "currents", "truth", "unresolved", "square"):
             np.testing.assert_array_equal(fields[name], getattr(example, name))
         assert (fields["seed"] == example.seed).all()
+    if format == "hdf5":
+        with h5py.File(folder / "train-0.h5") as file:
+            assert file["truth"].attrs["units"] == "mol/m³"
     assert ": train:0-1." in (folder / "README.md").read_text()
-
-
-def test_units_are_in_the_files(tiny, tmp_path):
-    export(tiny, tmp_path / "a", "hdf5")
-    with h5py.File(tmp_path / "a" / "train-0.h5") as file:
-        assert file["truth"].attrs["units"] == "mol/m³"
 
 
 def test_the_score_on_the_card_is_ours(tiny, tmp_path, monkeypatch):
@@ -253,7 +239,7 @@ def test_a_missing_library_is_named_before_anything_is_written(tiny, tmp_path, m
     assert not (tmp_path / "out").exists()
 
 
-def test_the_card_warns_of_test_episodes(tmp_path):
+def test_the_readme_warns_of_test_episodes(tmp_path):
     export(eitbench.dataset(PIPE, "test:0", world=CHANGES), tmp_path)
     assert "Test episodes are among them" in (tmp_path / "README.md").read_text()
 

@@ -15,13 +15,11 @@ from eitbench.data.episodes import truth_discretisation
 from eitbench.data.recordings import (
     cycle_voltages,
     faults_of,
-    is_recorded,
     recording,
     recording_path,
     step_error,
 )
 from eitbench.data.regions import outline
-from eitbench.worlds.catalogue import PIPE_2D
 
 from recorded import bits, digest, forget, outline_bits
 from tiny_worlds import CHANGES, TINY
@@ -185,20 +183,6 @@ def test_playing_what_is_stored_needs_no_finite_elements(episode):
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True,
                           check=True)
     assert done.stdout == "True []\n"
-
-
-def test_is_recorded():
-    """False before, true after; false for another seed or world."""
-    assert not is_recorded(TINY, 7)
-    recording(TINY, 7)
-    assert is_recorded(TINY, 7) and not is_recorded(TINY, 8) and not is_recorded(PIPE_2D, 7)
-
-
-@pytest.mark.parametrize("seed", [-1, 1.0, True, "7", None])
-def test_seed_must_be_a_whole_number(seed):
-    """Seeds that would be rounded or cast are rejected by name."""
-    with pytest.raises(ValueError, match="seed must be an integer of at least 0"):
-        recording(TINY, seed)
 
 
 def test_an_unwritable_cache_still_plays(monkeypatch):

@@ -1,14 +1,10 @@
-"""Descriptions of vessels: shapes, orders of electrodes, flows, and meshes of KTC's format."""
+"""Descriptions of vessels: shapes, orders of electrodes and flows."""
 
 import numpy as np
 import pytest
-from eitbench.bench.playing import run_on_measurements
-from eitbench.envs.measured import MeasuredEnv
 from eitbench.measured.vessel import read_vessel
-from eitbench.physics.cem import CompleteElectrodeModel
 from eitbench.worlds.vessels import RoundTank
-from scipy.io import savemat
-from tanks import BELIEVED, VESSEL, angle, centroid, moving
+from tanks import VESSEL
 
 PIPE = {"kind": "rectangle", "length": 0.4, "width": 0.1, "electrodes": 16, "cover": 0.5}
 CYLINDER = {"kind": "cylinder", "length": 0.2, "radius": 0.05, "rings": 2, "electrodes": 4, "height": 0.04,
@@ -52,42 +48,6 @@ def test_electrodes_are_where_the_instrument_has_them(direction):
     assert np.argmax([sign * x for x, _ in middles]) == 2
 
 
-def write_ktc_mesh(path, first=1):
-    """The coarse mesh of the tank in KTC's variables; node numbers from 1, as in MATLAB."""
-    model = TANK.electrode_model(fine=False)
-    faces = np.empty((8, 1), dtype=object)
-    for row, facets in zip(faces, model.electrodes, strict=True):
-        row[0] = np.asarray(facets) + first
-    savemat(path, {"g": 100 * model.mesh.points, "H": model.mesh.cells + first, "elfaces": faces})
-    return {"kind": "mesh", "file": str(path), "electrodes": 8, "scale": 0.01}
-
-
-@pytest.mark.parametrize("first", [0, 1])
-def test_a_mesh_file_has_the_voltages_of_the_same_tank(tmp_path, first):
-    vessel = read_vessel(write_ktc_mesh(tmp_path / "mesh.mat", first))
-    ours = TANK.electrode_model(fine=False)
-    sigma = 0.2 * (1.0 + 3.0 * ours.mesh.points[:, 0])
-    expected = CompleteElectrodeModel(ours.mesh, ours.electrodes, 1e-3).transfer_resistance(sigma)
-    np.testing.assert_allclose(vessel.electrode_model(1e-3).transfer_resistance(sigma), expected, rtol=1e-9)
-
-
-def test_a_body_is_found_on_a_mesh_file(tmp_path):
-    """Within 2 cm, in a tank of 20 cm."""
-    env = MeasuredEnv(moving(frames=4), write_ktc_mesh(tmp_path / "mesh.mat"), **BELIEVED)
-    estimate = run_on_measurements(env, "log_walk_filter").mean[-1]
-    at = 0.05 * np.array([np.cos(angle(31, 32)), np.sin(angle(31, 32))])
-    assert np.linalg.norm(centroid(env.task.mesh.points, estimate) - at) < 0.02
-
-
-@pytest.mark.parametrize(("change", "message"), [
-    ({"electrodes": 9}, "vessel.electrodes must be 8, as in .*, got 9"), ({"scale": 0.0}, "scale must be"),
-    ({"file": "none.mat"}, "vessel.file must be a mesh file")])
-def test_bad_mesh_entries_are_named(tmp_path, change, message):
-    with pytest.raises(ValueError, match=message):
-        read_vessel(write_ktc_mesh(tmp_path / "mesh.mat") | change)
-
-
-def test_a_file_without_a_mesh_is_named(tmp_path):
-    savemat(tmp_path / "a.mat", {"g": np.zeros((3, 2))})
-    with pytest.raises(ValueError, match=r"a\.mat must hold H, elfaces"):
-        read_vessel({"kind": "mesh", "file": str(tmp_path / "a.mat"), "electrodes": 8})
+def test_a_mesh_file_must_exist():
+    with pytest.raises(ValueError, match=r"vessel.file must be a mesh file, got none\.msh"):
+        read_vessel({"kind": "mesh", "file": "none.msh", "electrodes": 8})

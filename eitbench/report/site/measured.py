@@ -23,9 +23,9 @@ from eitbench.report.templates import template
 
 MEANINGS = {each.heading: each.explanation for each in scores("measured").values()
             if each.name != "error"} | {
-    "relative to naive baseline":
-        "geometric mean, over the cases of a method, of its withheld RMSE relative to that of the "
-        "best naive baseline; lower is better",
+    "relative":
+        "withheld RMSE relative to that of the best naive baseline, geometric mean over the cases "
+        "of a method; lower is better",
     "floor": "naive baseline: homogeneous fluid, or the last complete frame alone",
 }
 """Explanations of the board's headings and marks."""
@@ -93,7 +93,7 @@ def all_cases_table(measured: Measured) -> Table:
         "method": _method(next(iter(own.values())), short=True),
         **{name: number_cell(withheld_rmse(own[name])) if name in own else Cell(NOTHING)
            for name in measured.records},
-        "relative to naive baseline": number_cell(relative(own))} for own in order],
+        "relative": number_cell(relative(own))} for own in order],
         label="all cases")
 
 
@@ -101,8 +101,7 @@ def measured_pages(measured: Measured, beside: Beside) -> dict[str, bytes]:
     """Render the page; none without records."""
     if not measured.records:
         return {}
-    shown = [{"case": case, "table": case_table(measured, name),
-              "picture": beside.picture(f"measured-{name}.webp", "")}
+    shown = [{"case": case, "table": case_table(measured, name)}
              for name, case in measured.cases.items()]
     html = template("site/measured.html.j2").render(
         root="", links=beside.links(""), cases=shown, together=all_cases_table(measured),
