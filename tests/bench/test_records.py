@@ -12,6 +12,8 @@ import jsonschema_rs
 import pytest
 from eitbench.bench.records import (
     BOARDS,
+    MAX_BYTES,
+    MAX_DEPTH,
     file_name,
     newest,
     read_record,
@@ -20,7 +22,6 @@ from eitbench.bench.records import (
     sealed,
     write_record,
 )
-from eitbench.bench.strict_json import MAX_BYTES, MAX_DEPTH
 from eitbench.bench.tracks import ARGUMENTS, boards_of, named
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.injection import InjectionEnv
@@ -287,7 +288,7 @@ def test_the_schema_knows_all_that_there_is():
     assert schema["$schema"].endswith("2020-12/schema")
     assert tuple(schema["properties"]["board"]["enum"]) == BOARDS
     assert set(schema["required"]) == set(schema["properties"]) == set(MINE)
-    assert set(episode("test:0", 0.1)) | {"message", "where"} == set(schema["$defs"]["episode"]["properties"])
+    assert set(episode("test:0", 0.1)) | {"message", "where", "actions"} == set(schema["$defs"]["episode"]["properties"])
 
 
 def test_scores_are_open(tmp_path):
