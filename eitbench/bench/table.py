@@ -1,5 +1,5 @@
-"""One model of a table: cells of text with the number to sort by. It becomes Markdown here, which
-is also what a terminal shows, and HTML in the pages of `eitbench.report`."""
+"""Tables: cells of text with the number to sort by, as Markdown, in a terminal, and in pages of
+`eitbench.report`."""
 
 from __future__ import annotations
 
@@ -15,40 +15,36 @@ NOTHING = "–"
 
 
 class Cell(NamedTuple):
-    """What one method has in one column."""
+    """One cell of a table."""
 
     text: str
     value: float | str | None = None
-    """What to sort by; None comes last. Words are sorted by a text, numbers by a number."""
+    """Sorting key; None comes last. Words have a text, numbers a number."""
     picture: Markup = Markup()
     link: str = ""
     small: str = ""
-    """Said after the text, quietly."""
+    """Secondary text."""
     badges: tuple[str, ...] = ()
-    opens: str = ""
-    """What a click shows: the parts of its line, by this name."""
 
     @property
     def plain(self) -> str:
-        """All that it says, without picture and link."""
-        said = " ".join(filter(None, [self.text, self.small]))
-        return said + (f" ({', '.join(self.badges)})" if self.badges else "")
+        """All text of the cell."""
+        text = " ".join(filter(None, [self.text, self.small]))
+        return text + (f" ({', '.join(self.badges)})" if self.badges else "")
 
 
 class Row(NamedTuple):
-    """A line of a table."""
+    """One line of a table."""
 
     cells: list[Cell]
     flags: str = ""
-    """What the toggles of a page go by, separated by spaces."""
-    group: str = ""
-    """Lines of one group follow each other, below its name."""
+    """Words for the filters of a page, separated by spaces."""
     parts: tuple[Row, ...] = ()
-    """Lines that it stands for, shown where they are asked for."""
+    """Lines that it summarises, collapsed at first."""
 
 
 class Table(NamedTuple):
-    """Headings, and under them the cells of each row."""
+    """Headings and rows."""
 
     headings: list[str]
     rows: list[Row]
@@ -56,29 +52,26 @@ class Table(NamedTuple):
 
     @classmethod
     def of(cls, rows: Iterable[Mapping[str, Cell | str]], *, label: str = "",
-           flags: Sequence[str] = (), groups: Sequence[str] = (),
-           keep: Sequence[str] = ()) -> Table:
-        """From a mapping heading -> cell for each row, all with the same headings; a text stands
-        for a cell of words. Columns in which there is nothing are left out, but for those to
-        ``keep``."""
-        made = [{heading: _cell(cell) for heading, cell in row.items()} for row in rows]
+           flags: Sequence[str] = (), keep: Sequence[str] = ()) -> Table:
+        """Make a table from mappings heading -> cell, all with the same headings; a text stands for
+        a cell of words. Empty columns are left out unless listed in ``keep``."""
+        made = [{heading: cell if isinstance(cell, Cell) else Cell(cell, cell)
+                 for heading, cell in row.items()} for row in rows]
         headings = [heading for heading in (made[0] if made else ())
                     if heading in keep or any(row[heading].plain != NOTHING for row in made)]
-        lines = [Row([row[heading] for heading in headings],
-                     flags[i] if flags else "", groups[i] if groups else "")
-                 for i, row in enumerate(made)]
-        return cls(headings, lines, label)
+        return cls(headings, [Row([row[heading] for heading in headings], flags[i] if flags else "")
+                              for i, row in enumerate(made)], label)
 
     @property
     def kinds(self) -> list[str]:
-        """Of each column, for the style sheet: with ``drawn`` intervals, of ``words``, or of
-        numbers, which is empty."""
+        """Style of each column: ``drawn`` intervals, ``words``, or numbers, which is empty."""
         return [_kind([row.cells[i] for row in self.rows]) for i in range(len(self.headings))]
 
     def fitted(self, width: int, order: Sequence[str] = ()) -> Table:
-        """With as many columns as lines of ``width`` letters hold; what is not in ``order`` goes
-        first, the last column before the others, then what stands last there. The first of the
-        ``order`` stays."""
+        """Return the table with as many columns as lines of ``width`` characters hold.
+
+        Columns that are not in ``order`` go first, then the last in ``order``; its first stays.
+        """
         def place(heading: str) -> tuple[int, int]:
             at = order.index(heading) if heading in order else len(order)
             return at, self.headings.index(heading)
@@ -87,18 +80,24 @@ class Table(NamedTuple):
         for heading in sorted(self.headings, key=place)[:0:-1]:
             if len(table.markdown().partition("\n")[0]) <= width:
                 break
-            table = table._without(heading)
+            table = table.without(heading)
         return table
 
-    def _without(self, heading: str) -> Table:
+    def without(self, heading: str) -> Table:
+        """Return the table without a column."""
         i = self.headings.index(heading)
         rows = [row._replace(cells=row.cells[:i] + row.cells[i + 1:]) for row in self.rows]
-        return self._replace(headings=self.headings[:i] + self.headings[i + 1:], rows=rows)
+        return Table(self.headings[:i] + self.headings[i + 1:], rows, self.label)
+
+    def left_out(self, fitted: Table) -> str:
+        """Return a line that names the columns that a `fitted` table lacks, or nothing."""
+        missing = [heading for heading in self.headings if heading not in fitted.headings]
+        return f"no room for {', '.join(missing)}" if missing else ""
 
     def markdown(self) -> str:
-        """Also pleasant to read in a terminal."""
-        said = [self.headings, *([cell.plain for cell in row.cells] for row in self.rows)]
-        lines = [[as_markdown(text) for text in line] for line in said]
+        """Return aligned Markdown."""
+        texts = [self.headings, *([cell.plain for cell in row.cells] for row in self.rows)]
+        lines = [[as_markdown(text) for text in line] for line in texts]
         widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
         words = [kind == "words" for kind in self.kinds]
 
@@ -113,12 +112,8 @@ class Table(NamedTuple):
 
 
 def number_cell(value: float | None) -> Cell:
-    """A number, shortly; None and what is not a number are nothing."""
+    """Return the cell of a number, `NOTHING` for None and NaN."""
     return Cell(NOTHING) if value is None or value != value else Cell(number(value), float(value))
-
-
-def _cell(said: Cell | str) -> Cell:
-    return said if isinstance(said, Cell) else Cell(said, said)
 
 
 def _kind(column: list[Cell]) -> str:

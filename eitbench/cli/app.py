@@ -223,16 +223,16 @@ def leaderboard(
     from eitbench._files import write_atomically
     from eitbench.bench.records import write_episode_table_of
     from eitbench.data.seasons import season_numbered
-    from eitbench.report.boards import boards, read_for_boards
-    from eitbench.report.site import Beside, Measured, render, render_site, write_site
+    from eitbench.report.boards import read_for_boards
+    from eitbench.report.site import Beside, Measured, collect, render, render_site, write_site
     with options.clear_errors():
         found, complaints = read_for_boards(records, season_numbered(season))
         measured = Measured.of(records.parent)
         complaints += measured.complaints
-        table = boards(found)
+        site = collect(found)
         out = records.parent if season is None else records.parent / f"season-{season}"
-        pages = render_site(found, table, Beside.of(records.parent, out / "site"), measured)
-        texts = render(found, table, measured)
+        pages = render_site(site, Beside.of(records.parent, out / "site"), measured)
+        texts = render(site, measured)
         write_site(out / "site", pages)
     for name, text in texts.items():
         write_atomically(out / name, text.encode())

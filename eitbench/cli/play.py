@@ -90,7 +90,7 @@ def policies(
     from eitbench.bench.run import run_jobs, unplayed
     from eitbench.bench.store import EpisodeStore, results_in
     from eitbench.bench.suites import jobs as jobs_of
-    from eitbench.report.policy_table import policy_rows, policy_table
+    from eitbench.report.policies import policy_rows, policy_table
     from eitbench.report.terminal import asked_of, width
     with options.clear_errors():
         todo = jobs_of("injection", [env], policy or [], options.numbers(seeds),
@@ -112,28 +112,24 @@ def report(out: Path, asked: Sequence[Job] = (), worlds: Sequence[dict[str, Any]
     it."""
     from eitbench._files import write_atomically
     from eitbench.bench.store import EpisodeStore
-    from eitbench.report import sweep, terminal
+    from eitbench.report.boards import anchors, run_boards, shipped_anchors
     from eitbench.report.page import write_page
-    from eitbench.report.summary import anchors, shown, summary
+    from eitbench.report.sweep import sweep_text, sweeps, swept
+    from eitbench.report.terminal import asked_of, markdown, terminal_tables, width
     store = EpisodeStore(out)
     records = store.write_records()
     if not records:
         raise typer.BadParameter(f"no results in {out}; make some with `eitbench run`")
-    known = {**terminal.shipped_anchors(records), **anchors(records)}
-    table = summary(records, known)
-    write_atomically(out / "leaderboard.md", f"{shown(table).markdown()}\n".encode())
-    told = terminal.asked_of(records, asked) if asked else records
-    number = sweep.swept(worlds)
-    if number is None:
-        options.say(terminal.tables(told, known, terminal.width()))
-    else:
-        found = list(sweep.sweeps(told, number))
-        options.say("\n\n".join(sweep.text(each, terminal.width()) for each in found))
-        plot = out / f"sweep-{number}.png"
-        write_atomically(plot, sweep.png(found))
-        options.say(f"\nwrote {plot}")
+    known = {**shipped_anchors(records), **anchors(records)}
+    boards = run_boards(records, known)
+    write_atomically(out / "leaderboard.md", markdown(boards).encode())
+    told = asked_of(records, asked) if asked else records
+    number = swept(worlds)
+    found = sweeps(told, number) if number else []
+    options.say("\n\n".join(sweep_text(each, width()) for each in found) if found
+                else terminal_tables(run_boards(told, known), width()))
     _say_failures(store, told, asked)
-    write_page(store, records, table)
+    write_page(store, boards, found)
     options.say(f"\nwrote {out / 'index.html'}")
 
 
@@ -145,11 +141,11 @@ def typed() -> str:
 def _say_failures(store: EpisodeStore, records: list[dict[str, Any]],
                   asked: Sequence[Job]) -> None:
     """What went wrong, and how to look at it."""
-    from eitbench.report.failures import debugging, failures
+    from eitbench.report.failures import debug_command, failures
     found = failures(store, records)
     for failure in found:
         options.say(failure, err=True)
-    hints = filter(None, (debugging(failure, asked) for failure in found))
+    hints = filter(None, (debug_command(failure, asked) for failure in found))
     if (hint := next(hints, "")) and "--isolate none" not in typed().replace("=", " "):
         options.say(f"to debug it in this process, where breakpoint() stops:\n  {hint}", err=True)
 

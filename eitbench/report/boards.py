@@ -1,159 +1,272 @@
-"""Leaderboards from records: ranks and intervals board by board, an aggregate for each class."""
+"""Leaderboards from records: scores, intervals, gains, skills and ranks, board by board."""
 
 from __future__ import annotations
 
 import math
 from array import array
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from statistics import median
-from typing import Any, NamedTuple
+from typing import Any
 
+import numpy as np
 import pandas as pd
 
+from eitbench._files import shipped
+from eitbench.bench.episode_table import read_episode_table, table_beside
 from eitbench.bench.ranking import shared_ranks
-from eitbench.bench.records import file_name, finished, newest, read_sound_records, version_number
+from eitbench.bench.records import (
+    BOARDS,
+    file_name,
+    finished,
+    newest,
+    read_sound_records,
+    version_number,
+)
+from eitbench.bench.scores import scores
 from eitbench.bench.statistics import (
     interquartile_mean,
     mean_over_environments,
     stratified_bootstrap,
 )
 from eitbench.bench.text import scores_by_seed, seed_ranges
-from eitbench.bench.tracks import CLASSES, FLOORS, home_of, ids, named, track_of_board
-from eitbench.bench.tracks import class_of as class_of_board
+from eitbench.bench.tracks import CLASSES, home_of, ids, named
 from eitbench.data.seasons import Season, current_season, season_of
-from eitbench.report.summary import (
-    Anchors,
-    anchors,
-    columns,
-    explanations,
+from eitbench.report.model import (
+    ALL,
+    IDENTITY,
+    Board,
+    Row,
+    class_of,
+    fields,
+    floor_of,
+    is_floor,
+    kind_of,
     place_of_world,
-    summary_row,
+    title_of,
     world,
 )
+from eitbench.scoring import skill
 
-ALL = "all"
-"""Stands for the environment in the rows of an aggregate."""
-_BEFORE = ("class", "environment", "method", "version", "title", "rank", "note", "official",
-           "seeds")
-_NUMBERS = ("error", "error_low", "error_high", "gain", "gain_low", "gain_high")
-_AFTER = {
-    "matmuls_per_step": (
-        "products/step", "time per step in units of a 1000 × 1000 × 1000 matrix product on one "
-        "thread of that processor, the median of all that were timed on it"),
-    "peak_memory": ("MB", "memory that the method's own process held at most"),
-}
-_FIRST = {
-    "rank": "one more than the number of methods that are significantly better; shared where none "
-            "is. Floors, references, privileged methods and those that have not finished every "
-            "episode have none",
-    "by": "who ran it: the maintainers (official), or its author (self-reported)",
-    "ẽ_c": "error of the estimate: squared distance from the truth over the square of the truth "
-           "(thesis 5.12), mean over episodes with its 95 % bootstrap interval; lower is better",
-    "gain": "1 − ẽ_c over that of the floor (homogeneous; random_pair) in the same episode: 0 as "
-            "the floor, 1 perfect. Interquartile mean with its 95 % bootstrap interval",
-}
-
-
-def others() -> list[str]:
-    """Scores that stand beside ranks, as means over the episodes."""
-    return [name for name in columns() if name != "error"]
-
-
-def fields() -> list[str]:
-    """Columns of `boards`."""
-    return [*_BEFORE, *_NUMBERS, *others(), *_AFTER]
-
-
-def headings() -> dict[str, str]:
-    """Column -> heading, of all numbers but those with intervals."""
-    shown = {name: heading for name, (heading, _) in columns().items() if name != "error"}
-    return shown | {name: heading for name, (heading, _) in _AFTER.items()}
-
-
-def meanings() -> dict[str, str]:
-    """Heading -> what it says."""
-    after = {heading: text for heading, text in _AFTER.values()}
-    scores = {heading: text for heading, text in explanations().items() if heading != "ẽ_c"}
-    return _FIRST | scores | after
-
-
-class Entry(NamedTuple):
-    """One record on its board."""
-
-    record: dict[str, Any]
-    """Cut down to the board's episodes."""
-    note: str
-    """Why it has no rank; empty if it competes."""
-    complete: bool
-    """Whether it finished every episode."""
-    gains: dict[str, float]
-    """Seed -> gain over the floor; empty without one."""
-
-    @property
-    def label(self) -> str:
-        """Name and version."""
-        return f"{self.record['method']}@{self.record['version']}"
-
-    @property
-    def errors(self) -> dict[str, float]:
-        """Seed -> ẽ_c."""
-        return scores_by_seed(self.record, "error")
+ANCHORS = ("homogeneous", "true_model_smoother")
+"""Methods with skills 0 and 1."""
+Anchors = Mapping[tuple[str, str, str], Mapping[str, float]]
+"""Method, world, split -> seed -> ẽ_c."""
+SPLITS = ("dev", "train", "own")
+"""Order of the boards of other splits than test, after the seasons."""
 
 
 def boards(records: list[dict[str, Any]]) -> pd.DataFrame:
-    """All boards in one table of `fields`, a row for each record that is not outdated, best first.
+    """Return the `leaderboards` of records as one table of `fields`."""
+    return board_table(leaderboards(records))
 
-    A board is an environment. Its episodes are those that its floor has played (without one, those
-    that anybody has); others are not looked at. After the boards of a class comes its aggregate,
-    with ``environment`` `ALL`, if there are several `counted` environments with a floor (an
-    official one, where any is): of methods that have finished every episode of every one of them.
-    ``seconds_per_step`` is in ms of the fastest episode, ``voltage_discrepancy`` in mV²,
-    ``peak_memory`` in 10⁶ bytes.
+
+def board_table(found: Iterable[Board]) -> pd.DataFrame:
+    """Return one row for each row of the boards, with the columns of `fields`."""
+    rows = [row.cells for board in found for row in board.rows]
+    types: dict[str, Any] = dict.fromkeys(fields()[len(IDENTITY):], float)
+    return pd.DataFrame(rows, columns=fields()).astype(types | {"rank": "Int64"})
+
+
+def leaderboards(records: list[dict[str, Any]]) -> list[Board]:
+    """Return a board for each environment, class by class, each class followed by its aggregate.
+
+    The episodes of a board are those that its floor has played; without a floor, all. Superseded
+    records are left out. An aggregate, with ``environment`` `ALL`, is of the methods that have
+    finished every episode of all `counted` environments with a floor, if there are several
+    (with an official floor, where there is any). ``seconds_per_step`` is in ms of the fastest
+    episode, ``voltage_discrepancy`` in mV², ``peak_memory`` in 10⁶ bytes.
 
     Raises
     ------
     ValueError
-        If a record is of other seeds than test, or they are of several seasons.
+        If a record has other seeds than test, or the records are of several seasons.
     """
     for record in records:
         if season_of(record["split"]) is None or record["split"] != records[0]["split"]:
             raise ValueError("leaderboards are made of the test seeds of one season; "
                              f"{file_name(record)} has {record['split']} seeds")
     current, _ = newest(records)
-    products = _matrix_products(current)
     known = anchors(current)
-    rows: list[dict[str, Any]] = []
+    products = _matrix_products(current)
+    found: list[Board] = []
     for name in CLASSES:
         members = [record for record in current if class_of(record) == name]
-        environments = sorted({(place_of_world(world(record)), record["environment"]["name"])
-                               for record in members})
-        played = {environment: _entries([record for record in members
-                                         if record["environment"]["name"] == environment])
-                  for _, environment in environments}
-        for environment, entries in played.items():
-            rows += _board(environment, entries, known, products)
-        rows += _aggregate(_counted({environment: entries for environment, entries in played.items()
-                                     if environment in counted()}))
-    types: dict[str, Any] = dict.fromkeys([*_NUMBERS, *others(), *_AFTER], float)
-    return pd.DataFrame(rows, columns=fields()).astype(types | {"rank": "Int64"})
+        made = [_board(group, known, products, ranked=True) for group in _by_environment(members)]
+        found += made
+        found += _aggregate(name, _counted(made))
+    return found
+
+
+def run_boards(records: list[dict[str, Any]], known: Anchors | None = None) -> list[Board]:
+    """Return the boards of a user's own results, one for each environment and split, without ranks.
+
+    Parameters
+    ----------
+    records : list
+        Of any splits and versions; all of their episodes are shown.
+    known : Anchors
+        Between which skills are measured; default: those among the records.
+    """
+    known = anchors(records) if known is None else known
+    products = _matrix_products(records)
+    return [_board(group, known, products, ranked=False)
+            for group in _by_environment(sorted(records, key=_split_order))]
+
+
+def _by_environment(records: Iterable[dict[str, Any]]) -> list[list[dict[str, Any]]]:
+    """Group records by split and environment, environments in the order of their worlds."""
+    groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for record in records:
+        groups.setdefault((record["split"], record["environment"]["name"]), []).append(record)
+    return [groups[key] for key in sorted(groups, key=lambda key: (
+        _split_order(groups[key][0]), place_of_world(world(groups[key][0])), key[1]))]
+
+
+def _split_order(record: dict[str, Any]) -> int:
+    """Return the place of a record's split: the latest season first."""
+    season = season_of(record["split"])
+    return -season.number if season else SPLITS.index(record["split"])
+
+
+def _board(records: list[dict[str, Any]], known: Anchors, products: dict[str, float], *,
+           ranked: bool) -> Board:
+    """Return the board of one environment, by mean error; unfinished methods come last."""
+    environment = records[0]["environment"]["name"]
+    floor = floor_of(records)
+    shown = [floor] if floor and ranked else records
+    seeds = {seed for record in shown for seed in record["seeds"]}
+    zero = scores_by_seed(floor, "error") if floor else {}
+    rows = sorted((_row(record, seeds, zero, known, products) for record in records
+                   if not seeds.isdisjoint(record["seeds"])), key=_place)
+    competing = {row.label: {environment: _errors(row)} for row in rows if not row.cells["note"]}
+    ranks = shared_ranks(competing) if competing and ranked else {}
+    return Board(class_of(records[0]), environment, title_of(records[0]), [
+        row._replace(cells=row.cells | {"rank": ranks.get(row.label)}, colour=i)
+        for i, row in enumerate(rows)])
+
+
+def _row(whole: dict[str, Any], seeds: set[str], zero: dict[str, float], known: Anchors,
+         products: dict[str, float]) -> Row:
+    """Return the row of a record on the board with these seeds, without its rank."""
+    record = whole | {
+        "episodes": [episode for episode in whole["episodes"] if episode["seed"] in seeds],
+        "seeds": [seed for seed in whole["seeds"] if seed in seeds]}
+    environment = record["environment"]["name"]
+    errors = scores_by_seed(record, "error")
+    gains = {seed: 1.0 - error / zero[seed] for seed, error in errors.items() if zero.get(seed)}
+    counts = {"failed": sum(episode["status"] != "ok" for episode in whole["episodes"]),
+              "missing": len(seeds - set(record["seeds"]))}
+    note = [*filter(None, [record["role"]]), *["privileged"] * record["privileged"],
+            *(f"{count} {what}" for what, count in counts.items() if count)]
+    cells = _identity(record, environment, ", ".join(note))
+    cells |= with_ends("error", {environment: errors}, mean_over_environments)
+    cells |= with_ends("gain", {environment: gains}, interquartile_mean)
+    cells |= {"seeds": seed_ranges(record["seeds"]), **_means(record, known),
+              "matmuls_per_step": _in_products(record, products), "peak_memory": _peak(record)}
+    return Row(cells, record, gains)
+
+
+def _identity(record: dict[str, Any], environment: str, note: str) -> dict[str, Any]:
+    return {"class": class_of(record), "environment": environment, "note": note, "rank": None,
+            **{name: record[name] for name in ("method", "version", "title", "official")}}
+
+
+def _errors(row: Row) -> dict[str, float]:
+    return scores_by_seed(row.record, "error") if row.record else {}
+
+
+def _place(row: Row) -> tuple[bool, float, str]:
+    errors = list(_errors(row).values())
+    mean = mean_over_environments(errors) if errors else math.inf
+    return not row.complete, mean, row.label
+
+
+def _means(record: dict[str, Any], known: Anchors) -> dict[str, float | None]:
+    """Return the mean of each score but the error, the least time per step, and the skill."""
+    found: dict[str, float | None] = {"skill": _skill(record, known)}
+    for name in scores():
+        values = list(scores_by_seed(record, name).values())
+        reduce: Callable[..., Any] = min if name == "seconds_per_step" else np.mean
+        if name != "error":
+            found[name] = float(reduce(values)) if values else None
+    return found
+
+
+def with_ends(name: str, values: dict[str, dict[str, float]],
+              statistic: Any) -> dict[str, float | None]:
+    """Return a statistic of environment -> seed -> score, ``name``, and the ends of its 95 %
+    interval, ``name_low`` and ``name_high``; None where unknown."""
+    keys = (name, f"{name}_low", f"{name}_high")
+    if not all(values.values()):
+        return dict.fromkeys(keys)
+    three = stratified_bootstrap({key: list(own.values()) for key, own in values.items()},
+                                 statistic)
+    return dict(zip(keys, (each if math.isfinite(each) else None for each in three), strict=True))
+
+
+# -- aggregates --------------------------------------------------------------------------------
 
 
 def counted() -> set[str]:
-    """Names of the environments that aggregates are of: all that are registered, without those with
-    arguments of somebody's own, and without shifts, which have a board of their own: a pipe and its
-    shifts would count as so many."""
+    """Return the names of the environments of aggregates: all registered ids with their default
+    arguments, without shifts, which have a board of their own."""
     return {named(id, {}) for id in ids() if not home_of(id)}
+
+
+def _counted(made: list[Board]) -> list[Board]:
+    """Return the boards of an aggregate: with a floor; with an official floor where there is any,
+    otherwise a third-party floor could exclude all other methods."""
+    names = counted()
+    own = [board for board in made if board.environment in names
+           and any(row.gains for row in board.rows)]
+    official = [board for board in own if any(
+        row.record and is_floor(row.record) and row.cells["official"] for row in board.rows)]
+    return official or own
+
+
+def _aggregate(of_class: str, made: list[Board]) -> list[Board]:
+    """Return the methods that have finished all of several environments, ordered and ranked by the
+    interquartile mean of their gains."""
+    if len(made) < 2:
+        return []
+    found = [{row.label: row for row in board.rows if row.complete and row.gains}
+             for board in made]
+    cells: dict[str, dict[str, Any]] = {}
+    competing = {}
+    for label, first in found[0].items():
+        if not all(label in rows for rows in found):
+            continue
+        own = [rows[label] for rows in found]
+        gains = {board.environment: row.gains for board, row in zip(made, own, strict=True)}
+        note = ", ".join(dict.fromkeys(word for row in own for word in row.badges))
+        assert first.record is not None
+        cells[label] = dict.fromkeys(fields()) | _identity(first.record, ALL, note)
+        cells[label] |= with_ends("gain", gains, interquartile_mean)
+        cells[label]["official"] = all(row.cells["official"] for row in own)
+        if not note:
+            competing[label] = gains
+    ranks = shared_ranks(competing, statistic=interquartile_mean,
+                         higher_is_better=True) if competing else {}
+    order = sorted(cells, key=lambda label: (-cells[label]["gain"], cells[label]["method"],
+                                             cells[label]["version"]))
+    rows = [Row(cells[label] | {"rank": ranks.get(label)}, colour=i)
+            for i, label in enumerate(order)]
+    return [Board(of_class, ALL, "All environments", rows)] if rows else []
+
+
+# -- records -----------------------------------------------------------------------------------
 
 
 def read_for_boards(folder: Path, season: Season | None = None,
                     ) -> tuple[list[dict[str, Any]], list[str]]:
-    """The records of a folder that can stand on the boards of a season (default: the current one),
-    and a sentence for each that can stand on none.
+    """Return the records of a folder that the boards of a season show (default: the current one),
+    and one sentence for each record that no board can show.
 
     Raises
     ------
     ValueError
-        If there is no such folder, or none of it can.
+        If there is no such folder, or it has no such record.
     """
     split = (season or current_season()).split
     if not folder.is_dir():
@@ -164,143 +277,62 @@ def read_for_boards(folder: Path, season: Season | None = None,
                    "leaderboards are made of test seeds"
                    for record in read if season_of(record["split"]) is None]
     if not found:
-        named = "".join(f"; {complaint}" for complaint in complaints)
+        listed = "".join(f"; {complaint}" for complaint in complaints)
         raise ValueError(f"records must be a folder with records of {split} seeds, got {folder}, "
-                         f"where there are none that can be shown{named}")
+                         f"where there are none that can be shown{listed}")
     return found, complaints
 
 
 def _packed(record: dict[str, Any]) -> dict[str, Any]:
-    """With the error of each step, which is most of a record, in a quarter of the memory."""
+    """Store the error of each step, most of a record, in a quarter of the memory."""
     for episode in record["episodes"]:
         if "step_errors" in episode:
             episode["step_errors"] = array("d", episode["step_errors"])
     return record
 
 
-def class_of(record: dict[str, Any]) -> str:
-    """Which of `CLASSES` a record belongs to."""
-    return class_of_board(record["environment"]["id"], record["board"])
+# -- skill and cost ----------------------------------------------------------------------------
 
 
-def _entries(records: list[dict[str, Any]]) -> list[Entry]:
-    """The records of one environment on the board's episodes."""
-    floor = floor_of(records)
-    seeds = {seed for record in ([floor] if floor else records) for seed in record["seeds"]}
-    zero = scores_by_seed(floor, "error") if floor else {}
-    entries = []
-    for whole in records:
-        record = whole | {
-            "episodes": [episode for episode in whole["episodes"] if episode["seed"] in seeds],
-            "seeds": [seed for seed in whole["seeds"] if seed in seeds]}
-        if not record["seeds"]:  # nothing that the board asks for
-            continue
-        errors = scores_by_seed(record, "error")
-        counts = {"failed": sum(episode["status"] != "ok" for episode in whole["episodes"]),
-                  "missing": len(seeds - set(record["seeds"]))}
-        shortcomings = [f"{count} {what}" for what, count in counts.items() if count]
-        note = ", ".join([*filter(None, [record["role"]]), *["privileged"] * record["privileged"],
-                          *shortcomings])
-        gains = {seed: 1.0 - error / zero[seed] for seed, error in errors.items() if zero.get(seed)}
-        entries.append(Entry(record, note, not shortcomings, gains))
-    return entries
+def anchors(records: Iterable[dict[str, Any]]) -> Anchors:
+    """Return the errors between which skills are measured: for each world and split those of the
+    board with the most data for each estimate, official where possible."""
+    found: dict[tuple[str, str, str], dict[str, Any]] = {}
+    for record in records:
+        # a third-party method of that name is no anchor
+        if record["method"] in ANCHORS and version_number(record.get("version", "v1")):
+            key = (record["method"], world(record), record["split"])
+            found[key] = max(found.get(key, record), record, key=lambda other: (
+                other["official"], BOARDS.index(other["board"]), finished(other)))
+    return {key: scores_by_seed(record, "error") for key, record in found.items()}
 
 
-def floor_of(records: list[dict[str, Any]]) -> dict[str, Any] | None:
-    """Whose gain is 0, of the records of one environment; None if its floor is not among them."""
-    floors = [record for record in records if is_floor(record)]
-    return max(floors, key=lambda record: (record["official"], finished(record)), default=None)
+def shipped_anchors(records: Iterable[dict[str, Any]]) -> Anchors:
+    """Return the `anchors` of the worlds of these records among the records of the package."""
+    kinds = {kind_of(record["environment"]["id"]) for record in records}
+    known = [id.replace("/", "-") for id in ids("estimation") if kind_of(id) in kinds]
+    published = read_episode_table(table_beside(shipped("leaderboards") / "results"))
+    return anchors([record for record in published if record["method"] in ANCHORS
+                    and record["environment"]["name"] in known])
 
 
-def _board(environment: str, entries: list[Entry], known: Anchors,
-           products: dict[str, float]) -> list[dict[str, Any]]:
-    """Rows of one environment, by their mean error; after them who has not finished every
-    episode."""
-    competing = {entry.label: {environment: entry.errors} for entry in entries if not entry.note}
-    ranks = shared_ranks(competing) if competing else {}
-    rows = []
-    for entry in sorted(entries, key=_place):
-        record = entry.record
-        summarised = summary_row(record, known)
-        means = {name: summarised[name] and summarised[name][0] for name in others()}
-        rows.append(_row(entry, environment, ranks.get(entry.label)) | {
-            "seeds": seed_ranges(record["seeds"]),
-            **with_ends("error", {environment: entry.errors}, mean_over_environments),
-            **with_ends("gain", {environment: entry.gains}, interquartile_mean),
-            **means,
-            "matmuls_per_step": _in_products(record, products), "peak_memory": _peak(record)})
-    return rows
-
-
-def _place(entry: Entry) -> tuple[bool, float, str]:
-    errors = list(entry.errors.values())
-    return not entry.complete, mean_over_environments(errors) if errors else math.inf, entry.label
-
-
-def _counted(played: dict[str, list[Entry]]) -> dict[str, list[Entry]]:
-    """The environments of an aggregate: those with a floor; where there are official floors, those
-    with an official one, or else a stranger with a floor of his own could shut all others out."""
-    own = {environment: entries for environment, entries in played.items()
-           if any(entry.gains for entry in entries)}
-    official = {environment: entries for environment, entries in own.items()
-                if any(is_floor(entry.record) and entry.record["official"] for entry in entries)}
-    return official or own
-
-
-def is_floor(record: dict[str, Any]) -> bool:
-    """Whether it is of the floor itself: a stranger's file may have its name, not its version."""
-    return (record["method"] == FLOORS[track_of_board(record["board"])]
-            and version_number(record["version"]) is not None)
-
-
-def _aggregate(played: dict[str, list[Entry]]) -> list[dict[str, Any]]:
-    """Rows of the methods that have finished all of several environments, ordered and ranked by the
-    interquartile mean of their gains."""
-    if len(played) < 2:
-        return []
-    found = [{entry.label: entry for entry in entries if entry.complete and entry.gains}
-             for entries in played.values()]
-    labels = [label for label in found[0] if all(label in entries for entries in found)]
-    gains = {label: {environment: entries[label].gains
-                     for environment, entries in zip(played, found, strict=True)}
-             for label in labels}
-    notes = {label: list(dict.fromkeys(word for entries in found
-                                       for word in filter(None, entries[label].note.split(", "))))
-             for label in labels}
-    competing = {label: own for label, own in gains.items() if not notes[label]}
-    ranks = shared_ranks(competing, statistic=interquartile_mean,
-                         higher_is_better=True) if competing else {}
-    rows = []
-    for label in labels:
-        row = _row(found[0][label], ALL, ranks.get(label))
-        row |= with_ends("gain", gains[label], interquartile_mean)
-        rows.append(row | {"note": ", ".join(notes[label]),
-                           "official": all(entries[label].record["official"] for entries in found)})
-    return sorted(rows, key=lambda row: (-row["gain"], row["method"], row["version"]))
-
-
-def _row(entry: Entry, environment: str, rank: int | None) -> dict[str, Any]:
-    record = entry.record
-    return {"class": class_of(record), "environment": environment, "method": record["method"],
-            "version": record["version"], "title": record["title"], "rank": rank,
-            "note": entry.note, "official": record["official"]}
-
-
-def with_ends(name: str, scores: dict[str, dict[str, float]],
-              statistic: Any) -> dict[str, float | None]:
-    """A statistic of environment -> seed -> score, ``name``, and the ends of its 95 % interval,
-    ``name_low`` and ``name_high``; None as far as there are none."""
-    if not all(scores.values()):
-        return dict.fromkeys((name, f"{name}_low", f"{name}_high"))
-    values = {key: list(own.values()) for key, own in scores.items()}
-    three = stratified_bootstrap(values, statistic)
-    return dict(zip((name, f"{name}_low", f"{name}_high"),
-                    (value if math.isfinite(value) else None for value in three), strict=True))
+def _skill(record: dict[str, Any], known: Anchors) -> float | None:
+    """Return (E_h − E)/(E_h − E_s) of the means over the seeds that all three have; None without
+    any."""
+    own = scores_by_seed(record, "error")
+    floor, reference = (known.get((name, world(record), record["split"]), {}) for name in ANCHORS)
+    # the last digit of a sum depends on its order
+    shared = sorted(own.keys() & floor.keys() & reference.keys())
+    if not shared:
+        return None
+    e, high, low = (float(np.mean([each[seed] for seed in shared]))
+                    for each in (own, floor, reference))
+    return skill(e, high, low) if high != low else None
 
 
 def _matrix_products(records: list[dict[str, Any]]) -> dict[str, float]:
-    """Processor -> time of a matrix product in s, the median of the runs: a single one depends on
-    what runs beside. Of official runs, where any was on that processor."""
+    """Return processor -> time of a matrix product in s: the median of the runs, official ones
+    where there are any, since a single one depends on the load."""
     timed: dict[str, dict[bool, list[float]]] = {}
     for record in records:
         for run in record["runs"]:
@@ -311,7 +343,7 @@ def _matrix_products(records: list[dict[str, Any]]) -> dict[str, float]:
 
 
 def _in_products(record: dict[str, Any], products: dict[str, float]) -> float | None:
-    """Time per step of the fastest episode in units of the matrix product on its processor."""
+    """Return the time per step of the fastest episode in matrix products of its processor."""
     return min((episode["scores"]["seconds_per_step"]
                 / products[record["runs"][episode["run"]]["machine"]["processor"]]
                 for episode in record["episodes"] if episode["status"] == "ok"), default=None)

@@ -1,4 +1,4 @@
-"""Episodes that a method did not finish, those together that ended in the same way."""
+"""Episodes that a method did not finish, grouped by their error."""
 
 from __future__ import annotations
 
@@ -15,48 +15,46 @@ from eitbench.bench.text import seed_ranges
 from eitbench.bench.variants import as_typed, flat
 from eitbench.data.seeds import name_seed
 
+_COMMANDS = {"estimation": ("run", "--baseline"), "injection": ("policies", "--policy")}
+"""Track -> the command that runs its methods, and the option that names them."""
+
 
 class Failure(NamedTuple):
-    """What a method did wrong in some episodes of a record."""
+    """One error of a method in some episodes of a record."""
 
     record: dict[str, Any]
     seeds: list[str]
-    """In the record's order."""
     message: str
     traceback: str
-    """The lines of the method's own code that led to it; empty where it was not its code."""
+    """Lines of the method's own code; empty if the error was raised elsewhere."""
 
     def __str__(self) -> str:
         environment = self.record["environment"]["id"]
-        who = f"{self.record['method']} in {environment} on {seed_ranges(self.seeds)}"
-        return f"failed: {who}: {cleaned(self.message)}" + (
+        where = f"{self.record['method']} in {environment} on {seed_ranges(self.seeds)}"
+        return f"failed: {where}: {cleaned(self.message)}" + (
             "\n" + textwrap.indent(self.traceback.rstrip(), "  ") if self.traceback else "")
 
 
 def failures(store: EpisodeStore, records: Iterable[dict[str, Any]]) -> list[Failure]:
-    """Those of records that were gathered from a store, in their order."""
+    """Return the failures of records of a store, in their order."""
     found = []
     for record in records:
         tracebacks = store.tracebacks(record)
         seeds: dict[tuple[str, str], list[str]] = {}
         for episode in record["episodes"]:
             if episode["status"] != "ok":
-                how = episode["message"], tracebacks[episode["seed"]]
-                seeds.setdefault(how, []).append(episode["seed"])
-        found += [Failure(record, those, *how) for how, those in seeds.items()]
+                error = episode["message"], tracebacks[episode["seed"]]
+                seeds.setdefault(error, []).append(episode["seed"])
+        found += [Failure(record, those, *error) for error, those in seeds.items()]
     return found
 
 
-_COMMANDS = {"estimation": ("run", "--baseline"), "injection": ("policies", "--policy")}
-"""Track -> the command that plays its methods, and the option that names them."""
-
-
-def debugging(failure: Failure, asked: Iterable[Job]) -> str:
-    """The command that plays the first of these episodes in its own process, where nothing hides
-    truth and files from the method; empty if it was not asked for."""
+def debug_command(failure: Failure, jobs: Iterable[Job]) -> str:
+    """Return the command that runs the first of these episodes in its own process, without
+    isolation; empty if it is not among the jobs."""
     first = failure.seeds[0]
     failed = (failure.record["environment"]["name"], failure.record["method"], first)
-    for job in asked:
+    for job in jobs:
         if (job.environment.name, job.load().name, name_seed(job.seed)) == failed:
             command, option = _COMMANDS[job.environment.track]
             given = json.loads(job.environment.kwargs)

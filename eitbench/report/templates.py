@@ -1,26 +1,27 @@
-"""The templates of our pages, in which whatever a method calls itself is text and nothing more."""
+"""Jinja templates of all pages; text from records is escaped."""
 
 from __future__ import annotations
 
+import re
 from functools import lru_cache
 from typing import Any
 from urllib.parse import quote
 
 import jinja2
+from markupsafe import Markup, escape
 
 from eitbench._foreign import cleaned
-from eitbench.report.rows import badge, breakable, rows_html
 
 _DRAWING = ('<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 32 32">'
             '<rect y="5" width="32" height="22" rx="5" fill="#0b6e75"/>'
             '<path d="M4 21C12 12 18 20 28 11" stroke="#f0c246" stroke-width="5" fill="none"/>'
             '</svg>')
 ICON = f"data:image/svg+xml,{quote(_DRAWING, safe='')}"
-"""A pipe and what flows in it, for the browser's tab."""
+"""Icon of the browser's tab: a pipe with a slug."""
 
 
 def template(name: str) -> jinja2.Template:
-    """One of the templates beside this file."""
+    """Return one of the templates in this folder."""
     return _environment().get_template(name)
 
 
@@ -28,12 +29,19 @@ def template(name: str) -> jinja2.Template:
 def _environment() -> jinja2.Environment:
     made = jinja2.Environment(loader=jinja2.PackageLoader("eitbench.report", "."), autoescape=True,
                               trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
-                              undefined=jinja2.StrictUndefined, finalize=_seen)
-    made.globals |= {"rows_html": rows_html, "breakable": breakable, "badge": badge,
-                     "icon": ICON}
+                              undefined=jinja2.StrictUndefined, finalize=_visible)
+    made.globals |= {"breakable": breakable, "icon": ICON}
     return made
 
 
-def _seen(value: Any) -> Any:
-    """A stranger's text with all its characters to be seen; what is HTML already as it is."""
+def _visible(value: Any) -> Any:
+    """Return text with control characters spelt out, and markup as it is."""
     return cleaned(value, lines=True) if type(value) is str else value
+
+
+def breakable(text: str) -> Markup:
+    """Return HTML of a name that may break after underscores and slashes and before @, ẽ_c
+    excepted."""
+    html = str(escape(_visible(text)))
+    html = html.replace("_", "_<wbr/>").replace("ẽ_<wbr/>", "ẽ_").replace("@", "<wbr/>@")
+    return Markup(re.sub(r"/(?=\w{3})", "/<wbr/>", html))

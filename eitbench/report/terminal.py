@@ -1,43 +1,30 @@
-"""What `eitbench run` and `eitbench policies` say of the records that they were asked for."""
+"""Tables that `eitbench run` and `eitbench leaderboard` print."""
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
-import pandas as pd
-
-from eitbench._files import shipped
-from eitbench.bench.episode_table import read_episode_table, table_beside
+from eitbench._foreign import as_markdown
 from eitbench.bench.run import Job
-from eitbench.bench.table import Cell, Table
-from eitbench.bench.tracks import ids
 from eitbench.data.seeds import name_seed
 from eitbench.report.charts import shortened
-from eitbench.report.summary import (
-    ANCHORS,
-    Anchors,
-    anchors,
-    kind_of,
-    scores_shown,
-    summary,
-)
+from eitbench.report.model import Board
+from eitbench.report.tables import run_table
 
-FIRST = ("method", "ẽ_c", "board", "skill", "seeds", "NIS/m", "ms/step", "contrast", "ẽ_v")
-"""Columns in the order of their importance: where a line is too short the last ones are left out,
-and before them all others."""
-LONGEST = 30
-"""letters of a name, or of what is said of seeds; of longer ones the middle is left out"""
+COLUMN_PRIORITY = ("method", "ẽ_c", "skill", "seeds", "NIS/m", "ms/step", "contrast", "ẽ_v")
+"""Where a line is too short the last of these are left out, and all other columns before them."""
+MAX_LABEL_CHARS = 30
 
 
 def width() -> int:
-    """Letters of a line: the terminal's, 80 where there is none."""
+    """Return the columns of the terminal; 80 without one."""
     return shutil.get_terminal_size().columns
 
 
 def asked_of(records: Iterable[dict[str, Any]], jobs: Iterable[Job]) -> list[dict[str, Any]]:
-    """The records' episodes that were asked for."""
+    """Return the records restricted to the episodes of these jobs."""
     asked: dict[tuple[str, str], set[str]] = {}
     for job in jobs:
         key = (job.environment.name, job.load().name)
@@ -52,46 +39,32 @@ def asked_of(records: Iterable[dict[str, Any]], jobs: Iterable[Job]) -> list[dic
     return found
 
 
-def shipped_anchors(records: Iterable[dict[str, Any]]) -> Anchors:
-    """Of the worlds of these records the `anchors` among the official records that come with the
-    package."""
-    kinds = {kind_of(record["environment"]["id"]) for record in records}
-    known = [id.replace("/", "-") for id in ids("estimation") if kind_of(id) in kinds]
-    published = read_episode_table(table_beside(shipped("leaderboards") / "results"))
-    return anchors([record for record in published if record["method"] in ANCHORS
-                    and record["environment"]["name"] in known])
-
-
-def tables(records: list[dict[str, Any]], known: Anchors, letters: int) -> str:
-    """A table of each world, as wide as a line of so many letters at most, and below them what has
-    to be explained; skills are measured between the anchors that are ``known``."""
-    table = summary(records, known)
-    titles, full = zip(*(_table(str(world), rows)
-                         for world, rows in table.groupby("world", sort=False)), strict=True)
-    shown = [each.fitted(letters, FIRST) for each in full]
-    parts = [f"{title}\n\n{each.markdown()}" for title, each in zip(titles, shown, strict=True)]
-    if any(cell.text.endswith("†") for each in shown for row in each.rows for cell in row.cells):
-        parts.append("† 1 − contrast, since the references did not play these episodes: 0 is the\n"
-                     "homogeneous estimate of the whole record, 1 no error at all")
-    left_out = dict.fromkeys(heading for wide, each in zip(full, shown, strict=True)
-                             for heading in wide.headings if heading not in each.headings)
+def terminal_tables(boards: Sequence[Board], characters: int) -> str:
+    """Return a table of each board, at most ``characters`` wide, and notes."""
+    whole = [run_table(board, title="method") for board in boards]
+    parts = []
+    left_out: dict[str, None] = {}
+    for board, table in zip(boards, whole, strict=True):
+        seeds = {row.cells[1].text for row in table.rows}
+        rows = [row._replace(cells=[cell._replace(text=shortened(cell.text, MAX_LABEL_CHARS))
+                                    for cell in row.cells]) for row in table.rows]
+        table = table._replace(rows=rows)
+        if len(seeds) == 1:
+            table = table.without("seeds")
+        shown = table.fitted(characters, COLUMN_PRIORITY)
+        left_out |= dict.fromkeys(heading for heading in table.headings
+                                  if heading not in shown.headings)
+        title = ", ".join([board.title, board.of_class, *(seeds if len(seeds) == 1 else ())])
+        parts.append(f"{title}\n\n{shown.markdown()}")
+    if any("†" in part for part in parts):
+        parts.append("† 1 − contrast, since the references have no record of these episodes: 0 is\n"
+                     "the homogeneous estimate of the whole record, 1 no error at all")
     if left_out:
         parts.append(f"no room for {', '.join(left_out)}")
     return "\n\n".join(parts)
 
 
-def _table(world: str, rows: pd.DataFrame) -> tuple[str, Table]:
-    """Its title, which says what all lines have in common, and all of it."""
-    boards = list(rows["board"])
-    played = [f"{row['seeds']}, {row['failed']} failed" if row["failed"] else row["seeds"]
-              for _, row in rows.iterrows()]
-    lines = []
-    for board, seeds, (_, row) in zip(boards, played, rows.iterrows(), strict=True):
-        cells: dict[str, Cell | str] = {"method": shortened(row["name"], LONGEST)}
-        if len(set(boards)) > 1:
-            cells["board"] = board
-        if len(set(played)) > 1:
-            cells["seeds"] = shortened(seeds, LONGEST)
-        lines.append(cells | scores_shown(row))
-    shared = [each[0] for each in (boards, played) if len(set(each)) == 1]
-    return ", ".join([world, *shared]), Table.of(lines)
+def markdown(boards: Sequence[Board]) -> str:
+    """Return the tables of all boards as Markdown."""
+    return "\n\n".join(f"## {as_markdown(board.title)}\n\n{run_table(board).markdown()}"
+                       for board in boards) + "\n"

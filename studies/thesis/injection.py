@@ -19,7 +19,7 @@ from eitbench.bench.suites import jobs as jobs_of
 from eitbench.bench.text import mean_and_interval
 from eitbench.data.seeds import name_seed
 from eitbench.report.animate import animate
-from eitbench.report.policy_table import (
+from eitbench.report.policies import (
     OPEN_LOOP,
     errors_by_policy,
     policy_rows,

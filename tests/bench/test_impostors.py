@@ -6,9 +6,8 @@ import os
 import pytest
 from eitbench.bench.methods import MOST_BYTES, find_method
 from eitbench.bench.records import file_name, read_record, sealed
-from eitbench.report.boards import boards
-from eitbench.report.site import render
-from eitbench.report.summary import summary
+from eitbench.report.boards import boards, run_boards
+from eitbench.report.site import collect, render
 
 from tiny import record
 
@@ -36,13 +35,13 @@ def test_a_file_of_the_floor_s_name_is_no_floor():
     theirs, mine = record("homogeneous", [9.0] * 8, version="1"), record("mine", FLOOR)
     best = record("true_model_smoother", [0.1] * 8, role="reference")
     assert boards([theirs, mine])["gain"].isna().all()
-    assert all(skill is None for skill in summary([theirs, mine, best])["skill"])
+    assert all(row.cells["skill"] is None for board in run_boards([theirs, mine, best]) for row in board.rows)
 
 
 def test_a_csv_holds_no_formula():
     """What begins like one is text in the programs that open it."""
     made = record("=HYPERLINK(\"x\")", FLOOR, title="@SUM(1)")
-    line = render([made])["leaderboard.csv"].splitlines()[1]
+    line = render(collect([made]))["leaderboard.csv"].splitlines()[1]
     assert "'=HYPERLINK" in line and ",'@SUM(1)," in line
 
 

@@ -14,8 +14,10 @@ from eitbench.bench.tracks import TRACKS, Environment
 from eitbench.bench.verify import differences_of
 from eitbench.data.regions import mass_between
 from eitbench.numerics.fem import mass_matrix
-from eitbench.report import policy_table, summary
-from eitbench.report.site import render
+from eitbench.report import policies
+from eitbench.report.boards import run_boards
+from eitbench.report.site import collect, render
+from eitbench.report.tables import run_table
 from eitbench.worlds import entry
 
 from choosing import BUDGET, FAULTS, FLOW, NAME, make, world
@@ -130,14 +132,14 @@ def test_boards_show_it_where_it_is_known():
     old = [injection("random_pair", 1.0, role="floor", scores={"spent": 40}),
            injection("opposite", 0.9, scores={"spent": 40})]
     new = injection("greedy_a", 0.5, scores={"spent": 40, "nis": 1.2, "crps": 0.44})
-    (heading,) = rows_of(render(old)["leaderboard.md"], "rank |")
+    (heading,) = rows_of(render(collect(old))["leaderboard.md"], "rank |")
     assert "NIS/m" not in heading and "CRPS" not in heading
-    text = render([*old, new])["leaderboard.md"]
+    text = render(collect([*old, new]))["leaderboard.md"]
     (heading,) = rows_of(text, "rank |")
     place = heading.index("NIS/m")
     assert rows_of(text, " greedy_a@")[0][place] == "1.2"
     assert rows_of(text, " opposite@")[0][place] == "–"
-    shown = said(summary.shown(summary.summary([*old, new])))
+    shown = said(run_table(run_boards([*old, new])[0]))
     assert sorted(shown["CRPS"]) == ["0.44", "–", "–"]
 
 
@@ -148,8 +150,8 @@ def test_the_table_of_policies_shows_it_where_it_is_known():
          "seconds_per_step": 0.001}
         for name, error, claimed in (("old", 1.0, [None, None]), ("new", 2.0, [1.0, 2.0]))
         for k, nis in enumerate(claimed)])
-    lines = policy_table.policy_table(rows, []).splitlines()
+    lines = policies.policy_table(rows, []).splitlines()
     headings = [cell.strip() for cell in lines[0].strip("|").split("|")]
     assert headings == ["policy", "ẽ_c", "worse than old by", "NIS/m", "injections", "ms/step"]
     assert [line.split("|")[4].strip() for line in lines[2:]] == ["–", "1.5"]
-    assert "NIS/m" not in policy_table.policy_table(rows.drop(columns="nis"), [])
+    assert "NIS/m" not in policies.policy_table(rows.drop(columns="nis"), [])

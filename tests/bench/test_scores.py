@@ -10,8 +10,10 @@ import pytest
 from eitbench.bench import scores
 from eitbench.bench.records import read_records
 from eitbench.bench.scores import Outcome, Score, register_score, scored
-from eitbench.report import boards, compare, summary
-from eitbench.report.site import render, render_site
+from eitbench.report import compare
+from eitbench.report.boards import run_boards
+from eitbench.report.site import collect, render, render_site
+from eitbench.report.tables import run_table
 from eitbench.worlds import entry
 
 from tables import said
@@ -75,13 +77,13 @@ def test_a_new_score_is_shown_everywhere(apart):
             episode["scores"]["worst_step"] = max(episode["step_errors"])
     expected = {record["method"]: 100.0 * np.mean([max(episode["step_errors"])
                                                    for episode in record["episodes"]]) for record in records}
-    assert "worst" in summary.shown(summary.summary(records)).headings
-    made = render(records)
+    assert "worst" in run_table(run_boards(records)[0]).headings
+    made = render(collect(records))
     rows = {row["method"]: row for row in csv.DictReader(io.StringIO(made["leaderboard.csv"]))}
     for method, value in expected.items():
         assert float(rows[method]["worst_step"]) == pytest.approx(value, rel=1e-5)
     assert "| worst |" in made["leaderboard.md"] and "**worst**: the worst step" in made["leaderboard.md"]
-    site = render_site(records, boards.boards(records))
+    site = render_site(collect(records))
     assert "the worst step" in site["environments/eitbench-Pipe2D-v0.html"].decode()
     a, b = ([record for record in records if record["method"] == name]
             for name in ("kalman_filter", "homogeneous"))

@@ -70,7 +70,7 @@ def test_ten_lines_of_ones_own_get_a_table_and_a_page(tmp_path):
     assert code == 0 and "| mine " in said and "| homogeneous " in said
     results = tmp_path / "results"
     table = (results / "leaderboard.md").read_text(encoding="utf-8")
-    assert "My method" in table and "Best homogeneous estimate" in table and len(table.splitlines()) == 4
+    assert "My method" in table and "Best homogeneous estimate" in table and len(table.splitlines()) == 6
     assert "My method" in (results / "index.html").read_text(encoding="utf-8")
     assert "wrote results/index.html" in said
     (path,) = (results / "records").glob("eitbench-Pipe2D-v0--mine--*--dev.json")
@@ -107,7 +107,7 @@ def test_every_board_by_default(tmp_path):
                                                    "    boards = ('filter', 'fixed-lag', 'smoothing')"))
     code, said, _ = eitbench("run", "--baseline", "mine.py", "--seeds", "dev:0", "-j", "1")
     boards = ("filter", "fixed-lag", "smoothing")
-    assert code == 0 and [said.count(f"| mine   | {board} ") for board in boards] == [1, 1, 1]
+    assert code == 0 and [said.count(f", {board}, dev:0\n") for board in boards] == [1, 1, 1]
 
 
 def test_suites():

@@ -5,8 +5,12 @@ import re
 import pytest
 from browser import Browser, executable
 from eitbench.bench.records import sealed
-from eitbench.report.boards import boards
-from eitbench.report.site import render_site, write_site
+from eitbench.bench.store import EpisodeStore
+from eitbench.report.boards import run_boards
+from eitbench.report.page import write_page
+from eitbench.report.site import Beside, collect, render_site, write_site
+from eitbench.report.site.beside import HEADLINE
+from PIL import Image
 
 from tiny import record, several_boards
 
@@ -33,8 +37,10 @@ def widest():
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    made, records = tmp_path_factory.mktemp("site"), [*several_boards(), *widest()]
-    write_site(made, render_site(records, boards(records)))
+    made, records = tmp_path_factory.mktemp("site"), [*several_boards(), *widest(), *(
+        record(f"ppo_seed{seed}", [0.1 + 0.01 * seed] * 8, board="injection",
+               title=f"ppo trained with seed {seed}") for seed in (0, 1))]
+    write_site(made, render_site(collect(records)))
     return made
 
 
@@ -107,8 +113,6 @@ def test_filter_by_words_and_by_kind(index):
         index.press("Backspace")
     assert len(column(index, 1)) == everybody
 
-    index.click("input[name=outdated]")
-    assert len(column(index, 1)) == everybody + 1 and "outdated" in column(index, 1)[-1]
     index.click("input[name=unranked]")
     names = " ".join(column(index, 1))
     assert "floor" not in names and "reference" not in names and "failing" in names
@@ -163,14 +167,6 @@ def test_nothing_overflows(tab, folder, page, width):
     assert wide > 0 or width > 380
 
 
-def test_less_motion_where_it_is_asked_for(tab, folder):
-    """Links jump instead of gliding."""
-    tab.open((folder / "index.html").as_uri())
-    for wish, behaviour in (("reduce", "auto"), ("no-preference", "smooth")):
-        tab.prefer(prefers_reduced_motion=wish)
-        assert tab.js("getComputedStyle(document.documentElement).scrollBehavior") == behaviour
-
-
 WITHIN = """(() => { const card = document.querySelector('.block .card'), right = card.getBoundingClientRect().right;
     return [...card.querySelectorAll('thead th')].filter(cell => cell.getBoundingClientRect().right <= right)
         .map(cell => cell.textContent.trim()); })()"""
@@ -214,7 +210,59 @@ def test_an_axis_and_the_floor_are_drawn(index):
     """In the heading of each drawn column, and as a line in each cell of it, at one place."""
     places = index.js(f"[...document.querySelectorAll('{BOARD} td:nth-child(3) path.grid')]"
                       ".map(line => line.getAttribute('d'))")
-    assert len(places) == len(column(index, 2)) + 1 and len(set(places)) == 1     # the outdated one is hidden
+    assert len(places) == len(column(index, 2)) and len(set(places)) == 1
     assert index.js(f"document.querySelectorAll('{BOARD} thead svg.axis text').length") >= 3
     left = "document.querySelector('{} {} svg').getBoundingClientRect().left"
     assert index.js(left.format(BOARD, "thead")) == index.js(left.format(BOARD, "td:nth-child(3)"))
+
+
+AGENTS = "#board-injection-eitbench-Pipe2DInjection-v0"
+
+
+@pytest.mark.parametrize("scripts", [True, False], ids=["with scripts", "without"])
+def test_trainings_open_by_keyboard(tab, folder, scripts):
+    """Also where no script runs; sorted and found as one line."""
+    tab.send("Emulation.setScriptExecutionDisabled", value=not scripts)
+    tab.open((folder / "index.html").as_uri())
+    seen = f"[...document.querySelectorAll('{AGENTS} tr.part')].filter(row => row.checkVisibility()).length"
+    assert tab.js(f"document.querySelectorAll('{AGENTS} summary').length") == 1 and tab.js(seen) == 0
+    tab.js(f"document.querySelector('{AGENTS} summary').focus()")
+    tab.press("Enter")
+    assert tab.js(seen) == 2
+    if scripts:
+        tab.click(f"{AGENTS} thead th:nth-child(2) button")
+        names = tab.js(f"[...document.querySelectorAll('{AGENTS} tbody tr')].map(row => row.cells[1].textContent)")
+        assert [re.findall("seed.(?=@)", name) for name in names if "ppo" in name.lower()] == [[], ["seed0"], ["seed1"]]
+        tab.js("document.querySelector('input[type=search]').focus()")
+        tab.type("ppo_seed1")
+        tab.wait("document.querySelector('output').textContent.startsWith('1 of')")
+    tab.send("Emulation.setScriptExecutionDisabled", value=False)
+
+
+def test_the_picture_can_be_stopped(tab, tmp_path):
+    """By a button; it stands still where less motion is preferred."""
+    records = [record(name, [error] * 2, official=True, version="v1") for name, error in (
+        ("homogeneous", 0.02), ("gauss_newton", 0.037), ("extended_kalman_filter", 0.004))]
+    for name in HEADLINE:
+        (tmp_path / "media").mkdir(exist_ok=True)
+        Image.new("RGB", (72, 60), "teal").save(tmp_path / "media" / name)
+    write_site(tmp_path / "site", render_site(collect(records), Beside.of(tmp_path, tmp_path / "site")))
+    for wish, first in (("no-preference", 0), ("reduce", 1)):
+        tab.prefer(prefers_reduced_motion=wish)
+        tab.open((tmp_path / "site" / "index.html").as_uri())
+        words = ["Stop the picture", "Play the picture"]
+        assert tab.js("document.querySelector('.hero img').currentSrc").endswith(HEADLINE[first])
+        assert tab.js("document.querySelector('.pause').textContent") == words[first]
+        tab.click(".pause")
+        tab.wait(f"document.querySelector('.hero img').currentSrc.endsWith('{HEADLINE[1 - first]}')")
+
+
+@pytest.mark.parametrize("width", [390, 1280])
+def test_the_results_page_fits(tab, tmp_path, width):
+    """Sortable and without overflow, as the site."""
+    path = write_page(EpisodeStore(tmp_path), run_boards(widest()))
+    tab.size(width)
+    tab.open(path.as_uri())
+    assert tab.js("document.documentElement.scrollWidth") == width
+    tab.click("thead th:nth-child(3) button")
+    assert tab.js("document.querySelector('tbody td').textContent") == "True model smoother"

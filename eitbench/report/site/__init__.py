@@ -1,114 +1,96 @@
-"""The leaderboards as a static site, as Markdown, and as CSV.
+"""Leaderboards as a static site, as Markdown, and as CSV.
 
 Rendered from the records and from what the repository holds: docstrings of environments and
-methods, our baselines' files and checkpoints. The same records and the same checkout give the same
-bytes.
+methods, files and checkpoints of built-in methods. The same records and the same checkout give the
+same bytes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
-
-import pandas as pd
 
 from eitbench._files import replace_folder
 from eitbench._foreign import as_cell, as_markdown
-from eitbench.bench.records import file_name, newest
-from eitbench.report.boards import boards, meanings
+from eitbench.bench.records import file_name
+from eitbench.report.boards import board_table
+from eitbench.report.model import meanings
 from eitbench.report.site.beside import Beside
-from eitbench.report.site.collect import about_season, collect
-from eitbench.report.site.environment import environment_pages
-from eitbench.report.site.index import index_pages
+from eitbench.report.site.collect import Site, collect
+from eitbench.report.site.environment import environment_page
+from eitbench.report.site.index import index_page
 from eitbench.report.site.measured import NOBODY, Measured, measured_pages, measured_text
-from eitbench.report.site.method import method_pages
+from eitbench.report.site.method import method_page
 from eitbench.report.site.robustness import robustness_pages, robustness_text
-from eitbench.report.site.tables import PAGE, plain_table
+from eitbench.report.tables import markdown_table
+
+__all__ = ["Beside", "Measured", "collect", "render", "render_site", "write_site"]
 
 MARK = b"<strong>eitbench</strong> leaderboards"
-"""By which an index.html is known to be ours."""
-HERE = Path(__file__).parent
-ASSETS = {"style.css": ("../style.css", "site.css"), "script.js": ("script.js",)}
-"""Files that all pages share, and what they are put together from."""
+"""Text by which the index.html of a site is recognised."""
+HERE = Path(__file__).parent.parent
 
 
-def render_site(records: list[dict[str, Any]], table: pd.DataFrame,
-                beside: Beside = Beside(),  # noqa: B008 (it is never changed)
+def render_site(site: Site, beside: Beside = Beside(),  # noqa: B008 (it is never changed)
                 measured: Measured = NOBODY) -> dict[str, bytes]:
-    """All files of the site, by their path within it.
+    """Return all files of the site, by their path within it.
 
     Parameters
     ----------
-    records : list
-        As `records.read_records` has them.
-    table : DataFrame
-        Their `boards.boards`.
+    site : Site
+        As `collect` makes it of records.
     beside : Beside
-        What lies beside the site's folder: animations of episodes, and what is linked to. Default:
-        nothing.
+        Files beside the site's folder: animations, and link targets. Default: none.
     measured : Measured
-        Records of real instruments. Default: none.
+        Records of measurement files. Default: none.
     """
-    site = collect(records, table)
-    files = index_pages(site, beside, measured)
+    files = {"index.html": index_page(site, beside, measured)}
     for board in site.boards:
         if not board.is_aggregate:
-            files |= environment_pages(site, board, beside)
-    files |= method_pages(site, beside) | robustness_pages(site, beside)
-    files |= measured_pages(measured, beside)
-    return files | {name: b"".join((HERE / part).read_bytes() for part in parts)
-                    for name, parts in ASSETS.items()}
+            files[f"environments/{board.environment}.html"] = environment_page(site, board, beside)
+    for name in dict.fromkeys(record["method"] for record in site.records):
+        files[f"methods/{name}.html"] = method_page(site, name, beside)
+    files |= robustness_pages(site, beside) | measured_pages(measured, beside)
+    return files | {name: (HERE / name).read_bytes() for name in ("style.css", "script.js")}
 
 
-def render(records: list[dict[str, Any]], table: pd.DataFrame | None = None,
-           measured: Measured = NOBODY) -> dict[str, str]:
-    """The content of ``leaderboard.csv`` and ``leaderboard.md``, by file name, from the records,
-    if it is made already their `boards`, and the records of real instruments, which are in the
-    second alone. The same records give the same text."""
-    found = boards(records) if table is None else table
-    site = collect(records, found)
+def render(site: Site, measured: Measured = NOBODY) -> dict[str, str]:
+    """Return the content of ``leaderboard.csv`` and ``leaderboard.md``, by file name; records of
+    measurement files are in the second only."""
     parts = ["# Leaderboards", "*Rendered from the records by `eitbench leaderboard --records "
-             "leaderboards/results`; [README.md](README.md) says how to add one.*"]
-    if not site.boards:
-        parts.append("There are no records yet.")
-    else:
-        parts.append(f"**{about_season(site.season)}**")
-    for name in site.classes:
+             "leaderboards/results`; [README.md](README.md) says how to add one.*",
+             f"**{site.about_season}**" if site.boards else "There are no records yet."]
+    for name, boards in site.classes.items():
         parts.append(f"## {name}")
-        for board in site.boards:
-            if board.of_class == name and board.current:
-                seeds = "" if board.is_aggregate else f", {board.seeds}"
-                first = board._replace(rows=board.current[:PAGE])
-                parts += [f"### {as_markdown(board.title)}{seeds}",
-                          plain_table(first).markdown()]
-                if left := len(board.current) - len(first.rows):
-                    parts.append(f"{left:,} more are in leaderboard.csv.")
+        for board in boards:
+            seeds = f", {board.seeds}" if board.seeds else ""
+            parts += [f"### {as_markdown(board.title)}{seeds}", markdown_table(board).markdown()]
     parts += robustness_text(site)
     parts += measured_text(measured)
     if site.boards:
-        said = [f"- **{heading}**: {text}" for heading, text in meanings().items()]
-        parts += ["## What the columns say", "\n".join(said)]
-    if outdated := newest(records)[1]:
-        parts += ["## Outdated records", "Made by an earlier version of the method.\n\n"
-                  + "\n".join(f"- {as_markdown(file_name(record))}" for record in outdated)]
-    texts = {name: found[name].map(as_cell) for name in ("environment", "method", "title")}
-    plain = found.assign(**texts).to_csv(index=False, float_format="%.6g", lineterminator="\n")
+        listed = [f"- **{heading}**: {text}" for heading, text in meanings().items()]
+        parts += ["## Column descriptions", "\n".join(listed)]
+    if site.outdated:
+        parts += ["## Superseded records", "Made by an earlier version of the method.\n\n"
+                  + "\n".join(f"- {as_markdown(file_name(record))}" for record in site.outdated)]
+    table = board_table(site.boards)
+    texts = {name: table[name].map(as_cell) for name in ("environment", "method", "title")}
+    plain = table.assign(**texts).to_csv(index=False, float_format="%.6g", lineterminator="\n")
     return {"leaderboard.csv": plain, "leaderboard.md": "\n\n".join(parts) + "\n"}
 
 
 def write_site(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Make the folder hold these files and no others: a page whose records are gone goes too. All
-    at once: an interruption leaves the site that was there.
+    """Make the folder hold these files and no others, all at once: an interruption leaves the
+    previous site.
 
     Raises
     ------
     ValueError
-        If the folder is neither empty nor such a site: then nothing of it is touched.
+        If the folder is neither empty nor such a site: then it is not touched.
     """
     index = folder / "index.html"
-    ours = index.is_file() and MARK in index.read_bytes()
-    if folder.exists() and any(folder.iterdir()) and not ours:
+    is_site = index.is_file() and MARK in index.read_bytes()
+    if folder.exists() and any(folder.iterdir()) and not is_site:
         raise ValueError("folder must be empty or hold a site of the leaderboards, since other "
                          f"files in it are deleted; {folder} holds something else")
     replace_folder(folder, files)

@@ -2,44 +2,40 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from eitbench.bench.records import finished
 from eitbench.report.site.beside import HEADLINE, Beside
-from eitbench.report.site.collect import MEASURED, ROBUSTNESS, Site, about_season
-from eitbench.report.site.headline import headline, numbers
+from eitbench.report.site.collect import MEASURED, ROBUSTNESS, Site
+from eitbench.report.site.headline import headline, key_figures
 from eitbench.report.site.measured import Measured
 from eitbench.report.site.robustness import families
-from eitbench.report.site.tables import axes, explanations, more, rows_file, table
+from eitbench.report.tables import Axes, explanations, page_table
 from eitbench.report.templates import template
 
 ABOUT = {
-    "filter": "Where is what now? The estimate of each moment, from the measurements until then.",
-    "fixed-lag": "The same a few measurements later.",
-    "smoothing": "Every moment, once the whole record is known.",
+    "filter": "Estimates of each moment from the measurements until then.",
+    "fixed-lag": "Estimates of each moment from the measurements until a few later.",
+    "smoothing": "Estimates of each moment from the whole record.",
     "stationary": "Targets that stand still.",
-    "injection": "Which current to inject next; a Kalman filter inside makes the estimate.",
+    "injection": "The next current is chosen; a Kalman filter inside makes the estimate.",
 }
-"""What each class asks for."""
+"""Class -> task."""
 
 
-def index_pages(site: Site, beside: Beside, measured: Measured) -> dict[str, bytes]:
-    """The HTML of ``index.html``, and the lines for which it has no room."""
-    made = {board.anchor: table(board, "", compact=True) for board in site.boards}
-    longer = {anchor: more(each, anchor, "") for anchor, each in made.items()}
-    classes: list[dict[str, Any]] = [{
-        "name": name, "about": ABOUT[name],
-        "boards": [(board, made[board.anchor], longer[board.anchor], axes(board))
-                   for board in site.boards if board.of_class == name],
-    } for name in site.classes]
-    html = template("site/index.html.j2").render(
-        root="", links=beside.links(""), headline=headline(site), numbers=numbers(site),
+def index_page(site: Site, beside: Beside, measured: Measured) -> bytes:
+    """Return the HTML of ``index.html``."""
+    tables = {board.anchor: page_table(board, "", compact=True) for board in site.boards}
+    classes = [{"name": name, "about": ABOUT[name],
+                "boards": [(board, tables[board.anchor], Axes.of(board).drawn())
+                           for board in boards]} for name, boards in site.classes.items()]
+    top = headline(site)
+    return template("site/index.html.j2").render(
+        root="", links=beside.links(""), headline=top,
+        figures=[*([top.figure] if top else []), *key_figures(site)],
         moving=beside.picture(HEADLINE[0], ""), still=beside.picture(HEADLINE[1], ""),
         n_environments=sum(not board.is_aggregate for board in site.boards),
-        n_records=len(site.records), n_methods=len(site.methods), classes=classes,
-        season=about_season(site.season), robustness=ROBUSTNESS if families(site) else "",
+        n_records=len(site.records),
+        n_methods=len({record["method"] for record in site.records}), classes=classes,
+        season=site.about_season, robustness=ROBUSTNESS if families(site) else "",
         measured=MEASURED if measured.records else "",
         last=max(map(finished, site.records), default="")[:10],
-        explanations=explanations(list(made.values())))
-    return {"index.html": html.encode()} | {
-        each.file: rows_file(made[anchor], each.file) for anchor, each in longer.items() if each}
+        explanations=explanations(tables.values())).encode()

@@ -1,7 +1,8 @@
-"""The robustness board: what methods score at home, and where the truth is not what they believe.
+"""The robustness board: scores in the nominal world, and where the truth differs from the model.
 
-Errors of two worlds cannot be compared as they are: strong slugs are a larger part of what is
-there. So a method is judged by its gains, each over the floor in the same world, and by the least.
+Errors of two worlds are not comparable: strong slugs are a larger part of the truth. Methods are
+therefore judged by their gains, each relative to the floor in the same world, and ordered by the
+least.
 """
 
 from __future__ import annotations
@@ -9,70 +10,51 @@ from __future__ import annotations
 import math
 import re
 from statistics import fmean
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from markupsafe import Markup
 
 from eitbench.bench.table import NOTHING, Cell, Table, number_cell
 from eitbench.bench.text import number
 from eitbench.bench.tracks import home_of, ids, named
+from eitbench.report.model import Board, Row, kind_of, method_address
 from eitbench.report.site.beside import Beside
-from eitbench.report.site.collect import ROBUSTNESS, Board, Row, Site, method_address
+from eitbench.report.site.collect import ROBUSTNESS, Site
 from eitbench.report.site.environment import markdown
-from eitbench.report.site.tables import flags
-from eitbench.report.summary import kind_of
+from eitbench.report.tables import flags
 from eitbench.report.templates import template
 from eitbench.worlds.registry import entry
 
 BELOW = "below the floor"
 MEANINGS = {
-    "home": "ẽ_c in the world that methods were made for: squared distance from the truth over the "
-            "square of the truth, mean over the episodes; lower is better",
-    "a shift": "ẽ_c where one thing is not what methods are told or learned from, and how many "
-               "times that of home it is",
-    BELOW: "its ẽ_c is larger than that of the best floor in the same world, which knows next to "
-           "nothing",
-    "most": "the largest of the ratios to home, and of which shift",
-    "mean gain": "over the floor in the same world, as on the boards (0 as the floor, 1 perfect): "
-                 "the mean of all shifts",
-    "least gain": "the least of these, and of which shift; the board is ordered by it. Who has not "
-                  "finished all shifts has neither. Ratios alone would praise who is bad at home",
-    "reference": "is told the true flow; of noise, contacts and slugs that have changed it is told "
-                 "nothing, and is no bound",
+    "nominal": "ẽ_c in the world of the model: squared distance from the truth over the square of "
+               "the truth, mean over the episodes; lower is better",
+    "a shift": "ẽ_c where one property differs from the model and from the training episodes, and "
+               "its ratio to the nominal one",
+    BELOW: "ẽ_c is larger than that of the best floor in the same world",
+    "mean gain": "gain over the floor in the same world, as on the boards (0 as the floor, 1 "
+                 "perfect): the mean of all shifts",
+    "least gain": "the least of these gains, and its shift; the board is ordered by it. Methods "
+                  "that have not finished all shifts have neither. Ratios alone would favour "
+                  "methods with a large nominal error",
+    "reference": "has the true flow, but the nominal noise, contacts and slugs; it is not a bound",
 }
-"""What the board says, by its headings and marks."""
+"""Heading or mark -> explanation."""
 
 
 class Family(NamedTuple):
-    """A world, and those in which estimators believe to be in it."""
+    """A nominal world and its shifts."""
 
     home: str
     """id"""
-    at_home: Board | None
-    """None if nobody has a record there"""
+    nominal: Board | None
+    """None without a record"""
     shifts: dict[str, Board]
-    """Heading -> board, of those that anybody has played, as they were registered."""
-
-
-class Standing(NamedTuple):
-    """A method in a family."""
-
-    at_home: Row | None
-    shifted: dict[str, Row]
-    """Heading of a shift -> its row there, one at least."""
-    gains: dict[str, float]
-    """Heading of a shift -> gain over the floor there; empty if it has not finished all shifts."""
-    below: frozenset[str]
-    """Headings of the shifts in which it is worse than the best floor, and no floor itself."""
-
-    @property
-    def row(self) -> Row:
-        """By which it is named."""
-        return self.at_home or next(iter(self.shifted.values()))
+    """Heading -> board, of those with records, in the order of registration."""
 
 
 def families(site: Site) -> list[Family]:
-    """Of the registered ids with a `home`, those that have records; each home once."""
+    """Return the registered ids with a nominal id that have records, grouped by it."""
     boards = {board.environment: board for board in site.boards if not board.is_aggregate}
     found: dict[str, Family] = {}
     for id in ids():
@@ -90,125 +72,88 @@ def heading(id: str, home: str) -> str:
     return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", words).lower()
 
 
-def standings(family: Family) -> list[Standing]:
-    """Every method with a record of a shift: that with the largest least gain first, those that
-    have not finished all shifts last."""
-    at_home = {row.label: row for row in family.at_home.current} if family.at_home else {}
-    rows = {name: {row.label: row for row in board.current}
-            for name, board in family.shifts.items()}
-    floors = {name: floor(board) for name, board in family.shifts.items()}
-    made = []
-    for label in dict.fromkeys(label for own in rows.values() for label in own):
-        shifted = {name: own[label] for name, own in rows.items() if label in own}
-        gains = {name: row.cells["gain"] for name, row in shifted.items()
+def robustness_table(family: Family) -> Table:
+    """Return the board of a family, the largest least gain first, unfinished methods last."""
+    nominal = {row.label: row for row in family.nominal.rows} if family.nominal else {}
+    shifted = {name: {row.label: row for row in board.rows}
+               for name, board in family.shifts.items()}
+    floors = {name: _best_floor(board) for name, board in family.shifts.items()}
+    lines: list[tuple[float, dict[str, Cell | str], str]] = []
+    for label in dict.fromkeys(label for rows in shifted.values() for label in rows):
+        home = nominal.get(label)
+        own = {name: rows[label] for name, rows in shifted.items() if label in rows}
+        gains = {name: row.cells["gain"] for name, row in own.items()
                  if row.complete and row.cells["gain"] is not None}
-        below = frozenset(name for name, row in shifted.items() if "floor" not in row.badges
-                          and (row.cells["error"] or 0.0) > floors[name])
-        whole = gains.keys() == rows.keys()
-        made.append(Standing(at_home.get(label), shifted, gains if whole else {}, below))
-    return sorted(made, key=lambda each: -min(each.gains.values(), default=-math.inf))
+        row = home or next(iter(own.values()))
+        cells: dict[str, Cell | str] = {"method": _method(row), "nominal": _error(home)}
+        cells |= {name: _error(own.get(name), home, floors[name]) for name in family.shifts}
+        least = min(gains, key=gains.__getitem__) if gains.keys() == shifted.keys() else ""
+        cells["mean gain"] = number_cell(fmean(gains.values()) if least else None)
+        cells["least gain"] = Cell(number(gains[least]), gains[least],
+                                   small=least) if least else Cell(NOTHING)
+        lines.append((-gains[least] if least else math.inf, cells, flags(row)))
+    lines.sort(key=lambda line: line[0])
+    return Table.of([cells for _, cells, _ in lines], keep=["nominal"],
+                    label=f"{kind_of(family.home)} and its shifts",
+                    flags=[flag for _, _, flag in lines])
 
 
-def floor(board: Board) -> float:
-    """The least ẽ_c of a board's floors, the official ones where there are any; without, ∞."""
-    floors = [row for row in board.current if "floor" in row.badges and row.complete]
+def _best_floor(board: Board) -> float:
+    """Return the least ẽ_c of a board's floors, official ones where there are any; else ∞."""
+    floors = [row for row in board.rows if "floor" in row.badges and row.complete]
     official = [row for row in floors if row.cells["official"]]
     return min((row.cells["error"] for row in official or floors), default=math.inf)
 
 
-def robustness_table(family: Family) -> Table:
-    """The board of a family, with links from the site's folder."""
-    found = standings(family)
-    lines = [{"method": _method(each.row), "home": _error(each.at_home),
-              **{name: _shifted(each, name) for name in family.shifts},
-              "most": _most(each), "mean gain": _mean(each), "least gain": _least(each)}
-             for each in found]
-    return Table.of(lines, label=f"{kind_of(family.home)} and its shifts", keep=["home"],
-                    flags=[flags(each.row) for each in found])
-
-
 def _method(row: Row) -> Cell:
     title = row.cells["title"]
-    said = [word for word in row.badges if word in ("floor", "reference", "privileged")]
+    words = [word for word in row.badges if word in ("floor", "reference", "privileged")]
     return Cell(title, title.casefold(), small=row.label, link=method_address(row.cells["method"]),
-                badges=(*said, *["self-reported"] * (not row.cells["official"])))
+                badges=(*words, *["self-reported"] * (not row.cells["official"])))
 
 
-def _error(row: Row | None, small: str = "", badges: tuple[str, ...] = ()) -> Cell:
-    """ẽ_c, and what a row lacks."""
+def _error(row: Row | None, home: Row | None = None, floor: float = math.inf) -> Cell:
+    """Return ẽ_c, its ratio to the nominal one, and marks: worse than the floor, unfinished."""
     if row is None:
         return Cell(NOTHING)
-    lacks = tuple(word for word in row.badges if "failed" in word or "missing" in word)
     error = row.cells["error"]
+    lacks = [word for word in row.badges if "failed" in word or "missing" in word]
     if error is None:
-        return Cell(NOTHING, badges=lacks)
-    return Cell(number(error), error, small=small, badges=(*badges, *lacks))
-
-
-def _shifted(standing: Standing, name: str) -> Cell:
-    row = standing.shifted.get(name)
-    ratio = _ratio(standing, name)
-    marks = (BELOW,) if name in standing.below else ()
-    return _error(row, "" if ratio is None else f"× {number(ratio)}", marks)
-
-
-def _ratio(standing: Standing, name: str) -> float | None:
-    """ẽ_c of a shift over that of home; None unless it has finished both."""
-    home, row = standing.at_home, standing.shifted.get(name)
-    if home is None or row is None or not (home.complete and row.complete):
-        return None
-    if not home.cells["error"]:
-        return None
-    return float(row.cells["error"] / home.cells["error"])
-
-
-def _most(standing: Standing) -> Cell:
-    ratios = {name: ratio for name in standing.shifted
-              if (ratio := _ratio(standing, name)) is not None}
-    if not standing.gains or not ratios:
-        return Cell(NOTHING)
-    name = max(ratios, key=ratios.__getitem__)
-    return Cell(f"× {number(ratios[name])}", ratios[name], small=name)
-
-
-def _mean(standing: Standing) -> Cell:
-    return number_cell(fmean(standing.gains.values()) if standing.gains else None)
-
-
-def _least(standing: Standing) -> Cell:
-    if not standing.gains:
-        return Cell(NOTHING)
-    name = min(standing.gains, key=standing.gains.__getitem__)
-    return Cell(number(standing.gains[name]), standing.gains[name], small=name)
+        return Cell(NOTHING, badges=tuple(lacks))
+    below = [BELOW] if "floor" not in row.badges and error > floor else []
+    ratio = ""
+    if home and home.complete and row.complete and home.cells["error"]:
+        ratio = f"× {number(error / home.cells['error'])}"
+    return Cell(number(error), error, small=ratio, badges=(*below, *lacks))
 
 
 def robustness_pages(site: Site, beside: Beside) -> dict[str, bytes]:
-    """The HTML of the page; none where nobody has played a shift."""
+    """Return the HTML of the page; nothing without a record of a shift."""
     found = families(site)
     if not found:
         return {}
-    shown = [{"home": family.home, "board": family.at_home, "table": robustness_table(family),
-              "shifts": {name: (board, what_has_changed(board))
-                         for name, board in family.shifts.items()}} for family in found]
+    shown: list[dict[str, Any]] = [{
+        "home": family.home, "board": family.nominal, "table": robustness_table(family),
+        "shifts": {name: (board, definition(board)) for name, board in family.shifts.items()},
+    } for family in found]
     html = template("site/robustness.html.j2").render(
         root="", links=beside.links(""), families=shown, explanations=MEANINGS)
     return {ROBUSTNESS: html.encode()}
 
 
-def what_has_changed(board: Board) -> Markup:
-    """The first paragraph of what a shift says of itself, as HTML."""
+def definition(board: Board) -> Markup:
+    """Return the first paragraph of the description of a shift, as HTML."""
     id = next(row.record["environment"]["id"] for row in board.rows if row.record)
     return markdown(entry(id).about.strip().split("\n\n")[0])
 
 
 def robustness_text(site: Site) -> list[str]:
-    """The section of the boards as Markdown, in parts; none where nobody has played a shift."""
+    """Return the Markdown section in parts; nothing without a record of a shift."""
     found = families(site)
     if not found:
         return []
-    parts = ["## robustness", "What methods score where the truth is not what they are told or "
-             "learned from, beside what they score at home; ordered by the least gain over the "
-             "floor in the same world."]
+    parts = ["## robustness", "Scores where the truth differs from the model, beside nominal ones; "
+             "ordered by the least gain over the floor in the same world."]
     for family in found:
         parts += [f"### {kind_of(family.home)} and its shifts",
                   robustness_table(family).markdown()]

@@ -1,4 +1,4 @@
-"""Scores of injection policies: what was played, as rows, and the table made of them."""
+"""Scores of injection policies: ranked table, paired differences, and the adaptivity gap."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from eitbench.bench.text import mean_and_interval, rounded
 
 OPEN_LOOP = ("adjacent", "opposite", "transverse", "best_pair", "best_cycle", "best_currents",
              "schedule")
-"""Our policies that inject the same whatever is measured."""
+"""Built-in policies whose injections do not depend on the measurements."""
 
 
 def policy_rows(jobs: Sequence[Job], results: Iterable[dict[str, Any]]) -> pd.DataFrame:
-    """One row for each of the jobs that succeeded according to ``results``: policy, seed, and every
+    """Return one row for each job that succeeded according to ``results``: policy, seed, and every
     score of injection boards, in its own unit."""
     rows = [{"policy": result["method"], "seed": result["seed"], **result["scores"]}
             for result in successful(jobs, results).values()]
@@ -29,66 +29,60 @@ def policy_rows(jobs: Sequence[Job], results: Iterable[dict[str, Any]]) -> pd.Da
 
 
 def errors_by_policy(rows: pd.DataFrame) -> pd.DataFrame:
-    """ẽ_c with a row an episode and a column a policy; agents that differ in their training's seed
-    are averaged."""
-    named = rows.assign(policy=_without_training_seed(rows))
-    return named.pivot_table(index="seed", columns="policy", values="error")
+    """Return ẽ_c with a row an episode and a column a policy; agents that differ in their training
+    seed are averaged."""
+    return _untrained(rows).pivot_table(index="seed", columns="policy", values="error")
 
 
 def ranking(errors: pd.DataFrame) -> list[str]:
-    """Columns of `errors_by_policy`, the best first. Who failed in an episode comes after all who
-    did not: a mean over the others, perhaps the easy ones, is no match for theirs."""
+    """Return the columns of `errors_by_policy`, the best first; policies that failed in an episode
+    come last, since the others may be the easy ones."""
     return sorted(map(str, errors),
                   key=lambda name: (errors[name].isna().any(), errors[name].mean()))
 
 
-def _without_training_seed(rows: pd.DataFrame) -> pd.Series:
-    return rows["policy"].str.replace(r"_seed\d+$", "", regex=True)
+def _untrained(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return the rows with training seeds removed from the names."""
+    return rows.assign(policy=rows["policy"].str.replace(r"_seed\d+$", "", regex=True))
 
 
-def policy_table(rows: pd.DataFrame, privileged: Sequence[str], letters: int | None = None) -> str:
-    """Markdown: policies by their mean ẽ_c, and by how much each is worse than the best that is not
-    privileged, both with 95 % intervals over episodes; the means of all other scores that any of
-    them has; below it the adaptivity gap, if the policies for it were played.
+def policy_table(rows: pd.DataFrame, privileged: Sequence[str], width: int | None = None) -> str:
+    """Return Markdown: policies by their mean ẽ_c, their paired difference to the best that is not
+    privileged, both with 95 % intervals over episodes, the means of all other scores, and the
+    adaptivity gap if the policies for it are there.
 
-    Agents that differ in the seed of their training only are one policy: an episode's error is the
-    mean of theirs. Policies that did not finish every episode are below all that did, with the
-    number of those they did. What the filter says of itself has columns where an episode has it.
-    Of columns for which lines of so many ``letters`` have no room the last are left out.
+    Of columns for which lines of ``width`` characters have no room the last are left out.
     """
     if rows.empty:
         return "no episode was finished"
-    rows = rows.assign(policy=_without_training_seed(rows))
+    rows = _untrained(rows)
     errors = errors_by_policy(rows)
     names = ranking(errors)
     best = next((name for name in names if name not in privileged), names[0])
-    others = {name: score for name, score in scores("injection").items() if name != "error"}
     lines = []
     for name in names:
         own = rows[rows["policy"] == name]
         title = name + " (privileged)" * (name in privileged)
         if (finished := errors[name].count()) < len(errors):
             title += f" ({finished} of {len(errors)} episodes)"
-        behind = _mean(errors[name] - errors[best])
         cells: dict[str, Cell | str] = {
-            "policy": title,
-            "ẽ_c": _mean(errors[name]),
-            f"worse than {best} by": Cell(NOTHING) if name == best else behind,
-            **{score.heading: _summarised(own, score) for score in others.values()}}
+            "policy": title, "ẽ_c": _mean(errors[name]),
+            f"worse than {best} by":
+                Cell(NOTHING) if name == best else _mean(errors[name] - errors[best])}
+        cells |= {score.heading: _summarised(own, score)
+                  for score in scores("injection").values() if score.name != "error"}
         lines.append(cells)
     whole = Table.of(lines, keep=list(lines[0])[:3])
-    table = whole if letters is None else whole.fitted(letters, whole.headings)
-    text = table.markdown()
-    if left_out := whole.headings[len(table.headings):]:
-        text += f"\n\nno room for {', '.join(left_out)}"
+    table = whole if width is None else whole.fitted(width, whole.headings)
+    parts = [table.markdown(), *filter(None, [whole.left_out(table)])]
     there = [name for name in OPEN_LOOP if name in errors]
     needed = [*there, "clairvoyant", "random_pair"]
     if there and set(needed) <= set(errors) and not errors[needed].isna().any().any():
         gap, low, high = adaptivity_gap(rows, there)
         interval = (f"95 % interval {low:.2f} to {high:.2f}" if math.isfinite(low)
                     else f"an interval takes {FEWEST} episodes")
-        text += f"\n\nadaptivity gap {gap:.2f} ({interval}) over {len(errors)} episodes"
-    return text
+        parts.append(f"adaptivity gap {gap:.2f} ({interval}) over {len(errors)} episodes")
+    return "\n\n".join(parts)
 
 
 def _mean(values: pd.Series) -> Cell:
@@ -97,18 +91,16 @@ def _mean(values: pd.Series) -> Cell:
 
 
 def _summarised(own: pd.DataFrame, score: Score) -> Cell:
-    """The mean over the episodes, of times the fastest; nothing where no episode has it."""
-    if score.name not in own:
-        return Cell(NOTHING)
-    values = own[score.name].astype(float).dropna() * score.factor
+    """Return the mean over the episodes, of times the least; nothing without a value."""
+    values = own[score.name].astype(float).dropna() if score.name in own else pd.Series(dtype=float)
     if values.empty:
         return Cell(NOTHING)
-    return number_cell(float(values.mean() if score.repeats else values.min()))
+    return number_cell(score.factor * float(values.mean() if score.repeats else values.min()))
 
 
 def adaptivity_gap(table: pd.DataFrame, open_loop: Sequence[str]) -> tuple[float, float, float]:
-    """(best open-loop − clairvoyant) / (random − clairvoyant), mean errors each, with its 95 %
-    interval by bootstrap over the episodes, as `stratified_bootstrap`.
+    """Return (best open-loop − clairvoyant) / (random − clairvoyant) of mean errors, with the ends
+    of its 95 % bootstrap interval over the episodes, infinite where there are too few.
 
     Parameters
     ----------
@@ -116,17 +108,12 @@ def adaptivity_gap(table: pd.DataFrame, open_loop: Sequence[str]) -> tuple[float
         Columns policy, seed and error, with the policies clairvoyant, random_pair and
         ``open_loop``, all on the same episodes.
     open_loop : sequence of str
-        Names; the one of them with the least mean error counts.
-
-    Returns
-    -------
-    gap, low, high
-        The ends are infinite where there are too few episodes for an interval.
+        Names; the one with the least mean error counts.
 
     Raises
     ------
     ValueError
-        If one of these policies is not there, or has not played every episode.
+        If one of these policies is missing in some episode.
     """
     errors = table.pivot_table(index="seed", columns="policy", values="error")
     needed = ["clairvoyant", "random_pair", *open_loop]

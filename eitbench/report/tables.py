@@ -1,0 +1,195 @@
+"""Boards as tables for pages, Markdown and terminals."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
+
+from markupsafe import Markup
+
+from eitbench.bench.table import NOTHING, Cell, Table, number_cell
+from eitbench.bench.table import Row as TableRow
+from eitbench.bench.text import mean_and_interval, number, rounded, scores_by_seed, with_interval
+from eitbench.report import charts
+from eitbench.report.model import (
+    COSTS,
+    Board,
+    Row,
+    columns,
+    floor_of,
+    headings,
+    meanings,
+    method_address,
+)
+from eitbench.report.trainings import Line, lines
+
+COMPACT = ("seconds_per_step", "peak_memory")
+"""Numbers beside ranks and intervals in the index; the page of an environment has all."""
+WORST_GAIN = -1.0
+"""Lower end of the drawn axis of gains: a method twice as bad as the floor."""
+DRAWN = {"error": ("ẽ_c", True), "gain": ("gain", False)}
+"""Score with an interval -> heading, and whether its axis is logarithmic."""
+
+
+class Axes(NamedTuple):
+    """Drawn axes of a board's intervals: one for each column, with a line at the floor."""
+
+    ends: dict[str, tuple[float, float]]
+    marks: dict[str, float | None]
+
+    @classmethod
+    def of(cls, board: Board) -> Axes:
+        floor = floor_of(row.record for row in board.rows if row.record)
+        zero = next((row.cells["error"] for row in board.rows
+                     if floor and row.record is floor), None)
+        return cls({name: _ends(board, name) for name in DRAWN}, {"error": zero, "gain": 0.0})
+
+    def cell(self, row: Row, name: str, parts: Sequence[Row] = ()) -> Cell:
+        """Return a score with its interval, drawn and written, and the range of the trainings."""
+        value, low, high = row.three(name)
+        if math.isnan(value):
+            return Cell(NOTHING)
+        text, _, interval = with_interval(value, low, high).partition(" ")
+        each = sorted(part.cells[name] for part in parts if part.competes)
+        if each:
+            spread = with_interval(value, each[0], each[-1]).partition(" ")[2].strip("()")
+            interval += f" each {spread or number(value)}"
+        drawn = charts.cell((value, low, high), *self.ends[name], log=DRAWN[name][1],
+                            mark=self.marks[name], each=each)
+        return Cell(text, value, Markup(drawn), small=interval.strip())
+
+    def drawn(self) -> dict[str, Markup]:
+        """Return heading -> the axis of its column, as SVG."""
+        return {heading: Markup(charts.cell_axis(*self.ends[name], log=log, mark=self.marks[name]))
+                for name, (heading, log) in DRAWN.items()}
+
+
+def _ends(board: Board, name: str) -> tuple[float, float]:
+    """Return the ends of the axis that shows all intervals of the board."""
+    ends = [end for row in board.rows for end in row.three(name) if math.isfinite(end)]
+    if name == "gain":
+        return max(min(ends, default=0.0), WORST_GAIN), 1.0
+    positive = [end for end in ends if end > 0] or [1.0]
+    return min(positive), max(positive)
+
+
+def page_table(board: Board, root: str, *, compact: bool = False) -> Table:
+    """Return a board for a page; ``root`` leads from the page to the site's folder."""
+    axes = Axes.of(board)
+    together = lines(board)
+    beaten = _outperformed(together)
+    of_lines = Counter(line.row.cells["rank"] for line in together)
+    of_rows = Counter(row.cells["rank"] for row in board.rows)
+
+    def cells(row: Row, parts: Sequence[Row], shared: Counter[Any]) -> dict[str, Cell]:
+        return {"rank": _rank(row, shared), "method": _method(row, root, parts, beaten),
+                **{heading: axes.cell(row, name, parts) for name, (heading, _) in DRAWN.items()},
+                **_numbers(row, COMPACT if compact else headings())}
+
+    made = Table.of((cells(line.row, line.parts, of_lines) for line in together),
+                    label=board.title, keep=["rank"], flags=[flags(line.row) for line in together])
+
+    def part(row: Row) -> TableRow:
+        own = cells(row, (), of_rows)
+        return TableRow([own[heading] for heading in made.headings], flags(row))
+
+    return made._replace(rows=[row._replace(parts=tuple(map(part, line.parts)))
+                               for row, line in zip(made.rows, together, strict=True)])
+
+
+def markdown_table(board: Board) -> Table:
+    """Return a board as text: one line for each record."""
+    axes = Axes.of(board)
+    shared = Counter(row.cells["rank"] for row in board.rows)
+    return Table.of([{
+        "rank": _rank(row, shared), "method": _method(row, ""),
+        **{heading: axes.cell(row, name) for name, (heading, _) in DRAWN.items()},
+        "by": "official" if row.cells["official"] else "self-reported",
+        **_numbers(row, headings())} for row in board.rows], keep=["rank"])
+
+
+def run_table(board: Board, *, title: str = "title", drawn: bool = False) -> Table:
+    """Return the board of a user's own results.
+
+    ``title`` is the field that names a method. Intervals are ``drawn``, or ± half the 95 % interval
+    of the mean error is written.
+    """
+    axes = Axes.of(board)
+    rows = []
+    for row in board.rows:
+        failed = [word for word in row.badges if "failed" in word]
+        cells: dict[str, Cell | str] = {
+            "method": row.cells[title], "seeds": ", ".join([row.cells["seeds"], *failed])}
+        if drawn:
+            cells |= {heading: axes.cell(row, name) for name, (heading, _) in DRAWN.items()}
+        else:
+            cells["ẽ_c"] = _error(row)
+        cells |= _numbers(row, [name for name in headings() if name not in COSTS])
+        if row.cells["skill"] is None and row.cells.get("contrast_error") is not None:
+            without = 1.0 - row.cells["contrast_error"]
+            cells["skill"] = Cell(f"{number(without)}†", without)
+        rows.append(cells)
+    return Table.of(rows, label=board.title, keep=["ẽ_c", "skill"])
+
+
+def _error(row: Row) -> Cell:
+    errors = list(scores_by_seed(row.record, "error").values()) if row.record else []
+    if not errors:
+        return Cell(NOTHING)
+    return Cell(rounded(*mean_and_interval(errors)), row.cells["error"])
+
+
+def _numbers(row: Row, names: Iterable[str]) -> dict[str, Cell]:
+    known = columns()
+    return {known[name][0]: number_cell(row.cells[name]) for name in names}
+
+
+def _outperformed(together: list[Line]) -> dict[str, str]:
+    """Return label of a reference -> a note that competing methods have a smaller error."""
+    found = {}
+    before: list[str] = []
+    for row, _ in together:
+        if row.competes:
+            before.append(row.cells["title"])
+        elif before and "reference" in row.cells["note"]:
+            better = before[0] if len(before) == 1 else f"{len(before)} others"
+            found[row.label] = f"no bound: {better} better here"
+    return found
+
+
+def _rank(row: Row, shared: Counter[Any]) -> Cell:
+    rank = row.cells["rank"]
+    if rank is None:
+        return Cell(NOTHING)
+    last = row.cells.get("last_rank", rank)
+    if last > rank:
+        return Cell(f"{rank}–{last}", float(rank))
+    return Cell(f"{rank}", float(rank), small="shared" if shared[rank] > 1 else "")
+
+
+def _method(row: Row, root: str, parts: Sequence[Row] = (),
+            beaten: dict[str, str] | None = None) -> Cell:
+    title = row.cells["title"]
+    badges = list(row.badges)
+    if beaten is not None:
+        badges += [*filter(None, [beaten.get(row.label)]),
+                   *["self-reported"] * (not row.cells["official"])]
+    if parts:
+        return Cell(title, title.casefold(), small=f"mean of {len(parts)} trainings",
+                    badges=tuple(badges))
+    return Cell(title, title.casefold(), small=row.label, badges=tuple(badges),
+                link=root + method_address(row.cells["method"]))
+
+
+def flags(row: Row) -> str:
+    """Return the words by which the filters of a page select."""
+    holds = {"self-reported": not row.cells["official"], "unranked": row.unranked}
+    return " ".join(name for name, is_so in holds.items() if is_so)
+
+
+def explanations(tables: Iterable[Table]) -> dict[str, str]:
+    """Return heading -> explanation of the headings of these tables."""
+    shown = {heading for each in tables for heading in each.headings}
+    return {heading: text for heading, text in meanings().items() if heading in shown}

@@ -1,0 +1,226 @@
+"""Boards of a user's own results and their texts: statistics against scipy, rounding, skill, and order."""
+
+import math
+import re
+
+import numpy as np
+import pytest
+from eitbench.bench.text import mean_and_interval, number, rounded, seed_ranges, with_interval
+from eitbench.report.boards import run_boards
+from eitbench.report.model import title_of, world
+from eitbench.report.tables import run_table
+from eitbench.report.terminal import markdown, terminal_tables
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from tables import said
+from tiny import BOARD_IDS, record
+
+FLOOR, REFERENCE = [0.020, 0.024, 0.022], [0.004, 0.002, 0.003]
+
+
+def made(method, board, errors, kwargs=None, **changes):
+    """A record whose episode test:i has ``errors[i]``; with arguments of its environment, if any."""
+    if kwargs:
+        changes["environment"] = {"id": BOARD_IDS[board], "name": f"{board}-changed", "kwargs": kwargs}
+    return record(method, errors, board=board, version="v1", **changes)
+
+
+ANCHORS = [made("homogeneous", "smoothing", FLOOR), made("true_model_smoother", "smoothing", REFERENCE)]
+
+
+def row(records, method, board):
+    """The cells of one method on one board."""
+    return next(row.cells for each in run_boards(records) if each.of_class == board
+                for row in each.rows if row.cells["method"] == method)
+
+
+# -- statistics -------------------------------------------------------------------------------------------------------
+
+
+@given(st.lists(st.floats(0.001, 100.0), min_size=2, max_size=30))
+def test_interval_is_students(values):
+    """Mean and half width of the 95 % interval, as scipy.stats has them."""
+    mean, half = mean_and_interval(values)
+    assert mean == pytest.approx(np.mean(values), rel=1e-12)
+    expected = stats.sem(values) * stats.t(len(values) - 1).ppf(0.975)
+    assert half == pytest.approx(expected, rel=1e-9, abs=1e-12)
+
+
+def test_interval_of_known_numbers():
+    """1, 2, 3: t = 4.303 at two degrees of freedom, over √3. One value has no interval."""
+    assert mean_and_interval([1.0, 2.0, 3.0]) == pytest.approx((2.0, 4.302653 / math.sqrt(3)), rel=1e-6)
+    assert mean_and_interval([0.5]) == (0.5, math.inf)
+
+
+@pytest.mark.parametrize(("mean", "half", "text"), [
+    (0.00534, 0.00041, "0.0053 ± 0.0004"), (0.00534, 0.00013, "0.00534 ± 0.00013"), (1.234, 0.5, "1.2 ± 0.5"),
+    (12.34, 3.0, "12 ± 3"), (123.4, 1.2, "123.4 ± 1.2"), (0.0096, 0.00096, "0.0096 ± 0.0010"),
+    (0.0123, math.inf, "0.0123"), (2.0, 0.0, "2"), (0.0, 0.0, "0"),
+])
+def test_rounded_examples(mean, half, text):
+    """The interval has one significant digit, two after a 1; the mean ends at the same place."""
+    assert rounded(mean, half) == text
+
+
+@given(st.floats(1e-3, 100.0), st.floats(1.01e-5, 1.0))
+def test_rounding_stays_within_the_interval(mean, part):
+    """Read back, the mean lies within the interval, which is right to a third; both end at the same decimal place."""
+    half = max(part * mean, 1.01e-5)
+    shown = rounded(mean, half)
+    match = re.fullmatch(r"(\d+(?:\.(\d+))?) ± (\d+(?:\.(\d+))?)", shown)
+    assert match, shown
+    assert abs(float(match[1]) - mean) <= half / 2
+    assert abs(float(match[3]) - half) <= 0.34 * half
+    assert len(match[2] or "") == len(match[4] or "")
+
+
+@given(st.floats(1e-4, 1.0), st.floats(0.0, 1e-5))
+def test_no_interval_is_shown_as_nothing(mean, half):
+    """An interval too narrow for the table is left out, or keeps a digit; "± 0.00000" would claim certainty."""
+    shown = rounded(mean, half)
+    assert float(shown.split(" ± ")[0]) == pytest.approx(mean, rel=6e-3)
+    assert "±" not in shown or float(shown.split(" ± ")[1]) > 0
+
+
+@pytest.mark.parametrize(("value", "text"), [(0.01234, "0.012"), (1.234, "1.23"), (29.47, "29.5"), (999.4, "999"),
+                                           (999.6, "1000"), (3078.2, "3078"), (0.0, "0"), (-1.234, "-1.23")])
+def test_numbers_are_short_and_never_powers_of_ten(value, text):
+    assert number(value) == text
+
+
+# -- skill ------------------------------------------------------------------------------------------------------------
+
+
+def test_skill_of_the_anchors():
+    """0 for the homogeneous estimate of the smoothing board, 1 for the smoother with the true model."""
+    assert row(ANCHORS, "homogeneous", "smoothing")["skill"] == 0.0
+    assert row(ANCHORS, "true_model_smoother", "smoothing")["skill"] == 1.0
+
+
+@pytest.mark.parametrize("board", ["filter", "fixed-lag", "smoothing"])
+def test_skill_is_measured_on_shared_episodes(board):
+    """On each board, means over the episodes that all three have: here only the first, (20 − 8)/(20 − 4)."""
+    mine = made("mine", board, [0.008, None, None])
+    assert row([*ANCHORS, mine], "mine", board)["skill"] == pytest.approx(12 / 16)
+    assert row([*ANCHORS, made("mine", board, [None])], "mine", board)["skill"] is None
+
+
+def test_skill_needs_its_anchors():
+    """Without either anchor, or with anchors of another world only, there is no skill."""
+    mine = made("mine", "filter", FLOOR)
+    for others in ([], ANCHORS[:1], ANCHORS[1:]):
+        assert row([*others, mine], "mine", "filter")["skill"] is None
+    elsewhere = made("mine", "filter", FLOOR, kwargs={"world": {"schedule": {"scored_steps": 16}}})
+    assert row([*ANCHORS, elsewhere], "mine", "filter")["skill"] is None
+
+
+def test_skill_of_a_wrong_belief():
+    """1 is the smoother that knows the true model, so an assumed velocity has the same anchors as none."""
+    wrong = made("mine", "filter", FLOOR, kwargs={"assume": {"mean_velocity": 7.0}})
+    assert row([*ANCHORS, wrong], "mine", "filter")["skill"] == pytest.approx(0.0)
+
+
+@pytest.mark.parametrize("official", [True, False])
+def test_anchors_look_back_on_the_longest_made(official):
+    """The anchors are the smoothing board's, though others of the world stand beside them; of several versions the
+    official one counts, whichever comes first."""
+    others = [made("homogeneous", "filter", [0.5] * 3), made("true_model_smoother", "filter", [0.4] * 3)]
+    mine = made("mine", "filter", REFERENCE)
+    assert row([*others, *ANCHORS, mine], "mine", "filter")["skill"] == pytest.approx(1.0)
+    assert row([*others, mine], "mine", "filter")["skill"] == pytest.approx((0.5 - 0.003) / 0.1)
+    version = made("true_model_smoother", "smoothing", [0.001] * 3) | {"official": official}
+    expected = (0.022 - 0.003) / (0.022 - (0.001 if official else 0.003))
+    official_anchors = [anchor | {"official": not official} for anchor in ANCHORS]
+    for records in ([version, *official_anchors], [*official_anchors, version]):
+        assert row([*records, mine], "mine", "filter")["skill"] == pytest.approx(expected)
+
+
+# -- environments -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("id", "kwargs", "name", "title"), [
+    ("eitbench/Pipe2DFixedLag-v0", {}, "Pipe2D", "Pipe2DFixedLag-v0"),
+    ("eitbench/Pipe3DSmoothing-v0", {"lag": "all", "world": None}, "Pipe3D", "Pipe3DSmoothing-v0 (lag=all)"),
+    ("eitbench/Pipe2D-v0", {"world": {"schedule": {"scored_steps": 3}}}, "Pipe2D (schedule.scored_steps=3)",
+     "Pipe2D-v0 (schedule.scored_steps=3)"),
+    ("eitbench/Pipe2DBiasedVelocity-v0", {"world": {"region": None}, "assume": {"profile": "plug"}},
+     "Pipe2DBiasedVelocity (region=null)", "Pipe2DBiasedVelocity-v0 (assume.profile=plug, region=null)"),
+])
+def test_names(id, kwargs, name, title):
+    """A world is named without lag and assumptions, which leave the truth unchanged; a title has all arguments."""
+    given = {"environment": {"id": id, "name": "x" if kwargs else id.replace("/", "-"), "kwargs": kwargs}}
+    assert (world(given), title_of(given)) == (name, title)
+
+
+def test_order_of_boards_and_methods():
+    """Test seeds first, then worlds as registered, their boards, and methods by error; failures come last."""
+    records = [made("d", "smoothing", [0.2]), made("e", "filter", {"dev:0": 0.1}), made("c", "filter", [None]),
+               made("f", "filter", [0.1], id="eitbench/Pipe3D-v0"), made("b", "filter", [0.3]),
+               made("a", "filter", [0.2])]
+    found = run_boards(records)
+    assert [[row.cells["method"] for row in board.rows] for board in found] == [
+        ["a", "b", "c"], ["d"], ["f"], ["e"]]
+    assert all(row.cells["rank"] is None for board in found for row in board.rows)
+
+
+def test_all_episodes_of_a_run_are_shown():
+    """More than the floor has; gains are of the shared ones."""
+    records = [made("homogeneous", "filter", FLOOR, role="floor"), made("mine", "filter", [0.01] * 5)]
+    mine = row(records, "mine", "filter")
+    assert mine["seeds"] == "test:0-4" and mine["error"] == pytest.approx(0.01)
+    assert mine["gain"] == pytest.approx(1 - 0.01 / 0.022, rel=0.01)
+
+
+# -- tables -----------------------------------------------------------------------------------------------------------
+
+
+def test_failures_are_counted_not_averaged():
+    """Scores are of the finished episodes; the table has the number of others."""
+    (board,) = run_boards([made("mine", "filter", [0.1, 0.2, None]), made("bad", "filter", [None])])
+    text = said(run_table(board))
+    assert list(text["seeds"]) == ["test:0-2, 1 failed", "test:0, 1 failed"] and list(text["ẽ_c"])[1] == "–"
+    assert text["ẽ_c"][0] == rounded(*mean_and_interval([0.1, 0.2]))
+
+
+def test_units_and_missing_values():
+    """Time in ms, voltage discrepancy in mV²; the skill falls back to 1 − contrast; empty columns are absent."""
+    scores = {"seconds_per_step": 0.0025, "voltage_discrepancy": 4e-6, "contrast_error": 0.25}
+    (board,) = run_boards([made("mine", "filter", [0.1], scores=scores), made("other", "filter", [0.2])])
+    text = said(run_table(board))
+    assert (text["ms/step"][0], text["ẽ_V"][0], text["skill"][0]) == ("2.5", "4", "0.75†")
+    assert text["ẽ_V"][1] == text["skill"][1] == "–" and "CRPS" not in text
+
+
+def test_the_drawn_table_has_bootstrap_intervals():
+    """From six episodes on; the numbers are those of the board."""
+    (board,) = run_boards([made("mine", "filter", [0.1, 0.2, 0.15, 0.12, 0.18, 0.11])])
+    (cells,) = said(run_table(board, drawn=True)).to_dict("records")
+    assert cells["ẽ_c"] == with_interval(*board.rows[0].three("error")) and "(" in cells["ẽ_c"]
+
+
+def test_terminal_tables_fit_and_name_what_is_left_out():
+    """A title with what all rows share, aligned lines within the width, and the names of missing columns."""
+    scores = {"contrast_error": 0.2, "nis": 1.1, "crps": 1.0, "coverage_50": 0.5, "coverage_90": 0.9}
+    found = run_boards([made("mine", "filter", [0.1, 0.2], scores=scores), made("y" * 50, "filter", [0.2, 0.2])])
+    title, table, note, missing = terminal_tables(found, 70).split("\n\n")
+    assert title == "Pipe2D-v0, filter, test:0-1" and note.startswith("† ") and missing.startswith("no room for ")
+    lines = table.splitlines()
+    assert len(lines) == 4 and {len(line) for line in lines} == {len(lines[0])} and len(lines[0]) <= 70
+    assert "y" * 29 + "…" in table and lines[1].split("|")[2].endswith(":")
+    uneven = terminal_tables(run_boards([made("a", "filter", [0.1, 0.2]), made("b", "filter", [0.2])]), 200)
+    assert "| test:0-1" in uneven and uneven.startswith("Pipe2D-v0, filter\n")
+
+
+def test_markdown_is_a_table():
+    """Every line has the same number of cells and the same width, whatever a title contains."""
+    odd = made("mine", "filter", [0.1, 0.2], title="mine | yours")
+    lines = markdown(run_boards([odd, made("b", "filter", [0.2])])).splitlines()[2:]
+    assert len(lines) == 4 and re.fullmatch(r"[|:-]+", lines[1]) and len({len(line) for line in lines}) == 1
+    assert len({len(re.findall(r"(?<!\\)\|", line)) for line in lines}) == 1
+
+
+def test_seeds_are_named_by_their_ranges():
+    assert seed_ranges(["test:0", "test:1", "test:2", "test:7"]) == "test:0-2,7"
+    assert seed_ranges(["dev:10", "dev:9"]) == "dev:9-10" and seed_ranges(["300001"]) == "300001"
