@@ -114,14 +114,15 @@ def run_table(board: Board, *, title: str = "title", drawn: bool = False) -> Tab
     """Return the board of a user's own results.
 
     ``title`` is the field that names a method. Intervals are ``drawn``, or ± half the 95 % interval
-    of the mean error is written.
+    of the mean error is written. Seeds have a column if they differ.
     """
     axes = Axes.of(board)
+    seeds = run_seeds(board)
     rows = []
-    for row in board.rows:
-        failed = [word for word in row.badges if "failed" in word]
-        cells: dict[str, Cell | str] = {
-            "method": row.cells[title], "seeds": ", ".join([row.cells["seeds"], *failed])}
+    for row, played in zip(board.rows, seeds, strict=True):
+        cells: dict[str, Cell | str] = {"method": row.cells[title]}
+        if len(set(seeds)) > 1:
+            cells["seeds"] = played
         if drawn:
             cells |= {heading: axes.cell(row, name) for name, (heading, _) in DRAWN.items()}
         else:
@@ -132,6 +133,18 @@ def run_table(board: Board, *, title: str = "title", drawn: bool = False) -> Tab
             cells["skill"] = Cell(f"{number(without)}†", without)
         rows.append(cells)
     return Table.of(rows, label=board.title, keep=["ẽ_c", "skill"])
+
+
+def run_seeds(board: Board) -> list[str]:
+    """Return the seeds of each row, and how many of them failed."""
+    return [", ".join([row.cells["seeds"], *(word for word in row.badges if "failed" in word)])
+            for row in board.rows]
+
+
+def run_title(board: Board) -> str:
+    """Return environment, class, and the seeds if they are the same for all rows."""
+    seeds = set(run_seeds(board))
+    return ", ".join([board.title, board.of_class, *(seeds if len(seeds) == 1 else ())])
 
 
 def _error(row: Row) -> Cell:
