@@ -18,7 +18,7 @@ from solvers import entry_by_entry, pair_by_pair, refactorisations, splu_and_sol
 from eitbench.numerics.fem import element, to_skfem
 from eitbench.numerics.mesh import Mesh, graded_pipe_mesh
 from eitbench.physics.cem import CompleteElectrodeModel
-from eitbench.worlds.pipe2d import PIPE_2D
+from eitbench.worlds.catalogue import PIPE_2D
 
 SIZES = ((5, 13), (7, 20), (11, 32))
 """cells at an electrode and across: 4,300, 9,200 and 23,000 unknowns"""

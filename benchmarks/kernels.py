@@ -15,7 +15,7 @@ from references import reference_flow, reference_model
 from eitbench.physics.cem import CompleteElectrodeModel
 from eitbench.physics.flow import PlaneChannelFlow
 from eitbench.physics.transport import ConvectionDiffusion
-from eitbench.worlds.pipe2d import PIPE_2D
+from eitbench.worlds.catalogue import PIPE_2D
 
 CELLS = {"the estimators' model": (5, 14), "the truth": (10, 28)}
 FLOWS = {"the estimators' model": (PIPE_2D.model, 1), "the truth": (PIPE_2D.truth, 8)}

@@ -16,8 +16,8 @@ from eitbench.estimation.parameters import table_5_1
 from eitbench.numerics.mesh import rectangle_mesh
 from eitbench.physics.observation import ObservationModel
 from eitbench.physics.transport import ConvectionDiffusion
-from eitbench.worlds.parts import Discretisation
-from eitbench.worlds.pipe2d import PIPE_2D
+from eitbench.worlds.catalogue import PIPE_2D
+from eitbench.worlds.world import Discretisation
 
 CELLS = ((44, 10), (62, 15), (80, 20))
 """along and across the pipe: 495, 1008 and 1701 nodes"""

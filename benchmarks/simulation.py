@@ -18,7 +18,7 @@ from solvers import refactorisations
 from eitbench.data.bank import recording_bytes
 from eitbench.data.episodes import simulate, simulate_together, truth_discretisation
 from eitbench.physics.flow import PlaneChannelFlow
-from eitbench.worlds.pipe2d import PIPE_2D
+from eitbench.worlds.catalogue import PIPE_2D
 
 BANK = 256
 

@@ -17,7 +17,7 @@ from common import Row, ceilings, in_fresh_process, peak_growth
 
 import eitbench  # noqa: F401 (registers)
 from eitbench.data.bank import fill
-from eitbench.worlds.pipe2d import PIPE_2D
+from eitbench.worlds.catalogue import PIPE_2D
 
 ESTIMATION, INJECTION = "eitbench/Pipe2D-v0", "eitbench/Pipe2DInjection-v0"
 EPISODES = 64

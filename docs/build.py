@@ -38,7 +38,6 @@ ELSEWHERE = {
     "examples/bubble_tank": "worlds.md",
     "leaderboards/README.md": "leaderboards.md",
     "leaderboards/leaderboard.md": "boards-as-text.md",
-    "leaderboards/measured": "measured-data.md",
     "leaderboards/site": "boards",
     "studies/README.md": "studies.md",
 }

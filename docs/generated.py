@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parent.parent
 REFERENCE = {
     "eitbench": [f"eitbench.{name}" for name in (
         "evaluate", "Task", "Estimate", "make_task", "simulate", "Episode", "World", "Rules",
-        "register", "page", "report.plot", "data.learning.examples")],
+        "register", "page", "report.plot", "data.dataset")],
     "eitbench.envs": ["eitbench.envs.estimation.EstimationEnv",
                       "eitbench.envs.injection.InjectionEnv"],
     "eitbench.estimation": ["eitbench.estimation"],
@@ -29,7 +29,7 @@ REFERENCE = {
                         "eitbench.worlds.mesh_vessel", "eitbench.worlds.flows",
                         "eitbench.worlds.slugs", "eitbench.worlds.bodies",
                         "eitbench.worlds.instrument", "eitbench.worlds.schedule",
-                        "eitbench.worlds.parts"],
+                        "eitbench.worlds.world"],
     "eitbench.scoring": ["eitbench.scoring", "eitbench.bench.scores"],
     "eitbench.bench": ["eitbench.bench", "eitbench.bench.statistics", "eitbench.bench.ranking"],
     "eitbench.rl": ["eitbench.rl.training", "eitbench.rl.agents", "eitbench.rl.vec_env",

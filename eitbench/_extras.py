@@ -8,7 +8,7 @@ from contextlib import contextmanager
 EXTRAS = {
     "bench": ("cloudpickle", "jinja2", "jsonschema_rs", "markdown_it", "matplotlib", "orjson",
               "pandas", "PIL", "typer", "yaml"),
-    "export": ("h5py", "pyarrow"),
+    "export": ("h5py",),
     "mesh": ("meshio",),
     "minari": ("minari",),
     "rl": ("torch", "stable_baselines3", "sb3_contrib"),

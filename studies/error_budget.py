@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 import eitbench
-from eitbench.data.learning.examples import Example
+from eitbench.data.dataset import Example
 from eitbench.data.seeds import parse_seeds
 from eitbench.estimation import (
     InflowFilter,

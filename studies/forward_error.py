@@ -21,9 +21,8 @@ from eitbench.numerics.fem import mass_matrix
 from eitbench.numerics.mesh import graded_pipe_mesh
 from eitbench.physics.cem import CompleteElectrodeModel
 from eitbench.physics.observation import ObservationModel
-from eitbench.worlds.parts import Discretisation
-from eitbench.worlds.pipe2d import PIPE_2D
-from eitbench.worlds.world import World
+from eitbench.worlds.catalogue import PIPE_2D
+from eitbench.worlds.world import Discretisation, World
 
 SEEDS, STATES = "train:0-3", range(20, 99, 6)
 

@@ -15,7 +15,7 @@ from eitbench import simulate
 from eitbench.numerics.round import round_pipe_mesh
 from eitbench.physics.cem import CompleteElectrodeModel
 from eitbench.physics.observation import ObservationModel
-from eitbench.worlds.pipe3d import PIPE_3D
+from eitbench.worlds.catalogue import PIPE_3D
 
 REFERENCE = ((5, 6), 6, (2.5, 1.75, 2.5), 2)
 MESHES = {"P1": ((3, 4), 6, (2.0, 1.5, 2.0), 1), "P1, finer": ((4, 6), 7, (2.0, 1.5, 2.0), 1),

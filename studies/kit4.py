@@ -17,9 +17,8 @@ from matplotlib.figure import Figure
 from scipy.ndimage import center_of_mass, label
 from thesis.common import bare, save
 
-from eitbench.bench.measured import play_record
-from eitbench.bench.measured_cases import read_case
-from eitbench.envs.measured import MeasuredEnv
+from eitbench.bench.playing import run_on_measurements
+from eitbench.envs.measured import MeasuredEnv, case_env
 
 ROOT = Path(__file__).parents[1]
 RADIUS = 14.0
@@ -57,13 +56,13 @@ BODIES = {
 def main(folder: Path) -> None:
     figure = Figure(figsize=(10.5, 3.9), dpi=110, layout="constrained")
     for axes, (name, bodies) in zip(figure.subplots(1, len(BODIES)), BODIES.items(), strict=True):
-        case = read_case(ROOT / "leaderboards" / "measured" / f"{name}.yml")
-        env = case.env(folder / Path(case.file).name)
-        played = play_record(env, "log_map")
-        estimate = np.log10(played.mean[-1] / env.task.expected_concentration)
+        _, number = name.split("-")
+        env = case_env(name, folder / f"datamat_{number.replace('.', '_')}.mat")
+        run = run_on_measurements(env, "log_map")
+        estimate = np.log10(run.mean[-1] / env.task.expected_concentration)
         off = [distance(env, estimate, body) for body in bodies]
-        print(f"{name}: bodies are off by {', '.join(f'{each:.1f}' for each in off)} cm; readings "
-              f"that were withheld are missed by {played.withheld:.1f} noise std", flush=True)
+        print(f"{name}: bodies are off by {', '.join(f'{each:.1f}' for each in off)} cm; "
+              f"withheld RMSE {run.withheld_rmse:.1f} noise std", flush=True)
         draw(axes, env, estimate, bodies, name)
     shown = figure.axes[-1].collections[0]
     figure.colorbar(shown, ax=figure.axes, label="conductivity / background (decades)")

@@ -6,7 +6,8 @@ baselines/networks, and draws docs/learned_LESSON.png with scores on dev:0-31. E
 seen of them are kept in results/learned; the same command goes on from there.
 """
 
-from collections.abc import Mapping, Sequence
+import io
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -20,10 +21,9 @@ from networks import Correction, joined
 from tqdm import tqdm, trange
 
 import eitbench
-from eitbench.data import store
+from eitbench._files import write_atomically
 from eitbench.data.bank import fill
-from eitbench.data.learning.examples import Dataset, Example
-from eitbench.data.learning.reduced import strongest
+from eitbench.data.dataset import Dataset, Example, strongest
 from eitbench.data.parallel import in_parallel
 from eitbench.data.seeds import parse_seeds
 from eitbench.estimation import FilterSeen, FirstFrame, VoltagesSeen, suiting_models, suiting_priors
@@ -127,7 +127,6 @@ def features(examples: Dataset, example: Example, basis: np.ndarray,
         see = FilterSeen(task, prior, first.c_bh, basis, max(LAGS), model)
         inputs, (reduced, *each) = see.record(record, 0, *LAGS)
         later = {f"reduced {lag}": modes for lag, modes in zip(LAGS, each, strict=True)}
-    # in the order of `FEATURES`, in which `store` knows them again
     return {
         "inputs": inputs.astype(np.float32),
         "reduced": reduced,
@@ -145,8 +144,18 @@ def in_modes(examples: Dataset, example: Example, basis: np.ndarray,
 
 
 def basis_and_rest(lesson: Lesson) -> Mapping[str, np.ndarray]:
-    return store.kept(place(lesson) / "modes.npz", ("basis", "rest"),
-                      lambda: modes(eitbench.dataset(lesson.env, "train:0-99"), lesson.modes))
+    return kept(place(lesson) / "modes.npz",
+                lambda: modes(eitbench.dataset(lesson.env, "train:0-99"), lesson.modes))
+
+
+def kept(path: Path, make: Callable[[], Mapping[str, np.ndarray]]) -> Mapping[str, np.ndarray]:
+    """Return the arrays of a file; made and written first, if it is missing."""
+    if not path.exists():
+        content = io.BytesIO()
+        np.savez(content, **make())
+        write_atomically(path, content.getvalue())
+    with np.load(path) as stored:
+        return dict(stored)
 
 
 def of_episode(lesson: Lesson, seed: int, basis: np.ndarray) -> Mapping[str, np.ndarray]:
@@ -155,9 +164,7 @@ def of_episode(lesson: Lesson, seed: int, basis: np.ndarray) -> Mapping[str, np.
         examples = eitbench.dataset(lesson.env, [seed])
         return features(examples, examples[0], basis, lesson.sees)
 
-    later = [] if lesson.sees == "voltages" else [f"reduced {lag}" for lag in LAGS]
-    path = place(lesson) / lesson.sees / f"{seed}.npz"
-    return store.kept(path, (*FEATURES, *later), make, str(seed))
+    return kept(place(lesson) / lesson.sees / f"{seed}.npz", make)
 
 
 def place(lesson: Lesson) -> Path:

@@ -35,7 +35,7 @@ def main() -> None:
         for policy in policies:
             record = records[f"eitbench-{world}-v0", policy]
             exact = scores_by_seed(record, "error")
-            full = job_of(record, isolate="never")
+            full = job_of(record, isolate="none")
             reduced = Environment(full.environment.id, json.dumps({"estimator": "reduced"}))
             steps = [exact[seed]
                      - run_episode(Job(reduced, full.method,

@@ -18,10 +18,10 @@ from matplotlib.patches import Circle
 from scipy.optimize import least_squares
 from thesis.common import bare, save
 
-from eitbench.bench.measured import play_record
-from eitbench.bench.measured_cases import read_case
-from eitbench.data.measured.eidors import read
+from eitbench.bench.playing import run_on_measurements
 from eitbench.envs.measured import MeasuredEnv
+from eitbench.measured import read
+from eitbench.measured.cases import read_case
 
 ROOT = Path(__file__).parents[1]
 FIRST = 3
@@ -47,16 +47,16 @@ RODS = [Rod("IIRC, round the tank", "iirc", "v_rotate", True),
 def main(folder: Path) -> None:
     figure = Figure(figsize=(10.5, 3.9), dpi=110, layout="constrained")
     for axes, rod in zip(figure.subplots(1, len(RODS)), RODS, strict=True):
-        case = read_case(ROOT / "leaderboards" / "measured" / f"{rod.case}.yml")
-        record = read(folder / case.file, rod.variable)
-        env = MeasuredEnv(record, dict(case.vessel), **case.settings)
+        case = read_case(rod.case)
+        record = read(folder / case.file, name=rod.variable)
+        env = MeasuredEnv(record, dict(case.vessel), **case.options)
         ends = np.arange(FIRST * record.frame, len(record.readings) + 1, record.frame)
-        played = play_record(env, "log_steady_filter", kept=ends)
-        path = np.array([middle(env, estimate) for estimate in played.mean])
+        run = run_on_measurements(env, "log_steady_filter", kept=set(ends.tolist()))
+        path = np.array([middle(env, estimate) for estimate in run.mean])
         nearest = circle(path) if rod.is_round else line(path)
-        times = record.times[played.steps - 1]
-        print(f"{rod.title}: {described(path, nearest, rod.is_round)}; withheld readings are "
-              f"missed by {played.withheld:.2f} noise std", flush=True)
+        times = record.times[run.steps - 1]
+        print(f"{rod.title}: {described(path, nearest, rod.is_round)}; withheld RMSE "
+              f"{run.withheld_rmse:.2f} noise std", flush=True)
         radius = 100.0 * env.vessel.shape.radius
         axes.add_patch(Circle((0.0, 0.0), radius, fill=False, color="0.4"))
         axes.plot(*nearest.T, color="#d1495b", linewidth=1.2)

@@ -3,7 +3,7 @@
 Simulates tanks like those of the Kuopio Tomography Challenge (23 cm, 32 electrodes), with bodies
 that conduct 50 times better or 1000 times worse, on a mesh that no estimator has, estimates them
 with log_map, and prints the challenge's score of each rule. What scores best on the first twelve
-tanks, and of equals what claims least, is what `eitbench.bench.segmentation` does; twelve others
+tanks, and of equals what claims least, is what `eitbench.measured.segmentation` does; twelve others
 show what that is worth.
 """
 
@@ -16,10 +16,17 @@ import numpy as np
 from joblib import Parallel, delayed
 from tqdm import tqdm
 
-from eitbench.bench.measured import play_record
-from eitbench.bench.segmentation import BETTER, PIXELS, WATER, WORSE, ktc_score, segmented
-from eitbench.data.measured import Measurements
+from eitbench.bench.playing import run_on_measurements
 from eitbench.envs.measured import MeasuredEnv
+from eitbench.measured import Measurements
+from eitbench.measured.segmentation import (
+    CONDUCTIVE,
+    PIXELS,
+    RESISTIVE,
+    WATER,
+    ktc_score,
+    segment,
+)
 from eitbench.numerics.round import electrode_disc
 from eitbench.physics.cem import CompleteElectrodeModel
 from eitbench.worlds.vessels import RoundTank
@@ -28,7 +35,7 @@ RADIUS, COUNT, COVER = 0.115, 32, 0.5
 VESSEL = {"kind": "circle", "radius": RADIUS, "electrodes": COUNT, "cover": COVER}
 SIGMA = 0.15
 """S/m of the water; a plane model: A are A per m of depth"""
-RATIOS = {WORSE: 1e-3, BETTER: 50.0}
+RATIOS = {RESISTIVE: 1e-3, CONDUCTIVE: 50.0}
 NOISE = 1e-3
 """of a reading, and of the largest one a hundredth of that"""
 TANKS = 12
@@ -74,10 +81,10 @@ def scores(seed: int) -> np.ndarray:
     """(parts, leasts) of one tank."""
     bodies = drawn(seed)
     env = MeasuredEnv(record(bodies, seed), VESSEL)
-    estimate = play_record(env, "log_map").mean[-1]
+    estimate = run_on_measurements(env, "log_map").mean[-1]
     truth = picture(bodies)
-    return np.array([[ktc_score(truth, segmented(env, estimate, part, least)) for least in LEASTS]
-                     for part in PARTS])
+    return np.array([[ktc_score(truth, segment(env.vessel, env.task, estimate, part, least))
+                      for least in LEASTS] for part in PARTS])
 
 
 def drawn(seed: int) -> list[Body]:
@@ -90,7 +97,7 @@ def drawn(seed: int) -> list[Body]:
         far = (RADIUS - radius - 0.01) * np.sqrt(random.uniform())
         angle = random.uniform(0.0, 2.0 * np.pi)
         body = Body(far * np.array([np.cos(angle), np.sin(angle)]), random.choice([0, 3, 4]),
-                    radius, random.uniform(0.0, np.pi), random.choice([WORSE, BETTER]))
+                    radius, random.uniform(0.0, np.pi), random.choice([RESISTIVE, CONDUCTIVE]))
         if all(np.hypot(*(body.middle - other.middle)) > body.radius + other.radius + 0.01
                for other in bodies):
             bodies.append(body)

@@ -15,7 +15,7 @@ from eitbench.data.seeds import parse_seeds
 from eitbench.estimation import best_homogeneous, gauss_newton
 from eitbench.numerics.fem import stiffness_matrix
 from eitbench.scoring import relative_error
-from eitbench.worlds.pipe2d import PIPE_2D
+from eitbench.worlds.catalogue import PIPE_2D
 
 SEEDS, STATES = "train:0-3", (30, 60, 90)
 ALPHAS = 2.0 ** np.arange(-5, 2.5, 0.5)

@@ -7,9 +7,7 @@ from eitbench.numerics.mesh import graded_pipe_mesh, rectangle_mesh
 from eitbench.numerics.round import extrude, round_pipe_mesh, uniform_disc
 from eitbench.physics.cem import CompleteElectrodeModel
 from eitbench.worlds import entry, register
-from eitbench.worlds.pipe2d_biased import PIPE_2D_BIASED
-from eitbench.worlds.pipe2d_obstacle import PIPE_2D_OBSTACLE
-from eitbench.worlds.pipe3d import PIPE_3D
+from eitbench.worlds.catalogue import PIPE_2D_BIASED, PIPE_2D_OBSTACLE, PIPE_3D
 from eitbench.worlds.vessels import PlanePipe, RoundPipe
 
 

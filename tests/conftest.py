@@ -1,6 +1,7 @@
 """Which tests are the core, what processes of a run share, and one BLAS thread for each (several on
 few cores are slower, not faster)."""
 
+import hashlib
 import os
 from pathlib import Path
 
@@ -19,8 +20,8 @@ PLACES = {
     "examples": "study",                       # installs two packages and plays with them
     "bench/test_golden.py": "study",           # simulates every world, runs every method
     "bench/test_checkpoints.py": "study",      # plays every trained agent
-    "bench/test_replay.py": "study",           # plays records again
     "bench/test_verify.py": "study",           # plays records again, and false ones
+    "test_docs.py::test_documentation_builds": "study",
     "report/test_boards.py::test_published_files_are_rendered_from_the_records": "study",
     "report/test_site.py::test_the_published_site_is_rendered_from_the_records": "study",
     "report/test_site_browser.py": "browser",
@@ -48,11 +49,18 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture(scope="session")
 def run_cache(pytestconfig, tmp_path_factory):
-    """A cache folder that all processes share, and the next run too: what lies there names the code
-    it was computed with, so that other code never finds it. `pytest --cache-clear` empties it. With
-    `-p no:cacheprovider` a folder of this process."""
+    """A cache folder that all processes share, and the next run of the same code too. (Users' caches
+    depend on declared versions instead; tests must notice a change before its version is raised.)
+    `pytest --cache-clear` empties it. With `-p no:cacheprovider` a folder of this process."""
     kept = getattr(pytestconfig, "cache", None)
-    return str(kept.mkdir("episodes") if kept else tmp_path_factory.mktemp("episodes"))
+    if not kept:
+        return str(tmp_path_factory.mktemp("episodes"))
+    import eitbench  # not before BLAS has been told how many threads
+    code = hashlib.sha256()
+    for package in ("numerics", "physics", "worlds", "data"):
+        for file in sorted(Path(eitbench.__file__).parent.joinpath(package).glob("*.py")):
+            code.update(file.read_bytes())
+    return str(kept.mkdir(f"episodes-{code.hexdigest()[:16]}"))
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -3,16 +3,14 @@
 import hashlib
 
 import numpy as np
-from eitbench.data import recordings
-
-HEADER = 256
-"""Bytes before the first step of a recording of TINY."""
+from eitbench.data import beginnings, cache, regions
 
 
 def forget():
-    """What a new process does not know: files found in order, and outlines."""
-    recordings._sound.clear()
-    recordings._outline.cache_clear()
+    """Forget what a new process does not know: verified files, outlines and beginnings."""
+    cache._sound.clear()
+    regions._outline.cache_clear()
+    beginnings._beginning.cache_clear()
 
 
 def forget_made(module):

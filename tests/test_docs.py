@@ -5,6 +5,8 @@ import contextlib
 import io
 import json
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -63,3 +65,10 @@ def snippets(page: Path) -> list[str]:
 def test_an_estimator_reads_voltages_of_ones_own():
     """The page on measured data: the level of a homogeneous vessel comes out of its voltages."""
     assert printed(snippets(ROOT / "docs" / "measured-data.md")[1]) == "28.00 mol/m³"
+
+
+def test_documentation_builds():
+    """All pages with the generated ones, links and anchors whole; no notebook is executed."""
+    done = subprocess.run([sys.executable, "docs/build.py", "--draft"], cwd=ROOT, capture_output=True, text=True,
+                          check=False)
+    assert done.returncode == 0, done.stdout + done.stderr

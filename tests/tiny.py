@@ -5,9 +5,7 @@ import json
 from pathlib import Path
 
 from eitbench.bench import store
-from eitbench.bench.contradictions import split_of
-from eitbench.bench.records import SCHEMA, sealed
-from eitbench.bench.sandbox import keeper
+from eitbench.bench.records import SCHEMA, sealed, split_of
 from eitbench.bench.tracks import Environment
 
 SCENARIO = {"flow": {"mean_velocity": 45.0}, "schedule": {"scored_steps": 3, "pattern": {"frame": 2}},
@@ -140,10 +138,3 @@ def several_boards() -> list[dict]:
             record("<i>\"odd\"", of(0.8), title="Odd <script>alert(1)</script> & | \"co\"", runs=[RUN | {
                 "command": "eitbench submit --baseline '<b>it' --env x"}]),
             record("greedy_a", of(0.4), board="injection", scores={"spent": 30})]
-
-
-def without_namespaces(folder):
-    """The keeper of a system that grants none."""
-    path = folder / "keeper.py"
-    path.write_text(Path(keeper.__file__).read_text().replace("NAMESPACES[name] for", "1 for"))
-    return str(path)

@@ -1,6 +1,6 @@
 """Worlds whose episodes take a third of a second, made from ours."""
 
-from eitbench.worlds.pipe2d import PIPE_2D
+from eitbench.worlds.catalogue import PIPE_2D
 
 from short import merged
 

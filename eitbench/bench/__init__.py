@@ -1,38 +1,76 @@
-"""Floor 6: run methods on environments, keep what came out, and report it."""
+"""Methods, runs, scores, records and verification of the benchmark."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from eitbench._extras import needed_by
 
 if TYPE_CHECKING:
     import pandas as pd
 
+_COLUMNS = ("environment", "board", "method", "version", "title", "role", "privileged", "official",
+            "outdated", "split", "seed", "status", "metric", "value")
 
-def load(folder: Path | str | None = None) -> pd.DataFrame:
-    """All records of a folder as a tidy table: one row for each score of each episode.
+
+def load(folder: Path | str | None = None, *, measured: bool = False) -> pd.DataFrame:
+    """Load all records of a folder as a tidy table: one row for each score of each episode.
 
     Parameters
     ----------
     folder : path
-        Default: the published records, ``leaderboards/results``.
+        Default: the published records, ``leaderboards/results``, or the table of their episodes
+        where only that is installed.
+    measured : bool
+        Whether to include records of measured cases, which are in a checkout only.
 
     Returns
     -------
     DataFrame
         environment, board, method, version, title, role, privileged, official, outdated, split,
-        seed, status, metric, value. Metrics are named and measured as in
+        seed, status, metric, value. Metrics have the names and units of
         ``leaderboards/schema.json`` (s, V², bytes). A failed episode has one row, with the metric
-        error and no value. ``outdated`` are records of an earlier version of a method of ours than
-        there is one of: not to be mixed with the others.
+        error and no value. ``outdated`` marks records of an earlier version of a built-in method
+        than the newest one.
 
     Raises
     ------
     ValueError
-        Naming the file, if one is no valid record.
+        Naming the file, if one is not a valid record.
     """
     with needed_by("eitbench.leaderboard.load"):
-        from eitbench.bench.tidy import tidy
-    return tidy(folder)
+        import pandas as pd
+
+        from eitbench._files import shipped
+        from eitbench.bench.records import newest, read_measured_files, read_records
+    path = Path(folder or shipped("leaderboards") / "results")
+    records = read_records(path, keep=_without_steps)
+    if measured:
+        records += read_measured_files(path)[0].values()
+    groups = newest(records)
+    rows = [row for group, outdated in zip(groups, (False, True), strict=True)
+            for record in group for row in _rows(record, outdated)]
+    types = dict.fromkeys(("privileged", "official", "outdated"), bool) | {"value": float}
+    return pd.DataFrame(rows, columns=list(_COLUMNS)).astype(types)
+
+
+def _rows(record: dict[str, Any], outdated: bool) -> Iterator[tuple[Any, ...]]:
+    fields = record | {"environment": record["environment"]["name"], "outdated": outdated}
+    first = tuple(fields[name] for name in _COLUMNS[:10])
+    for episode in record["episodes"]:
+        scores = {"error": math.nan}
+        if episode["status"] == "ok":
+            scores = episode["scores"] | {"peak_memory": episode["peak_memory"]}
+        for metric, value in scores.items():
+            if value is not None:
+                yield *first, episode["seed"], episode["status"], metric, value
+
+
+def _without_steps(record: dict[str, Any]) -> dict[str, Any]:
+    """Drop the errors of single steps, most of a record, which no row holds."""
+    for episode in record["episodes"]:
+        episode.pop("step_errors", None)
+    return record

@@ -1,4 +1,4 @@
-"""`evaluate`: the scores of a method as a table, from Python, with nothing written to disk."""
+"""`evaluate`: the scores of a method as a table, in Python, with nothing written to disk."""
 
 from __future__ import annotations
 
@@ -14,61 +14,81 @@ from tqdm import tqdm
 from eitbench import _check
 from eitbench.bench.methods import FORMS, Method, load_method, method_of
 from eitbench.bench.playing import play
+from eitbench.bench.run import Job
 from eitbench.bench.scores import scored
+from eitbench.bench.suites import isolated_job
 from eitbench.bench.tracks import Environment
 from eitbench.data.parallel import in_parallel
 from eitbench.data.seeds import name_seed, parse_seeds
 
 
 def evaluate(method: Any, env: str | gym.Env, seeds: str | Iterable[int], *,
-             world: dict[str, Any] | None = None, n_jobs: int = 1) -> pd.DataFrame:
-    """Play a method on episodes, and score it as the commands do.
+             world: dict[str, Any] | None = None, n_jobs: int = 1,
+             isolate: str | None = None) -> pd.DataFrame:
+    """Run a method on episodes, and score it as the commands do.
+
+    By default the method's code runs in this process, with all its rights: it can read the truth,
+    files and the network. Use ``isolate`` for a third-party file.
 
     Parameters
     ----------
     method : class, name or path
-        A class ``Estimator`` or ``Policy`` as in a method's file, under whatever name; or the name
-        of one of ours; or the path of a file. It plays in this process (with ``n_jobs`` in those
-        that are started), not behind a wall.
+        A class ``Estimator`` or ``Policy`` as in a method's file, under any name; or the name of a
+        built-in method; or the path of a file.
     env : str or Env
-        A registered id, or an environment that `gymnasium.make` has made, whose arguments count.
+        A registered id, or an environment made by `gymnasium.make`, whose arguments are used.
     seeds : str or iterable of int
         As in ``"dev:0-9"``, or the seeds themselves.
     world : dict
         Changes of the world's parts, as `gymnasium.make` takes them.
     n_jobs : int
-        Processes. With one, what the method prints is seen, and a debugger stops in it.
+        Processes. With one, the method's output is shown, and a debugger stops in it.
+    isolate : str
+        As the option ``--isolate`` of ``eitbench run``, for a method by name or path: the method
+        runs in a separate process. Default: in this process, or those of ``n_jobs``.
 
     Returns
     -------
     DataFrame
         A row for each seed: environment, method, seed (as ``dev:3``), and each score by its name,
-        in SI units as in ``leaderboards/schema.json``; None where the method claims nothing.
+        in SI units as in ``leaderboards/schema.json``; None where the method gives no value.
 
     Raises
     ------
     ValueError
         If an argument is wrong, or the method does not suit the environment.
     Exception
-        Whatever the method raises, with a note that says in which episode.
+        The exception that the method raises, with a note that names the episode.
     """
     asked = environment_of(env, world)
-    loaded = method_given(method, asked.track)
+    if isolate is None:
+        runner: Method | Job = method_given(method, asked.track)
+    elif isinstance(method, str | Path):
+        runner = isolated_job(asked, str(method), isolate)
+    else:
+        raise ValueError("method must be a name or a path to be isolated, got "
+                         f"{type(method).__name__}")
     numbers = parse_seeds(seeds) if isinstance(seeds, str) else [
         _check.integer("seeds", seed, low=0) for seed in seeds]
     if not numbers:
         raise ValueError("seeds must name at least one episode, got none")
-    work = [(asked, loaded, seed) for seed in numbers]
+    work = [(asked, runner, seed) for seed in numbers]
     if _check.integer("n_jobs", n_jobs, low=1) == 1:
         played: Iterable[dict[str, Any]] = (_row(*each) for each in work)
     else:
         played = in_parallel(_row, work, n_jobs)
-    bar = tqdm(played, total=len(work), desc=loaded.name, unit="episode", disable=None)
+    bar = tqdm(played, total=len(work), desc=_method(runner).name, unit="episode", disable=None)
     rows = {row["seed"]: row for row in bar}
     return pd.DataFrame([rows[name_seed(seed)] for seed in dict.fromkeys(numbers)])
 
 
-def _row(asked: Environment, method: Method, seed: int) -> dict[str, Any]:
+def _method(runner: Method | Job) -> Method:
+    """Return the method; of a job that of the isolated process, which is started once."""
+    return runner.load() if isinstance(runner, Job) else runner
+
+
+def _row(asked: Environment, runner: Method | Job, seed: int) -> dict[str, Any]:
+    method = _method(runner)
     try:
         outcome = play(asked, method, seed).outcome
     except Exception as error:

@@ -1,124 +1,139 @@
-"""Episodes that nobody could prepare for: their seeds follow from a salt that only the maintainers
-know.
+"""Compare a record with held-out episodes, whose seeds follow from a secret of the maintainers.
 
-Held-out episode k = 0, 1, … has the seed SHA-256(salt ‖ k) mod 2⁶³, k as eight bytes, the first the
-highest. The salt's own SHA-256 is published, so that it cannot be chosen after a method was seen
-(`eitbench.bench.salts`).
+Held-out episode k = 0, 1, … has the seed SHA-256(secret ‖ k) mod 2⁶³, with k as eight bytes, most
+significant first. The SHA-256 of the secret is committed to ``leaderboards/held_out.json``, so that
+the secret cannot be chosen after a method was seen.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+import hashlib
+import json
+import math
+import os
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from scipy.stats import permutation_test
 
-from eitbench.bench.contradictions import version_number
+from eitbench._files import shipped
+from eitbench.bench.isolation import check_out_of_reach
 from eitbench.bench.methods import is_ours
 from eitbench.bench.run import Job, run_episode
-from eitbench.bench.statistics import FEWEST
-from eitbench.bench.table import Cell, Table
 from eitbench.bench.text import scores_by_seed
-from eitbench.bench.too_good import judged, too_good
 from eitbench.bench.tracks import FLOORS
-from eitbench.data.seasons import drawn_seeds
-from eitbench.data.seeds import parse_seeds
+from eitbench.data.seeds import SPLITS, parse_seeds
+
+COMMITMENT = shipped("leaderboards") / "held_out.json"
+SECRET_BYTES = 32
+SIGNIFICANCE_LEVEL = 0.05
+MIN_RATIO = 1e-12
+FIRST_SEED = max(split.stop for split in SPLITS.values())
+"""Seeds below belong to the public splits."""
 
 
-class Plays(NamedTuple):
-    """What is played to judge a record: no record of the floor is believed."""
+def read_secret(path: Path) -> bytes:
+    """Read the secret, hexadecimal digits in a file of its owner only. ``ValueError`` if it cannot
+    be read, others or isolated methods can read it, or another secret is committed."""
+    check_out_of_reach(path, "secret")
+    try:
+        is_shared = os.name == "posix" and path.stat().st_mode & 0o077
+        secret = bytes.fromhex(path.read_text())
+    except (OSError, ValueError) as error:
+        raise ValueError(f"secret {path} must be a file of hexadecimal digits: {error}") from None
+    if is_shared:
+        raise ValueError(f"secret {path} must be readable by its owner only; use `chmod 600`")
+    if len(secret) != SECRET_BYTES:
+        raise ValueError(f"secret {path} must have {SECRET_BYTES} bytes, got {len(secret)}")
+    committed = json.loads(COMMITMENT.read_text())["salt_sha256"] if COMMITMENT.exists() else None
+    if committed != hashlib.sha256(secret).hexdigest():
+        raise ValueError(f"secret {path} has the sha256 {hashlib.sha256(secret).hexdigest()}, but "
+                         f"{COMMITMENT} commits to {committed}")
+    return secret
 
-    own: list[Job]
-    """The method in held-out episodes."""
-    beside: list[Job]
-    """The board's floor in the same."""
-    there: list[Job]
-    """The floor in the record's episodes that the method has finished."""
+
+def held_out_seeds(secret: bytes, count: int) -> list[int]:
+    """Return the seeds of the first ``count`` held-out episodes."""
+    digests = (hashlib.sha256(secret + k.to_bytes(8, "big")).digest() for k in range(count))
+    drawn = (int.from_bytes(digest, "big") % 2**63 for digest in digests)
+    return [seed if seed >= FIRST_SEED else seed + FIRST_SEED for seed in drawn]
 
 
-def plays(record: dict[str, Any], job: Job, salt: bytes, episodes: int) -> Plays:
-    """What is to be played to judge a record by so many held-out episodes.
+def verify_held_out(record: dict[str, Any], job: Job, secret: bytes,
+                    episodes: int) -> tuple[dict[str, str], list[str]]:
+    """Run a record's method on held-out episodes, and test whether its record is better.
+
+    The errors of both are relative to those of the naive baseline on the same episodes, which is
+    run here too.
 
     Parameters
     ----------
     record, job
-        As read, and what `verify.job_of` makes of it.
-    salt : bytes
-        As read by `salts.read_published_salt`.
+        As read, and as `verify.job_of` returns.
+    secret : bytes
     episodes : int
-        How many held-out episodes the method and the board's floor play.
+        How many held-out episodes.
+
+    Returns
+    -------
+    row, problems
+        Geometric mean of the relative errors, public and held-out, and p; a sentence for each
+        problem.
 
     Raises
     ------
     ValueError
-        If the episodes are too few to judge, or the method is a stranger's and could reach their
-        seeds.
+        If the episodes are too few for the test, or the method is third-party and not confined by
+        bubblewrap: it could read the seeds.
     """
-    if not is_ours(job.method) and job.isolation != "landlock":
-        raise ValueError(f"{job.method} is not ours and can play held-out episodes behind a wall "
-                         f"only, Landlock's; here isolation is {job.isolation}")
-    errors = scores_by_seed(record, "error")
-    if min(episodes, len(errors)) < 2 or episodes + len(errors) < FEWEST:
-        raise ValueError(f"held-out episodes and those of the record must be {FEWEST} together, "
-                         f"and two each, to be compared; got {episodes} and {len(errors)}")
-    floor = Job(job.environment, FLOORS[job.environment.track], 0)
-    seeds = drawn_seeds(salt, episodes)
-    return Plays([job._replace(seed=seed) for seed in seeds],
-                 [floor._replace(seed=seed) for seed in seeds],
-                 [floor._replace(seed=parse_seeds(name)[0]) for name in errors])
+    if not is_ours(job.method) and job.isolation != "bubblewrap":
+        raise ValueError(f"{job.method} must run under bubblewrap on held-out episodes, got "
+                         f"isolation {job.isolation}")
+    public = scores_by_seed(record, "error")
+    if math.comb(episodes + len(public), episodes) < 2.0 / SIGNIFICANCE_LEVEL:
+        raise ValueError("held-out and recorded episodes must be more for a test, got "
+                         f"{episodes} and {len(public)}")
+    baseline = Job(job.environment, FLOORS[job.environment.track], 0)
+    seeds = held_out_seeds(secret, episodes)
+    own, naive = (_errors(each, seeds) for each in (job, baseline))
+    there = _errors(baseline, [parse_seeds(name)[0] for name in public])
+    problems = [f"held-out episode {k}: {error}" for k, error in enumerate(own)
+                if isinstance(error, str)]
+    recorded = _log_ratios(list(public.values()), there)
+    held_out = _log_ratios(own, naive)
+    if min(len(recorded), len(held_out)) < 2:
+        return {}, problems
+    p = p_value(recorded, held_out)
+    means = [float(np.exp(each.mean())) for each in (recorded, held_out)]
+    row = {"recorded": f"{means[0]:.3g} ({len(recorded)})",
+           "held-out": f"{means[1]:.3g} ({len(held_out)})", "p": f"{p:.2g}"}
+    if p < SIGNIFICANCE_LEVEL:
+        problems.append(f"error relative to {baseline.method}: {means[0]:.3g} in the record, "
+                        f"{means[1]:.3g} on held-out episodes (p = {p:.2g})")
+    return row, problems
 
 
-def verdict(record: dict[str, Any], own: list[dict[str, Any]], beside: list[dict[str, Any]],
-            there: list[dict[str, Any]]) -> tuple[str, list[str]]:
-    """Whether what a record says is better than what its method does in held-out episodes.
-
-    Parameters
-    ----------
-    record
-        As read.
-    own, beside, there
-        The results of its `plays`, in their order.
-
-    Returns
-    -------
-    table, differences
-        Markdown, and a sentence for each thing that is not as the record says;
-        `too_good.judged` says how the two are compared.
-    """
-    errors = scores_by_seed(record, "error")
-    said = [{"status": "ok", "scores": {"error": error}} for error in errors.values()]
-    differences = [f"failed in a held-out episode: {result['message']}"
-                   for result in (*own, *beside) if result["status"] == "failed"]
-    if version_number(record["version"]) is None:  # whose file was looked at some time ago
-        played = {result["method_sha256"] for result in own if "method_sha256" in result}
-        differences += [f"the file that played has the sha256 {other}, that of the record has "
-                        f"{record['method_sha256']}"
-                        for other in sorted(played - {record["method_sha256"]})]
-    differences += [f"the floor failed in {name}: {result['message']}"
-                    for name, result in zip(errors, there, strict=True)
-                    if result["status"] == "failed"]
-    record_pairs = _pairs(said, there)
-    new_pairs = _pairs(own, beside)
-    if min(len(record_pairs), len(new_pairs)) < 2:
-        return "", differences
-    found = judged(record_pairs, new_pairs)
-    rows: list[dict[str, Cell | str]] = [
-        {"compared with the floor": finding.name,
-         f"record, {len(record_pairs)} episodes": Cell(f"{finding.record:.3g}"),
-         f"held-out, {len(new_pairs)}": Cell(f"{finding.held_out:.3g}"),
-         "p": Cell(f"{finding.p:.2g}")} for finding in found]
-    differences += [f"{finding.name}: {finding.record:.3g} in the record, {finding.held_out:.3g} "
-                    f"held-out; so much better is an honest record with p = {finding.p:.2g}"
-                    for finding in too_good(found)]
-    return Table.of(rows).markdown(), differences
+def p_value(recorded: np.ndarray, held_out: np.ndarray, n_resamples: int = 9999) -> float:
+    """Return how often a random division of all values has recorded ones at least as small,
+    relative to the held-out ones, in the mean (permutation test, one-sided)."""
+    result = permutation_test(
+        (recorded, held_out), lambda a, b, axis: a.mean(axis=axis) - b.mean(axis=axis),
+        vectorized=True, alternative="less", n_resamples=n_resamples,
+        random_state=np.random.default_rng(0))
+    return float(result.pvalue)
 
 
-def held_out(record: dict[str, Any], todo: Plays) -> tuple[str, list[str]]:
-    """Play all that is to be played here and now, one after the other; the `verdict`."""
-    return verdict(record, *([run_episode(job)[0] for job in jobs] for jobs in todo))
+def _errors(job: Job, seeds: list[int]) -> list[Any]:
+    """Return the error of each episode, or the message of one that failed."""
+    results = (run_episode(job._replace(seed=seed))[0] for seed in seeds)
+    return [result["scores"]["error"] if result["status"] == "ok" else result["message"]
+            for result in results]
 
 
-def _pairs(own: list[dict[str, Any]], floor: list[dict[str, Any]]) -> np.ndarray:
-    """(n, 2) ẽ_c of a method and of the floor, of the episodes that both finished."""
-    pairs = [(a["scores"]["error"], b["scores"]["error"]) for a, b in zip(own, floor, strict=True)
-             if a["status"] == b["status"] == "ok"]
-    return np.array([pair for pair in pairs if pair[1] > 0.0]).reshape(-1, 2)
+def _log_ratios(errors: list[Any], naive: list[Any]) -> np.ndarray:
+    """Return log(error / naive error) of the episodes that both finished, rounded to what another
+    processor repeats."""
+    ratios = [a / b for a, b in zip(errors, naive, strict=True)
+              if not isinstance(a, str) and not isinstance(b, str) and b > 0.0]
+    return np.round(np.log(np.maximum(ratios, MIN_RATIO)), 6)

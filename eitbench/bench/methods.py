@@ -179,6 +179,12 @@ def _loaders() -> dict[str, EntryPoint]:
     return {f".{point.name}": point for point in entry_points(group=LOADERS)}
 
 
+def loader_of(path: Path) -> str:
+    """Return the module and function that load a method's file; empty for a .py file."""
+    point = _loaders().get(path.suffix)
+    return "" if point is None else point.value
+
+
 def version_of(path: Path, sha256: str) -> str:
     """What a method's records say of its version: of ours that of its card, v1 where there is none;
     of all others eight digits of their file's sha256."""

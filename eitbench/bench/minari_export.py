@@ -1,4 +1,4 @@
-"""What a policy injects, as a Minari data set."""
+"""Export the episodes of a policy as a Minari data set."""
 
 from __future__ import annotations
 
@@ -14,38 +14,37 @@ from eitbench.bench.methods import Method, load_method
 from eitbench.bench.playing import policys_random
 from eitbench.bench.tracks import check_track
 from eitbench.data.bank import fill
-from eitbench.data.learning.card import ranges
-from eitbench.data.learning.examples import asked_seeds
+from eitbench.data.dataset import asked_seeds
+from eitbench.data.export import WARNING, seed_ranges
 from eitbench.data.seeds import for_scores, is_test, name_seed
-from eitbench.envs.injection import InjectionEnv
 
 if TYPE_CHECKING:
     from minari.data_collector import EpisodeBuffer
 
-CARD = """\
+DESCRIPTION = """\
 {env}: process tomography in which an agent chooses every injection. Policy {policy}: {title}. \
 Episodes {seeds}; the seed of each is in its metadata, and with it and the actions the environment \
 gives the same observations and rewards again. Observations are scaled, as \
-eitbench.envs.injection_core.scaled says; rewards are by how much the estimate's relative squared \
-error lies below that of the best constant, zero in states that are not scored. Simulated by \
-eitbench {version}; no measured data, no persons. Licence: MIT. {warning}"""
+eitbench.envs.injection_core.scaled says; rewards are the difference between the relative squared \
+errors of the best constant and of the estimate, zero in states that are not scored. Simulated by \
+eitbench {version}; no measured data, no personal data. Licence: MIT. {warning}"""
 
 
 def export_minari(name: str, env: str, policy: str, seeds: str | Sequence[int], *,
                   n_jobs: int = 1, backend: str = "loky") -> int:
-    """Let a policy play, and write its episodes where Minari finds them; return their number.
+    """Run a policy, write its episodes where Minari finds them, and return their number.
 
     All are written at the end: an interrupted export leaves nothing but simulated episodes in the
-    cache, and begins anew.
+    cache, and starts again.
 
     Parameters
     ----------
     name : str
         Of the data set, as in ``eitbench/pipe2d/random-pair-v0``.
     env : str
-        Id of an injection environment, which is played as ``gym.make(env)``.
+        Id of an injection environment, which is made by ``gym.make(env)``.
     policy : str
-        Name of one of our policies, or the path of a file, which runs in this process.
+        Name of a built-in policy, or the path of a file, which runs in this process.
     seeds : str or sequence of int
         As of `eitbench.dataset`.
     n_jobs, backend
@@ -54,8 +53,8 @@ def export_minari(name: str, env: str, policy: str, seeds: str | Sequence[int], 
     Raises
     ------
     ValueError
-        If there is no such environment, policy or seed, the policy does not suit the environment,
-        or the name is malformed or taken.
+        For an unknown environment, policy or seed, a policy that does not suit the environment, or
+        a name that is malformed or taken.
     ModuleNotFoundError
         If Minari is not installed.
     """
@@ -64,18 +63,18 @@ def export_minari(name: str, env: str, policy: str, seeds: str | Sequence[int], 
     _check_name(name)
     check_track(env, "injection")
     numbers = asked_seeds(seeds)
-    player = load_method(policy, "injection")
+    method = load_method(policy, "injection")
     made = gym.make(env)
-    inner = _inner(made)
-    if not player.suits(inner.rules):
+    inner: Any = made.unwrapped
+    if not method.suits(inner.rules):
         raise ValueError(f"policy must suit env, got {policy!r}, which does not")
     fill(inner.world, numbers, n_jobs=n_jobs, backend=backend)
-    episodes = [_played(made, player, seed, k) for k, seed in enumerate(
+    episodes = [_run(made, method, seed, k) for k, seed in enumerate(
         tqdm(numbers, desc="playing", unit="episode", disable=None))]
     # by its id: the spec of one that is made knows its length, and would be truncated there too
-    create_dataset_from_buffers(name, episodes, env=env, algorithm_name=player.name,
+    create_dataset_from_buffers(name, episodes, env=env, algorithm_name=method.name,
                                 author="eitbench", requirements=["eitbench"],
-                                description=_card(env, player, numbers))
+                                description=_description(env, method, numbers))
     return len(episodes)
 
 
@@ -92,35 +91,29 @@ def _check_name(name: str) -> None:
                          f"`minari delete {name}` removes")
 
 
-def _inner(env: gym.Env[Any, Any]) -> InjectionEnv:
-    inner = env.unwrapped
-    assert isinstance(inner, InjectionEnv)
-    return inner
-
-
-def _played(env: gym.Env[Any, Any], policy: Method, seed: int, number: int) -> EpisodeBuffer:
+def _run(env: gym.Env[Any, Any], policy: Method, seed: int, number: int) -> EpisodeBuffer:
+    """Run one episode."""
     from minari.data_collector import EpisodeBuffer
-    inner = _inner(env)
+    inner: Any = env.unwrapped
     with for_scores():
-        seen = [env.reset(seed=seed)[0]]
+        observations = [env.reset(seed=seed)[0]]
     player = policy.make(inner.rules, policys_random(seed), *[inner.core] * policy.privileged)
-    told: list[tuple[Any, ...]] = []
+    steps: list[tuple[Any, ...]] = []
     ended = False
     while not ended:
         raw = {name: array[0] for name, array in inner.core.observe().items()}
         action = player.act(raw)
         observation, reward, terminated, truncated, _ = env.step(action)
-        seen.append(observation)
-        told.append((action, reward, terminated, truncated))
+        observations.append(observation)
+        steps.append((action, reward, terminated, truncated))
         ended = terminated or truncated
-    columns = map(np.array, zip(*told, strict=True))  # in the buffer's order
-    return EpisodeBuffer(number, seed, None, np.array(seen), *columns, infos={})
+    columns = map(np.array, zip(*steps, strict=True))  # in the buffer's order
+    return EpisodeBuffer(number, seed, None, np.array(observations), *columns, infos={})
 
 
-def _card(env: str, policy: Method, seeds: Sequence[int]) -> str:
+def _description(env: str, policy: Method, seeds: Sequence[int]) -> str:
     from eitbench import __version__
-    held = ranges(name_seed(seed).replace(":", "-") for seed in seeds)
-    warning = ("Test episodes are among them: report on them, and neither learn nor choose."
-               if any(map(is_test, seeds)) else "")
-    return CARD.format(env=env, policy=policy.name, title=policy.title, seeds="; ".join(held),
-                       version=__version__, warning=warning).strip()
+    held = seed_ranges(name_seed(seed).replace(":", "-") for seed in seeds)
+    return DESCRIPTION.format(
+        env=env, policy=policy.name, title=policy.title, seeds="; ".join(held),
+        version=__version__, warning=WARNING if any(map(is_test, seeds)) else "").strip()

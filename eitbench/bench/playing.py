@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+import json
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from threadpoolctl import threadpool_limits
+from tqdm import tqdm
 
 from eitbench import _check
-from eitbench.bench.methods import Method
+from eitbench.bench.measured import MeasuredRun
+from eitbench.bench.methods import Method, load_method
 from eitbench.bench.outcomes import Claim, Said, outcome_of, outcome_of_claims
 from eitbench.bench.scores import Outcome
-from eitbench.bench.tracks import Environment, board_of, check_track
+from eitbench.bench.tracks import Environment, board_of, check_track, is_measured
 from eitbench.data.seeds import for_scores
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.injection import InjectionEnv
+from eitbench.estimation.walk import RandomWalk
+from eitbench.physics.rest import AtRest
 from eitbench.worlds.registry import entry
 from eitbench.worlds.streams import in_state, randomness
 from eitbench.worlds.task import Estimate, Task
@@ -33,23 +39,28 @@ class Episode(NamedTuple):
     currents: np.ndarray
     """(steps, L) A (A/m in 2D), injected in each step"""
     fields: dict[str, np.ndarray]
-    """Means and standard deviations of an estimator's estimates as float32, for pictures; of a
-    policy none."""
+    """Means and standard deviations of an estimator's estimates as float32, for pictures; none of a
+    policy, or on measurements."""
+    actions: list[Any] | None = None
+    """of a policy, JSON-ready"""
 
 
-def environment(asked: Environment) -> EstimationEnv | InjectionEnv:
+def environment(asked: Environment) -> Any:
     """Made once a process, so that its models, and what methods derive from them, are shared by all
     its episodes; errors as `Environment.make`."""
-    return _made(asked, entry(asked.id).world)
+    if is_measured(asked.id):
+        return _made(asked, None, "")
+    registered = entry(asked.id)
+    return _made(asked, registered.world, json.dumps(dict(registered.settings)))
 
 
 @lru_cache(maxsize=4)
-def _made(asked: Environment, world: World) -> EstimationEnv | InjectionEnv:
-    """Whose ``world`` is that of the id: another process may have told this one of another."""
+def _made(asked: Environment, world: World | None, settings: str) -> Any:
+    """Make it with the ``world`` and the ``settings`` of the id, which may be registered anew."""
     return asked.make()
 
 
-def can_play(method: Method, env: EstimationEnv | InjectionEnv) -> bool:
+def can_play(method: Method, env: Any) -> bool:
     """Whether an environment is of one of a method's boards, and such as suits it."""
     known = env.rules if isinstance(env, InjectionEnv) else env.task
     return board_of(env) in method.boards and method.suits(known)
@@ -68,7 +79,40 @@ def play(asked: Environment, method: Method, seed: int) -> Episode:
     env = environment(asked)
     if isinstance(env, InjectionEnv):
         return _injected(env, method, seed)
+    if is_measured(asked.id):
+        run = run_on_measurements(env, method, seed, kept={env.episode_steps})
+        measurements = env.measurements
+        return Episode(run.outcome(env), measurements.currents[measurements.injections], {})
     return estimated(env, method, seed)
+
+
+def run_on_measurements(env: MeasuredEnv, method: str | Method, seed: int = 0, *,
+                        kept: Collection[int] | None = None) -> MeasuredRun:
+    """Run a built-in estimator, or the one of a path, on measurements.
+
+    ``seed`` draws the withheld readings; estimates are kept at the steps ``kept``, by default all.
+    ``ValueError`` if the method does not suit the task or answers wrongly.
+    """
+    if isinstance(method, str):
+        method = load_method(method, "estimation")
+    if "filter" not in method.boards:
+        raise ValueError("method must estimate the present state, as in filtering, got "
+                         f"{method.name} for {', '.join(method.boards)}")
+    env.reset(seed=seed)                            # chooses the task before the clock starts
+    if not method.suits(env.task):
+        raise ValueError(f"method must suit a target that {_motion(env.task)}, got {method.name}")
+    with threadpool_limits(1):
+        steps = tqdm(_estimates(env, method, seed), total=env.episode_steps, desc=method.name,
+                     unit="reading", disable=None, leave=False)
+        return MeasuredRun.collect(env, method.name, steps, kept)
+
+
+def _motion(task: Task) -> str:
+    if isinstance(task.transport, AtRest):
+        return "stands still"
+    if isinstance(task.transport, RandomWalk):
+        return "walks at random"
+    return f"is carried by a flow that is {'known' if task.velocity is None else 'estimated'}"
 
 
 def estimated(env: EstimationEnv, estimator: Method, seed: int) -> Episode:
@@ -81,8 +125,9 @@ def _injected(env: InjectionEnv, policy: Method, seed: int) -> Episode:
     seconds = 0.0
     currents = list[np.ndarray]()
     claims = list[Claim]()
+    actions = list[Any]()
     # the clock of `injections` stands still while the filter is asked
-    for t, observation, elapsed in injections(env, policy, seed):
+    for t, observation, elapsed in injections(env, policy, seed, actions):
         seconds += elapsed
         currents.append(observation["currents"])
         if (error := env.error) is not None:
@@ -90,13 +135,14 @@ def _injected(env: InjectionEnv, policy: Method, seed: int) -> Episode:
             claims.append(Claim(t, error, means[0], stds[0], env.core.innovations()[0]))
     spent = sum(bool(each.any()) for each in currents)
     outcome = outcome_of_claims(env.core.world, seed, claims, seconds / env.core.length, spent)
-    return Episode(outcome, np.array(currents), {})
+    return Episode(outcome, np.array(currents), {}, actions)
 
 
-def injections(env: InjectionEnv, policy: Method, seed: int,
+def injections(env: InjectionEnv, policy: Method, seed: int, actions: list[Any] | None = None,
                ) -> Iterator[tuple[int, dict[str, np.ndarray], float]]:
     """(t of the state now seen, observation, seconds the policy took) after each of its injections
-    in one episode, the first with what it took to prepare; errors as `play`."""
+    in one episode, the first with what it took to prepare; errors as `play`. ``actions`` receives
+    what the policy returned."""
     if not policy.suits(env.rules):
         raise ValueError(f"policy {policy.name} does not suit {env.spec.id if env.spec else env}")
     with for_scores():
@@ -110,6 +156,8 @@ def injections(env: InjectionEnv, policy: Method, seed: int,
         action = player.act(observation)
         seconds = time.perf_counter() - begin
         observation, _, done, _, _ = env.step(action)
+        if actions is not None:
+            actions.append(np.asarray(action).tolist())
         t += 1
         yield t, observation, seconds
         begin = time.perf_counter()
@@ -122,7 +170,7 @@ def policys_random(seed: int) -> np.random.Generator:
     return in_state(drawn.bit_generator.state)
 
 
-def estimates(env: EstimationEnv | MeasuredEnv, estimator: Method,
+def estimates(env: EstimationEnv, estimator: Method,
               seed: int) -> Iterator[tuple[int, Estimate]]:
     """(t, estimate of the state t ≥ 1) in one episode. The estimator sees the task and the
     measurements; rewards and the environment itself stay here."""

@@ -1,54 +1,60 @@
-"""Records: what one version of a method did in one environment, as JSON that says how to repeat it.
+"""Records: the scores of one version of a method in one environment, as JSON that can be repeated.
 
-A record says: this version of a method, in this version of a world (the -vN of its id), on these
-seeds, scored this. Numbers decide; commit, machine and digest of the code stand beside each run and
-decide nothing.
+A record names the version of a method, the version of a world (the -vN of its id), the seeds, and
+the scores of each episode. Numbers decide; commit and machine stand beside each run and decide
+nothing.
 
 The format is published in ``leaderboards/schema.json``, and a record is checked against it when it
 is written and when it is read. It carries the sha256 of its own content, so that a number changed
 by hand is noticed. That guards against accidents; whether a self-reported number is true is found
-out by running the method again. Records of the format before are read as well
-(`eitbench.bench.schema2`).
+out by running the method again.
+
+An installed package holds the scores of all published records in one table
+(`eitbench.bench.episode_table`) in place of the records.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import math
+import re
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from functools import lru_cache
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-from eitbench._files import write_atomically
+import jsonschema_rs
+
+from eitbench._files import shipped, write_atomically
 from eitbench._foreign import cleaned
-from eitbench.bench import schema2, tracks
-from eitbench.bench.contradictions import contradictions, version_number
-from eitbench.bench.names import folded
-from eitbench.bench.quick import quickly, validator
+from eitbench.bench import tracks
+from eitbench.bench.episode_table import read_episode_table, table_beside, write_episode_table
 from eitbench.bench.strict_json import parsed
+from eitbench.data.seeds import name_seed, parse_seeds
 
 SCHEMA = 3
 BOARDS = tracks.ALL_BOARDS
 SHARED = ("board", "title", "parameters", "role", "privileged", "version", "method_sha256",
           "checkpoint_sha256")
-"""What all episodes of a record have in common, beside environment and method."""
-MOST_EPISODES = 10_000
-"""of a record; nor has it more runs"""
-MOST_WALLS = 20
-"""of a run"""
-MOST_STEPS = 100_000
-"""errors of an episode"""
+"""Fields that all episodes of a record have in common, beside environment and method."""
+MAX_KWARGS_CHARS = 10_000
+"""of an environment's arguments as JSON, which become headings"""
+_BUILTIN_VERSION = re.compile(r"v([1-9][0-9]*)")
+
+
+# -- files --------------------------------------------------------------------------------------
 
 
 def write_record(folder: Path, record: dict[str, Any]) -> Path:
-    """Write a record into ``folder``, whole or not at all, and return its path; what had its name
-    is replaced. ``ValueError``, naming file and fields, if it is not what the schema asks for."""
+    """Write a record into ``folder`` atomically and return its path; a file of the same name is
+    replaced. ``ValueError``, naming file and fields, if it breaks the schema."""
     record = sealed(record)
-    path = Path(folder) / _named_by_content(record)
+    path = Path(folder) / _name_if_any(record)
     try:
-        _check(record)
+        check_record(record)
     except ValueError as error:
         raise ValueError(f"record {cleaned(str(path))} {cleaned(str(error))}") from None
     write_atomically(path, _text(record).encode())
@@ -56,54 +62,37 @@ def write_record(folder: Path, record: dict[str, Any]) -> Path:
 
 
 def read_record(path: Path) -> dict[str, Any]:
-    """A record as it was written; one of the format before as it would be written today.
+    """Read one record.
 
-    ``ValueError``, naming file and fields, if it cannot be read, is not what the schema asks for,
-    was changed since it was written, or has another name than its content asks for.
+    ``ValueError``, naming file and fields, if it cannot be read, breaks the schema, was changed
+    since it was written, or has another name than its content requires.
     """
     try:
-        return _read(path)
+        record = parsed(path)
+        check_record(record)
+        if record["sha256"] != _digest(record):
+            raise ValueError("was changed since it was written: its sha256 is not that of its "
+                             "content")
+        if path.name != file_name(record):
+            raise ValueError(f"must have the name {file_name(record)}, as its content requires")
     except (OSError, ValueError) as error:
         raise ValueError(f"record {cleaned(str(path))} {cleaned(str(error))}") from None
-
-
-def _read(path: Path) -> dict[str, Any]:
-    """As `read_record`; what is wrong, without the file's name."""
-    record = quickly(path, SCHEMA)
-    name = None
-    if record is None or _too_many(record):
-        record, name = _carefully(path)
-    else:
-        _refuse(contradictions(record))
-    name = name or file_name(record)
-    if path.name != name:
-        raise ValueError(f"must have the name {name}, as its content asks for")
     return record
 
 
-def _carefully(path: Path) -> tuple[dict[str, Any], str | None]:
-    """A valid record, and the name that its file must have if the record is of the format
-    before."""
-    record = parsed(path)
-    written = record
-    name = None
-    if isinstance(record, dict) and record.get("schema") == schema2.NUMBER:
-        content, name = schema2.upgraded(record)
-        record = sealed(content)
-    _check(record)
-    if written.get("sha256") != sealed(written)["sha256"]:
-        raise ValueError("was changed since it was written: its sha256 is no longer that of its "
-                         "content")
-    return record, name
-
-
 def read_records(folder: Path, *, keep: Callable[[dict[str, Any]], Any] = dict) -> list[Any]:
-    """All records of a folder, by file name; none if there is no such folder. Records of an
-    environment that is not registered, or no longer in that version, are left out with a warning.
-    Of many thousands ``keep`` may leave out what nobody asks for, one by one.
+    """Read all records of a folder, by file name; none if there is no such folder. Records of an
+    environment that is not registered in that version are left out with a warning. ``keep`` may
+    reduce each record as soon as it is read.
 
-    ``ValueError``, naming all of them, if some are not as `read_record` asks for.
+    Where there is no folder, but the table of its episodes lies beside it, as in an installed
+    package, the records are those of the table, without runs and errors of single steps.
+
+    ``ValueError``, naming all of them, if some are not valid; see `read_record`.
     """
+    folder = Path(folder)
+    if not folder.is_dir() and (table := table_beside(folder)).is_file():
+        return [keep(record) for record in read_episode_table(table)]
     records, complaints = read_sound_records(folder, keep=keep)
     if complaints:
         raise ValueError("; ".join(complaints))
@@ -112,20 +101,20 @@ def read_records(folder: Path, *, keep: Callable[[dict[str, Any]], Any] = dict) 
 
 def read_sound_records(folder: Path, *, keep: Callable[[dict[str, Any]], Any] = dict,
                        ) -> tuple[list[Any], list[str]]:
-    """As `read_records`, but those that are not valid are left out, with a sentence for each that
-    names the file."""
+    """Read the valid records of a folder, and a sentence for each other file that names it."""
     sound, complaints = read_sound_files(folder, keep=keep)
     return list(sound.values()), complaints
 
 
 def read_sound_files(folder: Path, *, keep: Callable[[dict[str, Any]], Any] = dict,
                      ) -> tuple[dict[Path, Any], list[str]]:
-    """As `read_sound_records`, with the path of each record."""
+    """Read as `read_sound_records`, with the path of each record."""
     kept = {}
-    standing = {}
     complaints = []
     known = set(tracks.ids())
     for path in sorted(Path(folder).glob("*.json")):
+        if path.name.startswith(tracks.MEASURED_FILES):         # see `read_measured_files`
+            continue
         try:
             record = read_record(path)
         except ValueError as error:
@@ -134,101 +123,115 @@ def read_sound_files(folder: Path, *, keep: Callable[[dict[str, Any]], Any] = di
         id = record["environment"]["id"]
         if id in known:
             kept[path] = keep(record)
-            standing[path] = _Standing.of(record, path)
         else:
             warnings.warn(f"record {cleaned(str(path))} is left out: there is no environment "
                           f"{cleaned(id)}", stacklevel=4)
-    clashing = _clashing(standing)
-    complaints += [f"record {cleaned(str(path))} {what}" for path, what in clashing.items()]
-    return {path: each for path, each in kept.items() if path not in clashing}, complaints
+    return kept, complaints
 
 
-class _Standing(NamedTuple):
-    """What decides between records that cannot stand beside each other: the least stays."""
-
-    unofficial: bool
-    misnamed: bool
-    """Of the format before."""
-    finished: str
-    file: str
-    environment: str
-    kwargs: str
-    method: str
-    split: str
-    version: str
-
-    @classmethod
-    def of(cls, record: dict[str, Any], path: Path) -> _Standing:
-        environment, method, split = _lineage(record)
-        return cls(not record["official"], path.name != file_name(record), finished(record),
-                   path.name, environment, _json(record["environment"]["kwargs"]), method, split,
-                   record["version"])
-
-
-def _clashing(records: dict[Path, _Standing]) -> dict[Path, str]:
-    """Path -> what is wrong, of records that cannot stand beside others of the same folder: they
-    are of the same episodes of one method, of another environment under the same name, or of a
-    method whose name differs from another's for some systems only. Official ones stay, then those
-    of the present format, then older ones."""
-    versions = set[tuple[str, ...]]()
-    given: dict[str, str] = {}
-    methods: dict[str, str] = {}
-    wrong = {}
-    for path, each in sorted(records.items(), key=lambda pair: pair[1]):
-        key = (each.environment, each.method, each.split, each.version)
-        if key in versions:
-            wrong[path] = "is of the same version and the same split as another record"
-        elif given.setdefault(each.environment, each.kwargs) != each.kwargs:
-            wrong[path] = f"gives other arguments to {each.environment} than another record"
-        elif (other := methods.setdefault(folded(each.method), each.method)) != each.method:
-            wrong[path] = ("is of a method whose name differs from that of another only as some "
-                           f"systems do not see: {cleaned(each.method)}, {cleaned(other)}")
+def read_measured_files(folder: Path) -> tuple[dict[Path, dict[str, Any]], list[str]]:
+    """Valid records of measured cases in a folder by path, and a sentence for each invalid one."""
+    found, errors = {}, []
+    for path in sorted(Path(folder).glob(f"{tracks.MEASURED_FILES}*.json")):
+        try:
+            record = read_record(path)
+            if not tracks.is_measured(record["environment"]["id"]):
+                raise ValueError(f"record {cleaned(str(path))} refers to an unknown case")
+        except ValueError as error:
+            errors.append(str(error))
         else:
-            versions.add(key)
-    return wrong
+            found[path] = record
+    return found, errors
 
 
-def sealed(record: dict[str, Any]) -> dict[str, Any]:
-    """The record with the ``sha256`` of its content: canonical JSON of all other fields."""
-    content = {key: value for key, value in record.items() if key != "sha256"}
-    try:
-        content = json.loads(_json(content))
-        text = _json(content, separators=(",", ":")).encode()
-    # NaN, or something that is no JSON at all, or too deep
-    except (TypeError, ValueError, RecursionError) as error:
-        raise ValueError(f"record cannot be written as JSON: {error}") from None
-    return content | {"sha256": hashlib.sha256(text).hexdigest()}
+def write_episode_table_of(folder: Path) -> Path:
+    """Write the table of all valid records of a folder beside it, and return its path."""
+    path = table_beside(folder)
+    write_episode_table(read_sound_records(folder)[0], path)
+    return path
 
 
 def file_name(record: dict[str, Any]) -> str:
-    """Of the file that a record has; see `tracks.record_name`."""
+    """Return the name of a record's file; see `tracks.record_name`."""
     return tracks.record_name(record["environment"]["name"], record["method"], record["version"],
                               record["split"])
 
 
+def _name_if_any(record: dict[str, Any]) -> str:
+    try:
+        return file_name(record)
+    except (KeyError, TypeError):                     # the check will name the missing field
+        return "(nameless)"
+
+
+def sealed(record: dict[str, Any]) -> dict[str, Any]:
+    """Return the record with the ``sha256`` of its content: canonical JSON of all other fields."""
+    content = {key: value for key, value in record.items() if key != "sha256"}
+    try:
+        content = json.loads(_json(content))
+        return content | {"sha256": _digest(content)}
+    # NaN, or an object that JSON does not have, or too deep
+    except (TypeError, ValueError, RecursionError) as error:
+        raise ValueError(f"record cannot be written as JSON: {error}") from None
+
+
+def _digest(record: dict[str, Any]) -> str:
+    content = {key: value for key, value in record.items() if key != "sha256"}
+    return hashlib.sha256(_json(content, separators=(",", ":")).encode()).hexdigest()
+
+
+def _text(record: dict[str, Any]) -> str:
+    """JSON with sorted keys, a line for each field, episode and run, so that changes can be
+    read."""
+    lines = []
+    for key, value in sorted(record.items()):
+        if key in ("episodes", "runs"):
+            lines.append(f" {_json(key)}: [\n  " + ",\n  ".join(map(_json, value)) + "\n ]")
+        else:
+            lines.append(f" {_json(key)}: {_json(value)}")
+    return "{\n" + ",\n".join(lines) + "\n}\n"
+
+
+def _json(value: Any, **how: Any) -> str:
+    return json.dumps(value, sort_keys=True, ensure_ascii=False, allow_nan=False, **how)
+
+
+# -- several records ----------------------------------------------------------------------------
+
+
+def split_of(seed: str) -> str:
+    """Return ``test`` for ``test:4``, and ``own`` for a plain number."""
+    return seed.split(":")[0] if ":" in seed else "own"
+
+
+def version_number(version: str) -> int | None:
+    """Return 3 for ``v3``, a version of a built-in method; None for the digits of a file's hash."""
+    return int(version[1:]) if _BUILTIN_VERSION.fullmatch(version) else None
+
+
+def finished(record: dict[str, Any]) -> str:
+    """Return the time of its last episode, in UTC as ISO 8601."""
+    return max(episode["finished"] for episode in record["episodes"])
+
+
 def alike(runs: Iterable[dict[str, Any]], *keys: str) -> list[list[dict[str, Any]]]:
-    """Runs grouped by code, these ``keys`` and machine, whose matrix product each process times."""
+    """Group runs by code, these ``keys`` and machine, whose matrix product each process times."""
     groups: dict[str, list[dict[str, Any]]] = {}
     for run in runs:
         machine = {key: value for key, value in run["machine"].items() if key != "matmul_seconds"}
         code = ("commit", "dirty", "source", "versions", "blas")
-        what = [machine, *(run[key] for key in (*code, *keys))]
-        groups.setdefault(_json(what), []).append(run)
+        same = [machine, *(run.get(key) for key in (*code, *keys))]
+        groups.setdefault(_json(same), []).append(run)
     return list(groups.values())
 
 
-def finished(record: dict[str, Any]) -> str:
-    """When its last episode was, in UTC as ISO 8601 has it."""
-    return max(episode["finished"] for episode in record["episodes"])
-
-
 def newest(records: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Records that may stand on a board together, and the outdated ones, each in the given order.
+    """Separate records that may stand on a board together from outdated ones, each in the given
+    order.
 
-    Among those of one environment, one split and one method of ours only the highest version is
-    current, and an official one whatever the others call themselves: only a higher official one
-    makes it outdated. Versions of somebody else's method, whose names do not say which came first,
-    stand side by side.
+    Of one environment, split and built-in method only the highest version is current. An official
+    record is outdated only by a higher official one. Versions of third-party methods, which are not
+    ordered, stand side by side.
     """
     highest: dict[tuple[Any, ...], int] = {}
     for record in records:
@@ -247,85 +250,105 @@ def newest(records: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], list[di
 
 
 def _lineage(record: dict[str, Any]) -> tuple[str, ...]:
-    """What the versions of one method have in common."""
+    """Return the fields that all versions of one method have in common."""
     return record["environment"]["name"], record["method"], record["split"]
 
 
-def _check(record: Any) -> None:
-    """``ValueError`` naming fields if a record breaks the schema or contradicts itself."""
-    _refuse(_too_many(record) or _against_the_schema(record) or contradictions(record))
+# -- checks -------------------------------------------------------------------------------------
 
 
-def _refuse(wrong: list[str]) -> None:
-    """``ValueError`` that says what is wrong, if anything is."""
+def schema_text() -> str:
+    """Return the published schema."""
+    return (shipped("leaderboards") / "schema.json").read_text(encoding="utf-8")
+
+
+@lru_cache(maxsize=1)
+def _validator() -> Any:
+    return jsonschema_rs.validator_for(json.loads(schema_text()))
+
+
+def check_record(record: Any) -> None:
+    """Raise ``ValueError``, naming fields, if a record breaks the schema or contradicts itself."""
+    if not _validator().is_valid(record):
+        errors = islice(_validator().iter_errors(record), 20)
+        wrong = sorted(f"{_place(error.instance_path)}: {_shortened(error.message)}"
+                       for error in errors)
+    else:
+        wrong = list(_contradictions(record))
     if wrong:
         raise ValueError("is not valid: " + "; ".join(map(_shortened, wrong[:5])))
 
 
-def _too_many(record: Any) -> list[str]:
-    """A sentence for each list that is too long to be looked at: to compare the items of one with
-    each other would take for ever."""
-    if not isinstance(record, dict):
-        return []
-    seeds, runs, episodes = (record.get(name) for name in ("seeds", "runs", "episodes"))
-    wrong = []
-    if not _are_texts(seeds, MOST_EPISODES):
-        wrong.append(f"$.seeds: must be at most {MOST_EPISODES} texts")
-    for name, items in (("runs", runs), ("episodes", episodes)):
-        if isinstance(items, list) and len(items) > MOST_EPISODES:
-            wrong.append(f"$.{name}: must be at most {MOST_EPISODES}")
-    if wrong:
-        return wrong
-    wrong += [f"$.runs[{i}].walls: must be at most {MOST_WALLS} texts"
-              for i, walls in _inner(runs, "walls") if not _are_texts(walls, MOST_WALLS)]
-    return wrong + [f"$.episodes[{i}].step_errors: must be at most {MOST_STEPS}"
-                    for i, steps in _inner(episodes, "step_errors")
-                    if isinstance(steps, list) and len(steps) > MOST_STEPS]
-
-
-def _are_texts(items: Any, most: int) -> bool:
-    """False of a list that is longer, or has others in it; what is no list the schema will name."""
-    return not isinstance(items, list) or (
-        len(items) <= most and all(isinstance(item, str) for item in items))
-
-
-def _inner(items: Any, name: str) -> list[tuple[int, Any]]:
-    """What stands under a name in each object of a list, with its place."""
-    return [(i, each.get(name)) for i, each in enumerate(items if isinstance(items, list) else [])
-            if isinstance(each, dict)]
-
-
-def _against_the_schema(record: Any) -> list[str]:
-    errors = islice(validator().iter_errors(record), 20)
-    return sorted(f"{_place(error.instance_path)}: {_shortened(error.message)}" for error in errors)
-
-
 def _place(path: Iterable[str | int]) -> str:
-    """As in $.episodes[0].scores."""
+    """Format as in $.episodes[0].scores."""
     return "$" + "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in path)
-
-
-def _named_by_content(record: dict[str, Any]) -> str:
-    try:
-        return file_name(record)
-    except (KeyError, TypeError):                     # the check will say which field is missing
-        return "(nameless)"
-
-
-def _text(record: dict[str, Any]) -> str:
-    """JSON with sorted keys, a line for each field, episode and run, for changes to be read by."""
-    lines = []
-    for key, value in sorted(record.items()):
-        if key in ("episodes", "runs"):
-            lines.append(f" {_json(key)}: [\n  " + ",\n  ".join(map(_json, value)) + "\n ]")
-        else:
-            lines.append(f" {_json(key)}: {_json(value)}")
-    return "{\n" + ",\n".join(lines) + "\n}\n"
-
-
-def _json(value: Any, **how: Any) -> str:
-    return json.dumps(value, sort_keys=True, ensure_ascii=False, allow_nan=False, **how)
 
 
 def _shortened(message: str) -> str:
     return message if len(message) < 300 else f"{message[:140]} … {message[-140:]}"
+
+
+def _contradictions(record: dict[str, Any]) -> Iterator[str]:
+    """Yield a sentence, beginning with the field, for each rule that relates fields to each other
+    or to the environment, which a schema cannot express."""
+    yield from _of_the_environment(record)
+    version = record["version"]
+    if version_number(version) is None and version != record["method_sha256"][:8]:
+        yield "$.version: must be v1, v2, … of ours, or begin as method_sha256 does"
+    if record["official"] and any(run["commit"] is None or run["dirty"] for run in record["runs"]):
+        yield "$.official: must be false where a run was not of a commit without changes"
+    yield from _of_the_seeds(record)
+    yield from _of_the_episodes(record)
+
+
+def _of_the_environment(record: dict[str, Any]) -> Iterator[str]:
+    environment = record["environment"]
+    id = environment["id"]
+    kwargs = environment["kwargs"]
+    name = tracks.named(id, kwargs)
+    if environment["name"] != name:
+        yield f"$.environment.name: must be {name}, as id and kwargs require"
+    if len(json.dumps(kwargs)) > MAX_KWARGS_CHARS:
+        yield f"$.environment.kwargs: must have {MAX_KWARGS_CHARS} characters at most"
+    if id not in tracks.ids():                        # the record will be left out
+        return
+    try:
+        boards = tracks.boards_of(id, kwargs)
+    except ValueError as error:
+        yield f"$.environment.kwargs: {error}"
+        return
+    if record["board"] not in boards:
+        yield f"$.board: must be {' or '.join(boards)}, as the environment requires"
+
+
+def _of_the_seeds(record: dict[str, Any]) -> Iterator[str]:
+    if record["seeds"] != [episode["seed"] for episode in record["episodes"]]:
+        yield "$.seeds: must be those of the episodes, in their order"
+    for seed in record["seeds"]:
+        if not _is_seed(seed):
+            yield f"$.seeds: {cleaned(seed)[:40]!r} names no episode"
+    if {split_of(seed) for seed in record["seeds"]} != {record["split"]}:
+        yield f"$.seeds: must all be of the split {record['split']}"
+
+
+@lru_cache(maxsize=2**14)
+def _is_seed(seed: str) -> bool:
+    """Return whether a seed lies within its split and is written as `name_seed` does."""
+    try:
+        return name_seed(parse_seeds(seed)[0]) == seed
+    except ValueError:
+        return False
+
+
+def _of_the_episodes(record: dict[str, Any]) -> Iterator[str]:
+    lengths = set()
+    for i, episode in enumerate(record["episodes"]):
+        if episode["run"] >= len(record["runs"]):
+            yield f"$.episodes[{i}].run: there are only {len(record['runs'])} runs"
+        if steps := episode.get("step_errors"):
+            lengths.add(len(steps))
+            mean = math.fsum(steps) / len(steps)
+            if not math.isclose(episode["scores"]["error"], mean, rel_tol=1e-9):
+                yield f"$.episodes[{i}].scores.error: must be the mean of step_errors"
+    if len(lengths) > 1:
+        yield "$.episodes: must have the same number of step_errors each"

@@ -6,32 +6,32 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
+import sys
 import time
 from collections.abc import Iterable, Sequence
+from contextlib import redirect_stdout
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from eitbench._foreign import traceback_of, where_of
-from eitbench.bench.methods import Method, find_method, load_method, version_of
+from eitbench.bench import isolation
+from eitbench.bench.isolation import WorkerError, load_isolated
+from eitbench.bench.methods import Method, find_method, load_method, loader_of, version_of
 from eitbench.bench.playing import environment, play
-from eitbench.bench.prints import passed_on
 from eitbench.bench.records import SHARED
-from eitbench.bench.sandbox import guests
-from eitbench.bench.sandbox.host import GuestError
-from eitbench.bench.sandbox.wall import landlock_version
-from eitbench.bench.scores import scored
-from eitbench.bench.store import EpisodeStore, machine, provenance, source_digest
-from eitbench.bench.tracks import Environment, board_of
+from eitbench.bench.scores import SCORING, scored
+from eitbench.bench.store import EpisodeStore, machine, portable_command, provenance
+from eitbench.bench.tracks import Environment, board_of, is_measured, registered
+from eitbench.data.cache import world_digest
 from eitbench.data.episodes import simulate
 from eitbench.data.parallel import in_parallel
 from eitbench.data.seeds import name_seed
-from eitbench.data.store import world_digest
+from eitbench.measured.cases import read_case
 from eitbench.worlds.registry import entry
 
 _LASTING = ("environment", "method", *SHARED)
@@ -45,34 +45,42 @@ class Job(NamedTuple):
     method: str
     """Name or path."""
     seed: int
-    isolated: bool = False
-    """Whether the method runs in a process of its own, which is all that ever executes its file."""
+    isolation: str = "none"
+    """``none``, or the kind of worker in which alone the method's file is executed: ``process`` or
+    ``bubblewrap``."""
 
     def load(self) -> Method:
         """The method's file."""
         track = self.environment.track
-        if self.isolated:
-            return guests.load(track, self.environment.id, self.environment.kwargs, self.method)
-        with passed_on(self.method):
+        if self.isolation != "none":
+            return load_isolated(track, self.environment.id, self.environment.kwargs, self.method,
+                                 self.isolation)
+        with redirect_stdout(sys.stderr):
             return load_method(self.method, track)
 
-    @property
-    def isolation(self) -> str:
-        """What keeps the method from what it should not see: ``none``, a ``process``, or
-        ``landlock`` around it."""
-        return "none" if not self.isolated else "landlock" if landlock_version() else "process"
-
     def identity(self) -> str:
-        """What the outcome depends on; a stored result counts only for the very same. Nothing is
-        loaded. ``ValueError`` if there is no such method or environment."""
+        """Return a digest of the configuration and declared versions that the outcome depends on; a
+        stored result counts only for the very same. The method is not loaded. ``ValueError`` if
+        there is no such method or environment."""
         path = find_method(self.method, self.environment.track)
-        sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
-        asked = entry(self.environment.id)
-        world = asked.world.changed(json.loads(self.environment.kwargs).get("world"))
-        parts = [*self.environment, json.dumps(dict(asked.settings), sort_keys=True),
-                 world_digest(world), sha256, version_of(path, sha256), str(self.seed),
-                 source_digest(), np.__version__, scipy.__version__]
-        return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
+        files = {each.name: hashlib.sha256(each.read_bytes()).hexdigest()
+                 for each in (path, path.with_name("config.json"))
+                 if each == path or (path.suffix != ".py" and each.is_file())}
+        arguments = self.environment.arguments
+        world = arguments.pop("world", None)
+        parts = {"environment": self.environment.id, "arguments": arguments,
+                 "world": _content_digest(self.environment.id, world), "files": files,
+                 "loader": loader_of(path),
+                 "version": version_of(path, files[path.name]), "seed": self.seed,
+                 "scoring": SCORING}
+        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _content_digest(id: str, changes: dict[str, Any] | None) -> str:
+    """Return the digest of an environment's world with ``changes``, or of its measured case."""
+    if is_measured(id):
+        return read_case(registered(id)["case"]).digest
+    return world_digest(entry(id).world.changed(changes))
 
 
 def run_episode(job: Job) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -92,18 +100,20 @@ def run_episode(job: Job) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     fields: dict[str, np.ndarray] = {}
     begin = time.perf_counter()
     try:
-        with threadpool_limits(1), passed_on(method.name):
+        with threadpool_limits(1), redirect_stdout(sys.stderr):  # standard output is for tables
             played = play(job.environment, method, job.seed)
             numbers = scored(method.track, played.outcome)
         said = {"scores": numbers, "step_errors": played.outcome.errors.tolist()}
+        if played.actions is not None:
+            said["actions"] = played.actions
         json.dumps(said, allow_nan=False)  # what cannot be kept is the method's failure too
         result |= {"status": "ok"} | said
         fields = played.fields
     # whatever a method does wrong is its result, not our crash
     except (Exception, SystemExit) as error:
         result |= _failure(error, method.path)
-    if job.isolated:
-        result["peak_memory"] = guests.peak_memory()
+    if job.isolation != "none":
+        result["peak_memory"] = isolation.peak_memory()
     result["finished"] = datetime.now(UTC).isoformat(timespec="microseconds")
     result["seconds"] = time.perf_counter() - begin
     return result, fields
@@ -134,7 +144,7 @@ def _beginning(job: Job, method: Method) -> dict[str, Any]:
 
 def _failure(error: BaseException, own: Path) -> dict[str, Any]:
     """What a result says of it; ``own`` is the method's file."""
-    if isinstance(error, GuestError):
+    if isinstance(error, WorkerError):
         return {"status": "failed", "message": str(error), "where": error.where,
                 "traceback": error.traceback}
     return {"status": "failed", "message": f"{type(error).__name__}: {error}",
@@ -148,8 +158,8 @@ def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1, backend: 
 
     Each process stores an episode the moment it is done. ``backend`` is one of
     `eitbench.data.parallel.BACKENDS`, of which those of a cluster need the folders of ``store`` and
-    cache on all its machines; ``command`` is what the results will name as the command that made
-    them. Errors as `eitbench.data.parallel.in_parallel`.
+    cache on all its machines; the results name ``command``, without folders, as the command that
+    made them. Errors as `eitbench.data.parallel.in_parallel`.
     """
     todo = [job for job in jobs
             if not store.holds(job.environment.name, job.load().name, job.seed, job.identity())]
@@ -158,11 +168,11 @@ def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1, backend: 
     if not todo:
         return
     truths: dict[Any, Job] = {}  # each once, before several methods want it at once
-    for job in todo:
+    for job in (job for job in todo if not is_measured(job.environment.id)):
         truths.setdefault((environment(job.environment).world, job.seed), job)
-    run = {"command": command, **provenance(), "machine": machine()}
+    run = {"command": portable_command(command), **provenance(), "machine": machine()}
     home = platform.node()
-    guests.close()                                  # that of `Job.load`; the workers have their own
+    isolation.close()                               # that of `Job.load`; the workers have their own
     try:
         for function, work, label in (
             (_simulate_job, [(job,) for job in truths.values()], "simulating truths"),
@@ -173,7 +183,7 @@ def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1, backend: 
             for _ in tqdm(done, total=len(work), desc=label, unit="episode", disable=None):
                 pass
     finally:
-        guests.close()
+        isolation.close()
 
 
 def successful(
@@ -219,10 +229,9 @@ def _run_job(job: Job, store: EpisodeStore, run: dict[str, Any], home: str,
         result, fields = beginning | _failure(error, Path(job.method)), {}
     # whose times these are, not who asked
     elsewhere = {} if platform.node() == home else {"machine": machine()}
-    walls = {"walls": guests.walls()} if job.isolated else {}
-    result["run"] = run | elsewhere | {"isolation": job.isolation} | walls
+    result["run"] = run | elsewhere | {"isolation": job.isolation}
     try:
         store.put(job.environment.name, result["method"], job.seed, result, fields)
     except OSError:
-        guests.close()  # its folder may be what fills the disk
+        isolation.close()  # its folder may be what fills the disk
         store.put(job.environment.name, result["method"], job.seed, result, fields)

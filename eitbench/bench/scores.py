@@ -18,10 +18,15 @@ from eitbench import _check, scoring
 from eitbench.bench.tracks import TRACKS
 from eitbench.worlds.world import World
 
+SCORING = 1
+"""Version of how an episode is run and scored; raise it when the same method on the same episode
+gets other scores. Results of another version are not reused."""
 GROUP = "eitbench.scores"
 """Entry points of installed packages: each names a module that registers scores."""
 BETTER = ("lower", "higher", "nominal", "none")
 """Which way is better: less, more, nearer to what the explanation says; or neither."""
+KINDS = (*TRACKS, "measured")
+"""Tracks with simulated truth, and measurements of a real instrument."""
 
 
 @dataclass(frozen=True)
@@ -29,11 +34,12 @@ class Outcome:
     """What can be scored of an episode: S scored states at the m nodes of the truth's mesh. What an
     episode or a track does not have is None."""
 
-    world: World
+    world: World | None
+    """None of measurements"""
     seconds_per_step: float
     """s, of the method on one core"""
     errors: np.ndarray
-    """(S,) ẽ_c (5.12) of each state"""
+    """(S,) ẽ_c (5.12) of each state; of measurements, the mean square of `prediction_error`"""
     spent: int | None = None
     """injections that a policy made"""
     mean: np.ndarray | None = None
@@ -57,6 +63,10 @@ class Outcome:
     """(S, m) mol/m³, where every scored state has a variance"""
     velocity: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
     """(S, p) estimated and true m/s, and weights (p,), where the flow is asked for"""
+    mean_nis: float | None = None
+    """NIS/m of measurements"""
+    ktc: float | None = None
+    """score of the Kuopio Tomography Challenge, where a segmentation of the truth is known"""
 
     @property
     def weights(self) -> np.ndarray:
@@ -83,7 +93,7 @@ class Score:
     needs : sequence of str
         Fields of `Outcome` without which the score is None.
     tracks : sequence of str
-        Among `TRACKS`.
+        Among `KINDS`.
     factor : float
         What it is multiplied by where it is shown: 1e3 for seconds in ms.
     everywhere : bool
@@ -115,7 +125,7 @@ class Score:
         if self.better not in BETTER:
             raise ValueError(f"better must be one of {', '.join(BETTER)}, got {self.better!r}")
         for argument, given, known in (("needs", self.needs, Outcome.__dataclass_fields__),
-                                       ("tracks", self.tracks, TRACKS)):
+                                       ("tracks", self.tracks, KINDS)):
             if unknown := [each for each in given if each not in known]:
                 raise ValueError(f"{argument} must be among {', '.join(known)}; got "
                                  f"{', '.join(map(repr, unknown))}")
@@ -158,10 +168,11 @@ def register_score(score: Score) -> Score:
 
 
 def scores(track: str | None = None) -> dict[str, Score]:
-    """All of one track, or of both, by name, in the order of tables: ours, then those of installed
-    packages and those registered by hand."""
+    """All of one of `KINDS`, or of all tracks, by name, in the order of tables: ours, then those of
+    installed packages and those registered by hand."""
     _load_installed()
-    return {name: each for name, each in _scores.items() if track is None or track in each.tracks}
+    kinds = set(TRACKS) if track is None else {track}
+    return {name: each for name, each in _scores.items() if kinds & set(each.tracks)}
 
 
 @lru_cache(maxsize=1)
@@ -175,8 +186,9 @@ def _load_installed() -> None:
 
 
 def scored(track: str, outcome: Outcome) -> dict[str, float | None]:
-    """Name -> what each score of a track says of an episode."""
-    return {name: each(outcome) for name, each in scores(track).items()}
+    """Name -> what each score of a track says of an episode; of measurements, their own scores."""
+    kind = "measured" if outcome.world is None else track
+    return {name: each(outcome) for name, each in scores(kind).items()}
 
 
 def _contrast(outcome: Any) -> float:
@@ -189,8 +201,10 @@ def _of_velocity(outcome: Any) -> float:
     return scoring.relative_error(estimated, true, np.diag(weights))
 
 
-def _nis(outcome: Any) -> float:
+def _nis(outcome: Any) -> float | None:
     """The mean of νᵀS⁻¹ν/m, m being the readings that were used each time."""
+    if outcome.innovations is None:
+        return outcome.mean_nis
     innovations, covariances = outcome.innovations
     if isinstance(innovations, np.ndarray):                     # all at once: the same bits as ever
         return float(scoring.normalised_innovations(innovations, covariances).mean())
@@ -206,14 +220,22 @@ def _claimed(outcome: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarr
 
 for _score in (
     Score("error", "ẽ_c", "relative estimation error (5.12)",
-          lambda outcome: outcome.errors.mean(), tracks=TRACKS, everywhere=True),
+          lambda outcome: outcome.errors.mean(), tracks=KINDS, everywhere=True),
+    Score("prediction_error", "withheld RMSE",
+          "RMS residual of withheld readings relative to the standard deviation of their noise; 1 "
+          "is the noise level",
+          lambda outcome: float(np.sqrt(outcome.errors.mean())), tracks=("measured",)),
+    Score("ktc", "KTC",
+          "score of the Kuopio Tomography Challenge 2023: similarity of the estimate's and the "
+          "true segmentation, 1 if equal",
+          lambda outcome: outcome.ktc, better="higher", tracks=("measured",)),
     Score("contrast_error", "contrast",
           "error relative to the deviation from the homogeneous estimate; 1 is no better than that",
           _contrast, needs=("mean", "truth"), everywhere=True),
     Score("nis", "NIS/m",
           "normalised innovation squared, of all scored measurements; 1 when the filter's own "
           "uncertainty fits",
-          _nis, better="nominal", needs=("innovations",), tracks=TRACKS, everywhere=True),
+          _nis, better="nominal", tracks=KINDS, everywhere=True),
     Score("crps", "CRPS", "continuous ranked probability score, mol/m³",
           lambda outcome: scoring.crps(*_claimed(outcome)), needs=("std",), tracks=TRACKS,
           everywhere=True),
@@ -238,7 +260,7 @@ for _score in (
     Score("seconds_per_step", "ms/step",
           "time per injection on one core, in the fastest episode: what is done once for a model "
           "is left apart",
-          lambda outcome: outcome.seconds_per_step, tracks=TRACKS, factor=1e3, everywhere=True,
+          lambda outcome: outcome.seconds_per_step, tracks=KINDS, factor=1e3, everywhere=True,
           repeats=False),
 ):
     register_score(_score)

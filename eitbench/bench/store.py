@@ -7,6 +7,7 @@ import json
 import os
 import platform
 import re
+import shlex
 import subprocess
 import timeit
 import warnings
@@ -19,24 +20,31 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from eitbench._code import code_digest, package_files
 from eitbench._files import PACKAGE, write_atomically
 from eitbench._foreign import cleaned
-from eitbench.bench.contradictions import split_of
-from eitbench.bench.records import SCHEMA, SHARED, read_records, sealed, write_record
+from eitbench.bench.records import (
+    SCHEMA,
+    SHARED,
+    check_record,
+    read_records,
+    sealed,
+    split_of,
+    write_record,
+)
+from eitbench.bench.scores import SCORING
 from eitbench.bench.strict_json import parsed
+from eitbench.data import cache
 from eitbench.data.seeds import name_seed
 
 PACKAGES = ("eitbench", "numpy", "scipy", "gymnasium", "scikit-fem", "numba", "stable-baselines3",
             "sb3-contrib", "torch")
-"""Whose versions a record names."""
+"""Packages whose versions a record names."""
 _OF_ALL = ("environment", "method", *SHARED)
-"""What the results that make one record have in common."""
-_HERE = ("traceback",)
-"""What a result says for its user, and a record does not."""
-_NEEDED = {"identity", "seed", "finished", "status", "run", *_OF_ALL}
-_TEXTS = ("identity", "seed", "finished", "status", "method", "title", "board", "version",
-          "method_sha256")
+"""Fields that the results of one record have in common."""
+_LOCAL = ("traceback",)
+"""Fields of a result that its user sees and a record does not have."""
+_OUTPUTS = ("--out", "-o", "--to")
+"""Options of commands that name where results go, on which no score depends."""
 
 
 class EpisodeStore:
@@ -52,7 +60,7 @@ class EpisodeStore:
 
     def put(self, environment: str, method: str, seed: int, result: dict[str, Any],
             fields: dict[str, np.ndarray]) -> None:
-        """Store one episode; the estimates first, so that a result never stands without them."""
+        """Store one episode; the estimates first, so that a result is never without them."""
         path = self._path(environment, method, name_seed(seed))
         if fields:
             content = io.BytesIO()
@@ -61,31 +69,32 @@ class EpisodeStore:
         write_atomically(path, json.dumps(result, indent=1, allow_nan=False).encode())
 
     def holds(self, environment: str, method: str, seed: int, identity: str) -> bool:
-        """Whether a successful result of exactly this identity is there."""
-        result = _read(self._path(environment, method, name_seed(seed)))
-        return result is not None and result["identity"] == identity and result["status"] == "ok"
+        """Return whether a successful result of exactly this identity is there."""
+        try:
+            result = _read(self._path(environment, method, name_seed(seed)))
+        except ValueError:
+            return False
+        return result["identity"] == identity and result["status"] == "ok"
 
     def results(self) -> Iterator[dict[str, Any]]:
-        """All stored results; a file that is none is passed over with a warning that names it."""
+        """Yield all stored results; a damaged file is left out with a warning that names it."""
         for path in sorted(self.folder.glob("episodes/*/*/*.json")):
-            if result := _read(path):
-                yield result
-            else:
-                warnings.warn(f"{cleaned(str(path))} is left out: it is no result of an episode",
-                              stacklevel=2)
+            try:
+                yield _read(path)
+            except ValueError as error:
+                warnings.warn(f"{cleaned(str(path))} is left out: it {error}", stacklevel=2)
 
     def tracebacks(self, record: dict[str, Any]) -> dict[str, str]:
-        """Seed -> the lines of the method's own code that led to the failure of that episode."""
+        """Map the seed of each failed episode to the lines of the method's code that led to it."""
         environment, method = record["environment"]["name"], record["method"]
         failed = [episode["seed"] for episode in record["episodes"] if episode["status"] != "ok"]
-        kept = {seed: _read(self._path(environment, method, seed)) for seed in failed}
-        return {seed: str(result.get("traceback", "")) if result else ""
-                for seed, result in kept.items()}
+        kept = {seed: read_json(self._path(environment, method, seed)) or {} for seed in failed}
+        return {seed: str(result.get("traceback", "")) for seed, result in kept.items()}
 
     def fields(self, result: dict[str, Any]) -> dict[str, np.ndarray]:
-        """The estimates that belong to a result: ``mean`` and perhaps ``std``, (T, n) in mol/m³.
+        """Read the estimates of a result: ``mean`` and perhaps ``std``, (T, n) in mol/m³.
 
-        ``std`` is NaN in states of which the method claims none. ``FileNotFoundError`` if there are
+        ``std`` is NaN in states for which the method gave none. ``FileNotFoundError`` if there are
         no estimates; ``ValueError``, naming the file, if it is damaged.
         """
         path = self._path(result["environment"]["name"], result["method"], result["seed"])
@@ -98,7 +107,6 @@ class EpisodeStore:
         # a damaged archive may raise anything: zlib.error, NotImplementedError, RuntimeError, …
         except Exception as error:
             raise ValueError(f"estimates {path} cannot be read: {error}") from None
-        # no std before a method's first claim: NaN is allowed there
         if "mean" not in fields or not all(
                 each.ndim == 2 and each.dtype.kind == "f" and not np.isinf(each).any()
                 for each in fields.values()) or np.isnan(fields["mean"]).any():
@@ -106,28 +114,25 @@ class EpisodeStore:
         return fields
 
     def records(self, also: Iterable[dict[str, Any]] = ()) -> list[dict[str, Any]]:
-        """The episodes, gathered into one record per environment, method and split of the seeds;
-        not checked yet.
+        """Gather the episodes into one record per environment, method and split of the seeds; not
+        checked yet.
 
-        Of what lies here only results of the latest run's code count, so that nothing stale is
-        taken for new. ``also`` are results of records: where they are of the same version of the
-        method, they fill in what is missing here or failed.
+        Of the stored results only those of the latest method's file and scoring count. ``also`` are
+        results of records: where they are of the same version of the method, they fill in what is
+        missing here or failed.
         """
         own, others = _by_record(self.results()), _by_record(also)
         records = []
         for key in dict.fromkeys([*own, *others]):
-            fresh = _of_one_code(own.get(key, []))
+            fresh = _of_latest_code(own.get(key, []))
             version = _latest(fresh or others[key])["version"]
             known = [each for each in others.get(key, []) if each["version"] == version]
             records.append(_gathered([*fresh, *known]))
         return records
 
     def write_records(self) -> list[dict[str, Any]]:
-        """Write the `records` into ``records/`` and return them.
-
-        One that is not valid is left out with a warning: what a method claimed there is no obstacle
-        for the others.
-        """
+        """Write the `records` into ``records/`` and return them; one that is not valid is left out
+        with a warning."""
         written = []
         for record in self.records():
             try:
@@ -147,7 +152,7 @@ _Groups = dict[tuple[str, str, str], list[dict[str, Any]]]
 
 
 def _by_record(results: Iterable[dict[str, Any]]) -> _Groups:
-    """Results that may stand in one record: of an environment, a method and a split."""
+    """Group results by environment, method and split."""
     groups: _Groups = {}
     for result in results:
         key = (result["environment"]["name"], result["method"], split_of(result["seed"]))
@@ -159,17 +164,19 @@ def _latest(results: list[dict[str, Any]]) -> dict[str, Any]:
     return max(results, key=lambda result: result["finished"])
 
 
-def _of_one_code(results: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Those of the library and the method's file that ran last."""
-    def code(result: dict[str, Any]) -> tuple[str, str]:
-        return result["run"]["source"], result["method_sha256"]
+def _of_latest_code(results: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Select the results of the method's file and the declared versions that ran last."""
+    def code(result: dict[str, Any]) -> tuple[Any, ...]:
+        versions = result["run"]["versions"]
+        return result["method_sha256"], *map(versions.get, declared_versions())
 
     latest = code(_latest(results)) if results else None
     return [result for result in results if code(result) == latest]
 
 
 def _gathered(results: list[dict[str, Any]]) -> dict[str, Any]:
-    """The self-reported record of one version's episodes; of a seed's results the first success."""
+    """Make the self-reported record of one version's episodes; of several results of a seed the
+    first success counts."""
     latest = _latest(results)
     chosen: dict[str, dict[str, Any]] = {}
     for result in results:
@@ -177,58 +184,44 @@ def _gathered(results: list[dict[str, Any]]) -> dict[str, Any]:
             chosen[result["seed"]] = result
     # 9 before 10
     results = sorted(chosen.values(), key=lambda result: (len(result["seed"]), result["seed"]))
-    said = [json.dumps(result["run"], sort_keys=True) for result in results]
-    runs = dict(zip(said, (result["run"] for result in results), strict=True))
+    texts = [json.dumps(result["run"], sort_keys=True) for result in results]
+    runs = dict(zip(texts, (result["run"] for result in results), strict=True))
     place = {run: i for i, run in enumerate(runs)}
     return sealed({
         "schema": SCHEMA, "official": False, "split": split_of(latest["seed"]),
         **{key: latest[key] for key in _OF_ALL},
         "seeds": [result["seed"] for result in results], "runs": list(runs.values()),
-        "episodes": [{key: value for key, value in result.items() if key not in _OF_ALL + _HERE}
-                     | {"run": place[run]} for result, run in zip(results, said, strict=True)],
+        "episodes": [{key: value for key, value in result.items() if key not in _OF_ALL + _LOCAL}
+                     | {"run": place[run]} for result, run in zip(results, texts, strict=True)],
     })
 
 
 def results_of(record: dict[str, Any]) -> list[dict[str, Any]]:
-    """The results that were gathered into a record, as a store would hold them."""
-    shared = {key: record[key] for key in _OF_ALL}
-    return [episode | shared | {"run": record["runs"][episode["run"]]}
+    """Return the results that were gathered into a record, as a store would hold them."""
+    shared = {key: record[key] for key in _OF_ALL if key in record}
+    runs = record.get("runs", [])
+    return [episode | shared | ({"run": runs[episode["run"]]} if runs else {})
             for episode in record["episodes"]]
 
 
 def results_in(folder: Path) -> list[dict[str, Any]]:
-    """Those that were gathered into the records of a folder. Errors as `records.read_records`."""
+    """Return the results of all records of a folder. Errors as `records.read_records`."""
     return [result for record in read_records(folder) for result in results_of(record)]
 
 
-def _read(path: Path) -> dict[str, Any] | None:
-    """A result, if it is there and whole."""
-    result = read_json(path)
-    return result if result is not None and _is_whole(result) else None
-
-
-def _is_whole(result: dict[str, Any]) -> bool:
-    """Whether a record can be gathered from it and others; the record is checked in full then."""
-    if not result.keys() >= _NEEDED or not all(isinstance(result[name], str) for name in _TEXTS):
-        return False
-    environment = result["environment"]
-    run = result["run"]
-    return (isinstance(environment, dict) and isinstance(environment.get("kwargs"), dict)
-            and all(isinstance(environment.get(name), str) for name in ("id", "name"))
-            and isinstance(run, dict) and isinstance(run.get("source"), str)
-            and (result["status"] != "ok" or _is_scored(result)))
-
-
-def _is_scored(result: dict[str, Any]) -> bool:
-    scores = result.get("scores")
-    steps = result.get("step_errors")
-    return (isinstance(scores, dict) and isinstance(scores.get("error"), int | float)
-            and all(isinstance(score, int | float | None) for score in scores.values())
-            and isinstance(steps, list) and all(isinstance(step, int | float) for step in steps))
+def _read(path: Path) -> dict[str, Any]:
+    """Read a result. ``ValueError``, without the file's name, if a record of it alone is not
+    valid."""
+    result = parsed(path)
+    try:
+        check_record(_gathered([result]))
+    except (AttributeError, KeyError, TypeError) as error:
+        raise ValueError(f"is no result of an episode: {type(error).__name__}: {error}") from None
+    return result  # type: ignore[no-any-return]
 
 
 def read_json(path: Path) -> dict[str, Any] | None:
-    """What a file says, if it can be read and says a dict."""
+    """Read a JSON object; None if the file is missing, damaged, or holds something else."""
     try:
         content = parsed(path)
     except ValueError:
@@ -236,46 +229,63 @@ def read_json(path: Path) -> dict[str, Any] | None:
     return content if isinstance(content, dict) else None
 
 
-@lru_cache(maxsize=1)
-def source_digest() -> str:
-    """Hash of the code that scores depend on: stored results of other code are played again, and a
-    record says of each run which it was."""
-    rooms = ("numerics/*", "physics/*", "worlds/*", "data/*", "estimation/**/*", "scoring",
-             "envs/*", "rl/networks", "rl/agents", "bench/outcomes", "bench/playing", "bench/run",
-             "bench/scores")
-    return code_digest(package_files(*(f"{room}.py" for room in rooms)))
+# -- the code and the machine of a run ----------------------------------------------------------
+
+
+def declared_versions() -> dict[str, str]:
+    """Return the numbers that are raised when the same episode has other scores."""
+    return {"simulation": str(cache.SIMULATION), "scoring": str(SCORING)}
 
 
 @lru_cache(maxsize=1)
 def provenance() -> dict[str, Any]:
-    """Versions and commit of the code that this process runs."""
-    # results, not code
+    """Return versions and commit of the code that this process runs."""
+    # results are not code
     status = _git("--no-optional-locks", "status", "--porcelain", "--", ".", ":!leaderboards")
     config: Any = np.show_config(mode="dicts")  # type: ignore[call-overload]
     blas = config["Build Dependencies"]["blas"]
     packages = {name: _version(name) for name in PACKAGES}
     return {
-        "versions": {"python": platform.python_version(), **packages},
+        "versions": {"python": platform.python_version(), **packages, **declared_versions()},
         "blas": f"{blas['name']} {blas['version']}",
         "commit": _git("rev-parse", "HEAD"), "dirty": None if status is None else bool(status),
-        "source": source_digest(),
     }
+
+
+def portable_command(command: str) -> str:
+    """Return a command without the folders of the machine on which it was typed: without output
+    folders, and with the name alone of any other path that is absolute or leads upwards."""
+    try:
+        words = iter(shlex.split(command))
+    except ValueError:                                # an unbalanced quote
+        words = iter(command.split())
+    kept = []
+    for word in words:
+        option, equals, value = word.partition("=")
+        if word in _OUTPUTS:
+            next(words, None)
+        elif option not in _OUTPUTS and not re.match(r"-o[^-]", word):
+            kept.append(f"{option}={_portable(value)}" if equals else _portable(word))
+    return shlex.join(kept)
+
+
+def _portable(word: str) -> str:
+    path = Path(word)
+    return path.name if path.is_absolute() or ".." in path.parts else word
 
 
 @lru_cache(maxsize=1)
 def machine() -> dict[str, Any]:
-    """The machine of this process: in a cluster, another one than that of who started the run."""
+    """Describe the machine of this process; in a cluster it may be another than that of the process
+    that started the run."""
     return {"processor": _processor(), "cores": os.cpu_count(), "system": platform.system(),
             "blas_threads": 1, "matmul_seconds": matmul_seconds()}
 
 
 @lru_cache(maxsize=1)
 def matmul_seconds() -> float:
-    """Time of a 1000 × 1000 × 1000 matrix product in double precision on one thread here, in s: the
-    median of three.
-
-    In units of it, times of different machines can be compared.
-    """
+    """Time a 1000 × 1000 × 1000 matrix product in double precision on one thread, in s: the median
+    of three. In units of it, times of different machines can be compared."""
     a, b = np.random.default_rng(0).normal(size=(2, 1000, 1000))
     with threadpool_limits(1):
         return float(np.median(timeit.repeat(lambda: a @ b, number=1, repeat=3)))
@@ -290,7 +300,7 @@ def _version(package: str) -> str | None:
 
 def _git(*arguments: str) -> str | None:
     checkout = PACKAGE.parent
-    if not (checkout / ".git").exists():  # installed: a repository around it is somebody else's
+    if not (checkout / ".git").exists():  # installed: a repository around it is another one
         return None
     try:
         return subprocess.run(["git", *arguments], cwd=checkout, capture_output=True, text=True,

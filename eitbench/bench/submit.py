@@ -1,122 +1,114 @@
-"""Play the test episodes with one method, or all of ours, and write leaderboard records of them."""
+"""Run the test episodes with one method, or all built-in ones, and write leaderboard records."""
 
 from __future__ import annotations
 
-import glob
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 from eitbench.bench import suites, tracks
-from eitbench.bench.contradictions import split_of
-from eitbench.bench.records import read_record, write_record
+from eitbench.bench.records import read_record, split_of, write_record
 from eitbench.bench.run import Job, run_jobs, unplayed
 from eitbench.bench.store import EpisodeStore, provenance, results_of
 from eitbench.bench.text import seed_ranges
-from eitbench.data.seasons import current_season
 from eitbench.data.seeds import name_seed
 
 
 def submit(method: str | None, environments: list[str], seeds: list[int] | None,
            store: EpisodeStore, to: Path, *, policy: bool = False, official: bool = False,
-           isolate: str = "others", n_jobs: int = 1, backend: str = "loky",
+           isolate: str = "auto", n_jobs: int = 1, backend: str = "loky",
            command: str = "") -> Iterator[Path]:
-    """Play what neither ``store`` nor a record holds yet, and write one record for each environment
-    into the folder ``to``, one after the other: what was done before an interruption has its own.
+    """Check what is asked for, then return an iterator over the paths of records: it runs what
+    neither ``store`` nor an earlier record holds, environment after environment, and writes each
+    record into the folder ``to`` when its environment is finished.
 
-    Parameters
-    ----------
-    method : str or None
-        Name or path of a baseline, or of a ``policy``. None: all of ours.
-    environments : list of str
-        With a method at least one, and all of them must be such that it plays them; without, by
-        default all.
-    seeds : list of int
-        Of the season's test split; default: those of the full suite.
-    official : bool
-        Whether a maintainer runs it; else the records say that they are self-reported.
-    isolate : str
-        Whether the method runs in a process of its own; one of `suites.ISOLATE`.
-    n_jobs, backend, command
-        As in `run.run_jobs`.
-
-    Yields
-    ------
-    path
-        Of a record. All test episodes that the store, or a record there before, holds of this
-        version of the method are in them, those that failed too.
+    A record holds all test episodes, failed ones too, that the store or an earlier record has of
+    this version of the method. Without a ``method`` all built-in ones are run, by default in all
+    environments. ``official`` records are a maintainer's, from a commit without changes.
 
     Raises
     ------
     ValueError
-        If a seed is not of the test split, the method does not play one of the environments, an
-        official one is asked for from a checkout with changes, or a record is not valid or would
-        replace one that says more.
+        By the call, if a seed is not of the test split, the method does not run in one of the
+        environments, an official record is asked for from a checkout with changes, or a record
+        would lose its being official; by the iterator, if a record is not valid or would lose
+        episodes.
     """
     code = provenance()
     if official and (code["commit"] is None or code["dirty"]):
         where = f"and changes to {code['commit'][:8]}" if code["commit"] else "outside a checkout"
         raise ValueError("official must be False unless this is a commit without changes, got "
                          f"official=True {where}")
-    split = current_season().split
+    split = "test"
     outside = [name_seed(seed) for seed in seeds or [] if split_of(name_seed(seed)) != split]
     if outside:
-        raise ValueError(f"seeds of a submission must be of the season's split {split}, got "
+        raise ValueError(f"seeds of a submission must be of the split {split}, got "
                          f"{', '.join(outside)}")
     if method is not None and not environments:
         raise ValueError("env must name at least one environment to submit for")
-    asked = (_jobs(method, id, policy, seeds, isolate) for id in environments or tracks.ids())
-    # what does not fit is said before anything is played
-    for jobs in asked if method is None else list(asked):
-        before = list[dict[str, Any]]()
-        played = {(job.environment.name, job.load().name): job.load().version for job in jobs}
-        for (environment, name), version in played.items():
-            for path, earlier in _earlier(Path(to), environment, name, version, split):
-                _check_nothing_is_lost(path, earlier, official)
-                before += results_of(earlier) if earlier["official"] == official else []
-        run_jobs(unplayed(jobs, before), store, n_jobs=n_jobs, backend=backend, command=command)
-        made = []
-        for record in store.records(also=before):
-            key = record["environment"]["name"], record["method"]
-            if key in played and record["split"] == split:
-                there = _earlier(Path(to), *key, record["version"], split)
-                made.append((record | {"official": official}, there))
-        for record, there in made:
-            for path, earlier in there:
-                _check_nothing_is_lost(path, earlier, official, record["seeds"])
-        for record, there in made:
-            written = write_record(to, record)
-            for path, _ in there:
-                if path != written:                        # of an older format, under another name
-                    path.unlink()
-            yield written
+    asked: Iterable[list[Job]] = (_jobs(method, id, policy, seeds, isolate, official)
+                                  for id in environments or tracks.ids())
+    if method is not None:
+        asked = list(asked)
+        for jobs in asked:
+            _earlier(Path(to), jobs, split, official)
+    else:
+        for id in environments:
+            tracks.track_of(id)
+    return (path for jobs in asked
+            for path in _submitted(jobs, store, Path(to), split, official, n_jobs, backend,
+                                   command))
+
+
+def _submitted(jobs: list[Job], store: EpisodeStore, to: Path, split: str, official: bool,
+               n_jobs: int, backend: str, command: str) -> Iterator[Path]:
+    """Run the jobs of one environment and write their records."""
+    earlier = _earlier(to, jobs, split, official)
+    before = [result for record in earlier.values() if record["official"] == official
+              for result in results_of(record)]
+    run_jobs(unplayed(jobs, before), store, n_jobs=n_jobs, backend=backend, command=command)
+    asked = _versions(jobs)
+    made = [record | {"official": official} for record in store.records(also=before)
+            if (record["environment"]["name"], record["method"], record["version"]) in asked
+            and record["split"] == split]
+    found = {(record["environment"]["name"], record["method"]) for record in made}
+    for environment, method, _ in asked:
+        if (environment, method) not in found:
+            raise ValueError(f"{store.folder} holds no valid result of {method} in {environment}")
+    for record in made:
+        for path, old in earlier.items():
+            missing = [seed for seed in old["seeds"] if seed not in record["seeds"]]
+            if missing and all(old[key] == record[key] for key in ("method", "version")):
+                raise ValueError("to must not hold a record that says more; "
+                                 f"{path} would lose its episodes {seed_ranges(missing)}")
+    for record in made:
+        yield write_record(to, record)
 
 
 def _jobs(method: str | None, id: str, policy: bool, seeds: list[int] | None,
-          isolate: str) -> list[Job]:
-    """What is to be played in one environment."""
+          isolate: str, official: bool) -> list[Job]:
+    """Return what is to be run in one environment."""
     methods = [] if method is None else [method]
     asked = "injection" if policy else "estimation"
     track = tracks.track_of(id) if method is None else asked
-    return suites.jobs(track, [id], methods, seeds, isolate=isolate)
+    return suites.jobs(track, [id], methods, seeds, isolate=isolate, strict=official)
 
 
-def _earlier(to: Path, environment: str, method: str, version: str,
-             split: str) -> list[tuple[Path, dict[str, Any]]]:
-    """Records there of this version's episodes of a split; at most one, unless of several
-    formats."""
-    paths = sorted(to.glob(f"{environment}--{glob.escape(method)}--*.json"))
-    return [(path, record) for path, record in zip(paths, map(read_record, paths), strict=True)
-            if (record["method"], record["version"], record["split"]) == (method, version, split)]
+def _versions(jobs: list[Job]) -> list[tuple[str, str, str]]:
+    """Return environment, method and version of the jobs, each once."""
+    return list(dict.fromkeys((job.environment.name, job.load().name, job.load().version)
+                              for job in jobs))
 
 
-def _check_nothing_is_lost(path: Path, earlier: dict[str, Any], official: bool,
-                           seeds: list[str] | None = None) -> None:
-    """``ValueError`` if the record at ``path`` would lose what makes it worth more; before anything
-    is played, without ``seeds``, as far as is known then."""
-    missing = [] if seeds is None else [seed for seed in earlier["seeds"] if seed not in seeds]
-    lost = [*["its being official"] * (earlier["official"] and not official),
-            *([f"its episodes {seed_ranges(missing)}"] if missing else [])]
-    if lost:
-        raise ValueError("to must not hold a record that says more; "
-                         f"{path} would lose {' and '.join(lost)}")
+def _earlier(to: Path, jobs: list[Job], split: str, official: bool) -> dict[Path, dict[str, Any]]:
+    """Read the records in ``to`` of these versions of methods. ``ValueError`` if one is official
+    and the new one would not be."""
+    found = {}
+    for environment, method, version in _versions(jobs):
+        name = tracks.record_name(environment, method, version, split)
+        if (path := to / name).exists():
+            found[path] = read_record(path)
+            if found[path]["official"] and not official:
+                raise ValueError("to must not hold a record that says more; "
+                                 f"{path} would lose its being official")
+    return found

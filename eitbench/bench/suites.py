@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from eitbench.bench import playing
+from eitbench.bench.isolation import choose_isolation
 from eitbench.bench.methods import (
     FORMS,
     find_method,
     installed_methods,
-    is_ours,
     is_path,
-    load_method,
     own_agents,
     own_methods,
 )
@@ -33,12 +32,10 @@ from eitbench.bench.tracks import (
 
 TOO_SLOW_FOR_QUICK = {("filter", "gauss_newton")}
 """An image at every step takes minutes an episode."""
-ISOLATE = ("never", "others", "always")
-"""Whose methods run in a process of their own."""
 
 
 def jobs(track: str, environments: list[str], methods: list[str], seeds: list[int] | None = None, *,
-         suite: str = "full", estimator: str = "full", isolate: str = "others",
+         suite: str = "full", estimator: str = "full", isolate: str = "auto", strict: bool = False,
          worlds: Sequence[dict[str, Any]] = ({},)) -> list[Job]:
     """Every named method of a track in every named environment that it suits, and in each variant
     of that, ordered by environment, method and seed.
@@ -54,8 +51,8 @@ def jobs(track: str, environments: list[str], methods: list[str], seeds: list[in
     suite : "quick" or "full"
     estimator : str
         What stands inside environments that ask for injections: one of `tracks.ESTIMATORS`.
-    isolate : str
-        One of `ISOLATE`.
+    isolate, strict
+        As of `isolation.choose_isolation`.
     worlds : sequence of dict
         Variants of each environment: what `gymnasium.make` takes as ``world``.
 
@@ -82,11 +79,11 @@ def jobs(track: str, environments: list[str], methods: list[str], seeds: list[in
         env = _to_look_at(asked)
         board = board_of(env)
         numbers = default_seeds(id, suite) if seeds is None else seeds
-        # Environment by environment, since models are kept for a few only, and a guest for one
-        # method.
+        # Environment by environment, since models are kept for a few only, and a worker
+        # serves one method.
         for method in methods or [*own_methods(track), *own_agents(id)]:
             skipped = suite == "quick" and not methods and (board, method) in TOO_SLOW_FOR_QUICK
-            job = Job(asked, _absolute(method), 0, is_isolated(asked, method, isolate))
+            job = isolated_job(asked, method, isolate, strict)
             loaded = job.load()
             names[method] = loaded.name
             if not skipped and can_play(loaded, env):
@@ -99,13 +96,11 @@ def jobs(track: str, environments: list[str], methods: list[str], seeds: list[in
     return todo
 
 
-def is_isolated(environment: Environment, method: str, isolate: str) -> bool:
-    """Whether a method plays in a process of its own; ours that are shown the truth never do."""
-    if isolate not in ISOLATE:
-        raise ValueError(f"isolate must be one of {', '.join(ISOLATE)}, got {isolate!r}")
-    if isolate != "always" or not is_ours(method):
-        return isolate != "never" and not is_ours(method)
-    return not load_method(method, environment.track).privileged
+def isolated_job(environment: Environment, method: str, isolate: str,
+                 strict: bool = False) -> Job:
+    """Return the job of a method, by name or path, isolated as `isolation.choose_isolation`."""
+    kind = choose_isolation(environment, method, isolate, strict=strict)
+    return Job(environment, _absolute(method), 0, kind)
 
 
 def _to_look_at(asked: Environment) -> Any:

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import hashlib
 import json
+from inspect import Parameter, signature
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium as gym
+from gymnasium.envs.registration import load_env_creator
 
-from eitbench.data.seasons import in_season
 from eitbench.data.seeds import parse_seeds
 from eitbench.worlds.registry import entries, entry
 
@@ -38,9 +39,20 @@ ESTIMATORS = ("full", "reduced")
 """What may stand inside an injection environment: the exact filter, for scores, or that of
 training."""
 
+MEASURED = "eitbench.envs.measured:case_env"
+"""Entry point of the ids of measured cases."""
+MEASURED_FILES = "eitbench-Measured-"
+"""Beginning of the names of their records."""
+MEASURED_SEEDS = "test:0-4"
+"""Each withholds other readings of the same measurements."""
 QUICK = ("eitbench/Pipe2D-v0", "eitbench/Pipe2DFixedLag-v0", "eitbench/Pipe2DSmoothing-v0")
 """What the quick suite runs; the full one runs all that ask for estimates."""
 QUICK_SEEDS = "test:0-3"
+
+
+SCORED = {"estimation": {}, "injection": {"estimator": "full", "observation": "raw"}}
+"""Arguments of each track's environments in runs, unless others are given: with the exact filter,
+and what policies are shown as it is. In training, registered ids have other defaults."""
 
 
 class Environment(NamedTuple):
@@ -65,6 +77,14 @@ class Environment(NamedTuple):
         """One of `TRACKS`; ``ValueError`` if there is no such environment."""
         return track_of(self.id)
 
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """All arguments with which it is made, defaults included."""
+        creator = load_env_creator(str(gym.spec(self.id).entry_point))
+        defaults = {name: each.default for name, each in signature(creator).parameters.items()
+                    if each.default is not Parameter.empty}
+        return defaults | registered(self.id) | SCORED[self.track] | json.loads(self.kwargs)
+
     def make(self, **extra: Any) -> EstimationEnv | InjectionEnv:
         """A fresh environment as it is played, without gymnasium's wrappers.
 
@@ -73,19 +93,27 @@ class Environment(NamedTuple):
         ValueError
             If there is none of this id, or its arguments are wrong.
         """
-        arguments = json.loads(self.kwargs)
-        if self.track == "injection":
-            arguments = {"estimator": "full", "observation": "raw"} | arguments | extra
-            if arguments["estimator"] not in ESTIMATORS:
-                raise ValueError(f"estimator must be one of {', '.join(ESTIMATORS)}, got "
-                                 f"{arguments['estimator']!r}")
-        made: Any = gym.make(self.id, disable_env_checker=True, **(arguments | extra)).unwrapped
+        arguments = SCORED[self.track] | json.loads(self.kwargs) | extra
+        if arguments.get("estimator", "full") not in ESTIMATORS:
+            raise ValueError(f"estimator must be one of {', '.join(ESTIMATORS)}, got "
+                             f"{arguments['estimator']!r}")
+        made: Any = gym.make(self.id, disable_env_checker=True, **arguments).unwrapped
         return made
 
 
 def ids(track: str | None = None) -> list[str]:
     """Registered environments of one track, or of all, as they were registered."""
     return [id for id, each in entries().items() if track in (None, each.track)]
+
+
+def measured_ids() -> list[str]:
+    """Ids of measured cases, which no default suite contains."""
+    return [id for id in gym.registry if is_measured(id)]
+
+
+def is_measured(id: str) -> bool:
+    """Whether an id is a measured case: its data have no simulated truth."""
+    return id in gym.registry and gym.registry[id].entry_point == MEASURED
 
 
 def own_ids() -> list[str]:
@@ -95,12 +123,12 @@ def own_ids() -> list[str]:
 
 def track_of(id: str) -> str:
     """One of `TRACKS`; ``ValueError`` if there is no environment of this id."""
-    return entry(id).track
+    return "estimation" if is_measured(id) else entry(id).track
 
 
 def home_of(id: str) -> str:
     """The id whose task estimators get in this one too, though the truth is another; else empty."""
-    return entry(id).home
+    return "" if is_measured(id) else entry(id).home
 
 
 def check_track(id: str, track: str) -> None:
@@ -115,9 +143,8 @@ def registered(id: str) -> dict[str, Any]:
     """Arguments that an id was registered with; none for one that is not registered."""
     each = entries().get(id)
     if each is None:
-        return {}
-    played = {"estimator": "full", "observation": "raw"} if each.track == "injection" else {}
-    return played | dict(each.settings)
+        return dict(gym.registry[id].kwargs) if is_measured(id) else {}
+    return SCORED[each.track] | dict(each.settings)
 
 
 def changed(id: str, kwargs: dict[str, Any]) -> dict[str, Any]:
@@ -190,7 +217,9 @@ def track_of_board(board: str) -> str:
 
 
 def class_of(id: str, board: str) -> str:
-    """Which of `CLASSES` a board of an environment belongs to."""
+    """Which of `CLASSES` a board of an environment belongs to; ``measured`` of a case."""
+    if is_measured(id):
+        return "measured"
     each = entries().get(id)
     at_rest = each is not None and getattr(each.world.target, "stands_still", False)
     return "stationary" if at_rest else board
@@ -199,4 +228,6 @@ def class_of(id: str, board: str) -> str:
 def default_seeds(id: str, suite: str = "full") -> list[int]:
     """Seeds that are played in an environment when nobody says which: of the season's test
     episodes."""
-    return parse_seeds(in_season(QUICK_SEEDS if suite == "quick" else entry(id).seeds))
+    if is_measured(id):
+        return parse_seeds(MEASURED_SEEDS)
+    return parse_seeds(QUICK_SEEDS if suite == "quick" else entry(id).seeds)

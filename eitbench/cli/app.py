@@ -1,6 +1,4 @@
-"""The command line: `eitbench list | run | bank | export | train | policies | submit | verify |
-check | season | held-out | migrate | golden | kits | fit-prior | fit-model | estimate |
-submit-measured | leaderboard | compare | render | reproduce`."""
+"""The command line of eitbench."""
 
 from __future__ import annotations
 
@@ -15,13 +13,11 @@ from eitbench import __version__
 from eitbench.cli import options
 from eitbench.cli.estimate import estimate
 from eitbench.cli.export import export
-from eitbench.cli.maintain import golden, held_out, kits, migrate
-from eitbench.cli.measured import submit_measured
+from eitbench.cli.maintain import golden
 from eitbench.cli.play import policies, report, run, typed
 from eitbench.cli.priors import fit_model, fit_prior
-from eitbench.cli.season import app as season_commands
 from eitbench.cli.studies import thesis
-from eitbench.cli.trust import check, verify
+from eitbench.cli.trust import verify
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
                   context_settings={"help_option_names": ["-h", "--help"]}, help="""
@@ -54,8 +50,8 @@ def _main(
 def list_() -> None:
     """Show the environments, the baselines and policies, and which boards they play on."""
     from eitbench.bench.methods import load_method, own_methods
-    from eitbench.bench.tracks import boards_of, ids
-    from eitbench.data.recordings import outline
+    from eitbench.bench.tracks import boards_of, ids, measured_ids
+    from eitbench.data.regions import outline
     from eitbench.worlds.registry import entry
     from eitbench.worlds.task import lag_steps
     # Nothing is built: what takes long to make is shipped, the rest are numbers of the world.
@@ -77,6 +73,8 @@ def list_() -> None:
         allowed = "" if budget is None else f", {budget} of them allowed"
         options.say(f"  {name:40} injection   {what}, {world.n_steps - len(world.currents)} "
                     f"injections{allowed}")
+    for name in measured_ids():
+        options.say(f"  {name:40} measured    data are downloaded separately")
     for track, heading in (("estimation", "baselines"), ("injection", "policies")):
         options.say(heading)
         for name in own_methods(track):
@@ -102,8 +100,8 @@ def bank(
     import shutil
 
     from eitbench.data.bank import fill, missing_seeds, recording_bytes
+    from eitbench.data.cache import folder
     from eitbench.data.seeds import parse_seeds
-    from eitbench.data.store import folder
     from eitbench.worlds.registry import entry
     with options.clear_errors():
         numbers = parse_seeds(seeds)
@@ -168,7 +166,7 @@ def submit(
         help="Test episodes, as in test:0-9. Default: those of the boards.")] = None,
     official: Annotated[bool, typer.Option(
         "--official", help="For maintainers: a run of theirs.")] = False,
-    isolate: options.Isolate = options.Isolation.others,
+    isolate: options.Isolate = options.Isolation.auto,
     jobs: options.Jobs = options.CORES,
     backend: options.Backends = options.Backend.loky,
     out: options.Out = Path("results"),
@@ -196,16 +194,10 @@ def submit(
 
 
 app.command()(verify)
-app.command()(check)
-app.add_typer(season_commands, name="season")
-app.command("held-out")(held_out)
-app.command()(migrate)
 app.command()(golden)
-app.command()(kits)
 app.command("fit-prior")(fit_prior)
 app.command("fit-model")(fit_model)
 app.command()(estimate)
-app.command("submit-measured")(submit_measured)
 app.command()(export)
 
 
@@ -214,7 +206,8 @@ def leaderboard(
     out: options.Out = Path("results"),
     records: Annotated[Path | None, typer.Option(
         help="Folder of the leaderboards' records, such as leaderboards/results: render "
-             "leaderboard.csv, leaderboard.md and the pages site/ beside it instead.")] = None,
+             "leaderboard.csv, leaderboard.md, episodes.csv.gz and the pages site/ beside it "
+             "instead.")] = None,
     season: Annotated[int | None, typer.Option(
         min=1, help="With --records: the boards of an earlier season, in a folder season-N/ beside "
                     "them. Default: the current one.")] = None,
@@ -228,6 +221,7 @@ def leaderboard(
         with options.clear_errors():
             return report(out)
     from eitbench._files import write_atomically
+    from eitbench.bench.records import write_episode_table_of
     from eitbench.data.seasons import season_numbered
     from eitbench.report.boards import read_for_boards
     from eitbench.report.site import Beside, Measured, collect, render, render_site, write_site
@@ -244,6 +238,8 @@ def leaderboard(
         write_atomically(out / name, text.encode())
         options.say(f"wrote {out / name}")
     options.say(f"wrote {out / 'site' / 'index.html'}")
+    if season is None:
+        options.say(f"wrote {write_episode_table_of(records)}")
     for complaint in complaints:
         options.say(f"left out: {complaint}", err=True)
     raise typer.Exit(bool(complaints))
@@ -287,7 +283,7 @@ def render(
     out: Annotated[Path, typer.Option(
         "--out", "-o", help="An animation .gif or .webp, or a .png with --step.",
     )] = Path("results/episode.gif"),
-    isolate: options.Isolate = options.Isolation.others,
+    isolate: options.Isolate = options.Isolation.auto,
 ) -> None:
     """Draw an episode: truth, estimate, its spread, electrodes; of several baselines estimates."""
     from eitbench.bench.tracks import track_of
@@ -315,6 +311,26 @@ def reproduce(
         path, remark = thesis().FIGURES[name.value](options.numbers(seeds), jobs, out)
     options.say(f"wrote {path}\n{remark}")
 
+
+REPLACED = {
+    "check": "`eitbench verify RECORDS…` verifies the records of a submission",
+    "held-out": "docs/trust.md says how to draw the secret of held-out episodes",
+    "season": "`eitbench verify --top 3 --held-out 20 --secret FILE` verifies the first records; "
+              "there is one public test split",
+}
+"""Removed command -> what replaces it."""
+
+
+def _removed(name: str) -> None:
+    @app.command(name, hidden=True, add_help_option=False, context_settings={
+        "allow_extra_args": True, "ignore_unknown_options": True})
+    def removed() -> None:
+        options.say(f"`eitbench {name}` was removed: {REPLACED[name]}", err=True)
+        raise typer.Exit(2)
+
+
+for _name in REPLACED:
+    _removed(_name)
 
 if __name__ == "__main__":
     app()

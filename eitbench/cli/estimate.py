@@ -1,4 +1,4 @@
-"""The command `estimate`: what methods make of a record of a real instrument."""
+"""The command `estimate`: estimates from measurements of a real instrument."""
 
 from __future__ import annotations
 
@@ -13,95 +13,87 @@ from eitbench.cli import options
 
 def estimate(
     file: Annotated[Path, typer.Argument(
-        help="Record: our HDF5, .mat of KTC2023, KIT4 or EIDORS, a folder of Sciospec's .eit, or a "
-             "table.")],
+        help="Measurements: our HDF5, .mat of KTC2023, KIT4 or EIDORS, a folder of Sciospec's "
+             ".eit, or a table.")],
     vessel: Annotated[Path, typer.Option(help="YAML file that describes the vessel.")],
     baseline: Annotated[list[str], typer.Option(
         "--baseline", help="Method, by name or path; may be repeated. The first is drawn.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Page to write.")] = Path("report.html"),
     arrays: Annotated[Path | None, typer.Option(
-        help="File for all of the first method's estimates too, npz; they are kept in memory till "
-             "then.")] = None,
+        help="Write all estimates of the first method to this npz file too; they stay in memory "
+             "until then.")] = None,
     format: Annotated[str | None, typer.Option(
-        help="hdf5, ktc, eidors, sciospec or table. Default: what the file tells.")] = None,
+        help="hdf5, ktc, eidors, sciospec or table. Default: detected.")] = None,
     withheld: Annotated[float, typer.Option(
-        min=0.0, max=0.5, help="Part of the readings that methods are not shown and are judged "
-                               "by.")] = 0.1,
+        min=0.0, max=0.5, help="Fraction of the readings that is withheld from the methods and "
+                               "scores them.")] = 0.1,
     span: Annotated[str | None, typer.Option(
-        help="Only readings FIRST:LAST, counted from 0, the last not among them.")] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Which readings those are.")] = 0,
+        help="Only readings FIRST:LAST, counted from 0, without the last.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Draws the withheld readings.")] = 0,
     truth: Annotated[Path | None, typer.Option(
-        help="What was in a round tank, as KTC has it: variable truth of a .mat file, 256 × 256 "
-             "pixels 0 (water), 1 (conducts worse), 2 (better).")] = None,
+        help="Ground truth in a round tank, in the format of KTC: variable truth of a .mat file, "
+             "256 × 256 pixels 0 (water), 1 (resistive), 2 (conductive).")] = None,
     still: Annotated[bool, typer.Option("--still", help="The target does not move.")] = False,
     correction: Annotated[str, typer.Option(
-        help="What becomes of what the model of homogeneous fluid is off: offset or gain.")]
-    = "offset",
+        help="Correction of the misfit on homogeneous fluid: subtract an offset or divide by a "
+             "channel gain (offset or gain).")] = "offset",
     homogeneous_frames: Annotated[int, typer.Option(
-        min=1, help="First frames that are homogeneous fluid, where there is no reference.")] = 1,
+        min=1, help="Number of first frames of homogeneous fluid, without a reference.")] = 1,
 ) -> None:
-    """Estimate what an instrument saw in a tank or pipe: calibrates the vessel, plays methods, and
-    writes a page with the estimates, how well they predict readings that they were not shown,
-    and what is odd about the record."""
-    from eitbench.bench.measured import pages_steps, play_record
-    from eitbench.bench.segmentation import (
-        check_tank,
-        distances,
-        ktc_score,
-        read_truth,
-        segmented,
-    )
-    from eitbench.data.measured import read
+    """Estimate the concentration in a real tank or pipe: calibrate the vessel, run methods, and
+    write a page with estimates, residuals of withheld readings and data-quality warnings."""
+    from eitbench.bench.measured import plotted_steps
+    from eitbench.bench.playing import run_on_measurements
     from eitbench.envs.measured import MeasuredEnv
+    from eitbench.measured import read
+    from eitbench.measured.segmentation import read_truth, require_round_tank
     from eitbench.report.measured import write_report
     with options.clear_errors():
         if out.suffix != ".html":
             raise ValueError(f"--out must end in .html, got {out}")
-        record = read(file, format, None if span is None else _steps(span))
-        options.say(f"{file}: {len(record.readings)} times {len(record.matrix)} readings of "
-                    f"{record.currents.shape[1]} electrodes; a method takes about "
-                    f"{10 + 0.03 * len(record.readings):.0f} s")
-        env = MeasuredEnv(record, vessel, withheld=withheld, moves=False if still else None,
+        measurements = read(file, format, None if span is None else _steps(span))
+        T, M = measurements.readings.shape
+        options.say(f"{file}: {T} times {M} readings of {measurements.currents.shape[1]} "
+                    f"electrodes; a method takes about {10 + 0.03 * T:.0f} s")
+        env = MeasuredEnv(measurements, vessel, withheld=withheld, moves=False if still else None,
                           correction=correction, homogeneous_frames=homogeneous_frames)
-        picture = None if truth is None else read_truth(truth)
-        if picture is not None:
-            check_tank(env)
-        doubts = env.doubts()
-        for doubt in doubts:
-            options.say(f"odd: {doubt}", err=True)
-        played = []
+        mask = None if truth is None else read_truth(truth)
+        if mask is not None:
+            require_round_tank(env.vessel)
+        for warning in env.quality_warnings():
+            options.say(f"warning: {warning}", err=True)
+        runs = []
         for name in baseline:
-            kept = pages_steps(env) if arrays is None else None
-            played.append(play_record(env, name, seed, kept=kept))
-            options.say(f"{played[-1].method}: withheld readings missed by "
-                        f"{played[-1].withheld:.2f} noise std")
-            if played[-1].velocity is not None:
-                said = ", ".join(f"{each:.3g}" for each in played[-1].velocity[-1])
-                options.say(f"  mean velocity at the end {said} m/s")
-            if picture is not None:
-                found = segmented(env, played[-1].mean[-1])
-                options.say(f"  KTC's score {ktc_score(picture, found):.3f}; "
-                            f"{_said_of(distances(env, picture, found))}")
-        write_report(out, env, played, record.source, doubts, picture)
+            kept = plotted_steps(env) if arrays is None else None
+            run = run_on_measurements(env, name, seed, kept=kept)
+            runs.append(run)
+            options.say(f"{run.method}: withheld RMSE {run.withheld_rmse:.2f} noise std")
+            if run.velocity is not None:
+                velocity = ", ".join(f"{each:.3g}" for each in run.velocity[-1])
+                options.say(f"  mean velocity at the end {velocity} m/s")
+            if mask is not None:
+                options.say(f"  {_truth_scores(env, run, mask)}")
+        write_report(out, env, runs, mask)
         options.say(f"wrote {out}")
         if arrays is not None:
-            played[0].save(arrays, env)
+            runs[0].save(arrays, env)
             options.say(f"wrote {arrays}")
 
 
 def _steps(span: str) -> slice:
-    """``0:800``"""
+    """Parse ``0:800``."""
     first, colon, last = span.partition(":")
     if not (colon and first.isdigit() and (last.isdigit() or not last)):
         raise ValueError(f"--span must be two numbers such as 0:800, got {span!r}")
     return slice(int(first), int(last) if last else None)
 
 
-def _said_of(distances: list[float]) -> str:
-    """How far a picture's bodies are off, in m, infinite of one that it does not show."""
-    shown = [f"{100 * each:.2f}" for each in distances if isfinite(each)]
-    missing = len(distances) - len(shown)
-    if not shown:
-        return "it shows none of the bodies"
-    said = f"its bodies are off by {', '.join(shown)} cm"
-    return f"{said}; of {missing} it shows nothing" if missing else said
+def _truth_scores(env, run, truth) -> str:  # type: ignore[no-untyped-def]
+    """Describe the KTC score and the centroid errors of the last estimate."""
+    from eitbench.measured.segmentation import centroid_errors, ktc_score, segment
+    found = segment(env.vessel, env.task, run.mean[-1])
+    errors = centroid_errors(env.vessel, truth, found)
+    shown = [f"{100 * each:.2f}" for each in errors if isfinite(each)]
+    centroids = f"centroid errors {', '.join(shown)} cm; " if shown else ""
+    return (f"KTC score {ktc_score(truth, found):.3f}; {centroids}{len(errors) - len(shown)} of "
+            f"{len(errors)} inclusions missing")

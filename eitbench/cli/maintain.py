@@ -1,9 +1,8 @@
-"""The commands `golden`, `kits`, `migrate` and `held-out`, for maintainers."""
+"""The command `golden`, for maintainers."""
 
 from __future__ import annotations
 
 from itertools import chain
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -41,47 +40,3 @@ def golden(
                     "the method's next version with --new-version and run its records again",
                     err=True)
         raise typer.Exit(1)
-
-
-def kits(
-    names: Annotated[list[str] | None, typer.Argument(
-        help="Ids of worlds of ours. Default: all.")] = None,
-) -> None:
-    """For maintainers: make what is shipped for playing our worlds (eitbench/data/kits) anew, and
-    say whether it is still the same: exit status 0 if so, 1 if not. Missing kits are written; five
-    minutes for all."""
-    from eitbench.bench import kits as shipped
-    from eitbench.bench.tracks import own_ids
-    moved = False
-    with options.clear_errors():
-        for name, what in shipped.update(names or own_ids()):
-            moved |= what not in ("new", "same")
-            options.say(f"{name}: {what}")
-    if moved:
-        options.say("kits have moved: find out why; delete them and run this again, or give the "
-                    "world the next -vN", err=True)
-        raise typer.Exit(1)
-
-
-def migrate(
-    folder: Annotated[Path, typer.Argument(
-        exists=True, file_okay=False, help="Folder of records.")],
-) -> None:
-    """For maintainers: rewrite records of an older format in that of today; no episode, score or
-    run is lost."""
-    from eitbench.bench.migrate import migrate as rewritten
-    with options.clear_errors():
-        for old, new in rewritten(folder):
-            options.say(f"{old.name} -> {new.name}")
-
-
-def held_out(
-    new: Annotated[Path, typer.Option(
-        help="Where to write a new salt; keep it secret, and keep it.")],
-) -> None:
-    """For maintainers: draw the salt of held-out episodes, and publish its hash in
-    leaderboards/held_out.json, once."""
-    from eitbench.bench import salts
-    with options.clear_errors():
-        digest = salts.publish_new_salt(new)
-    options.say(f"wrote {new}, sha256 {digest}, and {salts.PUBLISHED}")

@@ -18,7 +18,7 @@ from eitbench.data.parallel import WorkerLost
 
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 Backend = StrEnum("Backend", ["loky", "ray", "dask"])
-Isolation = StrEnum("Isolation", ["never", "others", "always"])
+Isolation = StrEnum("Isolation", ["auto", "none", "process", "bubblewrap"])
 
 
 def found(path: Path | None) -> Path | None:
@@ -33,8 +33,10 @@ Backends = Annotated[Backend, typer.Option(
     "--backend", help="Who starts the processes: loky on this machine; ray or dask (extra cluster) "
                       "on the machines of one.")]
 Isolate = Annotated[Isolation, typer.Option(
-    help="Whose methods run in a process of their own, out of reach of truths and files: those "
-         "that are not ours, or all.")]
+    help="How methods run. none: in this process. process: in a separate one. bubblewrap: in a "
+         "separate one that reads no files, truths or network. auto: built-in methods in this "
+         "process; a third-party file in a separate one, which for official runs and verification "
+         "must be confined by bubblewrap.")]
 Environments = Annotated[list[str] | None, typer.Option(help="Environment id; may be repeated.")]
 InjectionId = Annotated[str, typer.Option(help="Id of an injection environment.")]
 Records = Annotated[Path, typer.Option(
@@ -63,16 +65,16 @@ def say(text: object, *, err: bool = False) -> None:
 
 @contextmanager
 def clear_errors() -> Iterator[None]:
-    """Turn a ValueError about an argument, the loss of a process, what a guest did wrong, or the
-    want of an extra into a message instead of a traceback."""
+    """Turn a ValueError about an argument, the loss of a process, an error in a worker, or a
+    missing extra into a message instead of a traceback."""
     try:
         yield
     except WorkerLost as error:
         say(error, err=True)
         raise typer.Exit(1) from error
     except RuntimeError as error:
-        from eitbench.bench.sandbox.host import GuestError
-        if not isinstance(error, GuestError):
+        from eitbench.bench.isolation import WorkerError
+        if not isinstance(error, WorkerError):
             raise
         say(error, err=True)  # a traceback would show a stranger's words as they are
         raise typer.Exit(1) from error

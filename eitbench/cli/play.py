@@ -35,7 +35,7 @@ def run(
         "--set", help="Change a number of the world, as in instrument.noise_relative=0.02; may be "
                       "repeated. Several values, as in 0.01,0.02,0.05, are played one after the "
                       "other, with a table and a chart on the page.")] = None,
-    isolate: options.Isolate = options.Isolation.others,
+    isolate: options.Isolate = options.Isolation.auto,
     jobs: options.Jobs = options.CORES,
     backend: options.Backends = options.Backend.loky,
     out: options.Out = Path("results"),
@@ -70,7 +70,7 @@ def policies(
         help="Episodes, such as dev:0-49. Default: those of the boards.")] = None,
     estimator: Annotated[str, typer.Option(
         help="full: the exact filter, for scores; reduced: that of training.")] = "full",
-    isolate: options.Isolate = options.Isolation.others,
+    isolate: options.Isolate = options.Isolation.auto,
     jobs: options.Jobs = options.CORES,
     backend: options.Backends = options.Backend.loky,
     out: options.Out = Path("results"),
@@ -146,7 +146,7 @@ def _say_failures(store: EpisodeStore, records: list[dict[str, Any]],
     for failure in found:
         options.say(failure, err=True)
     hints = filter(None, (debug_command(failure, asked) for failure in found))
-    if (hint := next(hints, "")) and "--isolate never" not in typed().replace("=", " "):
+    if (hint := next(hints, "")) and "--isolate none" not in typed().replace("=", " "):
         options.say(f"to debug it in this process, where breakpoint() stops:\n  {hint}", err=True)
 
 

@@ -1,7 +1,8 @@
-"""The commands `verify` and `check`: whether records are true."""
+"""The command `verify`: rerun episodes of records and compare."""
 
 from __future__ import annotations
 
+import tempfile
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,161 +12,127 @@ from eitbench.cli import options
 
 
 def verify(
-    record: Annotated[Path | None, typer.Argument(
-        help="A record's file.", callback=options.found)] = None,
-    baseline: Annotated[str | None, typer.Option(
-        help="The method's file, if it is not one of ours.")] = None,
-    policy: Annotated[str | None, typer.Option(help="The same of an injection policy.")] = None,
-    episodes: Annotated[int, typer.Option(min=0, help="How many are played again.")] = 3,
+    paths: Annotated[list[Path] | None, typer.Argument(
+        help="Files of records.", callback=lambda paths: [options.found(path)
+                                                          for path in paths or []])] = None,
+    method: Annotated[str | None, typer.Option(
+        "--method", "--baseline", "--policy",
+        help="File of the method. Default: the built-in one of that name, or the one with the "
+             "record's sha256 in the folder methods beside the records.")] = None,
+    replay: Annotated[bool, typer.Option(
+        "--replay", help="Apply a policy's recorded actions; its code does not run.")] = False,
+    episodes: Annotated[int, typer.Option(min=0, help="Episodes of each record to rerun.")] = 3,
     seed: Annotated[int | None, typer.Option(
-        min=0, help="By which they are drawn. Default: any; with --all 0.")] = None,
+        min=0, help="Of their choice. Default: random; with --all 0.")] = None,
     tolerance: Annotated[float, typer.Option(
-        min=0.0, help="Relative difference of scores that is none.")] = 1e-6,
-    isolate: options.Isolate = options.Isolation.always,
+        min=0.0, help="Relative difference of scores that is accepted.")] = 1e-6,
+    isolate: options.Isolate = options.Isolation.auto,
     held_out: Annotated[int, typer.Option(
-        "--held-out", min=0, help="For maintainers: play so many held-out episodes too, and "
-                                  "ask whether the record is too good.")] = 0,
-    salt_file: Annotated[Path | None, typer.Option(
-        help="From which they follow; see `eitbench held-out`.")] = None,
+        "--held-out", min=0, help="For maintainers: held-out episodes of each record, to test "
+                                  "whether the record is better.")] = 0,
+    secret: Annotated[Path | None, typer.Option(
+        help="File of the secret from which held-out seeds follow; see docs/trust.md.")] = None,
     every: Annotated[bool, typer.Option(
-        "--all", help="Every official record of a folder; resumes.")] = False,
+        "--all", help="Verify every official record of the folder RECORDS.")] = False,
+    top: Annotated[int, typer.Option(
+        "--top", min=0, help="Verify the first N records of each environment in RECORDS.")] = 0,
     records: options.Records = options.RECORDS,
-    env: Annotated[list[str] | None, typer.Option(
-        help="With --all: only this environment; may be repeated.")] = None,
+    env: options.Environments = None,
     jobs: options.Jobs = options.CORES,
     backend: options.Backends = options.Backend.loky,
-    out: Annotated[Path, typer.Option(
-        "--out", "-o", help="With --all: where what came out is kept.")] = Path("results/verify"),
-    data: Annotated[Path | None, typer.Option(
-        help="Of a record of the measured board: the instrument's file. One play is made again, "
-             "that of --seed, by default 0.")] = None,
-    truth: Annotated[Path | None, typer.Option(
-        help="With --data: the truth, if the case has one.")] = None,
-) -> None:
-    """Play episodes of a record again and say whether it is true: exit status 0 if so, 1 if not.
-
-    They are simulated anew, whatever the cache folder holds. Numbers decide: of our own methods it
-    does not matter which text of the library played; the file of somebody else's must be the very
-    one that the record names.
-
-    With --all, episodes of every official record of a folder, cheap environments first; the same
-    command again goes on where it was interrupted.
-    """
-    if data is not None:
-        return _verify_measured(record, data, baseline, seed or 0, truth)
-    if every:
-        if record or baseline or policy or held_out or salt_file:
-            raise typer.BadParameter("--all takes neither a record's file nor --baseline, "
-                                     "--policy, --held-out or --salt-file")
-        return _verify_all(records, env or [], out, tolerance, episodes=episodes, seed=seed or 0,
-                           isolate=isolate, n_jobs=jobs, backend=backend)
-    if record is None:
-        raise typer.BadParameter("a record's file must be given, or --all")
-    import secrets
-
-    from eitbench.bench import held_out as beyond
-    from eitbench.bench import verify as again
-    from eitbench.bench.records import read_record
-    from eitbench.bench.salts import hash_of, read_published_salt
-    with options.clear_errors():
-        if baseline and policy:
-            raise ValueError("only one of --baseline and --policy may be given")
-        if (held_out > 0) != (salt_file is not None):
-            raise ValueError("--held-out and --salt-file belong together")
-        if not episodes and not held_out:
-            raise ValueError("--episodes must be at least 1 where no --held-out episodes are "
-                             "played, got 0")
-        salt = read_published_salt(salt_file) if salt_file else b""
-    seed = secrets.randbelow(2**32) if seed is None else seed
-    differences = list[str]()
-    try:
-        with again.empty_cache():
-            claimed = read_record(record)
-            job = again.job_of(claimed, baseline or policy, isolate)
-            # what cannot be judged is said before anything is played
-            beyond_it = beyond.plays(claimed, job, salt, held_out) if held_out else None
-            if remark := again.outdated(claimed, job):
-                options.say(f"{remark}\n")
-            if episodes:
-                table, differences = again.verify(claimed, job, episodes=episodes, seed=seed,
-                                                  tolerance=tolerance)
-                options.say(f"episodes drawn with --seed {seed}, isolation {job.isolation}\n\n"
-                            f"{table}\n")
-            if beyond_it:
-                table, more = beyond.held_out(claimed, beyond_it)
-                differences += more
-                options.say("held-out episodes of the salt with sha256 "
-                            f"{hash_of(salt)}\n\n{table}\n")
-    except ValueError as error:
-        differences.append(str(error))
-    options.say_differences(differences)
-    options.say(f"{record.name}: what was played again is as it says")
-
-
-def _verify_all(folder: Path, environments: list[str], out: Path, tolerance: float,
-                **how: Any) -> None:
-    from eitbench.bench.replay import by_environment, differing, official_records, verify_all
-    with options.clear_errors():
-        rows = verify_all(official_records(folder, environments), out, **how)
-    options.say(by_environment(rows, tolerance))
-    options.say_differences(differing(rows, tolerance))
-
-
-def _verify_measured(record: Path | None, data: Path, baseline: str | None, seed: int,
-                     truth: Path | None) -> None:
-    if record is None:
-        raise typer.BadParameter("a record's file must be given with --data")
-    from eitbench.bench.measured_cases import read_case
-    from eitbench.bench.measured_records import read_measured_record, verify_measured
-    with options.clear_errors():
-        claimed = read_measured_record(record)
-        case = read_case(record.with_name(f"{claimed['case']}.yml"))
-        differences = verify_measured(claimed, case, data, baseline or claimed["method"], seed,
-                                      truth)
-    options.say_differences(differences)
-    options.say(f"{record.name}: what was played again is as it says")
-
-
-def check(
-    submitted: Annotated[Path, typer.Argument(
-        help="The submission's folder leaderboards.")],
-    against: Annotated[Path, typer.Option(
-        help="The folder into which it is to be merged.",
-        callback=options.found)] = Path("leaderboards"),
-    episodes: Annotated[int, typer.Option(
-        min=1, help="How many of each new record are played again.")] = 1,
-    seed: Annotated[int | None, typer.Option(
-        min=0, help="By which they are drawn. Default: any.")] = None,
-    held_out: Annotated[int, typer.Option(
-        "--held-out", min=0, help="Play so many held-out episodes of each method too.")] = 0,
-    salt_file: Annotated[Path | None, typer.Option(
-        help="From which they follow; see `eitbench held-out`.")] = None,
-    official: Annotated[bool, typer.Option(
-        "--official", help="Records may call themselves official.")] = False,
     out: Annotated[Path | None, typer.Option(
-        "--out", "-o", help="Write the report, Markdown, here too.")] = None,
+        "--out", "-o", help="Folder of results, with which the same command resumes. Default: "
+                            "results/verify with --all, else none is kept.")] = None,
 ) -> None:
-    """For maintainers: check all that a pull request adds or changes in leaderboards/, as their CI
-    does. Exit status 0 if nothing speaks against it, 1 if something does.
+    """Rerun episodes of records, and compare every score.
 
-    Run it in a checkout of your own: the submission is only read, and its methods play in
-    processes of their own.
+    Exit status 0 if all agree, 1 if one differs, 2 for wrong arguments. Episodes are simulated
+    again; the cache is not used. A third-party method's file must have the record's sha256, and
+    runs under bubblewrap unless --isolate process is given. Standard output is Markdown.
     """
+    import os
     import secrets
 
-    from eitbench._files import write_atomically
-    from eitbench.bench.salts import read_published_salt
-    from eitbench.report import submission
+    from eitbench.bench.held_out import read_secret
+    from eitbench.bench.verify import official_records, top_records
+    from eitbench.measured.cases import FOLDER_VARIABLE, measured_folder
     with options.clear_errors():
-        if (held_out > 0) != (salt_file is not None):
-            raise ValueError("--held-out and --salt-file belong together")
-        salt = read_published_salt(salt_file) if salt_file else b""
-        drawn = secrets.randbelow(2**32) if seed is None else seed
-        asked = submission.Asked(episodes, drawn, held_out, salt, official)
-        findings = list(submission.check(submitted, against, asked))
-    report = submission.markdown(findings)
-    options.say(f"{report}\nepisodes drawn with --seed {drawn}")
-    if out is not None:
-        write_atomically(out, report.encode())
-    if any(finding.problems for finding in findings):
-        raise typer.Exit(1)
+        _check_arguments(paths or [], every, top, episodes, held_out, secret, method)
+        key = read_secret(secret) if secret else b""
+        chosen = list(paths or [])
+        if every:
+            chosen = official_records(records, env or [])
+        elif top:
+            chosen = top_records(records, top, env or [])
+    # their folder is by default in the cache, which reruns do not use
+    os.environ.setdefault(FOLDER_VARIABLE, str(measured_folder().absolute()))
+    if every and out is None:
+        out = Path("results/verify")
+    drawn = 0 if every and seed is None else secrets.randbelow(2**32) if seed is None else seed
+    problems: list[str] = []
+    with tempfile.TemporaryDirectory(prefix="eitbench-verify-") as temporary:
+        if episodes:
+            problems += _rerun(chosen, out or Path(temporary), tolerance, episodes, drawn,
+                               {"file": method, "isolate": isolate, "replay": replay},
+                               {"n_jobs": jobs, "backend": backend})
+        if held_out:
+            problems += _held_out(chosen, Path(temporary), method, isolate, key, held_out)
+    options.say_differences(problems)
+    options.say(f"{len(chosen)} of {len(chosen)} records agree with their reruns")
+
+
+def _check_arguments(paths: list[Path], every: bool, top: int, episodes: int, held_out: int,
+                     secret: Path | None, method: str | None) -> None:
+    if bool(paths) + every + bool(top) != 1:
+        raise ValueError("one of the files of records, --all and --top must be given")
+    if method and len(paths) != 1:
+        raise ValueError("--method belongs to one record's file")
+    if (held_out > 0) != (secret is not None):
+        raise ValueError("--held-out and --secret belong together")
+    if not episodes and not held_out:
+        raise ValueError("--episodes must be at least 1 without --held-out, got 0")
+
+
+def _rerun(paths: list[Path], folder: Path, tolerance: float, episodes: int, seed: int,
+           how: dict[str, Any], workers: dict[str, Any]) -> list[str]:
+    """Print the table of reruns and return the problems."""
+    from eitbench.bench import verify as verification
+    with options.clear_errors():
+        rows = verification.verify(paths, folder, verification.Options(**how), episodes=episodes,
+                                   seed=seed, **workers)
+    options.say(f"episodes drawn with --seed {seed}\n\n{verification.table_of(rows, tolerance)}\n")
+    for note in verification.notes_of(rows):
+        options.say(f"{note}\n")
+    return verification.problems_of(rows, tolerance)
+
+
+def _held_out(paths: list[Path], folder: Path, method: str | None, isolate: str, secret: bytes,
+              episodes: int) -> list[str]:
+    """Print the table of held-out episodes and return the problems."""
+    import hashlib
+
+    from eitbench.bench.held_out import verify_held_out
+    from eitbench.bench.isolation import WorkerError, close
+    from eitbench.bench.records import read_record
+    from eitbench.bench.table import Table
+    from eitbench.bench.verify import job_of
+    from eitbench.data.cache import cache_in
+    rows: list[dict[str, Any]] = []
+    problems: list[str] = []
+    with cache_in(folder / "held-out"):
+        for path in paths:
+            try:
+                record = read_record(path)
+                job = job_of(record, method, isolate, path.absolute().parents[1] / "methods")
+                row, found = verify_held_out(record, job, secret, episodes)
+            except (ValueError, WorkerError) as error:
+                row, found = {}, [str(error)]
+            rows += [{"error relative to the naive baseline": path.stem} | row] if row else []
+            problems += [f"{path.name}: {sentence}" for sentence in found]
+        close()
+    digest = hashlib.sha256(secret).hexdigest()
+    table = Table.of(rows).markdown() if rows else ""
+    options.say(f"held-out episodes of the secret with sha256 {digest}\n\n{table}\n")
+    return problems
+
+

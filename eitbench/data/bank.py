@@ -1,4 +1,4 @@
-"""A bank of recordings: many episodes, simulated ahead of training and kept on disk."""
+"""Simulate many episodes ahead of training and keep their recordings in the cache."""
 
 from __future__ import annotations
 
@@ -9,45 +9,43 @@ from typing import TYPE_CHECKING
 from tqdm import tqdm
 
 from eitbench import _check
+from eitbench.data import cache
 from eitbench.data.episodes import simulate_together
 from eitbench.data.parallel import in_parallel
-from eitbench.data.recordings import (
-    is_recorded,
-    make_recording,
-    outline,
-    recording_path,
-    recording_type,
-    store_recording,
-)
-from eitbench.data.regions import are_kept, integrals_path, make_integrals, store_integrals
+from eitbench.data.recordings import is_recorded, make_recording, recording_key, recording_type
+from eitbench.data.regions import outline
 
 if TYPE_CHECKING:
     from eitbench.worlds.world import World
 
 TOGETHER = 8
-"""Episodes that are simulated side by side."""
+"""Episodes that are simulated together."""
 
 
 def recording_bytes(world: World) -> int:
-    """Bytes of a recording on disk, with what lies beside it, but for headers of some 100 bytes."""
-    n = outline(world).mass.shape[0]
-    beside = 0 if world.region is None else 4 * n + 16  # see `Integrals`
-    return world.n_steps * (recording_type(world, n).itemsize + beside)
+    """Return the size of a recording on disk without its header."""
+    return world.n_steps * recording_type(world, outline(world).mass.shape[0]).itemsize
+
+
+def missing_seeds(world: World, seeds: Sequence[int]) -> list[int]:
+    """Return those of ``seeds`` without a sound recording."""
+    checked = dict.fromkeys(_check.integer("seeds", seed, low=0) for seed in seeds)
+    return [seed for seed in checked if not is_recorded(world, seed)]
 
 
 def fill(world: World, seeds: Sequence[int], *, n_jobs: int = 1, backend: str = "loky") -> int:
-    """Make the recordings that are missing, in ``n_jobs`` processes, and return their number.
+    """Simulate the missing recordings in ``n_jobs`` processes and return their number.
 
-    ``backend`` is one of `eitbench.data.parallel.BACKENDS`, of which those of a cluster need the
-    cache folder on all machines.
-
-    Each is stored as soon as it is done; after an interruption the same call goes on where it was.
-    Only what an environment needs is kept: the truth, five times as large, is simulated anew should
-    anybody ask for it.
+    ``backend`` is one of `eitbench.data.parallel.BACKENDS`; those of a cluster need the cache
+    folder on all machines. Each recording is stored as soon as it is done, so that the same call
+    resumes after an interruption. The truth itself, five times as large, is not kept.
     """
     n_jobs = _check.integer("n_jobs", n_jobs, low=1)
     missing = missing_seeds(world, seeds)
-    groups = _groups(world, missing, max(1, min(TOGETHER, -(-len(missing) // n_jobs))))
+    size = max(1, min(TOGETHER, -(-len(missing) // n_jobs)))
+    # The folder is determined here: a worker may have started under another environment.
+    place = cache.cache_folder().absolute()
+    groups = [(world, missing[k:k + size], place) for k in range(0, len(missing), size)]
     with tqdm(total=len(missing), desc="recording", unit="episode", disable=None) as bar:
         for done in in_parallel(_record, groups, n_jobs, backend):
             bar.update(done)
@@ -55,30 +53,16 @@ def fill(world: World, seeds: Sequence[int], *, n_jobs: int = 1, backend: str = 
 
 
 def fill_here(world: World, seeds: Sequence[int]) -> None:
-    """The same in this process, while somebody waits who is told for how long."""
-    for group in _groups(world, missing_seeds(world, seeds), TOGETHER):
-        _record(*group, progress=True)
+    """Simulate the missing recordings in this process, and report the progress."""
+    missing = missing_seeds(world, seeds)
+    for k in range(0, len(missing), TOGETHER):
+        _record(world, missing[k:k + TOGETHER], cache.cache_folder(), progress=True)
 
 
-def _groups(world: World, seeds: Sequence[int],
-            together: int) -> list[tuple[World, list[tuple[int, Path, Path]]]]:
-    """Arguments of `_record` for so many seeds at a time."""
-    # Paths are found out here: by now a worker may live in another environment than its parent.
-    todo = [(seed, recording_path(world, seed), integrals_path(world, seed)) for seed in seeds]
-    return [(world, todo[k:k + together]) for k in range(0, len(todo), together)]
-
-
-def missing_seeds(world: World, seeds: Sequence[int]) -> list[int]:
-    """Those of ``seeds`` without a sound recording."""
-    checked = dict.fromkeys(_check.integer("seeds", seed, low=0) for seed in seeds)
-    return [seed for seed in checked
-            if not (is_recorded(world, seed) and are_kept(world, seed))]
-
-
-def _record(world: World, todo: Sequence[tuple[int, Path, Path]], progress: bool = False) -> int:
-    episodes = simulate_together(world, [seed for seed, *_ in todo], progress)
-    for (seed, path, beside), episode in zip(todo, episodes, strict=True):
-        if world.region is not None:
-            store_integrals(beside, seed, make_integrals(world, episode))
-        store_recording(path, make_recording(world, seed, episode))
-    return len(todo)
+def _record(world: World, seeds: Sequence[int], place: Path, progress: bool = False) -> int:
+    """Simulate and store recordings, and return their number."""
+    with cache.cache_in(place):
+        for seed, episode in zip(seeds, simulate_together(world, seeds, progress), strict=True):
+            entries = make_recording(world, seed, episode)
+            cache.store(recording_key(world, seed), {"steps": entries})
+    return len(seeds)

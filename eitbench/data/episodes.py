@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache, wraps
-from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -16,11 +15,10 @@ from tqdm import tqdm
 
 from eitbench import _check
 from eitbench._notice import Wait
-from eitbench.data import store
+from eitbench.data.cache import Key, cached, episode_key
 from eitbench.worlds.instrument import Faults
-from eitbench.worlds.parts import Discretisation
 from eitbench.worlds.streams import randomness
-from eitbench.worlds.world import World
+from eitbench.worlds.world import Discretisation, World
 
 Made = TypeVar("Made")
 BEFOREHAND = "`eitbench bank --env ID --seeds train:0-99` makes episodes beforehand"
@@ -49,7 +47,7 @@ class Episode(NamedTuple):
 
 
 def simulate(world: World, seed: int, *, cache: bool = True, progress: bool = True) -> Episode:
-    """The episode of ``world`` with this seed, from the cache if it is there.
+    """Return the episode of ``world`` with this seed, from the cache or simulated.
 
     Parameters
     ----------
@@ -58,33 +56,32 @@ def simulate(world: World, seed: int, *, cache: bool = True, progress: bool = Tr
         ≥ 0; see `eitbench.data.seeds` for the public ranges.
     cache : bool
         Read from and write to the cache folder ($EITBENCH_CACHE, by default in the user's cache
-        folder). A file that is damaged or of another seed is replaced; files of other versions stay
-        beside it.
+        folder).
     progress : bool
-        Show a progress bar, on a terminal only, and say what takes longer than two seconds.
+        Show a progress bar, on a terminal only, and report what takes longer than two seconds.
     """
     seed = _check.integer("seed", seed, low=0)
 
-    def make() -> dict[str, Any]:
+    def build() -> dict[str, Any]:
         return next(simulate_together(world, [seed], progress))._asdict()
 
     if not cache:
-        return Episode(**make())
-    return Episode(**store.kept(_path(world, seed), Episode._fields, make, str(seed), small=True))
+        return Episode(**build())
+    return Episode(**cached(_key(world, seed), build))
 
 
 def is_simulated(world: World, seed: int) -> bool:
-    """Whether the truth is in the cache."""
-    return _path(world, seed).is_file()
+    """Return whether the cache holds the truth."""
+    return _key(world, seed).path.is_file()
 
 
-def _path(world: World, seed: int) -> Path:
-    return store.folder(world) / f"{seed}.truth.npz"
+def _key(world: World, seed: int) -> Key:
+    return episode_key(world, f"{seed}.truth")
 
 
 def once(many: int) -> Callable[[Callable[[World], Made]], Callable[[World], Made]]:
-    """What a function makes of a world is made once a process for all with the same `World.fluid`,
-    and kept for so ``many``."""
+    """Decorate a function of a world: it runs once a process for all worlds with the same
+    `World.fluid`, and results of ``many`` are kept."""
     def decorated(make: Callable[[World], Made]) -> Callable[[World], Made]:
         kept = lru_cache(maxsize=many)(make)
         return wraps(make)(lambda world: kept(world.fluid))
@@ -100,11 +97,9 @@ def truth_discretisation(world: World) -> Discretisation:
 
 def simulate_together(world: World, seeds: Sequence[int], progress: bool = True,
                       last: int | None = None) -> Iterator[Episode]:
-    """The episodes of several seeds, bit for bit as `simulate` gives them and without the cache; up
-    to the state ``last`` (default: all).
+    """Simulate several seeds, with the bits of `simulate`, up to the state ``last`` (default: all).
 
-    Eight concentrations in one flow are carried on together in the time of two, and eight
-    conductivities are solved for at once.
+    In one flow eight episodes take the time of two.
     """
     truth = truth_discretisation(world)
     label = f"simulating {world.name}, seed {', '.join(map(str, seeds))}"

@@ -1,4 +1,4 @@
-"""Work spread over processes, each with one BLAS thread: more get into each other's way."""
+"""Parallel execution in processes with one BLAS thread each."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tqdm import tqdm
 from eitbench.worlds.registry import Entry, registered_by_hand, take_over
 
 BACKENDS = ("loky", "ray", "dask")
-"""Who starts the processes: joblib on this machine, or a cluster."""
+"""Joblib on this machine, or a cluster."""
 
 Result = TypeVar("Result")
 
@@ -30,12 +30,11 @@ class WorkerLost(RuntimeError):
 
 def in_parallel(function: Callable[..., Result], arguments: Sequence[tuple], n_jobs: int,
                 backend: str = "loky") -> Iterator[Result]:
-    """Results of ``function(*each)``, as they come.
+    """Yield results of ``function(*each)`` in the order of completion.
 
-    ``ray`` and ``dask`` give the work to the cluster that $RAY_ADDRESS or $DASK_SCHEDULER_ADDRESS
-    names, and without one to ``n_jobs`` processes here. When one of their processes is killed
-    another takes up its work; else it is a `WorkerLost`. ``ValueError`` if there is no such
-    backend, or what it needs is not installed.
+    ``ray`` and ``dask`` use the cluster of $RAY_ADDRESS or $DASK_SCHEDULER_ADDRESS, and without one
+    ``n_jobs`` processes here; another process repeats the work of a killed one. With loky that is a
+    `WorkerLost`. ``ValueError`` for an unknown backend, or one that is not installed.
     """
     if backend not in BACKENDS:
         raise ValueError(f"backend must be one of {', '.join(BACKENDS)}, got {backend!r}")
@@ -81,10 +80,8 @@ def _with_dask(function: Callable[..., Result], arguments: Sequence[tuple], n_jo
 
 def _with_ray(function: Callable[..., Result], arguments: Sequence[tuple], n_jobs: int,
               ) -> Iterator[Result]:
-    """Without joblib, whose backend for ray gives all results at the end or, if one fails, none.
-
-    What a call writes to standard error comes with its result.
-    """
+    """Without joblib, whose backend for ray returns all results at the end or, if one fails, none.
+    What a call writes to standard error comes with its result."""
     import ray
     from ray.exceptions import NodeDiedError, OutOfMemoryError, WorkerCrashedError
     here = {} if "RAY_ADDRESS" in os.environ else {"num_cpus": n_jobs, "include_dashboard": False}
@@ -114,7 +111,7 @@ def _explained(error: BaseException) -> WorkerLost:
 
 def _watched(host: int, told: list[Entry], function: Callable[..., Result], *arguments: Any,
              ) -> Result:
-    """`_pinned`, in a process that ends soon after ``host``, the process that has started it."""
+    """Call `_pinned` in a process that ends soon after ``host``, its parent."""
     if os.getppid() == host:
         _end_with(host)
     return _pinned(told, function, *arguments)
@@ -122,10 +119,8 @@ def _watched(host: int, told: list[Entry], function: Callable[..., Result], *arg
 
 @lru_cache(maxsize=1)
 def _end_with(host: int) -> None:
-    """Look from now on, each second, whether this process has become an orphan.
-
-    (Linux would tell it, but as soon as the thread ends that has started it.)
-    """
+    """End this process within a second of its parent. (Linux's own signal would come as soon as the
+    thread ends that has started it.)"""
     def look() -> None:
         while os.getppid() == host:
             time.sleep(1.0)
@@ -136,14 +131,14 @@ def _end_with(host: int) -> None:
 
 def _heard(told: list[Entry], function: Callable[..., Result], *arguments: Any,
            ) -> tuple[Result, str]:
-    """The result of `_pinned`, and what was written to standard error."""
+    """Return the result of `_pinned`, and what was written to standard error."""
     written = io.StringIO()
     with redirect_stderr(written):
         return _pinned(told, function, *arguments), written.getvalue()
 
 
 def _pinned(told: list[Entry], function: Callable[..., Result], *arguments: Any) -> Result:
-    """Called in another process, which is ``told`` of the worlds that a script has registered."""
+    """Call a function in another process, which takes over the worlds that a script registered."""
     from threadpoolctl import threadpool_limits
     take_over(told)
     with threadpool_limits(1):

@@ -1,15 +1,16 @@
-"""Which training episode an environment begins without a seed: one of few at first, of more as it
-goes on, so that nobody waits for a thousand simulations before learning anything."""
+"""The training episodes that unseeded resets draw from: few at first, more later, so that training
+starts before a thousand episodes are simulated."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 from eitbench import _check
-from eitbench.data import store
+from eitbench.data import cache
 from eitbench.data.bank import TOGETHER, fill_here
-from eitbench.data.recordings import is_recorded, outline
-from eitbench.worlds.parts import Flow
+from eitbench.data.recordings import is_recorded
+from eitbench.data.regions import outline
+from eitbench.worlds.world import Flow
 
 if TYPE_CHECKING:
     import numpy as np
@@ -19,39 +20,36 @@ if TYPE_CHECKING:
 MOST = 1000
 """Training episodes that a growing pool ends with."""
 ALONE = 4
-"""First resets that play ``train:0``, which is simulated alone, and soon."""
+"""First resets, which play ``train:0``."""
 RESETS = 8
-"""A pool has doubled when there were so many resets for each of its new episodes: where they are
-simulated while an agent plays, that takes but a small part of its time."""
-
+"""Resets per episode at which a pool doubles: simulation takes little of the training time."""
 LARGE = 2500
-"""Nodes from which on a world is simulated one episode at a time while nobody needs more."""
+"""Nodes from which on episodes are simulated only when they are needed."""
 
 
 class Pool:
     """The episodes that unseeded resets are drawn from.
 
-    How many there are depends on the number of unseeded resets since the last seeded one alone,
-    not on what has been simulated: the same seed gives the same episodes everywhere.
+    Their number depends on the number of unseeded resets since the last seeded one, not on what has
+    been simulated: the same seed gives the same episodes everywhere.
 
     Parameters
     ----------
     episodes : int, optional
-        So many from the start; None: 1 for the first `ALONE` resets, then 8, and from then on the
+        Number from the start; None: 1 for the first `ALONE` resets, then 8, and from then on the
         largest power of two that is at most 1/8 of the number of resets, up to `MOST`.
     """
 
     def __init__(self, episodes: int | None) -> None:
         self.grows = episodes is None
         self.most = MOST if episodes is None else _check.integer("episodes", episodes, low=1)
-        """Episodes in the end."""
         self._resets = 0
         self._drawn_from = 0
         self._can_be_kept = True
 
     @property
     def size(self) -> int:
-        """Episodes that the next reset is drawn from."""
+        """Number of episodes that the next reset is drawn from."""
         if not self.grows:
             return self.most
         if self._resets < ALONE:
@@ -60,21 +58,20 @@ class Pool:
         return min(self.most, max(TOGETHER, 1 << earned.bit_length() >> 1))
 
     def draw(self, random: np.random.Generator) -> int:
-        """The seed of the next episode."""
+        """Return the seed of the next episode."""
         self._drawn_from = self.size
         self._resets += 1
         return int(random.integers(self._drawn_from))
 
     def restart(self) -> None:
-        """A seeded reset: what follows depends on nothing before it."""
+        """Forget all resets, after a seeded one."""
         self._resets = 0
         self._drawn_from = 0
 
     def provide(self, world: World, seed: int) -> None:
-        """If the episode of this seed is one of a growing pool and has to be simulated, simulate
-        all that the pool lacks, eight at a time.
+        """Simulate all missing episodes of a growing pool, eight at a time, if this is one of them.
 
-        With the first come the other seven at once, where the eight take the time of two.
+        Where eight episodes take the time of two, the first comes with the other seven.
         """
         wanted = self.grows and seed < self._drawn_from and self._can_be_kept
         if not wanted or is_recorded(world, seed):
@@ -84,10 +81,10 @@ class Pool:
             fill_here(world, range(many))
         except OSError as error:
             self._can_be_kept = False
-            store.warn_not_kept(store.folder(world), error)
+            cache.warn_not_kept(cache.folder(world), error)
 
 
 def _is_cheap(world: World) -> bool:
-    """Whether one flow carries all episodes, and the world is not large."""
+    """Return whether one flow advects all episodes, and the mesh is small."""
     shares_its_flow = type(world.flow).draw is Flow.draw and world.target.is_carried
     return shares_its_flow and outline(world).mass.shape[0] < LARGE

@@ -1,28 +1,24 @@
-"""Scores of a part of the vessel: what recordings hold of the whole, restricted to a world's region
-of interest.
+"""The mass matrices that scores are computed with, over the whole vessel or a region of interest.
 
-A world with a ``region`` counts errors between two cross-sections only. The integrals of
-`eitbench.data.recordings` are then taken over the cells of the truth's mesh that lie between them,
-and kept in a file beside the recording. Without a region they are the recording's own.
+With P the interpolation from the estimators' nodes to those of the simulated truth, M the truth's
+mass matrix over what counts, and all concentrations relative to the world's background,
+    ∫(ĉ − c)² = ĉᵀ M̃ ĉ − 2 ĉᵀ b_t + d_t,      M̃ = Pᵀ M P,   b_t = Pᵀ M c_t,   d_t = c_tᵀ M c_t.
+A world with a ``region`` counts errors between two cross-sections only.
 """
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import lru_cache
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from eitbench.data import kits, store
-from eitbench.data.episodes import Episode, once, simulate, truth_discretisation
-from eitbench.data.recordings import (
-    SPARSE,
-    half_mass,
-    integrate,
-    outline,
-    score_operators,
-    sparse_of,
-)
+from eitbench.data.cache import Key, cached, described, model_key
+from eitbench.data.episodes import Episode, once, truth_discretisation
+from eitbench.worlds.instrument import Instrument
+from eitbench.worlds.task import make_task
 
 if TYPE_CHECKING:
     import scipy.sparse as sp
@@ -30,9 +26,24 @@ if TYPE_CHECKING:
     from eitbench.numerics.mesh import Mesh
     from eitbench.worlds.world import World
 
+VERSION = 1
+"""Version of the outlines and region masses that are kept."""
+SPARSE = ("data", "indices", "indptr")
+"""Arrays that hold a sparse matrix."""
+
+
+class Outline(NamedTuple):
+    """The scoring constants that all episodes of a world share."""
+
+    mass: sp.csr_array
+    """(n, n) upper triangle of M̃ over the whole vessel, m² (m³ in 3D), doubled off the diagonal:
+    ĉᵀ·mass·ĉ = ĉᵀM̃ĉ."""
+    largest_voltage: float
+    """V, of the cycle's injections into liquid of the expected concentration."""
+
 
 class Integrals(NamedTuple):
-    """What an episode is scored by, t = 1 … T, over what counts; see `eitbench.data.recordings`."""
+    """The integrals that score an episode, t = 1 … T, over what counts."""
 
     moment: np.ndarray
     """(T, n) float32, b_t"""
@@ -43,53 +54,83 @@ class Integrals(NamedTuple):
 
 
 def integrals(world: World, seed: int, entries: np.ndarray) -> Integrals:
-    """What the episode of this seed, whose recording is ``entries``, is scored by. Over a region it
-    is from the cache if it is there; else it is simulated."""
-    if world.region is None:
-        return Integrals(entries["moment"], entries["deviation"], entries["square"])
-
-    def make() -> dict[str, Any]:
-        return make_integrals(world, simulate(world, seed))._asdict()
-
-    return Integrals(**store.kept(integrals_path(world, seed), Integrals._fields, make, str(seed)))
-
-
-def integrals_path(world: World, seed: int) -> Path:
-    """Where the integrals over a world's region are kept."""
-    return store.folder(world) / f"{seed}.region.npz"
-
-
-def are_kept(world: World, seed: int) -> bool:
-    """Whether the file of the region, if the world has one, is there and sound."""
-    if world.region is None:
-        return True
-    return store.load(integrals_path(world, seed), Integrals._fields, str(seed)) is not None
+    """Return the integrals of an episode's recording ``entries`` over what counts."""
+    prefix = "" if world.region is None else "region_"
+    return Integrals(*(entries[f"{prefix}{name}"] for name in Integrals._fields))
 
 
 def make_integrals(world: World, episode: Episode) -> Integrals:
-    """The integrals over the world's region; ``episode`` is its truth."""
-    moment, deviation, square = integrate(episode, world.background, *region_operators(world))
-    return Integrals(moment.astype(np.float32), deviation, square)
+    """Compute the integrals of an episode over what counts."""
+    return integrate(episode, world.background, *region_operators(world))
 
 
-def store_integrals(path: Path, seed: int, made: Integrals) -> None:
-    """Write the integrals of an episode where `integrals` finds them."""
-    store.save(path, made._asdict(), str(seed))
+def integrate(episode: Episode, background: float, interpolation: sp.csr_array,
+              mass: sp.csr_array) -> Integrals:
+    """Compute the integrals of an episode for these P and M."""
+    c = episode.concentration[1:].astype(float)
+    deviation = c - background
+    weighted = mass @ deviation.T
+    return Integrals((interpolation.T @ weighted).T.astype(np.float32),
+                     np.einsum("tn,nt->t", deviation, weighted),
+                     np.einsum("tn,nt->t", c, mass @ c.T))
+
+
+def outline(world: World) -> Outline:
+    """Return the outline of a world, shipped, cached or computed."""
+    return _outline(world.fluid)
+
+
+@lru_cache(maxsize=4)
+def _outline(fluid: World) -> Outline:
+    arrays = cached(outline_key(fluid), lambda: make_outline(fluid))
+    return Outline(csr_of(arrays), float(arrays["largest"]))
+
+
+def outline_key(world: World) -> Key:
+    """Return the key of a world's outline, which neither flow, target nor contacts change."""
+    instrument = Instrument(current=world.instrument.current)
+    fluid = described(replace(world.fluid, instrument=instrument))
+    numbers = {name: fluid[name] for name in ("vessel", "instrument", "prior")}
+    return model_key("outline", numbers | {"pattern": fluid["schedule"]["pattern"]}, VERSION)
+
+
+def make_outline(world: World) -> dict[str, np.ndarray]:
+    """Compute the arrays of a world's outline."""
+    task = make_task(world.fluid)
+    level = np.full(task.mesh.n_nodes, world.expected_concentration)
+    largest = np.abs(task.observation.voltages(level, world.fluid.currents)).max()
+    return half_mass(*score_operators(world)) | {"largest": np.array(largest)}
 
 
 @once(4)
 def score_mass(world: World) -> sp.csr_array:
-    """(n, n) M̃ of what counts, one triangle with doubled entries as `Outline.mass`."""
+    """Return M̃ (n, n) of what counts, one triangle with doubled entries as `Outline.mass`."""
     if world.region is None:
         return outline(world).mass
-    return sparse_of(kits.shipped_or_kept(
-        "region", kits.region_numbers(world), lambda: store.folder(world) / "region.npz", SPARSE,
-        lambda: half_mass(*region_operators(world))))
+    return csr_of(cached(region_key(world), lambda: make_region(world)))
+
+
+def region_key(world: World) -> Key:
+    """Return the key of the mass matrix of a world's region."""
+    return model_key("region", [described(world.vessel), world.region], VERSION)
+
+
+def make_region(world: World) -> dict[str, np.ndarray]:
+    """Compute the arrays of the mass matrix of a world's region."""
+    return half_mass(*region_operators(world))
+
+
+@once(2)
+def score_operators(world: World) -> tuple[sp.csr_array, sp.csr_array]:
+    """Return P and M over the whole vessel."""
+    from eitbench.numerics.fem import mass_matrix
+    truth = truth_discretisation(world).transport.mesh
+    return world.vessel.carrier(fine=False)[0].interpolation_to(truth.points), mass_matrix(truth)
 
 
 @once(2)
 def region_operators(world: World) -> tuple[sp.csr_array, sp.csr_array]:
-    """As `score_operators`, with the truth's mass matrix over the region."""
+    """Return P and M over what counts."""
     interpolation, mass = score_operators(world)
     if world.region is not None:
         mass = mass_between(truth_discretisation(world).transport.mesh, *world.region)
@@ -97,7 +138,8 @@ def region_operators(world: World) -> tuple[sp.csr_array, sp.csr_array]:
 
 
 def mass_between(mesh: Mesh, begin: float, end: float) -> sp.csr_array:
-    """(n, n) P1 mass matrix in m² (m³ in 3D) of the cells with centroids in begin < x < end (m)."""
+    """Return the P1 mass matrix (n, n) in m² (m³ in 3D) of the cells with centroids in
+    begin < x < end (m)."""
     import scipy.sparse as sp
     middle = mesh.points[mesh.cells][:, :, 0].mean(axis=1)
     inside = (begin < middle) & (middle < end)
@@ -107,3 +149,18 @@ def mass_between(mesh: Mesh, begin: float, end: float) -> sp.csr_array:
     rows = np.repeat(cells, corners, axis=1).ravel()
     columns = np.tile(cells, corners).ravel()
     return sp.csr_array((local.ravel(), (rows, columns)), shape=(mesh.n_nodes,) * 2)
+
+
+def half_mass(interpolation: sp.csr_array, mass: sp.csr_array) -> dict[str, np.ndarray]:
+    """Return M̃'s upper triangle with doubled entries off the diagonal as `SPARSE` arrays."""
+    import scipy.sparse as sp
+    full = interpolation.T @ mass @ interpolation
+    half = sp.csr_array(sp.triu(full) + sp.triu(full, 1))
+    return {name: getattr(half, name) for name in SPARSE}
+
+
+def csr_of(arrays: Mapping[str, np.ndarray]) -> sp.csr_array:
+    """Return the square matrix of `SPARSE` arrays."""
+    import scipy.sparse as sp
+    data, indices, indptr = (arrays[name] for name in SPARSE)
+    return sp.csr_array((data, indices, indptr), shape=(len(indptr) - 1,) * 2)

@@ -1,16 +1,13 @@
-"""Public episode seeds in disjoint splits: learn on `train`, choose on `dev`, report on `test`, or
-on the test split of the season (`eitbench.data.seasons`)."""
+"""Public episode seeds in disjoint splits: learn on `train`, choose on `dev`, report on `test`."""
 
 from __future__ import annotations
 
 import re
 import sys
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-
-from eitbench.data.seasons import drawn_names, season_of
 
 OURS = ("eitbench", "gymnasium")
 """Packages whose lines no user wrote."""
@@ -25,7 +22,7 @@ def parse_seeds(text: str) -> list[int]:
     ``ValueError`` if the text has another form, names an unknown split, or leaves its range.
     """
     split, colon, numbers = text.rpartition(":")
-    allowed = _seeds_of(split) if colon else range(0, 2**31)
+    allowed = SPLITS.get(split, range(0)) if colon else range(0, 2**31)
     if not allowed:
         raise ValueError(f"seeds must name one of the splits {', '.join(SPLITS)}, got {text!r}")
     seeds: list[int] = []
@@ -46,20 +43,12 @@ def name_seed(seed: int) -> str:
     for split, seeds in SPLITS.items():
         if seed in seeds:
             return f"{split}:{seed - seeds.start}"
-    return drawn_names().get(seed, str(seed))
+    return str(seed)
 
 
 def is_test(seed: int) -> bool:
-    """Whether scores are reported of this episode, in whatever season."""
-    return seed in SPLITS["test"] or seed in drawn_names()
-
-
-def _seeds_of(split: str) -> Sequence[int]:
-    """Empty if there is no such split, or its season has not begun."""
-    if split in SPLITS:
-        return SPLITS[split]
-    season = season_of(split)
-    return season.seeds if season else ()
+    """Return whether scores are reported of this episode."""
+    return seed in SPLITS["test"]
 
 
 class ReservedSeedWarning(UserWarning):

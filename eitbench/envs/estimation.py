@@ -18,11 +18,10 @@ from eitbench.data.recordings import cycle_voltages, outline, step_error, veloci
 from eitbench.data.regions import score_mass
 from eitbench.data.seeds import warn_of_reserved
 from eitbench.envs.spec import KnowsItsLength
-from eitbench.worlds.parts import Discretisation
 from eitbench.worlds.registry import entry
 from eitbench.worlds.streams import randomness
 from eitbench.worlds.task import Task, lag_steps, make_task
-from eitbench.worlds.world import World
+from eitbench.worlds.world import Discretisation, World
 
 if TYPE_CHECKING:
     from eitbench.data.episodes import Episode

@@ -1,198 +1,208 @@
-"""A record of a real instrument as an environment: ``eitbench/Measured-v0``."""
+"""Environments of measurements: ``eitbench/Measured-v0`` for a user's file, and one id per case."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
 from eitbench import _check
-from eitbench.data.measured import Measurements, read
-from eitbench.envs.estimation import RESET_NEEDED, EstimationEnv, Observation, checked_actions
+from eitbench.envs.estimation import RESET_NEEDED, Observation, checked_actions
 from eitbench.envs.spec import KnowsItsLength
-from eitbench.estimation.measured.calibration import calibrate, noise_of_frames
-from eitbench.estimation.measured.plausible import doubts
-from eitbench.estimation.measured.readings import ReadingModel
-from eitbench.estimation.measured.record import (
-    readings_there,
-    shown_reading,
-    withheld_readings,
+from eitbench.measured import Measurements, quality, read
+from eitbench.measured.calibration import calibrate, noise_of_frames
+from eitbench.measured.cases import MeasuredCase, read_case
+from eitbench.measured.model import (
+    MeasurementModel,
+    complete_channels,
+    sample_withheld,
+    visible_reading,
 )
-from eitbench.estimation.measured.task import measured_task
-from eitbench.estimation.measured.vessel import RealVessel, read_vessel
+from eitbench.measured.task import task_from_measurements
+from eitbench.measured.vessel import INITIAL_CONTACT_IMPEDANCE, VesselConfig, read_vessel
 from eitbench.physics.rest import AtRest
+from eitbench.worlds.task import Task
 
-if TYPE_CHECKING:
-    from eitbench.worlds.task import Task
-
-FIRST_GUESS = 1e-4
-"""Ω·m², of the contact impedances."""
 NOISE_FRAMES = 1000
-"""The first so many frames tell the noise."""
+"""The noise is estimated from the first frames, at most so many."""
+WITHHOLDING_SEEDS = 100_000
+"""Size of a split of seeds: ``test:3``, ``dev:3`` and ``train:3`` withhold the same readings."""
 
 
 class MeasuredEnv(KnowsItsLength, gym.Env[Observation, np.ndarray]):  # type: ignore[misc]
-    """Estimate what a record of a real instrument saw; the action is the estimate.
+    """Estimate the concentration in a real vessel from measurements, without ground truth.
 
-    Nobody knows the truth, so an estimate is judged by readings that its maker was not shown: the
-    reward is −mean ((reading − predicted)/std)² over the readings withheld of the injection that
-    was on, zero in the first frame; of a target at rest the last estimate is judged, by all that
-    was withheld. Which they are is drawn by the seed: of each injection a part,
-    the same whenever it comes again. Observations are as in `EstimationEnv`, except that voltages
-    are what the instrument read, (M,), and 0 where it read nothing or nothing is shown; the task's
-    `ReadingModel` knows which.
+    ## Action Space
 
-    Parameters
-    ----------
-    file : path or Measurements
-        What `eitbench.data.measured.read` reads.
-    vessel : path, mapping or RealVessel
-        What `read_vessel` reads.
-    withheld : float
-        Part of an injection's readings, from 0 to 0.5.
-    moves : bool, optional
-        Whether the target moves. Default: if there are two whole frames or more, or the vessel
-        has a flow.
-    correction : "offset" or "gain"
-        See `calibrate`.
-    homogeneous_frames : int
-        Where a record has no reference, so many of its first frames are taken for homogeneous.
-    believed
-        What else is believed of the target; arguments of `measured_task`.
+    At step t = 1 … T the action is the estimate of the state at the t-th reading: the concentration
+    at the nodes of `task.mesh` in mol/m³. Where the velocity is estimated too (`task.velocity`),
+    its parameters in m/s follow.
+
+    ## Observation Space
+
+    A `Dict` with the readings, (M,) V, and currents, (L,) A, of the active injection. Readings that
+    are withheld or missing are 0; the mask of the task's `MeasurementModel` tells which.
+
+    ## Rewards
+
+    −mean ((reading − predicted)/std)² over the withheld readings of the active injection, 0 in the
+    first frame. For a target at rest, all withheld readings score the last estimate.
+
+    ## Starting State
+
+    `reset(seed=s)` draws the withheld fraction of the readings of each injection, the same at each
+    of its uses; without a seed, the random generator of the environment draws s.
+
+    ## Episode End
+
+    Terminated after T steps. Never truncated.
+
+    ## Arguments
+
+    | name | default | meaning |
+    |---|---|---|
+    | `file` | | a file for `eitbench.measured.read`, or `Measurements` |
+    | `vessel` | | a file or mapping for `read_vessel`, or a `VesselConfig` |
+    | `withheld` | 0.1 | withheld fraction of the readings, from 0 to 0.5 |
+    | `moves` | None | whether the target moves; None: with two complete frames or more, or a flow |
+    | `correction` | "offset" | of the misfit on homogeneous fluid; or "gain", see `calibrate` |
+    | `homogeneous_frames` | 1 | number of first frames that replace a missing reference |
+
+    and those of `task_from_measurements`. A case, such as `eitbench/Measured-iirc-v0`, fixes all
+    but `file`.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012 (gymnasium's form)
+    lag = 0
 
     def __init__(self, file: Path | str | Measurements,
-                 vessel: Path | str | Mapping[str, Any] | RealVessel, *, withheld: float = 0.1,
+                 vessel: Path | str | Mapping[str, Any] | VesselConfig, *, withheld: float = 0.1,
                  moves: bool | None = None, correction: str = "offset",
-                 homogeneous_frames: int = 1, **believed: Any) -> None:
-        self.record = file if isinstance(file, Measurements) else read(file)
-        self.vessel = vessel if isinstance(vessel, RealVessel) else read_vessel(vessel)
-        record = self.record
-        n_electrodes = record.currents.shape[1]
-        if n_electrodes != self.vessel.n_electrodes:
-            raise ValueError(f"vessel must have the record's {n_electrodes} electrodes, got "
+                 homogeneous_frames: int = 1, **options: Any) -> None:
+        self.measurements = file if isinstance(file, Measurements) else read(file)
+        self.vessel = vessel if isinstance(vessel, VesselConfig) else read_vessel(vessel)
+        self.case: MeasuredCase | None = None
+        measurements = self.measurements
+        T, (M, L) = len(measurements.injections), measurements.matrix.shape
+        if self.vessel.n_electrodes != L:
+            raise ValueError(f"vessel must have the {L} electrodes of the measurements, got "
                              f"{self.vessel.n_electrodes}")
-        self.part = _check.number("withheld", withheld, low=0.0, high=0.5)
-        homogeneous = record.homogeneous(homogeneous_frames)
+        self.withheld = _check.number("withheld", withheld, low=0.0, high=0.5)
+        reference = measurements.homogeneous(homogeneous_frames)
+        self._electrodes = self.vessel.electrode_model(INITIAL_CONTACT_IMPEDANCE)
         self.calibration = calibrate(
-            self.vessel.electrode_model(FIRST_GUESS), record.currents, record.matrix,
-            homogeneous, depth=self.vessel.depth,
-            conductivity=self.vessel.conductivity, correction=correction,
-            noise=None if len(homogeneous) > 1 else noise_of_frames(record.frames(NOISE_FRAMES)))
+            self._electrodes, measurements.currents, measurements.matrix, reference,
+            depth=self.vessel.depth, conductivity=self.vessel.conductivity, correction=correction,
+            noise=(None if len(reference) > 1
+                   else noise_of_frames(measurements.frames(NOISE_FRAMES))))
         if moves is None:
-            flows = self.vessel.flow is not None
-            moves = flows or len(record.readings) >= 2 * record.frame
-        believed = {"moves": moves, **believed}
-        self.there = readings_there(record)
-        """(K, M) bool: readings that are there whenever an injection is."""
-        self.episode_steps = len(record.injections)
+            moves = self.vessel.flow is not None or 2 * measurements.frame <= T
+        self._options = {"moves": moves, **options}
+        self.available = complete_channels(measurements)
+        """(K, M) bool: readings that exist at every use of their injection"""
+        self.episode_steps = T
         self.spread: np.ndarray | None = None
-        """(n,) standard deviation in mol/m³ of the last estimate, for whoever has one."""
-        self._believed = believed
-        self._task_of = lru_cache(maxsize=1)(self._make_task)
-        self._show(0)
-        n = self.task.mesh.n_nodes
-        voltage = 100.0 * record.largest
-        current = float(np.abs(record.currents).max())
-        M, L = record.matrix.shape
+        """(n,) standard deviation of the last estimate in mol/m³, if the caller has one"""
+        self._seed = -1
+        self._step = 0
+        self._withhold(0)
+        voltage = 100.0 * measurements.largest
+        current = float(np.abs(measurements.currents).max())
         self.observation_space: spaces.Dict = spaces.Dict({  # type: ignore[assignment]
             "voltages": spaces.Box(-voltage, voltage, (M,), np.float64),
             "currents": spaces.Box(-current, current, (L,), np.float64)})
-        limit = np.full(n, 1e4 * self.task.expected_concentration)
+        limit = np.full(self.task.mesh.n_nodes, 1e4 * self.task.expected_concentration)
         if self.task.velocity is not None:
             limit = np.append(limit, 1e2 * np.abs(self.task.velocity.nominal))
         self.action_space: spaces.Box = spaces.Box(-limit, limit, dtype=np.float64)
-        self._step = 0
 
-    def _make_task(self, seed: int) -> Task:
-        hidden = withheld_readings(self.there, self.part, seed)
-        return measured_task(self.vessel, self.calibration, self.record,
-                             seen=self.there & ~hidden, **self._believed)
+    def _withhold(self, seed: int) -> None:
+        """Draw the withheld readings, and build the task without them."""
+        if seed == self._seed:
+            return
+        self.hidden = sample_withheld(self.available, self.withheld, seed)
+        """(K, M) bool: readings that the agent is not shown"""
+        self.task: Task = task_from_measurements(
+            self.vessel, self.calibration, self.measurements, mask=self.available & ~self.hidden,
+            **self._options)
+        """information for the agent"""
+        self._full_model = self.model.with_mask(self.available)
+        self._seed = seed
 
-    def _show(self, seed: int) -> None:
-        self.task: Task = self._task_of(seed)
-        """What the agent may know."""
+    @property
+    def model(self) -> MeasurementModel:
+        """The observation model of the task."""
         model = self.task.observation
-        assert isinstance(model, ReadingModel)
-        self.hidden = self.there & ~model.seen
-        """(K, M) bool: readings that the agent is not shown."""
-        self._judge = model.showing(self.there)
+        assert isinstance(model, MeasurementModel)
+        return model
 
     def reset(self, *, seed: int | None = None,
               options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
-        """Begin the record; the seed says which readings are withheld, by default 0."""
+        """Begin the measurements; the seed, or without one a random number, draws the withheld
+        readings."""
         super().reset(seed=seed)
-        self._show(seed or 0)
+        if seed is None:
+            seed = int(self.np_random.integers(WITHHOLDING_SEEDS))
+        self._withhold(seed % WITHHOLDING_SEEDS)
         self._step = 1
         self.spread = None
         return self._observe(), {"step": 1}
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Take the estimate (n,) in mol/m³ of the state in which the last readings were taken, and
-        after it the flow's parameters in m/s if the vessel's flow is asked for."""
+        """Take the estimate (n,) in mol/m³ of the state at the last readings, followed by the
+        parameters of the flow in m/s if the velocity is estimated."""
         if not 1 <= self._step <= self.episode_steps:
             raise gym.error.ResetNeeded(RESET_NEEDED)
         n = self.task.mesh.n_nodes
         estimate = checked_actions(action, self.action_space, n)[:n]
         reward = 0.0
-        if judged := self.judged_by(self._step):
-            off = np.concatenate([self.missed(t, estimate) for t in judged])
-            reward = -float(np.mean(off**2)) if len(off) else 0.0
+        if steps := self.scoring_steps(self._step):
+            residuals = np.concatenate([self.withheld_residuals(t, estimate) for t in steps])
+            reward = -float(np.mean(residuals**2)) if len(residuals) else 0.0
         self._step += 1
         return (self._observe(), reward, self._step > self.episode_steps, False,
                 {"step": self._step})
 
-    def doubts(self) -> list[str]:
-        """What is odd about the record; see `eitbench.estimation.measured.plausible.doubts`."""
-        return doubts(self.record, self.calibration, self.vessel.electrode_model(FIRST_GUESS))
+    def quality_warnings(self) -> list[str]:
+        """Return data-quality warnings; see `eitbench.measured.quality`."""
+        return quality.quality_warnings(self.measurements, self.calibration, self._electrodes)
 
-    def judged_by(self, t: int) -> range:
-        """By the withheld readings of which injections 1 … T an estimate at t is judged."""
-        T = self.episode_steps
+    def scoring_steps(self, t: int) -> range:
+        """Return the injections, 1 … T, whose withheld readings score an estimate at t."""
         if isinstance(self.task.transport, AtRest):
-            return range(1, T + 1) if t == T else range(0)
+            return range(1, self.episode_steps + 1) if t == self.episode_steps else range(0)
         return range(t, t + 1) if t > self.task.warm_up else range(0)
 
-    def missed(self, t: int, estimate: np.ndarray) -> np.ndarray:
-        """By how much an estimate (n,) misses the readings withheld at t = 1 … T, in standard
-        deviations of their noise."""
-        return self.off(t, estimate)[self.hidden[self.record.injections[t - 1]]]
+    def withheld_residuals(self, t: int, estimate: np.ndarray) -> np.ndarray:
+        """Residuals of an estimate (n,) at the readings withheld at t = 1 … T, relative to the
+        standard deviation of their noise."""
+        return self.residuals(t, estimate)[self.hidden[self.measurements.injections[t - 1]]]
 
-    def off(self, t: int, estimate: np.ndarray) -> np.ndarray:
-        """(M,) by how much an estimate (n,) misses each reading at t = 1 … T, in standard
-        deviations of its noise; NaN where nothing was read."""
-        reading = self.record.readings[t - 1]
-        k = self.record.injections[t - 1]
-        predicted = self._judge.voltages(estimate, self.record.currents[k][None])[0]
-        off: np.ndarray = (reading - predicted) / self.task.noise.std(np.nan_to_num(reading))
-        return np.where(self.there[k], off, np.nan)
+    def residuals(self, t: int, estimate: np.ndarray) -> np.ndarray:
+        """(M,) residuals of an estimate (n,) at all readings of t = 1 … T, relative to the
+        standard deviation of their noise; NaN where nothing was measured."""
+        reading = self.measurements.readings[t - 1]
+        k = self.measurements.injections[t - 1]
+        predicted = self._full_model.voltages(estimate, self.measurements.currents[k][None])[0]
+        residuals = (reading - predicted) / self.task.noise.std(np.nan_to_num(reading))
+        found: np.ndarray = np.where(self.available[k], residuals, np.nan)
+        return found
 
     def _observe(self) -> Observation:
         if self._step > self.episode_steps:
             return {name: np.zeros_like(space.low)  # type: ignore[attr-defined]
                     for name, space in self.observation_space.items()}
-        voltages, currents = shown_reading(self.task, self.record, self._step - 1)
+        voltages, currents = visible_reading(self.model, self.measurements, self._step - 1)
         return {"voltages": voltages, "currents": currents.copy()}
 
 
-def simulated_record(env: EstimationEnv, seed: int) -> Measurements:
-    """What an instrument would have written of an episode: currents and readings to the mean of
-    all electrodes, in A and V, or in A/m where the pipe is plane. The truth is no part of it."""
-    observation, _ = env.reset(seed=seed)
-    L = env.task.currents.shape[1]
-    V = np.empty((env.episode_steps - env.lag, L))
-    I = np.empty_like(V)
-    nothing = np.zeros_like(env.action_space.low)  # type: ignore[attr-defined]
-    for t in range(len(V)):
-        V[t], I[t] = observation["voltages"], observation["currents"]
-        observation, *_ = env.step(nothing)
-    return Measurements.of_sequence(
-        I, np.eye(L), V, env.task.transport.time_step * np.arange(1, len(V) + 1),
-        source={"file": f"{env.world.name}, episode {seed}", "assumed": "simulated"})
+def case_env(case: Path | str, file: Path | str | None = None) -> MeasuredEnv:
+    """Build the environment of a case; ``ValueError`` says which ``file`` is missing."""
+    found = read_case(case)
+    env = MeasuredEnv(found.measurements(file), dict(found.vessel), **found.options)
+    env.case = found
+    return env

@@ -19,7 +19,6 @@ from eitbench.estimation.gauss_newton import gauss_newton
 from eitbench.estimation.homogeneous import best_homogeneous
 from eitbench.estimation.identification import identified_model
 from eitbench.estimation.identified import IdentifiedModel, suiting_models
-from eitbench.estimation.inflow_batch import InflowBatch
 from eitbench.estimation.inflow_history import InflowFilter
 from eitbench.estimation.inflow_map import most_probable_inflow, smoothed_inflow
 from eitbench.estimation.inflow_prior import (
@@ -48,7 +47,6 @@ from eitbench.estimation.kalman import (
 )
 from eitbench.estimation.parameters import initial_covariance, starting_filter, table_5_1
 from eitbench.estimation.quadratic_voltages import QuadraticVoltages, ScaledVoltages
-from eitbench.estimation.reduced_transport import ReducedTransport
 from eitbench.estimation.smoother import (
     Smoothed,
     fixed_interval_smoother,
@@ -56,22 +54,21 @@ from eitbench.estimation.smoother import (
     smoothed_state,
 )
 from eitbench.estimation.smoothness import smoothness_covariance
-from eitbench.estimation.surrogate import Surrogate, surrogate_dataset
 from eitbench.estimation.switching_inflow import SwitchingInflowFilter
 from eitbench.estimation.unknown_flow import UnknownFlow, asked_flow, scaled_flow
 
 __all__ = [
     "CorrectedTracker", "DenseKalmanFilter", "EnsembleFilter", "FilterSeen", "FilterStep",
     "Filtered", "FirstFrame", "FreeCovariance", "IdentifiedModel",
-    "InflowBatch", "InflowFilter", "InflowPrior", "InflowSmoother", "InflowTracker",
+    "InflowFilter", "InflowPrior", "InflowSmoother", "InflowTracker",
     "JointFilter", "JointInflowFilter", "JointStep", "KalmanFilter", "LinearisedObservations",
-    "Observation", "QuadraticVoltages", "ReducedTransport", "Regimes", "Response",
-    "ScaledVoltages", "Smoothed", "Surrogate", "SwitchingInflowFilter", "UnknownFlow",
+    "Observation", "QuadraticVoltages", "Regimes", "Response",
+    "ScaledVoltages", "Smoothed", "SwitchingInflowFilter", "UnknownFlow",
     "VoltagesSeen", "asked_flow", "best_homogeneous", "blank", "changing_responses",
     "corrected", "fit_inflow_prior", "fixed_interval_smoother", "gauss_newton",
     "identified_model", "initial_covariance", "kalman_filter", "learned_inflow_prior",
     "linearised", "load_network", "most_probable_inflow", "network_suits", "reduced_response",
     "remember", "said", "scaled_flow", "smoothed_inflow", "smoothed_means", "smoothed_state",
     "smoothness_covariance", "starting_filter", "steady_response", "suiting_models",
-    "suiting_priors", "surrogate_dataset", "table_5_1",
+    "suiting_priors", "table_5_1",
 ]

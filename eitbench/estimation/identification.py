@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from eitbench import _check
-from eitbench.data.learning.examples import Dataset, Example
+from eitbench.data.dataset import Dataset, Example
 from eitbench.data.seeds import SPLITS, name_seed
 from eitbench.estimation.first_frame import FirstFrame
 from eitbench.estimation.identified import IdentifiedModel, told

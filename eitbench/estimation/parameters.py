@@ -17,7 +17,7 @@ from eitbench.physics.rest import AtRest
 if TYPE_CHECKING:
     from eitbench.numerics.mesh import Mesh
     from eitbench.physics.transport import Transport
-    from eitbench.worlds.parts import Prior
+    from eitbench.worlds.world import Prior
 
 
 def starting_filter(transport: Transport, prior: Prior,

@@ -11,6 +11,8 @@ from eitbench import _check
 
 STEP = 0.1
 """By how much a mode raises the logarithm, root mean square, where differences are taken."""
+CACHE_BYTES = 2**27
+"""Memory for what a model keeps of each injection: in 2D that of 250, more than there are pairs."""
 
 
 class Resistances(Protocol):
@@ -53,7 +55,9 @@ class QuadraticVoltages:
             ahead, back = (self._by_mode(model, modes, sign * h * mode) for sign in (1.0, -1.0))
             self._curvature[k] = (ahead - back) / (2.0 * h)
         self._curvature = 0.5 * (self._curvature + self._curvature.swapaxes(0, 1))
-        self._of_injection = lru_cache(maxsize=64)(self._contracted)
+        L = self._resistance.shape[0]
+        injections = CACHE_BYTES // (8 * L * (n + q * q))
+        self._of_injection = lru_cache(maxsize=max(1, injections))(self._contracted)
 
     def _by_mode(self, model: Resistances, modes: np.ndarray, u: np.ndarray) -> np.ndarray:
         """(q, L·L) derivatives by the modes at ln(c/c_0) = u."""

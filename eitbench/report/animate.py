@@ -14,10 +14,10 @@ from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from eitbench import _check
+from eitbench.bench.isolation import choose_isolation
 from eitbench.bench.methods import Method
 from eitbench.bench.playing import estimates, injections
 from eitbench.bench.run import Job
-from eitbench.bench.suites import is_isolated
 from eitbench.bench.tracks import Environment, board_of
 from eitbench.data.seeds import parse_seeds
 from eitbench.envs.injection import InjectionEnv
@@ -35,7 +35,7 @@ MOVING = (".gif", ".webp")
 
 
 def animate(environment: str, methods: Sequence[str], seed: str, step: int | None, path: Path, *,
-            every: int = 1, isolate: str = "others") -> Path:
+            every: int = 1, isolate: str = "auto") -> Path:
     """Play a baseline, or a policy, on one episode and draw its scored states into ``path``, one in
     ``every``, or only state ``step``. Of several baselines the estimates are drawn below the truth.
 
@@ -53,8 +53,9 @@ def animate(environment: str, methods: Sequence[str], seed: str, step: int | Non
     if played.track == "injection" and len(methods) > 1:
         raise ValueError(f"policy must be one for {environment}, got {', '.join(methods)}")
     with threadpool_limits(1):
-        loaded = [Job(played, method, seeds[0], is_isolated(played, method, isolate)).load()
-                  for method in methods]
+        kinds = [choose_isolation(played, method, isolate) for method in methods]
+        loaded = [Job(played, method, seeds[0], kind).load()
+                  for method, kind in zip(methods, kinds, strict=True)]
         env: Any = played.make(render_mode="rgb_array")
         for each in loaded:
             if board_of(env) not in each.boards:

@@ -13,15 +13,15 @@ import numpy as np
 import pandas as pd
 
 from eitbench._files import shipped
-from eitbench.bench.contradictions import version_number
+from eitbench.bench.episode_table import read_episode_table, table_beside
 from eitbench.bench.ranking import shared_ranks
 from eitbench.bench.records import (
     BOARDS,
     file_name,
     finished,
     newest,
-    read_record,
     read_sound_records,
+    version_number,
 )
 from eitbench.bench.scores import scores
 from eitbench.bench.statistics import (
@@ -185,7 +185,7 @@ def _place(row: Row) -> tuple[bool, float, str]:
 def _means(record: dict[str, Any], known: Anchors) -> dict[str, float | None]:
     """Return the mean of each score but the error, the least time per step, and the skill."""
     found: dict[str, float | None] = {"skill": _skill(record, known)}
-    for name in scores():
+    for name in scores() | scores("measured"):
         values = list(scores_by_seed(record, name).values())
         reduce: Callable[..., Any] = min if name == "seconds_per_step" else np.mean
         if name != "error":
@@ -311,9 +311,9 @@ def shipped_anchors(records: Iterable[dict[str, Any]]) -> Anchors:
     """Return the `anchors` of the worlds of these records among the records of the package."""
     kinds = {kind_of(record["environment"]["id"]) for record in records}
     known = [id.replace("/", "-") for id in ids("estimation") if kind_of(id) in kinds]
-    folder = shipped("leaderboards") / "results"
-    return anchors([read_record(path) for name in known for method in ANCHORS
-                    for path in folder.glob(f"{name}--{method}--*.json")])
+    published = read_episode_table(table_beside(shipped("leaderboards") / "results"))
+    return anchors(record for record in published if record["method"] in ANCHORS
+                   and record["environment"]["name"] in known)
 
 
 def _skill(record: dict[str, Any], known: Anchors) -> float | None:

@@ -13,8 +13,7 @@ from markupsafe import Markup
 
 from eitbench import _check
 from eitbench._files import readable, shipped
-from eitbench.bench.contradictions import version_number
-from eitbench.bench.records import finished, newest, read_record, read_records
+from eitbench.bench.records import finished, newest, read_record, read_records, version_number
 from eitbench.bench.scores import Score, scores
 from eitbench.bench.statistics import (
     Statistic,

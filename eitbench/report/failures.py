@@ -62,6 +62,6 @@ def debug_command(failure: Failure, jobs: Iterable[Job]) -> str:
                        for number, value in flat(given.get("world", {})).items()]
             estimator = ["--estimator", given["estimator"]] if "estimator" in given else []
             return shlex.join(["eitbench", command, "--env", job.environment.id, option, job.method,
-                               "--seeds", first, *changes, *estimator, "--isolate", "never",
+                               "--seeds", first, *changes, *estimator, "--isolate", "none",
                                "--jobs", "1"])
     return ""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import sys
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -79,10 +78,7 @@ def load_agent(path: Path, content: bytes) -> tuple[str, str, type[Agent], dict[
     if found != expected:
         raise ValueError(f"policy {path} must have the sha256 that lies beside it, {expected}; "
                          f"it has {found}")
-    from eitbench.rl import networks
     from eitbench.rl.training import algorithm_of
-    # as older models name their networks' module
-    sys.modules.setdefault("eitbench.pair_policy", networks)
     algo = asked["algo"]
     seed = asked["seed"]
     model = algorithm_of(algo).load(io.BytesIO(content), device="cpu")

@@ -41,8 +41,8 @@ from tqdm import tqdm
 from eitbench import _check
 from eitbench._files import readable, write_atomically
 from eitbench.bench.methods import load_method
+from eitbench.data.cache import npy
 from eitbench.data.seeds import SPLITS
-from eitbench.data.store import npy
 from eitbench.envs.injection import InjectionEnv, InjectionVectorEnv
 from eitbench.rl.imitation import check_imitation, imitate, suited
 from eitbench.rl.networks import MaskablePairPolicy, PairPolicy

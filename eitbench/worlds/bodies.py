@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from eitbench import _check
-from eitbench.worlds.parts import Discretisation, History, Target, check_positive, check_range
-from eitbench.worlds.world import World
+from eitbench.worlds.fields import check_positive, check_range
+from eitbench.worlds.world import Discretisation, History, Target, World
 
 if TYPE_CHECKING:
     from eitbench.worlds.streams import Randomness

@@ -13,15 +13,9 @@ import numpy as np
 from eitbench import _check
 from eitbench.physics.flow import PlaneChannelFlow, PlugFlow, PowerLawFlow
 from eitbench.physics.profiles import SkewedChannelFlow, VelocityModel, parabola
-from eitbench.worlds.parts import (
-    Discretisation,
-    Flow,
-    check_positive,
-    check_range,
-    refuse_assumptions,
-)
+from eitbench.worlds.fields import check_positive, check_range
 from eitbench.worlds.vessels import Bulge, PlanePipe
-from eitbench.worlds.world import World
+from eitbench.worlds.world import Discretisation, Flow, World, refuse_assumptions
 
 if TYPE_CHECKING:
     from eitbench.physics.navier_stokes import SteadyFlow
@@ -33,23 +27,16 @@ BELIEVED_PAST_A_BULGE = ("parabolic", "real")
 """What a model of the flow past a bulge may assume."""
 
 
-@dataclass(frozen=True)
-class LaminarFlow(Flow):
-    """Laminar flow with a known mean velocity; [T]: the thesis' number; [ours]: our choice."""
+class PipeFlow(Flow):
+    """Flow through a straight pipe whose estimators are told a laminar one of ``mean_velocity``."""
 
-    mean_velocity: float = 4.5
-    """v̄ in m/s [T]"""
-    diffusivity: float = 5e-4
-    """κ in m²/s [ours]: small, yet resolved by the model's mesh"""
-
-    def __post_init__(self) -> None:
-        check_positive(self, mean_velocity="m/s", diffusivity="m²/s")
+    mean_velocity: float
 
     def nominal(self, world: World, fine: bool) -> VelocityField:
         return world.vessel.laminar(self.mean_velocity)
 
     def check_assumed(self, world: World, assumed: Mapping[str, Any]) -> None:
-        """``mean_velocity`` in m/s, and in a plane pipe ``profile``, one of `PROFILES`."""
+        """Accept ``mean_velocity`` in m/s, and in a plane pipe ``profile``, one of `PROFILES`."""
         laminar_assumption(world, self.mean_velocity, assumed)
 
     def believed(self, world: World, **assumed: Any) -> VelocityField:
@@ -60,7 +47,20 @@ class LaminarFlow(Flow):
 
 
 @dataclass(frozen=True)
-class DrawnFlow(Flow):
+class LaminarFlow(PipeFlow):
+    """Laminar flow with a known mean velocity; [T]: the thesis' number; [ours]: our choice."""
+
+    mean_velocity: float = 4.5
+    """v̄ in m/s [T]"""
+    diffusivity: float = 5e-4
+    """κ in m²/s [ours]: small, yet resolved by the model's mesh"""
+
+    def __post_init__(self) -> None:
+        check_positive(self, mean_velocity="m/s", diffusivity="m²/s")
+
+
+@dataclass(frozen=True)
+class DrawnFlow(PipeFlow):
     """A flow through a plane pipe that is drawn for each episode (thesis 5.1.2 and ch. 6).
 
     v̄(t) = mean·(1 + swing·sin(2πt/period + phase)), its profile (1 − η²)·exp(kη). Estimators are
@@ -100,19 +100,6 @@ class DrawnFlow(Flow):
         _check.number("velocity_std", self.velocity_std, low=0.0, units="m/s")
         _check.number("velocity_walk", self.velocity_walk, low=0.0, units="m/s")
 
-    def nominal(self, world: World, fine: bool) -> VelocityField:
-        return world.vessel.laminar(self.mean_velocity)
-
-    def check_assumed(self, world: World, assumed: Mapping[str, Any]) -> None:
-        """As in `LaminarFlow`."""
-        laminar_assumption(world, self.mean_velocity, assumed)
-
-    def believed(self, world: World, **assumed: Any) -> VelocityField:
-        return laminar_assumption(world, self.mean_velocity, assumed)
-
-    def flush_steps(self, world: World) -> int:
-        return steps_through(world, self.mean_velocity)
-
     def lead_in(self, world: World) -> int:
         return steps_through(world, self.velocity_range[0] * (1.0 - self.swing_range[1]))
 
@@ -144,7 +131,7 @@ class DrawnFlow(Flow):
 
 
 @dataclass(frozen=True)
-class WanderingFlow(Flow):
+class WanderingFlow(PipeFlow):
     """A parabolic flow in a plane pipe whose mean velocity is a random walk; numbers are ours.
 
     At every time step it goes up or down by ``velocity_walk``, which is also the walk that
@@ -166,12 +153,6 @@ class WanderingFlow(Flow):
         check_positive(self, mean_velocity="m/s", diffusivity="m²/s", velocity_walk="m/s")
         _check.number("velocity_std", self.velocity_std, low=0.0, units="m/s")
         check_range(self, "velocity_range", "m/s")
-
-    def nominal(self, world: World, fine: bool) -> VelocityField:
-        return world.vessel.laminar(self.mean_velocity)
-
-    def flush_steps(self, world: World) -> int:
-        return steps_through(world, self.mean_velocity)
 
     def lead_in(self, world: World) -> int:
         return steps_through(world, self.velocity_range[0])

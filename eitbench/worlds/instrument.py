@@ -9,7 +9,7 @@ import numpy as np
 
 from eitbench import _check
 from eitbench.physics.observation import VoltageNoise
-from eitbench.worlds.parts import LATER, check_positive, check_range
+from eitbench.worlds.fields import LATER, check_positive, check_range
 
 LIMITS = ("L1", "L2", "Linf")
 """Norms that may bound the currents."""

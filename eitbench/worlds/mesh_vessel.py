@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from eitbench import _check
-from eitbench.worlds.parts import check_positive
+from eitbench.worlds.fields import check_positive
 
 if TYPE_CHECKING:
     from eitbench.numerics.mesh import Mesh

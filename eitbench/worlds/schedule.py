@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from eitbench import _check
-from eitbench.worlds.parts import check_positive
+from eitbench.worlds.fields import check_positive
 
 if TYPE_CHECKING:
     from eitbench.worlds.vessels import PlanePipe, RoundPipe, RoundTank

@@ -10,15 +10,8 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from eitbench.worlds.parts import (
-    LATER,
-    Discretisation,
-    History,
-    Target,
-    check_positive,
-    check_range,
-)
-from eitbench.worlds.world import World
+from eitbench.worlds.fields import LATER, check_positive, check_range
+from eitbench.worlds.world import Discretisation, History, Target, World
 
 if TYPE_CHECKING:
     from eitbench.physics.transport import Transport

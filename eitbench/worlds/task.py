@@ -10,8 +10,7 @@ import numpy as np
 
 from eitbench import _check
 from eitbench._html import small_table
-from eitbench.worlds.parts import Discretisation, Prior, Vessel
-from eitbench.worlds.world import World
+from eitbench.worlds.world import Discretisation, Prior, Vessel, World
 
 if TYPE_CHECKING:
     from eitbench.numerics.mesh import Mesh

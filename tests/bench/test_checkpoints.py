@@ -7,9 +7,9 @@ import zipfile
 
 import numpy as np
 import pytest
+from eitbench.bench import isolation
 from eitbench.bench.methods import baseline_folder, load_method, own_agents
 from eitbench.bench.run import Job, run_episode
-from eitbench.bench.sandbox import guests
 from eitbench.bench.tracks import Environment, ids
 
 from choosing import injected
@@ -56,9 +56,9 @@ def test_somebody_s_agent_plays_in_a_guest(tmp_path):
     asked = json.loads((folder / "config.json").read_text())
     job = Job(Environment(asked["env"], json.dumps({"estimator": "reduced"})), str(folder / "model.zip"), FIRST)
     try:
-        here, there = (run_episode(job._replace(isolated=isolated))[0] for isolated in (False, True))
+        here, there = (run_episode(job._replace(isolation=kind))[0] for kind in ("none", "process"))
     finally:
-        guests.close()
+        isolation.close()
     assert here["method"] == there["method"] == f"{asked['algo']}_seed{asked['seed']}"          # it is still ours
     assert here["status"] == "ok" and here["step_errors"] == there["step_errors"]
     assert here["checkpoint_sha256"] == there["checkpoint_sha256"] and there["peak_memory"] > 50e6

@@ -47,25 +47,25 @@ def test_a_cluster_plays_on_when_a_worker_is_killed(backend, tmp_path):
 
 @pytest.mark.cluster
 def test_what_a_method_prints_in_ray_is_passed_on(tmp_path, capsys):
-    """By those that run in its workers, and by guests of these."""
+    """By those that run in its workers, and by workers of these."""
     pytest.importorskip("ray")
     path = write_baseline(tmp_path, init="print('made')")
-    run_jobs([Job(FILTER, path, 1), Job(FILTER, path, 2, True)], EpisodeStore(tmp_path / "results"), n_jobs=2,
+    run_jobs([Job(FILTER, path, 1), Job(FILTER, path, 2, "process")], EpisodeStore(tmp_path / "results"), n_jobs=2,
              backend="ray")
-    assert capsys.readouterr().err.count("[mine] made\n") == 2
+    assert capsys.readouterr().err.count("made\n") == 2
 
 
 @pytest.mark.cluster
 @pytest.mark.parametrize("backend", CLUSTERS)
-def test_guests_play_in_a_cluster(backend, tmp_path):
-    """A stranger's file runs in guests of the workers."""
+def test_methods_are_isolated_in_a_cluster(backend, tmp_path):
+    """A third-party file runs in a separate process of each worker."""
     pytest.importorskip(CLUSTERS[backend])
     store, path = EpisodeStore(tmp_path / "results"), write_baseline(tmp_path)
-    jobs = [Job(FILTER, path, seed, True) for seed in (1, 2)]
+    jobs = [Job(FILTER, path, seed, "process") for seed in (1, 2)]
     run_jobs(jobs, store, n_jobs=2, backend=backend)
-    assert all(result["peak_memory"] > 50e6 and result["run"]["isolation"] != "none" for result in store.results())
-    assert errors(store) == {("mine", f"train:{job.seed}"): run_episode(job._replace(isolated=False))[0]["step_errors"]
-                             for job in jobs}
+    assert all(result["peak_memory"] > 50e6 and result["run"]["isolation"] == "process" for result in store.results())
+    assert errors(store) == {
+        ("mine", f"train:{job.seed}"): run_episode(job._replace(isolation="none"))[0]["step_errors"] for job in jobs}
 
 
 def test_here_a_killed_worker_ends_the_run_and_nothing_is_lost(tmp_path):

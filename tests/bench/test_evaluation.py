@@ -1,5 +1,8 @@
 """`eitbench.evaluate`: the numbers of the commands, from Python, of classes, names and files."""
 
+import contextlib
+import os
+
 import eitbench
 import gymnasium as gym
 import numpy as np
@@ -73,6 +76,25 @@ def test_what_the_method_raises_is_seen():
     with pytest.raises(ZeroDivisionError, match="dry") as caught:
         eitbench.evaluate(Fails, FILTER.id, "dev:0", world=SCENARIO)
     assert caught.value.__notes__ == ["Fails on eitbench/Pipe2D-v0, dev:0"]
+
+
+def test_a_file_is_isolated_if_asked_for(tmp_path):
+    """It scores the same, in another process; a class cannot be isolated."""
+    log = tmp_path / "log"
+    init = f"print(os.getpid(), file=open({str(log)!r}, 'w'))"
+    path = write_baseline(tmp_path, update="return Estimate(self.level + voltages.sum())")
+    spy = write_baseline(tmp_path, "spy", init=init, update="return Estimate(self.level + voltages.sum())")
+    here, apart = (eitbench.evaluate(path, FILTER.id, "dev:0-1", world=SCENARIO, isolate=isolate)
+                   for isolate in (None, "process"))
+    assert without_time(apart).equals(without_time(here))
+    eitbench.evaluate(spy, FILTER.id, "dev:0", world=SCENARIO)
+    assert int(log.read_text()) == os.getpid()
+    log.unlink()
+    with contextlib.suppress(RuntimeError):                       # where it may not write, that is its failure
+        eitbench.evaluate(spy, FILTER.id, "dev:0", world=SCENARIO, isolate="process")
+    assert not log.exists() or int(log.read_text()) != os.getpid()
+    with pytest.raises(ValueError, match="method must be a name or a path to be isolated, got type"):
+        eitbench.evaluate(Level, FILTER.id, "dev:0", isolate="process")
 
 
 @pytest.mark.parametrize(("arguments", "message"), [

@@ -1,14 +1,17 @@
 """What a stored result is recognised by: an episode of another world is none of this one's."""
 
+import json
 import subprocess
 import sys
 from dataclasses import replace
+from importlib.metadata import EntryPoint
 
 import pytest
+from eitbench.bench import methods, run, tracks
 from eitbench.bench.run import Job, run_jobs
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.tracks import Environment
-from eitbench.data.store import CACHE_VARIABLE
+from eitbench.data.cache import CACHE_VARIABLE
 from eitbench.worlds import entry, register, registry
 
 from short import register_apart
@@ -25,7 +28,7 @@ from eitbench.bench.store import EpisodeStore
 from eitbench.bench.tracks import Environment
 from eitbench.worlds import register
 from eitbench.worlds.flows import LaminarFlow
-from eitbench.worlds.pipe2d import PIPE_2D
+from eitbench.worlds.catalogue import PIPE_2D
 
 
 @dataclass(frozen=True)
@@ -71,6 +74,43 @@ def test_a_world_that_is_changed_to_itself_has_the_same_identity(tmp_path):
     first = Job(FILTER, path, 1).identity()
     registry.take_over([replace(entry(FILTER.id), world=replace(entry(FILTER.id).world))])
     assert Job(FILTER, path, 1).identity() == first
+
+
+def injection_identity(name="random_pair", **given):
+    return Job(Environment("eitbench/Pipe2DInjection-v0", json.dumps(given)), name, 1).identity()
+
+
+def test_a_changed_default_is_another_identity(monkeypatch):
+    """Of the arguments of scored runs, of the registration, of the environment's class, and of the version of scoring:
+    stored results of before are not reused. What is given as it is by default changes nothing."""
+    before = injection_identity()
+    assert injection_identity(estimator="full", gate=None) == before != injection_identity(estimator="reduced")
+
+    def changed_class(name, *, world=None, estimator="reduced", observation="scaled", gate=9.0): ...
+
+    changes = [lambda patch: patch.setitem(tracks.SCORED, "injection", {"estimator": "reduced", "observation": "raw"}),
+               lambda patch: patch.setattr(tracks, "load_env_creator", lambda name: changed_class),
+               lambda patch: patch.setattr(tracks, "registered", lambda id: {"gate": 4.0}),
+               lambda patch: patch.setattr(run, "SCORING", 99)]
+    found = {before}
+    for change in changes:
+        with monkeypatch.context() as patch:
+            change(patch)
+            found.add(injection_identity())
+    assert len(found) == 5 and injection_identity() == before
+
+
+def test_files_and_loader_of_a_method_are_in_its_identity(tmp_path, monkeypatch):
+    """Its own file, the configuration beside a model, and the function that loads it."""
+    model = tmp_path / "model.zip"
+    found = set()
+    for content, config in ((b"a", "{}"), (b"b", "{}"), (b"b", '{"algo": "ppo"}')):
+        model.write_bytes(content)
+        (tmp_path / "config.json").write_text(config)
+        found.add(injection_identity(str(model)))
+    monkeypatch.setattr(methods, "_loaders", lambda: {".zip": EntryPoint("zip", "mine:load", "eitbench.loaders")})
+    found.add(injection_identity(str(model)))
+    assert len(found) == 4
 
 
 def test_a_script_with_a_part_of_its_own_resumes(tmp_path):

@@ -53,14 +53,6 @@ def test_its_policy_is_the_one_that_is_scored():
     np.testing.assert_allclose(played, env.rules.currents(episode.actions))
 
 
-def test_card_says_what_is_in_it():
-    export_minari(NAME, ENV, "transverse", "test:0")
-    metadata = minari.load_dataset(NAME).storage.metadata
-    assert metadata["algorithm_name"] == "transverse" and metadata["requirements"] == ["eitbench"]
-    for words in (ENV, "Episodes test:0", "Test episodes are among them", "no measured data"):
-        assert words in metadata["description"]
-
-
 @pytest.mark.parametrize(("given", "said"), [
     ({"name": "a b"}, "out must be the name of a Minari data set"),
     ({"env": "eitbench/Pipe2D-v0"}, "does not ask for injections"),

@@ -15,7 +15,7 @@ from eitbench.envs.injection import InjectionEnv
 from eitbench.estimation.onboard.belief import Belief
 from eitbench.estimation.onboard.rules import Rules
 from eitbench.report.policies import adaptivity_gap, policy_rows, policy_table
-from eitbench.worlds.pipe2d import PIPE_2D
+from eitbench.worlds.catalogue import PIPE_2D
 from scipy.stats import t as student
 
 from choosing import filter_of, injected

@@ -2,24 +2,33 @@
 
 import hashlib
 import json
+import os
+import random
 import warnings
+from inspect import signature
 
+import jsonschema
 import jsonschema_rs
 import pytest
-from eitbench._files import shipped
-from eitbench.bench.migrate import migrate
-from eitbench.bench.quick import schema_text
 from eitbench.bench.records import (
     BOARDS,
     file_name,
     newest,
     read_record,
     read_records,
+    schema_text,
     sealed,
+    split_of,
+    version_number,
     write_record,
 )
-from eitbench.bench.tracks import named
+from eitbench.bench.strict_json import MAX_BYTES, MAX_DEPTH
+from eitbench.bench.tracks import ARGUMENTS, boards_of, named
+from eitbench.envs.estimation import EstimationEnv
+from eitbench.envs.injection import InjectionEnv
+from eitbench.worlds import entry
 
+import hostile
 from tiny import RUN, episode, record, sha, strict
 
 MINE = record("mine", [0.1, 0.25, None], parameters={"alpha": 0.1, "order": [1, 2], "β": 1e-22})
@@ -102,15 +111,20 @@ def test_the_digest_is_what_the_schema_says():
     ("source", sha("code"), "'source' was unexpected"),
     ("version", "1", r'\$\.version: "1" does not match'),
     ("version", "v0", r'\$\.version: "v0" does not match'),
+    ("version", "v1234567890", r'\$\.version: "v1234567890" does not match'),
     ("version", "deadbeef", r"\$\.version: must be v1, v2, … of ours, or begin as method_sha256 does"),
     ("version", ..., '"version" is a required property'),
-    ("runs.0.source", ..., r'\$\.runs\[0\]: "source" is a required property'),
+    ("schema", 2, r"\$\.schema: 3 was expected"),
     ("title", ..., '"title" is a required property'),
     ("title", "", r"\$\.title: "),
     ("title", "Fine |\n| 1 | Forged |", r"\$\.title: "),
     ("title", "Fine\n", r"\$\.title: "),
     ("title", 121 * "x", r"\$\.title: .* is longer than 120"),
+    ("title", "a\x1b[2Jb", r"\$\.title: .* is not allowed"),
+    ("title", "a\u202eb", r"\$\.title: .* is not allowed"),
     ("method", "mine\n", r"\$\.method: "),
+    ("method", "mi\u200bne", r"\$\.method: "),
+    ("method", 101 * "x", r"\$\.method: .* is longer than 100"),
     ("board", "smooth", r'\$\.board: "smooth" is not one of'),
     ("role", "best", r'\$\.role: "best" is not one of'),
     ("official", "no", r'\$\.official: "no" is not of type "boolean"'),
@@ -122,10 +136,22 @@ def test_the_digest_is_what_the_schema_says():
     ("split", "exam", r'\$\.split: "exam" does not match'),
     ("seeds", [], r"\$\.seeds: "),
     ("score", 1, "'score' was unexpected"),
+    ("seeds", ["test:0"] * 10_001, r"\$\.seeds: .*has more than 10000 items"),
+    ("runs", [RUN] * 10_001, r"\$\.runs: .*has more than 10000 items"),
+    ("runs.0.walls", ["net"] * 21, r"\$\.runs\[0\]\.walls: .*has more than 20 items"),
+    ("episodes.0.step_errors", [0.1] * 100_001, r"\$\.episodes\[0\]\.step_errors: .*has more than 100000 items"),
+    ("episodes.1.step_errors", [0.25, 0.25], r"\$\.episodes: must have the same number of step_errors each"),
+    ("episodes.0.scores.nis", 1e51, r"\$\.episodes\[0\]\.scores\.nis: 1e\+51 is greater than the maximum"),
+    ("episodes.0.scores.nis", -1e51, r"\$\.episodes\[0\]\.scores\.nis: -1e\+51 is less than the minimum"),
+    ("episodes.0.scores.nis", 1e-101, r"\$\.episodes\[0\]\.scores\.nis: .* is not allowed for 1e-101"),
+    ("episodes.0.step_errors", [1e60], r"\$\.episodes\[0\]\.scores\.error: must be the mean of step_errors"),
+    ("episodes.0.seconds", 1e308, r"\$\.episodes\[0\]\.seconds: 1e\+308 is greater"),
+    ("runs.0.machine.matmul_seconds", 1e-101, r"\$\.runs\[0\]\.machine\.matmul_seconds: .* is not allowed"),
     ("environment.id", "Pipe2D", r'\$\.environment\.id: "Pipe2D" does not match'),
     ("environment.name", "eitbench-Pipe3D-v0", r"\$\.environment\.name: must be eitbench-Pipe2D-v0, as id and"),
     ("environment.name", "eitbench-Pipe2D-v0-deadbeef", r"\$\.environment\.name: must be eitbench-Pipe2D-v0, as"),
     ("environment.kwargs", {"lag": 3}, r"\$\.environment\.name: must be eitbench-Pipe2D-v0-\w{8}, as id and"),
+    ("environment.kwargs", {"scenario": 10_000 * "x"}, r"\$\.environment\.kwargs: must have 10000 characters at most"),
     ("environment.kwargs", None, r'\$\.environment\.kwargs: null is not of type "object"'),
     ("runs.0.commit", ..., r'\$\.runs\[0\]: "commit" is a required property'),
     ("runs.0.isolation", "jail", r'\$\.runs\[0\]\.isolation: "jail" is not one of'),
@@ -273,102 +299,101 @@ def test_scores_are_open(tmp_path):
     assert read_record(write_record(tmp_path, mine))["episodes"][0]["scores"] == scores
 
 
-# -- the format before ------------------------------------------------------------------------------------------------
+# -- what no run could have made --------------------------------------------------------------------------------------
 
 
-def old(made, source="code", **changes):
-    """A record as it was written in schema 2, with its own seal."""
-    kept = {key: value for key, value in made.items() if key not in ("version", "sha256")}
-    runs = [{key: value for key, value in run.items() if key != "source"} for run in made["runs"]]
-    return sealed(kept | {"schema": 2, "source": sha(source), "runs": runs} | changes)
+PIPE, LATER, LONG = "eitbench/Pipe2D-v0", "eitbench/Pipe2DFixedLag-v0", "eitbench/Pipe2DSmoothing-v0"
+TOO_LONG = entry(PIPE).world.n_steps - 1
 
 
-def write_old(folder, content):
-    name = "--".join([content["environment"]["name"], content["method"], content["method_sha256"][:8]])
-    return write_unchecked(folder, content, f"{name}.json")
+@pytest.mark.parametrize(("id", "kwargs", "boards"), [
+    (PIPE, {}, "filter"), (PIPE, {"lag": 0}, "filter"), (PIPE, {"lag": 3}, "fixed-lag"), (LATER, {}, "fixed-lag"),
+    (PIPE, {"lag": TOO_LONG}, "smoothing"), (LONG, {}, "smoothing"), (LONG, {"lag": 0}, "filter"),
+    (LONG, {"lag": None}, "smoothing"), (PIPE, {"lag": "all", "world": {"flow": {}}}, "smoothing"),
+    (PIPE, {"lag": 3, "world": {"schedule": {"scored_steps": 1}}}, "fixed-lag smoothing"),
+    ("eitbench/Pipe2DInjection-v0", {"gate": 3.0}, "injection")])
+def test_a_board_is_that_of_the_environment(id, kwargs, boards, tmp_path):
+    """Whatever the record calls it."""
+    assert boards_of(id, kwargs) == tuple(boards.split())
+    environment = {"id": id, "name": named(id, kwargs), "kwargs": kwargs}
+    for board in BOARDS:
+        made = record("mine", [0.1], board=board, environment=environment)
+        if board in boards.split():
+            assert read_record(write_record(tmp_path, made)) == made
+        else:
+            with pytest.raises(ValueError, match=rf"\$\.board: must be {' or '.join(boards.split())}, as the env"):
+                read_record(write_unchecked(tmp_path / board, made))
 
 
-@pytest.mark.parametrize(("method", "official", "version"), [
-    ("kalman_filter", True, "v1"), ("kalman_filter", False, sha("kalman_filter1")[:8]),
-    ("mine", True, sha("mine1")[:8])])
-def test_records_of_the_format_before_are_read(method, official, version, tmp_path):
-    """As they would be written today: the source is each run's, and official ones of ours are of version 1."""
-    runs, episodes = [RUN, RUN | {"commit": "decaf"}], [episode("test:0", 0.1), episode("test:1", None) | {"run": 1}]
-    made = record(method, [0.1, None], official=official, runs=runs, episodes=episodes)
-    path = write_old(tmp_path, old(made))
-    expected = made | {"version": version, "runs": runs}
-    assert read_record(path) == sealed(expected) and read_records(tmp_path) == [sealed(expected)]
+@pytest.mark.parametrize(("kwargs", "message"), [
+    ({"scenario": 5}, "scenario is no argument of"), ({"world": 5}, "world must be an object, got int"),
+    ({"world": [1]}, "world must be an object, got list"), ({"assume": "all"}, "assume must be an object, got str"),
+    ({"lag": -1}, "lag must be 'all' or an integer"), ({"lag": 1.5}, "lag must be"), ({"lag": True}, "lag must be"),
+    ({"lag": "some"}, "lag must be"), ({"lag": {}}, "lag must be")])
+def test_arguments_that_there_are_not(kwargs, message, tmp_path):
+    """No run could have had them."""
+    environment = {"id": PIPE, "name": named(PIPE, kwargs), "kwargs": kwargs}
+    with pytest.raises(ValueError, match=rf"\$\.environment\.kwargs: {message}"):
+        read_record(write_unchecked(tmp_path, record("mine", [0.1], environment=environment)))
 
 
-@pytest.mark.parametrize(("name", "kwargs", "expected"), [
-    ("eitbench-Pipe2DFixedLag-v0", {"lag": 4}, {}),
-    ("eitbench-Pipe2DFixedLag-v0-12345678", {"lag": 4, "assume": {"flow": "real"}}, {"assume": {"flow": "real"}}),
-    ("eitbench-Pipe2DFixedLag-v0-12345678", {"lag": 3}, {"lag": 3})])
-def test_arguments_of_the_registration_are_left_out(name, kwargs, expected, tmp_path):
-    """What stays are those that somebody gave, and the name follows from them."""
-    environment = {"id": "eitbench/Pipe2DFixedLag-v0", "name": name, "kwargs": kwargs}
-    path = write_old(tmp_path, old(record("mine", [0.1], board="fixed-lag"), environment=environment))
-    found = read_record(path)["environment"]
-    assert found["kwargs"] == expected and found["name"] == named("eitbench/Pipe2DFixedLag-v0", expected)
+def test_the_arguments_are_those_of_the_environments():
+    """And no others."""
+    for track, single in (("estimation", EstimationEnv), ("injection", InjectionEnv)):
+        assert sorted(ARGUMENTS[track]) == sorted(set(signature(single).parameters) - {"name"})
 
 
-def test_an_old_seal_and_an_old_name_still_count(tmp_path):
-    """What was changed by hand, renamed or is not whole is refused as it always was."""
-    path = write_old(tmp_path, old(MINE))
-    text = path.read_text(encoding="utf-8")
-    path.write_text(text.replace("0.25", "0.24"), encoding="utf-8")
-    with pytest.raises(ValueError, match="was changed since it was written"):
+@pytest.mark.parametrize("text", ["1e999", "-1e999", "NaN", "Infinity", "9" * 400, "9" * 5000, '"\\ud800"',
+                                  "[" * MAX_DEPTH + "]" * MAX_DEPTH, "[" * 50_000 + "]" * 50_000])
+@pytest.mark.parametrize("place", ['"parameters": {"a": 7}', '"seconds": 7', '"error": 7'])
+def test_what_json_lacks_is_named_with_the_file(text, place, tmp_path):
+    """Numbers that are not finite, half a character, and lists that are nested too deep, wherever they stand."""
+    mine = record("mine", [7], parameters={"a": 7}, episodes=[episode("test:0", 7) | {"seconds": 7}])
+    path = write_unchecked(tmp_path, mine)
+    content = path.read_text()
+    assert place in content
+    path.write_text(content.replace(place, place.replace("7", text), 1))
+    with pytest.raises(ValueError, match=f"record .*{path.name} (cannot be read|is not valid)"):
         read_record(path)
-    path.write_text(text, encoding="utf-8")
-    renamed = path.rename(tmp_path / "eitbench-Pipe2D-v0--mine--v1.json")
-    with pytest.raises(ValueError, match=f"must have the name eitbench-Pipe2D-v0--mine--{sha('mine1')[:8]}.json"):
-        read_record(renamed)
-    for broken in (old(MINE) | {"runs": "none"}, {"schema": 2}, old(MINE) | {"environment": "Pipe2D"}):
-        with pytest.raises(ValueError, match="is not valid"):
-            read_record(write_unchecked(tmp_path, broken, "it.json"))
 
 
-def test_migrating_keeps_every_number(tmp_path):
-    """Old files are rewritten under their new names; what was new already is left as it is."""
-    made = [record("homogeneous", [0.1, 0.25, None], official=True, scores={"nis": 1.0 / 3.0}), record("mine", [0.1])]
-    before = [write_old(tmp_path, old(each)) for each in made]
-    new = write_record(tmp_path, record("yours", [0.3]))
-    content, read = new.read_bytes(), read_records(tmp_path)
-    moved = list(migrate(tmp_path))
-    assert [path for path, _ in moved] == sorted(before) and new.read_bytes() == content
-    assert {path.name for path in tmp_path.iterdir()} == {
-        "eitbench-Pipe2D-v0--homogeneous--v1.json", before[1].name, new.name}
-    assert sorted(read_records(tmp_path), key=str) == sorted(read, key=str)
-    for each in read_records(tmp_path):
-        (same,) = [other for other in [*made, record("yours", [0.3])] if other["method"] == each["method"]]
-        assert all(each[key] == same[key] for key in ("episodes", "seeds", "runs", "method_sha256"))
-    assert list(migrate(tmp_path)) == []
+def test_a_file_that_is_too_large_or_none_is_not_opened(tmp_path):
+    """Reading a pipe would never end."""
+    path = tmp_path / "it.json"
+    makers = [path.touch, path.mkdir] + ([lambda: os.mkfifo(path)] if hasattr(os, "mkfifo") else [])
+    for make in makers:
+        make()
+        if path.is_file():
+            os.truncate(path, MAX_BYTES + 1)
+        with pytest.raises(ValueError, match=r"it\.json cannot be read: it must be a file of at most 8 MiB"):
+            read_record(path)
+        path.rmdir() if path.is_dir() else path.unlink()
 
 
-def test_migrating_replaces_nothing_else(tmp_path):
-    """Where the new place is taken by a record that says something else, everything stays as it is."""
-    mine = record("homogeneous", [0.1], official=True)
-    write_old(tmp_path, old(mine))
-    write_record(tmp_path, record("homogeneous", [0.2], official=True, version="v1"))
-    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
-    with pytest.raises(ValueError, match=r"must not hold two records of one thing, but .*homogeneous--v1\.json"):
-        list(migrate(tmp_path))
-    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+def test_names_of_files_are_spelt_out_in_messages(tmp_path):
+    """A message never prints the control characters of a file's name."""
+    path = write_unchecked(tmp_path, record("mine", [0.1]), name="a\x1b[31m\u202e.json")
+    with pytest.raises(ValueError, match="must have the name") as caught:
+        read_record(path)
+    assert "\\x1b[31m\\u202e.json" in str(caught.value) and "\x1b" not in str(caught.value)
 
 
-def test_two_old_records_of_one_method_are_not_migrated_over_each_other(tmp_path):
-    """Of two files of a method of ours both would be its v1: they are named, and stay as they are."""
-    for text in ("one", "two"):
-        write_old(tmp_path, old(record("homogeneous", [0.1], official=True, method_sha256=sha(text))))
-    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
-    assert len(before) == 2
-    with pytest.raises(ValueError, match=r"both become eitbench-Pipe2D-v0--homogeneous--v1\.json") as caught:
-        list(migrate(tmp_path))
-    assert all(path.name in str(caught.value) for path in before)
-    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+@pytest.mark.parametrize(("text", "split", "number"), [("test:4", "test", None), ("7", "own", None), ("v3", "own", 3)])
+def test_names_of_splits_and_versions(text, split, number):
+    """Seeds name their split, versions of built-in methods their number."""
+    assert split_of(text) == split and version_number(text) == number
 
 
-def test_the_published_records_are_of_today():
-    """Nobody has to upgrade what the repository holds."""
-    texts = [path.read_text() for path in (shipped("leaderboards") / "results").glob("*.json")]
-    assert len(texts) >= 165 and all(json.loads(text)["schema"] == 3 for text in texts)
+def test_another_validator_agrees():
+    """Whatever is changed in a record, jsonschema accepts and rejects the same: anybody can check the format."""
+    ours, theirs = (make(json.loads(schema_text())) for make in (
+        jsonschema_rs.validator_for, jsonschema.Draft202012Validator))
+    chance, valid = random.Random(1), 0
+    for i in range(100):
+        made = hostile.honest(chance, i)
+        made = hostile.hostile(chance, made) if i % 3 else made
+        fits = ours.is_valid(made)
+        valid += fits
+        # the one knows letters of all alphabets where the other asks for 0 to 9 and a to z
+        assert fits <= theirs.is_valid(made) or not json.dumps(made, ensure_ascii=False).isascii()
+    assert 30 < valid < 90

@@ -15,9 +15,9 @@ from eitbench.bench.playing import estimated
 from eitbench.bench.run import Job, run_episode, run_jobs
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.tracks import Environment, board_of
+from eitbench.data.cache import CACHE_VARIABLE
 from eitbench.data.episodes import simulate, truth_discretisation
-from eitbench.data.store import CACHE_VARIABLE
-from eitbench.worlds.pipe2d import PIPE_2D
+from eitbench.worlds.catalogue import PIPE_2D
 from eitbench.worlds.task import Estimate, Task
 from scipy.optimize import minimize_scalar
 
@@ -300,13 +300,13 @@ def test_second_run_does_nothing(store, tmp_path):
 
 
 def test_identity_names_all_that_matters(tmp_path, monkeypatch):
-    """Environment, its arguments, seed, baseline file and our own code each make another outcome."""
+    """Environment, its arguments, seed, baseline file and the version of scoring each make another outcome."""
     path = write_baseline(tmp_path)
     same, *others = (Job(FILTER, path, 1), Job(FIXED_LAG, path, 1), Job(Environment(FILTER.id), path, 1),
                      Job(FILTER, path, 2), Job(FILTER, write_baseline(tmp_path, "other", doc="Other."), 1))
     assert Job(FILTER, path, 1).identity() == same.identity()
     identities = {same.identity(), *(other.identity() for other in others)}
-    monkeypatch.setattr(run, "source_digest", lambda: "older code")
+    monkeypatch.setattr(run, "SCORING", 99)
     assert len(identities | {same.identity()}) == 6
 
 

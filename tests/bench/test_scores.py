@@ -120,7 +120,7 @@ def test_only_scores_that_can_be_better_are_compared(name):
     ({"heading": "CRPS"}, "has the name or heading of another, crps"),
     ({"better": "more"}, "better must be one of lower, higher"),
     ({"needs": ("luck",)}, "needs must be among world, .*got 'luck'"),
-    ({"tracks": ("sprint",)}, "tracks must be among estimation, injection; got 'sprint'"),
+    ({"tracks": ("sprint",)}, "tracks must be among estimation, injection, measured; got 'sprint'"),
     ({"factor": 0.0}, "factor must be")])
 def test_bad_scores_are_refused(changes, message, apart):
     """Before anything is registered."""

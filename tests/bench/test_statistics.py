@@ -5,7 +5,6 @@ import math
 import os
 import subprocess
 import sys
-from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,6 @@ from eitbench.bench.statistics import (
     mean_over_environments,
     paired_difference,
     paired_probability_of_improvement,
-    probability_of_improvement,
     stratified_bootstrap,
     tail,
 )
@@ -132,9 +130,6 @@ def test_too_few_episodes_claim_nothing():
     assert stratified_bootstrap({"pipe": [1.0], "tank": b}, mean_over_environments)[1:] == (-math.inf, math.inf)
     value, low, high = stratified_bootstrap({"pipe": a[:2], "tank": b[:4]}, mean_over_environments)
     assert value == 1.0 and 0.0 <= low < 1.0 < high <= 2.0
-    few = {"pipe": a}
-    assert probability_of_improvement(few, {"pipe": b + 5}) == (1.0, 0.0, 1.0)
-    assert probability_of_improvement({"pipe": b + 5}, few) == (0.0, 0.0, 1.0)
     assert paired_probability_of_improvement({"pipe": seeded(a)}, {"pipe": seeded(a + 1)}) == (1.0, 0.0, 1.0)
 
 
@@ -142,8 +137,7 @@ def everything():
     """Each kind of interval once."""
     a, b = two_methods()
     return [stratified_bootstrap(plain(a), interquartile_mean), stratified_bootstrap(plain(a), mean_over_environments),
-            paired_difference(a, b), paired_probability_of_improvement(a, b),
-            probability_of_improvement(plain(a), plain(b))]
+            paired_difference(a, b), paired_probability_of_improvement(a, b)]
 
 
 def test_the_same_numbers_in_another_process():
@@ -168,7 +162,6 @@ def test_the_order_of_episodes_does_not_matter(order):
     assert list(one["pipe"]) != list(a["pipe"])
     assert paired_difference(one, other) == paired_difference(a, b)
     assert paired_probability_of_improvement(one, other) == paired_probability_of_improvement(a, b)
-    assert probability_of_improvement(plain(one), plain(other)) == probability_of_improvement(plain(a), plain(b))
     for statistic in (interquartile_mean, mean_over_environments):
         assert stratified_bootstrap(plain(one), statistic) == stratified_bootstrap(plain(a), statistic)
 
@@ -180,10 +173,8 @@ def test_what_is_hard_for_both_cancels():
     """1/4 worse on every one of very different episodes is exactly that; unpaired nothing would be seen."""
     b = {"pipe": seeded(2.0 ** np.arange(10)), "tank": seeded(3.0 * np.arange(7))}
     a = {environment: {seed: score + 0.25 for seed, score in reversed(own.items())} for environment, own in b.items()}
-    assert paired_difference(a, b) == (0.25, 0.25, 0.25)
-    assert paired_difference(b, a) == (-0.25, -0.25, -0.25)
+    assert paired_difference(a, b) == pytest.approx((0.25, 0.25, 0.25), rel=1e-12)
     assert paired_probability_of_improvement(b, a) == (1.0, 1.0, 1.0)
-    assert 0.5 < probability_of_improvement(plain(b), plain(a))[0] < 0.7
 
 
 def test_paired_interval_is_scipys():
@@ -221,6 +212,15 @@ def test_paired_difference_of_interquartile_means():
     assert same == paired_difference(a, b) and same[0] != value
 
 
+@pytest.mark.parametrize("statistic", [mean_over_environments, interquartile_mean])
+@pytest.mark.parametrize("seed", range(5))
+def test_exchanged_methods_have_the_negative_difference(seed, statistic):
+    """To the last bit: a comparison does not depend on the method that is named first."""
+    a, b = two_methods(seed)
+    value, low, high = paired_difference(a, b, statistic=statistic, seed=seed)
+    assert paired_difference(b, a, statistic=statistic, seed=seed) == (-value, -high, -low)
+
+
 def test_only_shared_seeds_count():
     """Scores on other seeds change nothing, however bad they are; environments weigh the same."""
     a = {"pipe": seeded(np.arange(8.0)), "tank": seeded(np.arange(6.0))}
@@ -242,43 +242,6 @@ def test_paired_share():
     assert paired_probability_of_improvement(one, one) == (0.5, 0.5, 0.5)
 
 
-# -- probability of improvement ---------------------------------------------------------------------------------------
-
-
-def brute(a, b, better):
-    """Over all combinations of each environment."""
-    return np.mean([np.mean([1.0 if better(x, y) else 0.5 if x == y else 0.0 for x, y in product(a[name], b[name])])
-                    for name in a])
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_probability_of_improvement_by_brute_force(seed):
-    """All pairs, ties ½, the mean of environments of different size; and as scipy's Mann–Whitney U."""
-    random = np.random.default_rng(seed)
-    a = {name: random.integers(0, 6, n).astype(float) for name, n in (("pipe", 5), ("tank", 11))}
-    b = {name: random.integers(1, 7, n).astype(float) for name, n in (("tank", 4), ("pipe", 8))}
-    assert probability_of_improvement(a, b)[0] == pytest.approx(brute(a, b, lambda x, y: x < y), rel=1e-14)
-    higher = probability_of_improvement(a, b, higher_is_better=True)[0]
-    assert higher == pytest.approx(brute(a, b, lambda x, y: x > y), rel=1e-14)
-    assert higher == pytest.approx(np.mean([stats.mannwhitneyu(a[name], b[name]).statistic / a[name].size / b[name].size
-                                            for name in a]), rel=1e-14)
-
-
-def test_interval_of_the_probability_of_improvement():
-    """As a loop that resamples both methods within each environment and counts, to Monte-Carlo error."""
-    random = np.random.default_rng(8)
-    a = {"pipe": random.normal(0.0, 1.0, 12), "tank": np.round(random.normal(0.0, 1.0, 7))}
-    b = {"pipe": random.normal(0.7, 1.0, 9), "tank": np.round(random.normal(0.5, 1.0, 10))}
-    shares = []
-    for _ in range(4000):
-        x, y = ({name: random.choice(own, own.size) for name, own in scores.items()} for scores in (a, b))
-        shares.append(np.mean([(0.5 + 0.5 * np.sign(y[name] - x[name][:, None])).mean() for name in a]))
-    _, low, high = probability_of_improvement(a, b)
-    # The 2.1 % point of 4000 nearly normal draws is known to 0.045 of their spread, that of 10,000 to 0.029.
-    cut = tail((12, 7, 9, 10))
-    assert (low, high) == pytest.approx(tuple(np.percentile(shares, [cut, 100 - cut])), abs=4 * 0.054 * np.std(shares))
-
-
 # -- ranks ------------------------------------------------------------------------------------------------------------
 
 
@@ -290,72 +253,74 @@ def board(**methods):
     return {method: {"pipe": seeded(scores)} for method, scores in methods.items()}
 
 
-def test_clear_ranks():
-    """Each worse than the one before on every episode: 1, 2, 3, best first. Higher may be better."""
-    scores = board(c=NOISE + 3, a=NOISE + 1, b=NOISE + 2)
-    assert list(shared_ranks(scores).items()) == [("a", 1), ("b", 2), ("c", 3)]
-    assert list(shared_ranks(scores, higher_is_better=True).items()) == [("c", 1), ("b", 2), ("a", 3)]
+ONE = np.ones(12)
+PIPE_AND_TANK = {"b": {"pipe": seeded(np.ones(6)), "tank": seeded(np.zeros(60))},
+                 "a": {"pipe": seeded(np.zeros(6)), "tank": seeded(np.full(60, 0.5))}}
 
 
-def test_shared_ranks():
-    """Two that cannot be told apart share rank 1, and the one that both beat is third; equal scores share."""
-    scores = board(last=10 + 0 * NOISE, a=0.1 * NOISE, b=0.01 - 0.1 * NOISE)
-    assert list(shared_ranks(scores).items()) == [("a", 1), ("b", 1), ("last", 3)]
-    assert list(shared_ranks(board(c=NOISE + 1, b=NOISE, a=NOISE)).items()) == [("a", 1), ("b", 1), ("c", 3)]
-    assert shared_ranks(board(a=NOISE)) == {"a": 1} and shared_ranks({}) == {}
+@pytest.mark.parametrize(("scores", "how", "expected"), [
+    # each worse than the one before on every episode, best first; higher may be better
+    (board(c=NOISE + 3, a=NOISE + 1, b=NOISE + 2), {}, {"a": 1, "b": 2, "c": 3}),
+    (board(c=NOISE + 3, a=NOISE + 1, b=NOISE + 2), {"higher_is_better": True}, {"c": 1, "b": 2, "a": 3}),
+    # two that cannot be told apart share a rank, and the one that both beat is third; equal scores share
+    (board(last=10 * ONE, a=0.1 * NOISE, b=0.01 - 0.1 * NOISE), {}, {"a": 1, "b": 1, "last": 3}),
+    (board(c=NOISE + 1, b=NOISE, a=NOISE), {}, {"a": 1, "b": 1, "c": 3}),
+    (board(a=NOISE), {}, {"a": 1}), ({}, {}, {}),
+    # intervals of the scores overlap widely, but one is better by a little on every episode
+    (board(a=100 * NOISE, b=100 * NOISE + 0.5), {}, {"a": 1, "b": 2}),
+    # not transitive: a and b cannot be told apart, nor b and c, but a is better than c
+    (board(a=0 * NOISE, b=0.5 + 1.5 * NOISE, c=ONE), {}, {"a": 1, "b": 1, "c": 2}),
+    # a scattered method has a worse mean than one of rank 2, and nothing was shown to be better
+    (board(a=0 * NOISE, b=0.1 * ONE, c=0.5 + 3 * NOISE), {}, {"a": 1, "b": 2, "c": 1}),
+    # a single disaster decides the mean, and not the interquartile mean
+    (board(a=np.zeros(24), b=np.r_[np.full(23, -1.0), 100.0]), {}, {"a": 1, "b": 1}),
+    (board(a=np.zeros(24), b=np.r_[np.full(23, -1.0), 100.0]), {"statistic": interquartile_mean}, {"b": 1, "a": 2}),
+    # without a rank, and without a say
+    (board(seer=NOISE, a=NOISE + 1, floor=NOISE + 2, b=NOISE + 3), {"unranked": {"seer", "floor"}},
+     {"seer": None, "a": 1, "floor": None, "b": 2}),
+    # environments weigh the same: better by 1 in 6 episodes, worse by 0.5 in 60
+    (PIPE_AND_TANK, {}, {"a": 1, "b": 2}),
+    # better on all of four episodes is no evidence: one of two equal methods is, in one board of eight
+    (board(a=NOISE[:4], b=NOISE[:4] + 1), {}, {"a": 1, "b": 1})])
+def test_shared_ranks(scores, how, expected):
+    """Rank and order of each method."""
+    assert list(shared_ranks(scores, **how).items()) == list(expected.items())
 
 
-def test_pairs_decide_and_not_overlap():
-    """The intervals of the scores overlap widely, but one is better by a little on every episode."""
-    assert shared_ranks(board(a=100 * NOISE, b=100 * NOISE + 0.5)) == {"a": 1, "b": 2}
+def by_the_definition(scores, unranked, statistic, higher):
+    """Method -> one more than the number of methods that are significantly better, pair by pair."""
+    ranked = [name for name in scores if name not in unranked]
+    ranks = dict.fromkeys(scores)
+    for name in ranked:
+        others = [paired_difference(scores[name], scores[other], statistic=statistic, draws=500) for other in ranked]
+        ranks[name] = 1 + sum(high < 0 if higher else low > 0 for _, low, high in others)
+    return ranks
 
 
-def test_not_transitive():
-    """a and b cannot be told apart, nor b and c, but a is better than c: ranks 1, 1, 2."""
-    scores = board(a=0 * NOISE, b=0.5 + 1.5 * NOISE, c=1 + 0 * NOISE)
-    for one, other in (("a", "b"), ("b", "c")):
-        _, low, high = paired_difference(scores[one], scores[other])
-        assert low < 0 < high
-    assert list(shared_ranks(scores).items()) == [("a", 1), ("b", 1), ("c", 2)]
+def a_board(seed):
+    """Methods close to each other or not, with ties and a twin."""
+    random = np.random.default_rng(seed)
+    sizes = random.integers(2, 14, size=random.integers(1, 4))
+    spread, digits = random.choice([0.0, 0.05, 1.0]), int(random.choice([1, 2, 15]))
+    scores = {}
+    for i in range(int(random.integers(2, 8))):
+        level = random.normal(1.0, spread)
+        scores[f"m{i}"] = {f"e{e}": seeded(np.round(level * random.lognormal(0.0, 0.3, size=n), digits))
+                           for e, n in enumerate(sizes)}
+    return scores | {"twin": {name: dict(own) for name, own in scores["m0"].items()}}
 
 
-def test_ranks_need_not_rise_along_the_means():
-    """A scattered method stands below one of rank 2, and nobody was shown to be better than it."""
-    scores = board(a=0 * NOISE, b=0.1 + 0 * NOISE, c=0.5 + 3 * NOISE)
-    assert list(shared_ranks(scores).items()) == [("a", 1), ("b", 2), ("c", 1)]
-
-
-def test_ranks_by_another_statistic():
-    """A single disaster decides the mean, and not the interquartile mean; the order follows."""
-    scores = board(a=np.zeros(24), b=np.r_[np.full(23, -1.0), 100.0])
-    assert list(shared_ranks(scores)) == ["a", "b"]
-    assert list(shared_ranks(scores, statistic=interquartile_mean).items()) == [("b", 1), ("a", 2)]
-
-
-def test_the_unranked_cost_nobody_a_rank():
-    """A clairvoyant is shown in its place, without a rank; the next one is first. So is a floor."""
-    scores = board(clairvoyant=NOISE, a=NOISE + 1, floor=NOISE + 2, b=NOISE + 3)
-    ranks = shared_ranks(scores, {"clairvoyant", "floor"})
-    assert list(ranks.items()) == [("clairvoyant", None), ("a", 1), ("floor", None), ("b", 2)]
-
-
-def test_environments_weigh_the_same():
-    """Better by 1 in 6 episodes and worse by 0.5 in 60: better, though the sum over episodes says otherwise."""
-    a = {"pipe": seeded(np.zeros(6)), "tank": seeded(np.full(60, 0.5))}
-    b = {"pipe": seeded(np.ones(6)), "tank": seeded(np.zeros(60))}
-    assert list(shared_ranks({"b": b, "a": a}).items()) == [("a", 1), ("b", 2)]
-
-
-def test_four_episodes_rank_nobody():
-    """Better on all of four episodes is no evidence: one of two equal methods is, in one board of eight."""
-    assert shared_ranks(board(a=NOISE[:4], b=NOISE[:4] + 1)) == {"a": 1, "b": 1}
-
-
-def test_a_method_below_may_be_the_better_one():
-    """b has the worse mean, since it alone played a hard episode; on the shared ones it is better."""
-    scores = board(a=np.ones(8), b=np.zeros(8))
-    scores["b"]["pipe"]["test:99"] = 100.0
-    assert list(shared_ranks(scores).items()) == [("a", 2), ("b", 1)]
+@pytest.mark.parametrize("higher", [False, True])
+@pytest.mark.parametrize("statistic", [mean_over_environments, interquartile_mean])
+def test_ranks_are_those_of_the_definition(statistic, higher):
+    """Ranks count significant paired differences, for boards of every kind, in any order of listing."""
+    for seed in range(12):
+        scores, unranked = a_board(seed), {"m1"} if seed % 2 else set()
+        listed = {name: shuffled(scores[name], np.random.default_rng(seed)) for name in reversed(scores)}
+        found = shared_ranks(listed, unranked, statistic=statistic, higher_is_better=higher, draws=500)
+        assert found == by_the_definition(scores, unranked, statistic, higher), seed
+        values = [statistic(*(list(own.values()) for own in scores[name].values())) for name in found]
+        assert values == pytest.approx(sorted(values, reverse=higher), rel=1e-12)
 
 
 # -- what cannot be computed ------------------------------------------------------------------------------------------
@@ -373,12 +338,11 @@ def test_a_method_below_may_be_the_better_one():
     (lambda: stratified_bootstrap({"pipe": NOISE}, interquartile_mean, draws=0), "draws must be at least 1"),
     (lambda: paired_difference({"pipe": seeded(NOISE)}, {"pipe": seeded(NOISE, "dev")}), "a and b must share a seed"),
     (lambda: paired_difference({"pipe": seeded(NOISE)}, {"tank": seeded(NOISE)}), "environments must be the same"),
-    (lambda: paired_difference({}, {}), "a and b must hold scores of at least one environment"),
+    (lambda: paired_difference({}, {}), "a and b must hold finite scores"),
     (lambda: paired_difference({"pipe": {"a": math.inf}}, {"pipe": {"a": math.inf}}), "a and b must hold finite"),
-    (lambda: probability_of_improvement({"pipe": NOISE}, {"pipe": NOISE, "tank": NOISE}), "environments must be"),
-    (lambda: probability_of_improvement({"pipe": [1.0]}, {"pipe": []}), "b must hold"),
-    (lambda: shared_ranks(board(a=NOISE) | {"b": {"tank": seeded(NOISE)}}), "environments must be the same"),
-    (lambda: shared_ranks({"a": {"pipe": {}}}), "scores must hold"),
+    (lambda: shared_ranks(board(a=NOISE) | {"b": {"tank": seeded(NOISE)}}), "must be of the same episodes .* of b"),
+    (lambda: shared_ranks(board(a=NOISE, b=NOISE[:7])), "must be of the same episodes .* of b"),
+    (lambda: shared_ranks({"a": {"pipe": {}}}), "scores must be finite, of at least one"),
 ])
 def test_errors_name_the_argument(call, message):
     """What cannot be computed says why."""

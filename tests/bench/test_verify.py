@@ -1,67 +1,75 @@
-"""Verifying: honest records pass, and whoever changed a number, a file or the cache is found out."""
+"""Verification: honest records agree; changed numbers, other files, caches and memorised episodes are found."""
 
+import hashlib
 import json
 import re
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from eitbench.bench import held_out, methods, run, salts
+from eitbench.bench import held_out, isolation, methods
 from eitbench.bench import store as store_module
 from eitbench.bench import verify as verification
+from eitbench.bench.held_out import held_out_seeds, p_value, read_secret
+from eitbench.bench.isolation import bubblewrap_problem
 from eitbench.bench.records import read_record, write_record
-from eitbench.bench.sandbox import guests, host, wire
-from eitbench.bench.sandbox.wall import landlock_version
-from eitbench.bench.tracks import named
+from eitbench.bench.run import Job, run_episode
+from eitbench.data.cache import CACHE_VARIABLE, cache_folder, folder
 from eitbench.data.episodes import simulate
-from eitbench.data.seasons import drawn_seeds
 from eitbench.data.seeds import SPLITS, parse_seeds
-from eitbench.data.store import CACHE_VARIABLE, cache_folder, folder
-from eitbench.worlds.pipe2d import PIPE_2D
+from eitbench.worlds.catalogue import PIPE_2D
 
 from commands import eitbench
-from short import PIPE, merged, shorten
+from short import PIPE, shorten
 from tiny import FILTER, SCENARIO, git_says, write_baseline
 
 INJECTION = "eitbench/Pipe2DInjection-v0"
-SALT = bytes(range(32))
-walled = pytest.mark.skipif(not landlock_version(), reason="this kernel has no Landlock")
+CURRENTS = "eitbench/Pipe2DInjectionCurrents-v0"
+SECRET = bytes(range(32))
+AGREE = "1 of 1 records agree"
+HERE = ("-j", 1, "--isolate", "process")
+confined = pytest.mark.skipif(bool(bubblewrap_problem()), reason=bubblewrap_problem() or "bubblewrap works")
 
 
 @pytest.fixture(autouse=True)
 def tiny_world(monkeypatch, tmp_path):
-    """The registered environments play tiny worlds, in an empty folder."""
+    """The registered environments run tiny worlds, in an empty folder."""
     git_says(monkeypatch)
-    shorten(monkeypatch, {FILTER.id: SCENARIO, INJECTION: PIPE})
-    monkeypatch.setattr(salts, "PUBLISHED", tmp_path / "leaderboards" / "held_out.json")
+    shorten(monkeypatch, {FILTER.id: SCENARIO, INJECTION: PIPE, CURRENTS: PIPE})
+    monkeypatch.setattr(held_out, "COMMITMENT", tmp_path / "held_out.json")
     monkeypatch.chdir(tmp_path)
     store_module.provenance.cache_clear()
     yield
-    guests.close()
+    isolation.close()
     store_module.provenance.cache_clear()
 
 
-def submitted(method, *more, env=FILTER.id, kind="--baseline"):
+def submitted(method, seeds="test:0", env=FILTER.id, kind="--baseline"):
     """The path of a record that is made as README says."""
-    code, said, complaint = eitbench("submit", kind, method, "--env", env, "-j", 1, "--to", "records", *more)
+    code, said, complaint = eitbench("submit", kind, method, "--env", env, *HERE, "--to", "board/results",
+                                     "--seeds", seeds)
     assert code == 0, complaint
     return Path(said.split(":")[0].removeprefix("wrote "))
 
 
-def forged(path, change, to="forged"):
+def changed(path, change, to="forged/results"):
     """The record with a changed content and the digest that goes with it."""
     record = json.loads(path.read_text())
     change(record)
     return write_record(Path(to), record)
 
 
-def better(record):
-    for episode in record["episodes"]:
-        episode["step_errors"] = [0.9 * error for error in episode["step_errors"]]
+def better(record, factor=0.9, count=None):
+    for episode in record["episodes"][:count]:
+        episode["step_errors"] = [factor * error for error in episode["step_errors"]]
         episode["scores"]["error"] = float(np.mean(episode["step_errors"]))
+
+
+def official(record):
+    record["official"] = True
+    for run in record["runs"]:
+        run |= {"commit": "0" * 40, "dirty": False}
 
 
 @pytest.fixture
@@ -70,315 +78,328 @@ def mine(tmp_path):
                           update="return Estimate(self.level + voltages.sum(), self.level, voltages, np.eye(4))")
 
 
-def test_an_honest_record_is_verified(mine):
-    """In a guest, from episodes that are simulated again; which of them, the seed says."""
-    path = submitted(mine, "--seeds", "test:0-3")
-    code, said, complaint = eitbench("verify", path, "--baseline", mine, "--episodes", 2, "--seed", 5)
-    assert (code, complaint) == (0, "") and "as it says" in said and "--seed 5" in said
-    drawn = re.findall(r"test:\d", said)
-    assert len(drawn) == 2 and said.count("| none") == 2
-    assert eitbench("verify", path, "--baseline", mine, "--episodes", 2, "--seed", 5)[1] == said
-    seeds = {tuple(re.findall(r"test:\d", verification.verify(*claim, episodes=2, seed=seed)[0]))
-             for claim in [(read_record(path), verification.job_of(read_record(path), mine))] for seed in range(4)}
-    assert len(seeds) > 1
-    with pytest.raises(ValueError, match="episodes must be an integer of at least 1, got 0"):
-        verification.verify({}, None, episodes=0)
+# -- reruns -------------------------------------------------------------------------------------
 
 
-def test_ours_are_known_by_name(tmp_path):
-    """Policies, privileged ones and failures too; arguments of one's own are those of the record."""
+def test_an_honest_record_agrees(mine):
+    """Of episodes that are simulated again, drawn by the seed; the output is a Markdown table."""
+    path = submitted(mine, "test:0-3")
+    command = ("verify", path, "--method", mine, "--episodes", 2, "--seed", 5, *HERE)
+    code, said, complaint = eitbench(*command)
+    assert code == 0 and AGREE in said and "--seed 5" in said, complaint
+    assert len(re.findall(r"\| test:\d +\| process +\|.*\| none +\|", said)) == 2
+    assert eitbench(*command)[1] == said
+    drawn = {tuple(verification.drawn_of(read_record(path), 2, seed)) for seed in range(8)}
+    assert len(drawn) > 1
+
+
+@confined
+def test_a_third_party_file_runs_under_bubblewrap(mine):
+    """It is found by its sha256 beside the records, as a pull request has it."""
+    path = submitted(mine)
+    place = Path("board/methods/somebody")
+    place.mkdir(parents=True)
+    shutil.copy(mine, place / "mine.py")
+    Path(mine).unlink()
+    code, said, complaint = eitbench("verify", path, "-j", 1)
+    assert code == 0 and "| bubblewrap" in said and AGREE in said, complaint
+
+
+def test_without_bubblewrap_a_third_party_file_does_not_run(mine, monkeypatch):
+    """The message says how to install it, and what the alternative is."""
+    path = submitted(mine)
+    monkeypatch.setattr(isolation, "bubblewrap_problem", lambda: "bubblewrap is not installed")
+    write_baseline(Path.cwd(), update="raise SystemExit('ran')")
+    code, _, complaint = eitbench("verify", submitted(mine, "test:1"), "--method", mine, "-j", 1)
+    assert code == 1 and "apt-get install bubblewrap" in complaint and "--isolate process" in complaint
+    assert eitbench("verify", path, "-j", 1)[0] == 1
+
+
+def test_built_in_methods_are_known_by_name(tmp_path):
+    """Policies, privileged ones and failures too; the arguments are those of the record."""
     for name in ("random_pair", "clairvoyant"):
         assert eitbench("policies", "--env", INJECTION, "--policy", name, "--seeds", "dev:0", "--estimator", "reduced",
                         "-j", 1)[0] == 0
         (path,) = tmp_path.glob(f"results/records/*--{name}--*")
-        code, said, complaint = eitbench("verify", path)
+        code, said, complaint = eitbench("verify", path, "-j", 1)
         assert code == 0 and "dev:0" in said, complaint
     fails = write_baseline(tmp_path, "fails", update="if voltages[0] != 0.0: raise ValueError('dry')")
-    path = submitted(fails, "--seeds", "test:0")
-    assert eitbench("verify", path, "--baseline", fails)[0] == 0
-    code, _, complaint = eitbench("verify", path)
-    assert code == 1 and "fails is none of ours: its file must be given" in complaint
+    path = submitted(fails)
+    assert eitbench("verify", path, "--method", fails, *HERE)[0] == 0
+    code, _, complaint = eitbench("verify", path, "-j", 1)
+    assert code == 1 and "fails is not a built-in method" in complaint and "--method" in complaint
 
 
-def test_a_record_from_before_a_score_is_verified(tmp_path):
-    """Without what the filter claims it is compared by the rest; with it, a wrong one is found."""
-    claims = ("nis", "crps", "coverage_50", "coverage_90", "spread_ratio")
-    assert eitbench("policies", "--env", INJECTION, "--policy", "random_pair", "--seeds", "dev:0",
-                    "--estimator", "reduced", "-j", 1)[0] == 0
-    (path,) = tmp_path.glob("results/records/*--random_pair--*")
-    now = read_record(path)["episodes"][0]["scores"]
-    assert all(now[name] is not None for name in claims)
-
-    def older(record):
-        for name in claims:
-            del record["episodes"][0]["scores"][name]
-
-    def wrong(record):
-        record["episodes"][0]["scores"]["nis"] *= 1.01
-
-    code, said, complaint = eitbench("verify", forged(path, older, "older"))
-    assert code == 0 and "as it says" in said, complaint
-    code, _, complaint = eitbench("verify", forged(path, wrong, "wrong"))
-    assert code == 1 and "nis is" in complaint
+def other(name, value):
+    return lambda record: record["episodes"][0]["scores"].update({name: value})
 
 
-@walled
-def test_a_stranger_s_policy_is_submitted_and_verified(tmp_path):
-    """In guests both times, by the same random numbers; the record says so."""
-    mine = tmp_path / "by_lot.py"
-    mine.write_text('"""Mine."""\nclass Policy:\n    def __init__(self, rules, random):\n'
-                    '        self.draw = lambda: int(random.integers(rules.action_space.n))\n'
-                    '    def act(self, observation):\n        return self.draw()\n')
-    path = submitted(mine, "--seeds", "test:0", env=INJECTION, kind="--policy")
-    record = read_record(path)
-    assert record["runs"][0]["isolation"] == "landlock" and record["episodes"][0]["peak_memory"] > 50e6
-    code, said, complaint = eitbench("verify", path, "--policy", mine)
-    assert code == 0 and "isolation landlock" in said, complaint
+def failed(record):
+    episode = record["episodes"][0]
+    del episode["scores"], episode["step_errors"]
+    episode |= {"status": "failed", "message": "RuntimeError: oh", "where": "mine.py:1"}
 
 
-def test_changed_numbers_are_found(mine, tmp_path):
-    """By hand: the digest. With the digest: the episodes say otherwise, whatever was changed."""
-    path = submitted(mine, "--seeds", "test:0")
-    by_hand = tmp_path / "by_hand" / path.name
-    by_hand.parent.mkdir()
-    by_hand.write_text(path.read_text().replace('"parameters": {"pair": [1, 2]}', '"parameters": {"pair": [1, 3]}'))
-    code, _, complaint = eitbench("verify", by_hand, "--baseline", mine)
+def redistributed(record):
+    steps = record["episodes"][0]["step_errors"]
+    record["episodes"][0]["step_errors"] = [steps[0] + 1e-4, steps[1] - 1e-4, *steps[2:]]
+
+
+@pytest.mark.parametrize(("change", "message"), [
+    (better, r"test:0: \w+ differs by 0\.1"), (other("nis", 1.0), "nis differs by"),
+    (other("crps", None), "crps differs"), (redistributed, "step_errors differs"), (failed, "the rerun ok"),
+    (lambda record: record.update(title="Theirs"), "title is 'Mine', but 'Theirs' in the record"),
+    (other("seconds_per_step", 1e-9), ""),                              # a clock proves nothing
+    (lambda record: record["episodes"][0]["scores"].pop("nis"), ""),    # made before that score existed
+], ids=["better", "score", "missing", "steps", "failed", "title", "time", "older"])
+def test_changed_numbers_are_found(change, message, mine):
+    """Also with the digest that goes with them."""
+    path = changed(submitted(mine), change)
+    code, said, complaint = eitbench("verify", path, "--method", mine, *HERE)
+    assert code == bool(message) and re.search(message, complaint) and (AGREE in said) != bool(message)
+
+
+def test_the_digest_notices_an_edit(mine):
+    path = submitted(mine)
+    path.write_text(path.read_text().replace('"parameters": {"pair": [1, 2]}', '"parameters": {"pair": [1, 3]}'))
+    code, _, complaint = eitbench("verify", path, "--method", mine, *HERE)
     assert code == 1 and "was changed since it was written" in complaint
 
-    def other(name, value):
-        return lambda record: record["episodes"][0]["scores"].update({name: value})
 
-    def failed(record):
-        episode = record["episodes"][0]
-        del episode["scores"], episode["step_errors"]
-        episode |= {"status": "failed", "message": "RuntimeError: oh", "where": "mine.py:1"}
-
-    def redistributed(record):
-        steps = record["episodes"][0]["step_errors"]
-        record["episodes"][0]["step_errors"] = [steps[0] + 1e-4, steps[1] - 1e-4, *steps[2:]]
-
-    def elsewhere(record):
-        given = {"world": merged(SCENARIO, {"flow": {"mean_velocity": 60.0}})}
-        record["environment"].update(kwargs=given, name=named(FILTER.id, given))
-
-    for change, message in (
-            (better, r"test:0: error is 0\.\d+, the record says 0\.\d+"), (other("nis", 1.0), "test:0: nis is"),
-            (other("crps", None), "test:0: crps is"), (redistributed, r"test:0: step_errors\[[01]\] is"),
-            (failed, r"test:0: status is ok, the record says failed \(RuntimeError: oh\)"),
-            (lambda record: record.update(title="Theirs"), "title is 'Mine', the record says 'Theirs'"),
-            (elsewhere, "test:0: error is")):
-        code, said, complaint = eitbench("verify", forged(path, change), "--baseline", mine)
-        assert code == 1 and re.search(message, complaint) and "as it says" not in said, (message, complaint)
-    slower = forged(path, other("seconds_per_step", 1e-9))
-    assert eitbench("verify", slower, "--baseline", mine)[0] == 0        # a clock is no proof of anything
+def test_the_tolerance_is_relative(mine):
+    """1e-4 agrees within 1e-3."""
+    path = changed(submitted(mine), lambda record: better(record, 1.0 + 1e-4))
+    for tolerance, code in (([], 1), (["--tolerance", "1e-3"], 0), (["--tolerance", "5e-5"], 1)):
+        assert eitbench("verify", path, "--method", mine, *HERE, *tolerance)[0] == code
 
 
-def test_the_tolerance_is_what_it_says(mine):
-    """A relative difference of 1e-4 is none where 1e-3 is allowed."""
-    path = submitted(mine, "--seeds", "test:0")
-
-    def slightly(record):
-        scores = record["episodes"][0]["scores"]
-        scores["nis"] *= 1.0 + 1e-4
-
-    other = forged(path, slightly)
-    assert eitbench("verify", other, "--baseline", mine)[0] == 1
-    assert eitbench("verify", other, "--baseline", mine, "--tolerance", "1e-3")[0] == 0
-    assert eitbench("verify", other, "--baseline", mine, "--tolerance", "5e-5")[0] == 1
-
-
-def test_another_file_of_a_stranger_is_named_and_not_played(mine, tmp_path):
-    """Its scores would say nothing of the record's."""
-    path = submitted(mine, "--seeds", "test:0")
-    changed = write_baseline(tmp_path / "changed", update="raise RuntimeError('played')")
-    code, said, complaint = eitbench("verify", path, "--baseline", changed)
-    assert code == 1 and said == "" and "the sha256 of mine.py is" in complaint
+def test_another_file_does_not_run(mine, tmp_path):
+    """Its scores would say nothing about the record; nor may a link to a built-in file take its place."""
+    path = submitted(mine)
+    another = write_baseline(tmp_path / "another", update=f"open({str(tmp_path / 'ran')!r}, 'w')")
+    code, _, complaint = eitbench("verify", path, "--method", another, *HERE)
+    assert code == 1 and "the sha256 of mine.py is" in complaint and not (tmp_path / "ran").exists()
+    link = tmp_path / "link" / "mine.py"
+    link.parent.mkdir()
+    link.symlink_to(methods.find_method("homogeneous", "estimation"))
+    with pytest.raises(ValueError, match="is a built-in method, but not mine"):
+        verification.job_of(read_record(path), str(link))
 
 
-def test_numbers_decide_and_not_the_text(tmp_path, monkeypatch):
-    """A record of ours is played whatever its words and digests are; of an older version it is said to be one."""
-    path = submitted("homogeneous", "--seeds", "test:0")
+def test_numbers_decide_and_not_the_text(monkeypatch):
+    """A built-in method's record may have other words; a record of an older version is noted, a newer one is wrong."""
+    path = submitted("homogeneous")
 
     def reworded(record):
         record |= {"title": "Another title", "method_sha256": "0" * 64, "parameters": {"words": 1}}
-        record["runs"] = [run | {"source": "0" * 64} for run in record["runs"]]
 
-    code, said, complaint = eitbench("verify", forged(path, reworded))
-    assert (code, complaint) == (0, "") and "as it says" in said and "now v" not in said
-    code, _, complaint = eitbench("verify", forged(path, lambda record: record.update(role=None)))
-    assert code == 1 and "role is 'floor', the record says None" in complaint
+    assert eitbench("verify", changed(path, reworded), "-j", 1)[0] == 0
+    code, _, complaint = eitbench("verify", changed(path, lambda record: record.update(role=None)), "-j", 1)
+    assert code == 1 and "role is 'floor', but None in the record" in complaint
+    newer = changed(path, lambda record: record.update(version="v9"))
+    code, _, complaint = eitbench("verify", newer, "-j", 1)
+    assert code == 1 and "the record is of v9, but homogeneous is v1" in complaint
     monkeypatch.setattr(methods, "version_of", lambda path, sha256: "v2")
-    code, said, _ = eitbench("verify", path)
+    code, said, _ = eitbench("verify", path, "-j", 1)
     assert code == 0 and "the record is of v1, and homogeneous is now v2" in said
-    code, said, complaint = eitbench("verify", forged(path, better))
-    assert code == 1 and "is now v2" in said and "test:0: error is" in complaint
 
 
-def test_the_cache_is_not_believed(mine, tmp_path, monkeypatch):
-    """A cache in which test:0 is another, easier episode makes a better score, but no record that holds."""
+def test_the_cache_is_not_used(mine, tmp_path, monkeypatch):
+    """A cache in which test:0 is another, easier episode makes a better score, but no record that agrees."""
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
     world, seed = PIPE_2D.changed(SCENARIO), parse_seeds("test:0")[0]
     honest = simulate(world, seed, progress=False)
-    level = np.full_like(honest.concentration, world.expected_concentration)
-    flat = honest._replace(concentration=level)
+    flat = honest._replace(concentration=np.full_like(honest.concentration, world.expected_concentration))
     shutil.rmtree(folder(world))
     with monkeypatch.context() as patch:
         patch.setattr("eitbench.data.episodes.simulate_together", lambda *_: iter([flat]))
-        path = submitted(mine, "--seeds", "test:0")
-    assert list(folder(world).glob("*.truth.npz"))
-    code, _, complaint = eitbench("verify", path, "--baseline", mine)
-    assert code == 1 and "test:0: error is" in complaint
+        path = submitted(mine)
+    assert list(folder(world).glob("*.truth.npy"))
+    assert eitbench("verify", path, "--method", mine, *HERE)[0] == 1
     assert cache_folder() == tmp_path / "cache"
 
 
-# -- held-out episodes ------------------------------------------------------------------------------------------------
+# -- many records -------------------------------------------------------------------------------
+
+
+def test_all_official_records_are_verified_and_a_false_one_is_named(monkeypatch):
+    """Once: the same command resumes. Damaged files are named before anything runs."""
+    for path in (submitted("homogeneous", "test:0-2"), submitted("random_pair", "test:0-2", INJECTION, "--policy")):
+        changed(path, official)
+    changed(submitted("persistence", "test:0-2"), lambda record: None)               # self-reported: not asked
+    command = ("verify", "--all", "--records", "forged/results", "--out", "again", "--episodes", 2, "-j", 1)
+    code, said, complaint = eitbench(*command)
+    assert code == 0 and "2 of 2 records agree" in said and "persistence" not in said, complaint
+    false = changed(submitted("persistence", "test:0-2"), lambda record: (official(record), better(record, 0.5)))
+    ran = []
+    monkeypatch.setattr(verification, "run_episode", lambda job: ran.append(job.method) or run_episode(job))
+    code, said, complaint = eitbench(*command)
+    assert code == 1 and complaint.count("differs: ") == 2 and ran == ["persistence"] * 2
+    assert false.name in complaint and "by 0.5" in complaint and "homogeneous" not in complaint
+    (Path("forged/results") / "damaged.json").write_text("{")
+    code, _, complaint = eitbench(*command)
+    assert code == 2 and "damaged.json" in complaint
+
+
+def test_the_first_records_of_a_board_are_chosen(mine):
+    """By mean error, self-reported ones too, without naive baselines."""
+    naive, own = submitted("homogeneous"), submitted(mine)
+    second = changed(own, lambda record: (better(record, 1.1), record.update(
+        version="1" * 8, method_sha256="1" * 64)), own.parent)
+    assert verification.top_records(own.parent, 3) == [own, second] and naive.exists()
+    assert verification.top_records(own.parent, 1, [FILTER.id]) == [own]
+    with pytest.raises(ValueError, match=f"such records of {INJECTION}"):
+        verification.top_records(own.parent, 1, [INJECTION])
+
+
+# -- recorded actions ---------------------------------------------------------------------------
+
+
+DRAWN = '''"""Drawn currents."""
+
+
+class Policy:
+    def __init__(self, rules, random):
+        self.space, self.random = rules.action_space, random
+
+    def act(self, observation):
+        drawn = self.random.uniform(-1.0, 1.0, self.space.shape).astype(self.space.dtype)
+        return drawn - drawn.mean()
+'''
+
+
+@pytest.mark.parametrize("env", [INJECTION, CURRENTS])
+def test_recorded_actions_are_replayed_without_the_policy(env, monkeypatch):
+    """Pairs and currents; with other actions the scores are others, and an action that is missing is named."""
+    Path("drawn.py").write_text(DRAWN)
+    path = submitted("random_pair" if env == INJECTION else "drawn.py", env=env, kind="--policy")
+    record = read_record(path)
+    assert len(record["episodes"][0]["actions"]) > 1
+
+    def refuse(*_):
+        raise AssertionError("the policy's code ran")
+
+    monkeypatch.setattr(verification, "run_episode", refuse)
+    code, said, complaint = eitbench("verify", path, "--replay", "-j", 1)
+    assert code == 0 and "| replay" in said, complaint
+
+    def other_first(record):
+        actions = record["episodes"][0]["actions"]
+        actions[0], actions[1] = actions[1], actions[0]
+
+    assert eitbench("verify", changed(path, other_first), "--replay", "-j", 1)[0] == 1
+    for change, message in ((lambda record: record["episodes"][0]["actions"].pop(), "as many as"),
+                            (lambda record: record["episodes"][0].pop("actions"), "has no recorded actions")):
+        code, _, complaint = eitbench("verify", changed(path, change), "--replay", "-j", 1)
+        assert code == 1 and message in complaint
+
+
+# -- held-out episodes --------------------------------------------------------------------------
+
+
+def write_secret(secret=SECRET, mode=0o600):
+    path = Path("secret").absolute()
+    path.write_text(secret.hex())
+    path.chmod(mode)
+    Path("held_out.json").write_text(json.dumps({"salt_sha256": hashlib.sha256(SECRET).hexdigest()}))
+    return path
 
 
 def test_held_out_seeds_are_the_formula():
-    """SHA-256 of salt and number, outside the public ranges; by coreutils: the first of bytes 0 … 31 is e0bc…"""
-    import hashlib
-    seeds = drawn_seeds(SALT, 50)
-    assert seeds[1] == int(hashlib.sha256(SALT + bytes(7) + b"\1").hexdigest(), 16) % 2**63
+    """SHA-256 of secret and number, outside the public splits; the commitment of the leaderboards is a hash."""
+    seeds = held_out_seeds(SECRET, 50)
+    assert seeds[1] == int(hashlib.sha256(SECRET + bytes(7) + b"\1").hexdigest(), 16) % 2**63
     assert len(set(seeds)) == 50 and max(split.stop for split in SPLITS.values()) <= min(seeds) < max(seeds) < 2**63
-    assert drawn_seeds(SALT, 3) == seeds[:3] and drawn_seeds(SALT[::-1], 3) != seeds[:3]
+    published = Path(held_out.__file__).parents[2] / "leaderboards" / "held_out.json"
+    assert re.fullmatch("[0-9a-f]{64}", json.loads(published.read_text())["salt_sha256"])
 
 
-def test_a_salt_is_its_owner_s_and_its_hash_everybody_s(tmp_path, monkeypatch):
-    """A file that others cannot read, and never overwrites another; the published hash decides which salt counts."""
-    code, said, _ = eitbench("held-out", "--new", "salt")
-    assert code == 0 and (tmp_path / "salt").stat().st_mode & 0o777 == 0o600
-    salt = salts.read_salt(tmp_path / "salt")
-    told = json.loads((tmp_path / "leaderboards" / "held_out.json").read_text())
-    assert told == {"salt_sha256": salts.hash_of(salt)} and told["salt_sha256"] in said and salt.hex() not in said
-    code, _, complaint = eitbench("held-out", "--new", "next")
-    assert code == 2 and "to draw another one, remove that file in a commit" in complaint
-    assert not (tmp_path / "next").exists()
-    with pytest.raises(ValueError, match="cannot be written"):
-        salts.new_salt(tmp_path / "salt")
-    assert salts.read_salt(tmp_path / "salt") == salt
-    (tmp_path / "words").write_text("hello")
-    salts.new_salt(tmp_path / "other")
-    with monkeypatch.context() as patch, pytest.raises(ValueError, match="which guests may read"):
-        patch.setattr(salts, "python_files", lambda: [tmp_path])
-        salts.read_salt(tmp_path / "salt")
-    for name, change, message in (("other", 0o600, "has the hash"), ("salt", 0o640, "readable by its owner only"),
-                                  ("words", 0o600, "salt .*words must hold hexadecimal digits"),
-                                  ("none", None, "cannot be read")):
-        if change:
-            (tmp_path / name).chmod(change)
+def test_a_secret_is_its_owners_and_committed():
+    """A file that others cannot read, whose hash was published before."""
+    assert read_secret(write_secret()) == SECRET
+    for secret, mode, message in ((bytes(32), 0o600, "commits to"), (SECRET, 0o640, "by its owner only"),
+                                  (b"short", 0o600, "must have 32 bytes, got 5")):
         with pytest.raises(ValueError, match=message):
-            salts.read_published_salt(tmp_path / name)
+            read_secret(write_secret(secret, mode))
+    for content in ("words", None):
+        path = Path("words").absolute()
+        path.write_text(content) if content else path.unlink()
+        with pytest.raises(ValueError, match="must be a file of hexadecimal digits"):
+            read_secret(path)
 
 
-def test_the_published_hash_is_found_from_everywhere(tmp_path):
-    """It is that of the checkout or the installed package, not of the working folder."""
-    program = "from eitbench.bench.salts import PUBLISHED; print(PUBLISHED)"
-    said = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, text=True, capture_output=True, check=True)
-    assert Path(said.stdout.strip()) == Path(run.__file__).parents[2] / "leaderboards" / "held_out.json"
+@pytest.mark.parametrize(("gain", "low", "high"), [(0.0, 0.02, 0.08), (0.3, 0.6, 1.0), (-0.3, 0.0, 0.01)])
+def test_the_test_rejects_what_it_should(gain, low, high):
+    """300 records of ten episodes, with 30 held-out: honest ones in 5 % of cases, those that are 30 % better on public
+    episodes mostly, those that are worse never."""
+    random = np.random.default_rng(7)
+    rejected = [p_value(random.normal(np.log1p(-gain), 0.3, 10), random.normal(0.0, 0.3, 30), 399) < 0.05
+                for _ in range(300)]
+    assert low <= np.mean(rejected) <= high
 
 
-def held_out_claim(tmp_path, monkeypatch, mine, episodes=6):
-    """Arguments of `verify` for held-out episodes alone, of a salt of zeros: one in twenty is bad luck."""
-    monkeypatch.setattr(salts.secrets, "token_bytes", bytes)
-    salts.new_salt(tmp_path / "salt")
-    return "--episodes", 0, "--held-out", episodes, "--salt-file", "salt", "--baseline", mine
-
-
-@walled
-def test_held_out_episodes_tell_the_honest_from_the_prepared(mine, tmp_path, monkeypatch):
-    """What the record says is no better than held-out; one that holds on public episodes only is."""
-    public = submitted(mine, "--seeds", "test:0-7")
-    claim = held_out_claim(tmp_path, monkeypatch, mine)
+@confined
+def test_held_out_episodes_tell_the_honest_from_the_prepared(mine, monkeypatch):
+    """Seeds and secret are neither printed nor passed to the worker; third-party files need bubblewrap."""
+    public = submitted(mine, "test:0-7")
+    claim = ("--episodes", 0, "--held-out", 6, "--secret", write_secret(), "--method", mine, "-j", 1)
+    passed = []
+    encode = isolation.encode_message
+    monkeypatch.setattr(isolation, "encode_message", lambda *message: passed.append(encode(*message)) or passed[-1])
     code, said, complaint = eitbench("verify", public, *claim)
-    assert code == 0 and salts.hash_of(bytes(32)) in said, complaint
-    assert "record, 8 episodes" in said and "held-out, 6" in said
-    assert all(re.search(rf"{name} *\|( +[\d.-]+ \|){{3}}", said)
-               for name in ("ẽ_c over the floor's", "gain over the floor", "smallest ratio"))
-
-    def much_better(record):
-        for _ in range(20):
-            better(record)
-
-    code, said, complaint = eitbench("verify", forged(public, much_better), *claim)
-    assert code == 1
-    for name in ("ẽ_c over the floor's", "gain over the floor"):
-        assert re.search(name + r": [\d.-]+ in the record, [\d.-]+ held-out; so much better is an honest", complaint)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(run, "landlock_version", lambda: 0)
-        code, _, complaint = eitbench("verify", public, *claim)
-        assert code == 1 and "behind a wall only" in complaint
-    code, _, complaint = eitbench("verify", public, *claim, "--isolate", "never")
-    assert code == 1 and "behind a wall only" in complaint
+    assert code == 0 and hashlib.sha256(SECRET).hexdigest() in said and re.search(r"\(8\).*\(6\)", said), complaint
+    assert sum(b'"update"' in message for message in passed) == 6 * 5
+    for seed in held_out_seeds(SECRET, 6):
+        spellings = (str(seed).encode(), seed.to_bytes(8, "little"), seed.to_bytes(8, "big"))
+        assert not any(each in message for each in spellings for message in passed) and str(seed) not in said
+    assert SECRET.hex() not in said
+    code, _, complaint = eitbench("verify", changed(public, lambda record: better(record, 0.1)), *claim)
+    assert code == 1 and re.search(r"0\.\d+ in the record, \S+ on held-out episodes \(p = 0\.0", complaint)
+    code, _, complaint = eitbench("verify", public, *claim, "--isolate", "process")
+    assert code == 1 and "must run under bubblewrap on held-out episodes" in complaint
 
 
-@walled
-def test_no_record_of_the_floor_is_believed(mine, tmp_path, monkeypatch):
-    """A file with the truth of its test episodes; beside it a floor that is as good, first by file name."""
-    honest = submitted(mine, "--seeds", "test:0-7")
-    floor = submitted("homogeneous", "--seeds", "test:0-7")
-
-    def with_the_truth(record, of=8):
-        for episode in sorted(record["episodes"], key=lambda episode: episode["scores"]["error"])[-of:]:
-            episode["step_errors"] = [1.2e-5 for _ in episode["step_errors"]]
-            episode["scores"]["error"] = float(np.mean(episode["step_errors"]))
-
-    def in_front(record):
-        with_the_truth(record)
-        record.update(version="00000000", method_sha256="0" * 64, official=False)
-        for episode, true in zip(record["episodes"], read_record(floor)["episodes"], strict=True):
-            episode["step_errors"] = [1.2e-5 * error for error in true["step_errors"]]
-            episode["scores"]["error"] = float(np.mean(episode["step_errors"]))
-
-    claim = held_out_claim(tmp_path, monkeypatch, mine)
-    for of in (8, 2):                                       # all, or the hardest two
-        prepared = forged(honest, lambda record, of=of: with_the_truth(record, of))
-        assert forged(floor, in_front).name < floor.name
-        code, _, complaint = eitbench("verify", prepared, *claim)
-        assert code == 1 and "smallest ratio: " in complaint
+def test_no_record_of_the_baseline_counts():
+    """The naive baseline is run here, on both kinds of episodes: compared with itself it is never better."""
+    path = submitted("homogeneous", "test:0-5")
+    row, problems = held_out.verify_held_out(read_record(path), Job(FILTER._replace(kwargs="{}"), "homogeneous", 0),
+                                             SECRET, 4)
+    assert not problems and row["recorded"] == "1 (6)" and row["held-out"] == "1 (4)" and float(row["p"]) == 1.0
+    with pytest.raises(ValueError, match="must be more for a test, got 1 and 6"):
+        held_out.verify_held_out(read_record(path), Job(FILTER._replace(kwargs="{}"), "homogeneous", 0), SECRET, 1)
 
 
-@walled
-def test_held_out_seeds_stay_here(mine, tmp_path, monkeypatch):
-    """Neither a message to a guest, nor its command line or surroundings, nor what is printed has one, or the salt."""
-    path = submitted(mine, "--seeds", "test:0-3")
-    monkeypatch.setattr(salts.secrets, "token_bytes", bytes)      # zeros: one salt in twenty is bad luck
-    salts.new_salt(tmp_path / "salt")
-    seeds = drawn_seeds(salt := salts.read_salt(tmp_path / "salt"), 2)
-    passed, popen, pack = [], host.subprocess.Popen, wire.pack
-
-    def started(command, **rest):
-        passed.append(repr((command, rest["env"], rest["cwd"])).encode())
-        return popen(command, **rest)
-
-    def packed(*message):
-        passed.append(pack(*message))
-        return passed[-1]
-
-    monkeypatch.setattr(host.subprocess, "Popen", started)
-    monkeypatch.setattr(wire, "pack", packed)
-    played = []
-    monkeypatch.setattr(held_out, "run_episode", lambda job: played.append(job.seed) or run.run_episode(job))
-    code, said, complaint = eitbench("verify", path, "--episodes", 0, "--held-out", 2, "--salt-file", "salt",
-                                     "--baseline", mine)
-    assert code == 0, complaint
-    assert played == [*seeds, *seeds, *parse_seeds("test:0-3")]
-    assert sum(b'"update"' in message for message in passed) == 2 * 5
-    for secret in (*(str(seed) for seed in seeds), *(f"{seed:x}" for seed in seeds), salt.hex()):
-        assert secret not in said + complaint and not any(secret.encode() in message for message in passed)
-    for secret in (salt, *(seed.to_bytes(8, order) for seed in seeds for order in ("little", "big"))):
-        assert not any(secret in message for message in passed)
+# -- the command --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("arguments", "message"), [
-    (["--held-out", "3"], "--held-out and --salt-file belong together"),
-    (["--salt-file", "salt"], "--held-out and --salt-file belong together"),
-    (["--episodes", "0"], "--episodes must be at least 1 where no --held-out episodes are played, got 0"),
-    (["--baseline", "a.py", "--policy", "b.py"], "only one of --baseline and --policy"),
+    ([], "one of the files of records, --all and --top must be given"),
+    (["r.json", "--all"], "one of the files of records, --all and --top must be given"),
+    (["r.json", "s.json", "--method", "a.py"], "--method belongs to one record's file"),
+    (["r.json", "--held-out", "3"], "--held-out and --secret belong together"),
+    (["r.json", "--secret", "salt"], "--held-out and --secret belong together"),
+    (["r.json", "--episodes", "0"], "--episodes must be at least 1 without --held-out, got 0"),
+    (["r.json", "--held-out", "3", "--secret", "none"], "must be a file of hexadecimal digits"),
 ])
 def test_mistakes_are_explained(arguments, message):
-    """Exit code 2, unlike that of an untrue record."""
-    code, said, complaint = eitbench("verify", "record.json", *arguments)
+    """Exit status 2, unlike that of a false record."""
+    code, said, complaint = eitbench("verify", *arguments)
     assert code == 2 and said == "" and message in complaint
     code, _, complaint = eitbench("verify", "record.json")
     assert code == 1 and "record record.json cannot be read" in complaint
+
+
+@pytest.mark.parametrize("command", ["check", "season", "held-out"])
+def test_removed_commands_name_their_replacement(command):
+    code, said, complaint = eitbench(command, "somewhere", "--out", "x", "--help")
+    assert code == 2 and said == ""
+    assert re.search(f"`eitbench {command}` was removed: .*(verify|docs/trust.md)", complaint)
+
+
+def test_the_workflow_calls_an_existing_command():
+    """Its options are those of `verify`."""
+    text = (Path(held_out.__file__).parents[2] / ".github/workflows/submission.yml").read_text()
+    (call,) = re.findall(r"bin/eitbench (verify .*?)(?: >|\n)", text)
+    options = re.findall(r"--[a-z-]+", call)
+    code, said, _ = eitbench("verify", "--help")
+    assert code == 0 and options and all(option in said for option in options)

@@ -24,9 +24,9 @@ from tiny import git_says
 
 ROOT = Path(__file__).parents[2]
 PIPE, INJECTION = "eitbench/Pipe2D-v0", "eitbench/Pipe2DInjection-v0"
-COMMANDS = ("list", "run", "bank", "train", "policies", "submit", "verify", "held-out", "migrate", "cards", "kits",
-            "fit-prior", "fit-model", "estimate", "submit-measured", "export", "leaderboard", "compare", "render",
-            "reproduce", "check", "season")
+COMMANDS = ("list", "run", "bank", "train", "policies", "submit", "verify", "golden",
+            "fit-prior", "fit-model", "estimate", "export", "leaderboard", "compare", "render",
+            "reproduce")
 TINY = {"flow": {"mean_velocity": 45.0}, "schedule": {"scored_steps": 3, "pattern": {"frame": 2}},
         "vessel": {"electrodes_per_wall": 2}}
 """A fast fluid flushes the pipe in two steps: an episode of five takes a third of a second."""
@@ -186,8 +186,6 @@ def test_documented_commands_are_commands():
         lines = re.findall(r"^.*?\beitbench (.*)$", "\n".join(blocks), re.MULTILINE)
         for words in lines + re.findall(r"`eitbench ([^`]*)`", text):
             command, *rest = words.split("#")[0].split()
-            if command == "season" and rest and not rest[0].startswith("-"):
-                command = f"{command} {rest.pop(0)}"
             named.setdefault(command, set()).update(word for word in rest if word.startswith("--"))
             helps.setdefault(command, eitbench(*command.split(), "--help")[1])
     assert {command.split()[0] for command in named} == set(COMMANDS)
@@ -244,7 +242,7 @@ def test_mistakes_are_explained(arguments, message, tmp_path):
     assert not (tmp_path / "results").exists() and not (tmp_path / "nothing").exists()
 
 
-@pytest.mark.parametrize(("given", "isolate"), [([], "others"), (["--isolate", "always"], "always")])
+@pytest.mark.parametrize(("given", "isolate"), [([], "auto"), (["--isolate", "process"], "process")])
 def test_an_episode_is_drawn_as_isolated_as_asked(given, isolate, monkeypatch):
     """As by all other commands that play."""
     asked = []

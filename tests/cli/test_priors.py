@@ -8,7 +8,7 @@ import pytest
 from eitbench.bench.methods import baseline_folder
 from eitbench.cli.app import app
 from eitbench.estimation import InflowPrior, suiting_priors
-from eitbench.worlds.pipe2d import PIPE_2D
+from eitbench.worlds.catalogue import PIPE_2D
 from eitbench.worlds.task import make_task
 from typer.testing import CliRunner
 

@@ -3,30 +3,23 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from eitbench.data import beginnings, store
+from eitbench.data import cache
 from eitbench.data.bank import fill
 from eitbench.data.beginnings import MARGIN, concentration_at, script, script_so_far
 from eitbench.data.episodes import simulate
 from eitbench.data.recordings import is_recorded
 from eitbench.worlds import entry
 
-from recorded import forget, forget_made
 from short import merged, short
 
 LONGER = {"schedule": {"scored_steps": 30}}
-IDS = ["eitbench/Pipe2D-v0", "eitbench/Pipe2DFixedLag-v0", "eitbench/Pipe2DInjectionFlow-v0",
+IDS = ["eitbench/Pipe2DFixedLag-v0", "eitbench/Pipe2DInjectionFlow-v0",
        "eitbench/RotatingTankInjection-v0", "eitbench/StationaryTank2D-v0"]
 
 
 @pytest.fixture(autouse=True)
-def place(tmp_path, monkeypatch):
-    """A cache folder of its own for each test, and a process that has simulated nothing."""
-    monkeypatch.setenv(store.CACHE_VARIABLE, str(tmp_path / "cache"))
-    forget()
-    forget_made(beginnings)
-    yield
-    forget()
-    forget_made(beginnings)
+def _place(place):
+    """A cache folder for each test."""
 
 
 def changes(id):
@@ -42,7 +35,7 @@ def test_its_bits_are_those_of_the_whole(id):
     begun = script_so_far(world, 3, 1)
     assert len(begun.entries) == 1 + MARGIN and not is_recorded(world, 3)
     states = [concentration_at(world, 3, t, 1) for t in (0, 1 + MARGIN)]
-    assert not list(store.folder(world).glob("3.*"))                       # nothing is left behind
+    assert not list(cache.folder(world).glob("3.*"))                       # nothing is left behind
     whole = script(world, 3)
     assert begun.entries.tobytes() == whole.entries[:1 + MARGIN].tobytes()
     for part, all_of_it in zip(begun.integrals, whole.integrals, strict=True):

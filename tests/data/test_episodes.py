@@ -4,89 +4,71 @@ import hashlib
 import itertools
 import subprocess
 import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from eitbench.data import episodes, store
+from eitbench.data import episodes
+from eitbench.data.cache import episode_key, store
 from eitbench.data.episodes import Episode, simulate, truth_discretisation
-from eitbench.data.store import CACHE_VARIABLE
-from eitbench.worlds.parts import Discretisation
-from eitbench.worlds.pipe2d import PIPE_2D
+from eitbench.data.recordings import recording
+from eitbench.worlds.catalogue import PIPE_2D
+from eitbench.worlds.world import Discretisation
 from scipy.stats import kstest
 
-from recorded import forget_made
-from short import merged
 from tiny_worlds import CHANGES, TINY
 
 
 @pytest.fixture(autouse=True)
-def cache(tmp_path, monkeypatch):
-    """A cache folder of its own for each test."""
-    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
-    return tmp_path / "cache"
+def _place(place):
+    """A cache folder for each test."""
 
 
 @pytest.fixture(scope="module")
-def fresh():
+def fresh(episode):
     """Seed 7, simulated without a cache."""
-    return simulate(TINY, 7, cache=False)
-
-
-@pytest.fixture
-def counted(monkeypatch):
-    """`simulate_together` replaced by one that gives a small episode of random numbers, and counts
-    its calls."""
-    rng = np.random.default_rng(3)
-    episode = Episode(rng.normal(size=(3, 20)).astype(np.float32), rng.normal(size=(2, 4, 4)),
-                      rng.normal(size=(2, 4)), rng.normal(size=(2, 3)))
-    calls = []
-    monkeypatch.setattr(episodes, "simulate_together",
-                        lambda *arguments: calls.append(arguments) or iter([episode]))
-    return SimpleNamespace(episode=episode, calls=calls)
+    return episode
 
 
 def bits(episode):
-    """All that makes two episodes the same."""
+    """Types, shapes and bytes of an episode's arrays."""
     return [(array.dtype.str, array.shape, array.tobytes()) for array in episode]
-
-
-def files(folder):
-    """Every file below a folder, hidden ones too."""
-    return sorted(path for path in Path(folder).rglob("*") if path.is_file())
-
-
-def stored(path):
-    """The episode of seed 7 in this file; None if it is not believed."""
-    arrays = store.load(path, Episode._fields, "7")
-    return arrays and Episode(**arrays)
 
 
 # -- reproducible ----------------------------------------------------------------------------------
 
 
 def test_shapes_are_those_of_the_docstring(fresh):
-    """(T + 1, n_truth) float32, (T, L, L) and (T, L), all finite; no velocity where nobody asks for
-    it."""
+    """All finite; no velocity where the flow is known."""
     n_truth = truth_discretisation(TINY).transport.mesh.n_nodes
     assert [array.shape for array in fresh] == [(6, n_truth), (5, 4, 4), (5, 4), (5, 0)]
     assert [array.dtype for array in fresh] == [np.float32, np.float64, np.float64, np.float64]
     assert all(np.isfinite(array).all() for array in fresh)
 
 
-def test_same_process_same_bits(fresh):
-    """Nothing is random but by the seed, and numpy's global state is neither used nor touched."""
+def test_same_bits_in_this_process_from_the_cache_and_side_by_side(fresh, monkeypatch):
+    """Only the seed is random, and numpy's global state is neither used nor changed. Up to an
+    earlier step the bits are those of the whole."""
     np.random.seed(1)  # noqa: NPY002 (the global state is what this is about)
     before = np.random.get_state()[1].copy()  # noqa: NPY002
     assert bits(simulate(TINY, 7, cache=False)) == bits(fresh)
     assert (np.random.get_state()[1] == before).all()  # noqa: NPY002
+    together = list(episodes.simulate_together(TINY, [7, 8]))
+    assert bits(together[0]) == bits(fresh)
+    assert bits(together[1]) == bits(simulate(TINY, 8, cache=False))
+    assert all((mine != theirs).mean() > 0.9 for mine,
+               theirs in zip(fresh[:3], together[1][:3], strict=True))
+    (begun,) = episodes.simulate_together(TINY, [7], last=2)
+    assert bits(begun) == bits(Episode(fresh.concentration[:3], *(array[:2] for array in fresh[1:])))
+    first = simulate(TINY, 7)
+    monkeypatch.setattr(episodes, "simulate_together", None)
+    assert bits(simulate(TINY, 7)) == bits(first) == bits(fresh)
 
 
-def test_other_processes_same_bits_and_share_one_file(fresh, cache):
+def test_other_processes_same_bits_and_share_one_file(fresh, place):
     """Two processes that simulate and store one episode at once leave a single valid file with the
     bits made here."""
-    program = ("from eitbench.worlds.pipe2d import PIPE_2D\n"
+    program = ("from eitbench.worlds.catalogue import PIPE_2D\n"
                "from eitbench.data.episodes import simulate\n"
                "import hashlib\n"
                f"episode = simulate(PIPE_2D.changed({CHANGES!r}), 7)\n"
@@ -96,100 +78,24 @@ def test_other_processes_same_bits_and_share_one_file(fresh, cache):
     digests = [process.communicate()[0].strip() for process in running]
     here = hashlib.sha256(b"".join(array.tobytes() for array in fresh)).hexdigest()
     assert digests == [here, here]
-    (path,) = files(cache)
-    assert bits(stored(path)) == bits(fresh)
+    assert len([path for path in place.rglob("*") if path.is_file()]) == 1
+    assert bits(simulate(TINY, 7)) == bits(fresh)
 
 
-def test_simulated_together_same_bits(fresh):
-    """Flows carried on side by side are the flows that each seed has alone, in the order of the
-    seeds."""
-    seeds = [7, 8, 9]
-    together = [bits(episode) for episode in episodes.simulate_together(TINY, seeds)]
-    assert together[0] == bits(fresh)
-    assert together == [bits(simulate(TINY, seed, cache=False)) for seed in seeds]
-
-
-def test_cached_equals_fresh(fresh, monkeypatch):
-    """The second call reads what the first one stored, bit for bit, and simulates nothing."""
-    first = simulate(TINY, 7)
-    monkeypatch.setattr(episodes, "simulate_together", None)
-    assert bits(simulate(TINY, 7)) == bits(first) == bits(fresh)
-
-
-def test_seeds_differ_in_flow_and_noise(fresh):
-    """Another seed is another inflow, hence other voltages, and other noise."""
-    other = simulate(TINY, 8, cache=False)
-    assert all((mine != theirs).mean() > 0.9 for mine,
-               theirs in zip(fresh[:3], other[:3], strict=True))
-
-
-def test_numbers_depend_on_the_world_not_on_the_cache(counted, cache):
-    """Episodes of other seeds and worlds lie in other files."""
-    other = PIPE_2D.changed(merged(CHANGES, {"flow": {"diffusivity": 1e-3}}))
-    for world, seed in itertools.product((TINY, other), (1, 2)):
-        simulate(world, seed)
-    assert len(counted.calls) == len(files(cache)) == 4
+def test_no_cache_neither_reads_nor_writes(fresh, place):
+    """`cache=False` leaves the folder alone and simulates even if a file is there."""
+    simulate(TINY, 7, cache=False)
+    assert not place.exists()
+    store(episode_key(TINY, "7.truth"), fresh._replace(noise=fresh.noise + 1.0)._asdict())
+    assert bits(simulate(TINY, 7, cache=False)) == bits(fresh)
 
 
 @pytest.mark.parametrize("seed", [-1, 1.0, True, "7", None])
 def test_seed_must_be_a_whole_number(seed):
-    """Seeds that would be rounded or cast are refused by name."""
-    with pytest.raises(ValueError, match="seed must be an integer of at least 0"):
-        simulate(TINY, seed)
-
-
-# -- cache -----------------------------------------------------------------------------------------
-
-
-def test_no_cache_neither_reads_nor_writes(counted, cache):
-    """`cache=False` leaves the folder alone and simulates even if a file is there."""
-    simulate(TINY, 7, cache=False)
-    assert not cache.exists()
-    simulate(TINY, 7)
-    simulate(TINY, 7, cache=False)
-    assert len(counted.calls) == 3
-
-
-def assert_rebuilt(path, counted):
-    """One simulation gives the right episode, and its file is good for the next call."""
-    before = len(counted.calls)
-    for _ in range(2):
-        assert bits(simulate(TINY, 7)) == bits(counted.episode)
-    assert len(counted.calls) == before + 1
-    assert files(path.parent) == [path]
-
-
-@pytest.mark.parametrize("damage", [
-    pytest.param(lambda data: b"", id="empty"),
-    pytest.param(lambda data: data[:len(data) // 2], id="half"),
-    pytest.param(lambda data: data[:-1], id="one byte short"),
-    pytest.param(lambda data: b"\0" * len(data), id="zeros"),
-    pytest.param(lambda data: b"not an episode", id="text"),
-])
-def test_damaged_file_is_rebuilt(damage, counted, cache):
-    """What a full disk or a lost power supply leaves is noticed and replaced."""
-    simulate(TINY, 7)
-    (path,) = files(cache)
-    path.write_bytes(damage(path.read_bytes()))
-    assert_rebuilt(path, counted)
-
-
-@pytest.mark.parametrize("other", ["seed", "world", "version"])
-def test_file_of_something_else_is_rebuilt(other, counted, cache, monkeypatch):
-    """A valid file under the right name but of another seed, world or code is not believed."""
-    simulate(TINY, 7)
-    (path,) = files(cache)
-    path.unlink()
-    with monkeypatch.context() as patch:
-        if other == "version":
-            patch.setattr(store, "_code", lambda: "older code")
-            forget_made(store)
-        world = TINY.changed({"instrument": {"current": 0.2}}) if other == "world" else TINY
-        simulate(world, 8 if other == "seed" else 7)
-    forget_made(store)
-    (stranger,) = files(cache)
-    stranger.rename(path)
-    assert_rebuilt(path, counted)
+    """Seeds that would be rounded or cast are rejected by name."""
+    for function in (simulate, recording):
+        with pytest.raises(ValueError, match="seed must be an integer of at least 0"):
+            function(TINY, seed)
 
 
 # -- what is simulated -----------------------------------------------------------------------------

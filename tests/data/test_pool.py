@@ -3,12 +3,11 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from eitbench.data import bank, pool, store
+from eitbench.data import bank, pool
 from eitbench.data.bank import fill
 from eitbench.data.pool import MOST, Pool
 from eitbench.worlds import entry
 
-from recorded import forget
 from short import short
 from tiny_worlds import FAST, TINY
 
@@ -19,12 +18,8 @@ ENVIRONMENTS = {"eitbench/Pipe2D-v0": {}, "eitbench/Pipe2DInjection-v0": {"estim
 
 
 @pytest.fixture(autouse=True)
-def place(tmp_path, monkeypatch):
-    """A cache folder of its own for each test."""
-    monkeypatch.setenv(store.CACHE_VARIABLE, str(tmp_path / "cache"))
-    forget()
-    yield tmp_path / "cache"
-    forget()
+def _place(place):
+    """A cache folder for each test."""
 
 
 def sizes(episodes, count):

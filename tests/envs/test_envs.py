@@ -11,9 +11,9 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
+from eitbench.data.cache import CACHE_VARIABLE
 from eitbench.data.episodes import Episode
 from eitbench.data.seeds import ReservedSeedWarning, for_scores
-from eitbench.data.store import CACHE_VARIABLE
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.worlds import Flow, Target, World, entries
 from estimating import ESTIMATION, PIPE, make, noise_actions, play

@@ -9,7 +9,7 @@ from eitbench.estimation import InflowFilter, suiting_priors
 from eitbench.estimation.onboard.belief import Belief
 from eitbench.estimation.onboard.inflow_operator import InflowOperator, prior_of
 from eitbench.worlds import entry
-from eitbench.worlds.pipe2d import PIPE_2D
+from eitbench.worlds.catalogue import PIPE_2D
 from eitbench.worlds.task import make_task
 from scipy.linalg import toeplitz
 

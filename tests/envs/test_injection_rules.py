@@ -6,8 +6,8 @@ import pytest
 from eitbench.estimation.onboard.operator import electrode_pairs
 from eitbench.estimation.onboard.rules import Rules
 from eitbench.worlds import entry
+from eitbench.worlds.catalogue import PIPE_2D
 from eitbench.worlds.instrument import Faults, Instrument
-from eitbench.worlds.pipe2d import PIPE_2D
 
 from choosing import BUDGET, CURRENTS, FAULTS, NAME, make, play, some_pairs
 

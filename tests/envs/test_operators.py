@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 from eitbench import make_task
-from eitbench.data import kits
+from eitbench.data import cache
+from eitbench.data.cache import CACHE_VARIABLE
 from eitbench.data.recordings import cycle_voltages, recording
-from eitbench.data.store import CACHE_VARIABLE
 from eitbench.estimation import FirstFrame, LinearisedObservations, kalman_filter, table_5_1
 from eitbench.estimation.onboard import reduced_operator
 from eitbench.estimation.onboard.operator import electrode_pairs
@@ -111,13 +111,13 @@ def test_stored_reduced_model_is_kept_and_damage_is_noticed(monkeypatch, tmp_pat
     covariances = np.einsum("kij,klj->kil", *[rng.integers(-5, 5, size=(2, 3, 3)).astype(float)] * 2)
     model = ReducedModel(*(rng.integers(-9, 9, size=(n, 3)) / 8.0 for n in (9, 3)), *covariances)
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
-    monkeypatch.setattr(kits, "KITS", tmp_path / "none")
+    monkeypatch.setattr(cache, "PACKAGE_DATA", tmp_path / "none")
     monkeypatch.setattr(reduced_operator, "make_model", lambda of: made.append(of) or model)
     for _ in range(2):
         stored = reduced_operator._stored_model(world)
         assert all((a == b).all() for a, b in zip(stored, model, strict=True))
     assert len(made) == 1
-    path, = tmp_path.rglob("reduced-*.npz")
+    path, = tmp_path.rglob("reduced-*.npy")
     data = path.read_bytes()
     for damaged in (data[:-9], data[:200] + bytes([data[200] ^ 1]) + data[201:], b""):
         path.write_bytes(damaged)
@@ -132,7 +132,7 @@ def test_worlds_that_differ_in_what_is_broken_share_their_model(monkeypatch, tmp
     made = []
     model = ReducedModel(np.ones((9, 3)), *np.ones((3, 3, 3)))
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
-    monkeypatch.setattr(kits, "KITS", tmp_path / "none")
+    monkeypatch.setattr(cache, "PACKAGE_DATA", tmp_path / "none")
     monkeypatch.setattr(reduced_operator, "make_model", lambda of: made.append(of) or model)
     world = entry(NAME).world
     same = [{"instrument": {"noise_floor": 1e-3, "limit": "L2"}}, {"instrument": {"dead": [1, 2]}},

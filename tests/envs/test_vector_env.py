@@ -12,7 +12,7 @@ import pytest
 from eitbench.data.episodes import simulate
 from eitbench.envs import estimation, estimation_vector
 from eitbench.worlds import entry
-from eitbench.worlds.pipe2d import PIPE_2D
+from eitbench.worlds.catalogue import PIPE_2D
 from eitbench.worlds.task import lag_steps
 from estimating import AT_HOME, ESTIMATION, PIPE
 from gymnasium.envs.registration import EnvSpec

@@ -13,7 +13,7 @@ from eitbench.estimation import (
     Observation,
     table_5_1,
 )
-from eitbench.worlds.pipe2d import PIPE_2D
+from eitbench.worlds.catalogue import PIPE_2D
 
 
 class LinearGaussian(NamedTuple):

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from eitbench.bench.methods import baseline_folder
 from eitbench.estimation import QuadraticVoltages, ScaledVoltages, reduced_response, steady_response, suiting_priors
-from eitbench.worlds.pipe2d import PIPE_2D
-from eitbench.worlds.pipe3d import PIPE_3D
+from eitbench.worlds.catalogue import PIPE_2D, PIPE_3D
 from eitbench.worlds.task import make_task
 from scipy.linalg import toeplitz
 
@@ -76,6 +75,22 @@ def test_slopes_are_those_of_the_voltages():
         ends = [scaled.voltages(c + sign * 1e-4 * way, task.currents[:3]) for sign in (1, -1)]
         expected = (ends[0] - ends[1]) / 2e-4
         np.testing.assert_allclose(slopes @ way, expected, atol=1e-6 * np.abs(expected).max())
+
+
+def test_every_pair_of_electrodes_is_contracted_once(monkeypatch):
+    """An agent that injects all 120 pairs in turn finds each again."""
+    calls = []
+    real = QuadraticVoltages._contracted
+    monkeypatch.setattr(QuadraticVoltages, "_contracted",
+                        lambda self, currents: calls.append(1) or real(self, currents))
+    task, basis, _ = fast()
+    model = QuadraticVoltages(task.observation, task.expected_concentration, basis[:, :4])
+    pairs = np.eye(16)[:, None] - np.eye(16)
+    pairs = pairs[np.triu_indices(16, 1)]
+    c = np.full(task.mesh.n_nodes, task.expected_concentration)
+    first, again = (model.voltages(c, pairs) for _ in range(2))
+    np.testing.assert_array_equal(first, again)
+    assert len(pairs) == len(calls) == 120
 
 
 def test_slugs_have_their_voltages():

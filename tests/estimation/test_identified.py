@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 import pytest
 from eitbench.bench.methods import baseline_folder
-from eitbench.data.learning.examples import Dataset
+from eitbench.data.dataset import Dataset
 from eitbench.data.seeds import parse_seeds
 from eitbench.estimation import (
     FirstFrame,
@@ -22,10 +22,7 @@ from eitbench.estimation import (
     suiting_models,
 )
 from eitbench.estimation.kalman import Observation, linearised
-from eitbench.worlds.pipe2d import PIPE_2D
-from eitbench.worlds.pipe2d_biased import PIPE_2D_BIASED
-from eitbench.worlds.pipe2d_obstacle import PIPE_2D_OBSTACLE
-from eitbench.worlds.pipe3d import PIPE_3D
+from eitbench.worlds.catalogue import PIPE_2D, PIPE_2D_BIASED, PIPE_2D_OBSTACLE, PIPE_3D
 from eitbench.worlds.task import make_task
 from scipy.linalg import toeplitz
 

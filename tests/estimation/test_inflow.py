@@ -19,9 +19,9 @@ from eitbench.estimation import (
     smoothed_inflow,
     suiting_priors,
 )
-from eitbench.worlds.pipe2d_obstacle import PIPE_2D_OBSTACLE
-from eitbench.worlds.rotating_tank import ROTATING_TANK_2D as ROTATING_TANK
-from eitbench.worlds.stationary_tank import STATIONARY_TANK_2D as STATIONARY_TANK
+from eitbench.worlds.catalogue import PIPE_2D_OBSTACLE
+from eitbench.worlds.catalogue import ROTATING_TANK_2D as ROTATING_TANK
+from eitbench.worlds.catalogue import STATIONARY_TANK_2D as STATIONARY_TANK
 from eitbench.worlds.task import make_task
 from models import white_inflow
 from scipy.linalg import toeplitz

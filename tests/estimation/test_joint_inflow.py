@@ -19,8 +19,7 @@ from eitbench.estimation import (
 )
 from eitbench.numerics.mesh import rectangle_mesh
 from eitbench.physics.transport import ConvectionDiffusion
-from eitbench.worlds.pipe2d_skewed import PIPE_2D_SKEWED
-from eitbench.worlds.stationary_tank import STATIONARY_TANK_2D
+from eitbench.worlds.catalogue import PIPE_2D_SKEWED, STATIONARY_TANK_2D
 from eitbench.worlds.task import make_task
 from models import white_inflow
 

@@ -16,7 +16,7 @@ from eitbench.numerics.fem import mass_matrix, stiffness_matrix
 from eitbench.numerics.mesh import rectangle_mesh
 from eitbench.numerics.round import uniform_disc
 from eitbench.worlds.bodies import disc_indicator
-from eitbench.worlds.stationary_tank import STATIONARY_TANK_2D
+from eitbench.worlds.catalogue import STATIONARY_TANK_2D
 from eitbench.worlds.task import make_task
 from scipy.linalg import cho_factor, cho_solve, eigvalsh
 from scipy.special import kv

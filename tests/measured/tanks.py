@@ -1,34 +1,39 @@
-"""Records that a simulated instrument took of a round tank, on a mesh of its own."""
+"""Measurements by a simulated instrument: in a round tank, on a mesh that no estimator has, and in an environment."""
 
 import numpy as np
-from eitbench.data.measured import Measurements
+from eitbench.measured import Measurements
 from eitbench.worlds.vessels import RoundTank
 
 VESSEL = {"kind": "circle", "radius": 0.1, "electrodes": 8, "cover": 0.4}
+BELIEVED = {"initial_std": 0.2, "walk_std": 0.05}
+"""Given where their choice by evidence is not tested, since that takes time."""
 SIGMA = 0.2
 CONTACTS = 1e-3 * np.linspace(0.5, 2.0, 8)
 
 
 def instrument(n_electrodes=8):
-    """Its injections (K, L), in A, and matrix (M, L): neighbours, as most have."""
+    """Injections (K, L) in A and matrix (M, L) of neighbours, the usual ones."""
     pairs = np.eye(n_electrodes) - np.roll(np.eye(n_electrodes), 1, axis=1)
     return 1e-3 * pairs, pairs
+
+
+def tank(contacts=CONTACTS):
+    model = RoundTank(radius=0.1, n_electrodes=8, electrode_cover=0.4).electrode_model(True)
+    return model.with_contacts(contacts)
 
 
 def homogeneous(noise=0.0, records=1, seed=0):
     """Readings (F, K, M) of homogeneous fluid."""
     currents, matrix = instrument()
-    electrodes = RoundTank(radius=0.1, n_electrodes=8, electrode_cover=0.4).electrode_model(True)
-    model = electrodes.with_contacts(CONTACTS)
+    model = tank()
     exact = currents @ model.transfer_resistance(np.full(model.mesh.n_nodes, SIGMA)) @ matrix.T
     return exact * (1.0 + noise * np.random.default_rng(seed).normal(size=(records, 8, 8)))
 
 
 def moving(frames=6, noise=1e-3, seed=1, records=3, amplitude=2 / 3, contacts=CONTACTS):
-    """A record of a body that conducts a third, on its way half round the tank."""
+    """A body with a third of the conductivity, on its way half round the tank."""
     currents, matrix = instrument()
-    model = RoundTank(radius=0.1, n_electrodes=8, electrode_cover=0.4).electrode_model(True)
-    model = model.with_contacts(contacts)
+    model = tank(contacts)
     T = 8 * frames
     readings = np.empty((T, 8))
     for t in range(T):
@@ -39,13 +44,43 @@ def moving(frames=6, noise=1e-3, seed=1, records=3, amplitude=2 / 3, contacts=CO
                         homogeneous(noise, records), {"file": "moving"})
 
 
+def still():
+    """One frame of the body at (5 cm, 0)."""
+    currents, matrix = instrument()
+    model = tank()
+    readings = currents @ model.transfer_resistance(conductivity(model.mesh.points, 0.0)) @ matrix.T
+    readings *= 1.0 + 1e-3 * np.random.default_rng(5).normal(size=readings.shape)
+    return Measurements(currents, np.arange(8), matrix, readings, 0.01 * np.arange(8), homogeneous(1e-3, 3),
+                        {"file": "still"})
+
+
 def angle(t, steps):
-    """Where the body is, in rad."""
+    """Direction of the body in rad."""
     return np.pi * t / steps
 
 
 def conductivity(points, angle, amplitude=2 / 3):
-    """Of a smooth body half way to the wall, which conducts less by this part."""
+    """A smooth body half way to the wall, with a conductivity that is lower by ``amplitude``."""
     centre = 0.05 * np.array([np.cos(angle), np.sin(angle)])
-    far = np.linalg.norm(points - centre, axis=1) / 0.025
-    return SIGMA * (1.0 - amplitude * np.exp(-far**2))
+    distance = np.linalg.norm(points - centre, axis=1) / 0.025
+    return SIGMA * (1.0 - amplitude * np.exp(-distance**2))
+
+
+def centroid(points, estimate):
+    """Of the nodes whose deficit in ln c is more than half of the extreme."""
+    u = np.log(estimate)
+    deficit = np.maximum(np.median(u) - u, 0.0)
+    deficit[deficit < 0.5 * deficit.max()] = 0.0
+    return deficit @ points / deficit.sum()
+
+
+def measurements_of(env, seed):
+    """Currents and potentials of an episode of a simulated environment, without its truth."""
+    observation, _ = env.reset(seed=seed)
+    T, L = env.episode_steps - env.lag, env.task.currents.shape[1]
+    V, I = np.empty((2, T, L))
+    for t in range(T):
+        V[t], I[t] = observation["voltages"], observation["currents"]
+        observation, *_ = env.step(np.zeros(env.action_space.shape))
+    return Measurements.from_sequence(I, np.eye(L), V, env.task.transport.time_step * np.arange(1, T + 1),
+                                      source={"file": "simulated"})

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from eitbench.data.measured import Measurements
-from eitbench.estimation.measured.calibration import calibrate, noise_of_frames
-from eitbench.estimation.measured.plausible import doubts
-from eitbench.estimation.measured.vessel import read_vessel
+from eitbench.measured import Measurements
+from eitbench.measured.calibration import calibrate, noise_of_frames
+from eitbench.measured.quality import quality_warnings
+from eitbench.measured.vessel import read_vessel
 from tanks import CONTACTS, SIGMA, VESSEL, homogeneous, instrument, moving
 
 CURRENTS, MATRIX = instrument()
@@ -40,7 +40,7 @@ def test_uncertainty_is_that_of_repetitions():
 def test_repeats_tell_the_noise():
     found = calibrated(homogeneous(noise=0.01, records=20))
     assert found.noise.relative == pytest.approx(0.01, rel=0.15)
-    assert found.noise_is_told
+    assert found.noise_from_repeats
 
 
 def test_frames_tell_the_noise_of_what_moves():
@@ -74,47 +74,47 @@ def record_of(readings, currents=CURRENTS, matrix=MATRIX):
     return Measurements(currents, np.arange(8), matrix, readings[0], np.arange(8.0))
 
 
-def doubts_about(readings, currents=CURRENTS, matrix=MATRIX, **more):
+def warnings_of(readings, currents=CURRENTS, matrix=MATRIX, **more):
     record = record_of(readings, currents, matrix)
     calibration = calibrate(ELECTRODES, record.currents, record.matrix, readings, **more)
-    return " ".join(doubts(record, calibration, ELECTRODES))
+    return " ".join(quality_warnings(record, calibration, ELECTRODES))
 
 
-def test_a_sound_record_raises_no_doubt():
-    assert doubts_about(homogeneous(noise=1e-3)) == ""
+def test_a_sound_record_has_no_warnings():
+    assert warnings_of(homogeneous(noise=1e-3)) == ""
 
 
 def test_swapped_electrodes_are_named():
     """The wires of electrodes 2 and 6: injections and readings name one for the other."""
     order = np.arange(8)
     order[[1, 5]] = 5, 1
-    assert "Electrodes 2 and 6 are swapped" in doubts_about(
+    assert "Electrodes 2 and 6 are swapped" in warnings_of(
         homogeneous(), CURRENTS[:, order], MATRIX[:, order])
 
 
 def test_readings_counted_the_other_way_are_named():
-    said = doubts_about(homogeneous(), CURRENTS, MATRIX[:, -np.arange(8) % 8])
+    said = warnings_of(homogeneous(), CURRENTS, MATRIX[:, -np.arange(8) % 8])
     assert "the other way round" in said
 
 
 def test_channels_that_amplify_differently_break_reciprocity():
     """By what they differ."""
     gains = 1.0 + 0.3 * np.random.default_rng(1).uniform(-1, 1, size=8)
-    assert "Exchanging injection and reading" in doubts_about(homogeneous() * gains)
-    assert doubts_about(homogeneous() * gains, correction="gain") == ""
+    assert "Exchanging injection and reading" in warnings_of(homogeneous() * gains)
+    assert warnings_of(homogeneous() * gains, correction="gain") == ""
 
 
 def test_gains_excuse_no_swapped_electrodes():
     order = np.arange(8)
     order[[1, 5]] = 5, 1
-    assert "Electrodes 2 and 6 are swapped" in doubts_about(
+    assert "Electrodes 2 and 6 are swapped" in warnings_of(
         homogeneous(), CURRENTS[:, order], MATRIX[:, order], correction="gain")
 
 
 def test_units_that_are_wrong_are_named():
-    assert "other units" in doubts_about(1e6 * homogeneous())
-    assert "other units" in doubts_about(homogeneous(), 1e3 * CURRENTS)
-    assert "not in volts" in doubts_about(1e3 * homogeneous(), conductivity=SIGMA)
+    assert "other units" in warnings_of(1e6 * homogeneous())
+    assert "other units" in warnings_of(homogeneous(), 1e3 * CURRENTS)
+    assert "not in volts" in warnings_of(1e3 * homogeneous(), conductivity=SIGMA)
 
 
 def test_a_dead_electrode_is_named():
@@ -122,36 +122,7 @@ def test_a_dead_electrode_is_named():
     readings = homogeneous(noise=1e-3)
     potential = np.zeros((8, 8))
     potential[:, 4] = 0.5 * np.abs(readings).max() * np.random.default_rng(3).normal(size=8)
-    assert "Electrode 5 looks dead" in doubts_about(readings + potential @ MATRIX.T)
-
-
-def test_vessels_are_read_or_refused(tmp_path):
-    """From YAML as from Python; what is missing, unknown or impossible is named."""
-    pytest.importorskip("yaml")
-    path = tmp_path / "vessel.yml"
-    path.write_text("kind: circle\nradius: 0.1\nelectrodes: 8\ncover: 0.4\n", encoding="utf-8")
-    np.testing.assert_array_equal(read_vessel(path).carrier().points, VESSEL_HERE.carrier().points)
-    for changed, said in (({"kind": "ball"}, "vessel.kind must be one of"),
-                          ({"radius": -1.0}, "vessel.radius"), ({"wdth": 1}, "has no wdth"),
-                          ({"width": 0.01}, "either width or cover, got both"),
-                          ({"direction": "left"}, "direction must be one of"),
-                          ({"electrodes": 0}, "vessel.electrodes")):
-        with pytest.raises(ValueError, match=said):
-            read_vessel(VESSEL | changed)
-    path.write_text("- a\n", encoding="utf-8")
-    with pytest.raises(ValueError, match="vessel must be a YAML file"):
-        read_vessel(path)
-
-
-@pytest.mark.parametrize("direction", ["counter-clockwise", "clockwise"])
-def test_electrodes_stand_where_the_instrument_has_them(direction):
-    """The first at 90°, the third a quarter further in the direction in which they are counted."""
-    vessel = read_vessel(VESSEL | {"first": 90.0, "direction": direction})
-    model = vessel.electrode_model(1e-3)
-    middles = [model.mesh.points[np.unique(facets)].mean(axis=0) for facets in model.electrodes]
-    sign = 1 if direction == "clockwise" else -1
-    assert np.argmax([y for _, y in middles]) == 0
-    assert np.argmax([sign * x for x, _ in middles]) == 2
+    assert "Electrode 5 looks dead" in warnings_of(readings + potential @ MATRIX.T)
 
 
 def test_moving_record_is_sound():

@@ -5,9 +5,9 @@ import tracemalloc
 import h5py
 import numpy as np
 import pytest
-from eitbench.data.measured import Measurements, read
 from eitbench.envs.measured import MeasuredEnv
-from tanks import VESSEL, moving
+from eitbench.measured import Measurements, read
+from tanks import BELIEVED, VESSEL, moving
 
 PAIR = np.array([[1.0, -1.0, 0.0], [0.0, 1.0, -1.0]])
 
@@ -68,7 +68,7 @@ def test_equal_injections_become_one():
     """In the order in which they come first; of a reference too."""
     currents = PAIR[[1, 0, 1]]
     reference = np.arange(9.0).reshape(1, 3, 3)
-    record = Measurements.of_sequence(currents, np.eye(3), np.ones((3, 3)), np.arange(3.0),
+    record = Measurements.from_sequence(currents, np.eye(3), np.ones((3, 3)), np.arange(3.0),
                                       reference)
     np.testing.assert_array_equal(record.currents, PAIR[[1, 0]])
     np.testing.assert_array_equal(record.injections, [0, 1, 0])
@@ -78,8 +78,13 @@ def test_equal_injections_become_one():
     assert record.frame == 2
 
 
-def test_driven_readings_are_known():
-    np.testing.assert_array_equal(small().driven, [[1, 1, 0], [0, 1, 1], [1, 1, 0]])
+@pytest.mark.parametrize("chunk", [3, 100])
+def test_a_frame_ends_with_the_first_use_of_the_last_injection(monkeypatch, chunk):
+    monkeypatch.setattr("eitbench.measured.measurements.CHUNK_VALUES", chunk)
+    sound = moving(frames=1)
+    some = Measurements(sound.currents, np.array([0, 1, 0, 2, 1, 4, 0]), sound.matrix, sound.readings[:7],
+                        np.arange(7.0))
+    assert some.frame == 6
 
 
 def test_frames_follow_each_other():
@@ -98,17 +103,17 @@ def test_a_large_record_stays_on_the_disk(tmp_path):
                          np.tile(sound.readings, (times, 1)), 0.01 * np.arange(64 * times), sound.reference)
     size = large.readings.nbytes
     assert size > 1 << 26
-    paths = large.part(slice(0, 640)).save(tmp_path / "short.h5"), large.save(tmp_path / "large.h5")
+    paths = large.select(slice(0, 640)).save(tmp_path / "short.h5"), large.save(tmp_path / "large.h5")
     del large
 
     def first_step(path):
         tracemalloc.start()
-        env = MeasuredEnv(path, VESSEL, initial_std=0.2, walk_std=0.05)
+        env = MeasuredEnv(path, VESSEL, **BELIEVED)
         observation, _ = env.reset(seed=0)
         env.step(np.full(env.task.mesh.n_nodes, env.task.expected_concentration))
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
-        return env.record, observation["voltages"], peak
+        return env.measurements, observation["voltages"], peak
 
     (short, seen, usual), (long, same, peak) = map(first_step, paths)
     assert peak - usual < size / 2
@@ -125,12 +130,12 @@ def test_a_large_record_stays_on_the_disk(tmp_path):
 def test_parts_of_a_record():
     """Of injections that came alone; the reference with them."""
     sound = moving(frames=3)
-    part = sound.part(slice(9, 12))
+    part = sound.select(slice(9, 12))
     np.testing.assert_array_equal(part.readings, sound.readings[9:12])
     np.testing.assert_array_equal(part.currents[part.injections], sound.currents[sound.injections[9:12]])
     np.testing.assert_array_equal(part.reference, sound.reference[:, 1:4])
     with pytest.raises(ValueError, match="steps must hold readings of the 24, got"):
-        sound.part(slice(30, 40))
+        sound.select(slice(30, 40))
 
 
 def test_what_could_not_be_written_leaves_what_was_there(tmp_path, monkeypatch):

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from eitbench.bench.measured import play_record
+from eitbench.bench.playing import run_on_measurements
 from eitbench.envs.measured import MeasuredEnv
 from eitbench.estimation.modes import ModesFilter
 from eitbench.estimation.walk import smooth_modes, steady
-from tanks import VESSEL, moving
+from tanks import BELIEVED, VESSEL, moving
 
 
 def test_correlation_is_that_of_a_matern_process():
@@ -53,7 +53,7 @@ def test_filter_is_that_of_the_stacked_state():
 
 def test_modes_make_the_fields_covariance():
     """But for a thousandth of the strongest one's variance."""
-    env = MeasuredEnv(moving(frames=3), VESSEL, initial_std=0.2, walk_std=0.05)
+    env = MeasuredEnv(moving(frames=3), VESSEL, **BELIEVED)
     walk = env.task.transport
     modes = smooth_modes(walk.mesh, walk.length)
     strongest = (modes**2).sum(axis=0).max()
@@ -65,5 +65,6 @@ def test_modes_make_the_fields_covariance():
 def test_a_steady_body_is_predicted_better_than_by_a_walk():
     """A body that goes half round a tank in 12 frames: by a tenth at least, withheld readings."""
     env = MeasuredEnv(moving(frames=12), VESSEL, withheld=0.15)
-    walk, steady_one = (play_record(env, name).withheld for name in ("log_walk_filter", "log_steady_filter"))
+    walk, steady_one = (run_on_measurements(env, name).withheld_rmse
+                        for name in ("log_walk_filter", "log_steady_filter"))
     assert steady_one < 0.9 * walk

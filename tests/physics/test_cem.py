@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from eitbench.numerics.mesh import Mesh, graded_pipe_mesh
 from eitbench.physics.cem import CompleteElectrodeModel
-from eitbench.worlds.pipe2d import PIPE_2D
+from eitbench.worlds.catalogue import PIPE_2D
 from numpy.testing import assert_allclose
 
 from references import reference_model, unsymmetrised

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from eitbench.physics.flow import PlaneChannelFlow
 from eitbench.physics.profiles import SkewedChannelFlow, VelocityModel, parabola
-from eitbench.worlds.pipe2d_skewed import PIPE_2D_SKEWED
+from eitbench.worlds.catalogue import PIPE_2D_SKEWED
 
 R = 0.05
 MODEL = VelocityModel(R, ((1.5, 0.0, -1.5), (0.0, 2.0), (0.5, 0.25, 0.0, -0.75)), (4.0, 0.0, 1.0), (1.0, 2.0, 3.0),

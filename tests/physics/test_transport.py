@@ -9,7 +9,7 @@ from eitbench.numerics.fem import mass_matrix
 from eitbench.numerics.mesh import Mesh, rectangle_mesh
 from eitbench.physics.flow import PlaneChannelFlow
 from eitbench.physics.transport import ConvectionDiffusion, _supg_matrices, inlet_nodes
-from eitbench.worlds.pipe2d import PIPE_2D
+from eitbench.worlds.catalogue import PIPE_2D
 
 # -- helpers ----------------------------------------------------------------------------------------------------------
 

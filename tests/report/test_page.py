@@ -12,12 +12,12 @@ import pytest
 from eitbench.bench.run import Job, run_jobs
 from eitbench.bench.store import EpisodeStore
 from eitbench.bench.tracks import Environment
-from eitbench.data.store import CACHE_VARIABLE
+from eitbench.data.cache import CACHE_VARIABLE
 from eitbench.numerics.round import extrude, uniform_disc
 from eitbench.report import charts, page
 from eitbench.report.boards import run_boards
 from eitbench.report.sweep import sweeps
-from eitbench.worlds.pipe3d import PIPE_3D
+from eitbench.worlds.catalogue import PIPE_3D
 from pages import Page, svgs
 from PIL import Image
 

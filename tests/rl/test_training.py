@@ -14,7 +14,7 @@ from eitbench.rl import training
 from eitbench.rl.agents import _mark, load_agent
 from eitbench.rl.training import Config, read_config, train
 from eitbench.rl.vec_env import InjectionVecEnv
-from eitbench.worlds.pipe2d import PIPE_2D
+from eitbench.worlds.catalogue import PIPE_2D
 from threadpoolctl import threadpool_limits
 
 from choosing import injected

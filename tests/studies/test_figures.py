@@ -12,8 +12,8 @@ import pytest
 from eitbench.bench.methods import load_method
 from eitbench.bench.text import seed_ranges
 from eitbench.cli.studies import NAME, thesis
+from eitbench.data.cache import CACHE_VARIABLE
 from eitbench.data.seeds import name_seed
-from eitbench.data.store import CACHE_VARIABLE
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.estimation import FirstFrame, initial_covariance
 from eitbench.physics.rest import AtRest

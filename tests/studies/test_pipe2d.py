@@ -18,7 +18,7 @@ from eitbench.data.seeds import parse_seeds
 from eitbench.estimation import best_homogeneous, gauss_newton
 from eitbench.numerics.fem import stiffness_matrix
 from eitbench.scoring import relative_error
-from eitbench.worlds.pipe2d import PIPE_2D
+from eitbench.worlds.catalogue import PIPE_2D
 
 thesis()
 pipe2d = importlib.import_module(f"{NAME}.pipe2d")

@@ -5,13 +5,9 @@ import pickle
 
 import numpy as np
 import pytest
-from eitbench.data import store
+from eitbench.data import cache
 from eitbench.worlds import entries
-from eitbench.worlds.pipe2d import PIPE_2D
-from eitbench.worlds.pipe2d_drifting import PIPE_2D_DRIFTING
-from eitbench.worlds.pipe2d_faults import PIPE_2D_FAULTS
-from eitbench.worlds.pipe2d_injection import PIPE_2D_CURRENTS
-from eitbench.worlds.stationary_tank import STATIONARY_TANK_2D
+from eitbench.worlds.catalogue import PIPE_2D, PIPE_2D_CURRENTS, PIPE_2D_DRIFTING, PIPE_2D_FAULTS, STATIONARY_TANK_2D
 
 
 def test_only_what_is_named_changes():
@@ -110,12 +106,12 @@ def test_what_is_wrong_is_named(changes, message):
 ])
 def test_instruments_and_beliefs_share_episodes(changes):
     """What is read and believed moves no fluid, and neither does a budget."""
-    assert store.folder(PIPE_2D.changed(changes)) == store.folder(PIPE_2D)
+    assert cache.folder(PIPE_2D.changed(changes)) == cache.folder(PIPE_2D)
 
 
 def test_ids_of_one_pipe_share_episodes():
     """The plain pipe, the one whose wires break, and the one with a source for each electrode."""
-    assert len({store.folder(world) for world in (PIPE_2D, PIPE_2D_FAULTS, PIPE_2D_CURRENTS)}) == 1
+    assert len({cache.folder(world) for world in (PIPE_2D, PIPE_2D_FAULTS, PIPE_2D_CURRENTS)}) == 1
 
 
 @pytest.mark.parametrize("changes", [
@@ -134,13 +130,13 @@ def test_ids_of_one_pipe_share_episodes():
 ])
 def test_other_fluids_do_not_share_episodes(changes):
     """Whatever the truth depends on keeps its episodes apart."""
-    assert store.folder(PIPE_2D.changed(changes)) != store.folder(PIPE_2D)
+    assert cache.folder(PIPE_2D.changed(changes)) != cache.folder(PIPE_2D)
 
 
 def test_regions_have_integrals_of_their_own():
     """And so a folder of their own."""
     whole = PIPE_2D_DRIFTING.changed({"region": None})
-    assert store.folder(whole) != store.folder(PIPE_2D_DRIFTING)
+    assert cache.folder(whole) != cache.folder(PIPE_2D_DRIFTING)
 
 
 def test_noise_is_that_of_the_instrument():

@@ -6,11 +6,8 @@ import pytest
 from eitbench.data import episodes
 from eitbench.data.episodes import simulate, truth_discretisation
 from eitbench.physics.flow import PlaneChannelFlow
+from eitbench.worlds.catalogue import PIPE_2D_BIASED, PIPE_2D_SKEWED, PIPE_2D_TIME_VARYING, PIPE_2D_UNKNOWN
 from eitbench.worlds.flows import DrawnFlow
-from eitbench.worlds.pipe2d_biased import PIPE_2D_BIASED
-from eitbench.worlds.pipe2d_skewed import PIPE_2D_SKEWED
-from eitbench.worlds.pipe2d_time_varying import PIPE_2D_TIME_VARYING
-from eitbench.worlds.pipe2d_unknown import PIPE_2D_UNKNOWN
 from eitbench.worlds.streams import randomness
 from scipy.stats import kstest
 

@@ -3,7 +3,7 @@ the model."""
 
 import numpy as np
 import pytest
-from eitbench.worlds.pipe3d import PIPE_3D
+from eitbench.worlds.catalogue import PIPE_3D
 
 SMALL = PIPE_3D.changed({
     "vessel": {"electrode_rings": 2, "electrodes_per_ring": 4}, "flow": {"mean_velocity": 16.0},

@@ -11,9 +11,9 @@ import eitbench
 import gymnasium as gym
 import numpy as np
 import pytest
-from eitbench.data import store
+from eitbench.data import cache
 from eitbench.worlds import entries, entry, register, registry
-from eitbench.worlds.pipe2d import PIPE_2D
+from eitbench.worlds.catalogue import PIPE_2D
 from eitbench.worlds.slugs import Slugs
 
 from short import PIPE, register_apart
@@ -111,11 +111,11 @@ def test_injections_are_chosen_in_it_too():
         np.testing.assert_array_equal(two["voltages"][0], one["voltages"])
 
 
-def test_the_file_of_a_part_counts():
-    """Episodes are kept under what they depend on, a part that is written elsewhere among it."""
-    assert store.identity(QUIET)["parts"] != store.identity(PIPE_2D)["parts"]
-    kind = store.identity(QUIET)["world"]["target"]["arrivals"]["kind"]
+def test_a_third_party_part_is_named_with_its_module():
+    """Episodes are kept under what they depend on, and a built-in part of that name is another."""
+    kind = cache.described(QUIET)["target"]["arrivals"]["kind"]
     assert kind == f"{Never.__module__}.Never"
+    assert cache.folder(QUIET) != cache.folder(PIPE_2D)
 
 
 def test_an_id_belongs_to_one_world():

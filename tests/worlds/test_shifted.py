@@ -6,10 +6,9 @@ from eitbench.data.episodes import simulate, truth_discretisation
 from eitbench.data.recordings import cycle_voltages, make_recording
 from eitbench.physics.cem import CompleteElectrodeModel
 from eitbench.worlds import entries, entry, register, registry
-from eitbench.worlds.instrument import Faults, Instrument
-from eitbench.worlds.pipe2d import PIPE_2D
-from eitbench.worlds.pipe2d_shifted import (
+from eitbench.worlds.catalogue import (
     HOME,
+    PIPE_2D,
     PIPE_2D_DOUBLE_NOISE,
     PIPE_2D_OTHER_CONTACTS,
     PIPE_2D_OTHER_INLET,
@@ -17,6 +16,7 @@ from eitbench.worlds.pipe2d_shifted import (
     PIPE_2D_SHORT_SLUGS,
     PIPE_2D_STRONG_SLUGS,
 )
+from eitbench.worlds.instrument import Faults, Instrument
 from eitbench.worlds.streams import randomness
 from eitbench.worlds.task import make_task
 from eitbench.worlds.vessels import PlanePipe, RoundPipe

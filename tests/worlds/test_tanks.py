@@ -13,9 +13,9 @@ from eitbench.data.episodes import simulate, simulate_together, truth_discretisa
 from eitbench.numerics.fem import mass_matrix
 from eitbench.numerics.round import electrode_disc
 from eitbench.worlds.bodies import disc_indicator
+from eitbench.worlds.catalogue import ROTATING_TANK_2D as ROTATING
+from eitbench.worlds.catalogue import STATIONARY_TANK_2D as STATIONARY
 from eitbench.worlds.flows import _stirred
-from eitbench.worlds.rotating_tank import ROTATING_TANK_2D as ROTATING
-from eitbench.worlds.stationary_tank import STATIONARY_TANK_2D as STATIONARY
 from eitbench.worlds.streams import randomness
 from eitbench.worlds.task import make_task
 from eitbench.worlds.vessels import RoundTank

@@ -3,21 +3,17 @@ training runs on."""
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Callable
 from functools import cache, lru_cache
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from eitbench._code import code_digest, package_files
 from eitbench._notice import say
-from eitbench.data import kits, store
-from eitbench.data.recordings import outline
-from eitbench.data.regions import score_mass
+from eitbench.data.cache import Key, cached, described, model_key
+from eitbench.data.regions import outline, score_mass
 from eitbench.estimation import LinearisedObservations, Observation, starting_filter
 from eitbench.estimation.onboard.operator import (
     BROKEN,
@@ -35,6 +31,8 @@ if TYPE_CHECKING:
     from eitbench.worlds.world import World
 
 RANK = 120
+VERSION = 1
+"""Version of the models that are kept."""
 Model = TypeVar("Model")
 
 
@@ -221,23 +219,31 @@ def _stored_model(world: World) -> ReducedModel:
 
 
 def stored_model(world: World, name: str, kind: type[Model], make: Callable[[], Model]) -> Model:
-    """A model, a named tuple of arrays: shipped, or from the cache if one of this name is there;
-    else it is made and kept. Its numbers are rounded to single precision."""
-    def path() -> Path:
-        code = code_digest(package_files("estimation/*.py", "estimation/onboard/*operator.py",
-                                         "estimation/onboard/packing.py", "worlds/task.py"))
-        whose = hashlib.sha256(f"{code} {store.described(world.sound)}".encode()).hexdigest()
-        return store.folder(world) / f"{name}-{whose[:16]}.npz"
+    """Return a model, a named tuple of arrays: shipped, cached or made. Its numbers are rounded to
+    single precision."""
+    key = stored_model_key(world, name)
 
-    def made() -> dict[str, np.ndarray]:
+    def build() -> dict[str, np.ndarray]:
         say(f"making the filter of reduced order of {world.name}, about half a minute; it is kept "
-            f"in {store.folder(world)}")
-        with threadpool_limits(1):                         # as many threads as here, the same bits
-            return packed(make())
+            f"in {key.path.parent}")
+        return pack_model(make)
 
-    entries = kind._fields  # type: ignore[attr-defined]
-    return kind(**unpacked(kits.shipped_or_kept(name, kits.model_numbers(world), path, entries,
-                                                made)))
+    return kind(**unpacked(cached(key, build)))
+
+
+def stored_model_key(world: World, name: str) -> Key:
+    """Return the key of a reduced model, which depends neither on the target nor on the number of
+    steps."""
+    sound = described(world.sound)
+    numbers = {part: sound[part] for part in ("vessel", "flow", "instrument", "prior")}
+    schedule = {part: sound["schedule"][part] for part in ("pattern", "time_step")}
+    return model_key(name, numbers | schedule, VERSION)
+
+
+def pack_model(make: Callable[[], Any]) -> dict[str, np.ndarray]:
+    """Make a model on one thread, whose number changes rounding, and return it as it is stored."""
+    with threadpool_limits(1):
+        return packed(make())
 
 
 def make_model(world: World) -> ReducedModel:

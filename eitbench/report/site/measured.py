@@ -1,7 +1,7 @@
-"""The measured board: how well methods predict what they were not shown of real records.
+"""The measured board: residuals of withheld readings of real instruments, by method.
 
-Nobody knows the truth of most of them. Plays of one record differ in the readings that are withheld
-and are no independent episodes, so the board orders and does not rank.
+The episodes of a case withhold different readings of the same measurements. They are not
+independent, so the board orders methods without ranks.
 """
 
 from __future__ import annotations
@@ -11,105 +11,97 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any, NamedTuple
 
-from eitbench.bench.measured_cases import Case, read_cases
-from eitbench.bench.measured_records import read_measured
+from eitbench.bench.records import finished, read_measured_files
+from eitbench.bench.scores import scores
 from eitbench.bench.table import NOTHING, Cell, Table, number_cell
 from eitbench.bench.text import number
+from eitbench.bench.tracks import registered
+from eitbench.measured.cases import MeasuredCase, read_case
 from eitbench.report.site.beside import Beside
 from eitbench.report.site.collect import MEASURED
 from eitbench.report.templates import template
 
-FOLDER = "measured"
-"""Of cases and records, in that of the leaderboards."""
-MEANINGS = {
-    "missed": "how far estimates miss readings that the method was not shown, root mean square in "
-              "standard deviations of the noise that it was told; 1 is as good as that noise "
-              "allows. Mean of the plays, and the least and the largest of them",
-    "ktc": "score of the Kuopio Tomography Challenge 2023: how alike the bodies of the estimate "
-           "and of the truth are, 1 if they are the same",
-    "NIS/m": "normalised innovations squared over the number of readings: 1 if the method knows "
-             "its error, more if it is too sure of itself",
-    "ms/reading": "time of the fastest play over the number of injections, on the machine that "
-                  "played",
-    "of the floor": "geometric mean, over the cases that a method has played, of what it misses "
-                    "over what the best floor misses; lower is better",
-    "floor": "knows next to nothing: homogeneous fluid, or the last whole frame alone",
+MEANINGS = {each.heading: each.explanation for each in scores("measured").values()
+            if each.name != "error"} | {
+    "relative":
+        "withheld RMSE relative to that of the best naive baseline, geometric mean over the cases "
+        "of a method; lower is better",
+    "floor": "naive baseline: homogeneous fluid, or the last complete frame alone",
 }
-"""What the board says, by its headings and marks."""
+"""Explanations of the board's headings and marks."""
 
 
 class Measured(NamedTuple):
-    """The board's cases that anybody has played, with their records: best first."""
+    """Cases that have records, with their records: the smallest withheld RMSE first."""
 
-    cases: dict[str, Case]
+    cases: dict[str, MeasuredCase]
     records: dict[str, list[dict[str, Any]]]
     complaints: list[str]
-    """A sentence for each file that is no record."""
+    """A sentence for each invalid file."""
 
     @classmethod
     def of(cls, leaderboards: Path) -> Measured:
-        """What lies in the folder of the leaderboards; nothing where nobody has played."""
-        folder = leaderboards / FOLDER
-        cases = read_cases(folder)
-        found, complaints = read_measured(folder, cases)
-        records = {case.name: sorted((each for each in _latest(found)
-                                      if each["case"] == case.name), key=missed)
-                   for case in cases}
-        records = {name: own for name, own in records.items() if own}
-        return cls({case.name: case for case in cases if case.name in records}, records,
-                   complaints)
+        """Read the records in the folder ``results`` of the leaderboards."""
+        found, complaints = read_measured_files(leaderboards / "results")
+        latest: dict[tuple[str, str], dict[str, Any]] = {}
+        for record in sorted(found.values(), key=finished):
+            if any(episode["status"] == "ok" for episode in record["episodes"]):
+                latest[record["environment"]["id"], record["method"]] = record
+        cases, records = {}, {}
+        for id in sorted({id for id, _ in latest}):
+            case = read_case(registered(id)["case"])
+            cases[case.name] = case
+            records[case.name] = sorted((record for (of, _), record in sorted(latest.items())
+                                         if of == id), key=withheld_rmse)
+        return cls(cases, records, complaints)
 
 
 NOBODY = Measured({}, {}, [])
 
 
-def missed(record: dict[str, Any]) -> float:
-    """Mean over the plays, in noise std."""
-    return fmean(play["withheld"] for play in record["plays"])
+def withheld_rmse(record: dict[str, Any]) -> float:
+    """Mean over the episodes, relative to the noise."""
+    return fmean(_values(record, "prediction_error"))
 
 
 def case_table(measured: Measured, name: str) -> Table:
-    """Everybody who has played a case."""
-    records = measured.records[name]
-    truths = dict.fromkeys(score for record in records for play in record["plays"]
-                           for score in play.get("truth", {}))
-    rows = [{"method": _method(record), "missed": _missed(record),
-             "NIS/m": _mean(record, "nis"),
-             **{score: _truth(record, score) for score in truths},
-             "ms/reading": number_cell(min(1e3 * play["seconds"] / play["readings"]
-                                           for play in record["plays"]))}
-            for record in records]
-    return Table.of(rows, label=measured.cases[name].title)
+    """Return the table of the methods of a case."""
+    with_truth = any(_values(record, "ktc") for record in measured.records[name])
+    return Table.of([{
+        "method": _method(record), **_cell(record, "prediction_error", spread=True),
+        **_cell(record, "nis"), **(_cell(record, "ktc") if with_truth else {}),
+        "ms/step": number_cell(1e3 * min(_values(record, "seconds_per_step")))}
+        for record in measured.records[name]], label=measured.cases[name].title)
 
 
 def all_cases_table(measured: Measured) -> Table:
-    """Methods and cases side by side: who has played most of them first, then by what they miss
-    over the floor."""
+    """Return the table of methods and cases: methods of most cases first, then by their withheld
+    RMSE relative to naive baselines."""
     methods: dict[str, dict[str, dict[str, Any]]] = {}
     for name, records in measured.records.items():
         for record in records:
             methods.setdefault(f"{record['method']}@{record['version']}", {})[name] = record
-    floors = {name: min((missed(record) for record in records if record["role"] == "floor"),
+    floors = {name: min((withheld_rmse(record) for record in records if record["role"] == "floor"),
                         default=math.nan) for name, records in measured.records.items()}
 
-    def over_floor(own: dict[str, dict[str, Any]]) -> float:
-        return math.exp(fmean(math.log(missed(record) / floors[name])
+    def relative(own: dict[str, dict[str, Any]]) -> float:
+        return math.exp(fmean(math.log(withheld_rmse(record) / floors[name])
                               for name, record in own.items()))
 
-    order = sorted(methods.values(), key=lambda own: (-len(own), over_floor(own)))
-    rows = [{"method": _method(next(iter(own.values())), short=True),
-             **{name: Cell(number(missed(own[name])), missed(own[name])) if name in own
-                else Cell(NOTHING) for name in measured.records},
-             "of the floor": number_cell(over_floor(own))} for own in order]
-    return Table.of(rows, label="all cases")
+    order = sorted(methods.values(), key=lambda own: (-len(own), relative(own)))
+    return Table.of([{
+        "method": _method(next(iter(own.values())), short=True),
+        **{name: number_cell(withheld_rmse(own[name])) if name in own else Cell(NOTHING)
+           for name in measured.records},
+        "relative": number_cell(relative(own))} for own in order],
+        label="all cases")
 
 
 def measured_pages(measured: Measured, beside: Beside) -> dict[str, bytes]:
-    """The HTML of the page; none where nobody has played."""
+    """Render the page; none without records."""
     if not measured.records:
         return {}
-    shown = [{"case": case, "table": case_table(measured, name),
-              "picture": beside.picture(f"measured-{name}.webp", "")}
+    shown = [{"case": case, "table": case_table(measured, name)}
              for name, case in measured.cases.items()]
     html = template("site/measured.html.j2").render(
         root="", links=beside.links(""), cases=shown, together=all_cases_table(measured),
@@ -118,11 +110,11 @@ def measured_pages(measured: Measured, beside: Beside) -> dict[str, bytes]:
 
 
 def measured_text(measured: Measured) -> list[str]:
-    """The section of the boards as Markdown, in parts; none where nobody has played."""
+    """Render the section of the boards as Markdown, in parts; none without records."""
     if not measured.records:
         return []
-    parts = ["## measured", "Records of real instruments: how far estimates miss readings that the "
-             "method was not shown, in standard deviations of the noise.",
+    parts = ["## measured", "Measurements of real instruments: RMS residual of withheld readings, "
+             "relative to the standard deviation of the noise.",
              all_cases_table(measured).markdown()]
     for name, case in measured.cases.items():
         parts += [f"### {name}", f"{case.title}. Data: {case.source}, {case.file}; licence: "
@@ -130,12 +122,19 @@ def measured_text(measured: Measured) -> list[str]:
     return [*parts, "\n".join(f"- **{name}**: {text}" for name, text in MEANINGS.items())]
 
 
-def _latest(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Of each method on each case the record that was finished last."""
-    found: dict[tuple[str, str], dict[str, Any]] = {}
-    for record in sorted(records, key=lambda record: str(record["finished"])):
-        found[record["case"], record["method"]] = record
-    return list(found.values())
+def _values(record: dict[str, Any], score: str) -> list[float]:
+    found = [episode["scores"].get(score) for episode in record["episodes"]
+             if episode["status"] == "ok"]
+    return [value for value in found if value is not None]
+
+
+def _cell(record: dict[str, Any], score: str, *, spread: bool = False) -> dict[str, Cell]:
+    """Heading and mean of a score, with the least and the largest value where they matter."""
+    heading, values = scores("measured")[score].heading, _values(record, score)
+    cell = number_cell(fmean(values) if values else None)
+    if spread:
+        cell = cell._replace(small=f"{number(min(values))} to {number(max(values))}")
+    return {heading: cell}
 
 
 def _method(record: dict[str, Any], *, short: bool = False) -> Cell:
@@ -144,19 +143,3 @@ def _method(record: dict[str, Any], *, short: bool = False) -> Cell:
     if short:
         return Cell(label, label.casefold(), badges=tuple(badges))
     return Cell(record["title"], record["title"].casefold(), small=label, badges=tuple(badges))
-
-
-def _missed(record: dict[str, Any]) -> Cell:
-    each = [play["withheld"] for play in record["plays"]]
-    return Cell(number(fmean(each)), fmean(each), small=f"{number(min(each))} to "
-                                                        f"{number(max(each))}")
-
-
-def _mean(record: dict[str, Any], name: str) -> Cell:
-    values = [play[name] for play in record["plays"] if play[name] is not None]
-    return number_cell(fmean(values) if values else None)
-
-
-def _truth(record: dict[str, Any], score: str) -> Cell:
-    values = [play["truth"][score] for play in record["plays"] if score in play.get("truth", {})]
-    return number_cell(fmean(values) if values else None)

@@ -1,0 +1,87 @@
+"""One compact table of all published episodes and their scores, made from the records.
+
+A package ships it in place of hundreds of JSON files. A row is an episode; scores and times are in
+SI units and have all their digits, as in the records.
+"""
+
+from __future__ import annotations
+
+import csv
+import gzip
+import io
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from eitbench._files import write_atomically
+
+NAME = "episodes.csv.gz"
+_OF_RECORDS = ("board", "method", "version", "title", "role", "privileged", "official", "split")
+_COLUMNS = ("id", "environment", "kwargs", *_OF_RECORDS, "finished", "seed", "status",
+            "peak_memory")
+"""before the scores"""
+
+
+def table_beside(folder: Path) -> Path:
+    """Return the path of the table that belongs to a folder of records."""
+    return folder.parent / NAME
+
+
+def write_episode_table(records: Iterable[dict[str, Any]], path: Path) -> None:
+    """Write the episodes of records as compressed CSV, atomically; the same records always give the
+    same bytes with one version of zlib."""
+    content = gzip.compress(episode_table(records).encode(), mtime=0)
+    write_atomically(path, content)
+
+
+def episode_table(records: Iterable[dict[str, Any]]) -> str:
+    """Return the table as CSV: a line for each episode, in the order of the records."""
+    rows = [(record, episode) for record in records for episode in record["episodes"]]
+    scores = sorted({name for _, episode in rows for name in episode.get("scores", {})})
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([*_COLUMNS, *scores])
+    for record, episode in rows:
+        environment = record["environment"]
+        own = episode.get("scores", {})
+        finished = max(each["finished"] for each in record["episodes"])
+        writer.writerow([
+            environment["id"], environment["name"],
+            json.dumps(environment["kwargs"], sort_keys=True),
+            *(record[name] for name in _OF_RECORDS), finished, episode["seed"], episode["status"],
+            episode["peak_memory"], *(own.get(name) for name in scores)])
+    return text.getvalue()
+
+
+def read_episode_table(path: Path) -> list[dict[str, Any]]:
+    """Read the records of a table: as they were written, without runs, parameters, hashes and the
+    errors of single steps. ``ValueError``, naming the file, if it is damaged."""
+    records: dict[tuple[str, ...], dict[str, Any]] = {}
+    try:
+        text = gzip.decompress(Path(path).read_bytes()).decode()
+        for row in csv.DictReader(io.StringIO(text)):
+            key = tuple(row[name] for name in ("environment", "method", "version", "split"))
+            record = records.get(key) or records.setdefault(key, _record(row))
+            record["seeds"].append(row["seed"])
+            record["episodes"].append(_episode(row))
+    except (OSError, EOFError, KeyError, ValueError) as error:
+        raise ValueError(f"table of episodes {path} cannot be read: {error}") from None
+    return list(records.values())
+
+
+def _record(row: dict[str, str]) -> dict[str, Any]:
+    environment = {"id": row["id"], "name": row["environment"], "kwargs": json.loads(row["kwargs"])}
+    flags = {name: row[name] == "True" for name in ("privileged", "official")}
+    return {name: row[name] for name in _OF_RECORDS} | flags | {
+        "environment": environment, "role": row["role"] or None, "seeds": [], "episodes": []}
+
+
+def _episode(row: dict[str, str]) -> dict[str, Any]:
+    peak = row["peak_memory"]
+    episode: dict[str, Any] = {name: row[name] for name in ("seed", "status", "finished")}
+    episode["peak_memory"] = int(peak) if peak else None
+    if row["status"] == "ok":
+        names = list(row)[len(_COLUMNS):]
+        episode["scores"] = {name: float(row[name]) for name in names if row[name]}
+    return episode

@@ -1,0 +1,735 @@
+"""Run a third-party estimator or policy in a separate process, confined by bubblewrap where asked.
+
+The worker process receives measurements on its standard input and returns estimates or actions on
+its standard output; messages are JSON and numeric arrays, and nothing that a worker sends is
+unpickled. Under bubblewrap it has no network, no capabilities, its own process table, and a file
+system that holds only Python, installed packages, this package and a private /tmp
+(``docs/trust.md``).
+"""
+
+from __future__ import annotations
+
+import atexit
+import ctypes
+import hashlib
+import io
+import json
+import math
+import os
+import re
+import select
+import shutil
+import signal
+import site
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import fields, is_dataclass
+from functools import cache, partial
+from importlib.metadata import entry_points
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cloudpickle
+import numpy as np
+
+from eitbench import _check
+from eitbench._files import PACKAGE
+from eitbench._foreign import cleaned, traceback_of, where_of
+from eitbench._notice import say
+from eitbench.bench.methods import (
+    PARAMETERS,
+    ROLES,
+    TITLE,
+    Method,
+    find_method,
+    is_ours,
+    is_path,
+    load_method,
+    own_files,
+    own_sha256,
+)
+from eitbench.bench.tracks import BOARDS, Environment, is_measured
+from eitbench.data.cache import CACHE_VARIABLE, cache_folder, model_key
+from eitbench.worlds import streams
+from eitbench.worlds.registry import entry, registered_by_hand, take_over
+
+ISOLATE = ("auto", "none", "process", "bubblewrap")
+"""Values of the option ``isolate``."""
+INSTALL = ("install bubblewrap (apt-get install bubblewrap), or accept a process that can read "
+           "your files with --isolate process")
+REPLY_TIMEOUT_S = 600.0
+EPISODE_TIMEOUT_S = 6 * 3600.0
+CHECK_INTERVAL_S = 0.2
+"""between two checks of a worker's memory and number of threads"""
+MAX_HEADER_BYTES = 1 << 20
+MAX_ARRAY_BYTES = 1 << 28
+MAX_OUTPUT_CHARS = 10_000
+"""of printed text that is shown for one episode"""
+METHOD_NAME = re.compile(r"[^./\\][^/\\]{0,99}")
+NUMERIC_ENV = ("OPENBLAS_", "MKL_", "OMP_", "NPY_", "NUMBA_CPU")
+"""Prefixes of environment variables that change the last bits of results."""
+ETC = ("alternatives", "group", "ld.so.cache", "localtime", "nsswitch.conf", "passwd")
+_NUMERIC_DTYPE = re.compile(r"[<>|][biuf][1248]")
+_ENTRY_POINTS = ("eitbench.worlds", "eitbench.methods", "eitbench.scores", "eitbench.loaders")
+_PR_SET_PDEATHSIG = 1
+_START = "from eitbench.bench.isolation import main; main()"
+
+Arrays = Mapping[str, np.ndarray]
+
+
+class WorkerError(RuntimeError):
+    """A worker's method raised an exception, exceeded a limit, or sent a malformed message."""
+
+    where = "worker"
+    traceback = ""
+    """Lines of the method's own file that led to the error."""
+
+
+class Limits(NamedTuple):
+    """Resources that a worker and all processes it starts may use."""
+
+    memory: int = 8 << 30
+    """bytes of address space of one process, and of resident memory of all"""
+    threads: int = 512
+    """processes and threads"""
+    disk: int = 1 << 30
+    """bytes of one file, and of the private /tmp under bubblewrap"""
+
+
+def choose_isolation(environment: Environment, method: str, isolate: str = "auto", *,
+                     strict: bool = False) -> str:
+    """Return ``none``, ``process`` or ``bubblewrap`` for a method, given by name or path.
+
+    ``auto`` runs built-in methods in this process, and third-party files in a plain process, or
+    under bubblewrap if ``strict``. Other values hold for built-in methods too, except privileged
+    ones. On measurements every method runs in this process, since a worker would read the file with
+    the withheld ones too. ``ValueError`` if there is no such value, bubblewrap is required and does
+    not work, or a third-party file would run in this process where that is ``strict``.
+    """
+    if isolate not in ISOLATE:
+        raise ValueError(f"isolate must be one of {', '.join(ISOLATE)}, got {isolate!r}")
+    if is_ours(method):
+        is_plain = isolate in ("auto", "none") or load_method(method, environment.track).privileged
+        kind = "none" if is_plain else isolate
+    elif isolate == "auto":
+        kind = "bubblewrap" if strict else "process"
+    else:
+        kind = isolate
+    if is_measured(environment.id):
+        if strict and isolate != "none" and not is_ours(method):
+            raise ValueError(f"{method} would run on measurements in this process, which only "
+                             "--isolate none permits")
+        return "none"
+    if strict and kind == "none" and not is_ours(method):
+        raise ValueError(f"isolate must be bubblewrap or process for the third-party file {method}")
+    if kind == "bubblewrap" and (reason := bubblewrap_problem()):
+        raise ValueError(f"{method} must run under bubblewrap, but {reason}; {INSTALL}")
+    if kind == "process" and not is_ours(method):
+        _notify_of_process(method)
+    return kind
+
+
+@cache
+def _notify_of_process(method: str) -> None:
+    say(f"{method} runs in a separate process that can read your files; --isolate bubblewrap "
+        "confines it, --isolate none runs it in this process")
+
+
+@cache
+def bubblewrap_problem() -> str:
+    """Return why bubblewrap cannot confine a process here; empty if it can."""
+    if not shutil.which("bwrap"):
+        return "bubblewrap is not installed"
+    command = [*bubblewrap(Limits()), sys.executable, "-S", "-c", ""]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return f"bubblewrap does not start: {error}"
+    return f"bubblewrap does not work here: {done.stderr.strip()}" if done.returncode else ""
+
+
+def bubblewrap(limits: Limits, files: Mapping[str, str] | None = None) -> list[str]:
+    """Return the command line that confines a program; ``files`` maps further paths inside the
+    sandbox to files outside that it may read."""
+    command = ["bwrap", "--unshare-all", "--die-with-parent", "--new-session", "--cap-drop", "ALL",
+               "--proc", "/proc", "--dev", "/dev", "--size", str(1 << 26), "--tmpfs", "/dev/shm",
+               "--size", str(limits.disk), "--tmpfs", "/tmp"]
+    readable = {place: place for place in map(str, readable_places())}
+    for inside, outside in (readable | dict(files or {})).items():
+        command += ["--ro-bind-try", outside, inside]
+    return [*command, "--remount-ro", "/dev", "--remount-ro", "/", "--chdir", "/tmp"]
+
+
+def readable_places() -> list[Path]:
+    """Return the files and folders that a worker under bubblewrap reads: Python, installed
+    packages, this package and its built-in methods, but nothing else of a checkout."""
+    installed = [place for place in sys.path
+                 if Path(place).name in ("site-packages", "dist-packages")]
+    # An installed package lies among its dependencies, a checkout among records and tests.
+    if not (PACKAGE.parent / "pyproject.toml").exists():
+        installed.append(str(PACKAGE.parent))
+    points = [point for group in _ENTRY_POINTS for point in entry_points(group=group)]
+    for package in sorted({point.module.partition(".")[0] for point in points}):
+        if (found := find_spec(package)) is not None:
+            installed += found.submodule_search_locations or [found.origin or ""]
+    places = ["/usr", "/bin", "/lib", "/lib64", "/sys/devices/system/cpu",
+              *(f"/etc/{name}" for name in ETC), sys.base_prefix, sys.prefix, sys.exec_prefix,
+              *site.getsitepackages(), site.getusersitepackages(), *installed, str(PACKAGE),
+              str(PACKAGE.parent / "baselines")]
+    return [Path(place) for place in dict.fromkeys(places) if place]
+
+
+def check_out_of_reach(path: Path, name: str) -> None:
+    """Raise ``ValueError``, naming what ``name`` calls it, if workers can read the path."""
+    for place in readable_places():
+        if path.resolve().is_relative_to(place.resolve()):
+            raise ValueError(f"{name} {path} must lie outside {place}, which isolated methods can "
+                             "read")
+
+
+# -- messages -----------------------------------------------------------------------------------
+
+
+def encode_message(header: Mapping[str, Any], arrays: Arrays | None = None) -> bytes:
+    """Return a message: two lengths, JSON of header and array layout, and the arrays' bytes."""
+    blocks = {name: np.asarray(array, order="C") for name, array in (arrays or {}).items()}
+    layout = [[name, _numeric(block.dtype.str), block.shape] for name, block in blocks.items()]
+    head = json.dumps([header, layout]).encode()
+    body = b"".join(block.tobytes() for block in blocks.values())
+    return struct.pack("<QQ", len(head), len(body)) + head + body
+
+
+def decode_message(read: Callable[[int], bytes], max_array_bytes: int = MAX_ARRAY_BYTES,
+                   ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Return header and arrays of the next message, where ``read(n)`` returns exactly n bytes.
+    ``ValueError`` if it is too long or malformed."""
+    head_bytes, body_bytes = struct.unpack("<QQ", read(16))
+    if head_bytes > MAX_HEADER_BYTES or body_bytes > max_array_bytes:
+        raise ValueError(f"a message must have at most {MAX_HEADER_BYTES} bytes of JSON and "
+                         f"{max_array_bytes} of arrays, got {head_bytes} and {body_bytes}")
+    head, body = read(head_bytes), read(body_bytes)
+    arrays = {}
+    position = 0
+    try:
+        header, layout = json.loads(head, parse_constant=_numeric)
+        _check.nesting("header", header)
+        json.dumps(header, ensure_ascii=False).encode()  # a lone surrogate cannot be stored
+        for name, dtype, shape in layout:
+            sizes = [_check.integer("axis", size, low=0, high=max_array_bytes) for size in shape]
+            array = np.frombuffer(body + b"\0" * 8, _numeric(dtype), math.prod(sizes), position)
+            arrays[str(name)] = array.reshape(sizes).copy()
+            position += array.nbytes
+        if position != body_bytes or not isinstance(header, dict):
+            raise ValueError("the arrays must fill the message")
+    except (TypeError, ValueError, OverflowError, RecursionError) as error:
+        raise ValueError(f"a message must be JSON and the arrays that it names: {error}") from None
+    return header, arrays
+
+
+def _numeric(dtype: Any) -> str:
+    """Return the dtype if it is numeric; numpy parses others as structures and objects."""
+    if not isinstance(dtype, str) or not _NUMERIC_DTYPE.fullmatch(dtype):
+        raise ValueError(f"values must be finite in JSON and numeric in arrays, got {dtype!r}")
+    return dtype
+
+
+# -- the process that asks ----------------------------------------------------------------------
+
+
+def load_isolated(track: str, id: str, kwargs: str, method: str, isolation: str) -> Method:
+    """Load a method, by name or path, for an environment with these arguments (JSON), without
+    executing its file in this process.
+
+    ``ValueError`` if there is no such file, it cannot be loaded, it is privileged, or it uses the
+    name of a built-in method.
+    """
+    path = find_method(method, track)
+    if is_ours(method):
+        loaded = load_method(method, track)
+        if loaded.privileged:
+            raise ValueError(f"{path} is privileged: it needs the ground truth")
+        start = partial(_start, track, id, kwargs, method, loaded.sha256, isolation)
+        return loaded._replace(make=_RemoteClass(start, loaded.suits))
+    sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
+    return _load(track, id, kwargs, method, path, sha256, isolation)
+
+
+def peak_memory() -> int | None:
+    """Return the most bytes that a process of the current worker has held; None if unknown."""
+    return _current[0][1].peak_memory if _current else None
+
+
+def close() -> None:
+    """End the current worker."""
+    while _current:
+        _current.pop()[1].close()
+
+
+_current: list[tuple[tuple[str, ...], Worker]] = []
+"""The worker of this process, which serves one method in one environment, and its key."""
+
+
+class _RemoteClass:
+    """Stands for a method's class: an instance is the worker, at the beginning of an episode."""
+
+    def __init__(self, start: Callable[[], Worker], suits: Callable[[Any], bool]) -> None:
+        self._start = start
+        self.suits = suits
+
+    def __call__(self, task: Any, random: np.random.Generator | None = None) -> Worker:
+        worker = self._start()
+        worker.begin(random)
+        return worker
+
+
+@cache
+def _load(track: str, id: str, kwargs: str, method: str, path: Path, sha256: str,
+          isolation: str) -> Method:
+    start = partial(_start, track, id, kwargs, method, sha256, isolation)
+    try:
+        about = start().about
+    except WorkerError as error:
+        raise ValueError(f"{path} cannot be loaded: {error}") from None
+    if about.get("privileged"):
+        raise ValueError(f"{path} is privileged: it needs the ground truth")
+    if path.suffix == ".py":
+        about = about | {"name": path.stem}  # a worker may report any name
+    _check_about(path, about, track)
+    built_in = own_files(id).get(about["name"])
+    if built_in is not None and own_sha256(built_in) != sha256:
+        raise ValueError(f"{path} has the name of a built-in method, {about['name']}, under which "
+                         "results are stored; rename it")
+    remote = _RemoteClass(start, lambda _: bool(about.get("suits")))
+    return Method(track, about["name"], about["title"], path, sha256, tuple(about["boards"]),
+                  about["parameters"], remote, about["role"])
+
+
+def _check_about(path: Path, about: dict[str, Any], track: str) -> None:
+    """Raise ``ValueError`` if a worker reports attributes that no method can have."""
+    name, title, boards, role = (about.get(key) for key in ("name", "title", "boards", "role"))
+    valid = {
+        "name": isinstance(name, str) and METHOD_NAME.fullmatch(name) and cleaned(name) == name,
+        "title": isinstance(title, str) and 0 < len(title) <= TITLE and cleaned(title) == title,
+        "role": role is None or role in ROLES,
+        "boards": isinstance(boards, list) and boards and all(
+            board in BOARDS[track] for board in boards)}
+    if wrong := [key for key, is_valid in valid.items() if not is_valid]:
+        raise ValueError(f"{path} reports an invalid {', '.join(wrong)}")
+    _check.document(f"{path}: parameters", about.get("parameters"), PARAMETERS)
+
+
+def _start(track: str, id: str, kwargs: str, method: str, sha256: str, isolation: str) -> Worker:
+    """Return the current worker if it serves this method, else a new one in its place."""
+    key = (track, id, kwargs, method, sha256, isolation)
+    if not _current or _current[0][0] != key or not _current[0][1].is_alive:
+        close()
+        atexit.register(close)
+        worker = Worker(track, id, json.loads(kwargs), method, isolation)
+        _current.append((key, worker))
+    worker = _current[0][1]
+    if worker.sha256 not in ("", sha256):
+        close()
+        raise WorkerError(f"ValueError: {method} was changed during the run")
+    return worker
+
+
+class Worker:
+    """A process that runs one estimator or policy in one environment, episode after episode.
+
+    Parameters
+    ----------
+    track : "estimation" or "injection"
+    id, kwargs
+        The environment. The worker makes its own, without an episode.
+    method : str
+        Name of a built-in method, or the path of a file, whose content is sent to the worker.
+    isolation : "process" or "bubblewrap"
+    limits : Limits
+    reply_timeout : float
+        s
+
+    Raises
+    ------
+    WorkerError
+        If the method cannot be loaded.
+    ValueError
+        If the cache folder lies where a worker under bubblewrap can read.
+    """
+
+    def __init__(self, track: str, id: str, kwargs: dict[str, Any], method: str,
+                 isolation: str = "bubblewrap", *, limits: Limits | None = None,
+                 reply_timeout: float = REPLY_TIMEOUT_S) -> None:
+        self.reply_timeout = reply_timeout
+        self.sha256 = ""
+        """of the file that runs; empty for a built-in method"""
+        self._name = cleaned(Path(method).stem)
+        self._limits = limits or Limits()
+        self._left_s = EPISODE_TIMEOUT_S
+        self._left_chars = MAX_OUTPUT_CHARS
+        self._next_check = 0.0
+        self._is_confined = isolation == "bubblewrap"
+        self._home = Path("/tmp" if self._is_confined else tempfile.mkdtemp(prefix="eitbench-"))
+        command = [sys.executable, "-P", "-c", _START, json.dumps(self._limits)]
+        if self._is_confined:
+            check_out_of_reach(cache_folder(), "the cache folder")
+            command = [*bubblewrap(self._limits, {"/tmp/cache/models": _models_folder()}), *command]
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+            start_new_session=True, env=self._environment(), cwd="/")
+        try:
+            assert self._process.stdin is not None and self._process.stdout is not None
+            self._input, self._output = self._process.stdin.fileno(), self._process.stdout.fileno()
+            os.set_blocking(self._input, False)
+            self.about = self._ask({"do": "load", "track": track, "id": id, "kwargs": kwargs},
+                                   self._files(id, method))[0]
+            """What the method's class reports about itself, unchecked."""
+        except BaseException:
+            self.close()
+            raise
+
+    def begin(self, random: np.random.Generator | None = None) -> None:
+        """Begin an episode with a new instance of the method; a policy draws from a generator in
+        the state of ``random``."""
+        self._left_s = EPISODE_TIMEOUT_S
+        self._left_chars = MAX_OUTPUT_CHARS
+        state = None if random is None else random.bit_generator.state
+        self._ask({"do": "begin", "random": state})
+
+    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Any:
+        """Return the estimator's `Estimate`, or None, after a measurement."""
+        from eitbench.worlds.task import Estimate
+        header, arrays = self._ask({"do": "update"}, {"voltages": voltages, "currents": currents})
+        if header.get("estimate") is None:
+            return None
+        if header["estimate"] != "Estimate" or not {"mean"} <= set(arrays) <= set(Estimate._fields):
+            raise WorkerError("ValueError: Estimator.update must return an Estimate or None, got "
+                              f"{_text(header['estimate'])}")
+        return Estimate(**arrays)
+
+    def act(self, observation: Arrays) -> Any:
+        """Return the policy's action."""
+        action = self._ask({"do": "act"}, observation)[1].get("action", np.zeros(0))
+        return int(action) if action.shape == () and action.dtype.kind in "iu" else action
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether the process can be asked: not after a crash, a limit or a malformed message."""
+        return self._process.poll() is None
+
+    @property
+    def peak_memory(self) -> int | None:
+        """Most bytes that one of its processes has held; None where /proc does not tell."""
+        return max((_status(pid, "VmHWM") for pid in self._family()), default=0) or None
+
+    def close(self) -> None:
+        """End the process and its children, and remove its folder."""
+        self._kill()
+        for pipe in (self._process.stdin, self._process.stdout):
+            if pipe:
+                pipe.close()
+        if not self._is_confined:
+            shutil.rmtree(self._home, ignore_errors=True)
+
+    def _environment(self) -> dict[str, str]:
+        """Return the worker's environment variables, which tell nothing about this process."""
+        variables = {name: value for name, value in os.environ.items()
+                     if name.startswith(NUMERIC_ENV)}
+        threads = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+        paths = {"PATH": os.environ.get("PATH", ""), "PYTHONPATH": str(PACKAGE.parent),
+                 "HOME": str(self._home), "TMPDIR": str(self._home),
+                 CACHE_VARIABLE: "/tmp/cache" if self._is_confined else str(cache_folder())}
+        kernels = {"NUMBA_CACHE_DIR": "/tmp/kernels"} if self._is_confined else {}
+        return variables | threads | paths | kernels | {"PYTHONDONTWRITEBYTECODE": "1"}
+
+    def _files(self, id: str, method: str) -> dict[str, np.ndarray]:
+        """Return the name of the method, the contents of its files, and an entry that only a
+        script has registered, as bytes."""
+        contents = {"method": str(method).encode(), "entry": _pickled_entry(id)}
+        if is_path(method) and is_ours(method):
+            contents["method"] = str(Path(method).resolve()).encode()
+        elif is_path(method):
+            path = Path(method)
+            beside = ("config.json", "sha256") if path.suffix == ".zip" else ()
+            for each in (path, *(path.with_name(name) for name in beside)):
+                if each.exists():
+                    contents[f"file:{each.name}"] = each.read_bytes()
+            contents["method"] = path.name.encode()
+            self.sha256 = hashlib.sha256(contents[f"file:{path.name}"]).hexdigest()
+        return {name: np.frombuffer(content, np.uint8) for name, content in contents.items()}
+
+    def _ask(self, header: dict[str, Any], arrays: Arrays | None = None,
+             ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        begin = time.monotonic()
+        try:
+            self._send(encode_message(header, arrays))
+            reply, received = self._receive()
+            self._left_s -= time.monotonic() - begin
+            if self._left_s < 0.0:
+                raise WorkerError("TimeoutError: its replies in one episode took more than "
+                                  f"{EPISODE_TIMEOUT_S:g} s")
+        except BaseException:  # a later reply would belong to this request
+            self._kill()
+            raise
+        self._show(_text(reply.pop("printed", ""), MAX_OUTPUT_CHARS))
+        if "error" in reply:
+            error = WorkerError(_text(reply["error"]))
+            error.where = _text(reply.get("where"))
+            error.traceback = _text(reply.get("traceback"))
+            raise error
+        return reply, received
+
+    def _show(self, printed: str) -> None:
+        """Print what the method has printed, each line marked with its name."""
+        if printed := printed[:self._left_chars].rstrip("\n"):
+            lines = cleaned(printed, lines=True).replace("\n", f"\n[{self._name}] ")
+            sys.stderr.write(f"[{self._name}] {lines}\n")
+        self._left_chars -= len(printed)
+
+    def _send(self, message: bytes) -> None:
+        deadline = time.monotonic() + self.reply_timeout
+        left = memoryview(message)
+        while left:  # a worker that does not read leaves the pipe full
+            self._wait([], [self._input], deadline)
+            try:
+                left = left[os.write(self._input, left):]
+            except BrokenPipeError:
+                raise self._ended() from None
+
+    def _receive(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        deadline = time.monotonic() + self.reply_timeout
+
+        def read(n: int) -> bytes:
+            parts = bytearray()
+            while len(parts) < n:
+                self._wait([self._output], [], deadline)
+                part = os.read(self._output, min(n - len(parts), 1 << 20))
+                if not part:
+                    raise self._ended()
+                parts += part
+            return bytes(parts)
+
+        try:
+            return decode_message(read)
+        except ValueError as error:
+            raise WorkerError(f"ValueError: {error}") from None
+
+    def _wait(self, readers: list[int], writers: list[int], deadline: float) -> None:
+        """Return when a pipe is ready; check time, memory and number of threads meanwhile."""
+        while True:
+            now = time.monotonic()
+            if now > deadline:
+                raise WorkerError(f"TimeoutError: no reply within {self.reply_timeout:g} s")
+            if now > self._next_check:
+                self._check_limits()
+                self._next_check = time.monotonic() + CHECK_INTERVAL_S
+            wait = min(CHECK_INTERVAL_S, deadline - now)
+            if any(select.select(readers, writers, [], max(0.0, wait))[:2]):
+                return
+
+    def _check_limits(self) -> None:
+        family = self._family()
+        threads = sum(_status(pid, "Threads") for pid in family)
+        memory = sum(_status(pid, "VmRSS") for pid in family)
+        if threads > self._limits.threads:
+            raise WorkerError(f"ResourceLimitError: it started more than {self._limits.threads} "
+                              "processes and threads")
+        if memory > self._limits.memory:
+            raise WorkerError("ResourceLimitError: it held more than "
+                              f"{self._limits.memory >> 20} MiB")
+
+    def _family(self) -> list[int]:
+        """Return the ids of the process and its descendants, of somewhat more than allowed at
+        most."""
+        found: list[int] = []
+        left = [self._process.pid]
+        while left and len(found) <= self._limits.threads:
+            pid = left.pop()
+            found.append(pid)
+            with suppress(OSError):
+                for thread in os.listdir(f"/proc/{pid}/task"):
+                    children = Path(f"/proc/{pid}/task/{thread}/children").read_text()
+                    left += map(int, children.split())
+        return found
+
+    def _ended(self) -> WorkerError:
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(1.0)
+        self._kill()
+        return WorkerError(f"ChildProcessError: the worker ended with status "
+                           f"{self._process.returncode}, as after a crash or at a memory limit")
+
+    def _kill(self) -> None:
+        """Kill the process and its children; under bubblewrap the kernel ends all of them."""
+        with suppress(ProcessLookupError, PermissionError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.wait()
+
+
+def _status(pid: int, field: str) -> int:
+    """Return a number of /proc/PID/status, bytes if it is a size; 0 if it is missing."""
+    try:
+        text = Path(f"/proc/{pid}/status").read_text(errors="replace")
+    except OSError:
+        return 0
+    found = re.search(rf"^{field}:\s+(\d+)( kB)?", text, re.MULTILINE)
+    return int(found[1]) * (1024 if found[2] else 1) if found else 0
+
+
+def _models_folder() -> str:
+    """Return the part of the cache that holds no episode."""
+    return str((cache_folder() / model_key("", None, 0).folder).absolute())
+
+
+def _classes(part: Any) -> list[type]:
+    """Return the classes of a world's parts, and their ancestors."""
+    parts = [getattr(part, each.name) for each in fields(part)]
+    return [*type(part).__mro__,
+            *(kind for inner in parts if is_dataclass(inner) for kind in _classes(inner))]
+
+
+def _pickled_entry(id: str) -> bytes:
+    """Return an entry that a script has registered, with the code of its parts; else nothing."""
+    if id not in [each.id for each in registered_by_hand()]:
+        return b""
+    names = {kind.__module__ for kind in _classes(entry(id).world)} & set(sys.modules)
+    modules = [sys.modules[name] for name in sorted(names)
+               if name.partition(".")[0] not in {"eitbench", *sys.stdlib_module_names}]
+    for module in modules:  # a worker cannot import them
+        cloudpickle.register_pickle_by_value(module)
+    try:
+        return bytes(cloudpickle.dumps(entry(id)))
+    finally:
+        for module in modules:
+            cloudpickle.unregister_pickle_by_value(module)
+
+
+def _text(value: Any, length: int = 2000) -> str:
+    return str(value)[:length]
+
+
+# -- the worker process -------------------------------------------------------------------------
+
+
+def main() -> None:
+    """Serve one method on standard input and output until the other side closes them."""
+    incoming, outgoing = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
+    null = os.open(os.devnull, os.O_RDWR)
+    for stream in range(3):  # what a method prints is not a reply
+        os.dup2(null, stream)
+    _set_limits(Limits(*json.loads(sys.argv[1])))
+    _copy_kernels()
+    server = _MethodServer()
+    while True:
+        sys.stdout = sys.stderr = printed = io.StringIO()
+        try:
+            header, arrays = decode_message(partial(_read_exactly, incoming), 2 * MAX_ARRAY_BYTES)
+        except EOFError:
+            return
+        try:
+            reply, result = getattr(server, header["do"])(header, arrays)
+            message = encode_message(reply | _printed(printed), result)
+        except (Exception, SystemExit) as error:
+            message = encode_message(server.describe(error) | _printed(printed))
+        outgoing.write(message)
+        outgoing.flush()
+
+
+def _read_exactly(stream: Any, n: int) -> bytes:
+    content = bytes(stream.read(n))
+    if len(content) < n:
+        raise EOFError
+    return content
+
+
+def _printed(stream: io.StringIO) -> dict[str, str]:
+    text = stream.getvalue()[:MAX_OUTPUT_CHARS].encode(errors="replace").decode()
+    return {"printed": text} if text else {}
+
+
+def _set_limits(limits: Limits) -> None:
+    """Limit address space, file size and open files, and end this process with its parent."""
+    import resource  # not on Windows
+    most = {resource.RLIMIT_AS: limits.memory, resource.RLIMIT_FSIZE: limits.disk,
+            resource.RLIMIT_NOFILE: 1024, resource.RLIMIT_CORE: 0}
+    if os.environ["HOME"] == "/tmp":  # else all processes of the user count
+        most[resource.RLIMIT_NPROC] = limits.threads
+    for kind, value in most.items():
+        resource.setrlimit(kind, (value, value))
+    if sys.platform.startswith("linux"):
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+
+
+def _copy_kernels() -> None:
+    """Copy compiled kernels to where numba expects them; to compile them takes 20 s."""
+    if "NUMBA_CACHE_DIR" not in os.environ:
+        return
+    source = PACKAGE / "numerics"
+    name = f"{source.name}_{hashlib.sha1(str(source).encode()).hexdigest()}"
+    place = Path(os.environ["NUMBA_CACHE_DIR"]) / name
+    place.mkdir(parents=True)
+    for path in (source / "__pycache__").glob("*.nb?"):
+        shutil.copy2(path, place)
+
+
+class _MethodServer:
+    """The requests that a worker answers; each returns a header and arrays."""
+
+    def __init__(self) -> None:
+        self._file = Path()
+        self._method: Any = None
+        self._known: Any = None
+        self._instance: Any = None
+
+    def load(self, header: dict[str, Any], arrays: Arrays) -> tuple[dict[str, Any], Arrays]:
+        """Load the method and return what its class reports about itself."""
+        import gymnasium as gym
+        contents = {name: array.tobytes() for name, array in arrays.items()}
+        method = contents["method"].decode()
+        if contents["entry"]:  # from the trusted side
+            take_over([cloudpickle.loads(contents["entry"])])
+        home = Path.home() / "method"
+        home.mkdir()
+        for name in (name for name in contents if name.startswith("file:")):
+            file = home / name.removeprefix("file:")
+            file.write_bytes(contents[name])
+            if file.name == method:
+                self._file = file
+        env: Any = gym.make(header["id"], disable_env_checker=True, **header["kwargs"]).unwrapped
+        self._method = load_method(str(self._file) if self._file.name else method, header["track"])
+        self._known = env.task if header["track"] == "estimation" else env.rules
+        attributes = ("name", "title", "boards", "parameters", "role", "privileged")
+        about = {name: getattr(self._method, name) for name in attributes}
+        return about | {"suits": self._method.suits(self._known)}, {}
+
+    def begin(self, header: dict[str, Any], arrays: Arrays) -> tuple[dict[str, Any], Arrays]:
+        """Make a new instance of the method."""
+        random = header["random"]
+        drawn = [] if random is None else [streams.in_state(random)]
+        self._instance = self._method.make(self._known, *drawn)
+        return {}, {}
+
+    def update(self, header: dict[str, Any], arrays: Arrays) -> tuple[dict[str, Any], Arrays]:
+        """Return the estimator's estimate after a measurement."""
+        estimate = self._instance.update(arrays["voltages"], arrays["currents"])
+        if not hasattr(estimate, "_asdict"):
+            return {"estimate": None if estimate is None else type(estimate).__name__}, {}
+        given = {name: value for name, value in estimate._asdict().items() if value is not None}
+        return {"estimate": "Estimate"}, {name: np.asarray(value) for name, value in given.items()}
+
+    def act(self, header: dict[str, Any], arrays: Arrays) -> tuple[dict[str, Any], Arrays]:
+        """Return the policy's action."""
+        return {}, {"action": np.asarray(self._instance.act(arrays))}
+
+    def describe(self, error: BaseException) -> dict[str, str]:
+        """Return an error as the header of a reply."""
+        message = f"{type(error).__name__}: {error}".replace(f"{self._file.parent}/", "")
+        found = {"error": message, "where": where_of(error, self._file),
+                 "traceback": traceback_of(error, self._file)}
+        return {key: _text(value).encode(errors="replace").decode()
+                for key, value in found.items()}

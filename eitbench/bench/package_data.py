@@ -1,0 +1,118 @@
+"""The files that the package ships so that built-in worlds start fast: scoring constants, reduced
+models, and the first steps of the first training episode."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from eitbench.bench.tracks import own_ids
+from eitbench.data.beginnings import make_beginning, shipped_key
+from eitbench.data.cache import PACKAGE_DATA, Arrays, Key, load_shipped, ship
+from eitbench.data.regions import csr_of, make_outline, make_region, outline_key, region_key
+from eitbench.estimation.onboard import joint_operator, reduced_operator
+from eitbench.estimation.onboard.packing import unpacked
+from eitbench.estimation.onboard.reduced_operator import pack_model, stored_model_key
+from eitbench.worlds.registry import Entry, entries, entry
+
+TOLERANCE = 1e-5
+"""Accepted difference relative to an array's largest entry: models are kept in single precision."""
+
+
+class ShippedFile(NamedTuple):
+    """A file that the package ships."""
+
+    key: Key
+    build: Callable[[], Arrays]
+
+
+def expected_files(ids: Iterable[str]) -> list[ShippedFile]:
+    """Return the files that these ids need, each once."""
+    files = {file.key: file for id in ids for file in _files(entry(id))}
+    return list(files.values())
+
+
+def _files(registered: Entry) -> Iterator[ShippedFile]:
+    world = registered.world
+    yield ShippedFile(outline_key(world), lambda: make_outline(world))
+    if world.region is not None:
+        yield ShippedFile(region_key(world), lambda: make_region(world))
+    needed = max(_needed_steps(each) for each in entries().values()
+                 if each.world.fluid == world.fluid)
+    if needed <= world.warm_up:
+        yield ShippedFile(shipped_key(world), lambda: make_beginning(world, needed))
+    if registered.track == "injection":
+        joint = world.velocity_model is not None
+        make = joint_operator.make_model if joint else reduced_operator.make_model
+        yield ShippedFile(stored_model_key(world, "joint" if joint else "reduced"),
+                          lambda: pack_model(lambda: make(world.sound)))
+
+
+def _needed_steps(registered: Entry) -> int:
+    """Return the steps of an episode that the first observation needs."""
+    return 1 + (registered.track == "injection") * len(registered.world.currents)
+
+
+def write_package_data(ids: Iterable[str] = ()) -> Iterator[tuple[str, str]]:
+    """Rebuild the shipped files of built-in ids (default: all), in five minutes, write the missing
+    ones and compare the others.
+
+    Yields
+    ------
+    name, result
+        ``result`` is ``new``, ``same`` or the difference, and then the file stays as it is.
+    """
+    for file in expected_files(ids or own_ids()):
+        built = file.build()
+        if not file.key.shipped_path.is_file():
+            ship(file.key, built)
+            yield file.key.name, "new"
+        else:
+            yield file.key.name, difference(load_shipped(file.key), built) or "same"
+
+
+def unused_files() -> list[str]:
+    """Return the names of shipped files that no built-in id needs."""
+    needed = {file.key.shipped_path.name for file in expected_files(own_ids())}
+    return sorted(path.name for path in PACKAGE_DATA.iterdir() if path.name not in needed)
+
+
+def difference(shipped: Arrays | None, built: Arrays) -> str:
+    """Return how shipped arrays differ from those built now; empty within `TOLERANCE`.
+
+    Another processor may choose another basis of the same space: models are compared in one. It
+    may also round to zero other entries of a sparse matrix.
+    """
+    if shipped is None:
+        return "missing or damaged"
+    if "indptr" in built:
+        shipped, built = _dense(shipped), _dense(built)
+    for name, array in built.items():
+        there = shipped[name]
+        if there.shape != array.shape or there.dtype != array.dtype:
+            return f"{name} is {there.dtype} {there.shape}, built {array.dtype} {array.shape}"
+    if "basis" in built:
+        shipped, built = unpacked(shipped), unpacked(built)
+        shipped = _in_basis(shipped, built["basis"])
+    for name, array in built.items():
+        off = np.abs(shipped[name].astype(float) - array).max() / (np.abs(array).max() or 1.0)
+        if not off <= TOLERANCE:
+            return f"{name} differs by {off:.2g} of its largest entry"
+    return ""
+
+
+def _dense(arrays: Arrays) -> Arrays:
+    """Return an outline or region mass with its matrix as one dense array."""
+    return {"mass": csr_of(arrays).toarray()} | {
+        name: array for name, array in arrays.items() if name == "largest"}
+
+
+def _in_basis(model: Arrays, basis: np.ndarray) -> Arrays:
+    """Return a model in the coordinates of another basis (n, r) of the same space."""
+    turn, *_ = np.linalg.lstsq(model["basis"], basis)
+    back = np.linalg.inv(turn)
+    return {**model, "basis": model["basis"] @ turn,
+            "transition": back @ model["transition"] @ turn,
+            "noise": back @ model["noise"] @ back.T, "initial": back @ model["initial"] @ back.T}

@@ -1,0 +1,330 @@
+"""Episodes as examples to learn from: measurements, and the true concentration.
+
+The truth is given on the estimators' nodes, as the concentration p_t that is nearest to it in the
+norm of the score. With M̃ and b_t as in `eitbench.data.regions`, M̃ p_t = b_t and
+    ∫(ĉ − c_t)² = (ĉ − p_t)ᵀ M̃ (ĉ − p_t) + ∫(p_t − c_t)²
+for every ĉ on these nodes: scores need no mesh of the truth. In reduced coordinates, ĉ = c̄ + B â
+and G = Bᵀ M̃ B, with a_t the coordinates nearest to the truth, scores are exact too:
+    ∫(c̄ + B â − c_t)² = (â − a_t)ᵀ G (â − a_t) + ∫(c̄ + B a_t − c_t)².
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from tqdm import tqdm
+
+from eitbench import _check
+from eitbench._extras import needed_by
+from eitbench.data.bank import TOGETHER, fill_here
+from eitbench.data.episodes import once
+from eitbench.data.recordings import cycle_voltages, recording
+from eitbench.data.regions import integrals, outline, score_mass
+from eitbench.data.seeds import is_test, name_seed, parse_seeds
+from eitbench.worlds.registry import entry
+from eitbench.worlds.world import World
+
+if TYPE_CHECKING:
+    import scipy.sparse as sp
+
+    from eitbench.numerics.mesh import Mesh
+
+MIN_MASS = 1e-9
+"""Fraction of the largest diagonal mass below which a node only touches a region by rounding."""
+SNAPSHOT_STRIDE = 2
+"""Steps between the states from which modes are computed."""
+RANK_TOLERANCE = 1e-12
+"""Directions with a smaller fraction of the largest squared singular value are dependent."""
+
+
+class Example(NamedTuple):
+    """An episode, t = 1 … T: L readings and n nodes of the estimators' mesh at each t."""
+
+    seed: int
+    """see `eitbench.data.seeds`"""
+    voltages: np.ndarray
+    """(T, L) V, measured under the world's injection cycle"""
+    currents: np.ndarray
+    """(T, L) A (A/m in 2D), injected"""
+    truth: np.ndarray
+    """(T, n) float32 mol/m³, the true concentration's projection p_t, or (T, q) its coordinates"""
+    unresolved: np.ndarray
+    """(T,) ∫(p_t − c_t)² in (mol/m³)²·m² (m³ in 3D): the error of the best estimate"""
+    square: np.ndarray
+    """(T,) ∫c_t² in the same unit"""
+    velocity: np.ndarray
+    """(T, k) m/s, the flow parameters that fit the true flow best; k = 0 where the flow is known"""
+
+
+@dataclass(frozen=True, eq=False)
+class Dataset:
+    """Examples of a world, in the order of their seeds; `dataset` makes it.
+
+    Iterating holds one example at a time. Missing episodes are simulated, eight together, and kept
+    in the cache; `eitbench bank` does so beforehand, in several processes.
+    """
+
+    env: str
+    """the environment's id"""
+    world: World
+    seeds: tuple[int, ...]
+    basis: np.ndarray | None = None
+    """(n, q) B in mol/m³ of reduced coordinates, or None: nodes"""
+    mean: float | np.ndarray = 0.0
+    """c̄ in mol/m³, one or (n,)"""
+
+    def __len__(self) -> int:
+        return len(self.seeds)
+
+    def __iter__(self) -> Iterator[Example]:
+        for k in range(0, len(self.seeds), TOGETHER):
+            group = self.seeds[k:k + TOGETHER]
+            fill_here(self.world, group)
+            yield from map(self.example, group)
+
+    def __getitem__(self, index: int) -> Example:
+        return self.example(self.seeds[index])
+
+    def example(self, seed: int) -> Example:
+        """Return the example of one episode, which is simulated if the cache does not hold it."""
+        world = self.world
+        entries = recording(world, seed)
+        truth, unresolved, square = _projected(world, seed, entries)
+        cycle = world.currents
+        nodal = Example(seed, cycle_voltages(world, seed, entries),
+                        cycle[np.arange(world.n_steps) % len(cycle)],
+                        (world.background + truth).astype(np.float32), unresolved, square,
+                        _fitted_flow(world, entries))
+        return nodal if self.basis is None else self.of(nodal)
+
+    def of(self, example: Example) -> Example:
+        """Return an example on the nodes in these coordinates."""
+        deviation = example.truth.astype(float) - self.mean
+        a = np.linalg.solve(self.mass, self._weighted.T @ deviation.T).T
+        left = deviation - a @ self._columns.T
+        square = np.einsum("tn,nt->t", left, self._nodal_mass @ left.T)
+        return example._replace(truth=a, unresolved=example.unresolved + square)
+
+    @property
+    def mesh(self) -> Mesh:
+        """Mesh of the nodes."""
+        return self.world.vessel.carrier(fine=False)[0]  # type: ignore[no-any-return]
+
+    @property
+    def warm_up(self) -> int:
+        """Number of first states that are not scored."""
+        return self.world.warm_up
+
+    @cached_property
+    def mass(self) -> Any:
+        """Sparse M̃ (n, n) in m² (m³ in 3D): ∫f² = fᵀ M̃ f of nodal values f, over what counts; or
+        G (q, q) in (mol/m³)²·m², the identity for a basis of `modes`."""
+        if self.basis is None:
+            return self._nodal_mass
+        gram = self._columns.T @ self._weighted
+        return 0.5 * (gram + gram.T)
+
+    def errors(self, example: Example, estimate: np.ndarray) -> np.ndarray:
+        """Return ∫(ĉ_t − c_t)²/∫c_t² (T,) of an ``estimate`` of the shape of `Example.truth`; ẽ_c
+        (thesis 5.12) is the mean over t > warm_up, as the environment scores it."""
+        estimate = _check.array("estimate", estimate, example.truth.shape)
+        off = estimate - example.truth
+        return (np.einsum("tn,nt->t", off, self.mass @ off.T) + example.unresolved) / example.square
+
+    def modes(self, q: int) -> np.ndarray:
+        """Return the q strongest modes (n, q) of the scored states of these examples relative to
+        the background: the best basis in the norm of the score, and orthonormal in it.
+        ``ValueError`` if there are fewer than q."""
+        return strongest(self, q)[0]
+
+    def reduced(self, basis: np.ndarray, mean: float | np.ndarray | None = None) -> Dataset:
+        """Return the same examples in coordinates a, c = mean + basis a, with exact scores.
+
+        Parameters
+        ----------
+        basis : (n, q) array, mol/m³
+            Such as `modes`. ``ValueError`` if its columns depend on each other.
+        mean : float or (n,) array, mol/m³
+            Default: the world's background.
+        """
+        n = self.mesh.n_nodes
+        basis = _check.array("basis", basis, (n, None), units="mol/m³")
+        if mean is None:
+            mean = self.world.background
+        elif np.ndim(mean):
+            mean = _check.array("mean", mean, (n,), units="mol/m³")
+        else:
+            _check.number("mean", mean, units="mol/m³")
+        reduced = Dataset(self.env, self.world, self.seeds, basis, mean)
+        squares = np.linalg.eigvalsh(reduced.mass)
+        if not squares[0] > RANK_TOLERANCE * squares[-1]:
+            raise ValueError("basis must have independent columns over what is scored; some of "
+                             f"these {len(squares)} depend on others")
+        return reduced
+
+    def concentration(self, coordinates: np.ndarray) -> np.ndarray:
+        """Return mol/m³ (..., n) of coordinates (..., q)."""
+        found: np.ndarray = self.mean + coordinates @ self._columns.T
+        return found
+
+    def torch(self) -> TorchDataset:
+        """Return the same as a map-style dataset for torch. ``ModuleNotFoundError`` without torch.
+
+        Missing episodes are simulated one by one when they are requested: `eitbench bank` does so
+        sooner and faster.
+        """
+        with needed_by("a dataset for torch"):
+            import torch  # noqa: F401
+        return TorchDataset(self)
+
+    @cached_property
+    def _nodal_mass(self) -> sp.csr_array:
+        return _symmetric(score_mass(self.world))
+
+    @property
+    def _columns(self) -> np.ndarray:
+        if self.basis is None:
+            raise ValueError("coordinates are those of `Dataset.reduced`, which has a basis")
+        return self.basis
+
+    @cached_property
+    def _weighted(self) -> np.ndarray:
+        weighted: np.ndarray = self._nodal_mass @ self._columns
+        return weighted
+
+
+class TorchDataset:
+    """A dataset whose items hold the fields of an `Example` as tensors in single precision."""
+
+    def __init__(self, examples: Dataset) -> None:
+        self.examples = examples
+
+    def __len__(self) -> int:
+        return len(self.examples)
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        import torch
+        fields = self.examples[index]._asdict()
+        seed = torch.tensor(fields.pop("seed"))
+        return {"seed": seed} | {name: torch.from_numpy(np.array(field, dtype=np.float32))
+                                 for name, field in fields.items()}
+
+
+def dataset(env: str, seeds: str | Sequence[int], *,
+            world: Mapping[str, Any] | None = None) -> Dataset:
+    """Return episodes of an environment as examples to learn from.
+
+    Parameters
+    ----------
+    env : str
+        A registered id. Of an injection environment, the voltages of its world's own cycle.
+    seeds : str or sequence of int
+        As in ``"train:0-199"``, or the seeds themselves. Test episodes, on which methods are
+        scored, require that their split is named: ``"test:0-9"``.
+    world : dict, optional
+        Numbers of the world's parts to change; see `World.changed`.
+
+    Raises
+    ------
+    ValueError
+        For an unknown environment, number or seed, or a test episode without its split.
+    """
+    return Dataset(env, entry(env).world.changed(world), asked_seeds(seeds))
+
+
+def asked_seeds(seeds: str | Sequence[int]) -> tuple[int, ...]:
+    """Return each seed once; ``ValueError`` for none, or a test episode without its split."""
+    numbers = parse_seeds(seeds) if isinstance(seeds, str) else [
+        _check.integer("seeds", seed, low=0) for seed in seeds]
+    if not numbers:
+        raise ValueError(f"seeds must name at least one episode, got {seeds!r}")
+    named = isinstance(seeds, str) and ":" in seeds
+    if not named and (tests := [seed for seed in numbers if is_test(seed)]):
+        raise ValueError("seeds must name the split of test episodes, on which methods are scored: "
+                         f"'{name_seed(tests[0])}', got {tests[0]}")
+    return tuple(dict.fromkeys(numbers))
+
+
+def strongest(examples: Dataset, q: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return modes (n, q) as `Dataset.modes` does, and the mean square (n,) in (mol/m³)² of the
+    remainder of c − background."""
+    n = examples.mesh.n_nodes
+    q = _check.integer("q", q, low=1, high=n)
+    second = np.zeros((n, n))
+    states = 0
+    for example in tqdm(examples, desc="modes", unit="episode", disable=None):
+        truth = example.truth[examples.warm_up::SNAPSHOT_STRIDE].astype(float)
+        deviation = truth - examples.world.background
+        second += deviation.T @ deviation
+        states += len(deviation)
+    second /= states
+    # R Rᵀ = second; modes R v/√λ of the eigenvectors v of Rᵀ M̃ R, since M̃ may be singular
+    values, vectors = np.linalg.eigh(second)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    values, vectors = np.linalg.eigh(root.T @ (examples.mass @ root))
+    many = int((values > RANK_TOLERANCE * values[-1]).sum())
+    if q > many:
+        raise ValueError(f"q must be at most {many}, as many modes as these states have; got {q}")
+    last = slice(None, -q - 1, -1)
+    basis = root @ vectors[:, last] / np.sqrt(values[last])
+    left = second.diagonal() - basis**2 @ values[last]
+    return basis, np.maximum(left, 0.0)
+
+
+def _fitted_flow(world: World, entries: np.ndarray) -> np.ndarray:
+    """Return the flow parameters (T, k) in m/s that fit a recording best."""
+    velocity = world.velocity_model
+    if velocity is None:
+        return np.empty((len(entries), 0))
+    gram = velocity.profiles.T @ (velocity.weights[:, None] * velocity.profiles)
+    return np.linalg.solve(gram, entries["velocity_moment"].T).T
+
+
+def _projected(world: World, seed: int,
+               entries: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return p_t less the background (T, n), ∫(p_t − c_t)² and ∫c_t² (T,).
+
+    With a region the integrals are over the region, and p_t is the projection there; nodes beyond
+    it have the projection of the whole vessel.
+    """
+    truth = _solver(world)(entries["moment"].astype(float).T).T
+    counted = integrals(world, seed, entries)
+    moment = counted.moment.astype(float)
+    if world.region is not None:
+        inside, solve = _region_solver(world)
+        truth[:, inside] = solve(moment[:, inside].T).T
+    unresolved = counted.deviation - np.einsum("tn,tn->t", moment, truth)
+    return truth, unresolved, np.array(counted.square)
+
+
+Solver = Callable[[np.ndarray], np.ndarray]
+
+
+@once(4)
+def _solver(world: World) -> Solver:
+    """Return b (n, T) -> M̃⁻¹ b over the whole vessel."""
+    return _factorised(_symmetric(outline(world).mass))
+
+
+@once(4)
+def _region_solver(world: World) -> tuple[np.ndarray, Solver]:
+    """Return the nodes that the world's region touches, and M̃⁻¹ of them."""
+    mass = _symmetric(score_mass(world))
+    diagonal = mass.diagonal()
+    inside = np.flatnonzero(diagonal > MIN_MASS * diagonal.max())
+    return inside, _factorised(mass[inside][:, inside])
+
+
+def _factorised(mass: sp.csr_array) -> Solver:
+    from scipy.sparse.linalg import splu
+    solver: Solver = splu(mass.tocsc()).solve
+    return solver
+
+
+def _symmetric(half: sp.csr_array) -> sp.csr_array:
+    """Return M̃ from its triangle with doubled entries."""
+    return (0.5 * (half + half.T)).tocsr()

@@ -1,0 +1,151 @@
+"""Examples as files that can be read without this package: one per episode, and a README."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from tqdm import tqdm
+
+from eitbench._extras import needed_by
+from eitbench._files import PACKAGE, write_atomically
+from eitbench.data.bank import fill
+from eitbench.data.cache import described, world_digest
+from eitbench.data.regions import SPARSE
+from eitbench.data.seeds import is_test, name_seed, parse_seeds
+
+if TYPE_CHECKING:
+    from eitbench.data.dataset import Dataset
+
+SUFFIXES = {"npz": "npz", "hdf5": "h5"}
+"""Format -> suffix of its files."""
+MANIFEST = "dataset.json"
+"""File that identifies the environment, format and version of an export."""
+MESH = "mesh.npz"
+
+INTEGRAL = "(mol/m³)²·m² (m³ in 3D)"
+UNITS = {"seed": "", "voltages": "V", "currents": "A (A/m in 2D)", "truth": "mol/m³",
+         "unresolved": INTEGRAL, "square": INTEGRAL, "velocity": "m/s"}
+"""Unit of each field."""
+README = PACKAGE / "data" / "export_readme.md"
+"""Template of the description of an export."""
+WARNING = "Test episodes are among them: report on them, and neither learn nor choose."
+
+
+def export(examples: Dataset, folder: Path, format: str = "npz", *, n_jobs: int = 1,
+           backend: str = "loky") -> int:
+    """Write each example into a file beside the mesh and a README; return the number of new ones.
+
+    Simulated episodes stay in the cache, and files are written atomically: the same call resumes
+    after an interruption, and other seeds may be added.
+
+    Parameters
+    ----------
+    examples : Dataset
+    folder : Path
+        New, empty, or of an export of the same world in the same format.
+    format : "npz" or "hdf5"
+        hdf5 needs the extra ``export``.
+    n_jobs, backend
+        Of the simulation; see `eitbench.data.bank.fill`.
+
+    Raises
+    ------
+    ValueError
+        If the format is unknown or the folder holds other files.
+    ModuleNotFoundError
+        If the format's library is not installed.
+    """
+    if format not in SUFFIXES:
+        raise ValueError(f"format must be one of {', '.join(SUFFIXES)}, got {format!r}")
+    if examples.basis is not None:
+        raise ValueError("examples must have their truth on the nodes, got reduced coordinates")
+    with needed_by(f"format {format}"):
+        if format == "hdf5":
+            import h5py  # noqa: F401
+    encode = _hdf5 if format == "hdf5" else _npz
+    about = _about(examples, format)
+    _claim(folder, json.dumps(about, indent=1) + "\n")
+    paths = {seed: folder / f"{name_seed(seed).replace(':', '-')}.{SUFFIXES[format]}"
+             for seed in examples.seeds}
+    missing = [seed for seed, path in paths.items() if not path.exists()]
+    fill(examples.world, missing, n_jobs=n_jobs, backend=backend)
+    mass = examples.mass
+    write_atomically(folder / MESH, _npz(
+        {"points": examples.mesh.points, "cells": examples.mesh.cells}
+        | {f"mass_{name}": getattr(mass, name) for name in SPARSE}))
+    for seed in tqdm(missing, desc="writing", unit="episode", disable=None):
+        fields = examples.example(seed)._asdict()
+        write_atomically(paths[seed], encode(fields))
+    write_atomically(folder / "README.md", _readme(folder, about).encode())
+    return len(missing)
+
+
+def _about(examples: Dataset, format: str) -> dict[str, Any]:
+    """Return what all files of a folder have in common, as JSON."""
+    from eitbench import __version__
+    world = examples.world
+    flow = world.velocity_model
+    return {"environment": examples.env, "format": format, "eitbench": __version__,
+            "digest": world_digest(world), "steps": world.n_steps, "warm_up": world.warm_up,
+            "time_step": world.time_step, "electrodes": world.vessel.n_electrodes,
+            "nodes": examples.mesh.n_nodes, "velocity": 0 if flow is None else flow.size,
+            "world": described(world)}
+
+
+def _claim(folder: Path, manifest: str) -> None:
+    """Write the manifest into a new folder; ``ValueError`` if the folder holds other files."""
+    path = folder / MANIFEST
+    if path.exists():
+        if path.read_text(encoding="utf-8") != manifest:
+            raise ValueError(f"out must be another folder: {path} is of another environment, "
+                             "format or version of eitbench")
+    elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise ValueError(f"out must be a new or empty folder, or one of an export; got {folder}")
+    else:
+        write_atomically(path, manifest.encode())
+
+
+def _readme(folder: Path, about: dict[str, Any]) -> str:
+    """Return a description of the files that the folder holds."""
+    held = seed_ranges(path.stem for path in folder.glob(f"[!.]*.{SUFFIXES[about['format']]}")
+                       if path.name != MESH)
+    tests = any(is_test(parse_seeds(each)[0]) for each in held)
+    return README.read_text(encoding="utf-8").format(
+        held="; ".join(held), warning=WARNING if tests else "", ms=1e3 * about["time_step"],
+        numbers=json.dumps(about["world"], indent=1), units=UNITS, **about)
+
+
+def seed_ranges(names: Iterable[str]) -> list[str]:
+    """Return ``train:0-99,200`` and so on, from ``train-0``, ``train-1`` …"""
+    numbers: dict[str, set[int]] = {}
+    for name in names:
+        split, _, number = name.rpartition("-")
+        numbers.setdefault(split, set()).add(int(number))
+    return [f"{split}:{_runs(each)}" if split else _runs(each)
+            for split, each in sorted(numbers.items())]
+
+
+def _runs(numbers: set[int]) -> str:
+    begins = sorted(number for number in numbers if number - 1 not in numbers)
+    ends = sorted(number for number in numbers if number + 1 not in numbers)
+    return ",".join(str(a) if a == b else f"{a}-{b}" for a, b in zip(begins, ends, strict=True))
+
+
+def _npz(arrays: Mapping[str, Any]) -> bytes:
+    content = io.BytesIO()
+    np.savez(content, **arrays)
+    return content.getvalue()
+
+
+def _hdf5(arrays: Mapping[str, Any]) -> bytes:
+    import h5py
+    content = io.BytesIO()
+    with h5py.File(content, "w") as file:
+        for name, array in arrays.items():
+            file.create_dataset(name, data=array).attrs["units"] = UNITS[name]
+    return content.getvalue()

@@ -1,1 +1,0 @@
-"""Data for people who learn: episodes as examples, for numpy and torch, and as files."""

@@ -1,0 +1,171 @@
+"""Measured cases: public measurements with vessel, settings and truth, each an environment id.
+
+A case is a YAML file in the folder ``cases``. It identifies its data by sha256 and does not hold
+them: users download them into a folder of their own.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from eitbench._check import nearest
+from eitbench.measured.measurements import Measurements
+from eitbench.measured.readers import load_yaml, read
+from eitbench.measured.segmentation import read_truth
+
+CASES = Path(__file__).with_name("cases")
+WITHHELD_FRACTION = 0.1
+FOLDER_VARIABLE = "EITBENCH_MEASURED"
+CHUNK_BYTES = 1 << 20
+_TEXTS = ("title", "file", "sha256", "licence", "source")
+_OPTIONAL = ("beside", "truth")
+_SETTINGS = ("format", "span", "correction", "homogeneous_frames", "moves", "model_error")
+"""Arguments of `read` and `MeasuredEnv`, and ``span``: first reading, from 0, and end."""
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredCase:
+    """One set of measurements with its vessel and settings, the same for all methods.
+
+    ``ValueError`` names an entry that is missing, unknown, or of the wrong kind.
+    """
+
+    name: str
+    title: str
+    file: str
+    """path of the file or folder below `measured_folder`"""
+    sha256: str
+    """of that file; of a folder, of its files one after another"""
+    licence: str
+    source: str
+    """where to download the file"""
+    vessel: Mapping[str, Any]
+    """entries of `read_vessel`"""
+    beside: Mapping[str, str] = field(default_factory=dict)
+    """name -> sha256 of files that the reader takes from the same folder"""
+    truth: Mapping[str, str] | None = None
+    """``file`` and ``sha256`` of a segmentation for `read_truth`"""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name in _TEXTS:
+            value = getattr(self, name)
+            if not isinstance(value, str) or not value.strip():
+                raise ValueError(f"case.{name} must be a text, got {value!r}")
+        for name in ("vessel", "beside"):
+            if not isinstance(getattr(self, name), Mapping):
+                raise ValueError(f"case.{name} must be entries like 'name: value', got "
+                                 f"{getattr(self, name)!r}")
+        if self.truth is not None and set(self.truth) != {"file", "sha256"}:
+            raise ValueError(f"case.truth must have file and sha256, got {self.truth!r}")
+        truth = {"truth.sha256": self.truth["sha256"]} if self.truth else {}
+        for name, digest in {"sha256": self.sha256, **self.beside, **truth}.items():
+            if not isinstance(digest, str) or not re.fullmatch("[0-9a-f]{64}", digest):
+                raise ValueError(f"case.{name} must be 64 hexadecimal digits, got {digest!r}")
+        span = self.settings.get("span", [0, 1])
+        if (not isinstance(span, list) or len(span) != 2
+                or not all(isinstance(end, int) for end in span) or not 0 <= span[0] < span[1]):
+            raise ValueError("case.span must be two increasing numbers such as [0, 800], got "
+                             f"{span!r}")
+        if unknown := sorted(set(self.settings) - set(_SETTINGS)):
+            known = (*_TEXTS, "vessel", *_OPTIONAL, *_SETTINGS)
+            raise ValueError(f"case has no {', '.join(unknown)}; there are {', '.join(known)}")
+
+    @cached_property
+    def digest(self) -> str:
+        """sha256 of all entries that numbers depend on; texts may change."""
+        content = {"sha256": self.sha256, "beside": dict(self.beside),
+                   "truth": self.truth and self.truth["sha256"], "vessel": dict(self.vessel),
+                   "withheld": WITHHELD_FRACTION, "settings": dict(self.settings)}
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Arguments of `MeasuredEnv` beside the measurements and the vessel."""
+        return {"withheld": WITHHELD_FRACTION} | {
+            name: value for name, value in self.settings.items() if name not in ("format", "span")}
+
+    def measurements(self, file: Path | str | None = None) -> Measurements:
+        """Read the measurements, by default from `measured_folder`; ``ValueError`` says which file
+        is missing or differs."""
+        path = measured_folder() / self.file if file is None else Path(file)
+        for each, digest in {path: self.sha256, **{path.with_name(name): digest for name, digest
+                                                   in self.beside.items()}}.items():
+            self._check(each, digest)
+        span = self.settings.get("span")
+        return read(path, self.settings.get("format"), None if span is None else slice(*span))
+
+    def truth_mask(self) -> np.ndarray | None:
+        """Read the segmentation (256, 256) of the truth; None if the case has none. ``ValueError``
+        as for `measurements`."""
+        if self.truth is None:
+            return None
+        path = measured_folder() / self.truth["file"]
+        self._check(path, self.truth["sha256"])
+        return read_truth(path)
+
+    def _check(self, path: Path, digest: str) -> None:
+        if not path.exists():
+            raise ValueError(
+                f"{case_id(self.name)} needs a file that is not here: {path.name} with sha256 "
+                f"{digest}, from {self.source} (licence: {self.licence}). Save it as {path}, or "
+                f"set ${FOLDER_VARIABLE} to the folder that has {self.file}")
+        if (found := file_sha256(path)) != digest:
+            raise ValueError(f"{path} must have the sha256 {digest} of the case {self.name}, got "
+                             f"{found}")
+
+
+def measured_folder() -> Path:
+    """$EITBENCH_MEASURED, else $XDG_DATA_HOME/eitbench/measured, else
+    ~/.local/share/eitbench/measured."""
+    if folder := os.environ.get(FOLDER_VARIABLE):
+        return Path(folder)
+    data = os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share"
+    return Path(data) / "eitbench" / "measured"
+
+
+def case_id(name: str) -> str:
+    """Return the environment id under which ``import eitbench`` registers a case."""
+    return f"eitbench/Measured-{name}-v0"
+
+
+def read_case(name: Path | str) -> MeasuredCase:
+    """Read a built-in case by name, or the case of a YAML file. ``ValueError`` names the file and
+    the fault."""
+    path = Path(name)
+    if path.suffix != ".yml":
+        names = {each.stem: each for each in sorted(CASES.glob("*.yml"))}
+        if str(name) not in names:
+            raise ValueError(f"case must be one of {', '.join(names)}, or a YAML file, got "
+                             f"{name}{nearest(name, names)}")
+        path = names[str(name)]
+    entries = load_yaml(path, "case")
+    if missing := [each for each in (*_TEXTS, "vessel") if each not in entries]:
+        raise ValueError(f"{path}: case must have {', '.join(missing)}")
+    fixed = {each: entries.pop(each) for each in (*_TEXTS, "vessel", *_OPTIONAL)
+             if each in entries}
+    try:
+        return MeasuredCase(path.stem, **fixed, settings=entries)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+def file_sha256(path: Path) -> str:
+    """Digest of a file, or of all files of a folder one after another, by name."""
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    digest = hashlib.sha256()
+    for each in filter(Path.is_file, files):
+        with each.open("rb") as stream:
+            while chunk := stream.read(CHUNK_BYTES):
+                digest.update(chunk)
+    return digest.hexdigest()

@@ -1,0 +1,269 @@
+"""`Measurements`: currents, readings and times of an instrument, with units, in one HDF5 file."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from eitbench import _check
+from eitbench._extras import needed_by
+from eitbench._files import replacing
+
+FORMAT = "eitbench measurements"
+VERSION = 1
+REQUIRED = ("currents", "injections", "matrix", "readings", "times")
+"""Data sets of a file; ``reference`` is optional."""
+MAX_IN_MEMORY_BYTES = 1 << 26
+CHUNK_VALUES = 1 << 20
+CURRENT_BALANCE_RTOL = 1e-6
+"""Tolerated sum of the currents of an injection, relative to its largest current."""
+
+
+@dataclass(frozen=True, eq=False)
+class Measurements:
+    """T readings of M numbers each, during K different injections by L electrodes.
+
+    Writable arrays are copied; read-only ones, such as the readings of a large file, stay where
+    they are (`load`). Currents whose sum differs from zero by rounding are reduced by their mean.
+    ``ValueError`` names a field of the wrong shape, without numbers, or in contradiction to
+    another.
+    """
+
+    currents: np.ndarray
+    """(K, L) A into each electrode, each injection once; rows sum to zero"""
+    injections: np.ndarray
+    """(T,) int, index of the active injection"""
+    matrix: np.ndarray
+    """(M, L) maps potentials, relative to the mean of all electrodes, to readings"""
+    readings: np.ndarray
+    """(T, M) V, NaN where nothing was measured"""
+    times: np.ndarray
+    """(T,) s, increasing"""
+    reference: np.ndarray | None = None
+    """(F, K, M) V, F frames of homogeneous fluid; NaN where nothing was measured"""
+    source: Mapping[str, Any] = field(default_factory=dict)
+    """JSON-ready provenance: file, instrument, licence, frequency, assumed units"""
+
+    def __post_init__(self) -> None:
+        currents = _balanced(_check.array("currents", self.currents, (None, None), units="A"))
+        K, L = currents.shape
+        matrix = _check.array("matrix", self.matrix, (None, L))
+        M = len(matrix)
+        readings = _check_readings("readings", self.readings, (None, M))
+        T = len(readings)
+        times = _check.array("times", self.times, (T,), units="s")
+        _check_increasing(times)
+        arrays = {"currents": currents, "injections": _check_indices(self.injections, T, K),
+                  "matrix": matrix, "readings": readings, "times": times, "reference": None}
+        if self.reference is not None:
+            arrays["reference"] = _check_readings("reference", self.reference, (None, K, M))
+        json.dumps(dict(self.source), allow_nan=False)
+        for name, value in arrays.items():
+            if value is not None and value.flags.writeable:
+                value = value.copy()
+                value.setflags(write=False)
+            object.__setattr__(self, name, value)
+
+    @classmethod
+    def from_sequence(cls, currents: np.ndarray, matrix: np.ndarray, readings: np.ndarray,
+                      times: np.ndarray, reference: np.ndarray | None = None,
+                      source: Mapping[str, Any] | None = None) -> Measurements:
+        """Merge equal rows of ``currents`` (T, L), one row a reading, into one injection each;
+        ``reference`` (F, T, M) has the same order."""
+        currents = _check.array("currents", currents, (None, None), units="A")
+        distinct, first, inverse = np.unique(currents, axis=0, return_index=True,
+                                             return_inverse=True)
+        order = np.argsort(first)                              # order of first use
+        injections = np.argsort(order)[inverse.reshape(-1)]
+        if reference is not None:
+            reference = np.asarray(reference, dtype=float)
+            if reference.ndim != 3 or reference.shape[1] != len(currents):
+                raise ValueError(f"reference must have shape (F, {len(currents)}, M), got "
+                                 f"{reference.shape}")
+            reference = _by_injection(reference, injections, len(distinct))
+        return cls(distinct[order], injections, matrix, readings, times, reference, source or {})
+
+    @cached_property
+    def frame(self) -> int:
+        """Number of readings until each injection has been active once."""
+        first = np.full(len(self.currents), -1)
+        for begin in range(0, len(self.injections), CHUNK_VALUES):
+            present, where = np.unique(self.injections[begin:begin + CHUNK_VALUES],
+                                       return_index=True)
+            new = first[present] < 0
+            first[present[new]] = begin + where[new]
+            if (first >= 0).all():
+                break
+        return 1 + int(first.max())
+
+    @cached_property
+    def largest(self) -> float:
+        """Largest magnitude of all readings in V."""
+        return max(float(np.abs(chunk[np.isfinite(chunk)]).max(initial=0.0))
+                   for chunk in _chunks(self.readings))
+
+    def homogeneous(self, frames: int = 1) -> np.ndarray:
+        """(F, K, M) V: the reference, or without one the first ``frames`` frames."""
+        if self.reference is not None:
+            return self.reference
+        steps = min(_check.integer("frames", frames, low=1) * self.frame, len(self.readings))
+        return _by_injection(self.readings[None, :steps], self.injections[:steps],
+                             len(self.currents))
+
+    def frames(self, most: int | None = None) -> np.ndarray:
+        """(F, K, M) V: the first ``most`` complete frames; NaN where nothing was measured."""
+        whole = len(self.readings) - len(self.readings) % self.frame
+        if most is not None:
+            whole = min(whole, most * self.frame)
+        return np.concatenate([
+            _by_injection(self.readings[None, t:t + self.frame], self.injections[t:t + self.frame],
+                          len(self.currents))
+            for t in range(0, max(whole, 1), self.frame)])
+
+    def select(self, steps: slice) -> Measurements:
+        """Return consecutive readings with the injections that they use."""
+        injections = self.injections[steps]
+        if not injections.size:
+            raise ValueError(f"steps must hold readings of the {len(self.injections)}, got {steps}")
+        used = np.unique(injections)
+        reference = None if self.reference is None else self.reference[:, used]
+        return Measurements(self.currents[used], np.searchsorted(used, injections), self.matrix,
+                            self.readings[steps], self.times[steps], reference, self.source)
+
+    def save(self, path: Path | str) -> Path:
+        """Write one HDF5 file atomically; needs the extra ``export``."""
+        with needed_by("a file of measurements"):
+            import h5py
+        path = Path(path)
+        with replacing(path) as temporary, h5py.File(temporary, "w") as file:
+            file.attrs.update(format=FORMAT, version=VERSION, source=json.dumps(dict(self.source)))
+            for name in (*REQUIRED, "reference"):
+                if (value := getattr(self, name)) is not None:
+                    file.create_dataset(name, data=value)
+        return path
+
+    @classmethod
+    def load(cls, path: Path | str, steps: slice = slice(None)) -> Measurements:
+        """Read a file of `save`, or only the readings ``steps`` of it.
+
+        Data sets of more than `MAX_IN_MEMORY_BYTES` are memory-mapped; their file must not
+        change. ``ValueError`` names the file and the fault.
+        """
+        with needed_by("a file of measurements"):
+            import h5py
+        path = Path(path)
+        try:
+            with h5py.File(path, "r") as file:
+                found = file.attrs.get("format"), file.attrs.get("version")
+                if found != (FORMAT, VERSION):
+                    raise ValueError(f"format must be {FORMAT!r}, version {VERSION}, got "
+                                     f"{found[0]!r}, version {found[1]!r}")
+                if missing := [name for name in REQUIRED if name not in file]:
+                    raise ValueError(f"{', '.join(missing)} must be data sets of the file")
+                content = {name: file[name][()] for name in ("currents", "matrix")}
+                content |= {name: _rows(path, file[name], steps)
+                            for name in ("injections", "times", "readings")}
+                if not content["injections"].size:
+                    raise ValueError("steps must hold some of its "
+                                     f"{len(file['injections'])} readings, got {steps}")
+                if "reference" in file:
+                    content["reference"] = file["reference"][()]
+                source = json.loads(file.attrs["source"])
+            return cls(**content, source=source)
+        except (OSError, KeyError, ValueError, TypeError) as error:
+            raise ValueError(f"{path} must be a file of measurements: {error}") from None
+
+
+def _rows(path: Path, dataset: Any, steps: slice) -> np.ndarray:
+    """Read rows of a data set, or map them if they are large, contiguous and of native type."""
+    large = dataset.size * dataset.dtype.itemsize > MAX_IN_MEMORY_BYTES
+    offset = dataset.id.get_offset()                 # None if it is compressed or chunked
+    if large and offset is not None and dataset.dtype in (np.float64, np.int64):
+        return np.memmap(path, dataset.dtype, "r", offset, dataset.shape)[steps]
+    rows: np.ndarray = dataset[steps]
+    rows.setflags(write=False)                       # avoids a copy in __post_init__
+    return rows
+
+
+def _chunks(values: np.ndarray) -> Iterator[np.ndarray]:
+    rows = max(CHUNK_VALUES // max(values[0].size, 1), 1)
+    for begin in range(0, len(values), rows):
+        yield values[begin:begin + rows]
+
+
+def _by_injection(records: np.ndarray, injections: np.ndarray, K: int) -> np.ndarray:
+    """Sort F sequences (F, T, M) by injection into (F·R, K, M), with R the largest number of
+    repetitions of an injection and NaN where an injection has fewer."""
+    F, T, M = records.shape
+    turn = np.zeros(T, dtype=int)
+    count = np.zeros(K, dtype=int)
+    for t, k in enumerate(injections):
+        turn[t] = count[k]
+        count[k] += 1
+    most = int(count.max())
+    found = np.full((F, most, K, M), np.nan)
+    found[:, turn, injections] = records
+    return found.reshape(F * most, K, M)
+
+
+def _balanced(currents: np.ndarray) -> np.ndarray:
+    """Check (K, L) injections and subtract what rounding leaves of their sums."""
+    sums = currents.sum(axis=1)
+    largest = np.abs(currents).max(axis=1)
+    if not largest.all():
+        raise ValueError(f"currents must flow, got none in injection {int(largest.argmin())}")
+    if (wrong := np.flatnonzero(np.abs(sums) > CURRENT_BALANCE_RTOL * largest)).size:
+        raise ValueError("currents must sum to zero over the electrodes, got "
+                         f"{sums[wrong[0]]:g} A in injection {wrong[0]}")
+    on = currents != 0.0
+    currents = currents - on * (sums / on.sum(axis=1))[:, None]
+    if len(np.unique(currents, axis=0)) < len(currents):
+        raise ValueError(f"currents must be {len(currents)} different injections, got duplicates; "
+                         "see Measurements.from_sequence")
+    return currents
+
+
+def _check_increasing(times: np.ndarray) -> None:
+    for begin in range(0, len(times), CHUNK_VALUES):
+        steps = np.diff(times[begin:begin + CHUNK_VALUES + 1])
+        if (back := np.flatnonzero(steps <= 0)).size:
+            t = begin + int(back[0])
+            raise ValueError(f"times must increase, got {times[t]:g} s and then "
+                             f"{times[t + 1]:g} s at reading {t + 1}")
+
+
+def _check_indices(given: np.ndarray, T: int, K: int) -> np.ndarray:
+    injections = np.asarray(given)
+    if injections.shape != (T,) or not np.issubdtype(injections.dtype, np.integer):
+        raise ValueError(f"injections must be {T} integers, one per reading, got "
+                         f"{injections.dtype} of shape {injections.shape}")
+    if injections.min() < 0 or injections.max() >= K:
+        raise ValueError(f"injections must be numbers from 0 to {K - 1}, got "
+                         f"{injections.min()} to {injections.max()}")
+    return injections.astype(np.int64, copy=False)
+
+
+def _check_readings(name: str, given: np.ndarray, shape: tuple[int | None, ...]) -> np.ndarray:
+    """Return an array of this shape whose entries are finite or NaN, not all of them NaN."""
+    value = np.asarray(given)
+    if np.iscomplexobj(value):
+        raise ValueError(f"{name} must be real, got complex numbers; choose a part")
+    try:
+        value = value.astype(float, copy=False)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} must hold numbers, got {value.dtype}") from None
+    if value.ndim != len(shape) or not value.size or any(
+            want not in (None, size) for want, size in zip(shape, value.shape, strict=True)):
+        wanted = ", ".join("any" if size is None else str(size) for size in shape)
+        raise ValueError(f"{name} must have shape ({wanted}), got {value.shape}")
+    if any(np.isinf(chunk).any() for chunk in _chunks(value)):
+        raise ValueError(f"{name} must be finite or NaN, got infinite values")
+    if all(np.isnan(chunk).all() for chunk in _chunks(value)):
+        raise ValueError(f"{name} must hold numbers, got NaN only")
+    return value

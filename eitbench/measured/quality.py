@@ -1,0 +1,135 @@
+"""Data-quality warnings: wrong units, electrodes that are swapped, miscounted or dead."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from eitbench.measured.calibration import CONTACT_PRIOR_MEAN, Calibration, electrode_sizes
+from eitbench.measured.measurements import Measurements
+
+if TYPE_CHECKING:
+    from eitbench.physics.cem import CompleteElectrodeModel
+
+CONDUCTIVITY_RANGE = (1e-4, 10.0)
+"""S/m of fluids in vessels; sea water has 5."""
+GAIN_RANGE = (0.5, 2.0)
+RECIPROCITY_TOLERANCE = 0.05
+"""Relative change of readings when injection and reading are exchanged."""
+MAX_MISFIT = 0.3
+"""Relative misfit of the homogeneous model from which on other electrode orders are tried."""
+REORDER_IMPROVEMENT = 0.5
+"""Factor to which another order must reduce the misfit to be reported."""
+BAD_ELECTRODE_RATIO = 4.0
+"""Misfit of a bad electrode relative to the median."""
+
+
+def quality_warnings(measurements: Measurements, calibration: Calibration,
+                     electrodes: CompleteElectrodeModel) -> list[str]:
+    """Return sentences on whatever contradicts readings in volts of fluid in this vessel.
+
+    Checks conductivity and gain, reciprocity, whether another order of the electrodes fits far
+    better, and electrodes whose readings fit far worse than others. Where each channel has its own
+    gain, neither reciprocity nor a misfit that no order explains is reported.
+    """
+    return [*_unit_warnings(calibration), *_reciprocity_warnings(measurements, calibration),
+            *_order_warnings(measurements, calibration, electrodes),
+            *_electrode_warnings(measurements, calibration)]
+
+
+def _unit_warnings(calibration: Calibration) -> list[str]:
+    found = []
+    low, high = CONDUCTIVITY_RANGE
+    if not low <= calibration.conductivity <= high:
+        found.append(f"The conductivity would be {calibration.conductivity:.3g} S/m, outside the "
+                     f"usual {low:g} to {high:g}: currents, readings or lengths are in other "
+                     "units.")
+    low, high = GAIN_RANGE
+    if not low <= calibration.gain <= high:
+        found.append(f"Readings are {calibration.gain:.3g} times the values for this conductivity: "
+                     "they are not in volts, or currents not in amperes.")
+    return found
+
+
+def _reciprocity_warnings(measurements: Measurements, calibration: Calibration) -> list[str]:
+    reading = _readings_across_injections(measurements)
+    has = reading >= 0
+    injected = np.abs(measurements.currents).max(axis=1)
+    exchanged = calibration.measured[:, reading[has]][has] / injected[has][:, None]
+    difference = exchanged - exchanged.T
+    known = np.isfinite(difference)
+    if not known.any() or calibration.correction == "gain":
+        return []
+    scale = np.sqrt(2.0 * np.mean(exchanged[known]**2))
+    change = float(np.sqrt(np.mean(difference[known]**2)) / scale)
+    if change <= RECIPROCITY_TOLERANCE:
+        return []
+    return [f"Exchanging injection and reading changes readings by {100 * change:.2g} %, which "
+            "breaks reciprocity: the order of injections or of readings is wrong, or channels "
+            "have different gains (then --correction gain helps)."]
+
+
+def _readings_across_injections(measurements: Measurements) -> np.ndarray:
+    """(K,) index of the reading across each injection's electrodes; -1 without one."""
+    rows = measurements.matrix - measurements.matrix.mean(axis=1, keepdims=True)
+    norms = np.outer(np.linalg.norm(measurements.currents, axis=1), np.linalg.norm(rows, axis=1))
+    cosine = measurements.currents @ rows.T / np.maximum(norms, 1e-300)
+    return np.where(cosine.max(axis=1) > 1.0 - 1e-9, cosine.argmax(axis=1), -1)
+
+
+def _order_warnings(measurements: Measurements, calibration: Calibration,
+                    electrodes: CompleteElectrodeModel) -> list[str]:
+    """Try other orders of the electrodes in the readings, and swapped pairs in both readings and
+    injections."""
+    L = electrodes.n_electrodes
+    model = electrodes.with_contacts(CONTACT_PRIOR_MEAN * electrode_sizes(electrodes).mean())
+    R = model.transfer_resistance(np.ones(model.mesh.n_nodes))
+    numbers = np.arange(L)
+    known = np.isfinite(calibration.measured)
+
+    def misfit(injecting: np.ndarray, reading: np.ndarray) -> float:
+        """Relative misfit of the readings off the injecting electrodes."""
+        currents = measurements.currents[:, injecting]
+        matrix = measurements.matrix[:, reading]
+        passive = known & (np.abs(currents) @ np.abs(matrix).T == 0.0)
+        used = passive if passive.any() else known
+        y, x = calibration.measured[used], (currents @ R @ matrix.T)[used]
+        return float(np.linalg.norm(y - (x @ y) / (x @ x) * x) / np.linalg.norm(y))
+
+    described = misfit(numbers, numbers)
+    if described <= MAX_MISFIT:
+        return []
+    orders = [("Readings seem to count electrodes the other way round than injections", numbers,
+               (first - numbers) % L) for first in range(L)]
+    orders += [(f"Readings seem to count electrodes from {turn} further than injections", numbers,
+                (numbers + turn) % L) for turn in range(1, L)]
+    for a, b in combinations(range(L), 2):
+        swapped = numbers.copy()
+        swapped[[a, b]] = b, a
+        orders.append((f"Electrodes {a + 1} and {b + 1} are swapped, it seems", swapped, swapped))
+    misfits = [misfit(injecting, reading) for _, injecting, reading in orders]
+    best = int(np.argmin(misfits))
+    if misfits[best] <= REORDER_IMPROVEMENT * described:
+        return [f"{orders[best][0]}: this reduces the misfit of the homogeneous model from "
+                f"{100 * described:.2g} % to {100 * misfits[best]:.2g} %."]
+    if calibration.correction == "gain":
+        return []
+    return [f"The homogeneous model has a misfit of {100 * described:.2g} % of the readings: the "
+            "vessel, the order of the electrodes or the units differ from the description."]
+
+
+def _electrode_warnings(measurements: Measurements, calibration: Calibration) -> list[str]:
+    involved = (measurements.matrix != 0).astype(float)
+    if (involved.sum(axis=1) > 2).any():
+        return []
+    squares = np.nan_to_num(calibration.measured - calibration.computed)**2
+    count = np.maximum((np.isfinite(calibration.measured) @ involved).sum(axis=0), 1.0)
+    scale = np.sqrt(np.nanmean(calibration.measured**2))
+    misfit = np.sqrt((squares @ involved).sum(axis=0) / count) / scale
+    median = float(np.median(misfit))
+    return [f"Electrode {worst + 1} looks dead or loose: the misfit of its readings is "
+            f"{100 * misfit[worst]:.2g} % of a mean reading, the median of all electrodes "
+            f"{100 * median:.2g} %."
+            for worst in np.flatnonzero((misfit > BAD_ELECTRODE_RATIO * median) & (misfit > 0.1))]

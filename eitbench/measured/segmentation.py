@@ -1,0 +1,123 @@
+"""Segmentation of an estimate in a round tank, and its score by ground truth.
+
+The score is that of the Kuopio Tomography Challenge 2023 (Räsänen et al., "Kuopio Tomography
+Challenge 2023 open electrical impedance tomographic dataset"): similarity of two segmentations.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from scipy.ndimage import center_of_mass, label
+
+from eitbench.measured.matlab import load_variables
+from eitbench.measured.vessel import VesselConfig
+from eitbench.worlds.task import Task
+from eitbench.worlds.vessels import RoundTank
+
+PIXELS = 256
+"""Along the tank's diameter."""
+WATER, RESISTIVE, CONDUCTIVE = 0, 1, 2
+"""Classes of pixels."""
+SSIM_SIGMA, SSIM_RADIUS = 80.0, 160
+"""Pixels, of the Gaussian window."""
+SSIM_CONSTANTS = 1e-4, 9e-4
+MIN_LOG_CONTRAST = 1.0
+"""Least |ln c/c̄| of an inclusion, …"""
+EXTREME_FRACTION = 0.5
+"""… and the fraction of its extreme from which on a pixel belongs to it: chosen by ``python
+studies/segment.py``."""
+MIN_PIXELS = 30
+"""Of an inclusion whose centroid counts."""
+
+
+def ktc_score(truth: np.ndarray, found: np.ndarray) -> float:
+    """Mean structural similarity of the conductive and the resistive inclusions of two
+    segmentations (256, 256); 1 if equal."""
+    return float(np.mean([_similarity(np.equal(truth, each), np.equal(found, each))
+                          for each in (RESISTIVE, CONDUCTIVE)]))
+
+
+def segment(vessel: VesselConfig, task: Task, estimate: np.ndarray,
+            fraction: float = EXTREME_FRACTION,
+            min_contrast: float = MIN_LOG_CONTRAST) -> np.ndarray:
+    """(256, 256) classes of an estimate (n,) in mol/m³; row 0 is the top, as in a photograph.
+
+    An inclusion is where ln(c/c̄) exceeds a ``fraction`` of its extreme in the tank, if the extreme
+    exceeds ``min_contrast``; c̄ is the calibrated background. ``ValueError`` if the vessel is not
+    a round tank.
+    """
+    radius = require_round_tank(vessel).radius
+    side = (np.arange(PIXELS) + 0.5) / PIXELS * 2.0 - 1.0
+    x, y = (each.ravel() * radius for each in np.meshgrid(side, -side))
+    inside = np.hypot(x, y) < 0.995 * radius                    # the mesh's wall is a polygon
+    background = task.expected_concentration
+    c = np.maximum(estimate, 1e-6 * background)
+    field = np.zeros(PIXELS**2)
+    field[inside] = (task.mesh.interpolation_to(np.stack([x[inside], y[inside]], axis=1))
+                     @ np.log(c / background))
+    classes = np.full(PIXELS**2, WATER)
+    for kind, sign in ((RESISTIVE, -1.0), (CONDUCTIVE, 1.0)):
+        extreme = float((sign * field).max())
+        if extreme > min_contrast:
+            classes[sign * field > fraction * extreme] = kind
+    return classes.reshape(PIXELS, PIXELS)
+
+
+def centroid_errors(vessel: VesselConfig, truth: np.ndarray, found: np.ndarray) -> list[float]:
+    """Distances in m from the centroid of each true inclusion to the nearest one found of its
+    class; infinite without one."""
+    pixel = 2.0 * require_round_tank(vessel).radius / PIXELS
+    errors = []
+    for kind in (RESISTIVE, CONDUCTIVE):
+        centroids = _centroids(found == kind)
+        errors += [pixel * float(min((np.hypot(*(each - other)) for other in centroids),
+                                     default=np.inf))
+                   for each in _centroids(truth == kind)]
+    return errors
+
+
+def read_truth(path: Path | str) -> np.ndarray:
+    """Read a segmentation (256, 256) of 0 (water), 1 (resistive) and 2 (conductive): variable
+    ``truth`` of a .mat file. ``ValueError`` names the file and the fault."""
+    truth = np.asarray(load_variables(Path(path), "truth")["truth"])
+    if truth.shape != (PIXELS, PIXELS) or not np.isin(truth, (WATER, RESISTIVE, CONDUCTIVE)).all():
+        raise ValueError(f"{path}: truth must be {PIXELS} × {PIXELS} numbers 0, 1 and 2, got "
+                         f"{truth.shape} with {np.unique(truth)[:5]}")
+    return truth.astype(int)
+
+
+def require_round_tank(vessel: VesselConfig) -> RoundTank:
+    """Return the vessel's shape; ``ValueError`` if it is not a round tank."""
+    if not isinstance(vessel.shape, RoundTank):
+        raise ValueError("vessel must be a circle where there is a truth, got a "
+                         f"{type(vessel.shape).__name__}")
+    return vessel.shape
+
+
+def _centroids(mask: np.ndarray) -> list[np.ndarray]:
+    bodies, count = label(mask)
+    return [np.array(center_of_mass(bodies == k)) for k in range(1, count + 1)
+            if (bodies == k).sum() >= MIN_PIXELS]
+
+
+def _similarity(truth: np.ndarray, found: np.ndarray) -> float:
+    """Mean structural similarity of two pictures in the range 0 to 1."""
+    a, b = truth.astype(float), found.astype(float)
+    mean_a, mean_b = _smooth(a), _smooth(b)
+    var_a, var_b = _smooth(a**2) - mean_a**2, _smooth(b**2) - mean_b**2
+    covariance = _smooth(a * b) - mean_a * mean_b
+    first, second = SSIM_CONSTANTS
+    above = (2.0 * mean_a * mean_b + first) * (2.0 * covariance + second)
+    below = (mean_a**2 + mean_b**2 + first) * (var_a + var_b + second)
+    return float((above / below).mean())
+
+
+def _smooth(picture: np.ndarray) -> np.ndarray:
+    """Weighted mean under the window, within the picture."""
+    distance = np.arange(PIXELS)[:, None] - np.arange(PIXELS)
+    window = np.exp(-0.5 * (distance / SSIM_SIGMA)**2) * (np.abs(distance) <= SSIM_RADIUS)
+    window /= window.sum(axis=1, keepdims=True)
+    smooth: np.ndarray = window @ picture @ window.T
+    return smooth

@@ -1,0 +1,214 @@
+"""Description of a real vessel: a YAML file with its shape, electrodes, depth and flow."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from eitbench import _check
+from eitbench.measured.readers import load_yaml
+from eitbench.numerics.mesh import Mesh
+from eitbench.physics.cem import CompleteElectrodeModel
+from eitbench.worlds.mesh_vessel import MeshVessel
+from eitbench.worlds.vessels import PlanePipe, RoundPipe, RoundTank
+
+DIRECTIONS = ("counter-clockwise", "clockwise")
+MAX_COVERAGE = 0.95
+"""Fraction of a wall that electrodes may cover."""
+INITIAL_CONTACT_IMPEDANCE = 1e-4
+"""Ω·m², before calibration."""
+ENTRIES = {
+    "circle": ({"radius", "electrodes"}, {"width", "cover", "first", "direction", "depth"}),
+    "rectangle": ({"length", "width", "electrodes"}, {"electrode_width", "cover", "depth", "flow"}),
+    "cylinder": ({"length", "radius", "rings", "electrodes", "height", "cover"},
+                 {"first", "direction", "flow"}),
+    "mesh": ({"file", "electrodes"}, {"scale", "depth"}),
+}
+"""Kind of vessel -> required and optional entries; each may also have ``conductivity``."""
+
+
+@dataclass(frozen=True)
+class FlowConfig:
+    """Laminar flow along a pipe."""
+
+    mean_velocity: float
+    """m/s, along the pipe"""
+    diffusivity: float = 5e-4
+    """κ in m²/s"""
+    velocity_std: float = 0.0
+    """m/s, prior of the mean velocity; if positive, the velocity is estimated too"""
+    velocity_walk: float = 0.0
+    """m/s, standard deviation of the mean velocity's random walk in a step"""
+
+    def __post_init__(self) -> None:
+        for name, units in (("mean_velocity", "m/s"), ("diffusivity", "m²/s")):
+            _check.number(f"flow.{name}", getattr(self, name), low=0.0, open_low=True, units=units)
+        for name in ("velocity_std", "velocity_walk"):
+            _check.number(f"flow.{name}", getattr(self, name), low=0.0, units="m/s")
+
+    @property
+    def is_estimated(self) -> bool:
+        """Whether the velocity is estimated."""
+        return self.velocity_std > 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class VesselConfig:
+    """A vessel, rotated or mirrored so that its electrodes are at those of the instrument.
+
+    Angles are those of a picture: 0° to the right, 90° at the top.
+    """
+
+    shape: RoundTank | PlanePipe | RoundPipe | MeshVessel
+    first: float = 0.0
+    """angle of the middle of the first electrode in degrees"""
+    direction: str = "counter-clockwise"
+    """in which electrodes are counted"""
+    depth: float = 1.0
+    """m of fluid for a plane model; 1 in 3D"""
+    conductivity: float | None = None
+    """S/m if known; then the gain of the instrument is calibrated"""
+    flow: FlowConfig | None = None
+    """of the fluid through a pipe; None for an unknown motion"""
+
+    def __post_init__(self) -> None:
+        _check.number("first", self.first, units="degrees")
+        _check.number("depth", self.depth, low=0.0, open_low=True, units="m")
+        if self.direction not in DIRECTIONS:
+            raise ValueError(f"direction must be one of {', '.join(DIRECTIONS)}, "
+                             f"got {self.direction!r}")
+        if self.conductivity is not None:
+            _check.number("conductivity", self.conductivity, low=0.0, open_low=True, units="S/m")
+        if self.flow and self.flow.is_estimated and not isinstance(self.shape, PlanePipe):
+            raise ValueError("flow.velocity_std must be 0 in a cylinder, whose velocity is not "
+                             f"estimated, got {self.flow.velocity_std:g}")
+
+    @property
+    def n_electrodes(self) -> int:
+        """L"""
+        return self.shape.n_electrodes
+
+    def transport_mesh(self) -> Mesh:
+        """Return the mesh of the estimates."""
+        return self._turned(self.shape.carrier(fine=False)[0])
+
+    def electrode_model(self, contact_impedance: np.ndarray | float) -> CompleteElectrodeModel:
+        """Return the electrodes with these contact impedances, (L,) or a scalar, in Ω·m²."""
+        return self._electrodes.with_contacts(contact_impedance)
+
+    @cached_property
+    def _electrodes(self) -> CompleteElectrodeModel:
+        # finer than estimates need, as calibration corrects its error for homogeneous fluid only
+        model = self.shape.electrode_model(fine=self.shape.carrier(fine=False)[0].dim == 2)
+        if not self._is_turned:
+            return model
+        return CompleteElectrodeModel(self._turned(model.mesh), model.electrodes,
+                                      model.contact_impedance, model.order)
+
+    @property
+    def _is_turned(self) -> bool:
+        return self.first != 0.0 or self.direction != DIRECTIONS[0]
+
+    def _turned(self, mesh: Mesh) -> Mesh:
+        if not self._is_turned:
+            return mesh
+        points = mesh.points.copy()
+        x = mesh.points[:, 0]
+        y = mesh.points[:, 1] * (1.0 if self.direction == DIRECTIONS[0] else -1.0)
+        angle = np.radians(self.first)
+        points[:, 0] = np.cos(angle) * x - np.sin(angle) * y
+        points[:, 1] = np.sin(angle) * x + np.cos(angle) * y
+        return Mesh(points, mesh.cells)
+
+
+def read_vessel(source: Path | str | Mapping[str, Any]) -> VesselConfig:
+    """Build the vessel that a YAML file, or a mapping of the same entries, describes.
+
+    Entries, in m and degrees, optional ones in brackets:
+
+    - circle: ``radius``, ``electrodes`` (number), ``width`` of one or ``cover`` (fraction of the
+      wall), [``first``, ``direction``, ``depth``]
+    - rectangle, a pipe with electrodes on both walls along the flow: ``length``, ``width``,
+      ``electrodes`` (total number), ``electrode_width`` or ``cover``, [``depth``, ``flow``]
+    - cylinder, a pipe with rings of electrodes: ``length``, ``radius``, ``rings``, ``electrodes``
+      (number per ring), ``height`` of one, ``cover``, [``first``, ``direction``, ``flow``]
+    - mesh: ``file``, ``electrodes`` (number), [``scale``, ``depth``]; see `MeshVessel`
+
+    and for all [``conductivity``] in S/m, if known. ``flow`` has the entries of `FlowConfig`.
+    ``ValueError`` names the entry and the fault.
+    """
+    if isinstance(source, Mapping):
+        return _vessel(dict(source), Path())
+    return _vessel(load_yaml(Path(source), "vessel"), Path(source).parent)
+
+
+def _vessel(entries: dict[str, Any], folder: Path) -> VesselConfig:
+    kind = entries.pop("kind", None)
+    if kind not in ENTRIES:
+        raise ValueError(f"vessel.kind must be one of {', '.join(ENTRIES)}, got {kind!r}")
+    required, optional = ENTRIES[kind]
+    if missing := sorted(required - set(entries)):
+        raise ValueError(f"vessel of kind {kind} must have {', '.join(missing)}")
+    if unknown := sorted(set(entries) - required - optional - {"conductivity"}):
+        raise ValueError(f"vessel of kind {kind} has no {', '.join(unknown)}; there are "
+                         f"{', '.join(sorted(required | optional))} and conductivity")
+    placed: dict[str, Any] = {
+        name: entries[name] for name in ("first", "direction", "depth", "conductivity")
+        if name in entries}
+    if "flow" in entries:
+        placed["flow"] = _flow(entries["flow"])
+    return VesselConfig(_shape(kind, entries, folder), **placed)
+
+
+def _shape(kind: str, entries: dict[str, Any], folder: Path) -> Any:
+    count = _check.integer("vessel.electrodes", entries["electrodes"], low=2)
+    if kind == "circle":
+        radius = _positive(entries, "radius")
+        cover = _cover(entries, "width", count, 2.0 * np.pi * radius)
+        return RoundTank(radius=radius, n_electrodes=count, electrode_cover=cover)
+    if kind == "rectangle":
+        if count % 2:
+            raise ValueError(f"vessel.electrodes must be even, half on each wall, got {count}")
+        length = _positive(entries, "length")
+        return PlanePipe(length=length, half_width=0.5 * _positive(entries, "width"),
+                         electrodes_per_wall=count // 2,
+                         electrode_cover=_cover(entries, "electrode_width", count // 2, length))
+    if kind == "cylinder":
+        return RoundPipe(length=entries["length"], radius=entries["radius"],
+                         electrode_rings=entries["rings"], electrodes_per_ring=count,
+                         electrode_length=entries["height"], electrode_cover=entries["cover"])
+    path = folder / str(entries["file"])
+    if not path.is_file():
+        raise ValueError(f"vessel.file must be a mesh file, got {path}")
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    return MeshVessel(str(path), digest, str(path), digest, count, scale=entries.get("scale", 1.0))
+
+
+def _flow(entries: Any) -> FlowConfig:
+    known = [each.name for each in fields(FlowConfig)]
+    if not isinstance(entries, Mapping) or not {"mean_velocity"} <= set(entries) <= set(known):
+        raise ValueError("vessel.flow must have mean_velocity (m/s), and may have "
+                         f"{', '.join(known[1:])}, got {entries!r}")
+    return FlowConfig(**entries)
+
+
+def _positive(entries: Mapping[str, Any], name: str) -> float:
+    return _check.number(f"vessel.{name}", entries[name], low=0.0, open_low=True, units="m")
+
+
+def _cover(entries: Mapping[str, Any], width: str, count: int, wall: float) -> float:
+    """Fraction of a wall (m) that electrodes cover."""
+    if (width in entries) == ("cover" in entries):
+        raise ValueError(f"vessel must have either {width} or cover, got "
+                         f"{'both' if width in entries else 'neither'}")
+    if "cover" in entries:
+        return _check.number("vessel.cover", entries["cover"], low=0.0, high=MAX_COVERAGE,
+                             open_low=True)
+    return count / wall * _check.number(f"vessel.{width}", entries[width], low=0.0, open_low=True,
+                                        high=MAX_COVERAGE * wall / count, units="m")

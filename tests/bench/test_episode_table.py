@@ -1,0 +1,79 @@
+"""The table of episodes that a package ships: it says of every score what the records say."""
+
+import gzip
+import re
+
+import pandas as pd
+import pytest
+from eitbench._files import shipped
+from eitbench.bench import load
+from eitbench.bench.episode_table import NAME, episode_table, read_episode_table, write_episode_table
+from eitbench.bench.records import newest, read_records, write_record
+from eitbench.report import compare
+from eitbench.report.summary import anchors
+from eitbench.report.terminal import shipped_anchors
+
+from tiny import several_boards
+
+RESULTS = shipped("leaderboards") / "results"
+
+
+def test_the_published_table_is_that_of_the_records():
+    """`eitbench leaderboard --records leaderboards/results` would change nothing, and `load` gives one frame."""
+    text = gzip.decompress((RESULTS.parent / NAME).read_bytes()).decode()
+    assert text == episode_table(read_records(RESULTS)), "run `eitbench leaderboard --records leaderboards/results`"
+    pd.testing.assert_frame_equal(load(RESULTS.parent / "none"), load(), check_exact=True)
+
+
+def test_published_records_name_no_folder_of_a_machine():
+    """Neither in the command nor anywhere else."""
+    texts = [path.read_text(encoding="utf-8") for path in RESULTS.glob("*.json")]
+    assert len(texts) >= 319
+    for text in texts:
+        assert not re.search(r'[ "=](/|~|[A-Z]:\\)\w|\.\./', text)
+
+
+def test_records_come_back(tmp_path):
+    """All that a comparison needs: floors, failures, odd names, scores that are missing."""
+    written = several_boards()
+    write_episode_table(written, tmp_path / NAME)
+    read = read_episode_table(tmp_path / NAME)
+    assert [each["method"] for each in read] == [each["method"] for each in written]
+    for made, found in zip(written, read, strict=True):
+        assert all(found[name] == made[name] for name in found if name != "episodes")
+        for one, other in zip(made["episodes"], found["episodes"], strict=True):
+            assert all(other[name] == one[name] for name in other)
+            assert ("scores" in one) == ("scores" in other)
+    assert [len(group) for group in newest(read)] == [len(group) for group in newest(written)]
+    for each in written:
+        write_record(tmp_path / "json", each)
+    listed, order = load(tmp_path / "results"), ["environment", "method", "version", "seed", "metric"]
+    pd.testing.assert_frame_equal(listed.sort_values(order, ignore_index=True),
+                                  load(tmp_path / "json").sort_values(order, ignore_index=True), check_exact=True)
+
+
+def test_compare_and_skill_need_no_records(tmp_path, monkeypatch):
+    """Where only the table is, methods are compared as in a checkout."""
+    folder = tmp_path / "results"
+    (tmp_path / NAME).write_bytes((RESULTS.parent / NAME).read_bytes())
+
+    def compared():
+        pair = [compare.find(name, tmp_path / "mine") for name in ("kalman_filter", "extended_kalman_filter")]
+        return compare.compare(*pair, "error", compare.floors(tmp_path / "mine"))
+
+    here = compared()
+    monkeypatch.setattr(compare, "SHIPPED", folder)
+    pd.testing.assert_frame_equal(compared(), here)
+    records = read_records(RESULTS)
+    assert shipped_anchors(records) == anchors(records)
+
+
+@pytest.mark.parametrize("damage", [
+    lambda data: data[:-9], lambda data: b"no gzip", lambda data: gzip.compress(b"a\n1\n"),
+    lambda data: gzip.compress(gzip.decompress(data)[:-3] + b"x,y\n")])
+def test_a_damaged_table_is_named(damage, tmp_path):
+    """With its path."""
+    write_episode_table(several_boards(), tmp_path / NAME)
+    (tmp_path / NAME).write_bytes(damage((tmp_path / NAME).read_bytes()))
+    with pytest.raises(ValueError, match=rf"table of episodes .*{NAME} cannot be read"):
+        load(tmp_path / "results")

@@ -1,0 +1,536 @@
+"""Third-party methods in a separate process: the same scores, and no way out under bubblewrap."""
+
+import gc
+import io
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from contextlib import closing, suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+from eitbench.bench import isolation, run, suites
+from eitbench.bench.isolation import (
+    MAX_HEADER_BYTES,
+    Limits,
+    Worker,
+    WorkerError,
+    bubblewrap_problem,
+    check_out_of_reach,
+    choose_isolation,
+    decode_message,
+    encode_message,
+    readable_places,
+)
+from eitbench.bench.run import Job, run_episode, run_jobs
+from eitbench.bench.store import EpisodeStore
+from eitbench.bench.tracks import Environment
+from eitbench.data.cache import CACHE_VARIABLE
+from eitbench.data.episodes import simulate
+from eitbench.worlds.catalogue import PIPE_2D
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from short import PIPE
+from tiny import FILTER, FIXED_LAG, SCENARIO, SMOOTHING, write_baseline
+
+ROOT = Path(__file__).parents[2]
+INJECTION = Environment("eitbench/Pipe2DInjection-v0", json.dumps({"world": PIPE, "estimator": "reduced"}))
+confined = pytest.mark.skipif(bool(bubblewrap_problem()), reason=bubblewrap_problem() or "bubblewrap works")
+KIND = "process" if bubblewrap_problem() else "bubblewrap"
+KINDS = ["process", pytest.param("bubblewrap", marks=confined)]
+
+POLICY = '''"""Random: drawn uniformly."""
+
+
+class Policy:
+    def __init__(self, rules, random):
+        self.rules, self.random = rules, random
+
+    def act(self, observation):
+        {act}
+'''
+
+
+@pytest.fixture(autouse=True)
+def cache(run_cache, monkeypatch):
+    """One cache for all tests of this session, and no worker left."""
+    monkeypatch.setenv(CACHE_VARIABLE, run_cache)
+    yield
+    isolation.close()
+
+
+def write_policy(folder, act="return int(self.random.integers(self.rules.action_space.n))"):
+    path = folder / "drawn.py"
+    path.write_text(POLICY.format(act=act))
+    return str(path)
+
+
+def worker(path, kind="bubblewrap", **how):
+    return closing(Worker("estimation", FILTER.id, json.loads(FILTER.kwargs), path, kind, **how))
+
+
+def ask(path, kind="bubblewrap", *, reply_timeout=60.0, **how):
+    """Run the file for some steps; returns what it raised."""
+    with worker(path, kind, **how) as there:
+        there.begin()
+        there.reply_timeout = reply_timeout
+        with pytest.raises(WorkerError) as caught:
+            there.update(np.zeros(4), np.zeros(4))
+        return str(caught.value), there.is_alive
+
+
+def lasting(result):
+    """A result without clocks and memory."""
+    scores = {name: value for name, value in result.get("scores", {}).items() if name != "seconds_per_step"}
+    return {key: value for key, value in result.items() if key not in ("finished", "seconds", "peak_memory")} | {
+        "scores": scores}
+
+
+# -- the same numbers ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("environment", [FILTER, FIXED_LAG, SMOOTHING, INJECTION],
+                         ids=["filter", "fixed-lag", "smoothing", "injection"])
+def test_scores_are_identical(environment, kind, tmp_path):
+    """An estimator that reports every field, a policy that depends on its random numbers; one worker runs both
+    episodes, and is the only process that executes the file."""
+    path = write_policy(tmp_path) if environment is INJECTION else write_baseline(
+        tmp_path, parameters="{'a': [1, 2.5]}", update="self.level = self.level + voltages.sum() + 0.1 * self.calls; "
+        "return Estimate(self.level, self.level**2, voltages, np.eye(4) + np.outer(voltages, voltages)) "
+        "if self.calls > self.task.lag else None")
+    for seed in (1, 2):
+        (here, fields), (there, others) = (run_episode(Job(environment, path, seed, each))
+                                           for each in ("none", kind))
+        assert here["status"] == "ok" and lasting(here) == lasting(there)
+        assert set(fields) == set(others) and all((fields[name] == others[name]).all() for name in fields)
+        assert here["peak_memory"] is None and 50e6 < there["peak_memory"] < 8e9
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_built_in_methods_run_there_too(kind):
+    """By name, as `submit --official --isolate bubblewrap` asks."""
+    here, there = (run_episode(Job(FILTER, "homogeneous", 1, each))[0] for each in ("none", kind))
+    assert here["status"] == "ok" and lasting(here) == lasting(there)
+
+
+def test_seeds_stay_with_the_host(tmp_path):
+    """A policy's generator depends on the episode, but its state does not tell the seed."""
+    path = write_policy(tmp_path, "raise RuntimeError(f'{self.random.bit_generator.state} "
+                                  "{self.random.integers(2**63)}')")
+    said = [run_episode(Job(INJECTION, path, seed, "process"))[0]["message"].split() for seed in (1, 2)]
+    assert said[0][-1] != said[1][-1]
+    assert min(map(int, re.findall(r"\d{10,}", " ".join(said[0])))) > 2**31
+
+
+def test_nothing_of_the_file_runs_in_the_host(tmp_path):
+    """Not even to read its title: neither in this process nor in a worker of joblib."""
+    trap = tmp_path / "trap"
+    path = write_baseline(tmp_path)
+    Path(path).write_text(f"{Path(path).read_text()}\nopen({str(trap)!r}, 'a').write(f'{{os.getppid()}} ')\n")
+    store = EpisodeStore(tmp_path / "results")
+    run_jobs([Job(FILTER, path, seed, "process") for seed in (1, 2)], store, n_jobs=2)
+    assert {result["status"] for result in store.results()} == {"ok"}
+    (record,) = store.write_records()
+    assert [each["isolation"] for each in record["runs"]] == ["process"]
+    assert all(episode["peak_memory"] > 50e6 for episode in record["episodes"])
+    before = trap.read_text()
+    Job(FILTER, path, 1).load()
+    assert trap.read_text() != before                     # executed here, it is noticed
+
+
+# -- which isolation ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("method", "isolate", "strict", "expected"), [
+    ("homogeneous", "auto", False, "none"), ("homogeneous", "auto", True, "none"),
+    ("homogeneous", "process", True, "process"), ("true_model_smoother", "process", True, "none"),
+    ("mine.py", "auto", False, "process"), ("mine.py", "none", False, "none"), ("mine.py", "process", True, "process"),
+])
+def test_isolation_depends_on_method_and_option(method, isolate, strict, expected):
+    """Built-in files run here by default, third-party files never do where that is strict."""
+    assert choose_isolation(FILTER, method, isolate, strict=strict) == expected
+
+
+def test_third_party_files_need_bubblewrap_where_strict(monkeypatch):
+    """The message says why it is missing and how to install it."""
+    monkeypatch.setattr(isolation, "bubblewrap_problem", lambda: "bubblewrap is not installed")
+    for asked in ({"strict": True}, {"isolate": "bubblewrap"}):
+        with pytest.raises(ValueError, match=r"is not installed; install bubblewrap \(apt-get install bubblewrap\), "
+                                             r"or .* --isolate process"):
+            choose_isolation(FILTER, "mine.py", **asked)
+    with pytest.raises(ValueError, match="isolate must be bubblewrap or process"):
+        choose_isolation(FILTER, "mine.py", "none", strict=True)
+    with pytest.raises(ValueError, match="isolate must be one of auto, none, process, bubblewrap, got 'never'"):
+        suites.jobs("estimation", [FILTER.id], ["homogeneous"], [1], isolate="never")
+
+
+def test_a_kernel_that_forbids_namespaces_is_recognised(monkeypatch, tmp_path):
+    """One probe, whose answer is the reason."""
+    program = tmp_path / "bwrap"
+    program.write_text("#!/bin/sh\necho 'bwrap: setting up uid map: Permission denied' >&2\nexit 1\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    assert "setting up uid map: Permission denied" in bubblewrap_problem.__wrapped__()
+
+
+# -- escapes ------------------------------------------------------------------------------------
+
+ATTEMPTS = {
+    "the ground truth": "Path(FOLDER, 'truth.npz').read_bytes()",
+    "the cache": "os.listdir(FOLDER)",
+    "the checkout": "Path(ROOT, 'README.md').read_text()",
+    "password hashes": "open('/etc/shadow').read()",
+    "the user's home": "Path(FOLDER, 'mine.txt').write_text('mine')",
+    "the built-in methods": "Path(ROOT, 'baselines', 'escape.tmp').write_text('mine')",
+    "TCP": "socket.create_connection(('127.0.0.1', PORT), timeout=5)",
+    "a service's socket": "socket.socket(socket.AF_UNIX).connect(FOLDER + '/service')",
+    "an abstract socket": "socket.socket(socket.AF_UNIX).connect('\\0' + FOLDER)",
+    "the host's variables": "Path(f'/proc/{HOST}/environ').read_bytes()",
+    "the host's memory": "open(f'/proc/{HOST}/mem', 'rb')",
+    "the host's process": "os.kill(HOST, 0)",
+    "inherited variables": "os.environ['EITBENCH_TEST_SECRET']",
+    "shared memory": "Path('/dev/shm', SHARED).read_bytes()",
+    "another root": "os.chroot('/')",
+    "the truth in memory": "found(SHAPE) or 1 / 0",
+}
+TRY = """
+import gc, os, socket
+from pathlib import Path
+def found(shape):
+    held = [value for each in gc.get_objects() if type(each) is dict for value in each.values()]
+    return any(type(value).__name__ == "ndarray" and list(value.shape) == shape for value in held)
+reached = []
+for what, deed in ATTEMPTS.items():
+    try:
+        eval(deed)
+        reached.append(what)
+    except (OSError, KeyError, ZeroDivisionError):
+        pass
+"""
+NEEDS_ROOT = {"password hashes", "another root"}
+
+
+@pytest.fixture(scope="module")
+def reached(tmp_path_factory):
+    """What the attempts reach in this process, and under bubblewrap."""
+    folder = tmp_path_factory.mktemp("secret")
+    truth = simulate(PIPE_2D.changed(SCENARIO), 3, progress=False).concentration
+    here = {"truth": truth, "a container, which the collector lists": []}
+    np.savez(folder / "truth.npz", truth)
+    shared = Path("/dev/shm", f"eitbench-test-{os.getpid()}")
+    shared.write_text("secret")
+    os.environ["EITBENCH_TEST_SECRET"] = "secret"
+    with (socket.create_server(("127.0.0.1", 0)) as server, socket.socket(socket.AF_UNIX) as service,
+          socket.socket(socket.AF_UNIX) as abstract):
+        service.bind(str(folder / "service"))
+        abstract.bind(f"\0{folder}")
+        service.listen()
+        abstract.listen()
+        known = {"FOLDER": str(folder), "ROOT": str(ROOT), "HOST": os.getpid(), "SHARED": shared.name,
+                 "PORT": server.getsockname()[1], "SHAPE": list(here["truth"].shape), "ATTEMPTS": ATTEMPTS}
+        source = "\n".join(f"{name} = {value!r}" for name, value in known.items()) + TRY
+        within = {}
+        gc.collect()
+        try:
+            exec(source, within)
+            path = write_baseline(folder, init=f"exec({source!r}, globals())",
+                                  update="raise RuntimeError(f'reached {reached}')")
+            there = ask(path)[0]
+        finally:
+            (ROOT / "baselines" / "escape.tmp").unlink(missing_ok=True)
+            shared.unlink()
+            del os.environ["EITBENCH_TEST_SECRET"]
+    assert there.startswith("RuntimeError: reached [")
+    return within["reached"], there
+
+
+@confined
+@pytest.mark.parametrize("what", ATTEMPTS)
+def test_it_does_not_reach(what, reached):
+    """The same code reaches it without bubblewrap, where that does not need root."""
+    here, there = reached
+    assert what in here or (what in NEEDS_ROOT and os.getuid())
+    assert repr(what) not in there
+
+
+@confined
+def test_datagrams_do_not_arrive(tmp_path):
+    """UDP has no connection that could be refused."""
+    with socket.socket(type=socket.SOCK_DGRAM) as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.settimeout(0.5)
+        send = ("import socket; socket.socket(type=socket.SOCK_DGRAM).sendto(b'truth', ('127.0.0.1', "
+                f"{listener.getsockname()[1]})); raise RuntimeError('sent')")
+        ask(write_baseline(tmp_path, update=send))
+        with pytest.raises(TimeoutError):
+            listener.recv(10)
+
+
+FORK = """
+        children = 0
+        try:
+            while True:
+                if not os.fork():
+                    {child}
+                    __import__("time").sleep(60)
+                    os._exit(0)
+                children += 1
+        except OSError:
+            raise RuntimeError("refused") if children < 200 else None
+"""
+
+
+@pytest.mark.parametrize(("statement", "message", "lives"), [
+    ("raise KeyError('oh')", "KeyError: 'oh'", True),
+    ("raise SystemExit('bye')", "SystemExit: bye", True),
+    ("return 7", "must return an Estimate or None, got int", True),
+    ("np.ones(2**29)", "MemoryError", True),
+    ("os._exit(3)", "ended with status 3", False),
+    ("os.kill(os.getpid(), 9)", "ended with status", False),
+    ("__import__('time').sleep(60)", "TimeoutError: no reply within 3 s", False),
+    ("while True: pass", "TimeoutError: no reply within 3 s", False),
+    ("os.write(4, bytes(2**10))", "ValueError: a message must", False),
+    ("os.write(4, (2**62).to_bytes(8, 'little') * 2)", "ValueError: a message must have at most", False),
+    ("os.close(4); __import__('time').sleep(60)", "ended with status|no reply within 3 s", False),
+    ("return Estimate(np.array([object()]))", "numeric in arrays", True),
+])
+def test_what_goes_wrong_is_reported(statement, message, lives, tmp_path):
+    """Exceptions, memory, crashes, silence, and messages that are malformed or too long."""
+    path = write_baseline(tmp_path, update=statement)
+    said, is_alive = ask(path, KIND, reply_timeout=3.0, limits=Limits(memory=3 << 30))
+    assert re.search(message, said) and is_alive == lives
+
+
+@confined
+@pytest.mark.parametrize(("child", "limits", "message"), [
+    ("pass", Limits(threads=100), "ResourceLimitError: it started more than 100|RuntimeError: refused"),
+    ("kept = np.ones(2**25)", Limits(memory=3 << 30), "ResourceLimitError: it held more than 3072 MiB|MemoryError"),
+], ids=["processes", "memory of all processes"])
+def test_limits_hold_for_all_its_processes(child, limits, message, tmp_path):
+    """Processes are also counted from outside, since the kernel does not count those of root."""
+    said, _ = ask(write_baseline(tmp_path, update=FORK.format(child=child)), limits=limits)
+    assert re.search(message, said)
+
+
+@confined
+def test_disk_space_is_limited(tmp_path):
+    """Its only writable folder lies in memory and has a size."""
+    write = ("content = bytes(2**20)\n        for k in range(200):\n"
+             "            open(f'{Path.home()}/{k}', 'wb').write(content)\n        raise RuntimeError('wrote all')")
+    said, _ = ask(write_baseline(tmp_path, update=write), limits=Limits(disk=100 << 20))
+    assert "No space left" in said
+
+
+STUBBORN = """
+        if os.fork():
+            while True: pass
+        for leave in (os.setsid, os.setpgrp):
+            try:
+                leave()
+            except OSError:
+                pass
+        while True: pass
+"""
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_worker_ends_with_its_host(kind, tmp_path):
+    """Killed or not; under bubblewrap its children, which have left their session, end too."""
+    path = write_baseline(tmp_path, update=STUBBORN if kind == "bubblewrap" else "while True: pass")
+    program = ("import numpy as np; from eitbench.bench.isolation import Worker\n"
+               f"there = Worker('estimation', {FILTER.id!r}, {json.loads(FILTER.kwargs)!r}, {path!r}, {kind!r})\n"
+               "there.begin(); there._send(__import__('eitbench.bench.isolation').bench.isolation.encode_message("
+               "{'do': 'update'}, {'voltages': np.zeros(4), 'currents': np.zeros(4)}))\n"
+               "import time; time.sleep(1.0); print(*there._family(), flush=True); time.sleep(60)")
+    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as host:
+        family = [int(pid) for pid in host.stdout.readline().split()]
+        assert len(family) >= (4 if kind == "bubblewrap" else 1) and all(map(is_running, family))
+        host.send_signal(signal.SIGKILL)
+    until = time.monotonic() + 20.0
+    while any(map(is_running, family)):
+        assert time.monotonic() < until
+        time.sleep(0.05)
+
+
+def is_running(pid):
+    """Whether there is such a process, other than one that has ended and was not waited for."""
+    with suppress(OSError):
+        return "State:\tZ" not in Path(f"/proc/{pid}/status").read_text()
+    return False
+
+
+def test_a_question_that_is_not_read_times_out(tmp_path):
+    """A worker may answer in advance and read nothing until the pipe is full."""
+    ahead = ("from eitbench.bench.isolation import encode_message\n        os.write(4, encode_message({}))\n"
+             "        while True: os.write(4, encode_message({'estimate': None}))")
+    with worker(write_baseline(tmp_path, init=ahead), "process") as there:
+        there.begin()
+        there.reply_timeout = 2.0
+        with pytest.raises(WorkerError, match="TimeoutError: no reply within 2 s"):
+            for _ in range(100):
+                there.update(np.zeros(1000), np.zeros(1000))
+        assert not there.is_alive
+
+
+def test_secrets_must_lie_elsewhere_than_python():
+    """Neither a cache with truths nor a maintainer's secret where workers read."""
+    place = next(place for place in readable_places() if place.is_dir() and "packages" in place.name)
+    with pytest.raises(ValueError, match=r"the cache folder .* must lie outside .*, which isolated methods can read"):
+        check_out_of_reach(place / "cache", "the cache folder")
+    check_out_of_reach(ROOT / "leaderboards" / "held_out.json", "a record")
+
+
+# -- failures are the episode's -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("statement", ["raise KeyError('oh')", "os._exit(3)"])
+def test_the_next_episode_begins_with_a_worker_that_answers(statement, tmp_path):
+    """The result of a failed episode names the user's line, also from another process."""
+    path = write_baseline(tmp_path, update=f"if self.task and voltages[0] != 0.0: {statement}")
+    job = Job(FILTER, path, 1, "process")
+    result, fields = run_episode(job)
+    assert result["status"] == "failed" and not fields
+    if "raise" in statement:
+        here = run_episode(job._replace(isolation="none"))[0]
+        assert lasting(result) == lasting(here) and result["where"].startswith("mine.py:")
+    assert run_episode(job)[0]["status"] == "failed"
+    job.load().make(None)
+    assert isolation._current[0][1].is_alive
+
+
+def test_a_changed_file_does_not_run(tmp_path):
+    """A record is of one file; a new worker would run another."""
+    path = write_baseline(tmp_path)
+    loaded = Job(FILTER, path, 1, "process").load()
+    isolation.close()
+    write_baseline(tmp_path, update="raise RuntimeError('changed')")
+    with pytest.raises(WorkerError, match="was changed during the run"):
+        loaded.make(None)
+
+
+ABOUT = """import os
+from eitbench.bench.isolation import encode_message
+valid = {{"title": "Mine", "boards": ["filter"], "role": None, "parameters": {{}}, "suits": True}}
+os.write(4, encode_message(valid | {{{}}}))
+"""
+"""A file that replies in the place of its process before it is loaded."""
+
+
+@pytest.mark.parametrize(("content", "message"), [
+    ("class Estimator: pass", "must define a class Estimator with a method update"),
+    ("raise SystemExit(3)", "cannot be loaded: SystemExit: 3"),
+    ("import os; os._exit(4)", "ended with status 4"),
+    (ABOUT.format("'title': 'a' * 121"), "reports an invalid title"),
+    (ABOUT.format("'title': 'a\\x1b[2J'"), "reports an invalid title"),
+    (ABOUT.format("'boards': [{}], 'role': [], 'name': 7"), "reports an invalid role, boards"),
+    (ABOUT.format("'parameters': {'a': 'b' * 10_000}"), "parameters must have at most"),
+    (ABOUT.format("'privileged': True"), "is privileged"),
+])
+def test_files_that_cannot_be_loaded_are_named(content, message, tmp_path):
+    """A ``ValueError`` with the path, also if the file makes the process lie."""
+    path = tmp_path / "mine.py"
+    path.write_text(content)
+    with pytest.raises(ValueError, match=message) as caught:
+        Job(FILTER, str(path), 1, "process").load()
+    assert str(path) in str(caught.value)
+
+
+def test_a_worker_does_not_choose_its_name(tmp_path):
+    """Results are stored under it: those of a file must not replace those of a built-in method."""
+    path = Path(write_baseline(tmp_path))
+    path.write_text(path.read_text() + "\nimport eitbench.bench.methods as b\nmade = b.Method\n"
+                    "b.Method = lambda track, name, *rest: made(track, 'homogeneous', *rest)\n")
+    assert Job(FILTER, str(path), 1, "process").load().name == "mine"
+    with pytest.raises(ValueError, match="has the name of one of ours"):
+        Job(FILTER, write_baseline(tmp_path, "homogeneous"), 1, "process").load()
+
+
+def test_output_is_marked_cleaned_and_limited(tmp_path, capsys):
+    """Standard error shows the method's lines; nothing in them moves the cursor."""
+    path = write_baseline(tmp_path, init="print('made\\x1b[2J'); print('x' * 20_000)")
+    with worker(path, "process") as there:
+        there.begin()
+    printed = capsys.readouterr().err
+    assert "[mine] made\\x1b[2J\n[mine] xxx" in printed and len(printed) < 11_000
+
+
+def test_an_episode_has_a_time_limit(tmp_path, monkeypatch):
+    """One reply after the other just in time could take days."""
+    with worker(write_baseline(tmp_path, update="__import__('time').sleep(0.2)"), "process") as there:
+        monkeypatch.setattr(isolation, "EPISODE_TIMEOUT_S", 0.5)
+        there.begin()
+        with pytest.raises(WorkerError, match="its replies in one episode took more"):
+            for _ in range(10):
+                there.update(np.zeros(4), np.zeros(4))
+
+
+def test_a_run_leaves_no_worker(tmp_path, monkeypatch):
+    """One worker for all episodes of a method, and none at the end."""
+    made = []
+
+    class Counted(Worker):
+        def __init__(self, *arguments, **rest):
+            assert not any(each.is_alive for each in made)
+            super().__init__(*arguments, **rest)
+            made.append(self)
+
+    monkeypatch.setattr(isolation, "Worker", Counted)
+    jobs = [Job(FILTER, write_baseline(tmp_path, name), seed, "process")
+            for name in ("first", "second") for seed in (1, 2)]
+    run.run_jobs(jobs, EpisodeStore(tmp_path / "results"))
+    assert len(made) == 4 and not any(each.is_alive or each._home.exists() for each in made)
+
+
+# -- messages -----------------------------------------------------------------------------------
+
+numbers = hnp.arrays(st.sampled_from([np.float64, np.float32, np.int64, np.bool_]),
+                     hnp.array_shapes(min_dims=0, min_side=0))
+
+
+@given(st.dictionaries(st.text(), st.integers() | st.text() | st.none()), st.dictionaries(st.text(), numbers))
+def test_messages_arrive(header, arrays):
+    """Headers and arrays of all shapes."""
+    said, there = decode_message(io.BytesIO(encode_message(header, arrays)).read)
+    assert said == header and set(there) == set(arrays)
+    for name, array in arrays.items():
+        assert there[name].dtype == array.dtype and there[name].shape == array.shape
+        np.testing.assert_array_equal(there[name], array)
+
+
+@pytest.mark.parametrize(("head", "body"), [
+    (b"nonsense", b""), (b"[1, []]", b""), (b"[{}, 7]", b""), (b"[{}, [7]]", b""), (b"[{}, []]", b"\0"),
+    (b'[{"a": NaN}, []]', b""), (b'[{"a": "\\ud800"}, []]', b""), (b"[" * 100_000, b""),
+    (b'[{"a": ' + b"[" * 30 + b"]" * 30 + b"}, []]", b""), (b'[{"a": ' + b"9" * 5000 + b"}, []]", b""),
+    (b'[{}, [["a", "<f8", [2]]]]', b"\0" * 8), (b'[{}, [["a", "<f8", [-1]]]]', b"\0" * 8),
+    (b'[{}, [["a", "O", [1]]]]', b"\0" * 8), (b'[{}, [["a", ",f8", [1]]]]', b"\0" * 8),
+    (b'[{}, [["a", {"a": 1}, [1]]]]', b""), (b'[{}, [["a", "<f8", [0, true]]]]', b""),
+    (b'[{}, [["a", "<f8", [0, 18446744073709551616]]]]', b""),
+    (b'[{}, [["a", "<f8", ' + b"[1" + b", 1" * 80 + b"]]]]", b"\0" * 8),
+])
+def test_malformed_messages_are_rejected(head, body):
+    """Objects above all, and whatever numpy would parse as a program."""
+    content = io.BytesIO(len(head).to_bytes(8, "little") + len(body).to_bytes(8, "little") + head + body)
+    with pytest.raises(ValueError, match="message must"):
+        decode_message(content.read)
+
+
+def test_long_messages_are_not_read():
+    """Their lengths come first."""
+    asked = []
+
+    def read(n):
+        asked.append(n)
+        return (MAX_HEADER_BYTES + 1).to_bytes(8, "little") + bytes(8)
+
+    with pytest.raises(ValueError, match="message must have at most"):
+        decode_message(read)
+    assert asked == [16]

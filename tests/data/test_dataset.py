@@ -1,0 +1,255 @@
+"""Examples to learn from: what they hold is what environments show and score, and files hold the same."""
+
+import json
+import pickle
+import re
+import sys
+
+import eitbench
+import gymnasium as gym
+import h5py
+import numpy as np
+import pytest
+import torch
+from eitbench.cli.app import app
+from eitbench.data import bank
+from eitbench.data.episodes import simulate
+from eitbench.data.export import export
+from eitbench.data.recordings import recording, step_error
+from eitbench.data.regions import integrals, region_operators, score_mass
+from typer.testing import CliRunner
+
+from short import WANDERING
+from tiny_worlds import CHANGES, FAST
+
+PIPE = "eitbench/Pipe2D-v0"
+REGION = "eitbench/Pipe2DInjectionFlow-v0"
+
+
+@pytest.fixture(scope="module")
+def tiny():
+    """Two episodes of five steps."""
+    return eitbench.dataset(PIPE, "train:0-1", world=CHANGES)
+
+
+def test_they_are_what_the_environment_shows_and_scores(tiny):
+    env = gym.make(PIPE, world=CHANGES)
+    random = np.random.default_rng(0)
+    for example in tiny:
+        observation, _ = env.reset(seed=example.seed)
+        estimate = example.truth + random.normal(size=example.truth.shape)
+        rewards = []
+        for t, mean in enumerate(estimate):
+            np.testing.assert_array_equal(observation["voltages"], example.voltages[t])
+            np.testing.assert_array_equal(observation["currents"], example.currents[t])
+            observation, reward, *_ = env.step(mean)
+            rewards.append(reward)
+        errors = tiny.errors(example, estimate)
+        np.testing.assert_allclose(errors[tiny.warm_up:], -np.array(rewards[tiny.warm_up:]), atol=1e-9)
+    assert [example.seed for example in tiny] == [0, 1] and tiny[-1].seed == 1
+
+
+@pytest.mark.parametrize("env, changes", [(PIPE, CHANGES), (REGION, WANDERING)])
+def test_truth_is_the_best_there_is_on_these_nodes(env, changes):
+    """What is left over is orthogonal, over what counts of the truth's own mesh, to all that there is."""
+    examples = eitbench.dataset(env, "train:0", world=changes)
+    (example,) = examples
+    truth = simulate(examples.world, 0).concentration[1:].astype(float)
+    interpolation, mass = region_operators(examples.world)
+    off = (truth - example.truth @ interpolation.T).T
+    weights = mass.sum(axis=0) @ interpolation
+    assert np.abs(interpolation.T @ (mass @ off)).max() < 1e-5 * weights.max() * np.abs(off).max()
+    np.testing.assert_allclose(example.unresolved, (off * (mass @ off)).sum(axis=0), rtol=1e-4)
+    np.testing.assert_allclose(example.square, (truth.T * (mass @ truth.T)).sum(axis=0), rtol=1e-9)
+    assert np.abs(example.truth - 28.0).max() < 3.0 * np.abs(truth - 28.0).max()       # beyond a region's edge too
+
+
+def test_errors_over_a_region_are_those_of_its_scores():
+    examples = eitbench.dataset(REGION, "train:0", world=WANDERING)
+    world, (example,) = examples.world, examples
+    estimate = 30.0 + np.random.default_rng(1).normal(size=example.truth.shape)
+    counted = integrals(world, 0, recording(world, 0))
+    expected = step_error(score_mass(world), estimate - world.background, *counted)
+    np.testing.assert_allclose(examples.errors(example, estimate), expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("env, changes", [(PIPE, CHANGES), (REGION, WANDERING)])
+def test_scores_are_the_same_in_few_coordinates(env, changes):
+    """Of any estimate in the span of a basis, which need not be orthonormal, about any mean."""
+    examples = eitbench.dataset(env, "train:0", world=changes)
+    random = np.random.default_rng(2)
+    basis = random.normal(size=(examples.mesh.n_nodes, 3))
+    for mean in (25.0, 30.0 + random.normal(size=len(basis))):
+        reduced = examples.reduced(basis, mean)
+        (example,) = reduced
+        said = random.normal(size=example.truth.shape)
+        estimate = reduced.concentration(said)
+        np.testing.assert_allclose(estimate, mean + said @ basis.T)
+        np.testing.assert_allclose(reduced.errors(example, said), examples.errors(examples[0], estimate), rtol=1e-9)
+        best = reduced.errors(example, example.truth)
+        for nudge in 1e-3 * np.eye(3):
+            assert (reduced.errors(example, example.truth + nudge) > best).all()
+    assert reduced[0].truth.shape == (len(example.voltages), 3)
+
+
+@pytest.mark.parametrize("env, changes", [(PIPE, CHANGES), (REGION, WANDERING)])
+def test_modes_are_the_best_basis(env, changes):
+    """Orthonormal over what is scored; they leave what the singular values that they leave say, and all of them
+    nothing."""
+    examples = eitbench.dataset(env, "train:0-1", world=changes)
+    squares, vectors = np.linalg.eigh(examples.mass.toarray())
+    root = vectors * np.sqrt(np.maximum(squares, 0.0))
+    states = np.concatenate([each.truth[examples.warm_up::2] for each in examples]) - examples.world.background
+    values = np.linalg.svd(states @ root, compute_uv=False)
+    for q in (1, len(states)):
+        reduced = examples.reduced(examples.modes(q))
+        np.testing.assert_allclose(reduced.mass, np.eye(q), atol=1e-9)
+        left = sum((reduced.of(each).unresolved - each.unresolved)[examples.warm_up::2].sum() for each in examples)
+        assert left == pytest.approx((values[q:]**2).sum(), rel=1e-5, abs=1e-9 * (values**2).sum())
+    with pytest.raises(ValueError, match=f"q must be at most {len(states)}, .* got {len(states) + 1}"):
+        examples.modes(len(states) + 1)
+
+
+@pytest.mark.parametrize("basis, mean, said", [
+    (np.ones((3, 2)), None, "basis"), (np.ones((1, 2)), None, "some of these 2 depend"),
+    (np.full((1, 1), np.nan), None, "basis"), (None, np.zeros(3), "mean"), (None, "much", "mean must be a number")])
+def test_bases_that_are_none_are_explained(tiny, basis, mean, said):
+    n = tiny.mesh.n_nodes
+    basis = np.ones((n, 1)) if basis is None else np.repeat(basis, n, axis=0) if len(basis) == 1 else basis
+    with pytest.raises(ValueError, match=said):
+        tiny.reduced(basis, mean)
+
+
+def test_the_flow_is_told_where_it_is_asked_for():
+    """A parabola is the profile itself, so that its mean velocity is found."""
+    examples = eitbench.dataset("eitbench/Pipe2DUnknownVelocity-v0", "train:0", world=FAST)
+    profiles = examples.world.velocity_model.profiles
+    there = simulate(examples.world, 0).velocity
+    np.testing.assert_allclose(examples[0].velocity @ profiles.T, there, rtol=1e-9)
+
+
+@pytest.mark.parametrize("env, seeds, said", [
+    ("eitbench/Nowhere-v0", "train:0", "env must be one of"),
+    (PIPE, [], "at least one episode, got \\[\\]"),
+    (PIPE, [1.5], "seeds must be an integer"),
+    (PIPE, [3, 200_003], "must name the split .* 'test:3', got 200003"),
+    (PIPE, "200003", "must name the split of test episodes"),
+])
+def test_mistakes(env, seeds, said):
+    with pytest.raises(ValueError, match=said):
+        eitbench.dataset(env, seeds)
+
+
+def test_an_estimate_of_another_shape_is_refused(tiny):
+    with pytest.raises(ValueError, match="estimate must have shape"):
+        tiny.errors(tiny[0], tiny[0].truth[:-1])
+
+
+def test_iterating_simulates_few_at_a_time(monkeypatch, tmp_path):
+    """Eight together, and those only that come next: memory is bounded."""
+    monkeypatch.setenv("EITBENCH_CACHE", str(tmp_path))
+    asked = []
+    simulated = bank.simulate_together
+
+    def counting(world, seeds, *more):
+        asked.append(list(seeds))
+        return simulated(world, seeds, *more)
+
+    monkeypatch.setattr(bank, "simulate_together", counting)
+    stream = iter(eitbench.dataset(PIPE, "train:0-8", world=CHANGES))
+    assert next(stream).seed == 0 and asked == [list(range(8))]
+    assert [example.seed for example in stream] == list(range(1, 9)) and asked[1:] == [[8]]
+
+
+# -- torch -----------------------------------------------------------------------------------------
+
+
+def test_torch_loads_batches(tiny):
+    """Through a pickle, as processes of a loader get it."""
+    batch = next(iter(torch.utils.data.DataLoader(pickle.loads(pickle.dumps(tiny.torch())), batch_size=2)))
+    assert batch["seed"].tolist() == [0, 1] and batch["truth"].dtype == torch.float32
+    for name in ("voltages", "currents", "truth", "square"):
+        expected = np.stack([getattr(example, name) for example in tiny])
+        np.testing.assert_allclose(batch[name].numpy(), expected, rtol=1e-6)
+
+
+def test_without_torch_it_says_what_to_install(tiny, monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch", None)
+    with pytest.raises(ModuleNotFoundError, match=r"a dataset for torch needs the extra rl"):
+        tiny.torch()
+
+
+# -- files -----------------------------------------------------------------------------------------
+
+
+def read(path):
+    """The fields of a file."""
+    if path.suffix == ".npz":
+        with np.load(path) as file:
+            return dict(file)
+    with h5py.File(path) as file:
+        return {name: np.array(each) for name, each in file.items()}
+
+
+@pytest.mark.parametrize("format, suffix", [("npz", "npz"), ("hdf5", "h5")])
+def test_files_hold_the_same_and_more_can_be_added(tiny, tmp_path, format, suffix):
+    first = eitbench.dataset(PIPE, "train:0", world=CHANGES)
+    folder = tmp_path / "out"
+    assert export(first, folder, format) == 1
+    before = (folder / f"train-0.{suffix}").stat().st_mtime_ns
+    assert export(tiny, folder, format) == 1
+    assert (folder / f"train-0.{suffix}").stat().st_mtime_ns == before
+    for example in tiny:
+        fields = read(folder / f"train-{example.seed}.{suffix}")
+        for name in ("voltages", "currents", "truth", "unresolved", "square"):
+            np.testing.assert_array_equal(fields[name], getattr(example, name))
+        assert (fields["seed"] == example.seed).all()
+    if format == "hdf5":
+        with h5py.File(folder / "train-0.h5") as file:
+            assert file["truth"].attrs["units"] == "mol/m³"
+    assert ": train:0-1." in (folder / "README.md").read_text()
+
+
+def test_the_score_on_the_card_is_ours(tiny, tmp_path, monkeypatch):
+    """Its lines, executed beside its files."""
+    export(tiny, tmp_path)
+    monkeypatch.chdir(tmp_path)
+    (lines,) = re.findall(r"```python\n(.*?)```", (tmp_path / "README.md").read_text(), re.DOTALL)
+    names = read(tmp_path / "train-1.npz")
+    names["estimate"] = 0.9 * names["truth"]
+    exec(lines, names)
+    expected = tiny.errors(tiny[1], names["estimate"])[tiny.warm_up:].mean()
+    assert names["score"] == pytest.approx(expected, rel=1e-12)
+
+
+def test_another_folder_is_not_touched(tiny, tmp_path):
+    (tmp_path / "mine.txt").write_text("mine")
+    with pytest.raises(ValueError, match="out must be a new or empty folder"):
+        export(tiny, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+    export(tiny, tmp_path / "theirs")
+    with pytest.raises(ValueError, match="of another environment, format or version"):
+        export(tiny, tmp_path / "theirs", "hdf5")
+
+
+def test_a_missing_library_is_named_before_anything_is_written(tiny, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with pytest.raises(ModuleNotFoundError, match="format hdf5 needs the extra export"):
+        export(tiny, tmp_path / "out", "hdf5")
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_readme_warns_of_test_episodes(tmp_path):
+    export(eitbench.dataset(PIPE, "test:0", world=CHANGES), tmp_path)
+    assert "Test episodes are among them" in (tmp_path / "README.md").read_text()
+
+
+def test_command(tmp_path, monkeypatch):
+    """It says what is written, and writes nothing for an unknown environment."""
+    told = CliRunner().invoke(app, ["export", "--env", "eitbench/StationaryTank2D-v0", "--seeds", "train:0",
+                                    "--out", str(tmp_path / "out"), "-j", "1"])
+    assert told.exit_code == 0 and "1 episodes written" in told.output, told.output
+    said = json.loads((tmp_path / "out" / "dataset.json").read_text())
+    assert said["environment"] == "eitbench/StationaryTank2D-v0" and said["format"] == "npz"
+    told = CliRunner().invoke(app, ["export", "--env", "eitbench/Nowhere-v0", "--out", str(tmp_path / "no")])
+    assert told.exit_code != 0 and not (tmp_path / "no").exists()

@@ -1,0 +1,100 @@
+"""Shipped files: they are what would be built now, and spare the first reset a simulation."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from eitbench.bench import package_data
+from eitbench.bench.package_data import difference, expected_files, unused_files
+from eitbench.bench.tracks import own_ids
+from eitbench.data import cache, episodes
+from eitbench.data.beginnings import make_beginning, shipped_key
+from eitbench.data.cache import load_shipped
+from eitbench.data.regions import outline_key, region_key
+from eitbench.estimation.onboard.packing import packed, unpacked
+from eitbench.estimation.onboard.reduced_operator import stored_model_key
+from eitbench.estimation.reduced import ReducedModel
+from eitbench.worlds import entry
+
+EXPECTED = expected_files(own_ids())
+CHEAP = {key(entry("eitbench/Pipe2D-v0").world) for key in (outline_key, shipped_key)}
+
+
+def test_exactly_the_needed_files_are_shipped():
+    assert unused_files() == []
+    for file in EXPECTED:
+        assert load_shipped(file.key) is not None, file.key
+    assert sum(file.key.shipped_path.stat().st_size for file in EXPECTED) < 3.7e6
+
+
+@pytest.mark.parametrize("file", [
+    pytest.param(file, id=file.key.name, marks=[] if file.key in CHEAP else [pytest.mark.slow])
+    for file in EXPECTED])
+def test_shipped_is_what_would_be_built(file):
+    assert difference(load_shipped(file.key), file.build()) == ""
+
+
+def test_models_are_compared_in_one_basis():
+    """Turned by a rotation it is the same model; with another number it is not."""
+    shipped = next(load_shipped(file.key) for file in EXPECTED if file.key.name.startswith("reduced"))
+    full = unpacked(shipped)
+    turn, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(120, 120)))
+    turned = {"basis": full["basis"] @ turn, **{name: turn.T @ full[name] @ turn
+                                                for name in ("transition", "noise", "initial")}}
+    again = packed(ReducedModel(**turned))
+    assert difference(shipped, again) == ""
+    again["noise"] = 1.001 * again["noise"]
+    assert "noise" in difference(shipped, again)
+
+
+def test_missing_files_are_written(tmp_path, monkeypatch):
+    """And compared the next time; a damaged one is named and stays."""
+    monkeypatch.setattr(cache, "PACKAGE_DATA", tmp_path)
+    monkeypatch.setattr(package_data, "make_beginning", lambda *_: {"transfer_resistance": np.ones(2)})
+    ids = ["eitbench/Pipe2D-v0"]
+    assert [result for _, result in package_data.write_package_data(ids)] == ["new", "new"]
+    assert [result for _, result in package_data.write_package_data(ids)] == ["same", "same"]
+    outline_key(entry(ids[0]).world).shipped_path.write_bytes(b"")
+    assert [result for _, result in package_data.write_package_data(ids)] == ["missing or damaged", "same"]
+
+
+@pytest.mark.parametrize(("key", "same", "other"), [
+    (outline_key,
+     [{"flow": {"mean_velocity": 4.0}}, {"instrument": {"noise_relative": 0.1}}, {"region": None},
+      {"instrument": {"contact_spread": 0.5, "untold_noise": 2.0}}, {"target": {"reach": [0.0, 0.5]}}],
+     [{"vessel": {"electrodes_per_wall": 4}}, {"prior": {"expected_concentration": 24.0}},
+      {"instrument": {"current": 0.2}}]),
+    (region_key,
+     [{"schedule": {"scored_steps": 3}}], [{"region": [0.1, 0.2]}, {"vessel": {"electrodes_per_wall": 4}}]),
+    (lambda world: stored_model_key(world, "joint"),
+     [{"schedule": {"budget": 3, "scored_steps": 9}}, {"instrument": {"dead": [1, 1]}}],
+     [{"instrument": {"noise_relative": 0.1}}, {"prior": {"nodal_std": 0.1}}, {"flow": {"mean_velocity": 4.0}},
+      {"schedule": {"time_step": 4e-3}}, {"vessel": {"electrodes_per_wall": 4}}])])
+def test_a_file_belongs_to_its_numbers(key, same, other):
+    """Numbers on which it does not depend may differ; no others."""
+    world = entry("eitbench/Pipe2DInjectionFlow-v0").world
+    assert all(key(world.changed(change)) == key(world) for change in same)
+    assert all(key(world.changed(change)) != key(world) for change in other)
+
+
+@pytest.mark.parametrize("id", [id for id in own_ids() if entry(id).world.warm_up])
+def test_the_first_reset_simulates_nothing(id, monkeypatch, tmp_path):
+    monkeypatch.setenv(cache.CACHE_VARIABLE, str(tmp_path))
+    monkeypatch.setattr(episodes, "truth_discretisation", None)
+    kwargs = {"estimator": "none"} if entry(id).track == "injection" else {}
+    env = gym.make(id, **kwargs)
+    observation, _ = env.reset()
+    assert observation["voltages"].any() or kwargs
+    env.step(env.action_space.sample())
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_shipped_beginning_is_that_of_the_episode():
+    """To the bit on this machine's kind, and the noise too; no scored step is among them."""
+    from eitbench.data.beginnings import script_so_far
+    world = entry("eitbench/Pipe2D-v0").world
+    entries = script_so_far(world, 0, 1).entries
+    assert len(entries) <= world.warm_up
+    (episode,) = episodes.simulate_together(world, [0], False, len(entries))
+    np.testing.assert_allclose(entries["transfer_resistance"],
+                               make_beginning(world, 17)["transfer_resistance"], rtol=1e-9)
+    np.testing.assert_array_equal(entries["noise"], episode.noise)

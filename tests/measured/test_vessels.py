@@ -1,0 +1,53 @@
+"""Descriptions of vessels: shapes, orders of electrodes and flows."""
+
+import numpy as np
+import pytest
+from eitbench.measured.vessel import read_vessel
+from eitbench.worlds.vessels import RoundTank
+from tanks import VESSEL
+
+PIPE = {"kind": "rectangle", "length": 0.4, "width": 0.1, "electrodes": 16, "cover": 0.5}
+CYLINDER = {"kind": "cylinder", "length": 0.2, "radius": 0.05, "rings": 2, "electrodes": 4, "height": 0.04,
+            "cover": 0.5}
+TANK = RoundTank(radius=0.1, n_electrodes=8, electrode_cover=0.4)
+
+
+def test_a_yaml_file_is_a_mapping(tmp_path):
+    path = tmp_path / "vessel.yml"
+    path.write_text("kind: circle\nradius: 0.1\nelectrodes: 8\ncover: 0.4\n", encoding="utf-8")
+    np.testing.assert_array_equal(read_vessel(path).transport_mesh().points, TANK.carrier(fine=False)[0].points)
+    path.write_text("- a\n", encoding="utf-8")
+    with pytest.raises(ValueError, match="vessel must be a YAML file"):
+        read_vessel(path)
+
+
+@pytest.mark.parametrize(("given", "message"), [
+    (VESSEL | {"kind": "ball"}, "vessel.kind must be one of"), (VESSEL | {"radius": -1.0}, "vessel.radius"),
+    (VESSEL | {"wdth": 1}, "has no wdth"), (VESSEL | {"width": 0.01}, "either width or cover, got both"),
+    (VESSEL | {"direction": "left"}, "direction must be one of"), (VESSEL | {"electrodes": 0}, "vessel.electrodes"),
+    ({"kind": "circle", "radius": 0.1}, "must have electrodes"),
+    (PIPE | {"electrodes": 15}, "vessel.electrodes must be even"),
+    (PIPE | {"flow": 4.5}, "vessel.flow must have mean_velocity"),
+    (PIPE | {"flow": {"velocity_std": 1.0}}, "vessel.flow must have mean_velocity"),
+    (PIPE | {"flow": {"mean_velocity": 1.0, "speed": 2.0}}, "vessel.flow must have mean_velocity"),
+    (PIPE | {"flow": {"mean_velocity": -1.0}}, "flow.mean_velocity"),
+    (CYLINDER | {"flow": {"mean_velocity": 1.0, "velocity_std": 0.1}}, "velocity_std must be 0 in a cylinder"),
+    (VESSEL | {"flow": {"mean_velocity": 1.0}}, "vessel of kind circle has no flow")])
+def test_bad_entries_are_named(given, message):
+    with pytest.raises(ValueError, match=message):
+        read_vessel(given)
+
+
+@pytest.mark.parametrize("direction", ["counter-clockwise", "clockwise"])
+def test_electrodes_are_where_the_instrument_has_them(direction):
+    """The first at 90°, the third a quarter further in the direction of counting."""
+    model = read_vessel(VESSEL | {"first": 90.0, "direction": direction}).electrode_model(1e-3)
+    middles = [model.mesh.points[np.unique(facets)].mean(axis=0) for facets in model.electrodes]
+    sign = 1 if direction == "clockwise" else -1
+    assert np.argmax([y for _, y in middles]) == 0
+    assert np.argmax([sign * x for x, _ in middles]) == 2
+
+
+def test_a_mesh_file_must_exist():
+    with pytest.raises(ValueError, match=r"vessel.file must be a mesh file, got none\.msh"):
+        read_vessel({"kind": "mesh", "file": "none.msh", "electrodes": 8})
