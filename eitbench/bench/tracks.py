@@ -226,8 +226,7 @@ def class_of(id: str, board: str) -> str:
 
 
 def default_seeds(id: str, suite: str = "full") -> list[int]:
-    """Seeds that are played in an environment when nobody says which: of the season's test
-    episodes."""
+    """Return the default seeds of an environment: test episodes."""
     if is_measured(id):
         return parse_seeds(MEASURED_SEEDS)
     return parse_seeds(QUICK_SEEDS if suite == "quick" else entry(id).seeds)

@@ -118,7 +118,7 @@ def verify(paths: Sequence[Path], folder: Path, options: Options = DEFAULT, *,
         close()
     rows += [stored for rerun in reruns if (stored := _stored(rerun)) is not None]
     order = {path.name: place for place, path in enumerate(paths)}
-    rows.sort(key=lambda row: (order[row["record"]], row["episode"]))
+    rows.sort(key=lambda row: (order[row["record"]], len(row["episode"]), row["episode"]))
     return pd.DataFrame(rows).drop(columns="identity")
 
 

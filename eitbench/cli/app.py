@@ -202,9 +202,6 @@ def leaderboard(
         help="Folder of the leaderboards' records, such as leaderboards/results: render "
              "leaderboard.csv, leaderboard.md, episodes.csv.gz and the pages site/ beside it "
              "instead.")] = None,
-    season: Annotated[int | None, typer.Option(
-        min=1, help="With --records: the boards of an earlier season, in a folder season-N/ beside "
-                    "them. Default: the current one.")] = None,
 ) -> None:
     """Print the table and write the page again from the results stored in a folder.
 
@@ -216,15 +213,14 @@ def leaderboard(
             return report(out)
     from eitbench._files import write_atomically
     from eitbench.bench.records import write_episode_table_of
-    from eitbench.data.seasons import season_numbered
     from eitbench.report.boards import read_for_boards
     from eitbench.report.site import Beside, Measured, collect, render, render_site, write_site
     with options.clear_errors():
-        found, complaints = read_for_boards(records, season_numbered(season))
+        found, complaints = read_for_boards(records)
         measured = Measured.of(records.parent)
         complaints += measured.complaints
         site = collect(found)
-        out = records.parent if season is None else records.parent / f"season-{season}"
+        out = records.parent
         pages = render_site(site, Beside.of(records.parent, out / "site"), measured)
         texts = render(site, measured)
         write_site(out / "site", pages)
@@ -232,8 +228,7 @@ def leaderboard(
         write_atomically(out / name, text.encode())
         options.say(f"wrote {out / name}")
     options.say(f"wrote {out / 'site' / 'index.html'}")
-    if season is None:
-        options.say(f"wrote {write_episode_table_of(records)}")
+    options.say(f"wrote {write_episode_table_of(records)}")
     for complaint in complaints:
         options.say(f"left out: {complaint}", err=True)
     raise typer.Exit(bool(complaints))

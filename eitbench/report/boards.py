@@ -31,7 +31,6 @@ from eitbench.bench.statistics import (
 )
 from eitbench.bench.text import scores_by_seed, seed_ranges
 from eitbench.bench.tracks import CLASSES, home_of, ids, named
-from eitbench.data.seasons import Season, current_season, season_of
 from eitbench.report.model import (
     ALL,
     IDENTITY,
@@ -52,8 +51,8 @@ ANCHORS = ("homogeneous", "true_model_smoother")
 """Methods with skills 0 and 1."""
 Anchors = Mapping[tuple[str, str, str], Mapping[str, float]]
 """Method, world, split -> seed -> ẽ_c."""
-SPLITS = ("dev", "train", "own")
-"""Order of the boards of other splits than test, after the seasons."""
+SPLITS = ("test", "dev", "train", "own")
+"""Order of the boards of splits."""
 
 
 def boards(records: list[dict[str, Any]]) -> pd.DataFrame:
@@ -80,11 +79,11 @@ def leaderboards(records: list[dict[str, Any]]) -> list[Board]:
     Raises
     ------
     ValueError
-        If a record has other seeds than test, or the records are of several seasons.
+        If a record has other seeds than test.
     """
     for record in records:
-        if season_of(record["split"]) is None or record["split"] != records[0]["split"]:
-            raise ValueError("leaderboards are made of the test seeds of one season; "
+        if record["split"] != "test":
+            raise ValueError("leaderboards are made of test seeds; "
                              f"{file_name(record)} has {record['split']} seeds")
     current, _ = newest(records)
     known = anchors(current)
@@ -124,9 +123,8 @@ def _by_environment(records: Iterable[dict[str, Any]]) -> list[list[dict[str, An
 
 
 def _split_order(record: dict[str, Any]) -> int:
-    """Return the place of a record's split: the latest season first."""
-    season = season_of(record["split"])
-    return -season.number if season else SPLITS.index(record["split"])
+    """Return the place of a record's split."""
+    return SPLITS.index(record["split"])
 
 
 def _board(records: list[dict[str, Any]], known: Anchors, products: dict[str, float], *,
@@ -258,27 +256,25 @@ def _aggregate(of_class: str, made: list[Board]) -> list[Board]:
 # -- records -----------------------------------------------------------------------------------
 
 
-def read_for_boards(folder: Path, season: Season | None = None,
-                    ) -> tuple[list[dict[str, Any]], list[str]]:
-    """Return the records of a folder that the boards of a season show (default: the current one),
-    and one sentence for each record that no board can show.
+def read_for_boards(folder: Path) -> tuple[list[dict[str, Any]], list[str]]:
+    """Return the records of a folder that boards show, and one sentence for each record that no
+    board can show.
 
     Raises
     ------
     ValueError
         If there is no such folder, or it has no such record.
     """
-    split = (season or current_season()).split
     if not folder.is_dir():
         raise ValueError(f"records must be a folder that exists, got {folder}")
     read, complaints = read_sound_records(folder, keep=_packed)
-    found = [record for record in read if record["split"] == split]
+    found = [record for record in read if record["split"] == "test"]
     complaints += [f"record {folder / file_name(record)} has {record['split']} seeds, and "
                    "leaderboards are made of test seeds"
-                   for record in read if season_of(record["split"]) is None]
+                   for record in read if record["split"] != "test"]
     if not found:
         listed = "".join(f"; {complaint}" for complaint in complaints)
-        raise ValueError(f"records must be a folder with records of {split} seeds, got {folder}, "
+        raise ValueError(f"records must be a folder with records of test seeds, got {folder}, "
                          f"where there are none that can be shown{listed}")
     return found, complaints
 

@@ -25,7 +25,6 @@ from eitbench.bench.statistics import (
 from eitbench.bench.table import NOTHING, Cell, Table, number_cell
 from eitbench.bench.text import scores_by_seed, with_interval
 from eitbench.bench.tracks import CLASSES
-from eitbench.data.seasons import current_season
 from eitbench.report import charts
 from eitbench.report.model import class_of, is_floor
 from eitbench.report.templates import template
@@ -162,7 +161,7 @@ def _pairs(a: list[dict[str, Any]], b: list[dict[str, Any]], score: str) -> list
         own, theirs = scores_by_seed(record, score), others.get(_place(record), {})
         if shared := own.keys() & theirs.keys():
             name, split = _place(record)
-            label = name if split == current_season().split else f"{name} ({split} seeds)"
+            label = name if split == "test" else f"{name} ({split} seeds)"
             found.append(_Pair(label, class_of(record), (name, split),
                                *({seed: side[seed] for seed in shared} for side in (own, theirs))))
     return found

@@ -192,7 +192,7 @@ def test_time_in_products_and_memory():
 
 def test_only_test_seeds():
     """Development scores are no leaderboard's."""
-    with pytest.raises(ValueError, match=r"seeds of one season; eitbench-Pipe2D-v0--a--\w+--dev\.json has dev"):
+    with pytest.raises(ValueError, match=r"made of test seeds; eitbench-Pipe2D-v0--a--\w+--dev\.json has dev"):
         boards([record("a", {"dev:0": 0.1})])
 
 

@@ -335,7 +335,7 @@ def test_every_link_resolves(site, pages):
 
 
 def test_links_beside_the_site(tmp_path):
-    """To what exists, also from the site of a season, which is one folder deeper."""
+    """To what exists, also from a site one folder deeper."""
     folder = tmp_path / "leaderboards"
     for name in (LINKS["How to submit"], LINKS["Code"], f"{METHODS}/kalman_filter.py", *(
             f"media/{name}" for name in HEADLINE)):

@@ -26,6 +26,7 @@ from eitbench.report.tables import markdown_table
 
 __all__ = ["Beside", "Measured", "collect", "render", "render_site", "write_site"]
 
+PUBLIC_EPISODES = "The test episodes are public: anybody can simulate them."
 MARK = b"<strong>eitbench</strong> leaderboards"
 """Text by which the index.html of a site is recognised."""
 HERE = Path(__file__).parent.parent
@@ -59,7 +60,7 @@ def render(site: Site, measured: Measured = NOBODY) -> dict[str, str]:
     measurement files are in the second only."""
     parts = ["# Leaderboards", "*Rendered from the records by `eitbench leaderboard --records "
              "leaderboards/results`; [README.md](README.md) says how to add one.*",
-             f"**{site.about_season}**" if site.boards else "There are no records yet."]
+             PUBLIC_EPISODES if site.boards else "There are no records yet."]
     for name, boards in site.classes.items():
         parts.append(f"## {name}")
         for board in boards:

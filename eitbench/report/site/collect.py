@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from eitbench.bench.records import newest
-from eitbench.data.seasons import Season, current_season, season_of
 from eitbench.report.boards import leaderboards
 from eitbench.report.model import Board
 
@@ -22,21 +21,6 @@ class Site(NamedTuple):
     """Class by class, each followed by its aggregate."""
     records: list[dict[str, Any]]
     """Sorted; superseded ones included."""
-
-    @property
-    def season(self) -> Season:
-        """Season of the test episodes."""
-        split = self.records[0]["split"] if self.records else ""
-        return season_of(split) or current_season()
-
-    @property
-    def about_season(self) -> str:
-        """A sentence about who could know the test episodes."""
-        season = self.season
-        if season.number == 1:
-            return "Season 1: its test episodes could be simulated by anyone from the beginning."
-        return (f"Season {season.number}, begun on {season.begun}: before that day only the "
-                "maintainers could simulate its test episodes.")
 
     @property
     def classes(self) -> dict[str, list[Board]]:
@@ -58,7 +42,7 @@ class Site(NamedTuple):
 
 
 def collect(records: list[dict[str, Any]]) -> Site:
-    """Return the site of the records of one season."""
+    """Return the site of the records."""
     return Site(leaderboards(records), sorted(records, key=lambda record: (
         record["environment"]["name"], record["method"], record["version"])))
 

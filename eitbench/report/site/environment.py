@@ -25,7 +25,7 @@ def environment_page(site: Site, board: Board, beside: Beside) -> bytes:
     description, details = documentation(id)
     animation = f"{board.environment}.webp"
     return template("site/environment.html.j2").render(
-        root="../", links=beside.links("../"), season=site.season.number, board=board, id=id,
+        root="../", links=beside.links("../"), board=board, id=id,
         table=table, axes=Axes.of(board).drawn(), explanations=explanations([table]),
         description=description, details=details,
         intervals=figures.error_chart(board), front=figures.cost_chart(board),

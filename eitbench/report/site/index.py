@@ -35,7 +35,7 @@ def index_page(site: Site, beside: Beside, measured: Measured) -> bytes:
         n_environments=sum(not board.is_aggregate for board in site.boards),
         n_records=len(site.records),
         n_methods=len({record["method"] for record in site.records}), classes=classes,
-        season=site.about_season, robustness=ROBUSTNESS if families(site) else "",
+        robustness=ROBUSTNESS if families(site) else "",
         measured=MEASURED if measured.records else "",
         last=max(map(finished, site.records), default="")[:10],
         explanations=explanations(tables.values())).encode()
