@@ -80,7 +80,7 @@ def test_policies_are_submitted_alike(tmp_path):
 
 def test_policies_by_command(tmp_path):
     """`policies` prints scores and resumes; what it played stands in the table and on the page of `leaderboard`."""
-    command = ("policies", "--env", INJECTION, "--policy", "adjacent", "--policy", "random_pair", "--policy",
+    command = ("run", "--env", INJECTION, "--policy", "adjacent", "--policy", "random_pair", "--policy",
                "clairvoyant", "--seeds", "test:0-1", "--estimator", "reduced", "-j", "1")
     code, said, _ = eitbench(*command)
     assert code == 0 and "| clairvoyant (privileged) |" in said and "adaptivity gap" in said
@@ -104,12 +104,12 @@ def test_policies_in_records_are_not_played_again(tmp_path):
     """The table is that of all the episodes; only those that no record holds are played."""
     policy, short = ("--env", INJECTION, "--policy", "adjacent"), ("-j", "1", "-o")
     assert eitbench("submit", *policy, "--seeds", "test:0", *short, "first")[0] == 0
-    code, said, _ = eitbench("policies", *policy, "--seeds", "test:0-1", "--records", "leaderboards/results", *short,
+    code, said, _ = eitbench("run", *policy, "--seeds", "test:0-1", "--records", "leaderboards/results", *short,
                              "rest")
     assert code == 0 and [path.name for path in tmp_path.glob("rest/episodes/*/*/*.json")] == ["test-1.json"]
     (score,) = re.findall(r"\| adjacent \| ([^|]+) \|", said)
-    assert f"| adjacent | {score} |" in eitbench("policies", *policy, "--seeds", "test:0-1", *short, "all")[1]
-    code, _, complaint = eitbench("policies", *policy, "--records", "nowhere", *short, "none")
+    assert f"| adjacent | {score} |" in eitbench("run", *policy, "--seeds", "test:0-1", *short, "all")[1]
+    code, _, complaint = eitbench("run", *policy, "--records", "nowhere", *short, "none")
     assert code == 2 and "--records must be a folder, got nowhere" in complaint
 
 
