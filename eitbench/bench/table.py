@@ -80,14 +80,10 @@ class Table(NamedTuple):
         for heading in sorted(self.headings, key=place)[:0:-1]:
             if len(table.markdown().partition("\n")[0]) <= width:
                 break
-            table = table.without(heading)
+            i = table.headings.index(heading)
+            rows = [row._replace(cells=row.cells[:i] + row.cells[i + 1:]) for row in table.rows]
+            table = Table(table.headings[:i] + table.headings[i + 1:], rows, table.label)
         return table
-
-    def without(self, heading: str) -> Table:
-        """Return the table without a column."""
-        i = self.headings.index(heading)
-        rows = [row._replace(cells=row.cells[:i] + row.cells[i + 1:]) for row in self.rows]
-        return Table(self.headings[:i] + self.headings[i + 1:], rows, self.label)
 
     def left_out(self, fitted: Table) -> str:
         """Return a line that names the columns that a `fitted` table lacks, or nothing."""

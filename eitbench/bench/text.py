@@ -1,4 +1,4 @@
-"""Numbers, seeds and tables as text, and scores of a record in the units in which they are said."""
+"""Numbers and seeds as text, and scores of a record in the units of tables."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from eitbench.bench.scores import scores
 
 
 def mean_and_interval(values: list[float]) -> tuple[float, float]:
-    """Mean, and half its 95 % confidence interval (Student's t), infinite for fewer than two."""
+    """Return the mean and half its 95 % confidence interval (Student's t), infinite for fewer than
+    two values."""
     mean = float(np.mean(values))
     n = len(values)
     if n < 2:
@@ -23,7 +24,7 @@ def mean_and_interval(values: list[float]) -> tuple[float, float]:
 
 @lru_cache(maxsize=256)
 def _students(freedom: int) -> float:
-    """The 97.5 % point of Student's t."""
+    """Return the 97.5 % point of Student's t."""
     return student.ppf(0.975, freedom)
 
 
@@ -42,7 +43,7 @@ def with_interval(value: float, low: float, high: float) -> str:
 
 
 def _places(half: float) -> int | None:
-    """Decimal places that half an interval leaves; None if it is none, or below the last shown."""
+    """Return the decimal places for half an interval; None if it is infinite or below the last."""
     if not math.isfinite(half) or half < 5e-6:
         return None
     place = -math.floor(math.log10(half))
@@ -52,7 +53,7 @@ def _places(half: float) -> int | None:
 
 
 def scores_by_seed(record: dict[str, Any], name: str) -> dict[str, float]:
-    """Seed -> score, of the episodes that have it; in the units of the table."""
+    """Return seed -> score in the units of tables, of the episodes that have it."""
     # records of older code have fewer scores
     values = {episode["seed"]: episode["scores"].get(name)
               for episode in record["episodes"] if episode["status"] == "ok"}
@@ -76,7 +77,7 @@ def seed_ranges(seeds: list[str]) -> str:
 
 
 def number(value: float) -> str:
-    """Two digits below 1, three above, and all that stand before the point."""
+    """Return two digits below 1, three above, and all before the point."""
     if abs(value) >= 999.5:
         return f"{value:.0f}"
     return f"{value:.2g}" if abs(value) < 1 else f"{value:.3g}"

@@ -1,4 +1,4 @@
-"""Variants of a world from what is typed, as in ``instrument.noise_relative=0.01,0.02``."""
+"""Variants of a world from settings such as ``instrument.noise_relative=0.01,0.02``."""
 
 from __future__ import annotations
 
@@ -9,19 +9,17 @@ from typing import Any
 
 
 def variants(settings: Iterable[str]) -> list[dict[str, Any]]:
-    """What `gymnasium.make` takes as ``world``, once for each combination of the values; without
-    settings a single one without changes.
+    """Return the argument ``world`` of `gymnasium.make` for each combination of the values.
 
     Parameters
     ----------
     settings : iterable of str
-        ``part.number=value``, or several values with commas between them; values as JSON has them,
-        or words.
+        ``part.number=value``, or several values separated by commas; values are JSON or words.
 
     Raises
     ------
     ValueError
-        If one has another form, two set the same number, or one gives a value twice.
+        If one has another form, two set the same number, or a value is repeated.
     """
     chosen: dict[str, list[Any]] = {}
     for setting in settings:
@@ -41,7 +39,7 @@ def variants(settings: Iterable[str]) -> list[dict[str, Any]]:
 
 
 def flat(changes: dict[str, Any]) -> dict[str, Any]:
-    """``{"instrument.noise_relative": 0.02}`` of ``{"instrument": {"noise_relative": 0.02}}``."""
+    """``{"instrument": {"noise_relative": 0.02}}`` -> ``{"instrument.noise_relative": 0.02}``."""
     found: dict[str, Any] = {}
     for key, value in changes.items():
         if isinstance(value, dict):
@@ -52,7 +50,7 @@ def flat(changes: dict[str, Any]) -> dict[str, Any]:
 
 
 def as_typed(value: Any) -> str:
-    """A value as in a setting: words without quotation marks."""
+    """Return a value as in a setting: words without quotation marks."""
     return value if isinstance(value, str) else json.dumps(value)
 
 
@@ -72,7 +70,7 @@ def _value(word: str) -> Any:
 
 
 def _nested(settings: Iterable[tuple[str, Any]]) -> dict[str, Any]:
-    """The inverse of `flat`."""
+    """Invert `flat`."""
     made: dict[str, Any] = {}
     for path, value in settings:
         *parts, name = path.split(".")

@@ -37,7 +37,7 @@ def run(
     settings: Annotated[list[str] | None, typer.Option(
         "--set", help="Change a number of the world, as in instrument.noise_relative=0.02; may be "
                       "repeated. Several values, as in 0.01,0.02,0.05, are run one after the "
-                      "other, with a table and a plot.")] = None,
+                      "other, with a table and a chart on the page.")] = None,
     estimator: Annotated[str, typer.Option(
         help="Filter inside injection environments. full: exact, for scores; reduced: as in "
              "training.")] = "full",

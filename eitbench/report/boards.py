@@ -185,7 +185,7 @@ def _place(row: Row) -> tuple[bool, float, str]:
 def _means(record: dict[str, Any], known: Anchors) -> dict[str, float | None]:
     """Return the mean of each score but the error, the least time per step, and the skill."""
     found: dict[str, float | None] = {"skill": _skill(record, known)}
-    for name in scores():
+    for name in scores() | scores("measured"):
         values = list(scores_by_seed(record, name).values())
         reduce: Callable[..., Any] = min if name == "seconds_per_step" else np.mean
         if name != "error":
@@ -312,8 +312,8 @@ def shipped_anchors(records: Iterable[dict[str, Any]]) -> Anchors:
     kinds = {kind_of(record["environment"]["id"]) for record in records}
     known = [id.replace("/", "-") for id in ids("estimation") if kind_of(id) in kinds]
     published = read_episode_table(table_beside(shipped("leaderboards") / "results"))
-    return anchors([record for record in published if record["method"] in ANCHORS
-                    and record["environment"]["name"] in known])
+    return anchors(record for record in published if record["method"] in ANCHORS
+                   and record["environment"]["name"] in known)
 
 
 def _skill(record: dict[str, Any], known: Anchors) -> float | None:

@@ -1,6 +1,7 @@
 """Small charts as inline SVG, coloured by the style sheet of the page: they follow light and dark.
 
-Matplotlib would give fixed colours and ten times the size.
+Their coordinates are rounded to 0.1 px, so that the same records give the same bytes everywhere;
+matplotlib's SVG depends on its version, has fixed colours and ten times the size.
 """
 
 from __future__ import annotations
@@ -34,8 +35,6 @@ class Series(NamedTuple):
     """Index of the page's colour, --c0, --c1, …"""
     values: np.ndarray
     """(n,) of a line; (value, low, high) of an interval, whose ends may be infinite."""
-    at: np.ndarray | None = None
-    """(n,) positions on the x axis, if they differ from those of the others."""
     faint: bool = False
 
 
@@ -85,13 +84,11 @@ def lines(x: np.ndarray, series: list[Series], x_label: str, y_label: str) -> st
     """Draw curves over a linear x axis and a logarithmic y axis; a series may end before ``x``."""
     values = np.concatenate([s.values for s in series])
     least = values[values > 0].min(initial=1.0) / 1.15  # where a perfect estimate's zero is drawn
-    last = max([x[-1], x[0] + 1, *(s.at[-1] for s in series if s.at is not None)])
-    px = Axis(x[0], last, LEFT, WIDTH - RIGHT, log=False)
+    px = Axis(x[0], max(x[-1], x[0] + 1), LEFT, WIDTH - RIGHT, log=False)
     py = Axis(least, max(values.max(), least) * 1.15, HEIGHT - BOTTOM, TOP, log=True)
     parts = _frame(px, py, x_label, y_label)
     for s in sorted(series, key=lambda s: not s.faint):
-        at = x if s.at is None else s.at
-        points = ((px(a), py(b)) for a, b in zip(at, s.values, strict=False))
+        points = ((px(a), py(b)) for a, b in zip(x, s.values, strict=False))
         parts.append(_polyline(f"series{' faint' * s.faint}", points, s.colour, s.name))
     return "".join([*parts, "</svg>"])
 
@@ -130,21 +127,6 @@ def optimal(points: list[Point]) -> list[Point]:
         if not best or p.y < best[-1].y:
             best.append(p)
     return best
-
-
-def calibration(series: list[Series], nominal: tuple[float, ...], x_label: str,
-                y_label: str) -> str:
-    """Draw observed against nominal coverage, both in %, with the diagonal."""
-    px = Axis(0.0, 100.0, LEFT, WIDTH - RIGHT, log=False)
-    py = Axis(0.0, 100.0, HEIGHT - BOTTOM, TOP, log=False)
-    parts = [*_frame(px, py, x_label, y_label),
-             _polyline("front", [(px(0), py(0)), (px(100), py(100))])]
-    for s in series:
-        places = [(px(a), py(b)) for a, b in zip(nominal, s.values, strict=True)]
-        name = f"{s.name}: {', '.join(f'{value:.0f} %' for value in s.values)}"
-        parts += [_polyline("series", places, s.colour, name),
-                  *(_dot(f"fill:{_colour(s.colour)}", x, y, name) for x, y in places)]
-    return "".join([*parts, "</svg>"])
 
 
 def intervals(rows: list[Series], x_label: str, *, log: bool = True,

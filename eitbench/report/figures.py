@@ -1,4 +1,4 @@
-"""Charts of a board: error, error against time, error over the episode, calibration, learning."""
+"""Charts of a board: error, error against computing time, and error over the episode."""
 
 from __future__ import annotations
 
@@ -8,12 +8,10 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from eitbench._files import shipped
 from eitbench.report import charts
 from eitbench.report.model import Board, Row
-from eitbench.report.trainings import agent
+from eitbench.report.trainings import agent, lines
 
-NOMINAL = ("coverage_50", "coverage_90")
 MAX_CURVES, N_STRONG = 7, 5
 """Curves that can be told apart, and the number drawn strongly where there are more."""
 
@@ -32,16 +30,16 @@ def _series(row: Row, values: Any, *, faint: bool = False) -> charts.Series:
 
 
 def error_chart(board: Board) -> Chart:
-    """Draw the mean error of each method with its interval."""
-    series = [_series(row, row.three("error")) for row in board.rows
-              if row.cells["error"] is not None]
-    return _chart(charts.intervals(series, "relative error ẽ_c")) if series else None
+    """Draw the mean errors of several methods with their intervals."""
+    series = [_series(line.row, line.row.three("error")) for line in lines(board)
+              if line.row.cells["error"] is not None]
+    return _chart(charts.intervals(series, "relative error ẽ_c")) if len(series) > 1 else None
 
 
 def cost_chart(board: Board) -> Chart:
     """Draw error against computing time per step; ``best`` names the methods on the front."""
-    rows = [row for row in board.rows
-            if row.cells["error"] is not None and row.cells["seconds_per_step"]]
+    rows = [line.row for line in lines(board)
+            if line.row.cells["error"] is not None and line.row.cells["seconds_per_step"]]
     points = [charts.Point(row.cells["title"], row.colour, row.cells["seconds_per_step"],
                            row.cells["error"], row.competes) for row in rows]
     if not points:
@@ -77,40 +75,3 @@ def _strong(rows: list[Row]) -> list[Row]:
             kinds.setdefault(agent(row.cells["method"]), row)
     best = list(kinds.values())[:N_STRONG - len(unranked)]
     return [row for row in rows if row in unranked or row in best]
-
-
-def calibration_chart(board: Board) -> Chart:
-    """Draw the observed coverage of nominal 50 % and 90 % intervals."""
-    rows = [row for row in board.rows if all(row.cells[name] is not None for name in NOMINAL)]
-    series = [_series(row, 100 * np.array([row.cells[name] for name in NOMINAL])) for row in rows]
-    if not series:
-        return None
-    return _chart(charts.calibration(series, (50.0, 90.0), "nominal coverage, %",
-                                     "observed coverage, %"), rows)
-
-
-def learning_chart(environment: str) -> Chart:
-    """Draw errors on dev episodes while built-in agents were trained: each training and the
-    mean."""
-    folder = shipped("baselines") / "checkpoints" / environment
-    series = []
-    legend = []
-    for colour, algorithm in enumerate(sorted(path for path in folder.glob("*") if path.is_dir())):
-        trainings = []
-        for path in sorted(algorithm.glob("seed*/evaluations.npz")):
-            with np.load(path, allow_pickle=False) as stored:
-                steps, errors = stored["steps"], stored["errors"].mean(axis=1)
-            trainings.append((steps, errors))
-            series.append(charts.Series(f"{algorithm.name}, {path.parent.name}", colour, errors,
-                                        steps, faint=True))
-        if trainings:
-            shared = sorted(set.intersection(*(set(steps.tolist()) for steps, _ in trainings)))
-            mean = np.mean([errors[np.searchsorted(steps, shared)]
-                            for steps, errors in trainings], axis=0)
-            name = f"{algorithm.name}, mean of {len(trainings)}"
-            series.append(charts.Series(name, colour, mean, np.array(shared)))
-            legend.append((colour % charts.COLOURS, colour >= charts.COLOURS, name))
-    if not series:
-        return None
-    svg = charts.lines(np.zeros(1), series, "steps of training", "relative error ẽ_c")
-    return {"svg": Markup(svg), "legend": legend}

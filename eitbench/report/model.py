@@ -123,24 +123,25 @@ def method_address(name: str) -> str:
     return f"methods/{quote(name)}.html"
 
 
-def columns() -> dict[str, tuple[str, str]]:
+def columns(*, measured: bool = False) -> dict[str, tuple[str, str]]:
     """Return name -> heading and explanation of each number: registered scores, gain, skill and
-    costs."""
-    each = {name: (score.heading, score.explanation) for name, score in scores().items()}
+    costs; with ``measured`` also the scores of measurements."""
+    known = scores() | (scores("measured") if measured else {})
+    each = {name: (score.heading, score.explanation) for name, score in known.items()}
     heading, text = each.pop("error")
     text += "; mean over the episodes with its 95 % interval; lower is better"
     return {"error": (heading, text), "gain": _GAIN, "skill": _SKILL} | each | COSTS
 
 
-def headings() -> dict[str, str]:
+def headings(*, measured: bool = False) -> dict[str, str]:
     """Return column -> heading of all numbers without an interval."""
-    return {name: heading for name, (heading, _) in columns().items()
+    return {name: heading for name, (heading, _) in columns(measured=measured).items()
             if name not in ("error", "gain")}
 
 
-def meanings() -> dict[str, str]:
+def meanings(*, measured: bool = False) -> dict[str, str]:
     """Return heading -> explanation."""
-    return {"rank": _RANK} | dict(columns().values())
+    return {"rank": _RANK} | dict(columns(measured=measured).values())
 
 
 def fields() -> list[str]:

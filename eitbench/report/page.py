@@ -55,7 +55,7 @@ def _section(store: EpisodeStore, board: Board) -> dict[str, Any]:
     """Return the contents of the section of one environment."""
     records = [row.record for row in board.rows if row.record]
     return {
-        "title": board.title, "about": f"{board.of_class}, {board.seeds}",
+        "title": board.title, "about": tables.run_title(board).removeprefix(f"{board.title}, "),
         "table": tables.run_table(board, drawn=True), "axes": tables.Axes.of(board).drawn(),
         "intervals": figures.error_chart(board), "curves": figures.curve_chart(board),
         "snapshots": _snapshots(store, board.rows),
@@ -64,9 +64,9 @@ def _section(store: EpisodeStore, board: Board) -> dict[str, Any]:
 
 
 def _snapshots(store: EpisodeStore, rows: list[Row]) -> dict[str, Any] | None:
-    """Return truth and estimates of the best methods in one episode, as PNG data; None if their
-    estimates are missing or do not fit the states."""
-    chosen = [row for row in rows if row.episodes()][:N_PICTURED]
+    """Return truth and estimates of the best methods but floors in one episode, as PNG data; None
+    if their estimates are missing or do not fit the states."""
+    chosen = [row for row in rows if row.episodes() and "floor" not in row.badges][:N_PICTURED]
     seeds = [{episode["seed"] for episode in row.episodes()} for row in chosen]
     shared = sorted(set.intersection(*seeds)) if seeds else []
     if not shared:

@@ -84,7 +84,7 @@ def page_table(board: Board, root: str, *, compact: bool = False) -> Table:
     of_rows = Counter(row.cells["rank"] for row in board.rows)
 
     def cells(row: Row, parts: Sequence[Row], shared: Counter[Any]) -> dict[str, Cell]:
-        return {"rank": _rank(row, shared), "method": _method(row, root, parts, beaten),
+        return {"rank": _rank(row, shared), "method": method_cell(row, root, parts, beaten),
                 **{heading: axes.cell(row, name, parts) for name, (heading, _) in DRAWN.items()},
                 **_numbers(row, COMPACT if compact else headings())}
 
@@ -104,7 +104,7 @@ def markdown_table(board: Board) -> Table:
     axes = Axes.of(board)
     shared = Counter(row.cells["rank"] for row in board.rows)
     return Table.of([{
-        "rank": _rank(row, shared), "method": _method(row, ""),
+        "rank": _rank(row, shared), "method": method_cell(row, ""),
         **{heading: axes.cell(row, name) for name, (heading, _) in DRAWN.items()},
         "by": "official" if row.cells["official"] else "self-reported",
         **_numbers(row, headings())} for row in board.rows], keep=["rank"])
@@ -114,24 +114,37 @@ def run_table(board: Board, *, title: str = "title", drawn: bool = False) -> Tab
     """Return the board of a user's own results.
 
     ``title`` is the field that names a method. Intervals are ``drawn``, or ± half the 95 % interval
-    of the mean error is written.
+    of the mean error is written. Seeds have a column if they differ.
     """
     axes = Axes.of(board)
+    seeds = run_seeds(board)
     rows = []
-    for row in board.rows:
-        failed = [word for word in row.badges if "failed" in word]
-        cells: dict[str, Cell | str] = {
-            "method": row.cells[title], "seeds": ", ".join([row.cells["seeds"], *failed])}
+    for row, played in zip(board.rows, seeds, strict=True):
+        cells: dict[str, Cell | str] = {"method": row.cells[title]}
+        if len(set(seeds)) > 1:
+            cells["seeds"] = played
         if drawn:
             cells |= {heading: axes.cell(row, name) for name, (heading, _) in DRAWN.items()}
         else:
             cells["ẽ_c"] = _error(row)
-        cells |= _numbers(row, [name for name in headings() if name not in COSTS])
+        cells |= _numbers(row, [name for name in headings(measured=True) if name not in COSTS])
         if row.cells["skill"] is None and row.cells.get("contrast_error") is not None:
             without = 1.0 - row.cells["contrast_error"]
             cells["skill"] = Cell(f"{number(without)}†", without)
         rows.append(cells)
     return Table.of(rows, label=board.title, keep=["ẽ_c", "skill"])
+
+
+def run_seeds(board: Board) -> list[str]:
+    """Return the seeds of each row, and how many of them failed."""
+    return [", ".join([row.cells["seeds"], *(word for word in row.badges if "failed" in word)])
+            for row in board.rows]
+
+
+def run_title(board: Board) -> str:
+    """Return environment, class, and the seeds if they are the same for all rows."""
+    seeds = set(run_seeds(board))
+    return ", ".join([board.title, board.of_class, *(seeds if len(seeds) == 1 else ())])
 
 
 def _error(row: Row) -> Cell:
@@ -142,7 +155,7 @@ def _error(row: Row) -> Cell:
 
 
 def _numbers(row: Row, names: Iterable[str]) -> dict[str, Cell]:
-    known = columns()
+    known = columns(measured=True)
     return {known[name][0]: number_cell(row.cells[name]) for name in names}
 
 
@@ -169,8 +182,12 @@ def _rank(row: Row, shared: Counter[Any]) -> Cell:
     return Cell(f"{rank}", float(rank), small="shared" if shared[rank] > 1 else "")
 
 
-def _method(row: Row, root: str, parts: Sequence[Row] = (),
-            beaten: dict[str, str] | None = None) -> Cell:
+def method_cell(row: Row, root: str, parts: Sequence[Row] = (),
+                beaten: dict[str, str] | None = None) -> Cell:
+    """Return title, name and badges of a method, linked to its page or with its trainings.
+
+    ``beaten`` are further badges by label; with them self-reported rows are marked too.
+    """
     title = row.cells["title"]
     badges = list(row.badges)
     if beaten is not None:
@@ -192,4 +209,4 @@ def flags(row: Row) -> str:
 def explanations(tables: Iterable[Table]) -> dict[str, str]:
     """Return heading -> explanation of the headings of these tables."""
     shown = {heading for each in tables for heading in each.headings}
-    return {heading: text for heading, text in meanings().items() if heading in shown}
+    return {heading: text for heading, text in meanings(measured=True).items() if heading in shown}

@@ -11,7 +11,7 @@ from eitbench.bench.run import Job
 from eitbench.data.seeds import name_seed
 from eitbench.report.charts import shortened
 from eitbench.report.model import Board
-from eitbench.report.tables import run_table
+from eitbench.report.tables import run_table, run_title
 
 COLUMN_PRIORITY = ("method", "ẽ_c", "skill", "seeds", "NIS/m", "ms/step", "contrast", "ẽ_v")
 """Where a line is too short the last of these are left out, and all other columns before them."""
@@ -45,17 +45,13 @@ def terminal_tables(boards: Sequence[Board], characters: int) -> str:
     parts = []
     left_out: dict[str, None] = {}
     for board, table in zip(boards, whole, strict=True):
-        seeds = {row.cells[1].text for row in table.rows}
         rows = [row._replace(cells=[cell._replace(text=shortened(cell.text, MAX_LABEL_CHARS))
                                     for cell in row.cells]) for row in table.rows]
         table = table._replace(rows=rows)
-        if len(seeds) == 1:
-            table = table.without("seeds")
         shown = table.fitted(characters, COLUMN_PRIORITY)
         left_out |= dict.fromkeys(heading for heading in table.headings
                                   if heading not in shown.headings)
-        title = ", ".join([board.title, board.of_class, *(seeds if len(seeds) == 1 else ())])
-        parts.append(f"{title}\n\n{shown.markdown()}")
+        parts.append(f"{run_title(board)}\n\n{shown.markdown()}")
     if any("†" in part for part in parts):
         parts.append("† 1 − contrast, since the references have no record of these episodes: 0 is\n"
                      "the homogeneous estimate of the whole record, 1 no error at all")
@@ -66,5 +62,5 @@ def terminal_tables(boards: Sequence[Board], characters: int) -> str:
 
 def markdown(boards: Sequence[Board]) -> str:
     """Return the tables of all boards as Markdown."""
-    return "\n\n".join(f"## {as_markdown(board.title)}\n\n{run_table(board).markdown()}"
+    return "\n\n".join(f"## {as_markdown(run_title(board))}\n\n{run_table(board).markdown()}"
                        for board in boards) + "\n"

@@ -5,7 +5,6 @@ import re
 from pathlib import Path
 from posixpath import dirname, join, normpath
 from urllib.parse import unquote, urlsplit
-from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -15,7 +14,7 @@ from eitbench.bench.table import NOTHING
 from eitbench.bench.text import number, with_interval
 from eitbench.bench.tracks import ids
 from eitbench.report import charts
-from eitbench.report.figures import _strong, learning_chart
+from eitbench.report.figures import _strong
 from eitbench.report.model import Row
 from eitbench.report.site import Beside, Measured, collect, render, render_site, write_site
 from eitbench.report.site.beside import HEADLINE, LINKS, METHODS
@@ -232,10 +231,6 @@ def test_of_many_curves_a_few_stand_out():
     rows = [Row({"method": name, "rank": None, "note": notes.get(name, "")}) for name in names]
     assert [row.cells["method"] for row in _strong(rows)] == ["bound", "ppo_seed3", "greedy", "cycle", "random"]
     assert _strong(rows[:7]) == rows[:7]
-    drawn = learning_chart(BUDGET.replace("/", "-"))
-    faint = ["faint" in line.get("class") for line in ElementTree.fromstring(drawn["svg"]).findall("polyline")
-             if "series" in line.get("class")]
-    assert faint == [True] * (len(faint) - 1) + [False] and len(faint) > 3 and learning_chart("elsewhere") is None
 
 
 # -- robustness, headline ---------------------------------------------------------------------------------------------

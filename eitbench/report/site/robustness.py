@@ -17,11 +17,11 @@ from markupsafe import Markup
 from eitbench.bench.table import NOTHING, Cell, Table, number_cell
 from eitbench.bench.text import number
 from eitbench.bench.tracks import home_of, ids, named
-from eitbench.report.model import Board, Row, kind_of, method_address
+from eitbench.report.model import Board, Row, kind_of
 from eitbench.report.site.beside import Beside
 from eitbench.report.site.collect import ROBUSTNESS, Site
 from eitbench.report.site.environment import markdown
-from eitbench.report.tables import flags
+from eitbench.report.tables import flags, method_cell
 from eitbench.report.templates import template
 from eitbench.worlds.registry import entry
 
@@ -85,7 +85,8 @@ def robustness_table(family: Family) -> Table:
         gains = {name: row.cells["gain"] for name, row in own.items()
                  if row.complete and row.cells["gain"] is not None}
         row = home or next(iter(own.values()))
-        cells: dict[str, Cell | str] = {"method": _method(row), "nominal": _error(home)}
+        cells: dict[str, Cell | str] = {"method": method_cell(row, "", beaten={}),
+                                        "nominal": _error(home)}
         cells |= {name: _error(own.get(name), home, floors[name]) for name in family.shifts}
         least = min(gains, key=gains.__getitem__) if gains.keys() == shifted.keys() else ""
         cells["mean gain"] = number_cell(fmean(gains.values()) if least else None)
@@ -103,13 +104,6 @@ def _best_floor(board: Board) -> float:
     floors = [row for row in board.rows if "floor" in row.badges and row.complete]
     official = [row for row in floors if row.cells["official"]]
     return min((row.cells["error"] for row in official or floors), default=math.inf)
-
-
-def _method(row: Row) -> Cell:
-    title = row.cells["title"]
-    words = [word for word in row.badges if word in ("floor", "reference", "privileged")]
-    return Cell(title, title.casefold(), small=row.label, link=method_address(row.cells["method"]),
-                badges=(*words, *["self-reported"] * (not row.cells["official"])))
 
 
 def _error(row: Row | None, home: Row | None = None, floor: float = math.inf) -> Cell:
