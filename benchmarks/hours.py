@@ -98,7 +98,7 @@ HOURS: dict[str, list[Step]] = {
         ("`PPO(\"MlpPolicy\", env).learn(6144)`", ["-c", LEARN]),
         command("train", "--env", BUDGET, "--algo", "maskable_ppo", "--config", "short.yml",
                 "--out", "agent"),
-        command("policies", "--env", BUDGET, "--policy", "agent/model.zip", "--policy",
+        command("run", "--env", BUDGET, "--policy", "agent/model.zip", "--policy",
                 "best_cycle", "--seeds", "dev:0-1", "--estimator", "reduced"),
     ],
     "Who reads the boards": [

@@ -66,7 +66,7 @@ def replace_folder(folder: Path, files: Mapping[str, bytes]) -> None:
 
 PACKAGE = Path(__file__).parent
 """Where this package lies."""
-SHIPPED = ("baselines", "leaderboards", "studies")
+SHIPPED = ("baselines", "leaderboards")
 """Folders that come with the package. Models of our agents, learned networks, animations and the
 rendered site are in a checkout only: an installed package would have four times its size."""
 

@@ -28,7 +28,6 @@ import tempfile
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import fields, is_dataclass
 from functools import cache, partial
 from importlib.metadata import entry_points
 from importlib.util import find_spec
@@ -586,27 +585,11 @@ def _models_folder() -> str:
     return str((cache_folder() / model_key("", None, 0).folder).absolute())
 
 
-def _classes(part: Any) -> list[type]:
-    """Return the classes of a world's parts, and their ancestors."""
-    parts = [getattr(part, each.name) for each in fields(part)]
-    return [*type(part).__mro__,
-            *(kind for inner in parts if is_dataclass(inner) for kind in _classes(inner))]
-
-
 def _pickled_entry(id: str) -> bytes:
-    """Return an entry that a script has registered, with the code of its parts; else nothing."""
-    if id not in [each.id for each in registered_by_hand()]:
-        return b""
-    names = {kind.__module__ for kind in _classes(entry(id).world)} & set(sys.modules)
-    modules = [sys.modules[name] for name in sorted(names)
-               if name.partition(".")[0] not in {"eitbench", *sys.stdlib_module_names}]
-    for module in modules:  # a worker cannot import them
-        cloudpickle.register_pickle_by_value(module)
-    try:
-        return bytes(cloudpickle.dumps(entry(id)))
-    finally:
-        for module in modules:
-            cloudpickle.unregister_pickle_by_value(module)
+    """Return an entry that a script has registered, which the worker does not know; else
+    nothing."""
+    is_known = id not in [each.id for each in registered_by_hand()]
+    return b"" if is_known else bytes(cloudpickle.dumps(entry(id)))
 
 
 def _text(value: Any, length: int = 2000) -> str:

@@ -18,7 +18,9 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import os
 import re
+import stat
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from functools import lru_cache
@@ -27,12 +29,13 @@ from pathlib import Path
 from typing import Any
 
 import jsonschema_rs
+import orjson
 
+from eitbench import _check
 from eitbench._files import shipped, write_atomically
 from eitbench._foreign import cleaned
 from eitbench.bench import tracks
 from eitbench.bench.episode_table import read_episode_table, table_beside, write_episode_table
-from eitbench.bench.strict_json import parsed
 from eitbench.data.seeds import name_seed, parse_seeds
 
 SCHEMA = 3
@@ -40,6 +43,10 @@ BOARDS = tracks.ALL_BOARDS
 SHARED = ("board", "title", "parameters", "role", "privileged", "version", "method_sha256",
           "checkpoint_sha256")
 """Fields that all episodes of a record have in common, beside environment and method."""
+MAX_BYTES = 2**23
+"""of a file"""
+MAX_DEPTH = 32
+"""levels of lists and objects within each other"""
 MAX_KWARGS_CHARS = 10_000
 """of an environment's arguments as JSON, which become headings"""
 _BUILTIN_VERSION = re.compile(r"v([1-9][0-9]*)")
@@ -68,7 +75,7 @@ def read_record(path: Path) -> dict[str, Any]:
     since it was written, or has another name than its content requires.
     """
     try:
-        record = parsed(path)
+        record = read_json(path)
         check_record(record)
         if record["sha256"] != _digest(record):
             raise ValueError("was changed since it was written: its sha256 is not that of its "
@@ -78,6 +85,20 @@ def read_record(path: Path) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         raise ValueError(f"record {cleaned(str(path))} {cleaned(str(error))}") from None
     return record
+
+
+def read_json(path: Path) -> Any:
+    """Read the JSON of a file; ``ValueError``, without the file's name, if it is too large, too
+    deep, not UTF-8, or has a number that is not finite (NaN, Infinity, 1e999)."""
+    try:
+        status = os.stat(path)
+        if not stat.S_ISREG(status.st_mode) or status.st_size > MAX_BYTES:
+            raise ValueError(f"it must be a file of at most {MAX_BYTES >> 20} MiB")
+        content = orjson.loads(path.read_bytes())
+        _check.nesting("lists and objects", content, MAX_DEPTH)
+    except (OSError, ValueError) as error:
+        raise ValueError(f"cannot be read: {error}") from None
+    return content
 
 
 def read_records(folder: Path, *, keep: Callable[[dict[str, Any]], Any] = dict) -> list[Any]:

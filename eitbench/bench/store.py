@@ -12,6 +12,7 @@ import subprocess
 import timeit
 import warnings
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -26,13 +27,13 @@ from eitbench.bench.records import (
     SCHEMA,
     SHARED,
     check_record,
+    read_json,
     read_records,
     sealed,
     split_of,
     write_record,
 )
 from eitbench.bench.scores import SCORING
-from eitbench.bench.strict_json import parsed
 from eitbench.data import cache
 from eitbench.data.seeds import name_seed
 
@@ -88,8 +89,11 @@ class EpisodeStore:
         """Map the seed of each failed episode to the lines of the method's code that led to it."""
         environment, method = record["environment"]["name"], record["method"]
         failed = [episode["seed"] for episode in record["episodes"] if episode["status"] != "ok"]
-        kept = {seed: read_json(self._path(environment, method, seed)) or {} for seed in failed}
-        return {seed: str(result.get("traceback", "")) for seed, result in kept.items()}
+        texts = dict.fromkeys(failed, "")
+        for seed in failed:
+            with suppress(ValueError):
+                texts[seed] = str(_read(self._path(environment, method, seed)).get("traceback", ""))
+        return texts
 
     def fields(self, result: dict[str, Any]) -> dict[str, np.ndarray]:
         """Read the estimates of a result: ``mean`` and perhaps ``std``, (T, n) in mol/m³.
@@ -212,21 +216,12 @@ def results_in(folder: Path) -> list[dict[str, Any]]:
 def _read(path: Path) -> dict[str, Any]:
     """Read a result. ``ValueError``, without the file's name, if a record of it alone is not
     valid."""
-    result = parsed(path)
+    result = read_json(path)
     try:
         check_record(_gathered([result]))
     except (AttributeError, KeyError, TypeError) as error:
         raise ValueError(f"is no result of an episode: {type(error).__name__}: {error}") from None
     return result  # type: ignore[no-any-return]
-
-
-def read_json(path: Path) -> dict[str, Any] | None:
-    """Read a JSON object; None if the file is missing, damaged, or holds something else."""
-    try:
-        content = parsed(path)
-    except ValueError:
-        return None
-    return content if isinstance(content, dict) else None
 
 
 # -- the code and the machine of a run ----------------------------------------------------------

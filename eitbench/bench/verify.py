@@ -26,12 +26,19 @@ from eitbench.bench.methods import (
     own_sha256,
 )
 from eitbench.bench.playing import play
-from eitbench.bench.records import SHARED, newest, read_record, read_sound_files, version_number
+from eitbench.bench.records import (
+    SHARED,
+    newest,
+    read_measured_files,
+    read_record,
+    read_sound_files,
+    version_number,
+)
 from eitbench.bench.run import Job, run_episode
 from eitbench.bench.scores import scored, scores
 from eitbench.bench.table import Cell, Table
 from eitbench.bench.text import scores_by_seed
-from eitbench.bench.tracks import Environment, ids, is_measured
+from eitbench.bench.tracks import Environment
 from eitbench.data.cache import cache_in
 from eitbench.data.parallel import in_parallel
 from eitbench.data.seeds import parse_seeds
@@ -139,13 +146,15 @@ def top_records(folder: Path, count: int, environments: Sequence[str] = ()) -> l
 
 def _current(folder: Path, environments: Sequence[str]) -> list[tuple[Path, dict[str, Any]]]:
     read, complaints = read_sound_files(folder)
+    if environments:                        # those of measurements, whose files are rarely there
+        measured, more = read_measured_files(folder)
+        read |= measured
+        complaints += more
     if complaints:
         raise ValueError("; ".join(complaints))
     current = {id(record) for record in newest(list(read.values()))[0]}
-    # Files of measurements are rarely there.
-    asked = set(environments) or {name for name in ids() if not is_measured(name)}
-    return [(path, record) for path, record in read.items()
-            if id(record) in current and record["environment"]["id"] in asked]
+    return [(path, record) for path, record in read.items() if id(record) in current
+            and (not environments or record["environment"]["id"] in environments)]
 
 
 def _none(folder: Path, environments: Sequence[str]) -> list[Path]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -13,11 +12,10 @@ from eitbench import __version__
 from eitbench.cli import options
 from eitbench.cli.estimate import estimate
 from eitbench.cli.export import export
+from eitbench.cli.fit import app as fit_commands
 from eitbench.cli.maintain import golden
-from eitbench.cli.play import policies, report, run, typed
-from eitbench.cli.priors import fit_model, fit_prior
-from eitbench.cli.studies import thesis
-from eitbench.cli.trust import verify
+from eitbench.cli.run import report, run, typed
+from eitbench.cli.verify import verify
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
                   context_settings={"help_option_names": ["-h", "--help"]}, help="""
@@ -28,8 +26,6 @@ writes results/index.html.
 """)
 
 Algorithm = StrEnum("Algorithm", ["ppo", "dqn", "sac", "recurrent_ppo", "maskable_ppo"])
-Figure = StrEnum("Figure", {  # type: ignore[misc]
-    re.sub(r"\W", "_", name).upper(): name for name in thesis().FIGURES})
 
 
 def _say_version(asked: bool) -> None:
@@ -83,7 +79,6 @@ def list_() -> None:
 
 
 app.command()(run)
-app.command()(policies)
 
 
 @app.command()
@@ -195,8 +190,7 @@ def submit(
 
 app.command()(verify)
 app.command()(golden)
-app.command("fit-prior")(fit_prior)
-app.command("fit-model")(fit_model)
+app.add_typer(fit_commands, name="fit")
 app.command()(estimate)
 app.command()(export)
 
@@ -296,23 +290,11 @@ def render(
         options.say(f"wrote {out}")
 
 
-@app.command()
-def reproduce(
-    name: Annotated[Figure, typer.Argument(
-        help="Figure or table of the thesis, or a study beside it.")],
-    seeds: Annotated[str | None, typer.Option(
-        help="Episodes; pictures show the first, sweeps average over all. Default: dev:0-1; of the "
-             "injection those of the boards.")] = None,
-    jobs: options.Jobs = options.CORES,
-    out: options.Out = Path("results/figures"),
-) -> None:
-    """Draw a figure of the thesis from our data, and say what agrees and what differs."""
-    with options.clear_errors():
-        path, remark = thesis().FIGURES[name.value](options.numbers(seeds), jobs, out)
-    options.say(f"wrote {path}\n{remark}")
-
-
 REPLACED = {
+    "fit-model": "`eitbench fit model`",
+    "fit-prior": "`eitbench fit prior`",
+    "policies": "`eitbench run --env ID --policy NAME` runs injection policies",
+    "reproduce": "`python studies/thesis NAME` in a checkout draws a figure of the thesis",
     "check": "`eitbench verify RECORDS…` verifies the records of a submission",
     "held-out": "docs/trust.md says how to draw the secret of held-out episodes",
     "season": "`eitbench verify --top 3 --held-out 20 --secret FILE` verifies the first records; "

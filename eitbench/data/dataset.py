@@ -1,16 +1,15 @@
 """Episodes as examples to learn from: measurements, and the true concentration.
 
-The truth is given on the estimators' nodes, as the concentration p_t that is nearest to it in the
-norm of the score. With M̃ and b_t as in `eitbench.data.regions`, M̃ p_t = b_t and
-    ∫(ĉ − c_t)² = (ĉ − p_t)ᵀ M̃ (ĉ − p_t) + ∫(p_t − c_t)²
-for every ĉ on these nodes: scores need no mesh of the truth. In reduced coordinates, ĉ = c̄ + B â
-and G = Bᵀ M̃ B, with a_t the coordinates nearest to the truth, scores are exact too:
+The truth is given on the estimators' nodes, as the concentration p_t nearest to it in the norm of
+the score. With M̃ and b_t as in `eitbench.data.regions`, M̃ p_t = b_t, and for every ĉ on these nodes
+    ∫(ĉ − c_t)² = (ĉ − p_t)ᵀ M̃ (ĉ − p_t) + ∫(p_t − c_t)².
+In reduced coordinates, ĉ = c̄ + B â and G = Bᵀ M̃ B, with a_t nearest to the truth, likewise
     ∫(c̄ + B â − c_t)² = (â − a_t)ᵀ G (â − a_t) + ∫(c̄ + B a_t − c_t)².
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -136,9 +135,8 @@ class Dataset:
         return (np.einsum("tn,nt->t", off, self.mass @ off.T) + example.unresolved) / example.square
 
     def modes(self, q: int) -> np.ndarray:
-        """Return the q strongest modes (n, q) of the scored states of these examples relative to
-        the background: the best basis in the norm of the score, and orthonormal in it.
-        ``ValueError`` if there are fewer than q."""
+        """Return the best basis (n, q), in the norm of the score, for the scored states relative to
+        the background; orthonormal in that norm. ``ValueError`` if they have fewer modes."""
         return strongest(self, q)[0]
 
     def reduced(self, basis: np.ndarray, mean: float | np.ndarray | None = None) -> Dataset:
@@ -173,10 +171,7 @@ class Dataset:
 
     def torch(self) -> TorchDataset:
         """Return the same as a map-style dataset for torch. ``ModuleNotFoundError`` without torch.
-
-        Missing episodes are simulated one by one when they are requested: `eitbench bank` does so
-        sooner and faster.
-        """
+        Missing episodes are simulated one by one; `eitbench bank` is faster."""
         with needed_by("a dataset for torch"):
             import torch  # noqa: F401
         return TorchDataset(self)
@@ -250,8 +245,8 @@ def asked_seeds(seeds: str | Sequence[int]) -> tuple[int, ...]:
 
 
 def strongest(examples: Dataset, q: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return modes (n, q) as `Dataset.modes` does, and the mean square (n,) in (mol/m³)² of the
-    remainder of c − background."""
+    """Return `Dataset.modes`, and the mean square (n,) in (mol/m³)² of what they leave of c less
+    the background."""
     n = examples.mesh.n_nodes
     q = _check.integer("q", q, low=1, high=n)
     second = np.zeros((n, n))
@@ -286,11 +281,8 @@ def _fitted_flow(world: World, entries: np.ndarray) -> np.ndarray:
 
 def _projected(world: World, seed: int,
                entries: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return p_t less the background (T, n), ∫(p_t − c_t)² and ∫c_t² (T,).
-
-    With a region the integrals are over the region, and p_t is the projection there; nodes beyond
-    it have the projection of the whole vessel.
-    """
+    """Return p_t less the background (T, n), ∫(p_t − c_t)² and ∫c_t² (T,). With a region these are
+    of the region; nodes beyond it have the projection of the whole vessel."""
     truth = _solver(world)(entries["moment"].astype(float).T).T
     counted = integrals(world, seed, entries)
     moment = counted.moment.astype(float)
@@ -301,28 +293,21 @@ def _projected(world: World, seed: int,
     return truth, unresolved, np.array(counted.square)
 
 
-Solver = Callable[[np.ndarray], np.ndarray]
-
-
 @once(4)
-def _solver(world: World) -> Solver:
+def _solver(world: World) -> Any:
     """Return b (n, T) -> M̃⁻¹ b over the whole vessel."""
-    return _factorised(_symmetric(outline(world).mass))
+    from scipy.sparse.linalg import splu
+    return splu(_symmetric(outline(world).mass).tocsc()).solve
 
 
 @once(4)
-def _region_solver(world: World) -> tuple[np.ndarray, Solver]:
+def _region_solver(world: World) -> tuple[np.ndarray, Any]:
     """Return the nodes that the world's region touches, and M̃⁻¹ of them."""
+    from scipy.sparse.linalg import splu
     mass = _symmetric(score_mass(world))
     diagonal = mass.diagonal()
     inside = np.flatnonzero(diagonal > MIN_MASS * diagonal.max())
-    return inside, _factorised(mass[inside][:, inside])
-
-
-def _factorised(mass: sp.csr_array) -> Solver:
-    from scipy.sparse.linalg import splu
-    solver: Solver = splu(mass.tocsc()).solve
-    return solver
+    return inside, splu(mass[inside][:, inside].tocsc()).solve
 
 
 def _symmetric(half: sp.csr_array) -> sp.csr_array:

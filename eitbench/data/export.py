@@ -40,25 +40,17 @@ def export(examples: Dataset, folder: Path, format: str = "npz", *, n_jobs: int 
            backend: str = "loky") -> int:
     """Write each example into a file beside the mesh and a README; return the number of new ones.
 
-    Simulated episodes stay in the cache, and files are written atomically: the same call resumes
-    after an interruption, and other seeds may be added.
+    The same call resumes after an interruption, and other seeds may be added.
 
     Parameters
     ----------
     examples : Dataset
     folder : Path
-        New, empty, or of an export of the same world in the same format.
+        New, empty, or of an export of the same world in the same format; otherwise ``ValueError``.
     format : "npz" or "hdf5"
-        hdf5 needs the extra ``export``.
+        hdf5 needs the extra ``export``; otherwise ``ModuleNotFoundError``.
     n_jobs, backend
         Of the simulation; see `eitbench.data.bank.fill`.
-
-    Raises
-    ------
-    ValueError
-        If the format is unknown or the folder holds other files.
-    ModuleNotFoundError
-        If the format's library is not installed.
     """
     if format not in SUFFIXES:
         raise ValueError(f"format must be one of {', '.join(SUFFIXES)}, got {format!r}")

@@ -30,14 +30,9 @@ LARGE = 2500
 class Pool:
     """The episodes that unseeded resets are drawn from.
 
-    Their number depends on the number of unseeded resets since the last seeded one, not on what has
-    been simulated: the same seed gives the same episodes everywhere.
-
-    Parameters
-    ----------
-    episodes : int, optional
-        Number from the start; None: 1 for the first `ALONE` resets, then 8, and from then on the
-        largest power of two that is at most 1/8 of the number of resets, up to `MOST`.
+    There are ``episodes`` of them. Without that number there is 1 for the first `ALONE` resets
+    since the last seeded one, then 8, and from then on the largest power of two that is at most 1/8
+    of the number of resets, up to `MOST`, whatever has been simulated.
     """
 
     def __init__(self, episodes: int | None) -> None:
@@ -69,10 +64,8 @@ class Pool:
         self._drawn_from = 0
 
     def provide(self, world: World, seed: int) -> None:
-        """Simulate all missing episodes of a growing pool, eight at a time, if this is one of them.
-
-        Where eight episodes take the time of two, the first comes with the other seven.
-        """
+        """Simulate all missing episodes of a growing pool, if this is one of them; with the first
+        the other seven, where eight take the time of two."""
         wanted = self.grows and seed < self._drawn_from and self._can_be_kept
         if not wanted or is_recorded(world, seed):
             return

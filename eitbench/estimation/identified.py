@@ -133,7 +133,7 @@ class IdentifiedModel:
                 return cls(**arrays, level=float(file["level"]),
                            source=json.loads(str(file["source"])))
         except (OSError, ValueError, KeyError, EOFError) as error:
-            raise ValueError(f"{path} must be a model of `eitbench fit-model`: {error}") from None
+            raise ValueError(f"{path} must be a model of `eitbench fit model`: {error}") from None
 
 
 def told(task: Task) -> np.ndarray:

@@ -127,7 +127,7 @@ class InflowPrior:
             raise ValueError(
                 f"the prior must be of the task's inlet, {len(task.transport.inlet)} nodes in "
                 f"steps of {task.transport.time_step:g} s; got one of {len(self.points)} nodes in "
-                f"steps of {self.time_step:g} s; make one by `eitbench fit-prior`")
+                f"steps of {self.time_step:g} s; make one by `eitbench fit prior`")
 
     def save(self, path: Path) -> None:
         """Write a file that `load` reads."""
@@ -147,7 +147,7 @@ class InflowPrior:
             regimes = said.pop("regimes", None)
             return cls(**said, regimes=None if regimes is None else Regimes(**regimes))
         except (OSError, ValueError, TypeError, AttributeError) as error:
-            raise ValueError(f"{path} must be a prior of `eitbench fit-prior`: {error}") from None
+            raise ValueError(f"{path} must be a prior of `eitbench fit prior`: {error}") from None
 
 
 def fit_inflow_prior(ratios: np.ndarray, points: np.ndarray, time_step: float, *,
@@ -245,7 +245,7 @@ def suiting_priors(folder: Path, task: Task, link: str) -> list[InflowPrior]:
 def _say_other_world(world: str, learned: str) -> None:
     """Report once a process which prior stands in for a missing one."""
     say(f"no inflow prior was learned in {world!r}: that of {learned} is used; "
-        "make one by `eitbench fit-prior`")
+        "make one by `eitbench fit prior`")
 
 
 def nominal_worlds(name: str) -> set[str]:

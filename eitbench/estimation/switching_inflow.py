@@ -41,7 +41,7 @@ class SwitchingInflowFilter:
     def __init__(self, task: Task, prior: InflowPrior, level: float, level_std: float) -> None:
         if prior.regimes is None:
             raise ValueError("prior must have regimes, got one without; make one by "
-                             "`eitbench fit-prior --quiet`")
+                             "`eitbench fit prior --quiet`")
         _check.number("level_std", level_std, low=0.0, open_low=True)
         regimes = prior.regimes
         flat = np.full((len(prior.points), 1), level_std)

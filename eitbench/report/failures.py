@@ -15,8 +15,8 @@ from eitbench.bench.text import seed_ranges
 from eitbench.bench.variants import as_typed, flat
 from eitbench.data.seeds import name_seed
 
-_COMMANDS = {"estimation": ("run", "--baseline"), "injection": ("policies", "--policy")}
-"""Track -> the command that runs its methods, and the option that names them."""
+_OPTIONS = {"estimation": "--baseline", "injection": "--policy"}
+"""Track -> the option of `eitbench run` that names its methods."""
 
 
 class Failure(NamedTuple):
@@ -56,12 +56,12 @@ def debug_command(failure: Failure, jobs: Iterable[Job]) -> str:
     failed = (failure.record["environment"]["name"], failure.record["method"], first)
     for job in jobs:
         if (job.environment.name, job.load().name, name_seed(job.seed)) == failed:
-            command, option = _COMMANDS[job.environment.track]
+            option = _OPTIONS[job.environment.track]
             given = json.loads(job.environment.kwargs)
             changes = [f"--set={number}={as_typed(value)}"
                        for number, value in flat(given.get("world", {})).items()]
             estimator = ["--estimator", given["estimator"]] if "estimator" in given else []
-            return shlex.join(["eitbench", command, "--env", job.environment.id, option, job.method,
+            return shlex.join(["eitbench", "run", "--env", job.environment.id, option, job.method,
                                "--seeds", first, *changes, *estimator, "--isolate", "none",
                                "--jobs", "1"])
     return ""

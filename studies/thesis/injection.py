@@ -56,7 +56,8 @@ def injection(seeds: list[int] | None, jobs: int, out: Path) -> tuple[Path, str]
     said = []
     for (env, title), axes in zip(WORLDS.items(), panels[:2].flat, strict=True):
         todo = jobs_of("injection", [env], [], seeds)
-        run_jobs(unplayed(todo, before), store, n_jobs=jobs, command="eitbench reproduce injection")
+        run_jobs(unplayed(todo, before), store, n_jobs=jobs,
+                 command="python studies/thesis injection")
         rows = policy_rows(todo, [*before, *store.results()])
         privileged = sorted({job.load().name for job in todo if job.load().privileged})
         _scores(axes, rows, privileged)

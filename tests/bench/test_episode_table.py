@@ -10,8 +10,7 @@ from eitbench.bench import load
 from eitbench.bench.episode_table import NAME, episode_table, read_episode_table, write_episode_table
 from eitbench.bench.records import newest, read_records, write_record
 from eitbench.report import compare
-from eitbench.report.summary import anchors
-from eitbench.report.terminal import shipped_anchors
+from eitbench.report.boards import anchors, shipped_anchors
 
 from tiny import several_boards
 

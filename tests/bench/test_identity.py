@@ -15,7 +15,7 @@ from eitbench.data.cache import CACHE_VARIABLE
 from eitbench.worlds import entry, register, registry
 
 from short import register_apart
-from tiny import FILTER, count, counting, write_baseline
+from tiny import FILTER, FIXED_LAG, count, counting, write_baseline
 from tiny_worlds import CHANGES, TINY
 
 ID = "mine/Tiny-v0"
@@ -74,6 +74,14 @@ def test_a_world_that_is_changed_to_itself_has_the_same_identity(tmp_path):
     first = Job(FILTER, path, 1).identity()
     registry.take_over([replace(entry(FILTER.id), world=replace(entry(FILTER.id).world))])
     assert Job(FILTER, path, 1).identity() == first
+
+
+def test_another_question_is_another_identity(tmp_path):
+    """Of another board, world, seed or method's file."""
+    path, other = write_baseline(tmp_path), write_baseline(tmp_path, "other", doc="Other.")
+    jobs = [Job(FILTER, path, 1), Job(FIXED_LAG, path, 1), Job(Environment(FILTER.id), path, 1), Job(FILTER, path, 2),
+            Job(FILTER, other, 1)]
+    assert len({job.identity() for job in jobs}) == 5 and Job(FILTER, path, 1).identity() == jobs[0].identity()
 
 
 def injection_identity(name="random_pair", **given):

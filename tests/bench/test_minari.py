@@ -42,7 +42,7 @@ def test_replaying_gives_the_same_again():
 
 
 def test_its_policy_is_the_one_that_is_scored():
-    """The same draws: injections are those of `eitbench policies`."""
+    """The same draws: injections are those of `eitbench run`."""
     from eitbench.bench.methods import load_method
     from eitbench.bench.playing import injections
     export_minari(NAME, ENV, "random_pair", "dev:3")

@@ -213,7 +213,7 @@ def test_played_episodes_are_kept(tmp_path, monkeypatch):
     """A record of the format that baselines have; what is there is not played again, but for what was cut short."""
     store = EpisodeStore(tmp_path / "new")
     todo = jobs_of(["opposite", "adjacent"], "dev:1,0", estimator="reduced")
-    run_jobs(todo, store, command="eitbench policies")
+    run_jobs(todo, store, command="eitbench run")
     rows = policy_rows(todo, store.results())
     assert sorted(zip(rows["policy"], rows["seed"], strict=True)) == [
         (policy, seed) for policy in ("adjacent", "opposite") for seed in ("dev:0", "dev:1")]

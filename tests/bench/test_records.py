@@ -12,17 +12,16 @@ import jsonschema_rs
 import pytest
 from eitbench.bench.records import (
     BOARDS,
+    MAX_BYTES,
+    MAX_DEPTH,
     file_name,
     newest,
     read_record,
     read_records,
     schema_text,
     sealed,
-    split_of,
-    version_number,
     write_record,
 )
-from eitbench.bench.strict_json import MAX_BYTES, MAX_DEPTH
 from eitbench.bench.tracks import ARGUMENTS, boards_of, named
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.injection import InjectionEnv
@@ -289,7 +288,8 @@ def test_the_schema_knows_all_that_there_is():
     assert schema["$schema"].endswith("2020-12/schema")
     assert tuple(schema["properties"]["board"]["enum"]) == BOARDS
     assert set(schema["required"]) == set(schema["properties"]) == set(MINE)
-    assert set(episode("test:0", 0.1)) | {"message", "where"} == set(schema["$defs"]["episode"]["properties"])
+    properties = set(schema["$defs"]["episode"]["properties"])
+    assert set(episode("test:0", 0.1)) | {"message", "where", "actions"} == properties
 
 
 def test_scores_are_open(tmp_path):
@@ -376,12 +376,6 @@ def test_names_of_files_are_spelt_out_in_messages(tmp_path):
     with pytest.raises(ValueError, match="must have the name") as caught:
         read_record(path)
     assert "\\x1b[31m\\u202e.json" in str(caught.value) and "\x1b" not in str(caught.value)
-
-
-@pytest.mark.parametrize(("text", "split", "number"), [("test:4", "test", None), ("7", "own", None), ("v3", "own", 3)])
-def test_names_of_splits_and_versions(text, split, number):
-    """Seeds name their split, versions of built-in methods their number."""
-    assert split_of(text) == split and version_number(text) == number
 
 
 def test_another_validator_agrees():

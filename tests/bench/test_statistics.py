@@ -51,22 +51,6 @@ def plain(scores):
 # -- interquartile mean -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("scores", "expected"), [
-    ([5.0], 5.0),                                           # 0 of 1 left out at either end
-    ([1.0, 6.0], 3.5),
-    ([1.0, 2.0, 9.0], 4.0),                                 # 0 of 3: the mean
-    ([9.0, 2.0, 100.0, 4.0], 6.5),                          # 1 of 4: (4 + 9)/2
-    ([-50.0, 1.0, 2.0, 6.0, 100.0], 3.0),                   # 1 of 5: (1 + 2 + 6)/3
-    ([-9.0, 1.0, 2.0, 3.0, 6.0, 99.0], 3.0),                # 1 of 6: (1 + 2 + 3 + 6)/4
-    ([-9.0, 1.0, 2.0, 3.0, 4.0, 10.0, 99.0], 4.0),          # 1 of 7: (1 + 2 + 3 + 4 + 10)/5
-    ([-9.0, -8.0, 1.0, 2.0, 3.0, 4.0, 98.0, 99.0], 2.5),    # 2 of 8: (1 + 2 + 3 + 4)/4
-])
-def test_interquartile_mean_by_hand(scores, expected):
-    """A quarter of the scores, rounded down, is left out at either end."""
-    assert interquartile_mean(scores) == pytest.approx(expected, rel=1e-15)
-    assert interquartile_mean(scores[::-1]) == pytest.approx(expected, rel=1e-15)
-
-
 @pytest.mark.parametrize("n", range(1, 30))
 def test_interquartile_mean_is_scipys(n):
     """The 25 % trimmed mean, of the environments pooled and for any number of draws at once."""

@@ -8,13 +8,11 @@ from eitbench.bench import store as store_module
 from eitbench.bench.records import newest, read_record, read_records, write_record
 from eitbench.bench.store import EpisodeStore, provenance
 from eitbench.bench.submit import submit
-from eitbench.data import bank
-from eitbench.data.cache import CACHE_VARIABLE
 from eitbench.data.seeds import parse_seeds
 
 from commands import eitbench
 from short import PIPE, shorten
-from tiny import FILTER, SCENARIO, SMOOTHING, count, counting, git_says, record, write_baseline
+from tiny import FILTER, SCENARIO, SMOOTHING, count, counting, git_says, write_baseline
 
 INJECTION = "eitbench/Pipe2DInjection-v0"
 TEST = parse_seeds("test:0-1")
@@ -82,7 +80,7 @@ def test_policies_are_submitted_alike(tmp_path):
 
 def test_policies_by_command(tmp_path):
     """`policies` prints scores and resumes; what it played stands in the table and on the page of `leaderboard`."""
-    command = ("policies", "--env", INJECTION, "--policy", "adjacent", "--policy", "random_pair", "--policy",
+    command = ("run", "--env", INJECTION, "--policy", "adjacent", "--policy", "random_pair", "--policy",
                "clairvoyant", "--seeds", "test:0-1", "--estimator", "reduced", "-j", "1")
     code, said, _ = eitbench(*command)
     assert code == 0 and "| clairvoyant (privileged) |" in said and "adaptivity gap" in said
@@ -106,12 +104,12 @@ def test_policies_in_records_are_not_played_again(tmp_path):
     """The table is that of all the episodes; only those that no record holds are played."""
     policy, short = ("--env", INJECTION, "--policy", "adjacent"), ("-j", "1", "-o")
     assert eitbench("submit", *policy, "--seeds", "test:0", *short, "first")[0] == 0
-    code, said, _ = eitbench("policies", *policy, "--seeds", "test:0-1", "--records", "leaderboards/results", *short,
+    code, said, _ = eitbench("run", *policy, "--seeds", "test:0-1", "--records", "leaderboards/results", *short,
                              "rest")
     assert code == 0 and [path.name for path in tmp_path.glob("rest/episodes/*/*/*.json")] == ["test-1.json"]
     (score,) = re.findall(r"\| adjacent \| ([^|]+) \|", said)
-    assert f"| adjacent | {score} |" in eitbench("policies", *policy, "--seeds", "test:0-1", *short, "all")[1]
-    code, _, complaint = eitbench("policies", *policy, "--records", "nowhere", *short, "none")
+    assert f"| adjacent | {score} |" in eitbench("run", *policy, "--seeds", "test:0-1", *short, "all")[1]
+    code, _, complaint = eitbench("run", *policy, "--records", "nowhere", *short, "none")
     assert code == 2 and "--records must be a folder, got nowhere" in complaint
 
 
@@ -209,57 +207,14 @@ def test_a_record_is_extended(official, tmp_path):
     assert submitted("c", "test:9-10") == both and count(log) == 2
 
 
-def test_an_invalid_record_is_in_nobody_s_way(tmp_path, monkeypatch):
-    """What another method claimed, and no schema allows, is left out of the table and the page."""
+def test_a_result_that_no_record_may_hold_is_not_submitted(tmp_path, monkeypatch):
+    """It is named, and nothing is written."""
     monkeypatch.setattr(run, "scored", lambda *asked, scored=run.scored: scored(*asked) | {"seconds_per_step": -1.0})
-    submitted = ("--env", FILTER.id, "--seeds", "test:0", "-j", "1")
     with pytest.warns(UserWarning, match=r"homogeneous/test-0\.json is left out: it is not valid: .*seconds_per_step"):
-        code, _, complaint = eitbench("run", "--baseline", "homogeneous", *submitted)
-    assert code == 2 and "no results in results" in complaint
-    with pytest.warns(UserWarning, match="left out"):
-        code, _, complaint = eitbench("submit", "--baseline", "homogeneous", *submitted)
+        code, _, complaint = eitbench("submit", "--baseline", "homogeneous", "--env", FILTER.id, "--seeds", "test:0",
+                                      "-j", "1")
     assert code == 2 and "holds no valid result of homogeneous" in complaint
     assert not (tmp_path / "leaderboards").exists()
-    monkeypatch.undo()
-    monkeypatch.chdir(tmp_path)
-    shorten(monkeypatch, {FILTER.id: SCENARIO})
-    with pytest.warns(UserWarning, match="left out"):
-        assert eitbench("run", "--baseline", "persistence", *submitted)[0] == 0
-    assert eitbench("submit", "--baseline", "persistence", *submitted)[0] == 0
-
-
-def test_mistyped_records_delete_nothing(tmp_path):
-    """Neither beside a folder that does not exist, nor in a folder site/ that is somebody else's."""
-    kept = tmp_path / "site" / "index.html"
-    kept.parent.mkdir()
-    kept.write_text("mine")
-    (tmp_path / "none").mkdir()
-    write_record(tmp_path / "results", record("homogeneous", [0.2, 0.3]))
-    for records, message in (("result", "records must be a folder that exists, got result"),
-                             ("none", "with records of test seeds, got none, where there are none"),
-                             ("results", "folder must be empty or hold a site of the leaderboards")):
-        code, _, complaint = eitbench("leaderboard", "--records", records)
-        assert code == 2 and message in complaint
-        assert {path.name for path in tmp_path.iterdir()} == {"site", "results", "none"} and kept.read_text() == "mine"
-
-
-@pytest.mark.parametrize("arguments", [
-    ("policies", "--env", INJECTION, "--policy", "adjacent", "--seeds", "test:0"),
-    ("submit", "--env", INJECTION, "--policy", "adjacent", "--seeds", "test:0"),
-    ("bank", "--env", INJECTION, "--seeds", "train:77")])
-def test_the_backend_is_that_of_all_that_is_done(arguments, monkeypatch):
-    """Whatever plays or records says that it is not installed, and names it."""
-    asked = []
-
-    def in_parallel(function, work, n_jobs, backend="loky"):
-        asked.append(backend)
-        raise ValueError("backend ray is not here")
-
-    monkeypatch.setattr(bank, "in_parallel", in_parallel)
-    monkeypatch.setattr(run, "in_parallel", in_parallel)
-    monkeypatch.setenv(CACHE_VARIABLE, "empty")
-    code, _, complaint = eitbench(*arguments, "-j", "1", "--backend", "ray")
-    assert code == 2 and "backend ray is not here" in complaint and asked == ["ray"]
 
 
 def test_from_a_file_to_the_boards_by_command(tmp_path):

@@ -118,7 +118,7 @@ def test_without_bubblewrap_a_third_party_file_does_not_run(mine, monkeypatch):
 def test_built_in_methods_are_known_by_name(tmp_path):
     """Policies, privileged ones and failures too; the arguments are those of the record."""
     for name in ("random_pair", "clairvoyant"):
-        assert eitbench("policies", "--env", INJECTION, "--policy", name, "--seeds", "dev:0", "--estimator", "reduced",
+        assert eitbench("run", "--env", INJECTION, "--policy", name, "--seeds", "dev:0", "--estimator", "reduced",
                         "-j", 1)[0] == 0
         (path,) = tmp_path.glob(f"results/records/*--{name}--*")
         code, said, complaint = eitbench("verify", path, "-j", 1)

@@ -286,7 +286,7 @@ def test_a_file_says_all(tmp_path):
 def test_other_files_are_told(tmp_path):
     for content in (b"", b"PK", b"{}"):
         (tmp_path / "b.npz").write_bytes(content)
-        with pytest.raises(ValueError, match=r"b\.npz must be a model of `eitbench fit-model`"):
+        with pytest.raises(ValueError, match=r"b\.npz must be a model of `eitbench fit model`"):
             IdentifiedModel.load(tmp_path / "b.npz")
     with pytest.raises(ValueError, match=r"spread must have shape \(24, 24\)"):
         replace(model(), spread=np.eye(3))

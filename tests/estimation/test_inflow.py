@@ -315,7 +315,7 @@ def test_an_inlet_that_hardly_differs_is_the_same():
 @pytest.mark.parametrize("text", ["", "[]", "{", '{"link": "linear"}', '{"link": 3}'])
 def test_other_files_are_told(tmp_path, text):
     (tmp_path / "a.json").write_text(text)
-    with pytest.raises(ValueError, match=r"a\.json must be a prior of `eitbench fit-prior`"):
+    with pytest.raises(ValueError, match=r"a\.json must be a prior of `eitbench fit prior`"):
         InflowPrior.load(tmp_path / "a.json")
 
 

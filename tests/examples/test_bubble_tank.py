@@ -59,7 +59,7 @@ def test_method_and_score_make_a_record_and_a_board(installed):
 
 def test_policies_and_pictures(installed):
     """Our policies play its world, and an episode is drawn."""
-    said = eitbench(installed, "policies", "--env", INJECTION, "--policy", "random_pair", "--policy",
+    said = eitbench(installed, "run", "--env", INJECTION, "--policy", "random_pair", "--policy",
                     "opposite", "--seeds", "dev:0-1", "--estimator", "reduced",
                     "--out", str(installed.folder / "played"))
     assert "random_pair" in said and "opposite" in said

@@ -25,7 +25,7 @@ COMMANDS = [
     ("leaderboard", "wrote results/index.html"),
     (("bank", *TANK, "--seeds", "train:0", "-j", "1"), "1 simulated"),
     (("export", *TANK, "--seeds", "train:0", "-o", "episodes", "-j", "1"), "1 episodes written"),
-    (("policies", *INJECTION, "--policy", "opposite", "--seeds", "dev:0", "--estimator", "reduced", "-j", "1"),
+    (("run", *INJECTION, "--policy", "opposite", "--seeds", "dev:0", "--estimator", "reduced", "-j", "1"),
      "opposite"),
     (("train", *INJECTION, "--config", "tiny.yml", "-o", "agent"), "wrote agent/model.zip"),
     (("submit", *TANK, "--baseline", "homogeneous", "--seeds", "test:0", "--to", "mine/results", "-j", "1"),
@@ -36,10 +36,9 @@ COMMANDS = [
     (("compare", "kalman_filter", "extended_kalman_filter"), "extended_kalman_filter"),
     (("compare", f"two/{RECORD}", "kalman_filter"), "kalman_filter"),
     (("render", *TANK, "--baseline", "homogeneous", "--step", "3", "-o", "it.png"), "wrote it.png"),
-    (("reproduce", "fig7.4", "--seeds", "dev:0", "-j", "1"), "wrote results/figures"),
     (("golden", "eitbench/StationaryTank2D-v0", "homogeneous"), "homogeneous: same"),
-    (("fit-prior", "--env", "eitbench/Pipe2D-v0", "--seeds", "train:0-3", "-o", "prior.json"), "prior.json: "),
-    (("fit-model", "--env", "eitbench/Pipe2D-v0", "--seeds", "train:0-1", "-o", "model.npz"), "model.npz: "),
+    (("fit", "prior", "--env", "eitbench/Pipe2D-v0", "--seeds", "train:0-3", "-o", "prior.json"), "prior.json: "),
+    (("fit", "model", "--env", "eitbench/Pipe2D-v0", "--seeds", "train:0-1", "-o", "model.npz"), "model.npz: "),
     (("estimate", "--help"), "instrument"),
 ]
 """Words, and what is said when it has worked."""

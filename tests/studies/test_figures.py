@@ -3,6 +3,7 @@ follow from them."""
 
 import importlib
 import re
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +12,6 @@ import pandas as pd
 import pytest
 from eitbench.bench.methods import load_method
 from eitbench.bench.text import seed_ranges
-from eitbench.cli.studies import NAME, thesis
 from eitbench.data.cache import CACHE_VARIABLE
 from eitbench.data.seeds import name_seed
 from eitbench.envs.estimation import EstimationEnv
@@ -27,9 +27,10 @@ from choosing import SHORT
 from short import merged, shorten
 from tiny_worlds import CHANGES
 
-FIGURES = thesis().FIGURES
+sys.path.append(str(Path(__file__).parents[2] / "studies"))
+FIGURES = importlib.import_module("thesis").FIGURES
 common, injection, obstacle, parameters, pipe2d, profiles, tanks, velocity = (
-    importlib.import_module(f"{NAME}.{name}") for name in
+    importlib.import_module(f"thesis.{name}") for name in
     ("common", "injection", "obstacle", "parameters", "pipe2d", "profiles", "tanks", "velocity"))
 error_of, estimates_of = common.error_of, common.estimates_of
 SEED = 100_000
@@ -190,7 +191,7 @@ def test_thesis_figures_show_dev_episodes_when_not_told(monkeypatch, tmp_path):
 
 def test_names():
     """Each name leads to a function of its own."""
-    modules = [importlib.import_module(f"{NAME}.{path.stem}")
+    modules = [importlib.import_module(f"thesis.{path.stem}")
                for path in Path(pipe2d.__file__).parent.glob("[!_]*.py")]
     for name in FIGURES:
         assert sum(callable(getattr(module, name.replace(".", "_"), None))

@@ -5,6 +5,8 @@ velocities on one. Dev seeds are for choosing and testing, never reported.
 """
 
 import importlib
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +14,6 @@ from eitbench import make_task, simulate
 from eitbench.bench.methods import load_method
 from eitbench.bench.run import Job, run_episode
 from eitbench.bench.tracks import Environment
-from eitbench.cli.studies import NAME, thesis
 from eitbench.data.recordings import score_operators
 from eitbench.data.seeds import parse_seeds
 from eitbench.estimation import best_homogeneous, gauss_newton
@@ -20,8 +21,8 @@ from eitbench.numerics.fem import stiffness_matrix
 from eitbench.scoring import relative_error
 from eitbench.worlds.catalogue import PIPE_2D
 
-thesis()
-pipe2d = importlib.import_module(f"{NAME}.pipe2d")
+sys.path.append(str(Path(__file__).parents[2] / "studies"))
+pipe2d = importlib.import_module("thesis.pipe2d")
 SEEDS = parse_seeds("dev:0-19")
 METHODS = {
     "homogeneous": ("eitbench/Pipe2D-v0", "homogeneous"),

@@ -1,4 +1,4 @@
-"""`eitbench fit-prior`, `fit-model`: what they write is what filters read, and they learn from training episodes
+"""`eitbench fit prior`, `fit model`: what they write is what filters read, and they learn from training episodes
 alone."""
 
 import json
@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 
 def told(*arguments):
-    return CliRunner().invoke(app, ["fit-prior", *map(str, arguments)])
+    return CliRunner().invoke(app, ["fit", "prior", *map(str, arguments)])
 
 
 def test_writes_what_filters_read(tmp_path):
@@ -46,8 +46,8 @@ def test_shipped_priors_are_what_the_command_writes(tmp_path, name):
     (["--env", "eitbench/RotatingTank2D-v0"], "target must have an inflow"),
     (["--env", "eitbench/Nowhere-v0"], "env must be one of"),
 ])
-@pytest.mark.parametrize("command", ["fit-prior", "fit-model"])
+@pytest.mark.parametrize("command", ["prior", "model"])
 def test_mistakes_are_told_before_anything_is_written(tmp_path, command, arguments, said):
-    done = CliRunner().invoke(app, [command, *arguments, "--out", str(tmp_path / "mine")])
+    done = CliRunner().invoke(app, ["fit", command, *arguments, "--out", str(tmp_path / "mine")])
     assert done.exit_code != 0 and said in " ".join(done.output.replace("│", " ").split())
     assert not (tmp_path / "mine").exists()

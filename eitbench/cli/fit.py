@@ -1,4 +1,4 @@
-"""The commands `fit-prior` and `fit-model`: what training episodes teach of inflow and flow."""
+"""The commands `fit prior` and `fit model`: learn inflow and flow from training episodes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,10 @@ from eitbench.cli import options
 
 Link = StrEnum("Link", ["logarithm", "linear"])
 
+app = typer.Typer(no_args_is_help=True, help="Fit priors and models to training episodes.")
 
+
+@app.command("prior")
 def fit_prior(
     env: Annotated[str, typer.Option(help="Id of an environment whose world has an inflow.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="File to write, JSON.")],
@@ -47,6 +50,7 @@ def fit_prior(
                     f"{1.0 / prior.regimes.ends:.1f} steps on average")
 
 
+@app.command("model")
 def fit_model(
     env: Annotated[str, typer.Option(help="Id of an environment whose world has an inflow.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="File to write, npz.")],

@@ -50,12 +50,10 @@ def verify(
     again; the cache is not used. A third-party method's file must have the record's sha256, and
     runs under bubblewrap unless --isolate process is given. Standard output is Markdown.
     """
-    import os
     import secrets
 
     from eitbench.bench.held_out import read_secret
     from eitbench.bench.verify import official_records, top_records
-    from eitbench.measured.cases import FOLDER_VARIABLE, measured_folder
     with options.clear_errors():
         _check_arguments(paths or [], every, top, episodes, held_out, secret, method)
         key = read_secret(secret) if secret else b""
@@ -64,8 +62,6 @@ def verify(
             chosen = official_records(records, env or [])
         elif top:
             chosen = top_records(records, top, env or [])
-    # their folder is by default in the cache, which reruns do not use
-    os.environ.setdefault(FOLDER_VARIABLE, str(measured_folder().absolute()))
     if every and out is None:
         out = Path("results/verify")
     drawn = 0 if every and seed is None else secrets.randbelow(2**32) if seed is None else seed

@@ -1,4 +1,4 @@
-"""The commands `run` and `policies`: play methods, and say what came out."""
+"""The command `run`: run methods, print the table and write the page."""
 
 from __future__ import annotations
 
@@ -22,88 +22,92 @@ Suite = StrEnum("Suite", ["quick", "full"])
 
 def run(
     suite: Annotated[Suite, typer.Option(
-        help="quick: the 2D pipe, test:0-3, four minutes on two cores; full: every environment, "
-             "more seeds, methods that take long.")] = Suite.quick,
-    env: Annotated[list[str] | None, typer.Option(
-        help="Environment id; may be repeated. Default: suite's.")] = None,
+        help="quick: the 2D pipe, test:0-3, four minutes on two cores; full: every estimation "
+             "environment, more seeds, slow methods too.")] = Suite.quick,
+    env: options.Environments = None,
     baseline: Annotated[list[str] | None, typer.Option(
-        help="Name of one of ours, or the path of your own .py file; may be repeated. Default: "
-             "all of ours.")] = None,
+        help="Name of a built-in estimator, or path of a .py file; may be repeated. Default: all "
+             "built-in ones.")] = None,
+    policy: Annotated[list[str] | None, typer.Option(
+        help="Name of a built-in injection policy, or path of a .py file or of an agent's "
+             "model.zip; may be repeated. Default in injection environments: all built-in "
+             "ones.")] = None,
     seeds: Annotated[str | None, typer.Option(
         help="Episodes, as in dev:0-9 or test:3. Default: the suite's.")] = None,
     settings: Annotated[list[str] | None, typer.Option(
         "--set", help="Change a number of the world, as in instrument.noise_relative=0.02; may be "
-                      "repeated. Several values, as in 0.01,0.02,0.05, are played one after the "
+                      "repeated. Several values, as in 0.01,0.02,0.05, are run one after the "
                       "other, with a table and a chart on the page.")] = None,
-    isolate: options.Isolate = options.Isolation.auto,
-    jobs: options.Jobs = options.CORES,
-    backend: options.Backends = options.Backend.loky,
-    out: options.Out = Path("results"),
-) -> None:
-    """Run baselines on environments, print the table and write the page.
-
-    Each episode is stored the moment it is done; the same command again resumes where it was
-    interrupted. The table is of what was asked for, the page of all that the folder holds.
-
-    Exit status 1 if a baseline finished none of its episodes.
-    """
-    from eitbench.bench import suites
-    from eitbench.bench.run import run_jobs
-    from eitbench.bench.store import EpisodeStore
-    from eitbench.bench.variants import variants
-    with options.clear_errors():
-        worlds = variants(settings or [])
-        todo = suites.jobs("estimation", env or [], baseline or [], options.numbers(seeds),
-                           suite=suite, isolate=isolate, worlds=worlds)
-        store = EpisodeStore(out)
-        run_jobs(todo, store, n_jobs=jobs, backend=backend, command=typed())
-        report(out, todo, worlds)
-        _end_if_lost(todo, store)
-
-
-def policies(
-    env: options.InjectionId,
-    policy: Annotated[list[str] | None, typer.Option(
-        help="Name of one of ours, the path of your own .py file, or of an agent's model.zip; may "
-             "be repeated. Default: all of ours.")] = None,
-    seeds: Annotated[str | None, typer.Option(
-        help="Episodes, such as dev:0-49. Default: those of the boards.")] = None,
     estimator: Annotated[str, typer.Option(
-        help="full: the exact filter, for scores; reduced: that of training.")] = "full",
+        help="Filter inside injection environments. full: exact, for scores; reduced: as in "
+             "training.")] = "full",
     isolate: options.Isolate = options.Isolation.auto,
     jobs: options.Jobs = options.CORES,
     backend: options.Backends = options.Backend.loky,
     out: options.Out = Path("results"),
     records: Annotated[Path | None, typer.Option(
         callback=options.found,
-        help="Folder of records, such as leaderboards/results: what they hold of these episodes is "
-             "not played again.")] = None,
+        help="For policies: folder of records whose episodes are not run again, such as "
+             "leaderboards/results.")] = None,
 ) -> None:
-    """Play injection policies, print their scores and the environment's adaptivity gap.
+    """Run estimators or injection policies, print the table and write the page.
 
-    Each episode is stored the moment it is done; the same command again resumes.
+    Each episode is stored when it is finished; the same command again resumes. The table shows
+    this run, the page all results in OUT. For policies the table includes the adaptivity gap.
 
-    Exit status 1 if a policy finished none of its episodes.
+    Exit status 1 if all episodes of a method failed.
     """
-    if records is not None and not records.is_dir():
-        raise typer.BadParameter(f"--records must be a folder, got {records}")
+    from eitbench.bench import suites
     from eitbench.bench.run import run_jobs, unplayed
     from eitbench.bench.store import EpisodeStore, results_in
-    from eitbench.bench.suites import jobs as jobs_of
-    from eitbench.report.policies import policy_rows, policy_table
-    from eitbench.report.terminal import asked_of, width
+    from eitbench.bench.variants import variants
     with options.clear_errors():
-        todo = jobs_of("injection", [env], policy or [], options.numbers(seeds),
-                       estimator=estimator, isolate=isolate)
+        track = _track_of(env or [], baseline, policy)
+        if records is not None and not records.is_dir():
+            raise ValueError(f"--records must be a folder, got {records}")
+        worlds = variants(settings or [])
+        todo = suites.jobs(track, env or [], (baseline or policy or []), options.numbers(seeds),
+                           suite=suite, estimator=estimator, isolate=isolate, worlds=worlds)
         before = results_in(records) if records else []
         store = EpisodeStore(out)
-        left = unplayed(todo, before)
+        left = unplayed(todo, before) if before else todo
         run_jobs(left, store, n_jobs=jobs, backend=backend, command=typed())
-    privileged = {job.load().name for job in todo if job.load().privileged}
-    rows = policy_rows(todo, [*before, *store.results()])
-    options.say(policy_table(rows, sorted(privileged), width()))
+        if track == "estimation":
+            report(out, todo, worlds)
+        else:
+            _report_policies(store, todo, left, before)
+        _end_if_lost(todo, store, before)
+
+
+def _track_of(env: list[str], baseline: list[str] | None, policy: list[str] | None) -> str:
+    """Return the track of a run; ``ValueError`` if its arguments belong to both."""
+    from eitbench.bench.tracks import track_of
+    tracks = {track_of(id) for id in env}
+    if baseline:
+        tracks.add("estimation")
+    if policy:
+        tracks.add("injection")
+    if len(tracks) > 1:
+        raise ValueError("one run must be of estimators or of injection policies, got "
+                         f"{', '.join([*env, *(baseline or []), *(policy or [])])}")
+    if policy and not env:
+        raise ValueError("env must be given with policy")
+    return tracks.pop() if tracks else "estimation"
+
+
+def _report_policies(store: EpisodeStore, todo: list[Job], left: list[Job],
+                     before: list[dict[str, Any]]) -> None:
+    """Print a table for each injection environment."""
+    from eitbench.report.policies import policy_rows, policy_table
+    from eitbench.report.terminal import asked_of, width
+    names = dict.fromkeys(job.environment.name for job in todo)
+    for name in names:
+        jobs = [job for job in todo if job.environment.name == name]
+        privileged = {job.load().name for job in jobs if job.load().privileged}
+        rows = policy_rows(jobs, [*before, *store.results()])
+        title = f"{name}\n\n" if len(names) > 1 else ""
+        options.say(title + policy_table(rows, sorted(privileged), width()))
     _say_failures(store, asked_of(store.write_records(), left), left)
-    _end_if_lost(todo, store, before)
 
 
 def report(out: Path, asked: Sequence[Job] = (), worlds: Sequence[dict[str, Any]] = ({},)) -> None:

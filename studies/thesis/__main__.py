@@ -1,0 +1,33 @@
+"""Draw a figure of the thesis: `python studies/thesis fig5.4 --seeds dev:0`."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from pathlib import Path
+
+from eitbench.data.seeds import parse_seeds
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from thesis import FIGURES
+
+
+def main() -> None:
+    """Draw one figure and print where it agrees with the thesis and where it differs."""
+    parser = argparse.ArgumentParser(description=__doc__.split(":")[0])
+    parser.add_argument("name", choices=FIGURES, help="figure or table of the thesis, or a study")
+    parser.add_argument("--seeds", help="episodes, as in dev:0-1; a picture shows the first")
+    parser.add_argument("--jobs", "-j", type=int, default=os.cpu_count(), help="processes")
+    parser.add_argument("--out", "-o", type=Path, default=Path("results/figures"))
+    asked = parser.parse_args()
+    try:
+        seeds = None if asked.seeds is None else parse_seeds(asked.seeds)
+    except ValueError as error:
+        parser.error(str(error))
+    path, remark = FIGURES[asked.name](seeds, asked.jobs, asked.out)
+    print(f"wrote {path}\n{remark}")
+
+
+if __name__ == "__main__":
+    main()
