@@ -1,6 +1,5 @@
 "use strict";
-// Sorting, filtering, paging, what headings mean, the theme. Without this file the pages say the same,
-// best first; of a board of thousands the first hundred.
+// Sorting, filtering, explanations of headings, colour scheme. Without scripts the pages show the same, best first.
 
 const root = document.documentElement;
 const darkByDefault = matchMedia("(prefers-color-scheme: dark)");
@@ -30,144 +29,59 @@ function themeButton(button) {
   show();
 }
 
-const boards = new Map();                // table -> its lines, wherever they are
-const PAGE = 100;
-
-class Board {                            // a table; of a long one a page at a time is in the document
-  constructor(table) {
-    this.table = table;
-    this.rows = [...table.tBodies];      // each a line with its parts, which are a method and its trainings
-    this.file = table.dataset.rows;      // with all lines; undefined where all are in the document
-    this.all = Number(table.dataset.all) || this.rows.length;
-    this.page = 0;
-    if (this.file) this.pager(table.closest(".card").nextElementSibling);
-  }
-
-  async whole() {                        // a script, since a page that is a file may read no other
-    if (this.file && !this.given) {
-      this.given = new Promise((resolve, reject) => {
-        waiting.set(this.file, resolve);
-        const script = document.createElement("script");
-        script.src = this.file;
-        script.onerror = reject;
-        document.head.append(script);
-      }).then((lines) => {
-        const made = document.createElement("template");
-        made.innerHTML = lines.join("");
-        this.rows = [...made.content.children];
-        applyAll();
-      });
-    }
-    await this.given;
-  }
-
-  get shown() { return this.rows.filter((row) => !row.hidden); }
-
-  draw(page = 0) {
-    if (!this.given) return;
-    const shown = this.shown;
-    const last = Math.max(0, Math.ceil(shown.length / PAGE) - 1);
-    this.page = Math.min(Math.max(page, 0), last);
-    const begin = this.page * PAGE;
-    const rows = shown.slice(begin, begin + PAGE);
-    [...this.table.tBodies].forEach((body) => body.remove());
-    this.table.append(...rows);
-    this.words.textContent = `${rows.length ? begin + 1 : 0} to ${begin + rows.length} of ${shown.length}.`;
-    this.buttons[0].disabled = this.page === 0;
-    this.buttons[1].disabled = this.page === last;
-  }
-
-  pager(line) {
-    this.words = line.querySelector("span");
-    this.buttons = ["Previous", "Next"].map((text, i) => {
-      const button = document.createElement("button");
-      button.type = "button";
-      button.textContent = text;
-      button.addEventListener("click", async () => {
-        await this.whole();
-        this.draw(this.page + (i ? 1 : -1));
-      });
-      return button;
-    });
-    this.buttons[0].disabled = true;
-    line.prepend(...this.buttons);
-  }
-}
-
-const waiting = new Map();
-function giveRows(file, lines) {         // what a file of lines calls
-  waiting.get(file)(lines);
-}
-
-let applyAll = () => {};                 // what is looked for and left out, once there is a form
-
 function sortable(table) {
   const headers = [...table.tHead.rows[0].cells];
-  const board = new Board(table);
-  boards.set(table, board);
   headers.forEach((header, column) => {
     const button = document.createElement("button");
     button.type = "button";
     button.append(...header.childNodes);
     header.append(button);
-    button.addEventListener("click", async () => {
+    button.addEventListener("click", () => {
       const descending = header.getAttribute("aria-sort") === "ascending";
       headers.forEach((other) => other.removeAttribute("aria-sort"));
       header.setAttribute("aria-sort", descending ? "descending" : "ascending");
-      await board.whole();
-      board.rows = sorted(board.rows, column, descending);
-      if (board.file) board.draw();
-      else table.append(...board.rows);
+      table.append(...sorted([...table.tBodies], column, descending));
     });
   });
 }
 
-function sorted(rows, column, descending) {
-  const value = (row) => row.rows[0].cells[column].dataset.value;
-  const known = rows.filter((row) => value(row) !== undefined);
-  const isNumber = known.every((row) => Number.isFinite(Number(value(row))));
+function sorted(bodies, column, descending) {      // rows without a value come last
+  const value = (body) => body.rows[0].cells[column].dataset.value;
+  const known = bodies.filter((body) => value(body) !== undefined);
+  const isNumber = known.every((body) => Number.isFinite(Number(value(body))));
   const order = (a, b) => isNumber ? value(a) - value(b) : value(a).localeCompare(value(b), "en");
   known.sort((a, b) => descending ? order(b, a) : order(a, b));
-  return [...known, ...rows.filter((row) => value(row) === undefined)];       // who has no score comes last
+  return [...known, ...bodies.filter((body) => value(body) === undefined)];
 }
 
 function filtering(form) {
   const blocks = [...document.querySelectorAll(".block")];
-  const said = form.querySelector("output");
   const apply = () => {
     const words = form.elements.words.value.toLocaleLowerCase("en").split(/\s+/).filter(Boolean);
     const left_out = [...form.querySelectorAll("input[type=checkbox]")].filter((box) => !box.checked).map((box) => box.name);
     let shown = 0, all = 0;
     for (const block of blocks) {
-      const board = boards.get(block.querySelector("table.board"));
-      let any = 0;
-      for (const row of board.rows) {
-        const names = [...row.querySelectorAll("td:nth-child(2)")].map((cell) => cell.textContent);
+      const bodies = [...block.querySelector("table.board").tBodies];
+      for (const body of bodies) {
+        const names = [...body.querySelectorAll("td:nth-child(2)")].map((cell) => cell.textContent);
         const text = `${block.dataset.words} ${names.join(" ")}`.toLocaleLowerCase("en");
-        const flags = (row.rows[0].dataset.flags || "").split(" ");
-        row.hidden = left_out.some((name) => flags.includes(name)) || !words.every((word) => text.includes(word));
-        any += !row.hidden;
+        const flags = (body.rows[0].dataset.flags || "").split(" ");
+        body.hidden = left_out.some((name) => flags.includes(name)) || !words.every((word) => text.includes(word));
       }
-      any += board.all - board.rows.length;           // not looked at yet
-      block.hidden = !any;
-      shown += any;
-      all += board.all;
-      board.draw();
+      block.hidden = bodies.every((body) => body.hidden);
+      shown += bodies.filter((body) => !body.hidden).length;
+      all += bodies.length;
     }
     for (const section of document.querySelectorAll("section")) {
       const own = [...section.querySelectorAll(".block")];
       section.hidden = own.length > 0 && own.every((block) => block.hidden);
     }
-    said.textContent = `${shown} of ${all} lines`;
+    form.querySelector("output").textContent = `${shown} of ${all} lines`;
   };
-  for (const box of form.querySelectorAll("input[type=checkbox]")) {          // no choice where there is nothing to hide
-    box.parentElement.hidden = !document.querySelector(`[data-flags~="${box.name}"], [data-rows]`);
+  for (const box of form.querySelectorAll("input[type=checkbox]")) {      // no choice where there is nothing to hide
+    box.parentElement.hidden = !document.querySelector(`[data-flags~="${box.name}"]`);
   }
-  applyAll = apply;
-  form.addEventListener("input", async () => {
-    await Promise.all([...boards.values()].map((board) => board.whole()));
-    apply();
-  });
+  form.addEventListener("input", apply);
   form.addEventListener("submit", (event) => event.preventDefault());
   form.hidden = false;
   apply();

@@ -75,7 +75,7 @@ def test_each_environment_has_a_section(made):
         assert {len(line.get("points").split()) for line in lines} == {steps}
     text = " ".join(Page(html).text)
     for expected in ("Best homogeneous estimate", "Evil <script>alert", "2 failed", "RuntimeError: <b>&lt;",
-                     'File "surely_failing.py", line', "eitbench run --baseline <script>",
+                     'File "surely_failing.py", line', "eitbench run --baseline '<script>'",
                      records[0]["runs"][0]["versions"]["numpy"], records[0]["runs"][0]["machine"]["processor"]):
         assert expected in text, expected
 

@@ -264,5 +264,5 @@ def test_the_results_page_fits(tab, tmp_path, width):
     tab.size(width)
     tab.open(path.as_uri())
     assert tab.js("document.documentElement.scrollWidth") == width
-    tab.click("thead th:nth-child(3) button")
+    tab.click("thead th:nth-child(2) button")
     assert tab.js("document.querySelector('tbody td').textContent") == "True model smoother"
