@@ -9,14 +9,14 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "eitbench"
-BUDGETS = {"numerics": 1620, "scoring": 130, "physics": 1480, "worlds": 2600, "data": 1300, "estimation": 5600,
-           "measured": 1900, "envs": 1700, "bench": 4000, "report": 2000, "rl": 810, "cli": 900}
+BUDGETS = {"numerics": 1620, "scoring": 130, "physics": 1480, "worlds": 2600, "data": 1650, "estimation": 5510,
+           "measured": 1900, "envs": 1700, "bench": 5400, "report": 3460, "rl": 800, "cli": 1010}
 """Package (or module) -> lines of Python allowed, blank lines and docstrings included. Each imports only from those
 before it."""
 TOP = 600
 """Lines allowed in the other modules at the top: public names, argument checks, files, messages."""
 BASELINES = 2000
-TESTS = 17_000
+TESTS = 22_720
 MODULES = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
            for path in PACKAGE.rglob("*.py")}
 

@@ -286,6 +286,9 @@ def render(
 
 
 REPLACED = {
+    "cards": "`eitbench golden`",
+    "submit-measured": "`eitbench submit --env eitbench/Measured-CASE-v0`",
+    "kits": "`eitbench.bench.package_data.write_package_data()`, for maintainers",
     "fit-model": "`eitbench fit model`",
     "fit-prior": "`eitbench fit prior`",
     "policies": "`eitbench run --env ID --policy NAME` runs injection policies",
