@@ -5,6 +5,9 @@ A configuration is a YAML file such as those in ``baselines/rl/``. A run leaves 
 episode), ``evaluations.npz`` (scores on dev episodes over time), ``sha256`` of the model, and
 TensorBoard's logs.
 
+Policies that a configuration names (``reference``, ``imitate.teacher``) run in this process,
+without isolation.
+
 A run that goes on draws other episodes and other noise than it did before. A checkpoint holds the
 networks and the optimisers, not what dqn and sac have gathered in their replay buffers: these go on
 with an empty one.
