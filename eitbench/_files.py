@@ -76,13 +76,6 @@ def shipped(name: str) -> Path:
     return PACKAGE / name if (PACKAGE / name).is_dir() else PACKAGE.parent / name
 
 
-def check_checkout(path: Path) -> None:
-    """``ValueError`` if a file for everybody to see would be written into an installed package."""
-    if path.is_relative_to(PACKAGE):
-        raise ValueError(f"{path} is published from a checkout, and this package is installed "
-                         "without one")
-
-
 def readable(path: Path) -> Path:
     """The file or folder to read: the path itself if it leads to one; if not, and it begins as one
     of ours does, as ``leaderboards/results`` in an empty folder, the one that is shipped."""

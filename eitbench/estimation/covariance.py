@@ -43,15 +43,10 @@ class FreeCovariance:
         other.__dict__ = self.__dict__ | {"scale": self.scale * factor}
         return other
 
-    def apply(self, t: int, X: np.ndarray, limit_times_X: np.ndarray | None = None) -> np.ndarray:
-        """Π_t X for X (n, k).
-
-        Most of the work is ``limit @ X``, the same at all times: it may be computed once.
-        """
+    def apply(self, t: int, X: np.ndarray) -> np.ndarray:
+        """Π_t X for X (n, k)."""
         U, signs = self._transient(t)
-        if limit_times_X is None:
-            limit_times_X = self.limit @ X
-        return self.scale * (limit_times_X + U @ (signs[:, None] * (U.T @ X)))
+        return self.scale * (self.limit @ X + U @ (signs[:, None] * (U.T @ X)))
 
     def apply_noise(self, X: np.ndarray) -> np.ndarray:
         """Γ_w X for X (n,) or (n, k)."""

@@ -103,10 +103,9 @@ class KalmanFilter:
         """Γ_{0|0} X for X (n, k)."""
         return self.covariance.apply(0, X)
 
-    def apply_covariance(self, X: np.ndarray,
-                         limit_times_X: np.ndarray | None = None) -> np.ndarray:
-        """Γ X for X (n, k), Γ that of the present state; arguments as in `FreeCovariance.apply`."""
-        return self.covariance.apply(self.time, X, limit_times_X) - self.known @ (self.known.T @ X)
+    def apply_covariance(self, X: np.ndarray) -> np.ndarray:
+        """Γ X for X (n, k), Γ that of the present state."""
+        return self.covariance.apply(self.time, X) - self.known @ (self.known.T @ X)
 
     def update(self, observation: Observation) -> FilterStep:
         """Take in one measurement of the present state."""
