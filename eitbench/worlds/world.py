@@ -196,6 +196,8 @@ class World:
     """m along the vessel's first axis; only errors between these cross-sections count. None: all"""
 
     def __post_init__(self) -> None:
+        for name, protocol in (("vessel", Vessel), ("flow", Flow), ("target", Target)):
+            _check_part(name, getattr(self, name), protocol)
         for part in (self.vessel, self.flow, self.target):
             if hasattr(part, "check"):
                 part.check(self)
@@ -410,6 +412,14 @@ class World:
         instrument = Instrument(current=self.instrument.current,
                                 contact_spread=self.instrument.contact_spread)
         return replace(self.sound, instrument=instrument, prior=Prior(self.expected_concentration))
+
+
+def _check_part(name: str, part: Any, protocol: type) -> None:
+    """Raise ``ValueError`` unless a part has all members of its protocol."""
+    members = [member for member in vars(protocol) if not member.startswith("_")]
+    if missing := [member for member in members if not hasattr(part, member)]:
+        raise ValueError(f"{name} must be a {protocol.__name__}, with {', '.join(members)}; got "
+                         f"{type(part).__name__} without {', '.join(missing)}")
 
 
 def _changed(part: Any, changes: Mapping[str, Any], where: str) -> Any:
