@@ -64,6 +64,7 @@ def git_says(monkeypatch, commit: str | None = None, status: str | None = "") ->
         return commit if commit is None or "rev-parse" in words else status
 
     monkeypatch.setattr(store, "_git", said)
+    store.provenance.cache_clear()
 
 
 def counting(log: Path) -> str:

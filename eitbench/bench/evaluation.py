@@ -73,10 +73,7 @@ def evaluate(method: Any, env: str | gym.Env, seeds: str | Iterable[int], *,
     if not numbers:
         raise ValueError("seeds must name at least one episode, got none")
     work = [(asked, runner, seed) for seed in numbers]
-    if _check.integer("n_jobs", n_jobs, low=1) == 1:
-        played: Iterable[dict[str, Any]] = (_row(*each) for each in work)
-    else:
-        played = in_parallel(_row, work, n_jobs)
+    played = in_parallel(_row, work, _check.integer("n_jobs", n_jobs, low=1))
     bar = tqdm(played, total=len(work), desc=_method(runner).name, unit="episode", disable=None)
     rows = {row["seed"]: row for row in bar}
     return pd.DataFrame([rows[name_seed(seed)] for seed in dict.fromkeys(numbers)])

@@ -55,34 +55,6 @@ DOUBLE = 1e-6
 SINGLE = 1e-4
 """Relative tolerances. The reduced filter and stored moments are in single precision."""
 
-_FAST = {"flow": {"mean_velocity": 45.0},
-         "schedule": {"scored_steps": 5, "pattern": {"frame": 2}},
-         "vessel": {"electrodes_per_wall": 2}}
-_CHOICE = {"flow": {"mean_velocity": 16.0}, "schedule": {"scored_steps": 4}}
-_REAL = {"schedule": {"scored_steps": 5}}
-SHORT: tuple[tuple[str, dict[str, Any]], ...] = (
-    ("eitbench/Pipe2D-v0", {"world": _FAST}),
-    ("eitbench/Pipe2DFixedLag-v0", {"world": _FAST, "lag": 2}),
-    ("eitbench/Pipe2DSmoothing-v0", {"world": _FAST}),
-    ("eitbench/StationaryTank2D-v0", {"world": {
-        "vessel": {"n_electrodes": 8}, "schedule": {"scored_steps": 5}}}),
-    ("eitbench/Pipe2DUnknownVelocity-v0", {"world": _FAST | {
-        "flow": {"mean_velocity": 45.0, "velocity_range": [40.0, 50.0]}}}),
-    ("eitbench/Pipe2DInjection-v0", {"world": _CHOICE}),
-    ("eitbench/Pipe2DInjectionCurrents-v0", {"world": _CHOICE}),
-    ("eitbench/Pipe2DInjectionFaults-v0", {"world": _CHOICE}),
-    ("eitbench/Pipe2DInjectionBudget-v0", {"world": _CHOICE, "estimator": "reduced"}),
-    ("eitbench/Pipe2DInjectionFlow-v0", {"world": _CHOICE | {
-        "flow": {"mean_velocity": 16.0, "velocity_range": [15.0, 17.0]}}, "estimator": "reduced"}),
-    ("eitbench/Pipe2DBiasedVelocity-v0", {"world": _REAL}),
-    ("eitbench/Pipe2DFixedLag-v0", {"world": _REAL}),
-    ("eitbench/Pipe2DSmoothing-v0", {"world": _REAL}),
-    ("eitbench/Pipe2DObstacle-v0", {"world": _REAL}),
-    ("eitbench/Pipe2DIntermittent-v0", {"world": _FAST}),
-)
-"""Environments with short episodes; a method plays the first of them that it suits. Networks were
-trained for the real flow, so some of these worlds have it."""
-
 
 # -- worlds ----------------------------------------------------------------------------------------
 
@@ -126,27 +98,25 @@ def check_world(id: str) -> list[str]:
     return [f"{id}: {sentence}" for sentence in differences(computed, expected)]
 
 
-def differences(computed: Any, expected: Any, place: str = "") -> list[str]:
+def differences(computed: Any, expected: Any, tolerance: float = DOUBLE,
+                place: str = "") -> list[str]:
     """Describe each number of two golden files that differs by more than the tolerance.
 
     Both arguments are as JSON gives them. A difference is relative to the largest number of its
-    list; observations have the tolerance `SINGLE`, all other numbers `DOUBLE`.
+    list; observations of a world have the tolerance `SINGLE`.
     """
     if isinstance(computed, dict) and isinstance(expected, dict):
         if computed.keys() != expected.keys():
             others = ", ".join(sorted(computed.keys() ^ expected.keys()))
             return [f"{place or 'the file'} has other names: {others}"]
         return [line for name in expected for line in differences(
-            computed[name], expected[name], f"{place}.{name}".lstrip("."))]
-    if not (isinstance(computed, list) and isinstance(expected, list)):
+            computed[name], expected[name], SINGLE if name == "observations" else tolerance,
+            f"{place}.{name}".lstrip("."))]
+    if not (_is_numeric(computed) and _is_numeric(expected)):
         return [] if computed == expected else [f"{place} is {computed!r}, expected {expected!r}"]
-    if len(computed) != len(expected):
-        return [f"{place} has {len(computed)} numbers, expected {len(expected)}"]
-    try:
-        new, old = np.array(computed, dtype=float), np.array(expected, dtype=float)
-    except (TypeError, ValueError):
-        return [f"{place} must hold numbers only"]
-    tolerance = SINGLE if place.startswith("observations") else DOUBLE
+    new, old = np.ravel(computed).astype(float), np.ravel(expected).astype(float)
+    if len(new) != len(old):
+        return [f"{place} has {len(new)} numbers, expected {len(old)}"]
     scale = np.abs(old).max(initial=0.0)
     off = np.abs(new - old)
     if (off <= tolerance * scale).all():                        # False for NaN too
@@ -156,21 +126,17 @@ def differences(computed: Any, expected: Any, place: str = "") -> list[str]:
             f"is {new[worst]:.10g}, expected {old[worst]:.10g}"]
 
 
-def update_worlds(ids: Iterable[str]) -> Iterator[tuple[str, str, list[str]]]:
-    """Compare worlds with their golden files, and write missing files.
+def _is_numeric(value: Any) -> bool:
+    values = value if isinstance(value, list) else [value]
+    return all(isinstance(each, int | float) for each in values)
 
-    Yields
-    ------
-    id, status, differences
-        ``status`` is ``new``, ``same`` or ``moved``; a file whose numbers moved stays as it is.
-    """
-    for id in ids:
-        if golden_path(id).is_file():
-            moved = check_world(id)
-            yield id, "moved" if moved else "same", moved
-        else:
-            write_atomically(golden_path(id), world_text(world_golden(id)).encode())
-            yield id, "new", []
+
+def _update_world(id: str) -> tuple[str, list[str]]:
+    if golden_path(id).is_file():
+        moved = check_world(id)
+        return "moved" if moved else "same", moved
+    write_atomically(golden_path(id), world_text(world_golden(id)).encode())
+    return "new", []
 
 
 def world_text(numbers: dict[str, Any]) -> str:
@@ -312,23 +278,15 @@ def read_golden(name: str) -> dict[str, Any] | None:
 
 
 def new_golden(name: str, method: str) -> dict[str, Any]:
-    """Choose the episodes of a method's first golden file.
-
-    They are two seeds of the first short environment that the method plays, and one unshortened
-    episode. ``ValueError`` if it plays none of `SHORT`.
-    """
-    for id, kwargs in SHORT:
-        if _can_play(method, id, kwargs):
-            short = {"environment": id, "kwargs": kwargs}
-            break
-    else:
-        raise ValueError(f"method {name} plays none of the short worlds {', '.join(dict(SHORT))}")
-    whole = next(id for id in tracks.own_ids() if _can_play(method, id, {}))
-    reduced = {"estimator": "reduced"} if "estimator" in short["kwargs"] else {}
-    episodes = [short | {"seed": "dev:0"}, short | {"seed": "dev:1"},
-                {"environment": whole, "kwargs": reduced, "seed": "dev:0"}]
-    return {"method": name, "version": 1, "tolerance": SINGLE if reduced else DOUBLE,
-            "episodes": episodes}
+    """Choose the episodes of a method's first golden file: those of the first golden file all of
+    whose environments the method plays. ``ValueError`` if there is none."""
+    for known in filter(None, map(read_golden, official_methods())):
+        asked = [{key: episode[key] for key in ("environment", "kwargs", "seed")}
+                 for episode in known["episodes"]]
+        if all(_can_play(method, each["environment"], each["kwargs"]) for each in asked):
+            return {"method": name, "version": 1, "tolerance": known["tolerance"],
+                    "episodes": asked}
+    raise ValueError(f"method {name} plays the episodes of no golden file")
 
 
 def run_golden(golden: dict[str, Any], method: str, which: Iterable[int] = range(3),
@@ -366,42 +324,39 @@ def _answer(played: playing.Episode) -> dict[str, Any]:
 
 def method_differences(expected: dict[str, Any], computed: dict[str, Any]) -> list[str]:
     """Describe each number of a method's golden file that differs; new scores are ignored."""
-    tolerance = expected["tolerance"]
     found = []
     for old, new in zip(expected["episodes"], computed["episodes"], strict=True):
-        where = f"{old['environment']} {old['seed']}"
-        for score, value in old["scores"].items():
-            now = new["scores"].get(score, math.nan)
-            if not math.isclose(now, value, rel_tol=tolerance, abs_tol=1e-300):
-                found.append(f"{where}: {score} is {new['scores'].get(score)}, expected {value}")
-        for key in ("mean", "last", "injections"):
-            if not _close(old.get(key, []), new.get(key, []), tolerance):
-                found.append(f"{where}: {key} is {new.get(key)}, expected {old.get(key)}")
+        known = new | {"scores": {name: new["scores"].get(name) for name in old["scores"]}}
+        found += differences(known, old, expected["tolerance"],
+                             f"{old['environment']} {old['seed']}")
     return found
 
 
-def update_methods(names: list[str], *, new_version: bool = False,
-                   ) -> Iterator[tuple[str, str, list[str]]]:
-    """Run the golden episodes of built-in methods (default: all), and write missing files.
+def update(names: list[str], *, new_version: bool = False) -> Iterator[tuple[str, str, list[str]]]:
+    """Compare built-in ids and methods (default: all) with their golden files, and write missing
+    files.
 
-    With ``new_version`` a file whose numbers moved is written with the next version number;
-    otherwise it stays as it is.
+    With ``new_version`` a method's file whose numbers moved is written with the next version
+    number; otherwise it stays as it is, as a world's file always does.
 
     Yields
     ------
     name, status, differences
         ``status`` is ``new``, ``same``, ``moved``, or the new version.
 
-    ``ValueError`` if a name is not a built-in method's.
+    ``ValueError`` if a name is neither an id nor a built-in method's.
     """
-    methods = official_methods()
-    if unknown := [name for name in names if name not in methods]:
-        raise ValueError(f"method must be one of {', '.join(methods)}; got {', '.join(unknown)}")
-    for name in names or methods:
-        yield (name, *_updated(name, methods[name], new_version))
+    ids, methods = tracks.own_ids(), official_methods()
+    if unknown := [name for name in names if name not in ids and name not in methods]:
+        raise ValueError(f"names must be ids, or methods of {', '.join(methods)}; got "
+                         f"{', '.join(unknown)}")
+    for name in names or [*ids, *methods]:
+        updated = (_update_world(name) if name in ids
+                   else _update_method(name, methods[name], new_version))
+        yield (name, *updated)
 
 
-def _updated(name: str, method: str, new_version: bool) -> tuple[str, list[str]]:
+def _update_method(name: str, method: str, new_version: bool) -> tuple[str, list[str]]:
     expected = read_golden(name)
     computed = run_golden(expected or new_golden(name, method), method)
     moved = method_differences(expected, computed) if expected else []
@@ -439,11 +394,3 @@ def _method_text(golden: dict[str, Any]) -> str:
              for key, value in golden.items() if key != "episodes"]
     body = " },\n {\n".join(f"{episode}\n" for episode in episodes)
     return "{\n" + ",\n".join(lines) + f',\n "episodes": [\n {{\n{body} }}\n ]\n}}\n'
-
-
-def _close(old: list[Any], new: list[Any], tolerance: float) -> bool:
-    """Compare numbers up to the tolerance relative to the largest, and choices exactly."""
-    if len(old) != len(new) or any(isinstance(each, list) for each in old):
-        return old == new
-    scale = max(map(abs, old), default=0.0)
-    return bool(np.allclose(new, old, rtol=0.0, atol=tolerance * scale))

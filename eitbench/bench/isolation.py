@@ -20,7 +20,6 @@ import re
 import select
 import shutil
 import signal
-import site
 import struct
 import subprocess
 import sys
@@ -179,8 +178,7 @@ def readable_places() -> list[Path]:
             installed += found.submodule_search_locations or [found.origin or ""]
     places = ["/usr", "/bin", "/lib", "/lib64", "/sys/devices/system/cpu",
               *(f"/etc/{name}" for name in ETC), sys.base_prefix, sys.prefix, sys.exec_prefix,
-              *site.getsitepackages(), site.getusersitepackages(), *installed, str(PACKAGE),
-              str(PACKAGE.parent / "baselines")]
+              *installed, str(PACKAGE), str(PACKAGE.parent / "baselines")]
     return [Path(place) for place in dict.fromkeys(places) if place]
 
 
@@ -385,8 +383,8 @@ class Worker:
             assert self._process.stdin is not None and self._process.stdout is not None
             self._input, self._output = self._process.stdin.fileno(), self._process.stdout.fileno()
             os.set_blocking(self._input, False)
-            self.about = self._ask({"do": "load", "track": track, "id": id, "kwargs": kwargs},
-                                   self._files(id, method))[0]
+            self.about = self._ask("load", self._files(id, method), track=track, id=id,
+                                   kwargs=kwargs)[0]
             """What the method's class reports about itself, unchecked."""
         except BaseException:
             self.close()
@@ -397,13 +395,12 @@ class Worker:
         the state of ``random``."""
         self._left_s = EPISODE_TIMEOUT_S
         self._left_chars = MAX_OUTPUT_CHARS
-        state = None if random is None else random.bit_generator.state
-        self._ask({"do": "begin", "random": state})
+        self._ask("begin", random=None if random is None else random.bit_generator.state)
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Any:
         """Return the estimator's `Estimate`, or None, after a measurement."""
         from eitbench.worlds.task import Estimate
-        header, arrays = self._ask({"do": "update"}, {"voltages": voltages, "currents": currents})
+        header, arrays = self._ask("update", {"voltages": voltages, "currents": currents})
         if header.get("estimate") is None:
             return None
         if header["estimate"] != "Estimate" or not {"mean"} <= set(arrays) <= set(Estimate._fields):
@@ -413,7 +410,7 @@ class Worker:
 
     def act(self, observation: Arrays) -> Any:
         """Return the policy's action."""
-        action = self._ask({"do": "act"}, observation)[1].get("action", np.zeros(0))
+        action = self._ask("act", observation)[1].get("action", np.zeros(0))
         return int(action) if action.shape == () and action.dtype.kind in "iu" else action
 
     @property
@@ -462,25 +459,30 @@ class Worker:
             self.sha256 = hashlib.sha256(contents[f"file:{path.name}"]).hexdigest()
         return {name: np.frombuffer(content, np.uint8) for name, content in contents.items()}
 
-    def _ask(self, header: dict[str, Any], arrays: Arrays | None = None,
+    def _ask(self, do: str, arrays: Arrays | None = None, **header: Any,
              ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        """Return the reply to a request, one of the methods of `_MethodServer`."""
         begin = time.monotonic()
+        self._deadline = begin + self.reply_timeout
         try:
-            self._send(encode_message(header, arrays))
-            reply, received = self._receive()
+            self._send(encode_message({"do": do, **header}, arrays))
+            reply, received = decode_message(self._read)
             self._left_s -= time.monotonic() - begin
             if self._left_s < 0.0:
                 raise WorkerError("TimeoutError: its replies in one episode took more than "
                                   f"{EPISODE_TIMEOUT_S:g} s")
+        except ValueError as error:
+            self._kill()
+            raise WorkerError(f"ValueError: {error}") from None
         except BaseException:  # a later reply would belong to this request
             self._kill()
             raise
         self._show(_text(reply.pop("printed", ""), MAX_OUTPUT_CHARS))
         if "error" in reply:
-            error = WorkerError(_text(reply["error"]))
-            error.where = _text(reply.get("where"))
-            error.traceback = _text(reply.get("traceback"))
-            raise error
+            failed = WorkerError(_text(reply["error"]))
+            failed.where = _text(reply.get("where"))
+            failed.traceback = _text(reply.get("traceback"))
+            raise failed
         return reply, received
 
     def _show(self, printed: str) -> None:
@@ -491,54 +493,43 @@ class Worker:
         self._left_chars -= len(printed)
 
     def _send(self, message: bytes) -> None:
-        deadline = time.monotonic() + self.reply_timeout
         left = memoryview(message)
         while left:  # a worker that does not read leaves the pipe full
-            self._wait([], [self._input], deadline)
+            self._wait([], [self._input])
             try:
                 left = left[os.write(self._input, left):]
             except BrokenPipeError:
                 raise self._ended() from None
 
-    def _receive(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-        deadline = time.monotonic() + self.reply_timeout
+    def _read(self, n: int) -> bytes:
+        parts = bytearray()
+        while len(parts) < n:
+            self._wait([self._output], [])
+            part = os.read(self._output, min(n - len(parts), 1 << 20))
+            if not part:
+                raise self._ended()
+            parts += part
+        return bytes(parts)
 
-        def read(n: int) -> bytes:
-            parts = bytearray()
-            while len(parts) < n:
-                self._wait([self._output], [], deadline)
-                part = os.read(self._output, min(n - len(parts), 1 << 20))
-                if not part:
-                    raise self._ended()
-                parts += part
-            return bytes(parts)
-
-        try:
-            return decode_message(read)
-        except ValueError as error:
-            raise WorkerError(f"ValueError: {error}") from None
-
-    def _wait(self, readers: list[int], writers: list[int], deadline: float) -> None:
+    def _wait(self, readers: list[int], writers: list[int]) -> None:
         """Return when a pipe is ready; check time, memory and number of threads meanwhile."""
         while True:
             now = time.monotonic()
-            if now > deadline:
+            if now > self._deadline:
                 raise WorkerError(f"TimeoutError: no reply within {self.reply_timeout:g} s")
             if now > self._next_check:
                 self._check_limits()
                 self._next_check = time.monotonic() + CHECK_INTERVAL_S
-            wait = min(CHECK_INTERVAL_S, deadline - now)
+            wait = min(CHECK_INTERVAL_S, self._deadline - now)
             if any(select.select(readers, writers, [], max(0.0, wait))[:2]):
                 return
 
     def _check_limits(self) -> None:
         family = self._family()
-        threads = sum(_status(pid, "Threads") for pid in family)
-        memory = sum(_status(pid, "VmRSS") for pid in family)
-        if threads > self._limits.threads:
+        if sum(_status(pid, "Threads") for pid in family) > self._limits.threads:
             raise WorkerError(f"ResourceLimitError: it started more than {self._limits.threads} "
                               "processes and threads")
-        if memory > self._limits.memory:
+        if sum(_status(pid, "VmRSS") for pid in family) > self._limits.memory:
             raise WorkerError("ResourceLimitError: it held more than "
                               f"{self._limits.memory >> 20} MiB")
 

@@ -128,13 +128,14 @@ def read_sound_records(folder: Path, *, keep: Callable[[dict[str, Any]], Any] = 
 
 
 def read_sound_files(folder: Path, *, keep: Callable[[dict[str, Any]], Any] = dict,
-                     ) -> tuple[dict[Path, Any], list[str]]:
-    """Read as `read_sound_records`, with the path of each record."""
+                     measured: bool = False) -> tuple[dict[Path, Any], list[str]]:
+    """Read as `read_sound_records`, with the path of each record; with ``measured`` only records of
+    measured cases, else only others."""
     kept = {}
     complaints = []
-    known = set(tracks.ids())
+    known = set(tracks.measured_ids() if measured else tracks.ids())
     for path in sorted(Path(folder).glob("*.json")):
-        if path.name.startswith(tracks.MEASURED_FILES):         # see `read_measured_files`
+        if path.name.startswith(tracks.MEASURED_FILES) != measured:
             continue
         try:
             record = read_record(path)
@@ -151,18 +152,8 @@ def read_sound_files(folder: Path, *, keep: Callable[[dict[str, Any]], Any] = di
 
 
 def read_measured_files(folder: Path) -> tuple[dict[Path, dict[str, Any]], list[str]]:
-    """Valid records of measured cases in a folder by path, and a sentence for each invalid one."""
-    found, errors = {}, []
-    for path in sorted(Path(folder).glob(f"{tracks.MEASURED_FILES}*.json")):
-        try:
-            record = read_record(path)
-            if not tracks.is_measured(record["environment"]["id"]):
-                raise ValueError(f"record {cleaned(str(path))} refers to an unknown case")
-        except ValueError as error:
-            errors.append(str(error))
-        else:
-            found[path] = record
-    return found, errors
+    """Read as `read_sound_files` the records of measured cases."""
+    return read_sound_files(folder, measured=True)
 
 
 def write_episode_table_of(folder: Path) -> Path:

@@ -51,21 +51,6 @@ MANY_ROWS = 30
 """From here on a table has a row for each environment instead of each episode."""
 
 
-class Options(NamedTuple):
-    """How episodes are rerun."""
-
-    file: str | None = None
-    """Path of the method's file; by default a built-in one, or that with the record's sha256 among
-    the methods submitted beside the records."""
-    isolate: str = "auto"
-    """As of `isolation.choose_isolation`, strict."""
-    replay: bool = False
-    """Replay recorded actions instead of running the policy."""
-
-
-DEFAULT = Options()
-
-
 class Rerun(NamedTuple):
     """One episode of one record, to be rerun."""
 
@@ -74,15 +59,26 @@ class Rerun(NamedTuple):
     """its position in the record"""
     outcome: Path
     """file of the comparison's result"""
-    options: Options
+    file: str | None
+    """Path of the method's file, as of `job_of`."""
+    isolate: str
+    """As of `isolation.choose_isolation`, strict."""
+    replay: bool
+    """Replay recorded actions instead of running the policy."""
+
+    def job(self, record: dict[str, Any]) -> Job:
+        """Return the job of the record that was read, with seed 0; errors as `job_of`."""
+        return job_of(record, self.file, self.isolate,
+                      self.record.absolute().parents[1] / "methods")
 
 
-def verify(paths: Sequence[Path], folder: Path, options: Options = DEFAULT, *,
-           episodes: int = 3, seed: int = 0, n_jobs: int = 1, backend: str = "loky",
-           ) -> pd.DataFrame:
+def verify(paths: Sequence[Path], folder: Path, *, file: str | None = None, isolate: str = "auto",
+           replay: bool = False, episodes: int = 3, seed: int = 0, n_jobs: int = 1,
+           backend: str = "loky") -> pd.DataFrame:
     """Rerun ``episodes`` of each record, drawn with this ``seed``, and compare the scores.
 
-    Episodes are simulated again. Comparisons are stored in ``folder`` as soon as they are made; the
+    ``file``, ``isolate`` and ``replay`` are as of `Rerun`. Episodes are simulated again.
+    Comparisons are stored in ``folder`` as soon as they are made; the
     same call with the same code and records resumes.
 
     Returns
@@ -105,7 +101,8 @@ def verify(paths: Sequence[Path], folder: Path, options: Options = DEFAULT, *,
         for number in drawn_of(record, episodes, seed):
             name = f"{path.stem}--{record['seeds'][number].replace(':', '-')}.json"
             work.append((record["episodes"][number]["seconds"],
-                         Rerun(path, number, folder / "outcomes" / name, options)))
+                         Rerun(path, number, folder / "outcomes" / name, file, isolate,
+                               replay)))
     reruns = [rerun for _, rerun in sorted(work, key=lambda timed: timed[0])]
     left = [(rerun,) for rerun in reruns if _stored(rerun) is None]
     try:
@@ -122,29 +119,14 @@ def verify(paths: Sequence[Path], folder: Path, options: Options = DEFAULT, *,
     return pd.DataFrame(rows).drop(columns="identity")
 
 
-def official_records(folder: Path, environments: Sequence[str] = ()) -> list[Path]:
+def select_records(folder: Path, environments: Sequence[str] = (), *, top: int = 0) -> list[Path]:
     """Return the paths of the current official records of a folder, of these environments or of
-    all that are simulated. ``ValueError`` if there are none, or naming all files that are not
-    valid."""
-    return [path for path, record in _current(folder, environments) if record["official"]] \
-        or _none(folder, environments)
+    all that are simulated.
 
-
-def top_records(folder: Path, count: int, environments: Sequence[str] = ()) -> list[Path]:
-    """Return the paths of the ``count`` current records with the smallest mean error in each
-    environment, without naive baselines, oracles and failures. Errors as `official_records`."""
-    ranked: dict[str, list[tuple[float, Path]]] = {}
-    for path, record in _current(folder, environments):
-        errors = list(scores_by_seed(record, "error").values())
-        if record["role"] is None and not record["privileged"] and len(errors) == len(
-                record["episodes"]):
-            name = record["environment"]["name"]
-            ranked.setdefault(name, []).append((float(np.mean(errors)), path))
-    return [path for records in ranked.values() for _, path in sorted(records)[:count]] \
-        or _none(folder, environments)
-
-
-def _current(folder: Path, environments: Sequence[str]) -> list[tuple[Path, dict[str, Any]]]:
+    With ``top``, of all current records the so many of each environment with the smallest mean
+    error, without naive baselines, oracles and failures. ``ValueError`` if there are none, or
+    naming all files that are not valid.
+    """
     read, complaints = read_sound_files(folder)
     if environments:                        # those of measurements, whose files are rarely there
         measured, more = read_measured_files(folder)
@@ -153,13 +135,25 @@ def _current(folder: Path, environments: Sequence[str]) -> list[tuple[Path, dict
     if complaints:
         raise ValueError("; ".join(complaints))
     current = {id(record) for record in newest(list(read.values()))[0]}
-    return [(path, record) for path, record in read.items() if id(record) in current
-            and (not environments or record["environment"]["id"] in environments)]
+    asked = {path: record for path, record in read.items() if id(record) in current
+             and (not environments or record["environment"]["id"] in environments)}
+    chosen = _first(asked, top) if top else [
+        path for path, record in asked.items() if record["official"]]
+    if not chosen:
+        which = f" of {', '.join(environments)}" if environments else ""
+        raise ValueError(f"records must be a folder with such records{which}, got {folder}")
+    return chosen
 
 
-def _none(folder: Path, environments: Sequence[str]) -> list[Path]:
-    which = f" of {', '.join(environments)}" if environments else ""
-    raise ValueError(f"records must be a folder with such records{which}, got {folder}")
+def _first(records: dict[Path, dict[str, Any]], count: int) -> list[Path]:
+    ranked: dict[str, list[tuple[float, Path]]] = {}
+    for path, record in records.items():
+        errors = list(scores_by_seed(record, "error").values())
+        is_ranked = record["role"] is None and not record["privileged"]
+        if is_ranked and len(errors) == len(record["episodes"]):
+            name = record["environment"]["name"]
+            ranked.setdefault(name, []).append((float(np.mean(errors)), path))
+    return [path for group in ranked.values() for _, path in sorted(group)[:count]]
 
 
 def drawn_of(record: dict[str, Any], episodes: int, seed: int) -> list[int]:
@@ -251,18 +245,18 @@ def _result(record: dict[str, Any], recorded: dict[str, Any], rerun: Rerun,
             ) -> tuple[dict[str, Any], str, list[str], str]:
     """Return the rerun's result, a note, what it states differently, and its isolation."""
     (seed,) = parse_seeds(recorded["seed"])
-    if rerun.options.replay:
+    if rerun.replay:
         return replayed(record, recorded, seed), "", [], "replay"
-    job = _job(record, rerun)
+    job = rerun.job(record)
     result = json.loads(json.dumps(run_episode(job._replace(seed=seed))[0]))
     fields = BUILTIN_FIELDS if is_builtin_record(record, job.method) else (*SHARED, "method")
     problems = [f"{name} is {result[name]!r}, but {record[name]!r} in the record"
                 for name in (*fields, "environment") if result[name] != record[name]]
     now, then = version_number(job.load().version), version_number(record["version"])
     note = ""
-    if now is not None and then is not None and then < now:
+    if now and then and then < now:
         note = f"the record is of {record['version']}, and {record['method']} is now v{now}"
-    if now is not None and then is not None and then > now:
+    if now and then and then > now:
         problems.append(f"the record is of {record['version']}, but {record['method']} is v{now}")
     return result, note, problems, job.isolation
 
@@ -311,18 +305,12 @@ def differences_of(recorded: dict[str, Any], result: dict[str, Any]) -> dict[str
 
 def _relative(a: Sequence[float | None], b: Sequence[float | None]) -> float:
     """Return the largest |a − b| / max(|a|, |b|); infinite where only one is a number."""
-    if len(a) != len(b):
-        return float(np.inf)
     first, second = np.array(a, float), np.array(b, float)
+    if len(a) != len(b) or (np.isnan(first) != np.isnan(second)).any():
+        return float(np.inf)
     size = np.maximum(np.abs(first), np.abs(second))
     relative = np.abs(first - second) / np.where(size > 0.0, size, 1.0)
-    missing = np.isnan(first) == np.isnan(second)
-    return float(np.where(np.isnan(relative), np.where(missing, 0.0, np.inf), relative).max())
-
-
-def _job(record: dict[str, Any], rerun: Rerun) -> Job:
-    file, isolate, _ = rerun.options
-    return job_of(record, file, isolate, rerun.record.absolute().parents[1] / "methods")
+    return float(np.nanmax(relative, initial=0.0))
 
 
 def _row(record: str, **known: Any) -> dict[str, Any]:
@@ -344,11 +332,11 @@ def _identity(rerun: Rerun) -> str:
     """Return the hash of all that a comparison depends on."""
     record = read_record(rerun.record)
     try:
-        job = _job(record, rerun)._replace(seed=parse_seeds(record["seeds"][rerun.episode])[0])
+        job = rerun.job(record)._replace(seed=parse_seeds(record["seeds"][rerun.episode])[0])
         depends = f"{job.identity()} {job.isolation}"
     except ValueError as error:
         depends = str(error)
-    content = f"{record['sha256']} {rerun.options} {depends}"
+    content = f"{record['sha256']} {rerun[3:]} {depends}"
     return hashlib.sha256(content.encode()).hexdigest()[:16]
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import chain
 from typing import Annotated
 
 import typer
@@ -22,15 +21,9 @@ def golden(
     numbers have moved needs a new id, the next -vN. All files take about half an hour.
     """
     from eitbench.bench import golden
-    from eitbench.bench.tracks import own_ids
-    worlds = [name for name in names or own_ids() if name in own_ids()]
-    methods = [name for name in names or [] if name not in worlds]
     any_moved = False
     with options.clear_errors():
-        compared = chain(
-            golden.update_worlds(worlds),
-            golden.update_methods(methods, new_version=new_version) if methods or not names else ())
-        for name, status, differences in compared:
+        for name, status, differences in golden.update(names or [], new_version=new_version):
             any_moved |= status == "moved"
             options.say(f"{name}: {status}")
             for difference in differences:

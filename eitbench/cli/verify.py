@@ -53,15 +53,11 @@ def verify(
     import secrets
 
     from eitbench.bench.held_out import read_secret
-    from eitbench.bench.verify import official_records, top_records
+    from eitbench.bench.verify import select_records
     with options.clear_errors():
         _check_arguments(paths or [], every, top, episodes, held_out, secret, method)
         key = read_secret(secret) if secret else b""
-        chosen = list(paths or [])
-        if every:
-            chosen = official_records(records, env or [])
-        elif top:
-            chosen = top_records(records, top, env or [])
+        chosen = paths or select_records(records, env or [], top=top)
     if every and out is None:
         out = Path("results/verify")
     drawn = 0 if every and seed is None else secrets.randbelow(2**32) if seed is None else seed
@@ -69,8 +65,8 @@ def verify(
     with tempfile.TemporaryDirectory(prefix="eitbench-verify-") as temporary:
         if episodes:
             problems += _rerun(chosen, out or Path(temporary), tolerance, episodes, drawn,
-                               {"file": method, "isolate": isolate, "replay": replay},
-                               {"n_jobs": jobs, "backend": backend})
+                               {"file": method, "isolate": isolate, "replay": replay,
+                                "n_jobs": jobs, "backend": backend})
         if held_out:
             problems += _held_out(chosen, Path(temporary), method, isolate, key, held_out)
     options.say_differences(problems)
@@ -90,12 +86,11 @@ def _check_arguments(paths: list[Path], every: bool, top: int, episodes: int, he
 
 
 def _rerun(paths: list[Path], folder: Path, tolerance: float, episodes: int, seed: int,
-           how: dict[str, Any], workers: dict[str, Any]) -> list[str]:
+           how: dict[str, Any]) -> list[str]:
     """Print the table of reruns and return the problems."""
     from eitbench.bench import verify as verification
     with options.clear_errors():
-        rows = verification.verify(paths, folder, verification.Options(**how), episodes=episodes,
-                                   seed=seed, **workers)
+        rows = verification.verify(paths, folder, episodes=episodes, seed=seed, **how)
     options.say(f"episodes drawn with --seed {seed}\n\n{verification.table_of(rows, tolerance)}\n")
     for note in verification.notes_of(rows):
         options.say(f"{note}\n")

@@ -27,7 +27,6 @@ from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.injection import InjectionEnv
 from eitbench.worlds import entry
 
-import hostile
 from tiny import RUN, episode, record, sha, strict
 
 MINE = record("mine", [0.1, 0.25, None], parameters={"alpha": 0.1, "order": [1, 2], "β": 1e-22})
@@ -109,68 +108,41 @@ def test_the_digest_is_what_the_schema_says():
     ("schema", 1, r"\$\.schema: 3 was expected"),
     ("source", sha("code"), "'source' was unexpected"),
     ("version", "1", r'\$\.version: "1" does not match'),
-    ("version", "v0", r'\$\.version: "v0" does not match'),
-    ("version", "v1234567890", r'\$\.version: "v1234567890" does not match'),
     ("version", "deadbeef", r"\$\.version: must be v1, v2, … of ours, or begin as method_sha256 does"),
     ("version", ..., '"version" is a required property'),
-    ("schema", 2, r"\$\.schema: 3 was expected"),
-    ("title", ..., '"title" is a required property'),
-    ("title", "", r"\$\.title: "),
     ("title", "Fine |\n| 1 | Forged |", r"\$\.title: "),
-    ("title", "Fine\n", r"\$\.title: "),
-    ("title", 121 * "x", r"\$\.title: .* is longer than 120"),
     ("title", "a\x1b[2Jb", r"\$\.title: .* is not allowed"),
     ("title", "a\u202eb", r"\$\.title: .* is not allowed"),
-    ("method", "mine\n", r"\$\.method: "),
     ("method", "mi\u200bne", r"\$\.method: "),
-    ("method", 101 * "x", r"\$\.method: .* is longer than 100"),
     ("board", "smooth", r'\$\.board: "smooth" is not one of'),
     ("role", "best", r'\$\.role: "best" is not one of'),
     ("official", "no", r'\$\.official: "no" is not of type "boolean"'),
-    ("privileged", ..., '"privileged" is a required property'),
     ("method", "../mine", r'\$\.method: "../mine" does not match'),
-    ("method_sha256", "5ha", r'\$\.method_sha256: "5ha" does not match'),
     ("checkpoint_sha256", "5ha", r"\$\.checkpoint_sha256: "),
-    ("checkpoint_sha256", ..., '"checkpoint_sha256" is a required property'),
-    ("split", "exam", r'\$\.split: "exam" does not match'),
     ("seeds", [], r"\$\.seeds: "),
     ("score", 1, "'score' was unexpected"),
     ("seeds", ["test:0"] * 10_001, r"\$\.seeds: .*has more than 10000 items"),
-    ("runs", [RUN] * 10_001, r"\$\.runs: .*has more than 10000 items"),
-    ("runs.0.walls", ["net"] * 21, r"\$\.runs\[0\]\.walls: .*has more than 20 items"),
     ("episodes.0.step_errors", [0.1] * 100_001, r"\$\.episodes\[0\]\.step_errors: .*has more than 100000 items"),
     ("episodes.1.step_errors", [0.25, 0.25], r"\$\.episodes: must have the same number of step_errors each"),
     ("episodes.0.scores.nis", 1e51, r"\$\.episodes\[0\]\.scores\.nis: 1e\+51 is greater than the maximum"),
-    ("episodes.0.scores.nis", -1e51, r"\$\.episodes\[0\]\.scores\.nis: -1e\+51 is less than the minimum"),
     ("episodes.0.scores.nis", 1e-101, r"\$\.episodes\[0\]\.scores\.nis: .* is not allowed for 1e-101"),
     ("episodes.0.step_errors", [1e60], r"\$\.episodes\[0\]\.scores\.error: must be the mean of step_errors"),
-    ("episodes.0.seconds", 1e308, r"\$\.episodes\[0\]\.seconds: 1e\+308 is greater"),
-    ("runs.0.machine.matmul_seconds", 1e-101, r"\$\.runs\[0\]\.machine\.matmul_seconds: .* is not allowed"),
     ("environment.id", "Pipe2D", r'\$\.environment\.id: "Pipe2D" does not match'),
     ("environment.name", "eitbench-Pipe3D-v0", r"\$\.environment\.name: must be eitbench-Pipe2D-v0, as id and"),
-    ("environment.name", "eitbench-Pipe2D-v0-deadbeef", r"\$\.environment\.name: must be eitbench-Pipe2D-v0, as"),
     ("environment.kwargs", {"lag": 3}, r"\$\.environment\.name: must be eitbench-Pipe2D-v0-\w{8}, as id and"),
     ("environment.kwargs", {"scenario": 10_000 * "x"}, r"\$\.environment\.kwargs: must have 10000 characters at most"),
-    ("environment.kwargs", None, r'\$\.environment\.kwargs: null is not of type "object"'),
     ("runs.0.commit", ..., r'\$\.runs\[0\]: "commit" is a required property'),
     ("runs.0.isolation", "jail", r'\$\.runs\[0\]\.isolation: "jail" is not one of'),
-    ("runs.0.versions.torch", ..., r'\$\.runs\[0\]\.versions: "torch" is a required property'),
-    ("runs.0.machine.matmul_seconds", 0.0, r"\$\.runs\[0\]\.machine\.matmul_seconds: 0.0 is less than"),
-    ("runs.0.machine.processor", None, r'\$\.runs\[0\]\.machine\.processor: null is not of type "string"'),
     ("episodes.0.scores.error", -1.0, r"\$\.episodes\[0\]\.scores\.error: -1.0 is less than the minimum"),
-    ("episodes.0.scores.error", None, r'\$\.episodes\[0\]\.scores\.error: null is not of type "number"'),
     ("episodes.0.scores.error", 0.05, r"\$\.episodes\[0\]\.scores\.error: must be the mean of step_errors"),
     ("episodes.0.scores.beauty", "much", r'\$\.episodes\[0\]\.scores\.beauty: "much" is not of type'),
     ("episodes.0.scores.Beauty", 1.0, r"\$\.episodes\[0\]\.scores: Additional properties are not allowed \('Beauty'"),
-    ("episodes.0.scores.seconds_per_step", -1.0, r"\$\.episodes\[0\]\.scores\.seconds_per_step: -1.0 is less"),
-    ("episodes.0.scores.seconds_per_step", ..., r'\$\.episodes\[0\]\.scores: "seconds_per_step" is a required'),
-    ("episodes.0.scores", ..., r'\$\.episodes\[0\]: "scores" is a required property'),
-    ("episodes.0.message", "all well", r"\$\.episodes\[0\]\.message: "),
     ("episodes.2.message", ..., r'\$\.episodes\[2\]: "message" is a required property'),
     ("episodes.2.scores", {"error": 0.1, "seconds_per_step": 0.1}, r"\$\.episodes\[2\]\.scores: "),
     ("episodes.1.finished", "yesterday", r'\$\.episodes\[1\]\.finished: "yesterday" does not match'),
     ("episodes.1.run", 1, r"\$\.episodes\[1\]\.run: there are only 1 runs"),
     ("episodes.1.seed", "test:0", r"\$\.seeds: must be those of the episodes"),
+    ("seeds", ["test:0", "dev:1", "test:2"], r"\$\.seeds: must all be of the split test"),
     ("seeds", ["test:0", "test:0", "test:2"], r'\$\.seeds: \["test:0","test:0","test:2"\] has non-unique elements'),
 ])
 def test_violations_are_named(path, value, message, tmp_path):
@@ -183,13 +155,6 @@ def test_violations_are_named(path, value, message, tmp_path):
     with pytest.raises(ValueError, match=message) as caught:
         read_records(tmp_path)
     assert str(file) in str(caught.value)
-
-
-def test_splits_do_not_mix(tmp_path):
-    """All seeds of a record are of its split."""
-    mixed = changed("seeds", ["test:0", "dev:1", "test:2"], changed("episodes.1.seed", "dev:1"))
-    with pytest.raises(ValueError, match=r"\$\.seeds: must all be of the split test"):
-        write_record(tmp_path, mixed)
 
 
 @pytest.mark.parametrize("seed", ["test:999999", "test:007", "200001", "train:100000", "99999999999"])
@@ -378,16 +343,22 @@ def test_names_of_files_are_spelt_out_in_messages(tmp_path):
     assert "\\x1b[31m\\u202e.json" in str(caught.value) and "\x1b" not in str(caught.value)
 
 
+def places(value, path=()):
+    """Where something stands in a record."""
+    inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    return [path, *(place for key, each in inner for place in places(each, (*path, key)))]
+
+
 def test_another_validator_agrees():
     """Whatever is changed in a record, jsonschema accepts and rejects the same: anybody can check the format."""
     ours, theirs = (make(json.loads(schema_text())) for make in (
         jsonschema_rs.validator_for, jsonschema.Draft202012Validator))
+    others = ["", "x" * 121, "a\x1bb", None, [], {}, 0, 0.5, 2**63, -1.0, 1e51, 5e-324, True, [None], {"a": {}}, ...]
     chance, valid = random.Random(1), 0
-    for i in range(100):
-        made = hostile.honest(chance, i)
-        made = hostile.hostile(chance, made) if i % 3 else made
-        fits = ours.is_valid(made)
-        valid += fits
-        # the one knows letters of all alphabets where the other asks for 0 to 9 and a to z
-        assert fits <= theirs.is_valid(made) or not json.dumps(made, ensure_ascii=False).isascii()
-    assert 30 < valid < 90
+    for place in places(MINE)[1:]:
+        for value in chance.sample(others, 3):
+            made = changed(".".join(map(str, place)), value)
+            fits = ours.is_valid(made)
+            valid += fits
+            assert fits == theirs.is_valid(made), (place, value)
+    assert valid > 30

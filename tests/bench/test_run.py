@@ -333,11 +333,3 @@ def test_a_method_need_not_claim_a_variance_before_the_first_scored_state(store,
     assert np.isfinite(fields["mean"]).all()
     warm_up = PIPE_2D.changed(SCENARIO).warm_up
     assert warm_up > 0 and np.isnan(fields["std"][:warm_up]).all() and (fields["std"][warm_up:] == 2).all()
-
-
-def test_processes_change_nothing_but_the_time(store, tmp_path):
-    """Two workers and one give the same scores."""
-    path = write_baseline(tmp_path, update="return Estimate(self.level + voltages.sum() + voltages[0])")
-    jobs = [Job(FILTER, path, seed) for seed in (1, 2)]
-    run_jobs(jobs, store, n_jobs=2)
-    assert [scores_of(result) for result in store.results()] == [scores_of(run_episode(job)[0]) for job in jobs]

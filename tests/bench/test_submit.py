@@ -22,13 +22,8 @@ TEST = parse_seeds("test:0-1")
 def tiny_world(monkeypatch, tmp_path):
     """The registered environments play tiny worlds, in an empty folder, from a clean commit."""
     git_says(monkeypatch, "c0ffee")
-    for name in (FILTER.id, SMOOTHING.id):
-        shorten(monkeypatch, {name: SCENARIO})
-    shorten(monkeypatch, {INJECTION: PIPE})
+    shorten(monkeypatch, {FILTER.id: SCENARIO, SMOOTHING.id: SCENARIO, INJECTION: PIPE})
     monkeypatch.chdir(tmp_path)
-    provenance.cache_clear()
-    yield
-    provenance.cache_clear()
 
 
 def test_a_submission_is_a_record_an_environment(tmp_path):
