@@ -59,13 +59,6 @@ def test_contrast_form_measures_against_the_homogeneous_estimate(square):
     assert relative_error(truth + y, truth, mass) < 0.02
 
 
-def test_mass_may_be_dense_or_sparse(square):
-    """Either kind of matrix gives the same number."""
-    x, y, mass = square
-    arguments = (x + y)[None], x[None]
-    assert relative_error(*arguments, mass.toarray()) == pytest.approx(relative_error(*arguments, mass), rel=1e-14)
-
-
 # -- voltages ---------------------------------------------------------------------------------------------------------
 
 

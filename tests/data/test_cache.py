@@ -72,19 +72,10 @@ def test_arrays_come_back_mapped_and_read_only(place):
     assert isinstance(mapped, np.memmap)
 
 
-def test_a_missing_file_is_not_created_by_looking(place):
-    assert not is_cached(KEY) and not place.exists()
-    KEY.path.mkdir(parents=True)
-    assert not is_cached(KEY)
-
-
 @pytest.mark.parametrize("damage", [
     pytest.param(lambda data: b"", id="empty"),
-    pytest.param(lambda data: data[:2], id="shorter than a checksum"),
     pytest.param(lambda data: data[:len(data) // 2], id="half"),
-    pytest.param(lambda data: data[:-1], id="one byte short"),
     pytest.param(lambda data: b"\0" * len(data), id="zeros"),
-    pytest.param(lambda data: b"not an array", id="text"),
 ])
 def test_damaged_file_is_built_again(damage, place):
     cached(KEY, lambda: ARRAYS)

@@ -239,11 +239,6 @@ def test_a_missing_library_is_named_before_anything_is_written(tiny, tmp_path, m
     assert not (tmp_path / "out").exists()
 
 
-def test_the_readme_warns_of_test_episodes(tmp_path):
-    export(eitbench.dataset(PIPE, "test:0", world=CHANGES), tmp_path)
-    assert "Test episodes are among them" in (tmp_path / "README.md").read_text()
-
-
 def test_command(tmp_path, monkeypatch):
     """It says what is written, and writes nothing for an unknown environment."""
     told = CliRunner().invoke(app, ["export", "--env", "eitbench/StationaryTank2D-v0", "--seeds", "train:0",

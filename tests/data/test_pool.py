@@ -3,7 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from eitbench.data import bank, pool
+from eitbench.data import bank
 from eitbench.data.bank import fill
 from eitbench.data.pool import MOST, Pool
 from eitbench.worlds import entry
@@ -40,10 +40,6 @@ def test_it_grows_with_the_resets():
     changes = [k for k in range(1, 9000) if found[k] != found[k - 1]]
     assert changes == [4] + [8 * 2**k for k in range(4, 10)] + [8 * 1024]
     assert found[-1] == MOST == max(found)
-
-
-def test_so_many_as_asked_for_are_there_from_the_start():
-    assert set(sizes(3, 50)) == {3}
 
 
 def test_it_begins_anew_after_a_seed():
@@ -87,19 +83,3 @@ def test_what_is_simulated_is_what_is_drawn_from(world, expected, monkeypatch):
     drawn.provide(world, 300)                                                 # not one of the pool
     Pool(30).provide(world, 20)                                               # one that does not grow
     assert groups == expected
-
-
-def test_a_cache_that_cannot_be_written_is_tried_once(monkeypatch):
-    calls = []
-
-    def refuse(world, seeds):
-        calls.append(seeds)
-        raise PermissionError("no")
-
-    monkeypatch.setattr(pool, "fill_here", refuse)
-    drawn = Pool(None)
-    seed = drawn.draw(np.random.default_rng(0))
-    with pytest.warns(UserWarning, match="cannot be kept"):
-        drawn.provide(TINY, seed)
-    drawn.provide(TINY, seed)
-    assert len(calls) == 1

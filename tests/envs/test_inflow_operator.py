@@ -8,7 +8,6 @@ from eitbench.data.seeds import parse_seeds
 from eitbench.estimation import InflowFilter, suiting_priors
 from eitbench.estimation.onboard.belief import Belief
 from eitbench.estimation.onboard.inflow_operator import InflowOperator, prior_of
-from eitbench.worlds import entry
 from eitbench.worlds.catalogue import PIPE_2D
 from eitbench.worlds.task import make_task
 from scipy.linalg import toeplitz
@@ -200,10 +199,3 @@ def test_wrong_inflows_are_named(name, inflow, message):
     """Before anything is computed."""
     with pytest.raises(ValueError, match=message):
         make("reduced", name, inflow=inflow)
-
-
-def test_ids_say_what_the_filter_believes():
-    """Registered as a setting, white where none is."""
-    for name, believed in ((INFLOW, "learned"), (FAULTS, "white")):
-        assert entry(name).settings.get("inflow", "white") == believed
-        assert make("reduced", name).unwrapped.rules.inflow == believed

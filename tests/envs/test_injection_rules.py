@@ -14,8 +14,7 @@ from choosing import BUDGET, CURRENTS, FAULTS, NAME, make, play, some_pairs
 
 @pytest.mark.parametrize(("limit", "order"), [("L1", 1), ("L2", 2), ("Linf", np.inf)])
 def test_currents_are_projected(limit, order):
-    """They sum to zero; those within the limit are only centred, others scaled onto a pair's
-    norm."""
+    """They sum to zero; those within the limit are only centred, others scaled onto a pair's norm."""
     rules = Rules(PIPE_2D.changed({"instrument": {"limit": limit}}))
     assert rules.limit == limit
     free = np.random.default_rng(0).uniform(-1.0, 1.0, (50, 16))
@@ -71,8 +70,7 @@ def test_budget_is_spent_and_then_nothing_flows():
 @pytest.mark.parametrize("budget", [0, 1, 3, 7])
 @pytest.mark.parametrize("estimator", ["none", "reduced"])
 def test_a_spaced_budget_is_spent_exactly(estimator, budget):
-    """Whether there is a first frame or none: over the agent's own steps, evenly, the last at the
-    end."""
+    """Whether there is a first frame or none: over the agent's own steps, evenly, the last at the end."""
     env = make(estimator, BUDGET, longer={"schedule": {"scored_steps": 8, "budget": budget}})
     rules = env.unwrapped.rules
     assert rules.has_frame == (estimator != "none")
@@ -119,8 +117,7 @@ def test_rules_are_the_worlds():
 
 
 def test_dead_electrodes_read_nothing_and_carry_nothing():
-    """A broken wire reads interference; what would have to pass it does not flow; all else is 𝓡
-    I."""
+    """A broken wire reads interference; what would have to pass it does not flow; all else is 𝓡 I."""
     instrument = Instrument(dead=(3, 3), failing=(2, 2), loose=(2, 2), interference=0.5)
     noise = instrument.noise
     assert noise == PIPE_2D.noise
@@ -179,8 +176,7 @@ def test_a_floor_adds_to_the_noise():
 
 
 def test_faults_depend_on_the_seed_alone_and_are_shown_by_doubt():
-    """The same seed has the same faults; electrodes in doubt after a while are those with a
-    fault."""
+    """The same seed has the same faults; electrodes in doubt after a while are those with a fault."""
     faults = {"dead": [3, 3], "failing": [0, 0], "loose": [0, 0]}
     longer = {"instrument": faults, "schedule": {"scored_steps": 24}}
     env = make("reduced", FAULTS, longer=longer)
@@ -234,8 +230,7 @@ def test_the_largest_currents_are_those_at_the_bounds(kind, limit):
         assert reward == paid
 
 
-@pytest.mark.parametrize("action", [
-    np.full(16, 1.0 + 1.0j), np.ma.masked_all(16), np.full(16, np.timedelta64(1, "s"))])
+@pytest.mark.parametrize("action", [np.full(16, 1.0 + 1.0j), np.ma.masked_all(16), np.full(16, np.timedelta64(1, "s"))])
 def test_currents_are_real_numbers(action):
     """Complex ones, masked ones and times are none."""
     env = make("reduced", CURRENTS).unwrapped

@@ -1,5 +1,4 @@
-"""Small worlds for the estimators, and the textbook in plain dense matrices to compare them
-with."""
+"""Small worlds for the estimators, and the textbook in plain dense matrices to compare them with."""
 
 from functools import lru_cache
 from typing import NamedTuple
@@ -43,8 +42,7 @@ class Gaussian(NamedTuple):
 
 
 def random_model(rng, n=14, radius=0.9):
-    """A stable model far from normal (‖F‖ ≈ 1.7, as in the pipe), with noise of less than full
-    rank."""
+    """A stable model far from normal (‖F‖ ≈ 1.7, as in the pipe), with noise of less than full rank."""
     F = rng.normal(size=(n, n))
     F *= radius / np.abs(np.linalg.eigvals(F)).max()
     gain = rng.normal(size=(n, n // 2))
@@ -56,8 +54,7 @@ def random_model(rng, n=14, radius=0.9):
 def random_design(rng, n, steps, m=3, noise=(50.0, 500.0)):
     """Another observation matrix (m, n) and other noise variances (m,) at each step.
 
-    By default the noise is about as large as what the state adds to a measurement, so that both
-    count.
+    By default the noise is about as large as what the state adds to a measurement, so that both count.
     """
     return [(rng.normal(size=(m, n)), rng.uniform(*noise, m)) for _ in range(steps)]
 
@@ -81,8 +78,7 @@ def dense_filter(model, observations):
     """The Kalman recursion with n×n covariances: [(predicted, filtered)] for t = 1 … T."""
     now, steps = Gaussian(model.mean, model.covariance), []
     for H, value, variance in observations:
-        predicted = Gaussian(model.F @ now.mean + model.s,
-                             model.F @ now.covariance @ model.F.T + model.Q)
+        predicted = Gaussian(model.F @ now.mean + model.s, model.F @ now.covariance @ model.F.T + model.Q)
         P = predicted.covariance
         K = np.linalg.solve(H @ P @ H.T + np.diag(variance), H @ P).T
         now = Gaussian(predicted.mean + K @ (value - H @ predicted.mean), P - K @ H @ P)
@@ -91,21 +87,18 @@ def dense_filter(model, observations):
 
 
 def rauch_tung_striebel(model, steps):
-    """The smoother that comes back over `dense_filter` with an n×n inverse a step: [smoothed] for t
-    = 1 … T."""
+    """The smoother that comes back over `dense_filter` with an n×n inverse a step: [smoothed] for t = 1 … T."""
     smoothed = [steps[-1][1]]
     for (_, filtered), (predicted, _) in zip(steps[-2::-1], steps[:0:-1], strict=True):
         G = np.linalg.solve(predicted.covariance, model.F @ filtered.covariance).T
         last = smoothed[-1]
         less = G @ (last.covariance - predicted.covariance) @ G.T
-        smoothed.append(Gaussian(filtered.mean + G @ (last.mean - predicted.mean),
-                                 filtered.covariance + less))
+        smoothed.append(Gaussian(filtered.mean + G @ (last.mean - predicted.mean), filtered.covariance + less))
     return smoothed[::-1]
 
 
 def joint_posterior(model, observations):
-    """All states c₁ … c_T given all measurements at once, from their joint Gaussian without any
-    recursion."""
+    """All states c₁ … c_T given all measurements at once, from their joint Gaussian without any recursion."""
     n, T = len(model.mean), len(observations)
     # c = A (offset + w), where A holds the powers of F and w the independent noises, c₀ being the
     # first of them.
@@ -129,8 +122,7 @@ def joint_posterior(model, observations):
 
 @lru_cache(maxsize=1)
 def pipe(steps=5):
-    """The thesis' pipe with n = 1701: its model in full matrices, a maker of its filter,
-    observations, `dense_filter`.
+    """The thesis' pipe with n = 1701: its model in full matrices, a maker of its filter, observations, `dense_filter`.
 
     The full matrices are put together from Table 5.1 here, the filter by ``table_5_1``.
     """
@@ -141,8 +133,7 @@ def pipe(steps=5):
     F, Y, H = evolution
     n, m = len(F), Y.shape[1]
     noise = evolution.state_noise_covariance((c_bh / 4)**2, (c_bh / 50)**2)
-    model = LinearGaussian(F, Y @ np.full(m, c_bh), noise, np.full(n, c_bh),
-                           (c_bh / 4)**2 * np.eye(n))
+    model = LinearGaussian(F, Y @ np.full(m, c_bh), noise, np.full(n, c_bh), (c_bh / 4)**2 * np.eye(n))
     linearised = LinearisedObservations(observation, PIPE_2D.noise, np.full(n, c_bh))
     c = c_bh * rng.uniform(0.9, 1.1, n)
     observations = []
@@ -163,8 +154,7 @@ def pipe(steps=5):
 
 
 class QuadraticModel:
-    """R(c) I = Σ_j c_j² T_j I with symmetric T_j: a stand-in for ``ObservationModel``, linear in
-    the currents I."""
+    """R(c) I = Σ_j c_j² T_j I with symmetric T_j: a stand-in for ``ObservationModel``, linear in the currents I."""
 
     def __init__(self, rng, n=6, electrodes=4):
         T = rng.normal(size=(n, electrodes, electrodes))
@@ -176,8 +166,7 @@ class QuadraticModel:
 
     def linearise(self, concentration, currents):
         self.calls += 1
-        return (self.voltages(concentration, currents),
-                np.einsum("j,jlm,km->klj", 2 * concentration, self.T, currents))
+        return (self.voltages(concentration, currents), np.einsum("j,jlm,km->klj", 2 * concentration, self.T, currents))
 
 
 def white_inflow(task):

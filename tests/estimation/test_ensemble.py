@@ -6,14 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from eitbench.estimation import (
-    EnsembleFilter,
-    InflowFilter,
-    InflowPrior,
-    Observation,
-    UnknownFlow,
-    inflow_response,
-)
+from eitbench.estimation import EnsembleFilter, InflowFilter, InflowPrior, Observation, UnknownFlow, inflow_response
 from eitbench.numerics.mesh import rectangle_mesh
 from eitbench.physics.transport import ConvectionDiffusion
 from eitbench.worlds.task import make_task

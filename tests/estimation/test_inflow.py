@@ -228,17 +228,6 @@ def test_nothing_is_more_probable():
     smoother.mean = best
 
 
-def test_linear_history_is_found_at_once():
-    """With a linear link and readings that hardly differ from linear ones the smoother is the maximum already: weak
-    inflows, to a hundredth of their standard deviation."""
-    weak = InflowPrior("linear", prior().points, 1e-3 * prior().modes, prior().correlation, prior().time_step)
-    smoother = smoothed_inflow(task(), weak, LEVEL, record())
-    mean, covariance = smoother.mean.copy(), smoother.covariance.copy()
-    most_probable_inflow(smoother, record())
-    np.testing.assert_allclose(smoother.mean, mean, atol=0.01)
-    np.testing.assert_allclose(smoother.covariance, covariance, atol=0.01)
-
-
 # -- learning the prior -----------------------------------------------------------------------------------------------
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from eitbench.estimation import KalmanFilter, LinearisedObservations, Observation, kalman_filter, linearised
+from eitbench.estimation import KalmanFilter, LinearisedObservations, kalman_filter, linearised
 from eitbench.physics.observation import VoltageNoise
 from eitbench.scoring import normalised_innovations
 from models import QuadraticModel, dense_filter, draw, pipe, random_design, random_model
@@ -51,28 +51,6 @@ def test_innovation_is_what_the_prediction_missed():
         np.testing.assert_allclose(step.innovation, value - H @ predicted.mean, atol=1e-9)
         S = H @ predicted.covariance @ H.T + np.diag(variance)
         np.testing.assert_allclose(step.innovation_covariance, S, atol=1e-9 * np.abs(S).max())
-
-
-def test_known_directions_stay_fewer_than_states():
-    """What is known has at most n directions, however many measurements came: 150 of them, 14 states."""
-    rng = np.random.default_rng(6)
-    model = random_model(rng)
-    filter_ = model.filter()
-    kalman_filter(filter_, draw(model, random_design(rng, 14, 50), rng)[1])
-    assert filter_.known.shape[0] == 14
-    assert filter_.known.shape[1] <= 14
-
-
-def test_nothing_measured_teaches_nothing():
-    """A blank observation (no injection) leaves the prediction as it was; prediction alone follows Π_t."""
-    rng = np.random.default_rng(7)
-    model = random_model(rng)
-    filter_ = model.filter()
-    filter_.predict()
-    before = filter_.mean.copy()
-    step = filter_.update(Observation(np.zeros((3, 14)), np.ones(3), np.ones(3)))
-    np.testing.assert_array_equal(step.mean, before)
-    np.testing.assert_allclose(step.variance, filter_.covariance.diagonal(1), rtol=1e-14)
 
 
 # -- against chance ---------------------------------------------------------------------------------------------------

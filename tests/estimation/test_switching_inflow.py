@@ -131,8 +131,7 @@ def test_innovations_are_those_of_the_mixture():
     expected = second.value - second.matrix @ (p[0] * points[0] + p[1] * points[1])
     slopes = [each.by_inflow(second.matrix) for each in filter_.filters]
     seen = slopes[0].shape[1]
-    S = sum(q * H @ each.covariance[:seen, :seen] @ H.T for q, H, each in
-            zip(p, slopes, filter_.filters, strict=True))
+    S = sum(q * H @ each.covariance[:seen, :seen] @ H.T for q, H, each in zip(p, slopes, filter_.filters, strict=True))
     apart = second.matrix @ (points[0] - points[1])
     S += p[0] * p[1] * np.outer(apart, apart) + np.diag(second.noise_variance)
     innovation, covariance = filter_.take_in(second, points)

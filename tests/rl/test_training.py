@@ -269,8 +269,7 @@ def test_an_agent_plays_as_it_was_evaluated(env, algo, tmp_path):
     config = replace(TINY, algorithm=options)
     path = train(env, algo, config, 1, tmp_path, kwargs)
     expected = np.load(tmp_path / "evaluations.npz")["errors"][-1]
-    errors = [injected(env, kwargs, str(path), seed, "reduced").errors.mean()
-              for seed in (100_000, 100_001)]
+    errors = [injected(env, kwargs, str(path), seed, "reduced").errors.mean() for seed in (100_000, 100_001)]
     np.testing.assert_allclose(errors, expected, rtol=1e-5)
     agent = load_method(str(path), "injection")
     chosen = []

@@ -32,10 +32,6 @@ def small(id):
     return entry(id).world.changed(world(id)["world"])
 
 
-def test_there_are_six():
-    assert len(SHIFTS) == 6 and all(id.startswith("eitbench/Pipe2D") for id in SHIFTS)
-
-
 # -- what estimators are told ---------------------------------------------------------------------
 
 
