@@ -3,10 +3,9 @@
 import json
 import random
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
-from eitbench.bench.records import file_name, sealed
+from eitbench.bench.records import sealed
 from eitbench.bench.tracks import named
 
 from tiny import BOARD_IDS, RUN, record
@@ -111,40 +110,3 @@ def special(chance: random.Random, made: dict[str, Any]) -> dict[str, Any]:
         {"episodes": [each | {"step_errors": [0.1] * chance.randint(1, 9)} if each["status"] == "ok" else each
                       for each in made["episodes"]]}]
     return resealed(made | chance.choice(ways))
-
-
-def folder_of(folder: Path, count: int, seed: int = 0) -> list[str]:
-    """Write so many files; returns the names of those that are valid for certain."""
-    chance = random.Random(seed)
-    folder.mkdir(parents=True, exist_ok=True)
-    sound = []
-    floors = [record("homogeneous" if board != "injection" else "random_pair", [0.2, 0.3, 0.25, 0.2, 0.22, 0.3],
-                     board=board, id=id, role="floor", official=True, version="v1")
-              for board, ids in IDS.items() for id in ids]
-    for i in range(count):
-        made = floors[i] if i < len(floors) else honest(chance, i)
-        name = file_name(made)
-        kind = chance.choice(["honest", "damaged", "hostile", "special"]) if i >= len(floors) else "honest"
-        if kind == "honest":
-            sound.append(name)
-            data = json.dumps(made).encode()
-        elif kind == "damaged":
-            data = damaged(chance, json.dumps(made))
-        else:
-            content = (hostile if kind == "hostile" else special)(chance, made)
-            data = json.dumps(content).encode()
-            name = _name(content, name)
-        path = folder / name
-        if not path.exists():
-            path.write_bytes(data)
-    return sound
-
-
-def _name(content: Any, otherwise: str) -> str:
-    """That its content asks for, if a file may have it."""
-    try:
-        name = file_name(content)
-    except (AttributeError, KeyError, TypeError):
-        return otherwise
-    fits = isinstance(name, str) and not set(name) & {"/", "\0"} and len(name.encode(errors="replace")) < 250
-    return name if fits and name.isprintable() else otherwise

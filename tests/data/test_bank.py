@@ -62,9 +62,6 @@ def stamps(place):
     return {path.name: (path.stat().st_ino, path.stat().st_mtime_ns) for path in place.iterdir()}
 
 
-# -- fill ------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("n_jobs", [1, 2])
 def test_recordings_have_the_bits_of_those_made_alone(n_jobs, place, alone, monkeypatch):
     """Eight at once or spread over processes: each recording is the one of its seed, and no truth lies beside it."""
@@ -140,9 +137,6 @@ def test_workers_write_where_the_parent_looks(monkeypatch, tmp_path):
         assert is_recorded(TINY, 0) and is_recorded(TINY, 1), name
 
 
-# -- the command line ------------------------------------------------------------------------------
-
-
 def test_command_fills_and_resumes(place, asked, alone):
     """It says what it made and what was there, and keeps it where environments look; dev:0 is not train:0."""
     code, said, _ = command("bank", "--seeds", "train:0-2", "-j", "1")
@@ -180,12 +174,3 @@ def test_mistakes_are_explained(arguments, message, place, asked):
     code, said, complaint = command("bank", *arguments)
     assert code == 2 and said == "" and message in complaint and "Traceback" not in complaint
     assert asked == [] and not place.exists()
-
-
-def test_command_with_an_unwritable_cache_is_explained(monkeypatch):
-    """No traceback."""
-    monkeypatch.setenv(CACHE_VARIABLE, "/dev/null/cache")
-    forget()
-    with pytest.warns(UserWarning, match="cannot be kept"):
-        code, _, complaint = command("bank", "--seeds", "train:0", "-j", "1")
-    assert code == 2 and "recordings cannot be kept in" in complaint

@@ -1,27 +1,20 @@
 """Recordings: they score as the truth does, they are bit for bit the simulation's."""
 
-import os
 import subprocess
 import sys
 
 import eitbench  # noqa: F401 (registers)
-import gymnasium as gym
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from eitbench.data import episodes, recordings, regions
-from eitbench.data.cache import CACHE_VARIABLE
 from eitbench.data.episodes import truth_discretisation
-from eitbench.data.recordings import cycle_voltages, faults_of, recording, recording_path, step_error
+from eitbench.data.recordings import cycle_voltages, faults_of, recording, step_error
 from eitbench.data.regions import outline
 
-from recorded import bits, digest, forget, outline_bits
+from recorded import bits
 from tiny_worlds import CHANGES, TINY
 
 pytestmark = pytest.mark.usefixtures("place")
-
-
-# -- independent integrals -------------------------------------------------------------------------
 
 
 def values_at(points, mesh):
@@ -94,9 +87,6 @@ def test_outline_knows_the_largest_voltage():
     assert outline(TINY).largest_voltage == pytest.approx(largest, rel=1e-10)
 
 
-# -- the simulation, bit for bit -------------------------------------------------------------------
-
-
 def test_resistances_and_noise_are_those_of_the_episode(episode):
     """Nothing is rounded of what makes the voltages."""
     entries = recording(TINY, 7)
@@ -130,30 +120,6 @@ def test_cycle_voltages_have_the_faults_of_the_episode():
     np.testing.assert_array_equal(read[np.ix_(~passes, others)], sound[np.ix_(~passes, others)])
 
 
-def test_stored_truth_fresh_truth_and_other_process_give_the_same_bits(episode, monkeypatch, tmp_path):
-    """Recordings and outlines do not depend on where their truth came from, or whether they were cached."""
-    fresh, stage = recording(TINY, 7), outline(TINY)
-    assert bits(fresh) == bits(recordings.make_recording(TINY, 7, episode))
-    before = bits(fresh), outline_bits(stage)
-    monkeypatch.setattr(episodes, "simulate_together", None)
-    recording_path(TINY, 7).unlink()
-    forget()
-    # from the stored truth
-    assert (bits(recording(TINY, 7)), outline_bits(outline(TINY))) == before
-    monkeypatch.setattr(recordings, "simulate", None)
-    monkeypatch.setattr(regions, "score_operators", None)
-    forget()
-    assert (bits(recording(TINY, 7)), outline_bits(outline(TINY))) == before         # from the disk
-    here = os.path.dirname(__file__)
-    program = (f"import sys; sys.path[:0] = [{here!r}, {os.path.dirname(here)!r}]\n"
-               "from test_recordings import *\n"
-               "print(digest(recording(TINY, 7), outline(TINY)))")
-    for place in (tmp_path / "elsewhere", tmp_path / "cache"):           # built, and from our files
-        done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True,
-                              check=True, env=os.environ | {CACHE_VARIABLE: str(place)})
-        assert done.stdout.strip() == digest(fresh, stage)
-
-
 def test_playing_what_is_stored_needs_no_finite_elements(episode):
     """With recording and outline on disk, making, resetting and stepping an environment builds no mesh."""
     recording(TINY, 7), outline(TINY)
@@ -165,17 +131,3 @@ def test_playing_what_is_stored_needs_no_finite_elements(episode):
                "print(rewards[-1] < 0.0, sorted(heavy & set(sys.modules)))")
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout == "True []\n"
-
-
-def test_an_unwritable_cache_still_plays(monkeypatch):
-    """The numbers are those of any other machine."""
-    entries = recording(TINY, 7)
-    monkeypatch.setenv(CACHE_VARIABLE, "/dev/null/cache")
-    forget()
-    with pytest.warns(UserWarning, match="cannot be kept"):
-        env = gym.make("eitbench/Pipe2D-v0", world=CHANGES).unwrapped
-        observation, _ = env.reset(seed=7)
-    np.testing.assert_array_equal(observation["voltages"], cycle_voltages(TINY, 7, entries)[0])
-    rewards = [env.step(np.full(1701, TINY.background))[1] for _ in range(5)]
-    np.testing.assert_allclose(rewards[2:], -(entries["deviation"] / entries["square"])[2:], rtol=1e-12)
-    assert rewards[:2] == [0.0, 0.0]

@@ -115,11 +115,3 @@ def test_nis_of_a_consistent_filter_averages_one(monkeypatch):
     spread = np.sqrt(2 / (32 * 40 * 16))
     assert abs(nis_of(random, 1.0) - 1.0) < 4 * spread
     assert nis_of(random, 2.0) > 1.0 + 40 * spread
-
-
-def test_without_an_estimator_there_is_none():
-    """Nobody predicts, so that nothing can differ."""
-    env = make("none").unwrapped
-    env.reset(seed=3)
-    env.step(7)
-    assert env.core.innovations() == [None]

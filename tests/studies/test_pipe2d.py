@@ -73,11 +73,6 @@ def test_stationary_method_works_on_a_stationary_target():
     assert 3 * image < constant, (image, constant)
 
 
-def test_persistence_uses_the_alpha_of_gauss_newton():
-    """One tuned value, in two files."""
-    assert load_method("persistence", "estimation").parameters == load_method("gauss_newton", "estimation").parameters
-
-
 @pytest.mark.slow
 def test_velocity_sweep_finds_the_true_velocity():
     """Over assumed mean velocities of 0, 50, …, 900 cm/s the error is smallest within 400–500; it is 450 in truth.

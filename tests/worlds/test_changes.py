@@ -5,7 +5,7 @@ import pickle
 
 import pytest
 from eitbench.worlds import entries
-from eitbench.worlds.catalogue import PIPE_2D, PIPE_2D_FAULTS, STATIONARY_TANK_2D
+from eitbench.worlds.catalogue import PIPE_2D
 
 
 def test_only_what_is_named_changes():
@@ -48,14 +48,6 @@ def test_every_number_can_be_named(id):
     assert pickle.loads(pickle.dumps(world)) == world
 
 
-def test_parts_can_be_swapped():
-    """For another dataclass, not for a number."""
-    faulty = PIPE_2D.changed({"instrument": PIPE_2D_FAULTS.instrument})
-    assert faulty == PIPE_2D_FAULTS
-    with pytest.raises(ValueError, match=r"world.instrument must be a dict of its numbers, got 3"):
-        PIPE_2D.changed({"instrument": 3})
-
-
 @pytest.mark.parametrize(("changes", "message"), [
     ({"colour": 1}, "^world has no 'colour'; there are vessel, flow, target, instrument, "
                     "schedule, prior, region$"),
@@ -77,12 +69,3 @@ def test_what_is_wrong_is_named(changes, message):
     """By the place of the part, the name of the number, what came and what is allowed."""
     with pytest.raises(ValueError, match=message):
         PIPE_2D.changed(changes)
-
-
-def test_noise_is_that_of_the_instrument():
-    """Read and believed."""
-    world = STATIONARY_TANK_2D.changed({"instrument": {"noise_relative": 0.05, "noise_floor": 1e-3}})
-    assert (world.noise.relative, world.noise.floor) == (0.05, 0.0)
-    assert world.instrument.believed_noise.floor == 1e-3
-    assert world.sound.instrument.noise_floor == 0.0
-    assert world.sound.instrument.noise_relative == 0.05

@@ -28,17 +28,6 @@ def mean_velocities(world, seeds):
     return np.array([drawn(world, seed)(1).mean_velocity for seed in seeds])
 
 
-# -- what is drawn ---------------------------------------------------------------------------------
-
-
-@each_world
-def test_seed_decides_the_flow(world):
-    """The same stream gives the same flow at every step, another one another."""
-    one, same, other = ([drawn(world, seed)(t) for t in range(-20, 99)] for seed in (1, 1, 2))
-    assert one == same
-    assert all(a != b for a, b in zip(one, other, strict=True))
-
-
 @each_world
 def test_mean_velocity_is_drawn_evenly_from_its_range(world):
     """A uniform distribution between its ends; about its mean where it swings, so there without the swing."""
@@ -93,9 +82,6 @@ def test_skewness_has_either_sign():
     low, high = PIPE_2D_SKEWED.flow.skewness_range
     assert abs((skewness > 0).mean() - 0.5) < 0.1       # four standard deviations
     assert kstest(np.abs(skewness), "uniform", (low, high - low)).pvalue > 1e-3
-
-
-# -- what is carried -------------------------------------------------------------------------------
 
 
 def test_known_velocity_makes_the_episode_of_the_plain_pipe():
@@ -185,9 +171,6 @@ def test_simulated_together_same_bits(world):
     for one, other in zip(together, alone, strict=True):
         assert [array.tobytes() for array in one] == [array.tobytes() for array in other]
     assert np.abs(together[0].concentration - together[1].concentration).max() > 0.1
-
-
-# -- mistakes --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("change", "message"), [

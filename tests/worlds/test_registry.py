@@ -55,9 +55,6 @@ def hands() -> list[str]:
     return [each.id for each in registry.registered_by_hand()]
 
 
-# -- by hand --------------------------------------------------------------------------------------
-
-
 def test_a_world_is_played_under_its_id():
     """By gymnasium's own `make`; in a pipe into which nothing comes the background is the truth."""
     register(QUIET, ID, about="Nothing happens.", lag=1)
@@ -77,20 +74,6 @@ def test_a_world_is_played_under_its_id():
     assert again.unwrapped.world is QUIET
     assert "Nothing happens." in eitbench.page(ID)
     assert "| `target.arrivals` | Never |" in eitbench.page(ID)
-
-
-def test_injections_are_chosen_in_it_too():
-    """On the other track, alone and side by side, with the gate that the id fixes."""
-    register(QUIET, "mine/QuietInjection-v1", track="injection", gate=5.0, seeds="test:0-1")
-    env = gym.make("mine/QuietInjection-v1", estimator="none", observation="raw")
-    assert env.unwrapped.rules.gate == 5.0
-    assert env.unwrapped.rules.name == "Quiet"
-    alone = env.reset(seed=2)[0], *(env.step(k)[0] for k in range(3))
-    many = gym.make_vec("mine/QuietInjection-v1", num_envs=2, estimator="none", observation="raw",
-                        vectorization_mode="vector_entry_point")
-    beside = many.reset(seed=[2, 3])[0], *(many.step(np.array([k, k]))[0] for k in range(3))
-    for one, two in zip(alone, beside, strict=True):
-        np.testing.assert_array_equal(two["voltages"][0], one["voltages"])
 
 
 def test_an_id_belongs_to_one_world():
@@ -122,6 +105,7 @@ def test_ids_of_another_form_are_refused(id):
     ({"gate": 3.0}, "settings of the track estimation are lag, assume; got gate"),
     ({"track": "injection", "lag": 3, "assume": {}}, "injection are gate, inflow; got assume, lag"),
     ({"track": "guessing"}, "track must be one of estimation, injection, got 'guessing'"),
+    ({"assume": {"mean_velocity": {1.0}}}, "not JSON"),
 ])
 def test_settings_of_another_track_are_refused(settings, message):
     """Each track has its own; what is refused leaves nothing behind."""
@@ -129,13 +113,6 @@ def test_settings_of_another_track_are_refused(settings, message):
         register(QUIET, ID, **settings)
     assert ID not in entries()
     assert ID not in gym.registry
-
-
-def test_settings_must_travel():
-    """As JSON, since records name them."""
-    with pytest.raises(ValueError, match="not JSON"):
-        register(QUIET, ID, assume={"mean_velocity": {1.0}})
-    assert ID not in entries()
 
 
 def test_an_id_of_somebody_else_is_refused():
@@ -152,9 +129,6 @@ def test_an_id_that_nobody_registered_is_named():
     """With those that there are."""
     with pytest.raises(ValueError, match=r"env must be one of eitbench/Pipe2D-v0, .*; got 'mine/"):
         entry(ID)
-
-
-# -- other processes ------------------------------------------------------------------------------
 
 
 def test_another_process_takes_over(tmp_path):
@@ -186,9 +160,6 @@ def test_who_is_told_last_counts():
     env = gym.make(ID).unwrapped
     assert env.world is OTHER
     assert env.lag == 2
-
-
-# -- installed packages ---------------------------------------------------------------------------
 
 
 def test_modules_of_entry_points_are_imported(monkeypatch, tmp_path):

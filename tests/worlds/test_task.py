@@ -2,7 +2,7 @@
 
 import functools
 import types
-from dataclasses import FrozenInstanceError, replace
+from dataclasses import replace
 
 import eitbench  # noqa: F401 (registers)
 import numpy as np
@@ -14,7 +14,6 @@ from eitbench.worlds.catalogue import PIPE_2D
 from eitbench.worlds.task import make_task
 from eitbench.worlds.world import World
 
-from short import merged
 from tiny_worlds import CHANGES, TINY
 
 
@@ -28,9 +27,6 @@ def cache(tmp_path, monkeypatch):
     """A cache folder of its own for each test."""
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
     return tmp_path / "cache"
-
-
-# -- lag and assumptions ---------------------------------------------------------------------------
 
 
 def test_says_what_the_world_says():
@@ -59,17 +55,6 @@ def test_wrong_lags(lag):
     assert repr(lag) in str(caught.value)
 
 
-def test_models_are_shared_and_tasks_frozen():
-    """Lags share one model, so that F is computed once; other worlds and beliefs have their own."""
-    task = make_task(TINY)
-    assert make_task(TINY, "all").transport is task.transport
-    other = PIPE_2D.changed(merged(CHANGES, {"flow": {"diffusivity": 1e-3}}))
-    assert make_task(other).transport is not task.transport
-    assert make_task(TINY, mean_velocity=60.0).transport is not task.transport
-    with pytest.raises(FrozenInstanceError):
-        task.lag = 3
-
-
 def test_assumed_velocity_changes_the_model_not_the_world(cache):
     """A wrong belief moves the model's fluid elsewhere; the episode and its voltages stay as they were."""
     right, wrong = environment(), environment(assume={"mean_velocity": 60.0})
@@ -91,9 +76,6 @@ def played(env, action):
         seen = [observation["voltages"], observation["currents"]]
         observation, reward, done, _, _ = env.step(action)
         yield np.concatenate([*seen, [reward]])
-
-
-# -- nothing of the truth --------------------------------------------------------------------------
 
 
 def reachable(start):
