@@ -26,8 +26,7 @@ PLACES = {
     "report/test_site.py::test_the_published_site_is_rendered_from_the_records": "study",
     "report/test_site_browser.py": "browser",
 }
-"""What is not the core, by folder, file or test: `pytest -m "not browser and not study"` leaves it
-out."""
+"""What is not the core, by folder, file or test: `pytest -m "not browser and not study"` leaves it out."""
 for place in PLACES:
     assert (TESTS / place.partition("::")[0]).exists(), f"there is no {place}"
 

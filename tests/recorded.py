@@ -1,8 +1,6 @@
 """What makes two recordings the same, and what a process forgets of them."""
 
-import hashlib
 
-import numpy as np
 from eitbench.data import beginnings, cache, regions
 
 
@@ -23,18 +21,3 @@ def forget_made(module):
 def bits(entries):
     """All that makes two recordings the same."""
     return entries.dtype, entries.shape, entries.tobytes()
-
-
-def outline_bits(stage):
-    """All that makes two outlines the same."""
-    mass = stage.mass
-    return [(array.dtype.str, array.tobytes())
-            for array in (mass.data, mass.indices, mass.indptr)] + [
-        mass.shape, stage.largest_voltage]
-
-
-def digest(entries, stage):
-    """Of a recording and an outline, to be compared between processes."""
-    mass = stage.mass
-    parts = [entries, mass.data, mass.indices, mass.indptr, np.array(stage.largest_voltage)]
-    return hashlib.sha256(b"".join(part.tobytes() for part in parts)).hexdigest()

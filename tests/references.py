@@ -25,16 +25,14 @@ class SuperLUCondensation:
 
     batch = 1
 
-    def __init__(self, pattern: sp.csc_array, n_ports: int,
-                 places: np.ndarray | None = None) -> None:
+    def __init__(self, pattern: sp.csc_array, n_ports: int, places: np.ndarray | None = None) -> None:
         del places                                       # only the speed depends on the order
         self.n = pattern.shape[0]
         self.n_ports = n_ports
         inner = pattern[:-n_ports, :-n_ports]
         self._place = np.append(_minimum_degree(inner), np.arange(self.n - n_ports, self.n))
         coo = pattern.tocoo()
-        permuted = sp.csc_array((np.ones(coo.nnz), (self._place[coo.row], self._place[coo.col])),
-                                shape=pattern.shape)
+        permuted = sp.csc_array((np.ones(coo.nnz), (self._place[coo.row], self._place[coo.col])), shape=pattern.shape)
         permuted.sort_indices()
         self._indices = permuted.indices
         self._indptr = permuted.indptr

@@ -71,5 +71,4 @@ def register_apart(monkeypatch) -> None:
 def shorten(monkeypatch, changes: dict[str, dict]) -> None:
     """Let registered ids play other worlds, in other processes too: id -> changes of the world."""
     register_apart(monkeypatch)
-    registry.take_over([replace(entry(name), world=entry(name).world.changed(each))
-                        for name, each in changes.items()])
+    registry.take_over([replace(entry(name), world=entry(name).world.changed(each)) for name, each in changes.items()])

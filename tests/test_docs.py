@@ -1,8 +1,6 @@
 """README and documentation: links lead somewhere. Building the site (`docs/build.py`) checks more: anchors of generated
 pages, README's first snippet, the notebooks."""
 
-import contextlib
-import io
 import json
 import re
 import subprocess
@@ -49,22 +47,12 @@ def test_readme_is_short():
     assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) < 120
 
 
-def printed(snippet: str) -> str:
-    """What a snippet of Python prints."""
-    out = io.StringIO()
-    with contextlib.redirect_stdout(out):
-        exec(compile(snippet, "snippet", "exec"), {})
-    return " ".join(out.getvalue().split())
-
-
-def snippets(page: Path) -> list[str]:
-    """The Python of a page."""
-    return re.findall(r"^```python\n(.*?)^```$", page.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
-
-
-def test_an_estimator_reads_voltages_of_ones_own():
+def test_an_estimator_reads_voltages_of_ones_own(capsys):
     """The page on measured data: the level of a homogeneous vessel comes out of its voltages."""
-    assert printed(snippets(ROOT / "docs" / "measured-data.md")[1]) == "28.00 mol/m³"
+    text = (ROOT / "docs" / "measured-data.md").read_text(encoding="utf-8")
+    snippet = re.findall(r"^```python\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)[1]
+    exec(compile(snippet, "snippet", "exec"), {})
+    assert capsys.readouterr().out == "28.00 mol/m³\n"
 
 
 def test_documentation_builds():

@@ -5,7 +5,6 @@ import logging
 import pytest
 from eitbench import _notice
 from eitbench._notice import Wait
-from eitbench.numerics import compiled
 
 
 @pytest.fixture
@@ -32,17 +31,3 @@ def test_a_terminal_is_told_there(monkeypatch, capsys, caplog):
     monkeypatch.setattr(_notice.sys.stderr, "isatty", lambda: True, raising=False)
     _notice.say("hello")
     assert capsys.readouterr().err == "eitbench: hello\n" and not caplog.records
-
-
-def test_kernels_that_are_not_compiled_yet_are_told_of(tmp_path, monkeypatch, caplog):
-    caplog.set_level(logging.INFO, "eitbench")
-    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
-    place = tmp_path / "__pycache__"
-    place.mkdir()
-    tell = compiled._tell_of_compiling.__wrapped__
-    tell(place)
-    assert "20 s" in caplog.text and "eitbench bank" in caplog.text
-    caplog.clear()
-    (place / "kernels.solve_lu-373.py311.nbi").touch()
-    tell(place)
-    assert not caplog.text

@@ -26,9 +26,6 @@ def square():
     return *mesh.points.T, mass_matrix(mesh)
 
 
-# -- the relative error -----------------------------------------------------------------------------------------------
-
-
 def test_relative_error_is_squared_without_a_root(square):
     """Constants: (ĉ − c)²/c² = (0.5/2)², whatever the mesh."""
     x, _, mass = square
@@ -59,16 +56,6 @@ def test_contrast_form_measures_against_the_homogeneous_estimate(square):
     assert relative_error(truth + y, truth, mass) < 0.02
 
 
-def test_mass_may_be_dense_or_sparse(square):
-    """Either kind of matrix gives the same number."""
-    x, y, mass = square
-    arguments = (x + y)[None], x[None]
-    assert relative_error(*arguments, mass.toarray()) == pytest.approx(relative_error(*arguments, mass), rel=1e-14)
-
-
-# -- voltages ---------------------------------------------------------------------------------------------------------
-
-
 def test_voltage_discrepancy_is_a_mean_square():
     """1/(T·N_V) Σ‖V − V̂‖²: (1 + 4 + 0 + 0 + 0 + 4)/(2·3)."""
     measured = np.array([[1.0, 2.0, 3.0], [0.0, 0.0, 0.0]])
@@ -88,9 +75,6 @@ def test_innovations_of_their_own_covariance_average_one():
     assert nis.mean() == pytest.approx(1.0, abs=5 * np.sqrt(2 / (m * T)))
     np.testing.assert_allclose(normalised_innovations(innovation, covariance / 2), 2 * nis, rtol=1e-9)
     assert nis[7] == pytest.approx(innovation[7] @ np.linalg.inv(covariance[7]) @ innovation[7] / m, rel=1e-9)
-
-
-# -- calibration ------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("mean", "std", "truth"), [(0.0, 1.0, 0.0), (1.0, 0.5, 2.2), (-3.0, 2.0, -9.0)])
@@ -157,9 +141,6 @@ def test_skill_runs_from_the_homogeneous_estimate_to_the_reference():
         [0.0, 0.5, 1.0, -1.0])
 
 
-# -- shapes -----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("left", "right"), [((3, 4), (3, 5)), ((3, 4), (1, 4)), ((4,), (4,)), ((2, 3, 4), (2, 3, 4))])
 @pytest.mark.parametrize("score", [
     lambda a, b: relative_error(a, b, np.eye(4)), voltage_discrepancy,
@@ -170,9 +151,6 @@ def test_arrays_must_be_a_pair_over_time_and_space(score, left, right):
     """No broadcasting: both arrays are (T, n), or it is an error that shows both shapes."""
     with pytest.raises(ValueError, match=r"same shape \(T, n\)"):
         score(np.ones(left), np.ones(right))
-
-
-# -- places -----------------------------------------------------------------------------------------------------------
 
 
 def plate():

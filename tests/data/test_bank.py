@@ -1,5 +1,4 @@
-"""The bank: exactly what is missing is made, with the bits of a recording made alone, and nothing
-done is lost."""
+"""The bank: exactly what is missing is made, with the bits of a recording made alone, and nothing done is lost."""
 
 import re
 import shutil
@@ -37,8 +36,7 @@ def place(tmp_path, monkeypatch):
 @pytest.fixture(scope="module")
 def alone():
     """The bytes of each recording when its episode is simulated by itself."""
-    return {seed: make_recording(TINY, seed, simulate(TINY, seed, cache=False)).tobytes()
-            for seed in SEEDS}
+    return {seed: make_recording(TINY, seed, simulate(TINY, seed, cache=False)).tobytes() for seed in SEEDS}
 
 
 @pytest.fixture
@@ -64,13 +62,9 @@ def stamps(place):
     return {path.name: (path.stat().st_ino, path.stat().st_mtime_ns) for path in place.iterdir()}
 
 
-# -- fill ------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("n_jobs", [1, 2])
 def test_recordings_have_the_bits_of_those_made_alone(n_jobs, place, alone, monkeypatch):
-    """Eight at once or spread over processes: each recording is the one of its seed, and no truth
-    lies beside it."""
+    """Eight at once or spread over processes: each recording is the one of its seed, and no truth lies beside it."""
     get_reusable_executor().shutdown(wait=True)      # workers keep the cache folder they began with
     assert fill(TINY, SEEDS, n_jobs=n_jobs) == 10
     assert names(place) == sorted(f"{seed}.npy" for seed in SEEDS)
@@ -79,8 +73,7 @@ def test_recordings_have_the_bits_of_those_made_alone(n_jobs, place, alone, monk
 
 
 def test_only_what_is_missing_is_made(place, asked, alone):
-    """In batches of eight. Seeds asked for twice are made once, and a damaged recording counts as
-    missing."""
+    """In batches of eight. Seeds asked for twice are made once, and a damaged recording counts as missing."""
     recording(TINY, 2)
     (place / "2.truth.npy").unlink()
     assert fill(TINY, [4, 2, 1, 4]) == 2 and asked == [[4, 1]]
@@ -96,8 +89,7 @@ def test_only_what_is_missing_is_made(place, asked, alone):
 
 
 def test_interrupted_fill_keeps_what_is_done_and_resumes(place, asked, alone, monkeypatch):
-    """Ctrl-C after the third recording: three are there and sound, and the next call makes the
-    other seven."""
+    """Ctrl-C after the third recording: three are there and sound, and the next call makes the other seven."""
     real = cache.store
 
     def interrupted(key, arrays):
@@ -145,21 +137,15 @@ def test_workers_write_where_the_parent_looks(monkeypatch, tmp_path):
         assert is_recorded(TINY, 0) and is_recorded(TINY, 1), name
 
 
-# -- the command line ------------------------------------------------------------------------------
-
-
 def test_command_fills_and_resumes(place, asked, alone):
-    """It says what it made and what was there, and keeps it where environments look; dev:0 is not
-    train:0."""
+    """It says what it made and what was there, and keeps it where environments look; dev:0 is not train:0."""
     code, said, _ = command("bank", "--seeds", "train:0-2", "-j", "1")
     assert code == 0
     assert "3 simulated, 0 were there" in said
     assert f"3 episodes, 0 MB in {place}" in said
-    code, said, _ = command("bank", "--seeds", "train:0-3", "-j", "1", "--env",
-                            "eitbench/Pipe2DSmoothing-v0")
+    code, said, _ = command("bank", "--seeds", "train:0-3", "-j", "1", "--env", "eitbench/Pipe2DSmoothing-v0")
     assert code == 0 and "1 simulated, 3 were there" in said and asked == [[0, 1, 2], [3]]
-    assert {seed: recording(TINY, seed).tobytes() for seed in range(4)} == {seed: alone[seed]
-                                                                            for seed in range(4)}
+    assert {seed: recording(TINY, seed).tobytes() for seed in range(4)} == {seed: alone[seed] for seed in range(4)}
     assert command("bank", "--seeds", "dev:0", "-j", "1")[0] == 0 and asked[2:] == [[100_000]]
 
 
@@ -184,17 +170,7 @@ def test_full_disk_is_refused_before_anything_is_simulated(place, asked, monkeyp
     (["-j", "0"], "--jobs"),
 ])
 def test_mistakes_are_explained(arguments, message, place, asked):
-    """Exit code 2 and a sentence that names the argument; no traceback, and nothing is
-    simulated."""
+    """Exit code 2 and a sentence that names the argument; no traceback, and nothing is simulated."""
     code, said, complaint = command("bank", *arguments)
     assert code == 2 and said == "" and message in complaint and "Traceback" not in complaint
     assert asked == [] and not place.exists()
-
-
-def test_command_with_an_unwritable_cache_is_explained(monkeypatch):
-    """No traceback."""
-    monkeypatch.setenv(CACHE_VARIABLE, "/dev/null/cache")
-    forget()
-    with pytest.warns(UserWarning, match="cannot be kept"):
-        code, _, complaint = command("bank", "--seeds", "train:0", "-j", "1")
-    assert code == 2 and "recordings cannot be kept in" in complaint

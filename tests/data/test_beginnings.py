@@ -4,7 +4,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from eitbench.data import cache
-from eitbench.data.bank import fill
 from eitbench.data.beginnings import MARGIN, concentration_at, script, script_so_far
 from eitbench.data.episodes import simulate
 from eitbench.data.recordings import is_recorded
@@ -17,9 +16,7 @@ IDS = ["eitbench/Pipe2DFixedLag-v0", "eitbench/Pipe2DInjectionFlow-v0",
        "eitbench/RotatingTankInjection-v0", "eitbench/StationaryTank2D-v0"]
 
 
-@pytest.fixture(autouse=True)
-def _place(place):
-    """A cache folder for each test."""
+pytestmark = pytest.mark.usefixtures("place")
 
 
 def changes(id):
@@ -72,18 +69,3 @@ def test_playing_is_the_same_whether_it_was_recorded_before(id, kwargs):
     assert all(recorded)
     for one, other in zip(first, again, strict=True):
         np.testing.assert_equal(one, other)
-
-
-def test_the_rest_of_a_pool_is_made_when_a_step_needs_it():
-    id = "eitbench/Pipe2DInjection-v0"
-    world = entry(id).world.changed(changes(id))
-    env = gym.make(id, world=changes(id), estimator="none")
-    env.reset()
-    for _ in range(MARGIN):
-        env.step(0)
-    assert not is_recorded(world, 0)
-    for _ in range(2):
-        env.step(0)
-    assert is_recorded(world, 0)
-    fill(world, range(2))
-    assert env.unwrapped.pool.size == 1

@@ -1,6 +1,5 @@
 """Examples to learn from: what they hold is what environments show and score, and files hold the same."""
 
-import json
 import pickle
 import re
 import sys
@@ -11,13 +10,11 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from eitbench.cli.app import app
 from eitbench.data import bank
 from eitbench.data.episodes import simulate
 from eitbench.data.export import export
 from eitbench.data.recordings import recording, step_error
 from eitbench.data.regions import integrals, region_operators, score_mass
-from typer.testing import CliRunner
 
 from short import WANDERING
 from tiny_worlds import CHANGES, FAST
@@ -161,9 +158,6 @@ def test_iterating_simulates_few_at_a_time(monkeypatch, tmp_path):
     assert [example.seed for example in stream] == list(range(1, 9)) and asked[1:] == [[8]]
 
 
-# -- torch -----------------------------------------------------------------------------------------
-
-
 def test_torch_loads_batches(tiny):
     """Through a pickle, as processes of a loader get it."""
     batch = next(iter(torch.utils.data.DataLoader(pickle.loads(pickle.dumps(tiny.torch())), batch_size=2)))
@@ -177,9 +171,6 @@ def test_without_torch_it_says_what_to_install(tiny, monkeypatch):
     monkeypatch.setitem(sys.modules, "torch", None)
     with pytest.raises(ModuleNotFoundError, match=r"a dataset for torch needs the extra rl"):
         tiny.torch()
-
-
-# -- files -----------------------------------------------------------------------------------------
 
 
 def read(path):
@@ -237,19 +228,3 @@ def test_a_missing_library_is_named_before_anything_is_written(tiny, tmp_path, m
     with pytest.raises(ModuleNotFoundError, match="format hdf5 needs the extra export"):
         export(tiny, tmp_path / "out", "hdf5")
     assert not (tmp_path / "out").exists()
-
-
-def test_the_readme_warns_of_test_episodes(tmp_path):
-    export(eitbench.dataset(PIPE, "test:0", world=CHANGES), tmp_path)
-    assert "Test episodes are among them" in (tmp_path / "README.md").read_text()
-
-
-def test_command(tmp_path, monkeypatch):
-    """It says what is written, and writes nothing for an unknown environment."""
-    told = CliRunner().invoke(app, ["export", "--env", "eitbench/StationaryTank2D-v0", "--seeds", "train:0",
-                                    "--out", str(tmp_path / "out"), "-j", "1"])
-    assert told.exit_code == 0 and "1 episodes written" in told.output, told.output
-    said = json.loads((tmp_path / "out" / "dataset.json").read_text())
-    assert said["environment"] == "eitbench/StationaryTank2D-v0" and said["format"] == "npz"
-    told = CliRunner().invoke(app, ["export", "--env", "eitbench/Nowhere-v0", "--out", str(tmp_path / "no")])
-    assert told.exit_code != 0 and not (tmp_path / "no").exists()

@@ -18,76 +18,53 @@ from scipy.stats import kstest
 
 from tiny_worlds import CHANGES, TINY
 
-
-@pytest.fixture(autouse=True)
-def _place(place):
-    """A cache folder for each test."""
+pytestmark = pytest.mark.usefixtures("place")
 
 
-@pytest.fixture(scope="module")
-def fresh(episode):
-    """Seed 7, simulated without a cache."""
-    return episode
-
-
-def bits(episode):
+def bits(arrays):
     """Types, shapes and bytes of an episode's arrays."""
-    return [(array.dtype.str, array.shape, array.tobytes()) for array in episode]
+    return [(array.dtype.str, array.shape, array.tobytes()) for array in arrays]
 
 
-# -- reproducible ----------------------------------------------------------------------------------
-
-
-def test_shapes_are_those_of_the_docstring(fresh):
-    """All finite; no velocity where the flow is known."""
-    n_truth = truth_discretisation(TINY).transport.mesh.n_nodes
-    assert [array.shape for array in fresh] == [(6, n_truth), (5, 4, 4), (5, 4), (5, 0)]
-    assert [array.dtype for array in fresh] == [np.float32, np.float64, np.float64, np.float64]
-    assert all(np.isfinite(array).all() for array in fresh)
-
-
-def test_same_bits_in_this_process_from_the_cache_and_side_by_side(fresh, monkeypatch):
+def test_same_bits_in_this_process_from_the_cache_and_side_by_side(episode, monkeypatch):
     """Only the seed is random, and numpy's global state is neither used nor changed. Up to an
     earlier step the bits are those of the whole."""
     np.random.seed(1)  # noqa: NPY002 (the global state is what this is about)
     before = np.random.get_state()[1].copy()  # noqa: NPY002
-    assert bits(simulate(TINY, 7, cache=False)) == bits(fresh)
+    assert bits(simulate(TINY, 7, cache=False)) == bits(episode)
     assert (np.random.get_state()[1] == before).all()  # noqa: NPY002
     together = list(episodes.simulate_together(TINY, [7, 8]))
-    assert bits(together[0]) == bits(fresh)
+    assert bits(together[0]) == bits(episode)
     assert bits(together[1]) == bits(simulate(TINY, 8, cache=False))
-    assert all((mine != theirs).mean() > 0.9 for mine,
-               theirs in zip(fresh[:3], together[1][:3], strict=True))
+    assert all((mine != theirs).mean() > 0.9 for mine, theirs in zip(episode[:3], together[1][:3], strict=True))
     (begun,) = episodes.simulate_together(TINY, [7], last=2)
-    assert bits(begun) == bits(Episode(fresh.concentration[:3], *(array[:2] for array in fresh[1:])))
+    assert bits(begun) == bits(Episode(episode.concentration[:3], *(array[:2] for array in episode[1:])))
     first = simulate(TINY, 7)
     monkeypatch.setattr(episodes, "simulate_together", None)
-    assert bits(simulate(TINY, 7)) == bits(first) == bits(fresh)
+    assert bits(simulate(TINY, 7)) == bits(first) == bits(episode)
 
 
-def test_other_processes_same_bits_and_share_one_file(fresh, place):
-    """Two processes that simulate and store one episode at once leave a single valid file with the
-    bits made here."""
+def test_other_processes_same_bits_and_share_one_file(episode, place):
+    """Two processes that simulate and store one episode at once leave a single valid file with the bits made here."""
     program = ("from eitbench.worlds.catalogue import PIPE_2D\n"
                "from eitbench.data.episodes import simulate\n"
                "import hashlib\n"
                f"episode = simulate(PIPE_2D.changed({CHANGES!r}), 7)\n"
                "print(hashlib.sha256(b''.join(array.tobytes() for array in episode)).hexdigest())")
-    running = [subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
-               for _ in range(2)]
+    running = [subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) for _ in range(2)]
     digests = [process.communicate()[0].strip() for process in running]
-    here = hashlib.sha256(b"".join(array.tobytes() for array in fresh)).hexdigest()
+    here = hashlib.sha256(b"".join(array.tobytes() for array in episode)).hexdigest()
     assert digests == [here, here]
     assert len([path for path in place.rglob("*") if path.is_file()]) == 1
-    assert bits(simulate(TINY, 7)) == bits(fresh)
+    assert bits(simulate(TINY, 7)) == bits(episode)
 
 
-def test_no_cache_neither_reads_nor_writes(fresh, place):
+def test_no_cache_neither_reads_nor_writes(episode, place):
     """`cache=False` leaves the folder alone and simulates even if a file is there."""
     simulate(TINY, 7, cache=False)
     assert not place.exists()
-    store(episode_key(TINY, "7.truth"), fresh._replace(noise=fresh.noise + 1.0)._asdict())
-    assert bits(simulate(TINY, 7, cache=False)) == bits(fresh)
+    store(episode_key(TINY, "7.truth"), episode._replace(noise=episode.noise + 1.0)._asdict())
+    assert bits(simulate(TINY, 7, cache=False)) == bits(episode)
 
 
 @pytest.mark.parametrize("seed", [-1, 1.0, True, "7", None])
@@ -98,12 +75,8 @@ def test_seed_must_be_a_whole_number(seed):
             function(TINY, seed)
 
 
-# -- what is simulated -----------------------------------------------------------------------------
-
-
 def test_truth_is_finer_than_the_model():
-    """No inverse crime: six times the CD nodes, at least twice the EIT unknowns, a quarter of the
-    sub-step."""
+    """No inverse crime: six times the CD nodes, at least twice the EIT unknowns, a quarter of the sub-step."""
     truth, model = truth_discretisation(PIPE_2D), PIPE_2D.model()
     assert model.transport.mesh.n_nodes == 1701
     assert truth.transport.mesh.n_nodes >= 6 * 1701
@@ -115,37 +88,31 @@ def test_truth_is_finer_than_the_model():
     assert fine <= coarse / 4
 
 
-def test_resistances_belong_to_the_concentrations(fresh):
+def test_resistances_belong_to_the_concentrations(episode):
     """𝓡 at index t − 1 is that of the concentration at t, seen on the truth's EIT mesh."""
     observation = truth_discretisation(TINY).observation
     for t in (1, 5):
-        expected = observation.transfer_resistance(fresh.concentration[t].astype(float))
+        expected = observation.transfer_resistance(episode.concentration[t].astype(float))
         # Concentrations are kept in single precision, resistances as computed.
-        np.testing.assert_allclose(fresh.transfer_resistance[t - 1], expected,
-                                   atol=1e-6 * np.abs(expected).max())
+        np.testing.assert_allclose(episode.transfer_resistance[t - 1], expected, atol=1e-6 * np.abs(expected).max())
 
 
-def test_voltages_follow_the_noise_formula(fresh):
-    """V = 𝓡I + std·n with std² = (1 % of the reading)² + (0.1 % of the largest)², at the step asked
-    for."""
+def test_voltages_follow_the_noise_formula(episode):
+    """V = 𝓡I + std·n with std² = (1 % of the reading)² + (0.1 % of the largest)², at the step asked for."""
     for step, currents in itertools.product((1, 2, 5), TINY.currents):
-        clean = fresh.transfer_resistance[step - 1] @ currents
-        noisy = clean + np.sqrt((0.01 * clean)**2
-                                + (0.001 * np.abs(clean).max())**2) * fresh.noise[step - 1]
-        np.testing.assert_allclose(fresh.voltages(step, currents, TINY), noisy, rtol=1e-12)
+        clean = episode.transfer_resistance[step - 1] @ currents
+        noisy = clean + np.sqrt((0.01 * clean)**2 + (0.001 * np.abs(clean).max())**2) * episode.noise[step - 1]
+        np.testing.assert_allclose(episode.voltages(step, currents, TINY), noisy, rtol=1e-12)
 
 
 def test_noise_is_standard_normal(monkeypatch):
-    """48,000 draws of one long episode: N(0, 1), and independent from one reading or step to the
-    next."""
-    electrodes = SimpleNamespace(cem=SimpleNamespace(n_electrodes=16),
-                                 transfer_resistance=lambda c: np.eye(16))
+    """48,000 draws of one long episode: N(0, 1), and independent from one reading or step to the next."""
+    electrodes = SimpleNamespace(cem=SimpleNamespace(n_electrodes=16), transfer_resistance=lambda c: np.eye(16))
     still = SimpleNamespace(mesh=SimpleNamespace(points=np.zeros((1, 2)), n_nodes=1),
                             inlet=np.array([0]),
                             # the flow takes no part in this
                             time_step=2.5e-3, step=lambda c, *_: c)
-    monkeypatch.setattr(episodes, "truth_discretisation",
-                        lambda _: Discretisation(still, electrodes))
+    monkeypatch.setattr(episodes, "truth_discretisation", lambda _: Discretisation(still, electrodes))
     long = PIPE_2D.changed({"schedule": {"scored_steps": 2982}})
     noise = simulate(long, 5, cache=False).noise
     assert noise.shape == (3000, 16)
@@ -156,47 +123,15 @@ def test_noise_is_standard_normal(monkeypatch):
     assert np.abs(neighbours).max() < 4 / np.sqrt(noise.size)
 
 
-def inflows(seeds=range(20), times=None):
-    """ln(c_in/background) of the real pipe, (seed, point, time)."""
-    times = np.linspace(-0.09, PIPE_2D.n_steps * 5e-3, 400) if times is None else times
-    points = np.stack([np.zeros(21), np.linspace(-0.05, 0.05, 21)], axis=1)
-    entering = np.array([[inflow(points, t) for t in times] for inflow in map(inflow_of, seeds)])
-    return np.log(entering / 30.0).transpose(0, 2, 1)
-
-
-def inflow_of(seed):
-    """What a generator of this seed lets in."""
-    return PIPE_2D.target.draw_inflow(PIPE_2D, np.random.default_rng(seed))
-
-
-def test_inflow_is_reproducible_and_positive():
-    """The same generator gives the same inflow; other seeds give others; c > 0, within a factor of
-    four of normal."""
-    mine = inflows([1, 2])
-    np.testing.assert_array_equal(mine, inflows([1, 2]))
-    assert (mine[0] != mine[1]).mean() > 0.9
-    assert np.isfinite(mine).all() and np.abs(mine).max() < np.log(4)
-
-
 def test_inflow_has_slugs_of_both_signs_from_beginning_to_end():
-    """Every episode sees concentration rise and fall by a tenth and more; on average it does
-    neither, at any time."""
-    level = inflows()
+    """Every episode sees concentration rise and fall by a tenth and more; on average it does neither, at any time."""
+    points = np.stack([np.zeros(21), np.linspace(-0.05, 0.05, 21)], axis=1)
+    times = np.linspace(-0.09, PIPE_2D.n_steps * 5e-3, 400)
+    drawn = [PIPE_2D.target.draw_inflow(PIPE_2D, np.random.default_rng(seed)) for seed in range(20)]
+    level = np.log([[inflow(points, t) for t in times] for inflow in drawn]).transpose(0, 2, 1) - np.log(30.0)
     assert (level.max(axis=(1, 2)) > np.log(1.1)).all()
     assert (level.min(axis=(1, 2)) < np.log(0.9)).all()
     assert abs(level.mean()) < 0.05
     activity = np.sqrt((level**2).mean(axis=(0, 1)))                # over time
     assert activity[:40].mean() > 0.6 * activity.mean()
     assert activity[-40:].mean() > 0.6 * activity.mean()
-
-
-def test_inflow_is_smooth():
-    """Neither jumps nor kinks: second differences over 10 µs and 0.1 mm stay below what five slugs
-    at once can bend."""
-    step, seeds = 1e-5, range(5)
-    level = inflows(seeds, times=np.arange(0.1, 0.13, step))
-    bend = np.abs(np.diff(level, 2, axis=2)).max() / step**2
-    assert 1e2 < bend < 5 * 0.40 / 6e-3**2
-    points = np.stack([np.zeros(1001), np.linspace(-0.05, 0.05, 1001)], axis=1)
-    across = np.log([inflow_of(seed)(points, 0.1) for seed in seeds])
-    assert np.abs(np.diff(across, 2, axis=1)).max() / 1e-4**2 < 5 * 0.40 / 0.010**2

@@ -3,11 +3,10 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from eitbench.bench import package_data
 from eitbench.bench.package_data import difference, expected_files, unused_files
 from eitbench.bench.tracks import own_ids
 from eitbench.data import cache, episodes
-from eitbench.data.beginnings import make_beginning, shipped_key
+from eitbench.data.beginnings import shipped_key
 from eitbench.data.cache import load_shipped
 from eitbench.data.regions import outline_key, region_key
 from eitbench.estimation.onboard.packing import packed, unpacked
@@ -46,17 +45,6 @@ def test_models_are_compared_in_one_basis():
     assert "noise" in difference(shipped, again)
 
 
-def test_missing_files_are_written(tmp_path, monkeypatch):
-    """And compared the next time; a damaged one is named and stays."""
-    monkeypatch.setattr(cache, "PACKAGE_DATA", tmp_path)
-    monkeypatch.setattr(package_data, "make_beginning", lambda *_: {"transfer_resistance": np.ones(2)})
-    ids = ["eitbench/Pipe2D-v0"]
-    assert [result for _, result in package_data.write_package_data(ids)] == ["new", "new"]
-    assert [result for _, result in package_data.write_package_data(ids)] == ["same", "same"]
-    outline_key(entry(ids[0]).world).shipped_path.write_bytes(b"")
-    assert [result for _, result in package_data.write_package_data(ids)] == ["missing or damaged", "same"]
-
-
 @pytest.mark.parametrize(("key", "same", "other"), [
     (outline_key,
      [{"flow": {"mean_velocity": 4.0}}, {"instrument": {"noise_relative": 0.1}}, {"region": None},
@@ -86,15 +74,3 @@ def test_the_first_reset_simulates_nothing(id, monkeypatch, tmp_path):
     assert observation["voltages"].any() or kwargs
     env.step(env.action_space.sample())
     assert not list(tmp_path.iterdir())
-
-
-def test_the_shipped_beginning_is_that_of_the_episode():
-    """To the bit on this machine's kind, and the noise too; no scored step is among them."""
-    from eitbench.data.beginnings import script_so_far
-    world = entry("eitbench/Pipe2D-v0").world
-    entries = script_so_far(world, 0, 1).entries
-    assert len(entries) <= world.warm_up
-    (episode,) = episodes.simulate_together(world, [0], False, len(entries))
-    np.testing.assert_allclose(entries["transfer_resistance"],
-                               make_beginning(world, 17)["transfer_resistance"], rtol=1e-9)
-    np.testing.assert_array_equal(entries["noise"], episode.noise)

@@ -1,38 +1,24 @@
 """Recordings: they score as the truth does, they are bit for bit the simulation's."""
 
-import os
 import subprocess
 import sys
 
 import eitbench  # noqa: F401 (registers)
-import gymnasium as gym
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from eitbench.data import episodes, recordings, regions
-from eitbench.data.cache import CACHE_VARIABLE
 from eitbench.data.episodes import truth_discretisation
-from eitbench.data.recordings import (
-    cycle_voltages,
-    faults_of,
-    recording,
-    recording_path,
-    step_error,
-)
+from eitbench.data.recordings import cycle_voltages, faults_of, recording, step_error
 from eitbench.data.regions import outline
 
-from recorded import bits, digest, forget, outline_bits
+from recorded import bits
 from tiny_worlds import CHANGES, TINY
 
 pytestmark = pytest.mark.usefixtures("place")
 
 
-# -- independent integrals -------------------------------------------------------------------------
-
-
 def values_at(points, mesh):
-    """Dense matrix from nodal values on ``mesh`` to values at ``points``: every point is looked for
-    in every cell."""
+    """Dense matrix from nodal values on ``mesh`` to values at ``points``: every point is looked for in every cell."""
     matrix, found = np.zeros((len(points), mesh.n_nodes)), np.zeros(len(points), dtype=bool)
     homogeneous = np.column_stack([points, np.ones(len(points))])
     for cell in mesh.cells:
@@ -45,8 +31,7 @@ def values_at(points, mesh):
 
 
 def integral_of_square(mesh, nodal):
-    """∫f² for nodal values (..., n): the three midpoints of a triangle's edges integrate a
-    quadratic exactly."""
+    """∫f² for nodal values (..., n): the three midpoints of a triangle's edges integrate a quadratic exactly."""
     corner = nodal[..., mesh.cells]
     middles = 0.5 * (corner + np.roll(corner, 1, axis=-1))
     edges = mesh.points[mesh.cells[:, 1:]] - mesh.points[mesh.cells[:, :1]]
@@ -62,8 +47,7 @@ def to_truth():
 
 @pytest.mark.parametrize("kind", ["near the truth", "good", "bad", "constant", "background"])
 def test_score_is_the_integral_over_the_truth(kind, episode, to_truth):
-    """The step error from moments equals ∫(ĉ − c)²/∫c² taken over the truth's own triangles,
-    whatever the estimate.
+    """The step error from moments equals ∫(ĉ − c)²/∫c² taken over the truth's own triangles, whatever the estimate.
 
     To 1e-6 of it, but for 3e-10 that single precision of the moments costs (measured: 6e-11).
     """
@@ -76,13 +60,11 @@ def test_score_is_the_integral_over_the_truth(kind, episode, to_truth):
                 "bad": rng.uniform(-250.0, 250.0, (5, len(nodes))),
                 "constant": np.full((5, len(nodes)), 25.0),
                 "background": np.full((5, len(nodes)), TINY.background)}[kind]
-    exact = integral_of_square(mesh, estimate @ to_truth.T - truth) / integral_of_square(mesh,
-                                                                                         truth)
+    exact = integral_of_square(mesh, estimate @ to_truth.T - truth) / integral_of_square(mesh, truth)
     if kind == "near the truth":
         assert exact.max() < 1e-4                   # what the coarser mesh cannot hold, and no more
     entries, mass = recording(TINY, 7), outline(TINY).mass
-    scored = step_error(mass, estimate - TINY.background, entries["moment"], entries["deviation"],
-                        entries["square"])
+    scored = step_error(mass, estimate - TINY.background, entries["moment"], entries["deviation"], entries["square"])
     np.testing.assert_allclose(scored, exact, **exactly)
     for t in range(5):                                 # one step at a time, as the environment asks
         one = step_error(mass, estimate[t] - TINY.background, entries["moment"][t],
@@ -91,8 +73,7 @@ def test_score_is_the_integral_over_the_truth(kind, episode, to_truth):
 
 
 def test_outline_holds_one_triangle_of_the_mass_on_the_estimators_nodes(to_truth):
-    """xᵀ·mass·x = ∫(Px)² over the truth's triangles for any x, and nothing is stored below the
-    diagonal."""
+    """xᵀ·mass·x = ∫(Px)² over the truth's triangles for any x, and nothing is stored below the diagonal."""
     mass, mesh = outline(TINY).mass, truth_discretisation(TINY).transport.mesh
     assert mass.shape == (1701, 1701) and sp.tril(mass, -1).nnz == 0 and sp.triu(mass, 1).nnz > 1701
     for x in np.random.default_rng(2).normal(size=(5, 1701)):
@@ -102,12 +83,8 @@ def test_outline_holds_one_triangle_of_the_mass_on_the_estimators_nodes(to_truth
 def test_outline_knows_the_largest_voltage():
     """That of the whole injection cycle into liquid of the expected concentration."""
     observation, level = TINY.model().observation, np.full(1701, TINY.expected_concentration)
-    largest = max(np.abs(observation.transfer_resistance(level) @ currents).max()
-                  for currents in TINY.currents)
+    largest = max(np.abs(observation.transfer_resistance(level) @ currents).max() for currents in TINY.currents)
     assert outline(TINY).largest_voltage == pytest.approx(largest, rel=1e-10)
-
-
-# -- the simulation, bit for bit -------------------------------------------------------------------
 
 
 def test_resistances_and_noise_are_those_of_the_episode(episode):
@@ -120,8 +97,7 @@ def test_resistances_and_noise_are_those_of_the_episode(episode):
 
 
 def test_cycle_voltages_are_those_of_the_episode(episode):
-    """Step by step what `Episode.voltages` says of the cycle's currents, which begin anew after
-    each frame."""
+    """Step by step what `Episode.voltages` says of the cycle's currents, which begin anew after each frame."""
     voltages = cycle_voltages(TINY, 7, recording(TINY, 7))
     assert voltages.shape == (5, 4)
     for t, currents in enumerate(TINY.currents[[0, 1, 0, 1, 0]], start=1):
@@ -144,35 +120,8 @@ def test_cycle_voltages_have_the_faults_of_the_episode():
     np.testing.assert_array_equal(read[np.ix_(~passes, others)], sound[np.ix_(~passes, others)])
 
 
-def test_stored_truth_fresh_truth_and_other_process_give_the_same_bits(episode, monkeypatch,
-                                                                       tmp_path):
-    """Recordings and outlines do not depend on where their truth came from, or whether they were
-    cached."""
-    fresh, stage = recording(TINY, 7), outline(TINY)
-    assert bits(fresh) == bits(recordings.make_recording(TINY, 7, episode))
-    before = bits(fresh), outline_bits(stage)
-    monkeypatch.setattr(episodes, "simulate_together", None)
-    recording_path(TINY, 7).unlink()
-    forget()
-    # from the stored truth
-    assert (bits(recording(TINY, 7)), outline_bits(outline(TINY))) == before
-    monkeypatch.setattr(recordings, "simulate", None)
-    monkeypatch.setattr(regions, "score_operators", None)
-    forget()
-    assert (bits(recording(TINY, 7)), outline_bits(outline(TINY))) == before         # from the disk
-    here = os.path.dirname(__file__)
-    program = (f"import sys; sys.path[:0] = [{here!r}, {os.path.dirname(here)!r}]\n"
-               "from test_recordings import *\n"
-               "print(digest(recording(TINY, 7), outline(TINY)))")
-    for place in (tmp_path / "elsewhere", tmp_path / "cache"):           # built, and from our files
-        done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True,
-                              check=True, env=os.environ | {CACHE_VARIABLE: str(place)})
-        assert done.stdout.strip() == digest(fresh, stage)
-
-
 def test_playing_what_is_stored_needs_no_finite_elements(episode):
-    """With recording and outline on disk, making, resetting and stepping an environment builds no
-    mesh."""
+    """With recording and outline on disk, making, resetting and stepping an environment builds no mesh."""
     recording(TINY, 7), outline(TINY)
     program = (f"import sys, gymnasium as gym, numpy as np, eitbench\n"
                f"env = gym.make('eitbench/Pipe2D-v0', world={CHANGES!r})\n"
@@ -180,21 +129,5 @@ def test_playing_what_is_stored_needs_no_finite_elements(episode):
                "rewards = [env.step(np.full(1701, 30.0))[1] for _ in range(5)]\n"
                "heavy = {'skfem', 'numba', 'eitbench.numerics.mesh'}\n"
                "print(rewards[-1] < 0.0, sorted(heavy & set(sys.modules)))")
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True,
-                          check=True)
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout == "True []\n"
-
-
-def test_an_unwritable_cache_still_plays(monkeypatch):
-    """The numbers are those of any other machine."""
-    entries = recording(TINY, 7)
-    monkeypatch.setenv(CACHE_VARIABLE, "/dev/null/cache")
-    forget()
-    with pytest.warns(UserWarning, match="cannot be kept"):
-        env = gym.make("eitbench/Pipe2D-v0", world=CHANGES).unwrapped
-        observation, _ = env.reset(seed=7)
-    np.testing.assert_array_equal(observation["voltages"], cycle_voltages(TINY, 7, entries)[0])
-    rewards = [env.step(np.full(1701, TINY.background))[1] for _ in range(5)]
-    np.testing.assert_allclose(rewards[2:], -(entries["deviation"] / entries["square"])[2:],
-                               rtol=1e-12)
-    assert rewards[:2] == [0.0, 0.0]

@@ -18,16 +18,6 @@ def test_splits_are_disjoint():
         assert not set(a) & set(b)
 
 
-def test_examples_of_the_docstring():
-    """Numbers count from the beginning of their split; without a split they are the seeds
-    themselves."""
-    assert parse_seeds("test:0-4") == [200_000, 200_001, 200_002, 200_003, 200_004]
-    assert parse_seeds("dev:3") == [100_003]
-    assert parse_seeds("dev:0-2,15") == [100_000, 100_001, 100_002, 100_015]
-    assert parse_seeds("17") == [17]
-    assert parse_seeds("17, 300017") == [17, 300_017]
-
-
 @given(st.integers(0, 2**31 - 1))
 def test_names_are_parsed_back(seed):
     """`parse_seeds` undoes `name_seed` for every seed, inside and outside the splits."""
@@ -42,13 +32,11 @@ def test_names_are_made_of_what_was_parsed(split, number):
     assert name_seed(seed) == f"{split}:{number}"
 
 
-@given(st.sampled_from(list(SPLITS)),
-       st.lists(st.tuples(numbers, st.integers(0, 20)), min_size=1, max_size=5))
+@given(st.sampled_from(list(SPLITS)), st.lists(st.tuples(numbers, st.integers(0, 20)), min_size=1, max_size=5))
 def test_parts_add_up_without_repeats(split, parts):
     """A list of ranges holds each of its numbers once, in the order of first mention."""
     spans = [(first, min(first + more, 99_999)) for first, more in parts]
-    text = f"{split}:" + ",".join(f"{first}-{last}" if last > first else f"{first}" for first,
-                                  last in spans)
+    text = f"{split}:" + ",".join(f"{first}-{last}" if last > first else f"{first}" for first, last in spans)
     expected = [SPLITS[split].start + i for first, last in spans for i in range(first, last + 1)]
     seeds = parse_seeds(text)
     assert len(seeds) == len(set(seeds))
@@ -56,12 +44,8 @@ def test_parts_add_up_without_repeats(split, parts):
 
 
 @pytest.mark.parametrize(("text", "message"), [
-    ("", "look like"), ("test:", "look like"), ("test:-3", "look like"), ("test:1,,2", "look like"),
-    ("test:1.5", "look like"), ("a", "look like"), ("exam:3", "one of the splits"),
-    (":3", "one of the splits"),
-    ("dev:test:3", "one of the splits"), ("test:4-1", "must increase"),
-    ("test:100000", "stay below 100000"),
-    ("dev:99999-100000", "stay below 100000"), (str(2**31), "stay below 2147483648"),
+    ("", "look like"), ("test:1,,2", "look like"), ("test:1.5", "look like"), ("exam:3", "one of the splits"),
+    ("test:4-1", "must increase"), ("dev:99999-100000", "stay below 100000"), (str(2**31), "stay below 2147483648"),
 ])
 def test_errors_say_what_was_expected(text, message):
     """Other forms, unknown splits and numbers beyond a split are refused, quoting the text."""

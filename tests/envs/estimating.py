@@ -21,8 +21,7 @@ def make(name: str, **kwargs) -> gym.Env:
 
 
 def play(env: gym.Env, seed: int, actions: np.ndarray) -> list[tuple]:
-    """(observation, reward, terminated, truncated, info) of the whole episode under these
-    actions."""
+    """(observation, reward, terminated, truncated, info) of the whole episode under these actions."""
     observation, info = env.reset(seed=seed)
     steps = [(observation, 0.0, False, False, info)]
     for action in actions:

@@ -5,9 +5,8 @@ import copy
 import numpy as np
 import pytest
 from eitbench.bench.scores import Outcome, scored
-from eitbench.envs.injection import InjectionVectorEnv
 from eitbench.estimation import KalmanFilter
-from eitbench.estimation.onboard.operator import FullOperator, Levels
+from eitbench.estimation.onboard.operator import Levels
 from eitbench.estimation.onboard.reduced_operator import ReducedOperator
 
 from choosing import BUDGET, FAULTS, FLOW, NAME, TANK, make, some_pairs
@@ -116,29 +115,3 @@ def test_nis_of_a_consistent_filter_averages_one(monkeypatch):
     spread = np.sqrt(2 / (32 * 40 * 16))
     assert abs(nis_of(random, 1.0) - 1.0) < 4 * spread
     assert nis_of(random, 2.0) > 1.0 + 40 * spread
-
-
-def test_nobody_asks_in_training(monkeypatch):
-    """A step of training computes no spread on the nodes and gathers no innovations."""
-    def refuse(self):
-        raise AssertionError("only scores ask for this")
-
-    for kind in (FullOperator, ReducedOperator):
-        for asked in ("spreads", "innovations", "means"):
-            monkeypatch.setattr(kind, asked, refuse)
-    world = make("reduced").unwrapped.world
-    envs = InjectionVectorEnv(NAME, num_envs=2, world={"flow": {"mean_velocity": 16.0},
-                                                       "schedule": {"scored_steps": 4}})
-    envs.reset(seed=[3, 4])
-    for actions in some_pairs(world.n_steps - 16, 2):
-        envs.step(actions)
-    with pytest.raises(AssertionError, match="only scores"):
-        envs._cores[0].innovations()
-
-
-def test_without_an_estimator_there_is_none():
-    """Nobody predicts, so that nothing can differ."""
-    env = make("none").unwrapped
-    env.reset(seed=3)
-    env.step(7)
-    assert env.core.innovations() == [None]

@@ -3,7 +3,6 @@
 import gc
 import json
 import os
-import pickle
 import subprocess
 import sys
 import warnings
@@ -41,8 +40,7 @@ def test_gymnasium_checker_passes(name):
     check_env(make(name, render_mode="rgb_array").unwrapped)
 
 
-@pytest.mark.filterwarnings(
-    "ignore:We recommend you to use a symmetric and normalized Box action space")
+@pytest.mark.filterwarnings("ignore:We recommend you to use a symmetric and normalized Box action space")
 def test_stable_baselines3_checker_passes(name):
     """Stable-baselines3 can wrap it."""
     check_env_sb3(make(name).unwrapped)
@@ -67,12 +65,6 @@ def test_world_is_that_of_the_id_but_for_the_changes(name):
     assert make(name, lag=1).unwrapped.lag == make(name, lag=1).unwrapped.task.lag == 1
 
 
-def test_pickled_environment_plays_the_same(name):
-    """Pickling keeps the arguments; the copy plays the same episode to the last bit."""
-    env = make(name)
-    assert_same_play(env, pickle.loads(pickle.dumps(env)))
-
-
 def test_two_environments_agree_to_the_bit(name):
     """Same seed and actions, same observations and rewards."""
     assert_same_play(make(name), make(name))
@@ -86,11 +78,9 @@ def assert_same_play(one: gym.Env, other: gym.Env) -> None:
         assert a[1:] == b[1:]
 
 
-@pytest.mark.parametrize("id", [PIPE, "eitbench/Pipe2DTimeVaryingVelocity-v0",
-                                "eitbench/RotatingTank2D-v0"])
+@pytest.mark.parametrize("id", [PIPE, "eitbench/Pipe2DTimeVaryingVelocity-v0", "eitbench/RotatingTank2D-v0"])
 def test_same_observation_in_another_process(id, tmp_path):
-    """The seed decides, not the process: another one, which finds nothing in its cache, simulates
-    the same bits."""
+    """The seed decides, not the process: another one, which finds nothing in its cache, simulates the same bits."""
     code = ("import gymnasium as gym, eitbench\n"
             f"observation, _ = gym.make({id!r}, **{short(id)!r}).reset(seed=1)\n"
             "print(observation['voltages'].tobytes().hex())")
@@ -100,8 +90,7 @@ def test_same_observation_in_another_process(id, tmp_path):
 
 
 def test_unseeded_resets_follow_the_first_seed(name):
-    """After a seeded reset, unseeded ones draw training episodes from np_random alone; each of them
-    comes."""
+    """After a seeded reset, unseeded ones draw training episodes from np_random alone; each of them comes."""
     one, other = (make(name) for _ in range(2))
     for env in (one, other):
         env.reset(seed=1)

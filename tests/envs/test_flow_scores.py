@@ -46,8 +46,7 @@ def test_leaderboard_scores_what_is_rewarded(name, said, monkeypatch):
     (SKEWED, r"Estimate.velocity must have shape \(3,\)"),
 ])
 def test_flow_is_refused_where_it_is_not_asked_for(id, message):
-    """A velocity in the plain pipe is a mistake, and so is one with too few numbers where it is
-    asked for."""
+    """A velocity in the plain pipe is a mistake, and so is one with too few numbers where it is asked for."""
     base = make(id).unwrapped
     said = Estimate(np.full(base.task.mesh.n_nodes, 31.0), velocity=np.array([4.5]))
     estimator = SimpleNamespace(update=lambda *_: said)

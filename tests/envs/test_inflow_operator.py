@@ -2,15 +2,10 @@
 
 import numpy as np
 import pytest
-from eitbench.bench.methods import baseline_folder
 from eitbench.data.regions import score_mass
-from eitbench.data.seeds import parse_seeds
-from eitbench.estimation import InflowFilter, suiting_priors
+from eitbench.estimation import InflowFilter
 from eitbench.estimation.onboard.belief import Belief
 from eitbench.estimation.onboard.inflow_operator import InflowOperator, prior_of
-from eitbench.worlds import entry
-from eitbench.worlds.catalogue import PIPE_2D
-from eitbench.worlds.task import make_task
 from scipy.linalg import toeplitz
 
 from choosing import BUDGET, FAULTS, FLOW, INFLOW, TANK, filter_of, make, some_pairs
@@ -140,46 +135,6 @@ def test_expected_error_is_that_of_the_spread():
     assert expected == pytest.approx((mass * covariance).sum(), rel=1e-6)
 
 
-def test_readings_that_are_not_believed_teach_nothing():
-    """Whatever a reading beyond the gate says, the filter knows the same; all others are used."""
-    env = make("reduced", INFLOW, gate=6.0)
-    first = env.reset(seed=3)[0]
-    voltages = env.step(7)[0]["voltages"]
-    rules = env.unwrapped.rules
-    told = []
-    for wrong in (0.5, -3.0):
-        belief = Belief(rules, first)
-        false = voltages.copy()
-        false[11] += wrong
-        operator = filter_of(belief)
-        _, kept = operator.assimilate(false[None], rules.table[7][None])
-        assert np.flatnonzero(~kept[0]).tolist() == [11]
-        assert len(operator.innovations()[0].value) == 15
-        told.append((operator.means(), operator.covariance))
-    np.testing.assert_array_equal(told[0][0], told[1][0])
-    np.testing.assert_array_equal(told[0][1], told[1][1])
-    belief = Belief(rules, first)
-    operator = filter_of(belief)
-    before = belief.predicted()
-    _, kept = operator.assimilate(voltages[None] + np.linspace(-3.0, 3.0, 16), rules.table[7][None])
-    assert not kept.any()
-    assert operator.innovations() == [None]
-    np.testing.assert_allclose(operator.covariance[0], before, atol=1e-12)
-
-
-def test_prior_is_that_of_the_baselines():
-    """The same episodes, the same prior, to the digits of its file; short records change nothing."""
-    task = make_task(PIPE_2D)
-    kept = suiting_priors(baseline_folder() / "priors", task, "logarithm")[0]
-    learned = prior_of(PIPE_2D.sound)
-    assert kept.source["seeds"] == "train:0-199"
-    assert parse_seeds("train:0-199") == list(range(200))
-    np.testing.assert_allclose(learned.correlation, kept.correlation, atol=1e-8)
-    np.testing.assert_allclose(learned.modes @ learned.modes.T, kept.modes @ kept.modes.T, atol=1e-8)
-    shorter = prior_of(PIPE_2D.changed({"schedule": {"scored_steps": 3}}))
-    np.testing.assert_array_equal(shorter.correlation, learned.correlation)
-
-
 @pytest.mark.parametrize("name", [FAULTS, BUDGET])
 def test_other_worlds_may_know_the_inflow_too(name):
     """By an argument; what is believed is no part of the world, nor of its episodes."""
@@ -200,10 +155,3 @@ def test_wrong_inflows_are_named(name, inflow, message):
     """Before anything is computed."""
     with pytest.raises(ValueError, match=message):
         make("reduced", name, inflow=inflow)
-
-
-def test_ids_say_what_the_filter_believes():
-    """Registered as a setting, white where none is."""
-    for name, believed in ((INFLOW, "learned"), (FAULTS, "white")):
-        assert entry(name).settings.get("inflow", "white") == believed
-        assert make("reduced", name).unwrapped.rules.inflow == believed

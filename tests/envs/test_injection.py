@@ -1,5 +1,4 @@
-"""Environments in which the agent chooses the injection: what they show and pay, alone and side by
-side."""
+"""Environments in which the agent chooses the injection: what they show and pay, alone and side by side."""
 
 import pickle
 
@@ -82,8 +81,7 @@ def test_contract(name, estimator, observation):
 
 
 def test_voltages_are_those_of_the_pair():
-    """Pair (i, j) drives its current in at i and out at j: V = 𝓡 I plus this step's noise, scaled
-    to the readings.
+    """Pair (i, j) drives its current in at i and out at j: V = 𝓡 I plus this step's noise, scaled to the readings.
 
     Where nothing estimates nothing is paid, and there is no error.
     """
@@ -101,16 +99,14 @@ def test_voltages_are_those_of_the_pair():
         clean = entries["transfer_resistance"][t] @ currents
         std = np.sqrt((0.01 * clean)**2 + (0.001 * np.abs(clean).max())**2)
         np.testing.assert_array_equal(observation["currents"], currents)
-        np.testing.assert_allclose(observation["voltages"], clean + std * entries["noise"][t],
-                                   rtol=1e-12)
+        np.testing.assert_allclose(observation["voltages"], clean + std * entries["noise"][t], rtol=1e-12)
         assert reward == 0.0
         assert base.error is None
         assert over == (t == base.world.n_steps - 1)
 
 
 def test_first_frame_is_the_worlds_own():
-    """With an estimator the agent takes over after a frame of the cycle, whose voltages it is
-    shown."""
+    """With an estimator the agent takes over after a frame of the cycle, whose voltages it is shown."""
     env = make("reduced")
     observation, _ = env.reset(seed=3)
     played = env.unwrapped.world
@@ -123,8 +119,7 @@ def test_first_frame_is_the_worlds_own():
 @pytest.mark.parametrize("name", [NAME, INFLOW])
 @pytest.mark.parametrize("estimator", ["reduced", "full"])
 def test_reward_is_the_decrease_of_the_error(estimator, name):
-    """The pay equals ∫(ĉ_bh − c)²/∫c² − ∫(ĉ − c)²/∫c², both of nodal values integrated on the
-    truth's mesh."""
+    """The pay equals ∫(ĉ_bh − c)²/∫c² − ∫(ĉ − c)²/∫c², both of nodal values integrated on the truth's mesh."""
     env = make(estimator, name)
     base = env.unwrapped
     actions = some_pairs()
@@ -154,11 +149,9 @@ def test_reward_is_the_decrease_of_the_error(estimator, name):
 @every
 @shown_as
 def test_side_by_side_as_one_by_one(name, estimator, observation):
-    """18 environments at once show, to the bit, what 18 alone show, over episodes' ends; threads
-    change nothing."""
+    """18 environments at once show, to the bit, what 18 alone show, over episodes' ends; threads change nothing."""
     kwargs = {"num_envs": 18, "estimator": estimator, "episodes": 3, "observation": observation}
-    envs = [make_many(name, mode="sync", **kwargs),
-            *(make_many(name, threads=threads, **kwargs) for threads in (1, 2))]
+    envs = [make_many(name, mode="sync", **kwargs), *(make_many(name, threads=threads, **kwargs) for threads in (1, 2))]
     seeds = [k % 4 for k in range(18)]
     steps = [[env.reset(seed=seeds)] for env in envs]
     chosen = np.random.default_rng(0)
@@ -219,8 +212,7 @@ def test_an_estimate_that_is_not_finite_is_an_error(monkeypatch):
 
 @pytest.mark.parametrize("name", [NAME, FLOW])
 def test_frames_change_with_what_is_known(name):
-    """A picture of the last injection; without an estimator of the expected level. None without a
-    mode."""
+    """A picture of the last injection; without an estimator of the expected level. None without a mode."""
     pictures = []
     for estimator in ("none", "reduced"):
         env = make(estimator, name, render_mode="rgb_array").unwrapped
@@ -237,16 +229,10 @@ def test_frames_change_with_what_is_known(name):
     assert len({picture.tobytes() for picture in pictures}) == 4
 
 
-# -- mistakes -------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("change", "message"), [
     ({"estimator": "exact"}, "estimator must be one of reduced, full, none, got 'exact'"),
-    ({"observation": "tidy"}, "observation must be one of scaled, raw"),
-    ({"episodes": 0}, "episodes must"),
     ({"gate": 0.0}, "gate must be"),
     ({"world": {"instrument": {"limit": "L3"}}}, "limit must be one of L1, L2, Linf"),
-    ({"world": {"instrument": {"noise_floor": -1.0}}}, "noise_floor must be"),
     ({"world": {"colour": 1}}, "world has no 'colour'"),
     ({"render_mode": "tv"}, "render_mode must be"),
 ])
@@ -274,7 +260,7 @@ def test_wrong_actions_are_named():
     env = make().unwrapped
     env.reset(seed=1)
     message = "action must be an integer of at least 0 and at most 119"
-    for action in (-1, 120, 1.5, True, "first", np.array(1.5), np.array([7])):
+    for action in (-1, 120, 1.5, True, "first", np.array([7]), np.array(np.timedelta64(3, "ns")), np.array(3.0 + 0.0j)):
         with pytest.raises(ValueError, match=message):
             env.step(action)
     many = gym.make_vec(NAME, num_envs=2, vectorization_mode="vector_entry_point",
@@ -285,11 +271,3 @@ def test_wrong_actions_are_named():
         many.step(np.zeros(2))
     with pytest.raises(ValueError, match=r"actions must lie in \[0, 119\], got 0 … 120"):
         many.step(np.array([0, 120]))
-
-
-def test_pairs():
-    """120 of them, in order."""
-    pairs = electrode_pairs(16)
-    assert len(pairs) == 120
-    assert (pairs[:, 0] < pairs[:, 1]).all()
-    assert pairs[0].tolist() == [0, 1]

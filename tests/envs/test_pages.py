@@ -2,12 +2,10 @@
 
 import inspect
 import re
-from dataclasses import make_dataclass
 
 import gymnasium as gym
 import pytest
 from eitbench import page
-from eitbench.envs import pages
 from eitbench.worlds import entries
 
 
@@ -67,16 +65,3 @@ def test_numbers_are_the_worlds(described):
             assert value == str(list(part) if isinstance(part, tuple) else part)
     assert len(values) > 30 and all(meanings.values())
     assert {"schedule.time_step", "instrument.noise_relative", "prior.nodal_std", "target.background"} <= set(values)
-
-
-def test_an_unknown_id_is_refused():
-    """With the known ones."""
-    with pytest.raises(ValueError, match=r"env must be one of eitbench/Pipe2D-v0, .*got 'mine/No-v0'"):
-        page("mine/No-v0")
-
-
-def test_a_bar_within_a_cell_is_escaped():
-    """Of a part's docstring."""
-    part = make_dataclass("Bar", [("size", int, 1)])()
-    type(part).__doc__ = "|I| ≤ 1"
-    assert pages._rows("bar", part, "a limit")[0] == r"| `bar` | Bar | a limit. \|I\| ≤ 1 |"

@@ -4,11 +4,8 @@ import numpy as np
 import pytest
 from eitbench import scoring
 from eitbench.data.recordings import score_operators
-from eitbench.worlds import entry
 from estimating import AT_HOME, VELOCITY, best_velocity, make
 
-PARAMETERS = {"Pipe2DUnknownVelocity": 1, "Pipe2DTimeVaryingVelocity": 1, "Pipe2DSkewedVelocity": 3}
-"""Of the flow, by the name of the world."""
 each_velocity = pytest.mark.parametrize("name", VELOCITY)
 
 
@@ -19,14 +16,12 @@ def name(request):
 
 
 def test_action_is_one_number_a_node_and_one_a_parameter_of_the_flow(name):
-    """(n + k,), symmetric about zero: ten times the expected concentration, and ten times the
-    velocity."""
+    """(n + k,), symmetric about zero: ten times the expected concentration, and ten times the velocity."""
     env = make(name)
     task = env.unwrapped.task
     n = task.mesh.n_nodes
-    k = PARAMETERS.get(entry(name).world.name, 0)
     velocity = env.unwrapped.world.velocity_model
-    assert k == (0 if velocity is None else velocity.size)
+    k = 0 if velocity is None else velocity.size
     assert task.velocity == velocity
     assert env.unwrapped.n_nodes == n
     assert env.action_space.shape == (n + k,)
@@ -35,17 +30,11 @@ def test_action_is_one_number_a_node_and_one_a_parameter_of_the_flow(name):
     np.testing.assert_array_equal(env.action_space.low, -expected)
 
 
-def test_every_velocity_has_its_parameters():
-    """The table above is of all worlds in which the flow is asked for."""
-    assert {entry(id).world.name for id in VELOCITY} == set(PARAMETERS)
-
-
 def test_reward_is_minus_the_relative_error_of_the_state_asked_for(name):
-    """At step i the state i − lag is scored, if it lies past the warm-up; the true state at the
-    nodes earns about 0.
+    """At step i the state i − lag is scored, if it lies past the warm-up; the true state at the nodes earns about 0.
 
-    What it earns is what the coarser mesh cannot hold, computed here on the truth's mesh; half as
-    much again errs by a quarter. The flow that fits best is given with it, where one is asked for.
+    What it earns is what the coarser mesh cannot hold, computed here on the truth's mesh; half as much again errs by a
+    quarter. The flow that fits best is given with it, where one is asked for.
     """
     env = make(name)
     base = env.unwrapped
@@ -76,11 +65,9 @@ def test_reward_is_minus_the_relative_error_of_the_state_asked_for(name):
 
 @each_velocity
 def test_reward_has_a_second_term_for_the_flow(name):
-    """−∫(v̂ − v)²/∫v² is added: nothing for the best fit, −1 for none and for twice the flow, else
-    as by quadrature.
+    """−∫(v̂ − v)²/∫v² is added: nothing for the best fit, −1 for none and for twice the flow, else as by quadrature.
 
-    ∫v̂ v is that of the recorded profile; the concentration is the same throughout, so that
-    differences are the flow's.
+    ∫v̂ v is that of the recorded profile; the concentration is the same throughout, so that differences are the flow's.
     """
     base = make(name).unwrapped
     base.reset(seed=1)
@@ -95,12 +82,10 @@ def test_reward_has_a_second_term_for_the_flow(name):
     earned = {}
     for label, guess in guesses.items():
         base.reset(seed=1)
-        earned[label] = np.array([base.step(np.append(level, guess(t)))[1]
-                                  for t in range(1, task.n_steps + 1)])
+        earned[label] = np.array([base.step(np.append(level, guess(t)))[1] for t in range(1, task.n_steps + 1)])
     scored = slice(task.warm_up, None)
     to_truth, mass = score_operators(base.world)
-    concentration = np.array([scoring.step_errors((to_truth @ level)[None], c[None], mass)[0]
-                              for c in base.truth()])
+    concentration = np.array([scoring.step_errors((to_truth @ level)[None], c[None], mass)[0] for c in base.truth()])
     terms = {label: -(rewards + concentration)[scored] for label, rewards in earned.items()}
     squared = (true**2 @ model.weights)[scored]
     np.testing.assert_allclose(terms["none"], 1.0, atol=1e-7)
@@ -117,8 +102,7 @@ def test_reward_has_a_second_term_for_the_flow(name):
 
 
 def test_what_is_revealed_is_the_episode(name):
-    """References are shown the whole record, which is what an agent sees step by step, and the flow
-    that there was."""
+    """References are shown the whole record, which is what an agent sees step by step, and the flow that there was."""
     base = make(name).unwrapped
     seen = [base.reset(seed=1)[0]]
     revealed = base.reveal()

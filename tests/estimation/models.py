@@ -1,5 +1,4 @@
-"""Small worlds for the estimators, and the textbook in plain dense matrices to compare them
-with."""
+"""Small worlds for the estimators, and the textbook in plain dense matrices to compare them with."""
 
 from functools import lru_cache
 from typing import NamedTuple
@@ -13,7 +12,12 @@ from eitbench.estimation import (
     Observation,
     table_5_1,
 )
+from eitbench.numerics.mesh import rectangle_mesh
+from eitbench.physics.transport import ConvectionDiffusion
 from eitbench.worlds.catalogue import PIPE_2D
+from eitbench.worlds.task import make_task
+
+from tiny_worlds import TINY
 
 
 class LinearGaussian(NamedTuple):
@@ -43,8 +47,7 @@ class Gaussian(NamedTuple):
 
 
 def random_model(rng, n=14, radius=0.9):
-    """A stable model far from normal (‖F‖ ≈ 1.7, as in the pipe), with noise of less than full
-    rank."""
+    """A stable model far from normal (‖F‖ ≈ 1.7, as in the pipe), with noise of less than full rank."""
     F = rng.normal(size=(n, n))
     F *= radius / np.abs(np.linalg.eigvals(F)).max()
     gain = rng.normal(size=(n, n // 2))
@@ -56,8 +59,7 @@ def random_model(rng, n=14, radius=0.9):
 def random_design(rng, n, steps, m=3, noise=(50.0, 500.0)):
     """Another observation matrix (m, n) and other noise variances (m,) at each step.
 
-    By default the noise is about as large as what the state adds to a measurement, so that both
-    count.
+    By default the noise is about as large as what the state adds to a measurement, so that both count.
     """
     return [(rng.normal(size=(m, n)), rng.uniform(*noise, m)) for _ in range(steps)]
 
@@ -74,15 +76,11 @@ def draw(model, design, rng):
     return np.array(truth), observations
 
 
-# -- the textbook ---------------------------------------------------------------------------------
-
-
 def dense_filter(model, observations):
     """The Kalman recursion with n×n covariances: [(predicted, filtered)] for t = 1 … T."""
     now, steps = Gaussian(model.mean, model.covariance), []
     for H, value, variance in observations:
-        predicted = Gaussian(model.F @ now.mean + model.s,
-                             model.F @ now.covariance @ model.F.T + model.Q)
+        predicted = Gaussian(model.F @ now.mean + model.s, model.F @ now.covariance @ model.F.T + model.Q)
         P = predicted.covariance
         K = np.linalg.solve(H @ P @ H.T + np.diag(variance), H @ P).T
         now = Gaussian(predicted.mean + K @ (value - H @ predicted.mean), P - K @ H @ P)
@@ -91,21 +89,18 @@ def dense_filter(model, observations):
 
 
 def rauch_tung_striebel(model, steps):
-    """The smoother that comes back over `dense_filter` with an n×n inverse a step: [smoothed] for t
-    = 1 … T."""
+    """The smoother that comes back over `dense_filter` with an n×n inverse a step: [smoothed] for t = 1 … T."""
     smoothed = [steps[-1][1]]
     for (_, filtered), (predicted, _) in zip(steps[-2::-1], steps[:0:-1], strict=True):
         G = np.linalg.solve(predicted.covariance, model.F @ filtered.covariance).T
         last = smoothed[-1]
         less = G @ (last.covariance - predicted.covariance) @ G.T
-        smoothed.append(Gaussian(filtered.mean + G @ (last.mean - predicted.mean),
-                                 filtered.covariance + less))
+        smoothed.append(Gaussian(filtered.mean + G @ (last.mean - predicted.mean), filtered.covariance + less))
     return smoothed[::-1]
 
 
 def joint_posterior(model, observations):
-    """All states c₁ … c_T given all measurements at once, from their joint Gaussian without any
-    recursion."""
+    """All states c₁ … c_T given all measurements at once, from their joint Gaussian without any recursion."""
     n, T = len(model.mean), len(observations)
     # c = A (offset + w), where A holds the powers of F and w the independent noises, c₀ being the
     # first of them.
@@ -124,13 +119,9 @@ def joint_posterior(model, observations):
     return [Gaussian(mean[i:i + n], C[i:i + n, i:i + n]) for i in range(n, (T + 1) * n, n)]
 
 
-# -- the pipe -------------------------------------------------------------------------------------
-
-
 @lru_cache(maxsize=1)
 def pipe(steps=5):
-    """The thesis' pipe with n = 1701: its model in full matrices, a maker of its filter,
-    observations, `dense_filter`.
+    """The thesis' pipe with n = 1701: its model in full matrices, a maker of its filter, observations, `dense_filter`.
 
     The full matrices are put together from Table 5.1 here, the filter by ``table_5_1``.
     """
@@ -141,8 +132,7 @@ def pipe(steps=5):
     F, Y, H = evolution
     n, m = len(F), Y.shape[1]
     noise = evolution.state_noise_covariance((c_bh / 4)**2, (c_bh / 50)**2)
-    model = LinearGaussian(F, Y @ np.full(m, c_bh), noise, np.full(n, c_bh),
-                           (c_bh / 4)**2 * np.eye(n))
+    model = LinearGaussian(F, Y @ np.full(m, c_bh), noise, np.full(n, c_bh), (c_bh / 4)**2 * np.eye(n))
     linearised = LinearisedObservations(observation, PIPE_2D.noise, np.full(n, c_bh))
     c = c_bh * rng.uniform(0.9, 1.1, n)
     observations = []
@@ -159,12 +149,8 @@ def pipe(steps=5):
     return model, make_filter, observations, exact
 
 
-# -- nonlinear observations -----------------------------------------------------------------------
-
-
 class QuadraticModel:
-    """R(c) I = Σ_j c_j² T_j I with symmetric T_j: a stand-in for ``ObservationModel``, linear in
-    the currents I."""
+    """R(c) I = Σ_j c_j² T_j I with symmetric T_j: a stand-in for ``ObservationModel``, linear in the currents I."""
 
     def __init__(self, rng, n=6, electrodes=4):
         T = rng.normal(size=(n, electrodes, electrodes))
@@ -176,8 +162,13 @@ class QuadraticModel:
 
     def linearise(self, concentration, currents):
         self.calls += 1
-        return (self.voltages(concentration, currents),
-                np.einsum("j,jlm,km->klj", 2 * concentration, self.T, currents))
+        return (self.voltages(concentration, currents), np.einsum("j,jlm,km->klj", 2 * concentration, self.T, currents))
+
+
+@lru_cache(maxsize=1)
+def tiny_task():
+    """The task of the tiny world."""
+    return make_task(TINY)
 
 
 def white_inflow(task):
@@ -185,3 +176,44 @@ def white_inflow(task):
     points = task.mesh.points[task.transport.inlet]
     return InflowPrior("linear", points, task.prior.inflow_std * np.eye(len(points)), np.ones(1),
                        task.transport.time_step)
+
+
+def two_modes(points, time_step=5e-3, link="logarithm", size=0.2, regimes=None):
+    """A prior of two modes across the inlet's nodes, correlated over four steps."""
+    r = points[:, 1] / R
+    return InflowPrior(link, points, size * np.stack([np.exp(-r**2), r], axis=1), 0.6**np.arange(5)**2.0, time_step,
+                       regimes=regimes)
+
+
+R = 0.05
+"""Half the height of the pipe in m."""
+MESH = rectangle_mesh(np.linspace(0.0, 0.4, 21), np.linspace(-R, R, 7))
+"""A coarse pipe of 147 nodes."""
+PROFILES = [lambda eta: 1.5 * (1 - eta**2), lambda eta: 1.5 * eta * (1 - eta**2),
+            lambda eta: 1.5 * (1 - eta**2) * (5 * eta**2 - 1)]
+HEIGHTS = np.linspace(-0.9, 0.9, 13)
+
+
+def directions(k):
+    """The fields of the first k profiles."""
+    return [lambda points, profile=profile: np.column_stack([profile(points[:, 1] / R), np.zeros(len(points))])
+            for profile in PROFILES[:k]]
+
+
+def shapes(k):
+    """(13, k) values of the first k profiles."""
+    return np.stack([profile(HEIGHTS) for profile in PROFILES[:k]], axis=1)
+
+
+def coarse_transport(theta, diffusivity):
+    """v = Σ θ_k v_k in the coarse pipe; fluid of mean speed 4.5 m/s passes it in 18 steps."""
+    fields = directions(len(theta))
+    return ConvectionDiffusion(MESH, lambda points: sum(t * v(points) for t, v in zip(theta, fields, strict=True)),
+                               diffusivity, 5e-3, substeps=4, inlet=np.arange(7))
+
+
+def averages(mesh, random, m):
+    """(m, n) averages about m random places, a little wider than a cell."""
+    places = random.uniform([0.0, -R], [0.4, R], (m, 2))
+    weights = np.exp(-0.5 * (((mesh.points - places[:, None]) / [0.02, 0.015])**2).sum(axis=2))
+    return weights / weights.sum(axis=1, keepdims=True)

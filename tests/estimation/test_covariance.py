@@ -56,17 +56,6 @@ def test_tolerance_drops_only_what_is_small(model):
     np.testing.assert_allclose(free(nothing).apply(1, np.eye(14)), model.Q, atol=1e-10 * np.abs(model.Q).max())
 
 
-def test_scaled_is_the_same_sequence_times_a_factor(model):
-    """Factors multiply, and the original stays as it was."""
-    covariance = free(model)
-    X, t = np.eye(14), 5
-    once = covariance.apply(t, X)
-    twice = covariance.scaled(2.0).scaled(3.5)
-    np.testing.assert_allclose(twice.apply(t, X), 7.0 * once, rtol=1e-14)
-    np.testing.assert_allclose(twice.diagonal(t), 7.0 * covariance.diagonal(t), rtol=1e-14)
-    np.testing.assert_array_equal(covariance.apply(t, X), once)
-
-
 @pytest.mark.parametrize("radius", [1.0, 1.02, 3.0])
 def test_a_state_that_never_settles_has_no_limit(radius):
     """Spectral radius ≥ 1 with noise: the covariance grows without end, which is an error."""

@@ -71,18 +71,6 @@ def test_target_at_rest_is_the_batch_estimate():
     np.testing.assert_allclose(filter_.covariance, np.linalg.inv(information), atol=1e-10)
 
 
-def test_at_rest_with_noise_the_covariance_grows_by_it():
-    """F = I: the mean stays, forcing is added, the covariance becomes Γ + Γ_w; without noise nothing changes."""
-    model = random_model(np.random.default_rng(5))
-    filter_ = DenseKalmanFilter(model.mean, model.covariance)
-    filter_.predict()
-    np.testing.assert_array_equal(filter_.mean, model.mean)
-    np.testing.assert_allclose(filter_.covariance, model.covariance, rtol=1e-14)
-    filter_.predict(forcing=model.s, noise=model.Q)
-    np.testing.assert_allclose(filter_.mean, model.mean + model.s, rtol=1e-14)
-    np.testing.assert_allclose(filter_.covariance, model.covariance + model.Q, rtol=1e-13)
-
-
 def test_a_given_mean_takes_the_place_of_the_linear_one():
     """As an extended filter needs it: the covariance moves with F, the mean is what is handed in."""
     model = random_model(np.random.default_rng(6))
@@ -109,16 +97,6 @@ def test_arguments_stay_as_they_are():
         np.testing.assert_array_equal(step.variance, before)
     for array, copy in zip(model, kept, strict=True):
         np.testing.assert_array_equal(array, copy)
-
-
-def test_covariance_stays_symmetric():
-    """Many turns and precise measurements later it still equals its transpose to the bit."""
-    rng, n = np.random.default_rng(8), 150
-    filter_, F = DenseKalmanFilter(np.zeros(n), 1e3 * np.eye(n)), np.linalg.qr(rng.normal(size=(n, n)))[0]
-    for H, variance in random_design(rng, n, 40, m=20, noise=(1e-4, 1e-3)):
-        filter_.predict(F)
-        filter_.update(Observation(H, np.zeros(20), variance))
-        np.testing.assert_array_equal(filter_.covariance, filter_.covariance.T)
 
 
 def test_variances_are_never_negative():

@@ -12,8 +12,7 @@ PAIRS = electrode_pairs(L)
 
 
 def a_state(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Derivatives of 𝓡 (L, L, n), covariance, weight of the errors, noise variances (pairs, L); all
-    at random."""
+    """Derivatives of 𝓡 (L, L, n), covariance, weight of the errors, noise variances (pairs, L); all at random."""
     rng = np.random.default_rng(seed)
     roots = rng.normal(size=(2, N, N))
     covariance, weight = roots @ roots.swapaxes(1, 2)
@@ -22,10 +21,8 @@ def a_state(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
 
 def gains_of(derivative, covariance, weight, noise_variance):
     rows = derivative.reshape(L * L, N)
-    plain, weighted = (rows @ middle @ rows.T
-                       for middle in (covariance, covariance @ weight @ covariance))
-    return pair_gains(plain.reshape(L, L, L, L), weighted.reshape(L, L, L, L), PAIRS,
-                      noise_variance)
+    plain, weighted = (rows @ middle @ rows.T for middle in (covariance, covariance @ weight @ covariance))
+    return pair_gains(plain.reshape(L, L, L, L), weighted.reshape(L, L, L, L), PAIRS, noise_variance)
 
 
 def textbook(matrix: np.ndarray, covariance: np.ndarray, noise_variance: np.ndarray) -> np.ndarray:
@@ -37,8 +34,7 @@ def textbook(matrix: np.ndarray, covariance: np.ndarray, noise_variance: np.ndar
 @settings(max_examples=20)
 @given(st.integers(0, 2**32 - 1))
 def test_gains_are_what_the_update_takes_away(seed):
-    """Of every pair: tr(W P) before less after, and half the logarithm of det P before over
-    after."""
+    """Of every pair: tr(W P) before less after, and half the logarithm of det P before over after."""
     derivative, covariance, weight, noise_variance = a_state(seed)
     traces, bits = gains_of(derivative, covariance, weight, noise_variance)
     for k, (i, j) in enumerate(PAIRS):

@@ -6,17 +6,11 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from eitbench.estimation import (
-    EnsembleFilter,
-    InflowFilter,
-    InflowPrior,
-    Observation,
-    UnknownFlow,
-    inflow_response,
-)
+from eitbench.estimation import EnsembleFilter, InflowFilter, Observation, UnknownFlow, inflow_response
 from eitbench.numerics.mesh import rectangle_mesh
 from eitbench.physics.transport import ConvectionDiffusion
 from eitbench.worlds.task import make_task
+from models import averages, two_modes
 
 from tiny_worlds import TINY
 
@@ -41,8 +35,7 @@ def task():
 
 
 def prior(link):
-    r = MESH.points[:5, 1] / R
-    return InflowPrior(link, MESH.points[:5], 0.2 * np.stack([np.exp(-r**2), r], axis=1), 0.6**np.arange(5)**2.0, 5e-3)
+    return two_modes(MESH.points[:5], link=link)
 
 
 def ensemble(link="logarithm", members=40, std=0.5, lead_in=24):
@@ -52,11 +45,8 @@ def ensemble(link="logarithm", members=40, std=0.5, lead_in=24):
 
 
 def observation(seed=5, m=6, variance=0.1):
-    """Averages about random places, a little wider than a cell."""
     random = np.random.default_rng(seed)
-    places = random.uniform([0.0, -R], [0.4, R], (m, 2))
-    weights = np.exp(-0.5 * (((MESH.points - places[:, None]) / [0.02, 0.015])**2).sum(axis=2))
-    H = weights / weights.sum(axis=1, keepdims=True)
+    H = averages(MESH, random, m)
     return Observation(H, LEVEL + 3.0 * random.normal(size=m), np.full(m, variance))
 
 

@@ -6,14 +6,12 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from eitbench.bench.methods import baseline_folder
 from eitbench.data.dataset import Dataset
 from eitbench.data.seeds import parse_seeds
 from eitbench.estimation import (
     FirstFrame,
     IdentifiedModel,
     InflowFilter,
-    InflowPrior,
     QuadraticVoltages,
     identified_model,
     most_probable_inflow,
@@ -22,8 +20,10 @@ from eitbench.estimation import (
     suiting_models,
 )
 from eitbench.estimation.kalman import Observation, linearised
-from eitbench.worlds.catalogue import PIPE_2D, PIPE_2D_BIASED, PIPE_2D_OBSTACLE, PIPE_3D
+from eitbench.worlds.catalogue import PIPE_2D
 from eitbench.worlds.task import make_task
+from models import tiny_task as task
+from models import two_modes
 from scipy.linalg import toeplitz
 
 from tiny_worlds import TINY
@@ -36,21 +36,13 @@ def examples(seeds):
 
 
 @lru_cache(maxsize=1)
-def task():
-    return make_task(TINY)
-
-
-@lru_cache(maxsize=1)
 def model():
     return identified_model(examples("train:0-23"), modes=24)
 
 
 @lru_cache(maxsize=1)
 def prior():
-    points = task().mesh.points[task().transport.inlet]
-    r = points[:, 1] / 0.05
-    return InflowPrior("logarithm", points, 0.2 * np.stack([np.exp(-r**2), r], axis=1), 0.6**np.arange(5)**2.0,
-                       task().transport.time_step)
+    return two_modes(task().mesh.points[task().transport.inlet], task().transport.time_step)
 
 
 def made(response, seed):
@@ -61,9 +53,6 @@ def made(response, seed):
     end = len(s) - TINY.n_steps
     past = [s[end + t:end + t - K:-1] for t in range(TINY.n_steps)]
     return np.array([response.basis @ np.tensordot(response.weights, each, 2) for each in past])
-
-
-# -- what is learned --------------------------------------------------------------------------------------------------
 
 
 def test_makes_states_of_episodes_that_it_never_saw():
@@ -100,11 +89,6 @@ def test_corrects_the_flow_as_told_from_few_episodes():
     assert off["corrected by 8"] < off["told"] < 0.5 * off["begun from nothing by 8"]
     assert off["corrected by 24"] < 0.6 * off["told"]
     assert 0.5 < off["corrected by 24"] / corrected.spread.trace() < 6.0
-
-
-def test_basis_is_orthonormal_in_the_scores_norm():
-    mass = examples("train:0").mass
-    np.testing.assert_allclose(model().basis.T @ (mass @ model().basis), np.eye(24), atol=1e-9)
 
 
 def test_mean_error_is_that_of_the_readings():
@@ -165,8 +149,7 @@ def test_filter_linearises_once_if_the_model_says_so():
         known = filter_.covariance[:slope.shape[1], :slope.shape[1]]
         flow = LEVEL * at.matrix @ once().basis
         number = int(np.flatnonzero(np.isclose(once().patterns, currents).all(axis=1))[0])
-        S = (slope @ known @ slope.T + flow @ once().spread @ flow.T
-             + std[:, None] * once().scatter[number] * std)
+        S = (slope @ known @ slope.T + flow @ once().spread @ flow.T + std[:, None] * once().scatter[number] * std)
         expected = at.value - at.matrix @ filter_.concentration() - std * once().bias[number]
         told = filter_.update(voltages, currents)
         np.testing.assert_allclose(told.covariance, S, rtol=1e-9, atol=1e-12 * S.max())
@@ -182,9 +165,6 @@ def test_learns_from_train_alone():
         identified_model(examples("train:0"), modes=24)
     with pytest.raises(ValueError, match="at least 4 episodes to correct the flow as told, got 3"):
         identified_model(examples("train:0-2"), modes=4, correct=True)
-
-
-# -- filters that take it ---------------------------------------------------------------------------------------------
 
 
 def test_filter_is_gaussian_conditioning():
@@ -265,9 +245,6 @@ def test_smoother_takes_out_the_mean_error():
     np.testing.assert_allclose(with_error.mean, without.mean, atol=0.02)
 
 
-# -- files ------------------------------------------------------------------------------------------------------------
-
-
 def test_a_file_says_all(tmp_path):
     """To single precision."""
     model().save(tmp_path / "a.npz")
@@ -292,27 +269,6 @@ def test_other_files_are_told(tmp_path):
         replace(model(), spread=np.eye(3))
     with pytest.raises(ValueError, match=r"scatter must have shape"):
         replace(model(), scatter=np.eye(4))
-
-
-@pytest.mark.parametrize("world, env, folder, learned", [
-    (PIPE_2D, "Pipe2D", "models", {"seeds": "train:0-199", "modes": 64}),
-    (PIPE_2D_OBSTACLE, "Pipe2DObstacle", "models", {"seeds": "train:0-199", "modes": 64}),
-    (PIPE_3D, "Pipe3D", "models", {"seeds": "train:0-31", "modes": 112, "correct": True}),
-    (PIPE_2D, "Pipe2D", "models/linearised",
-     {"seeds": "train:0-39", "modes": 64, "correct": True, "linearised": True}),
-    (PIPE_2D_BIASED, "Pipe2DBiasedVelocity", "models/linearised",
-     {"seeds": "train:0-39", "modes": 64, "correct": True, "linearised": True})])
-def test_ours_are_of_the_boards_they_name(world, env, folder, learned):
-    """Those of the task's own world come first; of a task that is told another flow they are not."""
-    models = baseline_folder() / folder
-    ours = suiting_models(models, make_task(world))[0]
-    assert ours.source == {"environment": f"eitbench/{env}-v0"} | learned
-    assert (ours.scatter is not None) == ("linearised" in learned)
-    if world is PIPE_2D:
-        assert not suiting_models(models, make_task(world, mean_velocity=4.0))
-
-
-# -- voltages in no time ----------------------------------------------------------------------------------------------
 
 
 @lru_cache(maxsize=1)
@@ -349,10 +305,3 @@ def test_derivatives_of_quadratic_voltages():
         step = 1e-4 * np.random.default_rng(seed).standard_normal(len(c))
         change = (quadratic().voltages(c + step, I) - quadratic().voltages(c - step, I)) / 2
         np.testing.assert_allclose(by_c @ step, change, atol=1e-6 * np.abs(change).max())
-
-
-def test_quadratic_voltages_name_what_is_wrong():
-    with pytest.raises(ValueError, match="level must be"):
-        QuadraticVoltages(task().observation, 0.0, model().basis)
-    with pytest.raises(ValueError, match="modes must have shape"):
-        QuadraticVoltages(task().observation, LEVEL, np.ones(3))

@@ -23,7 +23,8 @@ from eitbench.worlds.catalogue import PIPE_2D_OBSTACLE
 from eitbench.worlds.catalogue import ROTATING_TANK_2D as ROTATING_TANK
 from eitbench.worlds.catalogue import STATIONARY_TANK_2D as STATIONARY_TANK
 from eitbench.worlds.task import make_task
-from models import white_inflow
+from models import tiny_task as task
+from models import two_modes, white_inflow
 from scipy.linalg import toeplitz
 
 from tiny_worlds import TINY
@@ -31,18 +32,10 @@ from tiny_worlds import TINY
 LEVEL = 29.0
 
 
-@lru_cache(maxsize=1)
-def task():
-    return make_task(TINY)
-
-
 @lru_cache(maxsize=2)
 def prior(link="logarithm"):
     """Two modes across the inlet, a correlation over four steps."""
-    points = task().mesh.points[task().transport.inlet]
-    r = points[:, 1] / 0.05
-    return InflowPrior(link, points, 0.2 * np.stack([np.exp(-r**2), r], axis=1), 0.6**np.arange(5)**2.0,
-                       task().transport.time_step)
+    return two_modes(task().mesh.points[task().transport.inlet], task().transport.time_step, link)
 
 
 def record(seed=0):
@@ -71,9 +64,6 @@ def stepped(inflow, lag=0):
     return LEVEL + deviation
 
 
-# -- a flow that changes ----------------------------------------------------------------------------------------------
-
-
 def test_a_flow_that_changes_carries_each_inflow_by_what_flowed_then():
     """Inflows carried on step by step, each step by its own transport; before the first it was as in it."""
     nominal, faster = (make_task(TINY.changed({"flow": {"mean_velocity": speed}})).transport for speed in (45.0, 60.0))
@@ -87,9 +77,6 @@ def test_a_flow_that_changes_carries_each_inflow_by_what_flowed_then():
         before = after
     made = response.basis @ np.tensordot(response.weights, inflow[::-1][:K], 2)
     assert np.linalg.norm(made - state) < 0.02 * np.linalg.norm(state)                   # 0.01 is forgotten
-
-
-# -- the history makes the concentration ------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("link", ["linear", "logarithm"])
@@ -118,9 +105,6 @@ def test_derivatives_are_those_of_the_concentration(link):
                 sides.append(filter_.concentration(1)[::40])
             difference = (sides[0] - sides[1]) / 2e-4
             np.testing.assert_allclose(slope[:, 2 * k + mode], difference, atol=1e-6 * LEVEL)
-
-
-# -- the filter against dense conditioning ----------------------------------------------------------------------------
 
 
 def dense(filter_, observations, times):
@@ -189,9 +173,6 @@ def test_prediction_keeps_the_prior():
     assert not filter_.mean.any()
 
 
-# -- the most probable history ----------------------------------------------------------------------------------------
-
-
 @lru_cache(maxsize=1)
 def most_probable():
     smoother = smoothed_inflow(task(), prior(), LEVEL, record())
@@ -226,20 +207,6 @@ def test_nothing_is_more_probable():
         assert density(smoother, best + step, std) > least
         assert density(smoother, best - step, std) > least
     smoother.mean = best
-
-
-def test_linear_history_is_found_at_once():
-    """With a linear link and readings that hardly differ from linear ones the smoother is the maximum already: weak
-    inflows, to a hundredth of their standard deviation."""
-    weak = InflowPrior("linear", prior().points, 1e-3 * prior().modes, prior().correlation, prior().time_step)
-    smoother = smoothed_inflow(task(), weak, LEVEL, record())
-    mean, covariance = smoother.mean.copy(), smoother.covariance.copy()
-    most_probable_inflow(smoother, record())
-    np.testing.assert_allclose(smoother.mean, mean, atol=0.01)
-    np.testing.assert_allclose(smoother.covariance, covariance, atol=0.01)
-
-
-# -- learning the prior -----------------------------------------------------------------------------------------------
 
 
 def test_learns_the_law_of_what_it_is_shown():
@@ -288,9 +255,6 @@ def test_learns_from_train_alone():
         learned_inflow_prior(TINY, parse_seeds("dev:0-3"))
     with pytest.raises(ValueError, match="target must have an inflow, got"):
         learned_inflow_prior(STATIONARY_TANK, [0])
-
-
-# -- files, and what does not fit -------------------------------------------------------------------------------------
 
 
 def test_a_file_says_all(tmp_path):

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from eitbench.estimation import (
     InflowFilter,
-    InflowPrior,
     JointFilter,
     JointInflowFilter,
     Observation,
@@ -17,39 +16,26 @@ from eitbench.estimation import (
     inflow_response,
     scaled_flow,
 )
-from eitbench.numerics.mesh import rectangle_mesh
-from eitbench.physics.transport import ConvectionDiffusion
 from eitbench.worlds.catalogue import PIPE_2D_SKEWED, STATIONARY_TANK_2D
 from eitbench.worlds.task import make_task
-from models import white_inflow
+from models import MESH, averages, coarse_transport, directions, shapes, two_modes, white_inflow
 
 from tiny_worlds import TINY
 
-# -- a coarse pipe of 147 nodes, seen by local averages ---------------------------------------------------------------
-
-R, LEVEL, N = 0.05, 29.0, 147
-MESH = rectangle_mesh(np.linspace(0.0, 0.4, 21), np.linspace(-R, R, 7))
-PROFILES = [lambda eta: 1.5 * (1 - eta**2), lambda eta: 1.5 * eta * (1 - eta**2)]
-HEIGHTS = np.linspace(-0.9, 0.9, 13)
+LEVEL, N = 29.0, 147
 BOUNDS = (0.05, 4.0)
 
 
-def direction(profile):
-    return lambda points: np.column_stack([profile(points[:, 1] / R), np.zeros(len(points))])
-
-
-DIRECTIONS = [direction(profile) for profile in PROFILES]
+DIRECTIONS = directions(2)
 
 
 def transport_at(theta):
-    return ConvectionDiffusion(MESH, lambda points: sum(t * v(points) for t, v in zip(theta, DIRECTIONS, strict=True)),
-                               1e-2, 5e-3, substeps=4, inlet=np.arange(7))
+    return coarse_transport(theta, 1e-2)
 
 
 def flow(std=(1.0, 2.0), walk=(0.05, 0.02)):
     """v = θ_1 v_1 + θ_2 v_2 with a mean of 4.5 m/s at first, which passes the pipe in 18 steps."""
-    shapes = np.stack([profile(HEIGHTS) for profile in PROFILES], axis=1)
-    return UnknownFlow(transport_at, DIRECTIONS, np.array([4.5, 0.0]), np.array(std), np.array(walk), shapes)
+    return UnknownFlow(transport_at, DIRECTIONS, np.array([4.5, 0.0]), np.array(std), np.array(walk), shapes(2))
 
 
 @lru_cache(maxsize=1)
@@ -59,26 +45,18 @@ def task():
 
 @lru_cache(maxsize=2)
 def prior(link="logarithm"):
-    """Two modes across the inlet, a correlation over four steps."""
-    r = MESH.points[:7, 1] / R
-    return InflowPrior(link, MESH.points[:7], 0.2 * np.stack([np.exp(-r**2), r], axis=1), 0.6**np.arange(5)**2.0, 5e-3)
+    return two_modes(MESH.points[:7], link=link)
 
 
 def observations(count, seed=5, m=8):
-    """Averages about random places, a little wider than a cell."""
     random = np.random.default_rng(seed)
     for _ in range(count):
-        places = random.uniform([0.0, -R], [0.4, R], (m, 2))
-        weights = np.exp(-0.5 * (((MESH.points - places[:, None]) / [0.02, 0.015])**2).sum(axis=2))
-        H = weights / weights.sum(axis=1, keepdims=True)
+        H = averages(MESH, random, m)
         yield Observation(H, LEVEL + 3.0 * random.normal(size=m), np.full(m, 0.1))
 
 
 def near(actual, expected, part):
     np.testing.assert_allclose(actual, expected, atol=part * np.abs(expected).max(), rtol=0)
-
-
-# -- the histories make the concentration -----------------------------------------------------------------------------
 
 
 def stepped(z, steps):
@@ -111,9 +89,6 @@ def test_concentration_and_derivatives_are_those_of_the_transport():
         difference = (stepped(z + change, steps) - stepped(z - change, steps)) / (2 * h)
         assert np.abs(difference).max() > 1e-3
         near(slope[:, k, part], difference, 1e-6)
-
-
-# -- against other filters --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("link", ["linear", "logarithm"])
@@ -163,9 +138,6 @@ def test_a_white_inflow_gives_the_joint_filter():
     assert np.linalg.norm(filter_.parameters - belief.start) > 0.1
 
 
-# -- against a truth --------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("truth", [[3.4, 0.0], [5.0, 1.2]], ids=["slow", "skew"])
 def test_velocity_is_found(truth):
     """Inflows of the prior's own law in a flow one to two σ off: θ to 5 %, within its 3σ."""
@@ -203,9 +175,6 @@ def test_velocity_stays_within_its_bounds():
     assert filter_.parameters[0] == pytest.approx(0.05 * 4.5)
     filter_.predict()
     assert np.isfinite(filter_.concentration()).all()
-
-
-# -- flows, and what does not fit -------------------------------------------------------------------------------------
 
 
 def test_flows_of_a_task():

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from eitbench.estimation import KalmanFilter, LinearisedObservations, Observation, kalman_filter, linearised
+from eitbench.estimation import KalmanFilter, kalman_filter, linearised
 from eitbench.physics.observation import VoltageNoise
 from eitbench.scoring import normalised_innovations
 from models import QuadraticModel, dense_filter, draw, pipe, random_design, random_model
@@ -18,9 +18,6 @@ def assert_same(steps, reference, tolerance):
         np.testing.assert_allclose(step.variance, filtered.variance, atol=tolerance * predicted.variance.max())
         cross = predicted.covariance @ step.matrix.T
         np.testing.assert_allclose(step.cross_covariance, cross, atol=tolerance * np.abs(cross).max())
-
-
-# -- against the textbook ---------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("noise", [(0.2, 3.0), (50.0, 500.0)], ids=["precise", "noisy"])
@@ -51,31 +48,6 @@ def test_innovation_is_what_the_prediction_missed():
         np.testing.assert_allclose(step.innovation, value - H @ predicted.mean, atol=1e-9)
         S = H @ predicted.covariance @ H.T + np.diag(variance)
         np.testing.assert_allclose(step.innovation_covariance, S, atol=1e-9 * np.abs(S).max())
-
-
-def test_known_directions_stay_fewer_than_states():
-    """What is known has at most n directions, however many measurements came: 150 of them, 14 states."""
-    rng = np.random.default_rng(6)
-    model = random_model(rng)
-    filter_ = model.filter()
-    kalman_filter(filter_, draw(model, random_design(rng, 14, 50), rng)[1])
-    assert filter_.known.shape[0] == 14
-    assert filter_.known.shape[1] <= 14
-
-
-def test_nothing_measured_teaches_nothing():
-    """A blank observation (no injection) leaves the prediction as it was; prediction alone follows Π_t."""
-    rng = np.random.default_rng(7)
-    model = random_model(rng)
-    filter_ = model.filter()
-    filter_.predict()
-    before = filter_.mean.copy()
-    step = filter_.update(Observation(np.zeros((3, 14)), np.ones(3), np.ones(3)))
-    np.testing.assert_array_equal(step.mean, before)
-    np.testing.assert_allclose(step.variance, filter_.covariance.diagonal(1), rtol=1e-14)
-
-
-# -- against chance ---------------------------------------------------------------------------------------------------
 
 
 def twin(noise_factor):
@@ -121,9 +93,6 @@ def test_filter_is_consistent_on_its_own_model():
     assert min(nis[0], nees[0]) > 1.0
 
 
-# -- nonlinear observations -------------------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def nonlinear():
     """A quadratic observation model, a linearisation point, an injection, and voltages."""
@@ -156,16 +125,3 @@ def test_relinearised_at_the_prediction_the_innovation_is_the_true_one(nonlinear
     filter_.mean = point
     step = filter_.update(linearised(model, VoltageNoise(), filter_.mean, voltages, current))
     np.testing.assert_allclose(step.innovation, voltages - model.voltages(point, current[None])[0], atol=1e-12)
-
-
-def test_linearised_observations_compute_each_pattern_once(nonlinear):
-    """Kept patterns give the same as `linearised`, for new voltages too, and call the model once a pattern."""
-    model, point, current, voltages = nonlinear
-    noise, other = VoltageNoise(), current[::-1].copy()
-    kept = LinearisedObservations(model, noise, point)
-    pairs = [(voltages, current), (2 * voltages, current), (voltages, other), (-voltages, other), (voltages, current)]
-    results = [kept(v, i) for v, i in pairs]
-    assert model.calls == 2
-    for result, (v, i) in zip(results, pairs, strict=True):
-        for ours, direct in zip(result, linearised(model, noise, point, v, i), strict=True):
-            np.testing.assert_allclose(ours, direct, atol=1e-13)

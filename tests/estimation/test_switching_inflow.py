@@ -1,40 +1,28 @@
 """The filter of two regimes against exhaustive enumeration of what may have come when; and what is learned of them."""
 
 import itertools
-from functools import lru_cache
 
 import numpy as np
 import pytest
-from eitbench.bench.methods import baseline_folder
 from eitbench.estimation import (
     InflowPrior,
     Observation,
     Regimes,
     SwitchingInflowFilter,
     fit_inflow_prior,
-    suiting_priors,
 )
-from eitbench.worlds import entry
-from eitbench.worlds.task import make_task
+from models import tiny_task as task
+from models import two_modes
 from scipy.stats import multivariate_normal
-
-from tiny_worlds import TINY
 
 LEVEL = 29.0
 ROWS = 4
 
 
-@lru_cache(maxsize=1)
-def task():
-    return make_task(TINY)
-
-
 def prior(begins, ends):
     """Two modes across the inlet, a correlation over four steps; linear, so that enumeration is exact."""
     points = task().mesh.points[task().transport.inlet]
-    r = points[:, 1] / 0.05
-    return InflowPrior("linear", points, 0.1 * np.stack([np.exp(-r**2), r], axis=1), 0.6**np.arange(5)**2.0,
-                       task().transport.time_step, regimes=Regimes(begins, ends, 1e-3))
+    return two_modes(points, task().transport.time_step, "linear", 0.1, Regimes(begins, ends, 1e-3))
 
 
 def switching(begins, ends):
@@ -131,8 +119,7 @@ def test_innovations_are_those_of_the_mixture():
     expected = second.value - second.matrix @ (p[0] * points[0] + p[1] * points[1])
     slopes = [each.by_inflow(second.matrix) for each in filter_.filters]
     seen = slopes[0].shape[1]
-    S = sum(q * H @ each.covariance[:seen, :seen] @ H.T for q, H, each in
-            zip(p, slopes, filter_.filters, strict=True))
+    S = sum(q * H @ each.covariance[:seen, :seen] @ H.T for q, H, each in zip(p, slopes, filter_.filters, strict=True))
     apart = second.matrix @ (points[0] - points[1])
     S += p[0] * p[1] * np.outer(apart, apart) + np.diag(second.noise_variance)
     innovation, covariance = filter_.take_in(second, points)
@@ -150,16 +137,6 @@ def test_regimes_are_counted():
     slugs = (12 * 0.2**2 + 11 * 0.4**2) / 23
     assert found.quiet == pytest.approx(0.5e-6 / slugs)
     assert found.share == pytest.approx(found.begins / (found.begins + found.ends))
-
-
-@pytest.mark.parametrize("id, environment", [("Pipe2DIntermittent-v0", "eitbench/Pipe2DIntermittent-v0"),
-                                             ("Pipe2D-v0", "eitbench/Pipe2D-v0"),
-                                             ("Pipe2DUnknownVelocity-v0", "eitbench/Pipe2D-v0")])
-def test_a_world_takes_what_was_learned_in_it(id, environment):
-    """Where nothing was, what was learned in the plain pipe."""
-    found = suiting_priors(baseline_folder() / "priors", make_task(entry(f"eitbench/{id}").world), "logarithm")
-    assert found[0].source["environment"] == environment
-    assert len(found) == 2
 
 
 def test_mistakes_are_told(tmp_path):

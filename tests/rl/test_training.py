@@ -91,63 +91,15 @@ def test_a_killed_run_loses_no_more_than_an_interval(tmp_path, monkeypatch):
         with pytest.raises(KeyboardInterrupt):
             train(NAME, "ppo", TINY, 1, tmp_path, SHORT)
     assert calls == [16]
+    with (tmp_path / "monitor.csv").open("a") as file:
+        file.write("1")                                         # cut short
     model = training.algorithm_of("ppo").load(train(NAME, "ppo", TINY, 1, tmp_path, SHORT))
     assert model.num_timesteps == 32
     assert np.load(tmp_path / "evaluations.npz")["steps"].tolist() == [0, 16, 32]
-    with pytest.raises(ValueError, match="out must be an empty folder or one of the same run"):
-        train(NAME, "ppo", TINY, 2, tmp_path, SHORT)
-
-
-def killed_at_the_first_checkpoint(folder, monkeypatch, config=TINY):
-    """All but the model is written when the run is killed: the one that is kept has learnt nothing yet."""
-    save = training._save
-
-    def kill(model, path):
-        if model.num_timesteps:
-            raise KeyboardInterrupt
-        save(model, path)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(training, "_save", kill)
-        with pytest.raises(KeyboardInterrupt):
-            train(NAME, "ppo", config, 1, folder, SHORT)
-
-
-def test_no_row_is_kept_twice(tmp_path, monkeypatch):
-    """What was recorded of steps that are gone, and come again, is recorded once."""
-    killed_at_the_first_checkpoint(tmp_path, monkeypatch)
-    with (tmp_path / "monitor.csv").open("a") as file:
-        file.write("1")                                         # cut short
-    train(NAME, "ppo", TINY, 1, tmp_path, SHORT)
-    assert np.load(tmp_path / "evaluations.npz")["steps"].tolist() == [0, 16, 32]
     rows = (tmp_path / "monitor.csv").read_text().splitlines()
     assert [row.split(",")[0] for row in rows] == ["steps", *(str(8 * (1 + k // 2)) for k in range(8))]
-
-
-def test_a_run_that_goes_on_plays_other_episodes(tmp_path, monkeypatch):
-    """Not those of its beginning once more; whoever begins anew plays the same as ever."""
-    begin, keep, played = InjectionVecEnv._begin, training._Checkpoints._keep, []
-    config = replace(TINY, episodes=12)
-
-    def noting(self, seeds):
-        observation = begin(self, seeds)
-        played[-1].append(self.envs.seeds)
-        return observation
-
-    def kill(self):
-        keep(self)
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(InjectionVecEnv, "_begin", noting)
-    for name in ("a", "b"):
-        with monkeypatch.context() as patch:
-            patch.setattr(training._Checkpoints, "_keep", kill)
-            played.append([])
-            with pytest.raises(KeyboardInterrupt):
-                train(NAME, "ppo", config, 1, tmp_path / name, SHORT)
-    played.append([])
-    train(NAME, "ppo", config, 1, tmp_path / "a", SHORT)
-    assert played[0] == played[1] and played[0][:2] != played[2][:2]
+    with pytest.raises(ValueError, match="out must be an empty folder or one of the same run"):
+        train(NAME, "ppo", TINY, 2, tmp_path, SHORT)
 
 
 def test_a_finished_run_stays_as_it_is(tmp_path):
@@ -194,10 +146,7 @@ def test_a_pupil_learns_what_its_teacher_says(tmp_path):
     ("- a\n", "must hold entries of"), ("steps: 3\n", "must hold entries of"), ("a: [", "config must be a YAML file"),
     ("n_envs: 2\n", "config .*config.yml' must hold what `Config` asks for: .*'total_steps'"),
     ("total_steps: 1\nanneal: true\nalgorithm: fast\n", "algorithm must be a dict of names and values, got 'fast'"),
-    ("total_steps: 1\nimitate: [best_pair]\n", "imitate must be a dict"),
-    ("total_steps: 1\nhidden: 8\n", "hidden must be a list of integers, got 8"),
     ("total_steps: 1\nhidden: [8, x]\n", "each entry of hidden must be an integer of at least 1, got 'x'"),
-    ("total_steps: 1\nreference: 3\n", "reference must be the name or path of a policy, got 3"),
     ("total_steps: 1\nanneal: 'no'\n", "anneal must be true or false, got 'no'"),
     ("total_steps: -1\n", "total_steps must"), ("total_steps: 1\nreward_scale: 0\n", "reward_scale must"),
 ])
@@ -218,15 +167,12 @@ def test_wrong_arguments_are_named(tmp_path):
 
 
 @pytest.mark.parametrize(("env", "algo", "change", "kwargs", "message"), [
-    (NAME, "ppo", {"imitate": {"rounds": 1}}, {}, "imitate must hold teacher"),
     (NAME, "ppo", {"imitate": {"teacher": "event_triggered"}}, {},
      "imitate.teacher must be a policy that suits env, got 'event_triggered'"),
     (NAME, "ppo", {"imitate": {"teacher": "best_pair", "learning_rate": 0}}, {}, "imitate.learning_rate must be"),
     (NAME, "ppo", {"reference": "event_triggered"}, {}, "reference must be a policy that suits env"),
     (NAME, "ppo", {"algorithm": {"speed": 1, "seed": 2}}, {}, "algorithm must hold.*; got seed, speed"),
     (NAME, "sac", {}, {}, "sac is for actions that are currents, and env takes numbers"),
-    (CURRENTS, "dqn", {}, {}, "dqn is for actions that are numbers, and env takes currents"),
-    (CURRENTS, "maskable_ppo", {}, {}, "maskable_ppo is for actions that are numbers"),
     (CURRENTS, "ppo", {"imitate": {"teacher": "best_pair"}}, {}, "imitate is for actions that are numbers"),
     (NAME, "ppo", {}, {"episodes": 3, "estimator": "full"}, "kwargs must not hold.*; got episodes, estimator"),
     (NAME, "ppo", {"algorithm": {"n_steps": 0}}, {}, "algorithm must hold what ppo takes: "),
@@ -269,8 +215,7 @@ def test_an_agent_plays_as_it_was_evaluated(env, algo, tmp_path):
     config = replace(TINY, algorithm=options)
     path = train(env, algo, config, 1, tmp_path, kwargs)
     expected = np.load(tmp_path / "evaluations.npz")["errors"][-1]
-    errors = [injected(env, kwargs, str(path), seed, "reduced").errors.mean()
-              for seed in (100_000, 100_001)]
+    errors = [injected(env, kwargs, str(path), seed, "reduced").errors.mean() for seed in (100_000, 100_001)]
     np.testing.assert_allclose(errors, expected, rtol=1e-5)
     agent = load_method(str(path), "injection")
     chosen = []

@@ -1,10 +1,8 @@
-"""Every figure, drawn from tiny worlds and made-up estimates: what it draws, and that its words
-follow from them."""
+"""Every figure, drawn from tiny worlds and made-up estimates: what it draws, and that its words follow from them."""
 
 import importlib
 import re
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -49,8 +47,7 @@ def played_in(name, world, **kwargs):
 
 
 def perfect(env, name, seed):
-    """An estimator that knows the truth, where it is one of those that should be good; else it says
-    the same always."""
+    """An estimator that knows the truth, where it is one of those that should be good; else it says the same always."""
     env.reset(seed=seed)
     task = env.task
     if name in ("homogeneous", "gauss_newton"):
@@ -64,8 +61,7 @@ def perfect(env, name, seed):
     parameters = variance = None
     if task.velocity is not None:
         root = np.sqrt(task.velocity.weights)[:, None]
-        parameters = np.linalg.lstsq(root * task.velocity.profiles, root * env.true_velocity().T,
-                                     rcond=None)[0].T
+        parameters = np.linalg.lstsq(root * task.velocity.profiles, root * env.true_velocity().T, rcond=None)[0].T
         variance = np.full(task.velocity.size, 0.01)
     return [Estimate(state, np.full(len(state), 2.0 if "filter" in name else 1.0),
                      velocity=None if parameters is None else parameters[t],
@@ -85,16 +81,11 @@ def tiny_worlds(monkeypatch, run_cache):
     """Each figure's environment, small; episodes are shared by the tests, and kept from all others,
     since the flow past the bulge is another's here, by its cells."""
     monkeypatch.setenv(CACHE_VARIABLE, "{}-bulge-{}x{}".format(run_cache, *BULGE))
-    monkeypatch.setattr(pipe2d, "_env", lambda lag=0, mean_velocity=None: played_in(
-        "Pipe2D", PIPE, lag=lag))
-    monkeypatch.setattr(velocity, "_env", lambda flow: played_in(
-        f"Pipe2D{KINDS[flow]}Velocity", FLOW))
-    monkeypatch.setattr(obstacle, "_env", lambda flow: played_in(
-        "Pipe2DObstacle", OBSTACLE, assume={"flow": flow}))
-    monkeypatch.setattr(FlowPastBulge, "nominal", lambda flow, world, fine: _past_bulge(
-        world.vessel, flow, BULGE))
-    for name, id, steps in (("_stirred", "RotatingTank2D", 24),
-                            ("_at_rest", "StationaryTank2D", 16)):
+    monkeypatch.setattr(pipe2d, "_env", lambda lag=0, mean_velocity=None: played_in("Pipe2D", PIPE, lag=lag))
+    monkeypatch.setattr(velocity, "_env", lambda flow: played_in(f"Pipe2D{KINDS[flow]}Velocity", FLOW))
+    monkeypatch.setattr(obstacle, "_env", lambda flow: played_in("Pipe2DObstacle", OBSTACLE, assume={"flow": flow}))
+    monkeypatch.setattr(FlowPastBulge, "nominal", lambda flow, world, fine: _past_bulge(world.vessel, flow, BULGE))
+    for name, id, steps in (("_stirred", "RotatingTank2D", 24), ("_at_rest", "StationaryTank2D", 16)):
         env = played_in(id, {"schedule": {"scored_steps": steps}})
         monkeypatch.setattr(tanks, name, lambda env=env: env)
     monkeypatch.setattr(profiles, "_error", lambda lag, baseline, profile,
@@ -119,20 +110,17 @@ def draw(monkeypatch, name, folder, estimator):
 
 
 DRAWN = [name for name in FIGURES if name not in ("fig5.8", "fig5.10", "injection")]
-"""fig5.8 and injection have tests of their own; fig5.10 is in 3D, where even a made-up estimate
-takes minutes."""
+"""fig5.8 and injection have tests of their own; fig5.10 is in 3D, where even a made-up estimate takes minutes."""
 
 
 @pytest.mark.parametrize("name", DRAWN)
 def test_figure_is_drawn(name, monkeypatch, tmp_path):
-    """A picture, and words without a hole; with estimates that are right, all but what is about
-    real methods agrees."""
+    """A picture, and words without a hole; with estimates that are right, all but what is about real methods agrees."""
     remark = draw(monkeypatch, name, tmp_path, perfect)
     assert not re.search(r"\b(nan|inf|None)\b", remark)
     verdicts = [line for line in remark.splitlines() if line.startswith(("Agrees: ", "DIFFERS: "))]
     assert verdicts
-    if name in ("table5.1", "profiles", "fig6.1", "fig6.2", "fig6.4", "fig6.5", "fig6.6", "fig7.2",
-                "fig7.4"):
+    if name in ("table5.1", "profiles", "fig6.1", "fig6.2", "fig6.4", "fig6.5", "fig6.6", "fig7.2", "fig7.4"):
         assert all(line.startswith("Agrees") for line in verdicts), remark
 
 
@@ -184,74 +172,20 @@ def test_injection_is_drawn(monkeypatch, run_cache, tmp_path):
 
 def test_thesis_figures_show_dev_episodes_when_not_told(monkeypatch, tmp_path):
     """Nothing is drawn from test episodes by chance."""
-    monkeypatch.setattr(pipe2d, "fig5_4", lambda seeds, jobs,
-                        out: (out, " ".join(map(name_seed, seeds))))
+    monkeypatch.setattr(pipe2d, "fig5_4", lambda seeds, jobs, out: (out, " ".join(map(name_seed, seeds))))
     assert FIGURES["fig5.4"](None, 1, tmp_path)[1] == "dev:0 dev:1"
-
-
-def test_names():
-    """Each name leads to a function of its own."""
-    modules = [importlib.import_module(f"thesis.{path.stem}")
-               for path in Path(pipe2d.__file__).parent.glob("[!_]*.py")]
-    for name in FIGURES:
-        assert sum(callable(getattr(module, name.replace(".", "_"), None))
-                   for module in modules) == 1, name
-
-
-def test_one_run_serves_several_figures(monkeypatch, tmp_path):
-    """Figures 6.5 and 6.6 show the same episode: three methods are played once each."""
-    played = []
-
-    def counted(env, name, seed):
-        played.append(name)
-        return perfect(env, name, seed)
-
-    draw(monkeypatch, "fig6.5", tmp_path, counted)
-    draw(monkeypatch, "fig6.6", tmp_path, counted)
-    assert sorted(played) == ["filter_bank", "joint_extended_kalman_filter", "kalman_filter"]
-
-
-# -- what the figures compute ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("delay", [0, 3, 7])
 def test_lag_is_the_delay(delay):
-    """A sine and the same one some steps later, scaled and shifted: the delay, at a correlation of
-    one."""
+    """A sine and the same one some steps later, scaled and shifted: the delay, at a correlation of one."""
     truth = np.sin(np.arange(80) / 9.0)
     late = 2.0 + 0.5 * np.sin((np.arange(80) - delay) / 9.0)
     assert velocity.lag_of(late, truth) == (delay, pytest.approx(1.0, abs=1e-12))
 
 
-def test_table_names_the_best_cell_and_what_matters(monkeypatch, tmp_path):
-    """By made-up errors: the best is the table itself, the inflow noise matters most, at 20 % for a
-    factor of four."""
-    remark = draw(monkeypatch, "table5.1", tmp_path, perfect)
-    assert "0.00500 with the table's values, 0.00500 at best" in remark
-    assert "20.0 % (std of the inflow noise" in remark
-    assert "What matters most is the std of the inflow noise η." in remark
-    monkeypatch.setattr(parameters, "_error", lambda factors, _: 0.005 / factors.nodal_std)
-    remark = draw(monkeypatch, "table5.1", tmp_path, perfect)
-    assert "std of the nodal noise e × 4" in remark
-    assert "DIFFERS: the table's values are a good choice" in remark
-
-
-def test_changed_task_is_the_filters_alone():
-    """Other stds and another κ in the model; the environment's own task stays, and what is played
-    is what is scored."""
-    env = played_in("Pipe2D", CHANGES)
-    task = parameters._changed(env, parameters.Factors(2.0, 0.5, 4.0, 0.25))
-    assert task.prior == replace(env.task.prior, inflow_std=0.5, nodal_std=0.01, initial_std=1.0)
-    assert task.transport.diffusivity == pytest.approx(0.25 * env.task.transport.diffusivity)
-    np.testing.assert_array_equal(task.transport.inlet, env.task.transport.inlet)
-    assert env.task.prior.inflow_std == 0.25
-    table = parameters._played(env, parameters._changed(env, parameters.Factors()), SEED)
-    assert table == pytest.approx(error_of(env, estimates_of(env, "kalman_filter", SEED)), rel=1e-4)
-
-
 def test_map_estimate_is_the_most_probable():
-    """At rest its objective, misfit and prior, is lower than the linearised filter's, and flat to
-    the tolerance."""
+    """At rest its objective, misfit and prior, is lower than the linearised filter's, and flat to the tolerance."""
     env = played_in("StationaryTank2D", {"schedule": {"scored_steps": 3}})
     assert load_method("map_estimate", "estimation").make.suits(env.task)
     assert not load_method("map_estimate", "estimation").make.suits(played_in("RotatingTank2D", None).task)
@@ -269,8 +203,7 @@ def test_map_estimate_is_the_most_probable():
         misfit = (V - task.observation.voltages(c, I)) / task.noise.std(V)
         return (misfit**2).sum() + (c - first.c_bh) @ precision @ (c - first.c_bh)
 
-    best, linear = (estimates_of(env, name, SEED)[2].mean
-                    for name in ("map_estimate", "kalman_filter"))
+    best, linear = (estimates_of(env, name, SEED)[2].mean for name in ("map_estimate", "kalman_filter"))
     assert objective(best) < objective(linear)
     for direction in (linear - best, first.mean - best):
         assert objective(best + 0.05 * direction) > 0.999 * objective(best)

@@ -32,11 +32,6 @@ METHODS = {
 }
 
 
-GOLDEN = {"homogeneous": 0.020354, "filter": 0.0046947, "smoother": 0.0019687,
-          "stationary": 0.032892}
-"""ẽ_c on dev:0 in version 0.1.0; a change of physics or of an estimator shows here."""
-
-
 @pytest.mark.parametrize("seeds", [SEEDS[:1], pytest.param(SEEDS, marks=pytest.mark.slow)], ids=len)
 def test_order_of_the_methods(seeds):
     """Smoother < Kalman filter < 0.6 × homogeneous < stationary on average, the first two on every
@@ -46,13 +41,10 @@ def test_order_of_the_methods(seeds):
         results = [run_episode(Job(Environment(environment), baseline, seed))[0] for seed in seeds]
         assert all(result["status"] == "ok" for result in results), results
         errors[method] = np.array([result["scores"]["error"] for result in results])
-    assert {method: values[0] for method, values in errors.items()} == pytest.approx(GOLDEN,
-                                                                                     rel=0.01)
     mean = {method: values.mean() for method, values in errors.items()}
     assert mean["smoother"] < mean["filter"] < 0.6 * mean["homogeneous"] < mean["stationary"], mean
     assert (errors["smoother"] < errors["filter"]).all(), errors
-    assert (errors["filter"]
-            < np.minimum(errors["homogeneous"], errors["stationary"])).all(), errors
+    assert (errors["filter"] < np.minimum(errors["homogeneous"], errors["stationary"])).all(), errors
     # a stationary image is worse than saying nothing
     assert mean["homogeneous"] < mean["stationary"], mean
     assert 0.015 < mean["homogeneous"] < 0.04, mean          # the contrast the world promises
@@ -71,8 +63,7 @@ def test_stationary_method_works_on_a_stationary_target():
             clean = task.currents @ episode.transfer_resistance[state - 1]
             rng = np.random.default_rng([seed, state])
             voltages = clean + PIPE_2D.noise.std(clean) * rng.standard_normal(clean.shape)
-            c_bh = best_homogeneous(task.observation, task.noise, task.mesh.n_nodes, voltages,
-                                    task.currents, 30.0)
+            c_bh = best_homogeneous(task.observation, task.noise, task.mesh.n_nodes, voltages, task.currents, 30.0)
             constants.append(np.full(task.mesh.n_nodes, c_bh))
             images.append(gauss_newton(task.observation, voltages, task.currents,
                                        task.noise.std(voltages), penalty, constants[-1]))
@@ -82,20 +73,13 @@ def test_stationary_method_works_on_a_stationary_target():
     assert 3 * image < constant, (image, constant)
 
 
-def test_persistence_uses_the_alpha_of_gauss_newton():
-    """One tuned value, in two files."""
-    assert load_method("persistence", "estimation").parameters == load_method("gauss_newton", "estimation").parameters
-
-
 @pytest.mark.slow
 def test_velocity_sweep_finds_the_true_velocity():
-    """Over assumed mean velocities of 0, 50, …, 900 cm/s the error is smallest within 400–500; it
-    is 450 in truth.
+    """Over assumed mean velocities of 0, 50, …, 900 cm/s the error is smallest within 400–500; it is 450 in truth.
 
     The voltages alone, by discrepancy and by NIS, point near it too (thesis Fig. 5.8). One seed.
     """
-    sweep = {key: values.mean(axis=1) for key,
-             values in pipe2d.velocity_sweep(SEEDS[:1], jobs=1).items()}
+    sweep = {key: values.mean(axis=1) for key, values in pipe2d.velocity_sweep(SEEDS[:1], jobs=1).items()}
     best = {key: pipe2d.VELOCITIES[values.argmin()] for key, values in sweep.items()}
     assert 4.0 <= best["error"] <= 5.0, (best, sweep)
     assert 4.0 <= best["voltage_discrepancy"] <= 5.5, (best, sweep)

@@ -1,5 +1,4 @@
-"""Flows that differ from episode to episode: drawn from where the world says, and those that
-carry."""
+"""Flows that differ from episode to episode: drawn from where the world says, and those that carry."""
 
 import numpy as np
 import pytest
@@ -29,21 +28,9 @@ def mean_velocities(world, seeds):
     return np.array([drawn(world, seed)(1).mean_velocity for seed in seeds])
 
 
-# -- what is drawn ---------------------------------------------------------------------------------
-
-
-@each_world
-def test_seed_decides_the_flow(world):
-    """The same stream gives the same flow at every step, another one another."""
-    one, same, other = ([drawn(world, seed)(t) for t in range(-20, 99)] for seed in (1, 1, 2))
-    assert one == same
-    assert all(a != b for a, b in zip(one, other, strict=True))
-
-
 @each_world
 def test_mean_velocity_is_drawn_evenly_from_its_range(world):
-    """A uniform distribution between its ends; about its mean where it swings, so there without the
-    swing."""
+    """A uniform distribution between its ends; about its mean where it swings, so there without the swing."""
     steady = world.changed({"flow": {"swing_range": [0.0, 0.0]}})
     low, high = steady.flow.velocity_range
     means = mean_velocities(steady, range(400))
@@ -66,8 +53,7 @@ def test_estimators_are_told_another_velocity():
 
 @pytest.mark.parametrize("seed", range(4))
 def test_mean_velocity_swings_as_a_sine(seed):
-    """v̄(t) is a constant and one sine, of an amplitude and a period within their ranges, found by
-    least squares."""
+    """v̄(t) is a constant and one sine, of an amplitude and a period within their ranges, found by least squares."""
     world = PIPE_2D_TIME_VARYING
     flow = drawn(world, seed)
     steps = np.arange(1, 801)                           # four seconds: five periods and more
@@ -91,20 +77,15 @@ def test_mean_velocity_swings_as_a_sine(seed):
 
 
 def test_skewness_has_either_sign():
-    """About half of the flows are fastest in the upper half, by a |k| drawn evenly from its
-    range."""
+    """About half of the flows are fastest in the upper half, by a |k| drawn evenly from its range."""
     skewness = np.array([drawn(PIPE_2D_SKEWED, seed)(1).skewness for seed in range(400)])
     low, high = PIPE_2D_SKEWED.flow.skewness_range
     assert abs((skewness > 0).mean() - 0.5) < 0.1       # four standard deviations
     assert kstest(np.abs(skewness), "uniform", (low, high - low)).pvalue > 1e-3
 
 
-# -- what is carried -------------------------------------------------------------------------------
-
-
 def test_known_velocity_makes_the_episode_of_the_plain_pipe():
-    """With nothing left to draw, and so the same lead-in, it is `PIPE_2D`: the same inflow and
-    noise, to rounding."""
+    """With nothing left to draw, and so the same lead-in, it is `PIPE_2D`: the same inflow and noise, to rounding."""
     def of(velocity):
         return PIPE_2D_BIASED.changed(merged(CHANGES, {"flow": {"velocity_range": [velocity] * 2}}))
 
@@ -114,8 +95,7 @@ def test_known_velocity_makes_the_episode_of_the_plain_pipe():
     fixed, plain = (simulate(each, 7, cache=False) for each in (world, TINY))
     np.testing.assert_allclose(fixed.concentration, plain.concentration, rtol=3e-7)     # of float32
     scale = np.abs(plain.transfer_resistance).max()
-    np.testing.assert_allclose(fixed.transfer_resistance, plain.transfer_resistance,
-                               atol=1e-10 * scale)
+    np.testing.assert_allclose(fixed.transfer_resistance, plain.transfer_resistance, atol=1e-10 * scale)
     np.testing.assert_array_equal(fixed.noise, plain.noise)
     assert fixed.velocity.shape == (5, 0)
     other = simulate(of(44.0), 7, cache=False)
@@ -123,11 +103,9 @@ def test_known_velocity_makes_the_episode_of_the_plain_pipe():
 
 
 def test_slowest_fluid_flushes_the_pipe_before_the_start():
-    """``lead_in`` steps take the slowest mean velocity, its swing included, through the whole
-    pipe."""
+    """``lead_in`` steps take the slowest mean velocity, its swing included, through the whole pipe."""
     for world in WORLDS:
-        lowest = min(drawn(world, seed)(t).mean_velocity
-                     for seed in range(50) for t in range(0, 100, 5))
+        lowest = min(drawn(world, seed)(t).mean_velocity for seed in range(50) for t in range(0, 100, 5))
         length = world.vessel.length
         assert world.lead_in * world.time_step * lowest >= length * (1.0 - 1e-12)
         slowest = world.flow.velocity_range[0] * (1.0 - world.flow.swing_range[1])
@@ -136,8 +114,7 @@ def test_slowest_fluid_flushes_the_pipe_before_the_start():
 
 @each_unknown
 def test_recorded_flow_is_the_drawn_one(world):
-    """`Episode.velocity` is the profile at `VelocityModel.points` amid each time step, and has the
-    drawn mean."""
+    """`Episode.velocity` is the profile at `VelocityModel.points` amid each time step, and has the drawn mean."""
     world = world.changed(FAST)
     velocity = simulate(world, 7, cache=False).velocity
     model = world.velocity_model
@@ -155,8 +132,7 @@ def test_recorded_flow_is_the_drawn_one(world):
 
 
 def test_recorded_flow_is_the_one_that_carries():
-    """From one recorded state to the next with the recorded mean velocity, in the truth's two
-    steps: to rounding."""
+    """From one recorded state to the next with the recorded mean velocity, in the truth's two steps: to rounding."""
     world = PIPE_2D_TIME_VARYING.changed(FAST)
     half_width = world.vessel.half_width
     truth = truth_discretisation(world)
@@ -176,8 +152,7 @@ def test_recorded_flow_is_the_one_that_carries():
 
 @each_world
 def test_a_reference_is_given_the_flow_that_carries(world):
-    """A step with it, on the estimators' mesh, is one with the flow drawn for that very step, to
-    the bit."""
+    """A step with it, on the estimators' mesh, is one with the flow drawn for that very step, to the bit."""
     world = world.changed(FAST)
     model, flow = world.model(), drawn(world, 7)
     transport_at = world.true_transport(model, randomness(7).flow)
@@ -189,8 +164,7 @@ def test_a_reference_is_given_the_flow_that_carries(world):
 
 @each_world
 def test_simulated_together_same_bits(world):
-    """Flows that differ are carried on one by one: each episode is the one that its seed has
-    alone."""
+    """Flows that differ are carried on one by one: each episode is the one that its seed has alone."""
     world = world.changed(FAST)
     together = list(episodes.simulate_together(world, [8, 7], progress=False))
     alone = [simulate(world, seed, cache=False) for seed in (8, 7)]
@@ -199,31 +173,16 @@ def test_simulated_together_same_bits(world):
     assert np.abs(together[0].concentration - together[1].concentration).max() > 0.1
 
 
-# -- mistakes --------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("change", "message"), [
     ({"velocity_range": (5.0, 4.0)}, "velocity_range must be a range low ≤ high"),
-    ({"velocity_range": (0.0, 4.0)}, "velocity_range must"),
-    ({"velocity_range": (-1.0, 4.0)}, "velocity_range must"),
     ({"velocity_range": 4.5}, r"velocity_range must have shape \(2,\)"),
-    ({"velocity_range": (4.0, np.inf)}, "velocity_range must be finite"),
-    ({"velocity_range": ("slow", "fast")}, "velocity_range must be an array"),
-    ({"swing_range": (0.3, 0.2)}, "swing_range must be"),
     ({"swing_range": (0.5, 1.0)}, "swing_range must lie below 1"),
-    ({"swing_range": (-0.1, 0.2)}, "swing_range must be"),
     ({"period_range": (0.0, 0.4)}, "period_range must be"),
-    ({"period_range": (0.8, 0.4)}, "period_range must be"),
     ({"skewness_range": (0.6, 5.5)}, "skewness_range below 5"),
-    ({"skewness_range": (-1.0, 1.0)}, "skewness_range must be"),
-    ({"diffusivity": 0.0}, "diffusivity must be"),
     ({"velocity_std": -1.0}, "velocity_std must be"),
-    ({"velocity_std": "wide"}, "velocity_std must be"),
-    ({"velocity_walk": -0.1}, "velocity_walk must be"),
 ])
 def test_wrong_fields_are_named(change, message):
-    """The number, what came, and what was expected; where it is a part of a world, that part
-    too."""
+    """The number, what came, and what was expected; where it is a part of a world, that part too."""
     with pytest.raises(ValueError, match=message):
         DrawnFlow(**change)
     with pytest.raises(ValueError, match=f"^world.flow.*{message}"):

@@ -1,8 +1,6 @@
-"""The round tanks: a ball on an orbit of a steady flow, cylinders that stand still, and electrodes
-where they are said.
+"""The round tanks: a ball on an orbit of a steady flow, cylinders that stand still, and electrodes where they are said.
 
-Nothing of the truth may come from the estimators' meshes: an estimator would be tested against its
-own mistakes.
+Nothing of the truth may come from the estimators' meshes: an estimator would be tested against its own mistakes.
 """
 
 from functools import lru_cache
@@ -17,13 +15,11 @@ from eitbench.worlds.catalogue import ROTATING_TANK_2D as ROTATING
 from eitbench.worlds.catalogue import STATIONARY_TANK_2D as STATIONARY
 from eitbench.worlds.flows import _stirred
 from eitbench.worlds.streams import randomness
-from eitbench.worlds.task import make_task
 from eitbench.worlds.vessels import RoundTank
 from scipy.integrate import solve_ivp
 from scipy.stats import kstest
 
-SHORT = ROTATING.changed({"schedule": {"warm_up": 1, "scored_steps": 3},
-                          "vessel": {"n_electrodes": 8}})
+SHORT = ROTATING.changed({"schedule": {"warm_up": 1, "scored_steps": 3}, "vessel": {"n_electrodes": 8}})
 """Four injections of the same flow."""
 STILL = STATIONARY.changed({"schedule": {"scored_steps": 4}})
 each_world = pytest.mark.parametrize("world", [SHORT, STILL], ids=["rotating", "stationary"])
@@ -51,13 +47,9 @@ def both(world):
     return truth_discretisation(world), world.model()
 
 
-# -- what both have in common ----------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("n_electrodes", "cover"), [(16, 0.5), (7, 0.8), (4, 0.05)])
 def test_electrodes_lie_where_the_spans_say(n_electrodes, cover):
-    """Each has ``cells_at_electrodes`` facets, whose chords end at its edges and are as long as an
-    arc so cut is."""
+    """Each has ``cells_at_electrodes`` facets, whose chords end at its edges and are as long as an arc so cut is."""
     tank = RoundTank(n_electrodes=n_electrodes, electrode_cover=cover)
     spans, R = tank.electrode_spans, tank.radius
     np.testing.assert_allclose((spans[:, 1] - spans[:, 0]).sum(), 2.0 * np.pi * cover, rtol=1e-12)
@@ -71,8 +63,7 @@ def test_electrodes_lie_where_the_spans_say(n_electrodes, cover):
         np.testing.assert_allclose(np.hypot(*np.moveaxis(ends, -1, 0)), R, rtol=1e-12)
         middle = 0.5 * (first + last)
         angle = np.mod(np.arctan2(ends[..., 1], ends[..., 0]) - middle + np.pi, 2.0 * np.pi) - np.pi
-        np.testing.assert_allclose([angle.min(), angle.max()], [first - middle, last - middle],
-                                   atol=1e-9)
+        np.testing.assert_allclose([angle.min(), angle.max()], [first - middle, last - middle], atol=1e-9)
         chords = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
         np.testing.assert_allclose(chords, 2.0 * R * np.sin(0.5 * np.ptp(angle, axis=1)), rtol=1e-9)
         assert np.ptp(angle, axis=1).sum() == pytest.approx(last - first, rel=1e-9)  # no part twice
@@ -82,8 +73,7 @@ def test_electrodes_lie_where_the_spans_say(n_electrodes, cover):
 
 @each_world
 def test_truth_is_finer_than_the_model(world):
-    """Other nodes, and more than three times as many, for the target; more than twice as many for
-    the voltages."""
+    """Other nodes, and more than three times as many, for the target; more than twice as many for the voltages."""
     truth, model = both(world)
     assert truth.transport.mesh.n_nodes > 3 * model.transport.mesh.n_nodes
     assert truth.observation.cem.n_unknowns > 2 * model.observation.cem.n_unknowns
@@ -98,8 +88,7 @@ def test_truth_is_finer_than_the_model(world):
 
 @each_world
 def test_seed_decides_the_episode(world):
-    """Same seed, same bits, alone or beside others; another seed, another target and other
-    noise."""
+    """Same seed, same bits, alone or beside others; another seed, another target and other noise."""
     one, other = episode(world, 7), episode(world, 8)
     together = list(simulate_together(world, [8, 7], progress=False))
     for mine, theirs in ((one, together[1]), (other, together[0])):
@@ -110,8 +99,7 @@ def test_seed_decides_the_episode(world):
 
 
 def test_disc_indicator_holds_the_area_of_the_disc():
-    """∫ indicator = πa², but for the edge's (π²/12)·(edge/2a)² of it, and its rim lies at one
-    half."""
+    """∫ indicator = πa², but for the edge's (π²/12)·(edge/2a)² of it, and its rim lies at one half."""
     truth, _ = both(SHORT)
     mesh, centre, a = truth.transport.mesh, np.array([0.03, -0.05]), 0.03
     area = mass_matrix(mesh).sum(axis=0) @ disc_indicator(mesh.points, centre, a, 0.003)
@@ -121,12 +109,8 @@ def test_disc_indicator_holds_the_area_of_the_disc():
     assert disc_indicator(centre[None], centre, a, 0.003) > 1.0 - 1e-9
 
 
-# -- the stirred tank ------------------------------------------------------------------------------
-
-
 def test_flow_rests_on_the_wall():
-    """No slip at the nodes of the wall and amid its facets, where the fastest fluid does half a
-    metre a second."""
+    """No slip at the nodes of the wall and amid its facets, where the fastest fluid does half a metre a second."""
     flow = stirred(24)
     ends = flow.mesh.points[flow.mesh.boundary_facets]
     for points in (ends[:, 0], ends.mean(axis=1)):
@@ -135,11 +119,9 @@ def test_flow_rests_on_the_wall():
 
 
 def test_flow_has_nearly_no_divergence():
-    """∇·v is below 2 % of the vorticity (r.m.s., by differences), and less than a quarter of that
-    with half the rings.
+    """∇·v is below 2 % of the vorticity (r.m.s., by differences), and less than a quarter of that with half the rings.
 
-    Between the circles of two rings no fluid is lost: the flux through any circle about the middle
-    vanishes.
+    Between the circles of two rings no fluid is lost: the flux through any circle about the middle vanishes.
     """
     points = np.random.default_rng(0).uniform(-0.12, 0.12, (4000, 2))
     points = points[np.hypot(*points.T) < 0.12]
@@ -157,21 +139,9 @@ def test_flow_has_nearly_no_divergence():
         assert abs((stirred(24)(radius * outwards) * outwards).sum(axis=1).mean()) < 1e-3
 
 
-def test_flow_is_not_symmetric():
-    """It goes round counter-clockwise, on every circle at another speed on one side than on the
-    other."""
-    angle = 2.0 * np.pi * np.arange(100) / 100
-    along = np.stack([-np.sin(angle), np.cos(angle)], axis=1)
-    for radius in (0.03, 0.06, 0.1, 0.13):
-        points = radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        round_it = (stirred(24)(points) * along).sum(axis=1)
-        assert round_it.min() > 0.0 and np.ptp(round_it) > 0.05 * round_it.mean()
-
-
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_ball_goes_round_on_an_orbit_of_the_flow(seed):
-    """Its centre moves with the mean velocity over the disc: an integral over 192 points, solved to
-    high accuracy.
+    """Its centre moves with the mean velocity over the disc: an integral over 192 points, solved to high accuracy.
 
     In 2 s, or 1 m, the path may stray from that by 1 mm, a twentieth of the ball's radius.
     """
@@ -205,8 +175,7 @@ def test_ball_begins_within_its_range():
 
 
 def test_ball_keeps_its_content_and_lies_on_its_path():
-    """∫(background − c) = πa²·(background − c_ball) to 1 % at every step, and its centroid is the
-    centre, to 0.2 mm."""
+    """∫(background − c) = πa²·(background − c_ball) to 1 % at every step, and its centroid is the centre, to 0.2 mm."""
     mesh, ball = both(SHORT)[0].transport.mesh, SHORT.target
     concentration = episode(SHORT, 7).concentration.astype(float)
     weights = np.asarray(mass_matrix(mesh).sum(axis=0)).ravel()
@@ -221,25 +190,13 @@ def test_ball_keeps_its_content_and_lies_on_its_path():
     assert concentration.max() <= SHORT.background + 1e-4
 
 
-def test_one_pair_injects_throughout():
-    """One pattern in the cycle: electrode 0 to the one opposite."""
-    for world, opposite in ((ROTATING, 8), (SHORT, 4)):
-        (current,) = world.currents
-        assert np.flatnonzero(current).tolist() == [0, opposite]
-        assert current[0] == world.instrument.current == -current[opposite]
-    task = make_task(SHORT)
-    assert task.currents.shape == (1, 8) and task.calibration == 1 and task.warm_up == 1
-
-
 def test_model_of_the_stirred_tank_has_no_ball_and_keeps_what_it_holds():
-    """Concentration is carried and spreads, but neither enters nor leaves; what is even stays
-    even."""
+    """Concentration is carried and spreads, but neither enters nor leaves; what is even stays even."""
     model = both(SHORT)[1]
     mesh = model.transport.mesh
     assert len(model.transport.inlet) == 0
     weights = np.asarray(mass_matrix(mesh).sum(axis=0)).ravel()
-    np.testing.assert_allclose(model.transport.step(np.full(mesh.n_nodes, 30.0), 0.0, 0.0), 30.0,
-                               rtol=1e-10)
+    np.testing.assert_allclose(model.transport.step(np.full(mesh.n_nodes, 30.0), 0.0, 0.0), 30.0, rtol=1e-10)
     blob = c = disc_indicator(mesh.points, np.array([0.05, 0.0]), 0.022, 0.01)
     for _ in range(4):
         c = model.transport.step(c, 0.0, 0.0)
@@ -248,12 +205,8 @@ def test_model_of_the_stirred_tank_has_no_ball_and_keeps_what_it_holds():
     assert centroid[1][1] > centroid[0][1] + 0.01                                # counter-clockwise
 
 
-# -- the tank at rest ------------------------------------------------------------------------------
-
-
 def test_cylinders_stand_inside_apart_and_anywhere():
-    """Radii evenly from their ranges, walls apart by more than ``gap``, centres no further out than
-    ``furthest``."""
+    """Radii evenly from their ranges, walls apart by more than ``gap``, centres no further out than ``furthest``."""
     cylinders, radius = STATIONARY.target, STATIONARY.vessel.radius
     drawn = [cylinders.draw(STATIONARY, flow_stream(seed)) for seed in range(300)]
     centres = np.array([[centre for centre, _ in pair] for pair in drawn])
@@ -271,8 +224,7 @@ def test_cylinders_stand_inside_apart_and_anywhere():
 
 
 def test_nothing_moves_in_the_tank_at_rest():
-    """The concentration is constant in time, to the bit, and so is the resistance that is measured,
-    but for noise."""
+    """The concentration is constant in time, to the bit, and so is the resistance that is measured, but for noise."""
     still = episode(STILL, 7)
     for array in (still.concentration, still.transfer_resistance):
         np.testing.assert_array_equal(array, np.broadcast_to(array[:1], array.shape))
@@ -280,22 +232,19 @@ def test_nothing_moves_in_the_tank_at_rest():
 
 
 def test_cylinders_hold_their_metal():
-    """∫(c − background) = π(a₁² + a₂²)·(metal − 1)·background to 1 %; five-fold inside, the
-    background elsewhere."""
+    """∫(c − background) = π(a₁² + a₂²)·(metal − 1)·background to 1 %; five-fold inside, the background elsewhere."""
     mesh, c = both(STILL)[0].transport.mesh, episode(STILL, 7).concentration[0].astype(float)
     cylinders = STILL.target.draw(STILL, flow_stream(7))
     metal, background = STILL.target.metal, STILL.background
     expected = np.pi * sum(radius**2 for _, radius in cylinders) * (metal - 1.0) * background
     assert mass_matrix(mesh).sum(axis=0) @ (c - background) == pytest.approx(expected, rel=0.01)
-    away = np.min([np.hypot(*(mesh.points - centre).T) - radius for centre, radius in cylinders],
-                  axis=0)
+    away = np.min([np.hypot(*(mesh.points - centre).T) - radius for centre, radius in cylinders], axis=0)
     np.testing.assert_allclose(c[away < -0.006], metal * background, rtol=2e-3)
     np.testing.assert_allclose(c[away > 0.006], background, rtol=2e-3)
 
 
 def test_frame_of_the_tank_at_rest_measures_sixteen_things():
-    """Sixteen different injections, eight of them straight across, fifteen independent: all there
-    are of zero sum."""
+    """Sixteen different injections, eight of them straight across, fifteen independent: all there are of zero sum."""
     currents = STATIONARY.currents
     assert currents.shape == (16, 16) and len(np.unique(currents, axis=0)) == 16
     np.testing.assert_array_equal(np.sort(currents, axis=1)[:, [0, -1]], [[-0.1, 0.1]] * 16)
@@ -306,52 +255,22 @@ def test_frame_of_the_tank_at_rest_measures_sixteen_things():
     assert len(pairs) == 16                                              # none is another's reverse
 
 
-def test_estimate_is_asked_for_from_the_first_injection_on():
-    """No warm-up; ĉ_bh comes from one injection, and the evolution model is F = I."""
-    task = make_task(STATIONARY)
-    assert (task.warm_up, task.calibration, task.n_steps) == (0, 1, 32)
-    c = np.random.default_rng(0).uniform(20.0, 40.0, task.mesh.n_nodes)
-    np.testing.assert_array_equal(task.transport.step(c), c)
-
-
-# -- mistakes --------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("part", "change", "message"), [
-    ("vessel", {"radius": 0.0}, "radius must be"),
-    ("vessel", {"n_electrodes": 3}, "n_electrodes must be"),
-    ("vessel", {"electrode_cover": 1.0}, "electrode_cover"),
-    ("flow", {"viscosity": -1.0}, "viscosity"),
-    ("instrument", {"noise_relative": -0.1}, "noise_relative must"),
-    ("schedule", {"warm_up": -1}, "warm_up"),
-    ("target", {"start_radius": (0.5, 0.4)}, "start_radius must be"),
-    ("target", {"start_radius": (0.5, 0.9)},
-     "start_radius must be a range .* keeps the ball inside the tank"),
-    ("target", {"radius": 0.1}, "start_radius must be"),
-    ("instrument", {"current": "big"}, "current"),
-    ("flow", {"stirrer_position": (np.nan, 0.0)}, "stirrer_position must be"),
-])
-def test_wrong_numbers_of_the_stirred_tank_are_named(part, change, message):
+@pytest.mark.parametrize(("world", "part", "change", "message"), [
+    (ROTATING, "vessel", {"radius": 0.0}, "radius must be"),
+    (ROTATING, "vessel", {"electrode_cover": 1.0}, "electrode_cover"),
+    (ROTATING, "flow", {"viscosity": -1.0}, "viscosity"),
+    (ROTATING, "flow", {"stirrer_position": (np.nan, 0.0)}, "stirrer_position must be"),
+    (ROTATING, "target", {"start_radius": (0.5, 0.9)}, "start_radius must be a range .* keeps the ball inside"),
+    (STATIONARY, "vessel", {"n_electrodes": 7}, "n_electrodes must be an integer of at least 8"),
+    (STATIONARY, "target", {"gap": 0.12}, "gap must leave room"),
+    (STATIONARY, "target", {"metal": 0.0}, "metal must be"),
+    (STATIONARY, "target", {"small_radius": (0.018, 0.035)}, "small_radius must not reach beyond large_radius"),
+    (STATIONARY, "target", {"small_radius": 0.02}, r"small_radius must have shape \(2,\)"),
+], ids=str)
+def test_wrong_numbers_are_named(world, part, change, message):
     """The part, the number, what came, and what was expected."""
     with pytest.raises(ValueError, match=f"^world.*{part}.*{message}"):
-        ROTATING.changed({part: change})
-
-
-@pytest.mark.parametrize(("part", "change", "message"), [
-    ("target", {"gap": 0.12}, "gap must leave room"),
-    ("target", {"metal": 0.0}, "metal must be"),
-    ("schedule", {"scored_steps": 0}, "scored_steps"),
-    ("target", {"furthest": 0.8}, "furthest must be"),
-    ("target", {"large_radius": (0.03, 0.02)}, "large_radius must be a range"),
-    ("target", {"small_radius": (0.01, 0.05)}, "small_radius must be a range"),
-    ("target", {"small_radius": (0.018, 0.035)}, "small_radius must not reach beyond large_radius"),
-    ("target", {"small_radius": 0.02}, r"small_radius must have shape \(2,\)"),
-    ("vessel", {"n_electrodes": 7}, "n_electrodes must be"),
-])
-def test_wrong_numbers_of_the_tank_at_rest_are_named(part, change, message):
-    """The part, the number, what came, and what was expected."""
-    with pytest.raises(ValueError, match=f"^world.*{part}.*{message}"):
-        STATIONARY.changed({part: change})
+        world.changed({part: change})
 
 
 @pytest.mark.parametrize("radius", [0.01, 0.02, 0.04])
@@ -365,18 +284,3 @@ def test_cylinders_never_reach_through_the_wall(radius):
             assert size == radius and np.hypot(*centre) + size <= world.vessel.radius
     with pytest.raises(ValueError, match="furthest must be"):
         STATIONARY.changed({"target": sizes | {"furthest": most + 1e-6}})
-
-
-@pytest.mark.parametrize("n_electrodes", [4, 6, 7])
-def test_too_few_electrodes_are_refused(n_electrodes):
-    """Fewer than eight."""
-    with pytest.raises(ValueError, match="n_electrodes must be an integer of at least 8"):
-        STATIONARY.changed({"vessel": {"n_electrodes": n_electrodes}})
-
-
-@pytest.mark.parametrize("n_electrodes", [8, 12, 13, 32])
-def test_every_injection_injects(n_electrodes):
-    """With any number of electrodes that is taken, current enters at one and leaves at another."""
-    world = STATIONARY.changed({"vessel": {"n_electrodes": n_electrodes}})
-    ends = np.sort(world.currents, axis=1)[:, [0, -1]]
-    np.testing.assert_array_equal(ends, [[-0.1, 0.1]] * 16)

@@ -2,7 +2,7 @@
 
 import functools
 import types
-from dataclasses import FrozenInstanceError, replace
+from dataclasses import replace
 
 import eitbench  # noqa: F401 (registers)
 import numpy as np
@@ -14,7 +14,6 @@ from eitbench.worlds.catalogue import PIPE_2D
 from eitbench.worlds.task import make_task
 from eitbench.worlds.world import World
 
-from short import merged
 from tiny_worlds import CHANGES, TINY
 
 
@@ -30,12 +29,8 @@ def cache(tmp_path, monkeypatch):
     return tmp_path / "cache"
 
 
-# -- lag and assumptions ---------------------------------------------------------------------------
-
-
 def test_says_what_the_world_says():
-    """Times, currents, noise and level are the world's; estimates live on the CD mesh of its
-    model."""
+    """Times, currents, noise and level are the world's; estimates live on the CD mesh of its model."""
     task = make_task(TINY)
     assert (task.n_steps, task.warm_up, task.lag, task.expected_concentration) == (5, 2, 0, 25.0)
     np.testing.assert_array_equal(task.currents, TINY.currents)
@@ -48,8 +43,7 @@ def test_says_what_the_world_says():
 
 @pytest.mark.parametrize(("lag", "steps"), [(0, 0), (2, 2), (np.int64(4), 4), ("all", 4)])
 def test_lag(lag, steps):
-    """A number of steps, or the whole record: then the first state is asked for after the last
-    measurement."""
+    """A number of steps, or the whole record: then the first state is asked for after the last measurement."""
     assert make_task(TINY, lag).lag == steps
 
 
@@ -61,28 +55,8 @@ def test_wrong_lags(lag):
     assert repr(lag) in str(caught.value)
 
 
-def test_wrong_assumptions():
-    """What the model does not take, or cannot believe, is refused by name."""
-    with pytest.raises(ValueError, match="'viscosity'; there are mean_velocity, profile"):
-        make_task(TINY, viscosity=1.0)
-    with pytest.raises(ValueError, match="mean_velocity"):
-        make_task(TINY, mean_velocity=-1.0)
-
-
-def test_models_are_shared_and_tasks_frozen():
-    """Lags share one model, so that F is computed once; other worlds and beliefs have their own."""
-    task = make_task(TINY)
-    assert make_task(TINY, "all").transport is task.transport
-    other = PIPE_2D.changed(merged(CHANGES, {"flow": {"diffusivity": 1e-3}}))
-    assert make_task(other).transport is not task.transport
-    assert make_task(TINY, mean_velocity=60.0).transport is not task.transport
-    with pytest.raises(FrozenInstanceError):
-        task.lag = 3
-
-
 def test_assumed_velocity_changes_the_model_not_the_world(cache):
-    """A wrong belief moves the model's fluid elsewhere; the episode and its voltages stay as they
-    were."""
+    """A wrong belief moves the model's fluid elsewhere; the episode and its voltages stay as they were."""
     right, wrong = environment(), environment(assume={"mean_velocity": 60.0})
     rng = np.random.default_rng(2)
     c = rng.uniform(20.0, 40.0, 1701)
@@ -102,9 +76,6 @@ def played(env, action):
         seen = [observation["voltages"], observation["currents"]]
         observation, reward, done, _, _ = env.step(action)
         yield np.concatenate([*seen, [reward]])
-
-
-# -- nothing of the truth --------------------------------------------------------------------------
 
 
 def reachable(start):
@@ -131,8 +102,7 @@ def reachable(start):
             waiting.append(thing.__defaults__)
         waiting += [vars(thing)] if hasattr(thing, "__dict__") else []
         slots = [name for kind in type(thing).__mro__ for name in getattr(kind, "__slots__", ())]
-        waiting += [getattr(thing, name) for name in slots
-                    if isinstance(name, str) and hasattr(thing, name)]
+        waiting += [getattr(thing, name) for name in slots if isinstance(name, str) and hasattr(thing, name)]
     return list(found.values())
 
 
@@ -144,8 +114,7 @@ def sizes(discretisation):
 
 
 def traces_of_truth(task, world):
-    """What in ``task`` tells of the truth: episodes, worlds, the fine discretisation, arrays of its
-    size."""
+    """What in ``task`` tells of the truth: episodes, worlds, the fine discretisation, arrays of its size."""
     truth = truth_discretisation(world)
     its_own = {id(thing) for thing in reachable(truth) if isinstance(thing, np.ndarray)}
     fine = sizes(truth)
@@ -178,5 +147,4 @@ def test_the_search_finds_what_is_hidden(hide):
 def test_wrong_belief_does_not_tell_the_right_one():
     """A task that assumes 60 m/s holds no number 45, nor a flow of that velocity."""
     task = make_task(TINY, mean_velocity=60.0)
-    assert not [thing for thing in reachable(task)
-                if isinstance(thing, (int, float)) and thing == 45.0]
+    assert not [thing for thing in reachable(task) if isinstance(thing, (int, float)) and thing == 45.0]
