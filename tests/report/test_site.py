@@ -17,12 +17,11 @@ from eitbench.report import charts
 from eitbench.report.figures import _strong
 from eitbench.report.model import Row
 from eitbench.report.site import Beside, Measured, collect, render, render_site, write_site
-from eitbench.report.site.beside import HEADLINE, LINKS, METHODS
-from eitbench.report.site.collect import ROBUSTNESS
-from eitbench.report.site.environment import documentation, markdown
-from eitbench.report.site.headline import headline, key_figures
+from eitbench.report.site.collect import HEADLINE, LINKS, METHODS, ROBUSTNESS
+from eitbench.report.site.pages import documentation, headline, key_figures
 from eitbench.report.site.robustness import families, heading, robustness_table
 from eitbench.report.tables import markdown_table, page_table
+from eitbench.report.templates import markdown
 from eitbench.report.trainings import lines
 from pages import Page, svgs, text_of
 

@@ -9,7 +9,7 @@ from eitbench.bench.store import EpisodeStore
 from eitbench.report.boards import run_boards
 from eitbench.report.page import write_page
 from eitbench.report.site import Beside, collect, render_site, write_site
-from eitbench.report.site.beside import HEADLINE
+from eitbench.report.site.collect import HEADLINE
 from PIL import Image
 
 from tiny import record, several_boards

@@ -18,11 +18,9 @@ from eitbench.bench.table import NOTHING, Cell, Table, number_cell
 from eitbench.bench.text import number
 from eitbench.bench.tracks import home_of, ids, named
 from eitbench.report.model import Board, Row, kind_of
-from eitbench.report.site.beside import Beside
-from eitbench.report.site.collect import ROBUSTNESS, Site
-from eitbench.report.site.environment import markdown
+from eitbench.report.site.collect import ROBUSTNESS, Beside, Site
 from eitbench.report.tables import flags, method_cell
-from eitbench.report.templates import template
+from eitbench.report.templates import markdown, template
 from eitbench.worlds.registry import entry
 
 BELOW = "below the floor"
