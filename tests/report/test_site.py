@@ -20,9 +20,8 @@ from eitbench.report.site import Beside, Measured, collect, render, render_site,
 from eitbench.report.site.collect import HEADLINE, LINKS, METHODS, ROBUSTNESS
 from eitbench.report.site.pages import documentation, headline, key_figures
 from eitbench.report.site.robustness import families, heading, robustness_table
-from eitbench.report.tables import markdown_table, page_table
+from eitbench.report.tables import lines, markdown_table, page_table
 from eitbench.report.templates import markdown
-from eitbench.report.trainings import lines
 from pages import Page, svgs, text_of
 
 from tables import said

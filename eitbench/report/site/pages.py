@@ -25,9 +25,8 @@ from eitbench.report.model import ALL, Board, Row, headings, title_of
 from eitbench.report.site.collect import HEADLINE, MEASURED, METHODS, ROBUSTNESS, Beside, Site
 from eitbench.report.site.measured import Measured
 from eitbench.report.site.robustness import families
-from eitbench.report.tables import Axes, explanations, page_table
+from eitbench.report.tables import Axes, Line, explanations, lines, page_table
 from eitbench.report.templates import markdown, template
-from eitbench.report.trainings import Line, lines
 
 ABOUT = {
     "filter": "Estimates of each moment from the measurements until then.",
