@@ -134,10 +134,11 @@ def _board(records: list[dict[str, Any]], known: Anchors, products: dict[str, fl
     floor = floor_of(records)
     shown = [floor] if floor and ranked else records
     seeds = {seed for record in shown for seed in record["seeds"]}
-    zero = levels_of(floor)
+    zero = errors_of(floor)
     rows = sorted((_row(record, seeds, zero, known, products) for record in records
                    if not seeds.isdisjoint(record["seeds"])), key=_place)
-    competing = {row.label: {environment: _errors(row)} for row in rows if not row.cells["note"]}
+    competing = {row.label: {environment: errors_of(row.record)} for row in rows
+                 if not row.cells["note"]}
     ranks = shared_ranks(competing) if competing and ranked else {}
     return Board(class_of(records[0]), environment, title_of(records[0]), [
         row._replace(cells=row.cells | {"rank": ranks.get(row.label)}, colour=i)
@@ -151,7 +152,7 @@ def _row(whole: dict[str, Any], seeds: set[str], zero: dict[str, float], known: 
         "episodes": [episode for episode in whole["episodes"] if episode["seed"] in seeds],
         "seeds": [seed for seed in whole["seeds"] if seed in seeds]}
     environment = record["environment"]["name"]
-    errors = scores_by_seed(record, "error")
+    errors = errors_of(record)
     counts = {"failed": sum(episode["status"] != "ok" for episode in whole["episodes"]),
               "missing": len(seeds - set(record["seeds"]))}
     note = [*filter(None, [record["role"]]), *["privileged"] * record["privileged"],
@@ -168,12 +169,8 @@ def _identity(record: dict[str, Any], environment: str, note: str) -> dict[str, 
             **{name: record[name] for name in ("method", "version", "title", "official")}}
 
 
-def _errors(row: Row) -> dict[str, float]:
-    return scores_by_seed(row.record, "error") if row.record else {}
-
-
 def _place(row: Row) -> tuple[bool, float, str]:
-    errors = list(_errors(row).values())
+    errors = list(errors_of(row.record).values())
     mean = mean_over_environments(errors) if errors else math.inf
     return not row.complete, mean, row.label
 
@@ -189,9 +186,9 @@ def _means(record: dict[str, Any], known: Anchors) -> dict[str, float | None]:
     return found
 
 
-def levels_of(floor: dict[str, Any] | None) -> dict[str, float]:
-    """Return seed -> ẽ_c of a floor's record; nothing without a floor."""
-    return scores_by_seed(floor, "error") if floor else {}
+def errors_of(record: dict[str, Any] | None) -> dict[str, float]:
+    """Return seed -> ẽ_c of a record; nothing without one."""
+    return scores_by_seed(record, "error") if record else {}
 
 
 def gains_over(zero: dict[str, float], errors: dict[str, float]) -> dict[str, float]:

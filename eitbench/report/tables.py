@@ -12,11 +12,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from markupsafe import Markup
 
-from eitbench.bench.table import NOTHING, Cell, Table, number_cell
+from eitbench.bench.table import NOTHING, Cell, Table, mean_cell, number_cell
 from eitbench.bench.table import Row as TableRow
-from eitbench.bench.text import mean_and_interval, number, rounded, scores_by_seed, with_interval
+from eitbench.bench.text import number, with_interval
 from eitbench.report import charts
-from eitbench.report.boards import errors_and_gains, levels_of
+from eitbench.report.boards import errors_and_gains, errors_of
 from eitbench.report.model import (
     COSTS,
     Board,
@@ -99,12 +99,12 @@ def _average(values: list[float | None]) -> float | None:
 
 def _over_episodes(board: Board, rows: list[Row]) -> dict[str, Any]:
     """Return error and gain with their intervals; nothing without shared episodes."""
-    played = [scores_by_seed(row.record, "error") if row.record else {} for row in rows]
+    played = [errors_of(row.record) for row in rows]
     errors = {seed: float(np.mean([own[seed] for own in played]))
               for seed in played[0] if all(seed in own for own in played)}
     if not errors:
         return {}
-    return errors_and_gains(errors, levels_of(floor_of(_records(board))))
+    return errors_and_gains(errors, errors_of(floor_of(_records(board))))
 
 
 def _records(board: Board) -> list[dict[str, Any]]:
@@ -204,7 +204,7 @@ def run_table(board: Board, *, title: str = "title", drawn: bool = False) -> Tab
         if drawn:
             cells |= {heading: axes.cell(row, name) for name, (heading, _) in DRAWN.items()}
         else:
-            cells["ẽ_c"] = _error(row)
+            cells["ẽ_c"] = mean_cell(errors_of(row.record).values())
         cells |= _numbers(row, [name for name in headings(measured=True) if name not in COSTS])
         if row.cells["skill"] is None and row.cells.get("contrast_error") is not None:
             without = 1.0 - row.cells["contrast_error"]
@@ -223,13 +223,6 @@ def run_title(board: Board) -> str:
     """Return environment, class, and the seeds if they are the same for all rows."""
     seeds = set(run_seeds(board))
     return ", ".join([board.title, board.of_class, *(seeds if len(seeds) == 1 else ())])
-
-
-def _error(row: Row) -> Cell:
-    errors = list(scores_by_seed(row.record, "error").values()) if row.record else []
-    if not errors:
-        return Cell(NOTHING)
-    return Cell(rounded(*mean_and_interval(errors)), row.cells["error"])
 
 
 def _numbers(row: Row, names: Iterable[str]) -> dict[str, Cell]:

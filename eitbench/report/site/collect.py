@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from eitbench.bench.records import newest
 from eitbench.report.boards import leaderboards
 from eitbench.report.model import Board
+from eitbench.report.templates import template
 
 ROBUSTNESS = "robustness.html"
 """Address of the robustness board within the site."""
@@ -82,6 +83,11 @@ class Beside(NamedTuple):
         """Return words -> address of what exists; ``root`` leads from the page to the site."""
         return {words: f"{root}{self.root}{name}" for words, name in LINKS.items()
                 if name in self.found}
+
+    def page(self, kind: str, root: str = "", **contents: Any) -> bytes:
+        """Render a template of the site for a page from which ``root`` leads to the site."""
+        return template(f"site/{kind}.html.j2").render(
+            root=root, links=self.links(root), **contents).encode()
 
     def picture(self, name: str, root: str) -> str:
         """Return the address of a picture; empty if there is none."""

@@ -26,7 +26,7 @@ from eitbench.report.site.collect import HEADLINE, MEASURED, METHODS, ROBUSTNESS
 from eitbench.report.site.measured import Measured
 from eitbench.report.site.robustness import families
 from eitbench.report.tables import Axes, Line, explanations, lines, page_table
-from eitbench.report.templates import markdown, template
+from eitbench.report.templates import markdown
 
 ABOUT = {
     "filter": "Estimates of each moment from the measurements until then.",
@@ -50,8 +50,8 @@ def index_page(site: Site, beside: Beside, measured: Measured) -> bytes:
                 "boards": [(board, tables[board.anchor], Axes.of(board).drawn())
                            for board in boards]} for name, boards in site.classes.items()]
     top = headline(site)
-    return template("site/index.html.j2").render(
-        root="", links=beside.links(""), headline=top,
+    return beside.page(
+        "index", headline=top,
         figures=[*([top.figure] if top else []), *key_figures(site)],
         moving=beside.picture(HEADLINE[0], ""), still=beside.picture(HEADLINE[1], ""),
         n_environments=sum(not board.is_aggregate for board in site.boards),
@@ -60,7 +60,7 @@ def index_page(site: Site, beside: Beside, measured: Measured) -> bytes:
         robustness=ROBUSTNESS if families(site) else "",
         measured=MEASURED if measured.records else "",
         last=max(map(finished, site.records), default="")[:10],
-        explanations=explanations(tables.values())).encode()
+        explanations=explanations(tables.values()))
 
 
 class KeyFigure(NamedTuple):
@@ -137,8 +137,8 @@ def environment_page(site: Site, board: Board, beside: Beside) -> bytes:
     table = page_table(board, "../")
     description, details = documentation(id)
     animation = f"{board.environment}.webp"
-    return template("site/environment.html.j2").render(
-        root="../", links=beside.links("../"), board=board, id=id,
+    return beside.page(
+        "environment", "../", board=board, id=id,
         table=table, axes=Axes.of(board).drawn(), explanations=explanations([table]),
         description=description, details=details,
         intervals=figures.error_chart(board), front=figures.cost_chart(board),
@@ -147,7 +147,7 @@ def environment_page(site: Site, board: Board, beside: Beside) -> bytes:
         media_mb=f"{1e-6 * beside.media.get(animation, 0):.1f} MB",
         robustness=ROBUSTNESS if home_of(id) and named(id, {}) == board.environment else "",
         siblings=[other for other in site.classes[board.of_class]
-                  if other is not board and not other.is_aggregate]).encode()
+                  if other is not board and not other.is_aggregate])
 
 
 def documentation(id: str) -> tuple[Markup, Markup]:
@@ -166,12 +166,12 @@ def method_page(site: Site, name: str, beside: Beside) -> bytes:
     addresses = {(row.cells["environment"], row.cells["version"]): board.address
                  for board, row in placements}
     versions = dict.fromkeys(record["version"] for record in records)
-    return template("site/method.html.j2").render(
-        root="../", links=beside.links("../"), name=name, title=records[0]["title"],
+    return beside.page(
+        "method", "../", name=name, title=records[0]["title"],
         placements=_table(placements), gains=_gains(placements),
         checkout=f"../{beside.root}../" if METHODS in beside.found else "",
         versions=[_version([record for record in records if record["version"] == version],
-                           addresses) for version in versions]).encode()
+                           addresses) for version in versions])
 
 
 def _table(placements: list[Placement]) -> Table:
