@@ -9,7 +9,7 @@ from typing import NamedTuple
 from markupsafe import Markup
 
 from eitbench._foreign import as_markdown
-from eitbench.bench.text import number
+from eitbench.bench.text import mean_and_interval, number, rounded
 
 NOTHING = "–"
 
@@ -110,6 +110,15 @@ class Table(NamedTuple):
 def number_cell(value: float | None) -> Cell:
     """Return the cell of a number, `NOTHING` for None and NaN."""
     return Cell(NOTHING) if value is None or value != value else Cell(number(value), float(value))
+
+
+def mean_cell(values: Iterable[float]) -> Cell:
+    """Return the cell of a mean ± half its 95 % interval, `NOTHING` without values."""
+    known = list(values)
+    if not known:
+        return Cell(NOTHING)
+    mean, half = mean_and_interval(known)
+    return Cell(rounded(mean, half), mean)
 
 
 def _kind(column: list[Cell]) -> str:

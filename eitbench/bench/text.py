@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -19,13 +18,7 @@ def mean_and_interval(values: list[float]) -> tuple[float, float]:
     n = len(values)
     if n < 2:
         return mean, math.inf
-    return mean, float(_students(n - 1) * np.std(values, ddof=1) / math.sqrt(n))
-
-
-@lru_cache(maxsize=256)
-def _students(freedom: int) -> float:
-    """Return the 97.5 % point of Student's t."""
-    return student.ppf(0.975, freedom)
+    return mean, float(student.ppf(0.975, n - 1) * np.std(values, ddof=1) / math.sqrt(n))
 
 
 def rounded(mean: float, half: float) -> str:

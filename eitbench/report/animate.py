@@ -11,16 +11,12 @@ from matplotlib import colormaps
 from matplotlib.colors import to_rgb
 from PIL import Image
 from threadpoolctl import threadpool_limits
-from tqdm import tqdm
 
 from eitbench import _check
 from eitbench.bench.isolation import choose_isolation
 from eitbench.bench.methods import Method
-from eitbench.bench.playing import estimates, injections
 from eitbench.bench.run import Job
 from eitbench.bench.tracks import Environment, board_of
-from eitbench.data.seeds import parse_seeds
-from eitbench.envs.injection import InjectionEnv
 from eitbench.envs.rendering import (
     FIELD_MAP,
     IDLE,
@@ -29,6 +25,7 @@ from eitbench.envs.rendering import (
     SPREAD_MAP,
     draw_comparison,
 )
+from eitbench.report.plot import one_seed, played, states_at
 
 MOVING = (".gif", ".webp")
 """Suffixes of animations."""
@@ -46,28 +43,26 @@ def animate(environment: str, methods: Sequence[str], seed: str, step: int | Non
     if path.suffix not in suffixes:
         how = "without" if step is None else "with"
         raise ValueError(f"out must end in {' or '.join(suffixes)} {how} step, got {path.name}")
-    seeds = parse_seeds(seed)
-    if len(seeds) != 1:
-        raise ValueError(f"seed must name one episode, got {seed!r}")
-    played = Environment(environment)
-    if played.track == "injection" and len(methods) > 1:
+    number = one_seed(seed)
+    asked = Environment(environment)
+    if asked.track == "injection" and len(methods) > 1:
         raise ValueError(f"policy must be one for {environment}, got {', '.join(methods)}")
     with threadpool_limits(1):
-        kinds = [choose_isolation(played, method, isolate) for method in methods]
-        loaded = [Job(played, method, seeds[0], kind).load()
+        kinds = [choose_isolation(asked, method, isolate) for method in methods]
+        loaded = [Job(asked, method, number, kind).load()
                   for method, kind in zip(methods, kinds, strict=True)]
-        env: Any = played.make(render_mode="rgb_array")
+        env: Any = asked.make(render_mode="rgb_array")
         for each in loaded:
             if board_of(env) not in each.boards:
                 raise ValueError(f"baseline {each.name} plays {', '.join(each.boards)}, but "
                                  f"{environment} is a {board_of(env)} environment")
-        begin = env.core.first + 1 if played.track == "injection" else 1
+        begin = env.core.first + 1 if asked.track == "injection" else 1
         first, last = env.world.warm_up + 1, env.world.n_steps
         if step is not None:
             first = last = _check.integer("step", step, low=begin, high=last)
         draw = _drawn if len(loaded) == 1 else _compared
         frames = [Image.fromarray(frame)
-                  for frame in draw(env, loaded, seeds[0], range(first, last + 1, every))]
+                  for frame in draw(env, loaded, number, range(first, last + 1, every))]
     path.parent.mkdir(parents=True, exist_ok=True)
     options: dict[str, Any] = {}
     if path.suffix == ".gif":
@@ -84,33 +79,19 @@ def animate(environment: str, methods: Sequence[str], seed: str, step: int | Non
 
 def _drawn(env: Any, loaded: list[Method], seed: int, at: range) -> Iterator[np.ndarray]:
     """What the environment draws of one method at these t."""
-    played: Any = injections if isinstance(env, InjectionEnv) else estimates
-    for t, *_ in _until(at, played(env, loaded[0], seed)):
+    for t, *_ in played(env, loaded[0], seed, at[-1]):
         if t in at:
             yield np.asarray(env.render())
 
 
 def _compared(env: Any, loaded: list[Method], seed: int, at: range) -> Iterator[np.ndarray]:
     """Truth and the estimates of several baselines at these t."""
-    shown: list[tuple[str, dict[int, np.ndarray]]] = []
-    for method in loaded:
-        shown.append((method.title, {t: estimate.mean for t, estimate in
-                                     _until(at, estimates(env, method, seed)) if t in at}))
-    truth = env.truth()
-    task = env.task
+    shown = [(method.title, states_at(env, method, seed, at)) for method in loaded]
     for t in at:
-        fields = [("Truth", env.truth_mesh(), truth[t - 1])]
-        fields += [(title, task.mesh, means[t]) for title, means in shown]
-        yield draw_comparison(task, fields, task.currents[(t - 1) % len(task.currents)],
-                              t * task.transport.time_step)
-
-
-def _until(at: range, states: Iterator[Any]) -> Iterator[Any]:
-    """The states up to the last that is asked for."""
-    for state in tqdm(states, total=at[-1], desc="playing", unit="state", disable=None):
-        yield state
-        if state[0] == at[-1]:
-            break
+        truth, _, currents = shown[0][1][t]
+        fields = [("Truth", env.truth_mesh(), truth)]
+        fields += [(title, env.task.mesh, states[t][1]) for title, states in shown]
+        yield draw_comparison(env.task, fields, currents, t * env.task.transport.time_step)
 
 
 def _palette() -> Image.Image:

@@ -134,10 +134,11 @@ def _board(records: list[dict[str, Any]], known: Anchors, products: dict[str, fl
     floor = floor_of(records)
     shown = [floor] if floor and ranked else records
     seeds = {seed for record in shown for seed in record["seeds"]}
-    zero = scores_by_seed(floor, "error") if floor else {}
+    zero = errors_of(floor)
     rows = sorted((_row(record, seeds, zero, known, products) for record in records
                    if not seeds.isdisjoint(record["seeds"])), key=_place)
-    competing = {row.label: {environment: _errors(row)} for row in rows if not row.cells["note"]}
+    competing = {row.label: {environment: errors_of(row.record)} for row in rows
+                 if not row.cells["note"]}
     ranks = shared_ranks(competing) if competing and ranked else {}
     return Board(class_of(records[0]), environment, title_of(records[0]), [
         row._replace(cells=row.cells | {"rank": ranks.get(row.label)}, colour=i)
@@ -151,18 +152,16 @@ def _row(whole: dict[str, Any], seeds: set[str], zero: dict[str, float], known: 
         "episodes": [episode for episode in whole["episodes"] if episode["seed"] in seeds],
         "seeds": [seed for seed in whole["seeds"] if seed in seeds]}
     environment = record["environment"]["name"]
-    errors = scores_by_seed(record, "error")
-    gains = {seed: 1.0 - error / zero[seed] for seed, error in errors.items() if zero.get(seed)}
+    errors = errors_of(record)
     counts = {"failed": sum(episode["status"] != "ok" for episode in whole["episodes"]),
               "missing": len(seeds - set(record["seeds"]))}
     note = [*filter(None, [record["role"]]), *["privileged"] * record["privileged"],
             *(f"{count} {what}" for what, count in counts.items() if count)]
     cells = _identity(record, environment, ", ".join(note))
-    cells |= with_ends("error", {environment: errors}, mean_over_environments)
-    cells |= with_ends("gain", {environment: gains}, interquartile_mean)
+    cells |= errors_and_gains(errors, zero)
     cells |= {"seeds": seed_ranges(record["seeds"]), **_means(record, known),
               "matmuls_per_step": _in_products(record, products), "peak_memory": _peak(record)}
-    return Row(cells, record, gains)
+    return Row(cells, record, gains_over(zero, errors))
 
 
 def _identity(record: dict[str, Any], environment: str, note: str) -> dict[str, Any]:
@@ -170,12 +169,8 @@ def _identity(record: dict[str, Any], environment: str, note: str) -> dict[str, 
             **{name: record[name] for name in ("method", "version", "title", "official")}}
 
 
-def _errors(row: Row) -> dict[str, float]:
-    return scores_by_seed(row.record, "error") if row.record else {}
-
-
 def _place(row: Row) -> tuple[bool, float, str]:
-    errors = list(_errors(row).values())
+    errors = list(errors_of(row.record).values())
     mean = mean_over_environments(errors) if errors else math.inf
     return not row.complete, mean, row.label
 
@@ -191,8 +186,24 @@ def _means(record: dict[str, Any], known: Anchors) -> dict[str, float | None]:
     return found
 
 
-def with_ends(name: str, values: dict[str, dict[str, float]],
-              statistic: Any) -> dict[str, float | None]:
+def errors_of(record: dict[str, Any] | None) -> dict[str, float]:
+    """Return seed -> ẽ_c of a record; nothing without one."""
+    return scores_by_seed(record, "error") if record else {}
+
+
+def gains_over(zero: dict[str, float], errors: dict[str, float]) -> dict[str, float]:
+    """Return seed -> gain over the errors ``zero`` of the floor, of the shared seeds."""
+    return {seed: 1.0 - error / zero[seed] for seed, error in errors.items() if zero.get(seed)}
+
+
+def errors_and_gains(errors: dict[str, float], zero: dict[str, float]) -> dict[str, float | None]:
+    """Return mean error and interquartile mean gain of one environment, with their intervals."""
+    return (_with_ends("error", {"": errors}, mean_over_environments)
+            | _with_ends("gain", {"": gains_over(zero, errors)}, interquartile_mean))
+
+
+def _with_ends(name: str, values: dict[str, dict[str, float]],
+               statistic: Any) -> dict[str, float | None]:
     """Return a statistic of environment -> seed -> score, ``name``, and the ends of its 95 %
     interval, ``name_low`` and ``name_high``; None where unknown."""
     keys = (name, f"{name}_low", f"{name}_high")
@@ -240,7 +251,7 @@ def _aggregate(of_class: str, made: list[Board]) -> list[Board]:
         note = ", ".join(dict.fromkeys(word for row in own for word in row.badges))
         assert first.record is not None
         cells[label] = dict.fromkeys(fields()) | _identity(first.record, ALL, note)
-        cells[label] |= with_ends("gain", gains, interquartile_mean)
+        cells[label] |= _with_ends("gain", gains, interquartile_mean)
         cells[label]["official"] = all(row.cells["official"] for row in own)
         if not note:
             competing[label] = gains

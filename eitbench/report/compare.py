@@ -26,6 +26,7 @@ from eitbench.bench.table import NOTHING, Cell, Table, number_cell
 from eitbench.bench.text import scores_by_seed, with_interval
 from eitbench.bench.tracks import CLASSES
 from eitbench.report import charts
+from eitbench.report.boards import gains_over
 from eitbench.report.model import class_of, is_floor
 from eitbench.report.templates import template
 
@@ -138,8 +139,8 @@ def compare(a: list[dict[str, Any]], b: list[dict[str, Any]], score: str = "erro
     if score == "error":
         levels = {_place(record): scores_by_seed(record, "error") for record in
                   sorted(zero, key=lambda record: (record["official"], finished(record)))}
-        gains = [pair._replace(ours=_gains(pair.ours, levels[pair.place]),
-                               theirs=_gains(pair.theirs, levels[pair.place]))
+        gains = [pair._replace(ours=gains_over(levels[pair.place], pair.ours),
+                               theirs=gains_over(levels[pair.place], pair.theirs))
                  for pair in pairs if pair.place in levels]
         for kind in CLASSES:
             together = [pair for pair in gains if pair.kind == kind and pair.ours]
@@ -148,10 +149,6 @@ def compare(a: list[dict[str, Any]], b: list[dict[str, Any]], score: str = "erro
     elif len(pairs) > 1:
         rows.append(_row("all", score, pairs, mean_over_environments, higher))
     return pd.DataFrame(rows, columns=list(FIELDS))
-
-
-def _gains(errors: dict[str, float], floor: dict[str, float]) -> dict[str, float]:
-    return {seed: 1.0 - error / floor[seed] for seed, error in errors.items() if floor.get(seed)}
 
 
 def _pairs(a: list[dict[str, Any]], b: list[dict[str, Any]], score: str) -> list[_Pair]:

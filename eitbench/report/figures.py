@@ -10,7 +10,7 @@ from markupsafe import Markup
 
 from eitbench.report import charts
 from eitbench.report.model import Board, Row
-from eitbench.report.trainings import agent, lines
+from eitbench.report.tables import agent, lines
 
 MAX_CURVES, N_STRONG = 7, 5
 """Curves that can be told apart, and the number drawn strongly where there are more."""

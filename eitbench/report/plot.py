@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Iterator
 from typing import Any, Literal
 
 import gymnasium as gym
@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator, NullFormatter
+from tqdm import tqdm
 
 from eitbench import _check, scoring
 from eitbench.bench.evaluation import environment_of, method_given
@@ -89,17 +90,16 @@ def episode(method: Any, env: str | gym.Env, seed: int | str, *,
     import matplotlib.pyplot as plt
     asked = environment_of(env, world)
     loaded = method_given(method, asked.track)
-    number = _number_of(seed)
+    number = one_seed(seed)
     made = asked.make()
     if not can_play(loaded, made):
         raise ValueError(f"method {loaded.name} does not play {asked.id}")
-    played = made.world
-    _check.integer("times", times, low=1, high=played.schedule.scored_steps)
-    spread_over = np.linspace(played.warm_up + 1, played.n_steps, times + 2)[1:-1]
-    wanted = list(map(int, spread_over))
-    found = _states(made, loaded, number, set(wanted))
-    mesh = truth_discretisation(played).transport.mesh
-    interpolation, mass = region_operators(played)
+    world_of = made.world
+    _check.integer("times", times, low=1, high=world_of.schedule.scored_steps)
+    wanted = list(map(int, np.linspace(world_of.warm_up + 1, world_of.n_steps, times + 2)[1:-1]))
+    found = states_at(made, loaded, number, wanted)
+    mesh = truth_discretisation(world_of).transport.mesh
+    interpolation, mass = region_operators(world_of)
     task = made.task
     figure, axes = plt.subplots(times, 2, figsize=_size(task, times, 2), squeeze=False,
                                 sharex=True, sharey=True, layout="constrained")
@@ -108,7 +108,7 @@ def episode(method: Any, env: str | gym.Env, seed: int | str, *,
         error = scoring.step_errors((interpolation @ mean)[None], truth[None], mass)[0]
         last = _draw(row[0], task, mesh, truth, currents)
         _draw(row[1], task, task.mesh, mean, currents)
-        row[0].set_title(f"truth, t = {1e3 * t * played.time_step:.0f} ms", fontsize=9)
+        row[0].set_title(f"truth, t = {1e3 * t * world_of.time_step:.0f} ms", fontsize=9)
         row[1].set_title(f"{loaded.name}, ẽ_c = {error:.2g}", fontsize=9)
     for ax in axes.flat:
         ax.label_outer()
@@ -183,7 +183,8 @@ def logarithmic(ax: Axes, which: Literal["x", "y"]) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-def _number_of(seed: int | str) -> int:
+def one_seed(seed: int | str) -> int:
+    """Return the number of an episode; ``ValueError`` if it is none or several."""
     if not isinstance(seed, str):
         return _check.integer("seed", seed, low=0)
     numbers = parse_seeds(seed)
@@ -192,22 +193,28 @@ def _number_of(seed: int | str) -> int:
     return numbers[0]
 
 
-def _states(env: Any, method: Any, seed: int, wanted: set[int],
-            ) -> dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """t -> truth (m,), estimate (n,) and currents (L,) of the states that are wanted."""
+def played(env: Any, method: Any, seed: int, last: int) -> Iterator[Any]:
+    """Yield what `estimates` or `injections` yields up to the state t = ``last``."""
+    states = (injections if isinstance(env, InjectionEnv) else estimates)(env, method, seed)
+    for state in tqdm(states, total=last, desc="playing", unit="state", disable=None):
+        yield state
+        if state[0] == last:
+            break
+
+
+def states_at(env: Any, method: Any, seed: int, wanted: Collection[int],
+              ) -> dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Return t -> truth (m,) and estimate (n,) in mol/m³, and currents (L,) in A, of the wanted
+    states."""
     truth = simulate(env.world, seed).concentration
-    found = {}
-    if isinstance(env, InjectionEnv):
-        for t, observation, _ in injections(env, method, seed):
-            if t in wanted:
-                mean = env.core.estimate()[0][0]
-                found[t] = truth[t].astype(float), mean, observation["currents"]
-        return found
     cycle = env.world.currents
-    for t, estimate in estimates(env, method, seed):
+    found = {}
+    for t, said, *_ in played(env, method, seed, max(wanted)):
         if t in wanted:
-            mean = np.array(estimate.mean, dtype=float)
-            found[t] = truth[t].astype(float), mean, cycle[(t - 1) % len(cycle)]
+            mean, currents = ((env.core.estimate()[0][0], said["currents"])
+                              if isinstance(env, InjectionEnv)
+                              else (said.mean, cycle[(t - 1) % len(cycle)]))
+            found[t] = truth[t].astype(float), np.array(mean, dtype=float), currents
     return found
 
 

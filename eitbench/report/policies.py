@@ -12,8 +12,7 @@ import pandas as pd
 from eitbench.bench.run import Job, successful
 from eitbench.bench.scores import Score, scores
 from eitbench.bench.statistics import FEWEST, stratified_bootstrap
-from eitbench.bench.table import NOTHING, Cell, Table, number_cell
-from eitbench.bench.text import mean_and_interval, rounded
+from eitbench.bench.table import NOTHING, Cell, Table, mean_cell, number_cell
 
 OPEN_LOOP = ("adjacent", "opposite", "transverse", "best_pair", "best_cycle", "best_currents",
              "schedule")
@@ -66,9 +65,10 @@ def policy_table(rows: pd.DataFrame, privileged: Sequence[str], width: int | Non
         if (finished := errors[name].count()) < len(errors):
             title += f" ({finished} of {len(errors)} episodes)"
         cells: dict[str, Cell | str] = {
-            "policy": title, "ẽ_c": _mean(errors[name]),
+            "policy": title, "ẽ_c": mean_cell(errors[name].dropna()),
             f"worse than {best} by":
-                Cell(NOTHING) if name == best else _mean(errors[name] - errors[best])}
+                Cell(NOTHING) if name == best
+                else mean_cell((errors[name] - errors[best]).dropna())}
         cells |= {score.heading: _summarised(own, score)
                   for score in scores("injection").values() if score.name != "error"}
         lines.append(cells)
@@ -83,11 +83,6 @@ def policy_table(rows: pd.DataFrame, privileged: Sequence[str], width: int | Non
                     else f"an interval takes {FEWEST} episodes")
         parts.append(f"adaptivity gap {gap:.2f} ({interval}) over {len(errors)} episodes")
     return "\n\n".join(parts)
-
-
-def _mean(values: pd.Series) -> Cell:
-    mean, half = mean_and_interval(list(values.dropna()))
-    return Cell(rounded(mean, half), mean)
 
 
 def _summarised(own: pd.DataFrame, score: Score) -> Cell:

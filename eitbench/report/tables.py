@@ -1,18 +1,22 @@
-"""Boards as tables for pages, Markdown and terminals."""
+"""Boards as tables for pages, Markdown and terminals. Agents that differ only in their training
+seed are one line of a page."""
 
 from __future__ import annotations
 
 import math
-from collections import Counter
+import re
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
 from markupsafe import Markup
 
-from eitbench.bench.table import NOTHING, Cell, Table, number_cell
+from eitbench.bench.table import NOTHING, Cell, Table, mean_cell, number_cell
 from eitbench.bench.table import Row as TableRow
-from eitbench.bench.text import mean_and_interval, number, rounded, scores_by_seed, with_interval
+from eitbench.bench.text import number, with_interval
 from eitbench.report import charts
+from eitbench.report.boards import errors_and_gains, errors_of
 from eitbench.report.model import (
     COSTS,
     Board,
@@ -23,7 +27,6 @@ from eitbench.report.model import (
     meanings,
     method_address,
 )
-from eitbench.report.trainings import Line, lines
 
 COMPACT = ("seconds_per_step", "peak_memory")
 """Numbers beside ranks and intervals in the index; the page of an environment has all."""
@@ -31,6 +34,81 @@ WORST_GAIN = -1.0
 """Lower end of the drawn axis of gains: a method twice as bad as the floor."""
 DRAWN = {"error": ("ẽ_c", True), "gain": ("gain", False)}
 """Score with an interval -> heading, and whether its axis is logarithmic."""
+_SEED = re.compile(r"_seed\d+$")
+_OF_TITLE = re.compile(r" trained with seed \d+$")
+
+
+class Line(NamedTuple):
+    """One method, or all trainings of an agent."""
+
+    row: Row
+    parts: list[Row]
+    """Trainings, the best first; empty unless there are several."""
+
+
+def agent(method: str) -> str:
+    """Return the name of an agent without its training seed."""
+    return _SEED.sub("", method)
+
+
+def lines(board: Board) -> list[Line]:
+    """Return the lines of a board in its order.
+
+    The mean is over the ranked trainings, of which there must be two; its interval is over the
+    episodes, in each of which the scores of the trainings are averaged.
+    """
+    trainings: dict[tuple[str, bool], list[Row]] = defaultdict(list)
+    for row in board.rows:
+        if _SEED.search(row.cells["method"]) and not row.unranked:
+            trainings[agent(row.cells["method"]), row.cells["official"]].append(row)
+    groups = [Line(_mean(board, rows), rows) for rows in trainings.values()
+              if sum(row.competes for row in rows) > 1]
+    grouped = {row.label for group in groups for row in group.parts}
+    single = [Line(row, []) for row in board.rows if row.label not in grouped]
+    return sorted([*single, *groups], key=lambda line: _place(line.row)) if groups else single
+
+
+def _place(row: Row) -> tuple[bool, float]:
+    error, gain = row.cells["error"], row.cells["gain"]
+    return not row.complete, error if error is not None else math.inf if gain is None else -gain
+
+
+def _mean(board: Board, rows: list[Row]) -> Row:
+    """Return the line of an agent; ``last_rank`` is the worst of its trainings."""
+    ranked = [row for row in rows if row.competes]
+    unfinished = len(rows) - len(ranked)
+    first = ranked[0]
+    ranks = [row.cells["rank"] for row in ranked]
+    versions = {row.cells["version"] for row in ranked}
+    means = {name: _average([row.cells[name] for row in ranked])
+             for name in ("error", "gain", *headings())}
+    ends = dict.fromkeys(("error_low", "error_high", "gain_low", "gain_high"))
+    return first._replace(record=None, cells=first.cells | means | ends | {
+        **_over_episodes(board, ranked),
+        "method": agent(first.cells["method"]),
+        "note": f"{unfinished} of {len(rows)} unfinished" if unfinished else "",
+        "title": _OF_TITLE.sub("", first.cells["title"]),
+        "version": versions.pop() if len(versions) == 1 else "",
+        "rank": min(ranks), "last_rank": max(ranks)})
+
+
+def _average(values: list[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known else None
+
+
+def _over_episodes(board: Board, rows: list[Row]) -> dict[str, Any]:
+    """Return error and gain with their intervals; nothing without shared episodes."""
+    played = [errors_of(row.record) for row in rows]
+    errors = {seed: float(np.mean([own[seed] for own in played]))
+              for seed in played[0] if all(seed in own for own in played)}
+    if not errors:
+        return {}
+    return errors_and_gains(errors, errors_of(floor_of(_records(board))))
+
+
+def _records(board: Board) -> list[dict[str, Any]]:
+    return [row.record for row in board.rows if row.record]
 
 
 class Axes(NamedTuple):
@@ -41,7 +119,7 @@ class Axes(NamedTuple):
 
     @classmethod
     def of(cls, board: Board) -> Axes:
-        floor = floor_of(row.record for row in board.rows if row.record)
+        floor = floor_of(_records(board))
         zero = next((row.cells["error"] for row in board.rows
                      if floor and row.record is floor), None)
         return cls({name: _ends(board, name) for name in DRAWN}, {"error": zero, "gain": 0.0})
@@ -126,7 +204,7 @@ def run_table(board: Board, *, title: str = "title", drawn: bool = False) -> Tab
         if drawn:
             cells |= {heading: axes.cell(row, name) for name, (heading, _) in DRAWN.items()}
         else:
-            cells["ẽ_c"] = _error(row)
+            cells["ẽ_c"] = mean_cell(errors_of(row.record).values())
         cells |= _numbers(row, [name for name in headings(measured=True) if name not in COSTS])
         if row.cells["skill"] is None and row.cells.get("contrast_error") is not None:
             without = 1.0 - row.cells["contrast_error"]
@@ -145,13 +223,6 @@ def run_title(board: Board) -> str:
     """Return environment, class, and the seeds if they are the same for all rows."""
     seeds = set(run_seeds(board))
     return ", ".join([board.title, board.of_class, *(seeds if len(seeds) == 1 else ())])
-
-
-def _error(row: Row) -> Cell:
-    errors = list(scores_by_seed(row.record, "error").values()) if row.record else []
-    if not errors:
-        return Cell(NOTHING)
-    return Cell(rounded(*mean_and_interval(errors)), row.cells["error"])
 
 
 def _numbers(row: Row, names: Iterable[str]) -> dict[str, Cell]:

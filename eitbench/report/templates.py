@@ -8,6 +8,7 @@ from typing import Any
 from urllib.parse import quote
 
 import jinja2
+from markdown_it import MarkdownIt
 from markupsafe import Markup, escape
 
 from eitbench._foreign import cleaned
@@ -45,3 +46,17 @@ def breakable(text: str) -> Markup:
     html = str(escape(_visible(text)))
     html = html.replace("_", "_<wbr/>").replace("ẽ_<wbr/>", "ẽ_").replace("@", "<wbr/>@")
     return Markup(re.sub(r"/(?=\w{3})", "/<wbr/>", html))
+
+
+def markdown(text: str) -> Markup:
+    """Return HTML of a text with tables, its headings one level lower; HTML and links in it are
+    plain text."""
+    reader = MarkdownIt("commonmark", {"html": False}).enable("table")
+    reader.disable(["link", "image", "autolink"])
+    tokens = reader.parse(text)
+    for token in tokens:
+        if token.type in ("heading_open", "heading_close"):
+            token.tag = f"h{min(int(token.tag[1]) + 1, 6)}"
+    html = reader.renderer.render(tokens, reader.options, {})
+    begin = '<div class="card" tabindex="0" role="region" aria-label="table"><table>'
+    return Markup(html.replace("<table>", begin).replace("</table>", "</table></div>"))

@@ -3,7 +3,6 @@
 https://chromedevtools.github.io/devtools-protocol/ has the commands; a message is JSON and a zero byte.
 """
 
-import base64
 import fcntl
 import json
 import os
@@ -117,10 +116,6 @@ class Browser:
         """Media features, such as prefers_color_scheme="dark"."""
         self.send("Emulation.setEmulatedMedia", features=[
             {"name": name.replace("_", "-"), "value": value} for name, value in features.items()])
-
-    def screenshot(self, path):
-        """Of what the window shows, as PNG, to look at."""
-        path.write_bytes(base64.b64decode(self.send("Page.captureScreenshot", format="png")["data"]))
 
     def _loaded(self):
         while "Page.loadEventFired" not in self.events:

@@ -46,12 +46,7 @@ def test_interval_is_students(values):
     assert mean == pytest.approx(np.mean(values), rel=1e-12)
     expected = stats.sem(values) * stats.t(len(values) - 1).ppf(0.975)
     assert half == pytest.approx(expected, rel=1e-9, abs=1e-12)
-
-
-def test_interval_of_known_numbers():
-    """1, 2, 3: t = 4.303 at two degrees of freedom, over √3. One value has no interval."""
-    assert mean_and_interval([1.0, 2.0, 3.0]) == pytest.approx((2.0, 4.302653 / math.sqrt(3)), rel=1e-6)
-    assert mean_and_interval([0.5]) == (0.5, math.inf)
+    assert mean_and_interval(values[:1]) == (values[0], math.inf)
 
 
 @pytest.mark.parametrize(("mean", "half", "text"), [
@@ -74,14 +69,6 @@ def test_rounding_stays_within_the_interval(mean, part):
     assert abs(float(match[1]) - mean) <= half / 2
     assert abs(float(match[3]) - half) <= 0.34 * half
     assert len(match[2] or "") == len(match[4] or "")
-
-
-@given(st.floats(1e-4, 1.0), st.floats(0.0, 1e-5))
-def test_no_interval_is_shown_as_nothing(mean, half):
-    """An interval too narrow for the table is left out, or keeps a digit; "± 0.00000" would claim certainty."""
-    shown = rounded(mean, half)
-    assert float(shown.split(" ± ")[0]) == pytest.approx(mean, rel=6e-3)
-    assert "±" not in shown or float(shown.split(" ± ")[1]) > 0
 
 
 @pytest.mark.parametrize(("value", "text"), [(0.01234, "0.012"), (1.234, "1.23"), (29.47, "29.5"), (999.4, "999"),
@@ -114,10 +101,7 @@ def test_skill_needs_its_anchors():
         assert row([*others, mine], "mine", "filter")["skill"] is None
     elsewhere = made("mine", "filter", FLOOR, kwargs={"world": {"schedule": {"scored_steps": 16}}})
     assert row([*ANCHORS, elsewhere], "mine", "filter")["skill"] is None
-
-
-def test_skill_of_a_wrong_belief():
-    """1 is the smoother that knows the true model, so an assumed velocity has the same anchors as none."""
+    # an assumed velocity leaves the world, and so its anchors, as they are
     wrong = made("mine", "filter", FLOOR, kwargs={"assume": {"mean_velocity": 7.0}})
     assert row([*ANCHORS, wrong], "mine", "filter")["skill"] == pytest.approx(0.0)
 

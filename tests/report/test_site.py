@@ -14,17 +14,13 @@ from eitbench.bench.table import NOTHING
 from eitbench.bench.text import number, with_interval
 from eitbench.bench.tracks import ids
 from eitbench.report import charts
-from eitbench.report.figures import _strong
-from eitbench.report.model import Row
 from eitbench.report.site import Beside, Measured, collect, render, render_site, write_site
-from eitbench.report.site.beside import HEADLINE, LINKS, METHODS
-from eitbench.report.site.collect import ROBUSTNESS
-from eitbench.report.site.environment import documentation, markdown
-from eitbench.report.site.headline import headline, key_figures
+from eitbench.report.site.collect import HEADLINE, LINKS, METHODS, ROBUSTNESS
+from eitbench.report.site.pages import documentation, headline, key_figures
 from eitbench.report.site.robustness import families, heading, robustness_table
-from eitbench.report.tables import markdown_table, page_table
-from eitbench.report.trainings import lines
-from pages import Page, svgs, text_of
+from eitbench.report.tables import lines, markdown_table, page_table
+from eitbench.report.templates import markdown
+from pages import Page, text_of
 
 from tables import said
 from tiny import BOARD_IDS, RUN, record, several_boards
@@ -224,15 +220,6 @@ def test_an_outperformed_reference_is_marked():
     assert badges["Oracle"] == ("reference", "privileged", "self-reported")
 
 
-def test_of_many_curves_a_few_stand_out():
-    """Reference, floor and the best of the others, agents of several seeds once; of few, all."""
-    notes = {"bound": "reference", "random": "floor"}
-    names = ["bound", "ppo_seed3", "ppo_seed0", "greedy", "cycle", "pair", "ppo_seed1", "random"]
-    rows = [Row({"method": name, "rank": None, "note": notes.get(name, "")}) for name in names]
-    assert [row.cells["method"] for row in _strong(rows)] == ["bound", "ppo_seed3", "greedy", "cycle", "random"]
-    assert _strong(rows[:7]) == rows[:7]
-
-
 # -- robustness, headline ---------------------------------------------------------------------------------------------
 
 HOME, SHORT, NOISE = BOARD_IDS["filter"], "eitbench/Pipe2DShortSlugs-v0", "eitbench/Pipe2DDoubleNoise-v0"
@@ -331,6 +318,7 @@ def test_every_link_resolves(site, pages):
             assert target in site, (path, address)
             assert not parts.fragment or parts.fragment in anchors[target], (path, address)
         assert "style=" not in html or not re.search(r"@import|url\(", html)
+        assert set(re.findall(r"var\((--\w+)\)", html)) <= set(re.findall(r"(--\w+):", site["style.css"]))
     assert links > 50
 
 
@@ -350,19 +338,6 @@ def test_links_beside_the_site(tmp_path):
             assert (folder / "season-1" / "site" / page).parent.joinpath(address).resolve().exists() or (
                 address.endswith("leaderboard.csv")), address
     assert 'baselines/kalman_filter.py"' in files["methods/kalman_filter.html"]
-
-
-def test_charts_are_within_their_pictures(pages):
-    """Of every page; their colours are defined."""
-    for html in pages.values():
-        for chart in svgs(html):
-            width, height = (float(x) for x in chart.get("viewBox").split()[2:])
-            marks = [(float(mark.get("cx")), float(mark.get("cy"))) for mark in chart.iter("circle")]
-            marks += [tuple(map(float, point.split(","))) for line in chart.iter("polyline")
-                      for point in line.get("points").split()]
-            assert marks and all(0 <= x <= width and 0 <= y <= height for x, y in marks)
-    used = {colour for html in pages.values() for colour in re.findall(r"var\((--\w+)\)", html)}
-    assert used <= set(re.findall(r"(--\w+):", (PACKAGE / "report/style.css").read_text()))
 
 
 def test_markdown_is_text_and_tables():

@@ -9,7 +9,7 @@ from eitbench.bench.store import EpisodeStore
 from eitbench.report.boards import run_boards
 from eitbench.report.page import write_page
 from eitbench.report.site import Beside, collect, render_site, write_site
-from eitbench.report.site.beside import HEADLINE
+from eitbench.report.site.collect import HEADLINE
 from PIL import Image
 
 from tiny import record, several_boards
@@ -18,8 +18,6 @@ pytestmark = pytest.mark.skipif(executable() is None, reason="there is no Chromi
 BOARD = "#board-filter-eitbench-Pipe2D-v0"
 ENVIRONMENT, METHOD = "environments/eitbench-Pipe2D-v0.html", "methods/a.html"
 """One page of each kind, beside the index."""
-WIDE = "environments/eitbench-Pipe2DUnknownVelocity-v0.html"
-"""That of the board with the most columns."""
 
 
 def widest():
@@ -37,7 +35,7 @@ def widest():
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    made, records = tmp_path_factory.mktemp("site"), [*several_boards(), *widest(), *(
+    made, records = tmp_path_factory.mktemp("site"), [*several_boards(), *(
         record(f"ppo_seed{seed}", [0.1 + 0.01 * seed] * 8, board="injection",
                title=f"ppo trained with seed {seed}") for seed in (0, 1))]
     write_site(made, render_site(collect(records)))
@@ -120,18 +118,6 @@ def test_filter_by_words_and_by_kind(index):
     assert len(column(index, 1)) == 1 and "twin" in column(index, 1)[0]
 
 
-def test_open_a_method(index):
-    """A click leads to its page; its episodes open by keyboard; the way back is a link."""
-    index.click(f"{BOARD} tbody a", loads=True)
-    assert "/methods/" in index.js("location.pathname")
-    assert index.js("document.querySelector('h1').textContent") in ("A", "Twin", "Seer")
-    index.js("document.querySelector('summary').focus()")
-    index.press("Enter")
-    assert index.js("document.querySelector('details').open && document.querySelector('details table').rows.length") > 8
-    index.click("header nav a", loads=True)
-    assert index.js("location.pathname").endswith("index.html")
-
-
 def test_dark_by_preference_and_by_choice(index, folder):
     """The page follows the system until somebody chooses, and then remembers."""
     def paper():
@@ -167,23 +153,6 @@ def test_nothing_overflows(tab, folder, page, width):
     assert wide > 0 or width > 380
 
 
-WITHIN = """(() => { const card = document.querySelector('.block .card'), right = card.getBoundingClientRect().right;
-    return [...card.querySelectorAll('thead th')].filter(cell => cell.getBoundingClientRect().right <= right)
-        .map(cell => cell.textContent.trim()); })()"""
-
-
-def test_columns_that_are_seen_without_scrolling(tab, folder):
-    """All at 1280 px, whatever is scored; rank, method, error and gain on a phone."""
-    tab.open((folder / WIDE).as_uri())
-    tab.size(1280)
-    seen = tab.js(WITHIN)
-    assert len(seen) == tab.js("document.querySelectorAll('.block thead th').length") > 15
-    tab.size(390)
-    tab.wait("innerWidth === 390")
-    narrow = tab.js(WITHIN)
-    assert narrow[:2] == ["rank", "method"] and narrow[2].startswith("ẽ_c") and narrow[3].startswith("gain")
-
-
 def test_headings_explain_themselves(index):
     """To whoever points at them or comes by keyboard; Escape takes it away."""
     def tip():
@@ -204,16 +173,6 @@ def test_headings_explain_themselves(index):
     index.wait("!!document.querySelector('.tip:popover-open')")
     index.send("Input.dispatchMouseEvent", type="mouseMoved", x=1, y=1)
     index.wait("!document.querySelector('.tip:popover-open')")
-
-
-def test_an_axis_and_the_floor_are_drawn(index):
-    """In the heading of each drawn column, and as a line in each cell of it, at one place."""
-    places = index.js(f"[...document.querySelectorAll('{BOARD} td:nth-child(3) path.grid')]"
-                      ".map(line => line.getAttribute('d'))")
-    assert len(places) == len(column(index, 2)) and len(set(places)) == 1
-    assert index.js(f"document.querySelectorAll('{BOARD} thead svg.axis text').length") >= 3
-    left = "document.querySelector('{} {} svg').getBoundingClientRect().left"
-    assert index.js(left.format(BOARD, "thead")) == index.js(left.format(BOARD, "td:nth-child(3)"))
 
 
 AGENTS = "#board-injection-eitbench-Pipe2DInjection-v0"

@@ -15,12 +15,9 @@ from eitbench._foreign import as_cell, as_markdown
 from eitbench.bench.records import file_name
 from eitbench.report.boards import board_table
 from eitbench.report.model import meanings
-from eitbench.report.site.beside import Beside
-from eitbench.report.site.collect import Site, collect
-from eitbench.report.site.environment import environment_page
-from eitbench.report.site.index import index_page
+from eitbench.report.site.collect import Beside, Site, collect
 from eitbench.report.site.measured import NOBODY, Measured, measured_pages, measured_text
-from eitbench.report.site.method import method_page
+from eitbench.report.site.pages import environment_page, index_page, method_page
 from eitbench.report.site.robustness import robustness_pages, robustness_text
 from eitbench.report.tables import markdown_table
 

@@ -1,17 +1,29 @@
-"""Boards, records and addresses that the pages of the site share."""
+"""Boards, records, addresses and files beside the site that its pages share."""
 
 from __future__ import annotations
 
+import os
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from eitbench.bench.records import newest
 from eitbench.report.boards import leaderboards
 from eitbench.report.model import Board
+from eitbench.report.templates import template
 
 ROBUSTNESS = "robustness.html"
 """Address of the robustness board within the site."""
 MEASURED = "measured.html"
 """Address of the measured board."""
+HEADLINE = "headline.webp", "headline.png"
+"""Animation of the first page, and its still picture. Others are named like an environment, as in
+eitbench-Pipe2D-v0.webp."""
+LINKS = {"How to submit": "README.md", "Statistics": "../docs/statistics.md",
+         "Code": "../README.md"}
+"""Link of every page -> file, from the leaderboards' folder."""
+METHODS = "../baselines"
+"""Folder of the built-in methods, from the leaderboards' folder."""
 
 
 class Site(NamedTuple):
@@ -46,3 +58,37 @@ def collect(records: list[dict[str, Any]]) -> Site:
     return Site(leaderboards(records), sorted(records, key=lambda record: (
         record["environment"]["name"], record["method"], record["version"])))
 
+
+class Beside(NamedTuple):
+    """A folder of leaderboards, as a site within it refers to it."""
+
+    root: str = "../"
+    """Its address, from the site's folder."""
+    media: Mapping[str, int] = {}
+    """Name of each picture -> bytes."""
+    found: frozenset[str] = frozenset()
+    """Those of `LINKS` and `METHODS` that exist."""
+
+    @classmethod
+    def of(cls, folder: Path, site: Path) -> Beside:
+        """Return what a ``site`` finds in a ``folder`` and in the checkout around it."""
+        pictures = sorted(path for pattern in ("*.webp", "*.png")
+                          for path in (folder / "media").glob(pattern))
+        return cls(f"{Path(os.path.relpath(folder, site)).as_posix()}/",
+                   {path.name: path.stat().st_size for path in pictures},
+                   frozenset(name for name in (*LINKS.values(), METHODS)
+                             if (folder / name).exists()))
+
+    def links(self, root: str) -> dict[str, str]:
+        """Return words -> address of what exists; ``root`` leads from the page to the site."""
+        return {words: f"{root}{self.root}{name}" for words, name in LINKS.items()
+                if name in self.found}
+
+    def page(self, kind: str, root: str = "", **contents: Any) -> bytes:
+        """Render a template of the site for a page from which ``root`` leads to the site."""
+        return template(f"site/{kind}.html.j2").render(
+            root=root, links=self.links(root), **contents).encode()
+
+    def picture(self, name: str, root: str) -> str:
+        """Return the address of a picture; empty if there is none."""
+        return f"{root}{self.root}media/{name}" if name in self.media else ""

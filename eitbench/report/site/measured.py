@@ -17,8 +17,7 @@ from eitbench.bench.table import NOTHING, Cell, Table, number_cell
 from eitbench.bench.text import number
 from eitbench.bench.tracks import registered
 from eitbench.measured.cases import MeasuredCase, read_case
-from eitbench.report.site.beside import Beside
-from eitbench.report.site.collect import MEASURED
+from eitbench.report.site.collect import MEASURED, Beside
 from eitbench.report.templates import template
 
 MEANINGS = {each.heading: each.explanation for each in scores("measured").values()

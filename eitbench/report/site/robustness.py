@@ -18,11 +18,9 @@ from eitbench.bench.table import NOTHING, Cell, Table, number_cell
 from eitbench.bench.text import number
 from eitbench.bench.tracks import home_of, ids, named
 from eitbench.report.model import Board, Row, kind_of
-from eitbench.report.site.beside import Beside
-from eitbench.report.site.collect import ROBUSTNESS, Site
-from eitbench.report.site.environment import markdown
+from eitbench.report.site.collect import ROBUSTNESS, Beside, Site
 from eitbench.report.tables import flags, method_cell
-from eitbench.report.templates import template
+from eitbench.report.templates import markdown
 from eitbench.worlds.registry import entry
 
 BELOW = "below the floor"
@@ -130,9 +128,7 @@ def robustness_pages(site: Site, beside: Beside) -> dict[str, bytes]:
         "home": family.home, "board": family.nominal, "table": robustness_table(family),
         "shifts": {name: (board, definition(board)) for name, board in family.shifts.items()},
     } for family in found]
-    html = template("site/robustness.html.j2").render(
-        root="", links=beside.links(""), families=shown, explanations=MEANINGS)
-    return {ROBUSTNESS: html.encode()}
+    return {ROBUSTNESS: beside.page("robustness", families=shown, explanations=MEANINGS)}
 
 
 def definition(board: Board) -> Markup:
