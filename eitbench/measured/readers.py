@@ -237,13 +237,11 @@ def _table_row(path: Path, number: int, fields: list[str], L: int, decimal: str)
     if len(fields) != L + 2:
         raise ValueError(f"{path}: line {number} must have {L + 2} columns, two electrodes and {L} "
                          f"readings, got {len(fields)}; check the separator and the decimal point")
-    values = []
-    for text in fields:
-        try:
-            values.append(float(text.strip().replace(decimal, ".")) if text.strip() else np.nan)
-        except ValueError:
-            raise ValueError(f"{path}: line {number} must hold numbers with the decimal point "
-                             f"{decimal!r}, got {text.strip()!r}") from None
+    try:
+        values = [float(text.strip().replace(decimal, ".") or "nan") for text in fields]
+    except ValueError as error:
+        raise ValueError(f"{path}: line {number} must hold numbers with the decimal point "
+                         f"{decimal!r}: {error}") from None
     if not all(each in range(1, L + 1) for each in values[:2]) or values[0] == values[1]:
         raise ValueError(f"{path}: line {number} must begin with two electrodes from 1 to {L}, got "
                          f"{fields[0].strip()} and {fields[1].strip()}")
