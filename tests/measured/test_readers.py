@@ -127,7 +127,7 @@ KTC = {"Inj": CURRENTS.T, "Mpat": MATRIX.T, "Uel": VALUES}
 
 @pytest.mark.parametrize(("content", "name", "format", "message"), [
     (None, "a.mat", None, "there is none"),
-    (b"MATLAB 7.3 MAT-file, Platform: GLNXA64" + bytes(500), "a.mat", None, r"version 7\.3; save it with `-v7`"),
+    (b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + bytes(500), "a.mat", None, "`save -v7` writes: .*v7.3"),
     (b"", "a.mat", None, r"a\.mat must"),
     (b"MATLAB 5.0 MAT-file" + bytes(300), "a.mat", None, r"a\.mat must"),
     ({"Inj": CURRENTS.T, "Uel": VALUES}, "a.mat", None, "must hold Mpat; there are"),
