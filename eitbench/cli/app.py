@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from eitbench import __version__
-from eitbench.cli import options
+from eitbench.cli import learn, options
 from eitbench.cli.estimate import estimate
-from eitbench.cli.export import export
-from eitbench.cli.fit import app as fit_commands
-from eitbench.cli.maintain import golden
 from eitbench.cli.run import report, run, typed
 from eitbench.cli.verify import verify
 
@@ -24,8 +20,6 @@ Benchmark estimators that see a flow only through voltages on the pipe's wall.
 A first look:  eitbench run  — runs our baselines on four test episodes, prints the table, \
 writes results/index.html.
 """)
-
-Algorithm = StrEnum("Algorithm", ["ppo", "dqn", "sac", "recurrent_ppo", "maskable_ppo"])
 
 
 def _say_version(asked: bool) -> None:
@@ -47,106 +41,29 @@ def list_() -> None:
     """Show the environments, the baselines and policies, and which boards they play on."""
     from eitbench.bench.methods import load_method, own_methods
     from eitbench.bench.tracks import boards_of, ids, measured_ids
-    from eitbench.data.regions import outline
     from eitbench.worlds.registry import entry
     from eitbench.worlds.task import lag_steps
-    # Nothing is built: what takes long to make is shipped, the rest are numbers of the world.
-    options.say("environments")
-    for name in ids("estimation"):
+    lines = [("environments", "", "")]
+    for name in ids():
         world = entry(name).world
-        flow = world.velocity_model
-        numbers = outline(world).mass.shape[0] + (0 if flow is None else flow.size)
         lag = lag_steps(world, entry(name).settings.get("lag", 0))
-        options.say(f"  {name:40} {boards_of(name, {})[0]:10}  lag {lag}, "
-                    f"{world.schedule.scored_steps} scored of {world.n_steps} states, "
-                    f"{numbers} numbers each")
-    for name in ids("injection"):
-        world = entry(name).world
-        L = world.vessel.n_electrodes
-        limit = world.instrument.limit
         budget = world.schedule.budget
-        what = f"{limit} currents" if limit else f"{L * (L - 1) // 2} electrode pairs"
-        allowed = "" if budget is None else f", {budget} of them allowed"
-        options.say(f"  {name:40} injection   {what}, {world.n_steps - len(world.currents)} "
-                    f"injections{allowed}")
-    for name in measured_ids():
-        options.say(f"  {name:40} measured    data are downloaded separately")
+        allowed = "" if budget is None else f", {budget} injections allowed"
+        lines.append((f"  {name}", boards_of(name, {})[0],
+                      f"lag {lag}, {world.schedule.scored_steps} scored of {world.n_steps} states"
+                      f"{allowed}"))
+    lines += [(f"  {name}", "measured", "data are downloaded separately")
+              for name in measured_ids()]
     for track, heading in (("estimation", "baselines"), ("injection", "policies")):
-        options.say(heading)
-        for name in own_methods(track):
-            method = load_method(name, track)
-            options.say(f"  {name:40} {', '.join(method.boards):30}  {method.title}")
+        lines.append((heading, "", ""))
+        methods = {name: load_method(name, track) for name in own_methods(track)}
+        lines += [(f"  {name}", ", ".join(method.boards), method.title)
+                  for name, method in methods.items()]
+    for name, boards, about in lines:
+        options.say(f"{name:42} {boards:30}  {about}".rstrip())
 
 
 app.command()(run)
-
-
-@app.command()
-def bank(
-    env: Annotated[str, typer.Option(help="Environment id.")] = "eitbench/Pipe2D-v0",
-    seeds: Annotated[str, typer.Option(help="Episodes, such as train:0-999.")] = "train:0-99",
-    jobs: options.Jobs = options.CORES,
-    backend: options.Backends = options.Backend.loky,
-) -> None:
-    """Simulate many episodes ahead of training and keep what an environment needs of them.
-
-    They lie, memory-mapped, in the cache folder ($EITBENCH_CACHE). The same command again resumes.
-    """
-    import shutil
-
-    from eitbench.data.bank import fill, missing_seeds, recording_bytes
-    from eitbench.data.cache import folder
-    from eitbench.data.seeds import parse_seeds
-    from eitbench.worlds.registry import entry
-    with options.clear_errors():
-        numbers = parse_seeds(seeds)
-        world = entry(env).world
-    place = folder(world)
-    each = recording_bytes(world)
-    try:
-        place.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise typer.BadParameter(f"recordings cannot be kept in {place}: {error}") from error
-    missing = len(missing_seeds(world, numbers))
-    options.say(f"{len(numbers)} episodes, {len(numbers) * each / 1e6:.0f} MB in {place}; "
-                f"{missing} to simulate")
-    free = shutil.disk_usage(place).free
-    if missing * each > free:
-        raise typer.BadParameter(f"seeds need {missing * each / 1e9:.1f} GB more, and "
-                                 f"{free / 1e9:.1f} GB are free")
-    with options.clear_errors():
-        made = fill(world, numbers, n_jobs=jobs, backend=backend)
-    options.say(f"{made} simulated, {len(numbers) - made} were there")
-
-
-@app.command()
-def train(
-    env: options.InjectionId,
-    algo: Annotated[Algorithm, typer.Option(
-        help="Algorithm of stable-baselines3 or sb3-contrib.")] = Algorithm.ppo,
-    config: Annotated[Path, typer.Option(
-        help="A YAML file such as those in baselines/rl.")] = Path("baselines/rl/ppo.yml"),
-    seed: Annotated[int, typer.Option(
-        min=0, help="Of the training; episodes are drawn from the train split.")] = 0,
-    steps: Annotated[int | None, typer.Option(
-        min=0, help="Steps in place of the configuration's total_steps.")] = None,
-    out: Annotated[Path | None, typer.Option(
-        "--out", "-o", help="Folder of the run. Default: results/training/ENV/ALGO/seedK.")] = None,
-) -> None:
-    """Train an agent to choose injections.
-
-    The same command again goes on from the last checkpoint. The folder receives model.zip,
-    config.json, monitor.csv, evaluations.npz (scores on dev episodes) and logs for TensorBoard.
-    """
-    from dataclasses import replace
-    with options.clear_errors():
-        from eitbench.rl import training
-        asked = training.read_config(config)
-        if steps is not None:
-            asked = replace(asked, total_steps=steps)
-        folder = out or Path("results/training") / env.replace("/", "-") / algo / f"seed{seed}"
-        model = training.train(env, algo.value, asked, seed, folder)
-    options.say(f"wrote {model}")
 
 
 @app.command()
@@ -189,10 +106,38 @@ def submit(
 
 
 app.command()(verify)
-app.command()(golden)
-app.add_typer(fit_commands, name="fit")
-app.command()(estimate)
-app.command()(export)
+
+
+@app.command()
+def golden(
+    names: Annotated[list[str] | None, typer.Argument(
+        help="Environment ids or built-in methods. Default: all.")] = None,
+    new_version: Annotated[bool, typer.Option(
+        "--new-version", help="Write moved numbers as the method's next version.")] = False,
+) -> None:
+    """Compare worlds and built-in methods with their golden files (for maintainers).
+
+    Exit status 0 if all numbers agree, 1 otherwise. Missing files are written. A world whose
+    numbers have moved needs a new id, the next -vN. All files take about half an hour.
+    """
+    from eitbench.bench import golden
+    any_moved = False
+    with options.clear_errors():
+        for name, status, differences in golden.update(names or [], new_version=new_version):
+            any_moved |= status == "moved"
+            options.say(f"{name}: {status}")
+            for difference in differences:
+                options.say(f"  {difference}", err=status == "moved")
+    if any_moved:
+        options.say("numbers have moved: find the cause; or give the world the next -vN, or write "
+                    "the method's next version with --new-version and run its records again",
+                    err=True)
+        raise typer.Exit(1)
+
+
+app.add_typer(learn.fit, name="fit")
+for _command in (learn.bank, learn.train, learn.export, estimate):
+    app.command()(_command)
 
 
 @app.command()

@@ -69,12 +69,9 @@ def clear_errors() -> Iterator[None]:
     missing extra into a message instead of a traceback."""
     try:
         yield
-    except WorkerLost as error:
-        say(error, err=True)
-        raise typer.Exit(1) from error
     except RuntimeError as error:
         from eitbench.bench.isolation import WorkerError
-        if not isinstance(error, WorkerError):
+        if not isinstance(error, WorkerLost | WorkerError):
             raise
         say(error, err=True)  # a traceback would show a stranger's words as they are
         raise typer.Exit(1) from error

@@ -177,6 +177,16 @@ def _fit(model: _HomogeneousModel, start: np.ndarray, expected: np.ndarray, mean
     return x, slopes(x)
 
 
+def electrode_misfits(calibration: Calibration, matrix: np.ndarray) -> np.ndarray:
+    """(L,) V, RMS misfit of the homogeneous model at the readings of each electrode; ``matrix``
+    (M, L) maps potentials to readings."""
+    involved = (matrix != 0).astype(float)
+    squares = np.nan_to_num(calibration.measured - calibration.computed)**2
+    count = np.maximum((np.isfinite(calibration.measured) @ involved).sum(axis=0), 1.0)
+    misfits: np.ndarray = np.sqrt((squares @ involved).sum(axis=0) / count)
+    return misfits
+
+
 def electrode_sizes(electrodes: CompleteElectrodeModel) -> np.ndarray:
     """(L,) length of each electrode in m in 2D, square root of its area in 3D."""
     sizes = []

@@ -33,16 +33,12 @@ EIDORS_FRAME_TIMES = {"zc_demo3": 1 / 7, "zc_demo4": 1 / 7, "zc_resp": 1 / 7}
 def load_variables(path: Path, *required: str) -> dict[str, np.ndarray]:
     """Load the variables of a .mat file up to version 7; ``ValueError`` names the file, and
     ``required`` variables that are missing."""
-    if not path.is_file():
-        raise ValueError(f"{path} must be a file, there is none")
-    if path.open("rb").read(19) == b"MATLAB 7.3 MAT-file":
-        raise ValueError(f"{path} must be a MATLAB file up to version 7, got version 7.3; save it "
-                         "with `-v7`")
     try:
-        found = loadmat(path)
+        found = loadmat(path, appendmat=False)
     except (MatReadError, NotImplementedError, OSError, TypeError, ValueError, KeyError,
             IndexError) as error:
-        raise ValueError(f"{path} must be a complete MATLAB file: {error}") from None
+        raise ValueError(f"{path} must be a complete MATLAB file of version 7 or earlier, as "
+                         f"`save -v7` writes: {error}") from None
     found = {name: value for name, value in found.items() if not name.startswith("__")}
     if missing := [name for name in required if name not in found]:
         raise ValueError(f"{path} must hold {', '.join(missing)}; there are "

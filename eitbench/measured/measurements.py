@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -20,7 +20,6 @@ VERSION = 1
 REQUIRED = ("currents", "injections", "matrix", "readings", "times")
 """Data sets of a file; ``reference`` is optional."""
 MAX_IN_MEMORY_BYTES = 1 << 26
-CHUNK_VALUES = 1 << 20
 CURRENT_BALANCE_RTOL = 1e-6
 """Tolerated sum of the currents of an injection, relative to its largest current."""
 
@@ -58,7 +57,10 @@ class Measurements:
         readings = _check_readings("readings", self.readings, (None, M))
         T = len(readings)
         times = _check.array("times", self.times, (T,), units="s")
-        _check_increasing(times)
+        if (back := np.flatnonzero(np.diff(times) <= 0)).size:
+            before, after = times[back[0]:back[0] + 2]
+            raise ValueError(f"times must increase, got {before:g} s and then {after:g} s at "
+                             f"reading {back[0] + 1}")
         arrays = {"currents": currents, "injections": _check_indices(self.injections, T, K),
                   "matrix": matrix, "readings": readings, "times": times, "reference": None}
         if self.reference is not None:
@@ -92,21 +94,15 @@ class Measurements:
     @cached_property
     def frame(self) -> int:
         """Number of readings until each injection has been active once."""
-        first = np.full(len(self.currents), -1)
-        for begin in range(0, len(self.injections), CHUNK_VALUES):
-            present, where = np.unique(self.injections[begin:begin + CHUNK_VALUES],
-                                       return_index=True)
-            new = first[present] < 0
-            first[present[new]] = begin + where[new]
-            if (first >= 0).all():
-                break
+        first = np.zeros(len(self.currents), dtype=int)
+        first[self.injections[::-1]] = np.arange(len(self.injections))[::-1]
         return 1 + int(first.max())
 
     @cached_property
     def largest(self) -> float:
         """Largest magnitude of all readings in V."""
-        return max(float(np.abs(chunk[np.isfinite(chunk)]).max(initial=0.0))
-                   for chunk in _chunks(self.readings))
+        return float(max(np.fmax.reduce(self.readings, axis=None),
+                         -np.fmin.reduce(self.readings, axis=None)))
 
     def homogeneous(self, frames: int = 1) -> np.ndarray:
         """(F, K, M) V: the reference, or without one the first ``frames`` frames."""
@@ -191,12 +187,6 @@ def _rows(path: Path, dataset: Any, steps: slice) -> np.ndarray:
     return rows
 
 
-def _chunks(values: np.ndarray) -> Iterator[np.ndarray]:
-    rows = max(CHUNK_VALUES // max(values[0].size, 1), 1)
-    for begin in range(0, len(values), rows):
-        yield values[begin:begin + rows]
-
-
 def _by_injection(records: np.ndarray, injections: np.ndarray, K: int) -> np.ndarray:
     """Sort F sequences (F, T, M) by injection into (F·R, K, M), with R the largest number of
     repetitions of an injection and NaN where an injection has fewer."""
@@ -229,15 +219,6 @@ def _balanced(currents: np.ndarray) -> np.ndarray:
     return currents
 
 
-def _check_increasing(times: np.ndarray) -> None:
-    for begin in range(0, len(times), CHUNK_VALUES):
-        steps = np.diff(times[begin:begin + CHUNK_VALUES + 1])
-        if (back := np.flatnonzero(steps <= 0)).size:
-            t = begin + int(back[0])
-            raise ValueError(f"times must increase, got {times[t]:g} s and then "
-                             f"{times[t + 1]:g} s at reading {t + 1}")
-
-
 def _check_indices(given: np.ndarray, T: int, K: int) -> np.ndarray:
     injections = np.asarray(given)
     if injections.shape != (T,) or not np.issubdtype(injections.dtype, np.integer):
@@ -262,8 +243,8 @@ def _check_readings(name: str, given: np.ndarray, shape: tuple[int | None, ...])
             want not in (None, size) for want, size in zip(shape, value.shape, strict=True)):
         wanted = ", ".join("any" if size is None else str(size) for size in shape)
         raise ValueError(f"{name} must have shape ({wanted}), got {value.shape}")
-    if any(np.isinf(chunk).any() for chunk in _chunks(value)):
+    if np.isinf(value).any():
         raise ValueError(f"{name} must be finite or NaN, got infinite values")
-    if all(np.isnan(chunk).all() for chunk in _chunks(value)):
+    if np.isnan(value).all():
         raise ValueError(f"{name} must hold numbers, got NaN only")
     return value

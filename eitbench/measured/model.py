@@ -13,8 +13,6 @@ if TYPE_CHECKING:
     from eitbench.physics.cem import CompleteElectrodeModel
     from eitbench.physics.observation import ObservationModel
 
-CHUNK_ROWS = 10_000
-
 
 class MeasurementModel:
     """Readings gain · D U(c) + offset of potentials U = 𝓡(c) I, where ``mask``; a `VoltageModel`.
@@ -92,14 +90,11 @@ class MeasurementModel:
 def complete_channels(measurements: Measurements) -> np.ndarray:
     """(K, M) bool: readings that exist at every use of their injection; others are not used.
     ``ValueError`` if there are none."""
-    K, M = len(measurements.currents), len(measurements.matrix)
-    complete = np.ones((K, M), dtype=bool)
-    for begin in range(0, len(measurements.readings), CHUNK_ROWS):
-        injections = measurements.injections[begin:begin + CHUNK_ROWS]
-        finite = np.isfinite(measurements.readings[begin:begin + CHUNK_ROWS])
-        for k in np.unique(injections):
-            complete[k] &= finite[injections == k].all(axis=0)
-    complete[np.setdiff1d(np.arange(K), measurements.injections)] = False
+    finite = np.isfinite(measurements.readings)
+    complete = np.ones((len(measurements.currents), len(measurements.matrix)), dtype=bool)
+    for k, row in enumerate(complete):
+        used = measurements.injections == k
+        row &= used.any() & finite[used].all(axis=0)
     if not complete.any():
         raise ValueError("readings must hold some that exist at every use of their injection, got "
                          "none")

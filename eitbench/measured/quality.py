@@ -7,7 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from eitbench.measured.calibration import CONTACT_PRIOR_MEAN, Calibration, electrode_sizes
+from eitbench.measured.calibration import (
+    CONTACT_PRIOR_MEAN,
+    Calibration,
+    electrode_misfits,
+    electrode_sizes,
+)
 from eitbench.measured.measurements import Measurements
 
 if TYPE_CHECKING:
@@ -121,13 +126,10 @@ def _order_warnings(measurements: Measurements, calibration: Calibration,
 
 
 def _electrode_warnings(measurements: Measurements, calibration: Calibration) -> list[str]:
-    involved = (measurements.matrix != 0).astype(float)
-    if (involved.sum(axis=1) > 2).any():
+    if (np.count_nonzero(measurements.matrix, axis=1) > 2).any():
         return []
-    squares = np.nan_to_num(calibration.measured - calibration.computed)**2
-    count = np.maximum((np.isfinite(calibration.measured) @ involved).sum(axis=0), 1.0)
-    scale = np.sqrt(np.nanmean(calibration.measured**2))
-    misfit = np.sqrt((squares @ involved).sum(axis=0) / count) / scale
+    misfit = electrode_misfits(calibration, measurements.matrix)
+    misfit /= np.sqrt(np.nanmean(calibration.measured**2))
     median = float(np.median(misfit))
     return [f"Electrode {worst + 1} looks dead or loose: the misfit of its readings is "
             f"{100 * misfit[worst]:.2g} % of a mean reading, the median of all electrodes "

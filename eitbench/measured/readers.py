@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 from collections.abc import Callable
 from datetime import datetime
 from inspect import signature
@@ -79,8 +80,8 @@ class _Frame(NamedTuple):
     amplitude: float
     """A"""
     pairs: list[tuple[int, int]]
-    potentials: np.ndarray
-    """(K, L) complex, V"""
+    potentials: list[np.ndarray]
+    """(L,) V, real parts, for each pair"""
 
 
 def read_sciospec(path: Path | str) -> Measurements:
@@ -100,8 +101,8 @@ def read_sciospec(path: Path | str) -> Measurements:
     for file, frame in zip(files, frames, strict=True):
         if frame.pairs != first.pairs or frame.amplitude != first.amplitude:
             raise ValueError(f"{file} must have the injections of {files[0]}")
-    K, L = first.potentials.shape
-    readings = np.array([frame.potentials.real for frame in frames])
+    readings = np.array([frame.potentials for frame in frames])
+    K, L = readings.shape[1:]
     readings -= readings.mean(axis=2, keepdims=True)
     begins = np.array([frame.time for frame in frames])
     frame_time = float(np.median(np.diff(begins))) if len(frames) > 1 else 1.0
@@ -139,12 +140,11 @@ def _read_frame(path: Path) -> _Frame:
     if not body or len(body) % 2:
         raise ValueError(f"{path} must hold pairs of lines after its header, injection and "
                          f"potentials, got {len(body)} lines")
-    pairs, potentials = [], []
-    for number in range(0, len(body), 2):
-        line = header + number + 1
+    frame = _Frame(time, frequency, amplitude, [], [])
+    for line, pair, row in zip(itertools.count(header + 1, 2), body[::2], body[1::2], strict=False):
         try:
-            enters, leaves = (int(each) for each in body[number].split())
-            parts = np.array(body[number + 1].split(), dtype=float)
+            enters, leaves = (int(each) for each in pair.split())
+            parts = np.array(row.split(), dtype=float)
         except ValueError:
             raise ValueError(f"{path}: line {line} must be two electrodes, and the next one "
                              "numbers with decimal points") from None
@@ -153,10 +153,10 @@ def _read_frame(path: Path) -> _Frame:
                              f"two for each of {count} channels, got {len(parts)}")
         if not 1 <= min(enters, leaves) <= max(enters, leaves) <= count:
             raise ValueError(f"{path}: line {line} must name electrodes from 1 to {count}, got "
-                             f"{body[number]!r}")
-        pairs.append((enters, leaves))
-        potentials.append(parts[:2 * count:2] + 1j * parts[1:2 * count:2])
-    return _Frame(time, frequency, amplitude, pairs, np.array(potentials))
+                             f"{pair!r}")
+        frame.pairs.append((enters, leaves))
+        frame.potentials.append(parts[:2 * count:2])
+    return frame
 
 
 def read_table(path: Path | str, *, electrodes: int, current: float, time_step: float = 1.0,
@@ -237,13 +237,11 @@ def _table_row(path: Path, number: int, fields: list[str], L: int, decimal: str)
     if len(fields) != L + 2:
         raise ValueError(f"{path}: line {number} must have {L + 2} columns, two electrodes and {L} "
                          f"readings, got {len(fields)}; check the separator and the decimal point")
-    values = []
-    for text in fields:
-        try:
-            values.append(float(text.strip().replace(decimal, ".")) if text.strip() else np.nan)
-        except ValueError:
-            raise ValueError(f"{path}: line {number} must hold numbers with the decimal point "
-                             f"{decimal!r}, got {text.strip()!r}") from None
+    try:
+        values = [float(text.strip().replace(decimal, ".") or "nan") for text in fields]
+    except ValueError as error:
+        raise ValueError(f"{path}: line {number} must hold numbers with the decimal point "
+                         f"{decimal!r}: {error}") from None
     if not all(each in range(1, L + 1) for each in values[:2]) or values[0] == values[1]:
         raise ValueError(f"{path}: line {number} must begin with two electrodes from 1 to {L}, got "
                          f"{fields[0].strip()} and {fields[1].strip()}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 from collections.abc import Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +21,7 @@ from PIL import Image
 from eitbench._files import write_atomically
 from eitbench.bench.measured import N_PLOTTED_FRAMES
 from eitbench.envs.rendering import draw_electrodes, draw_field
+from eitbench.measured.calibration import electrode_misfits
 from eitbench.measured.segmentation import ktc_score, require_round_tank, segment
 from eitbench.physics.rest import AtRest
 from eitbench.report.templates import template
@@ -49,7 +51,8 @@ def write_report(path: Path, env: MeasuredEnv, runs: Sequence[MeasuredRun],
     calibration = env.calibration
     page = template("measured.html.j2").render(
         title=str(source.pop("file", "Measurements")), source=source,
-        methods=[_row(env, each) for each in runs], warnings=env.quality_warnings(),
+        methods=[(run.method, run.withheld_rmse, run.mean_nis(env.task.warm_up)) for run in runs],
+        warnings=env.quality_warnings(),
         facts=_facts(env), estimate=_estimate(env, runs[0]), first=runs[0].method,
         over_time=_figure(_over_time(env, runs)), velocity=_velocity(env, runs),
         fit=_figure(_fit(env)), correction=CORRECTION_TEXT[calibration.correction],
@@ -61,12 +64,6 @@ def write_report(path: Path, env: MeasuredEnv, runs: Sequence[MeasuredRun],
 
 def _is_at_rest(env: MeasuredEnv) -> bool:
     return isinstance(env.task.transport, AtRest)
-
-
-def _row(env: MeasuredEnv, run: MeasuredRun) -> dict[str, str]:
-    nis = run.mean_nis(env.task.warm_up)
-    return {"method": run.method, "withheld": f"{run.withheld_rmse:.2f}",
-            "nis": "–" if nis is None else f"{nis:.2f}"}
 
 
 def _facts(env: MeasuredEnv) -> dict[str, str]:
@@ -106,10 +103,8 @@ def _estimate(env: MeasuredEnv, run: MeasuredRun) -> str:
     after = np.flatnonzero(run.steps > min(env.task.warm_up, env.episode_steps - 1))
     rows = after[np.unique(np.linspace(0, len(after) - 1, N_PLOTTED_FRAMES).round().astype(int))]
     frames = [_image(_picture(env, run, int(row))) for row in rows]
-    content = io.BytesIO()
-    frames[0].save(content, "webp", save_all=True, append_images=frames[1:], loop=0, duration=125,
-                   quality=40, method=4)
-    return "data:image/webp;base64," + base64.b64encode(content.getvalue()).decode()
+    return _data_uri(frames[0], "webp", save_all=True, append_images=frames[1:], loop=0,
+                     duration=125, quality=40, method=4)
 
 
 def _picture(env: MeasuredEnv, run: MeasuredRun, row: int) -> Figure:
@@ -127,8 +122,7 @@ def _picture(env: MeasuredEnv, run: MeasuredRun, row: int) -> Figure:
     if run.variance is not None and np.isfinite(run.variance[row]).all():
         spread = scale * np.sqrt(run.variance[row])
         panels.append((spread, 0.0, float(spread.max()), "magma", "standard deviation / (mS/m)"))
-    figure = Figure(figsize=(5.2 * len(panels), 4.4), dpi=100, layout="constrained")
-    axes = figure.subplots(1, len(panels), squeeze=False)[0]
+    figure, axes = _panels(len(panels), (5.2 * len(panels), 4.4))
     current = env.measurements.currents[env.measurements.injections[t - 1]]
     for ax, (values, least, most, colours, label) in zip(axes, panels, strict=True):
         mappable = draw_field(ax, task.mesh, values, least, most, colours)
@@ -148,37 +142,48 @@ def _segmentations(env: MeasuredEnv, runs: Sequence[MeasuredRun], truth: np.ndar
     for run in runs:
         found = segment(env.vessel, env.task, run.mean[-1])
         pictures[f"{run.method}: {ktc_score(truth, found):.2f}"] = found
-    figure = Figure(figsize=(3.0 * len(pictures), 3.3), dpi=100, layout="constrained")
-    axes = figure.subplots(1, len(pictures), squeeze=False)[0]
+    figure, axes = _panels(len(pictures), (3.0 * len(pictures), 3.3))
     for ax, (title, picture) in zip(axes, pictures.items(), strict=True):
         ax.imshow(picture, cmap=CLASS_COLOURS, vmin=0, vmax=2, extent=(-side, side, -side, side),
                   interpolation="nearest")
         ax.add_patch(Circle((0.0, 0.0), side, fill=False, color="0.4"))
         ax.set(title=title, xlabel="x / cm")
-        _bare(ax)
     return figure
 
 
 def _over_time(env: MeasuredEnv, runs: Sequence[MeasuredRun]) -> Figure:
     """Withheld residuals and NIS of each method."""
-    figure = Figure(figsize=(10.5, 3.4), dpi=100, layout="constrained")
-    residual, nis = figure.subplots(1, 2)
+    figure, (residual, nis) = _panels(2, (10.5, 3.4))
+    frame = max(env.task.warm_up, 1)
+    _plot(residual, env, {run.method: np.sqrt(_frame_means(run.withheld_residual_rms**2, frame))
+                          for run in runs}, "withheld residual / noise std")
+    _plot(nis, env, {run.method: _frame_means(run.nis, frame) for run in runs}, "NIS/m")
+    for ax in (residual, nis):
+        ax.axhline(1.0, color="0.7", linewidth=1)
+        ax.set_yscale("log")
+        ax.set_ylim(bottom=max(ax.get_ylim()[0], MIN_PLOTTED))
     if not any(np.isfinite(run.nis).any() for run in runs):
         nis.set_axis_off()
-    frame = max(env.task.warm_up, 1)
-    for run, colour in zip(runs, COLOURS * len(runs), strict=False):
-        for ax, values in ((residual, run.withheld_residual_rms**2), (nis, run.nis)):
-            if np.isfinite(values).any():
-                smooth = _frame_means(values, frame)
-                ax.plot(env.measurements.times, np.sqrt(smooth) if ax is residual else smooth,
-                        color=colour, label=run.method, linewidth=1.6)
-    for ax, title in ((residual, "withheld residual / noise std"), (nis, "NIS/m")):
-        ax.axhline(1.0, color="0.7", linewidth=1)
-        ax.set(xlabel="time / s", ylabel=title, yscale="log")
-        ax.set_ylim(bottom=max(ax.get_ylim()[0], MIN_PLOTTED))
-        _bare(ax)
     residual.legend(frameon=False, fontsize=9)
     return figure
+
+
+def _velocity(env: MeasuredEnv, runs: Sequence[MeasuredRun]) -> str:
+    """Velocity estimates over time as a data URI; empty if the velocity is not estimated."""
+    if env.task.velocity is None:
+        return ""
+    figure, (axes,) = _panels(1, (10.5, 2.8))
+    _plot(axes, env, {run.method: run.velocity[:, 0] for run in runs if run.velocity is not None},
+          "mean velocity / (m/s)")
+    axes.legend(frameon=False, fontsize=9)
+    return _figure(figure)
+
+
+def _plot(axes: Axes, env: MeasuredEnv, curves: dict[str, np.ndarray], label: str) -> None:
+    """Draw values (T,) of each method over time."""
+    for (method, values), colour in zip(curves.items(), cycle(COLOURS), strict=False):
+        axes.plot(env.measurements.times, values, color=colour, label=method)
+    axes.set(xlabel="time / s", ylabel=label)
 
 
 def _frame_means(values: np.ndarray, frame: int) -> np.ndarray:
@@ -189,25 +194,9 @@ def _frame_means(values: np.ndarray, frame: int) -> np.ndarray:
     return np.where(weights > 0, total / np.maximum(weights, 1.0), np.nan)
 
 
-def _velocity(env: MeasuredEnv, runs: Sequence[MeasuredRun]) -> str:
-    """Velocity estimates over time as a data URI; empty if the velocity is not estimated."""
-    if env.task.velocity is None:
-        return ""
-    figure = Figure(figsize=(10.5, 2.8), dpi=100, layout="constrained")
-    axes = figure.subplots()
-    for run, colour in zip(runs, COLOURS * len(runs), strict=False):
-        if run.velocity is not None:
-            axes.plot(env.measurements.times, run.velocity[:, 0], color=colour, label=run.method)
-    axes.set(xlabel="time / s", ylabel="mean velocity / (m/s)")
-    axes.legend(frameon=False, fontsize=9)
-    _bare(axes)
-    return _figure(figure)
-
-
 def _fit(env: MeasuredEnv) -> Figure:
     """Measured readings of homogeneous fluid over those of the fitted model."""
-    figure = Figure(figsize=(10.5, 3.6), dpi=100, layout="constrained")
-    values, misfit = figure.subplots(1, 2)
+    figure, (values, misfit) = _panels(2, (10.5, 3.6))
     known = np.isfinite(env.calibration.measured)
     measured = 1e3 * env.calibration.measured[known]
     computed = 1e3 * env.calibration.computed[known]
@@ -218,31 +207,22 @@ def _fit(env: MeasuredEnv) -> Figure:
     misfit.plot(computed, measured - computed, ".", color=COLOURS[1], markersize=3)
     misfit.axhline(0.0, color="0.8", linewidth=1)
     misfit.set(xlabel="model / mV", ylabel="measured − model / mV")
-    _bare(values)
-    _bare(misfit)
     return figure
 
 
 def _contacts(env: MeasuredEnv) -> Figure:
     """Contact impedances with their uncertainty, and the misfit of each electrode's readings."""
     calibration = env.calibration
-    figure = Figure(figsize=(10.5, 3.2), dpi=100, layout="constrained")
-    impedance, misfit = figure.subplots(1, 2)
+    figure, (impedance, misfit) = _panels(2, (10.5, 3.2))
     z = 1e3 * calibration.contact_impedance
     number = np.arange(1, len(z) + 1)
     factor = np.exp(calibration.contact_impedance_std)
     impedance.errorbar(number, z, [z - z / factor, z * factor - z], fmt="o", color=COLOURS[0],
                        markersize=4, linewidth=1)
     impedance.set(xlabel="electrode", ylabel="contact impedance / (mΩ·m²)", yscale="log")
-    scale = np.nanmean(np.abs(calibration.measured))
-    squares = np.nan_to_num(calibration.measured - calibration.computed)**2
-    involved = (env.measurements.matrix != 0).astype(float)
-    count = np.maximum((np.isfinite(calibration.measured) @ involved).sum(axis=0), 1.0)
-    misfit.bar(number, 100 * np.sqrt((squares @ involved).sum(axis=0) / count) / scale,
-               color=COLOURS[1])
+    misfits = electrode_misfits(calibration, env.measurements.matrix)
+    misfit.bar(number, 100 * misfits / np.nanmean(np.abs(calibration.measured)), color=COLOURS[1])
     misfit.set(xlabel="electrode", ylabel="misfit of its readings / %\nof the mean reading")
-    _bare(impedance)
-    _bare(misfit)
     return figure
 
 
@@ -250,28 +230,36 @@ def _electrodes(run: MeasuredRun) -> Figure:
     """Residuals of each electrode's readings over time; bars for a single frame."""
     residuals = run.electrode_residual_rms
     number = np.arange(1, residuals.shape[1] + 1)
-    figure = Figure(figsize=(10.5, 1.6 + 0.09 * len(number)), dpi=100, layout="constrained")
-    axes = figure.subplots()
+    figure, (axes,) = _panels(1, (10.5, 1.6 + 0.09 * len(number)))
     if len(residuals) == 1:
         axes.bar(number, residuals[0], color=COLOURS[1])
         axes.set(xlabel="electrode", ylabel="residual of its readings / noise std")
-    else:
-        shown = np.log10(np.maximum(residuals.T, 1e-3))
-        drawn = axes.pcolormesh(run.frame_times, number, shown, cmap="magma", shading="nearest",
-                                vmin=0.0, vmax=max(1.0, float(np.nanmax(shown))))
-        axes.set(xlabel="time / s", ylabel="electrode")
-        axes.invert_yaxis()
-        bar = figure.colorbar(drawn, ax=axes, label="residual / noise std")
-        bar.ax.yaxis.set_major_formatter(_POWERS)
-    _bare(axes)
+        return figure
+    shown = np.log10(np.maximum(residuals.T, 1e-3))
+    drawn = axes.pcolormesh(run.frame_times, number, shown, cmap="magma", shading="nearest",
+                            vmin=0.0, vmax=max(1.0, float(np.nanmax(shown))))
+    axes.set(xlabel="time / s", ylabel="electrode")
+    axes.invert_yaxis()
+    bar = figure.colorbar(drawn, ax=axes, label="residual / noise std")
+    bar.ax.yaxis.set_major_formatter(_POWERS)
     return figure
 
 
 _POWERS = FuncFormatter(lambda value, _: f"{10**value:.3g}")
 
 
-def _bare(axes: Axes) -> None:
-    axes.spines[["top", "right"]].set_visible(False)
+def _panels(count: int, size: tuple[float, float]) -> tuple[Figure, Sequence[Axes]]:
+    """Return a figure of this size in inches, and its axes side by side."""
+    figure = Figure(figsize=size, dpi=100, layout="constrained")
+    axes = figure.subplots(1, count, squeeze=False)[0]
+    for ax in axes:
+        ax.spines[["top", "right"]].set_visible(False)
+    return figure, axes
+
+
+def _figure(figure: Figure) -> str:
+    """Draw a figure as a data URI."""
+    return _data_uri(_image(figure), "png")
 
 
 def _image(figure: Figure) -> Image.Image:
@@ -280,8 +268,7 @@ def _image(figure: Figure) -> Image.Image:
     return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
 
 
-def _figure(figure: Figure) -> str:
+def _data_uri(image: Image.Image, kind: str, **options: Any) -> str:
     content = io.BytesIO()
-    FigureCanvasAgg(figure)
-    figure.savefig(content, format="png")
-    return "data:image/png;base64," + base64.b64encode(content.getvalue()).decode()
+    image.save(content, kind, **options)
+    return f"data:image/{kind};base64," + base64.b64encode(content.getvalue()).decode()

@@ -5,6 +5,9 @@ from eitbench.measured import Measurements
 from eitbench.worlds.vessels import RoundTank
 
 VESSEL = {"kind": "circle", "radius": 0.1, "electrodes": 8, "cover": 0.4}
+PIPE = {"kind": "rectangle", "length": 0.4, "width": 0.1, "electrodes": 16, "cover": 0.5}
+CYLINDER = {"kind": "cylinder", "length": 0.2, "radius": 0.05, "rings": 2, "electrodes": 4, "height": 0.04,
+            "cover": 0.5}
 BELIEVED = {"initial_std": 0.2, "walk_std": 0.05}
 """Given where their choice by evidence is not tested, since that takes time."""
 SIGMA = 0.2

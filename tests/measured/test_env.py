@@ -14,21 +14,10 @@ from eitbench.envs.measured import MeasuredEnv
 from eitbench.estimation.walk import RandomWalk
 from eitbench.measured import Measurements
 from eitbench.measured.model import MeasurementModel
-from eitbench.measured.vessel import read_vessel
 from eitbench.numerics.fem import mass_matrix
 from eitbench.physics.rest import AtRest
 from gymnasium.utils.env_checker import check_env
-from tanks import BELIEVED, VESSEL, measurements_of, moving
-
-
-@pytest.fixture(scope="module")
-def record():
-    return moving(frames=6)
-
-
-@pytest.fixture(scope="module")
-def env(record):
-    return MeasuredEnv(record, VESSEL, withheld=0.15)
+from tanks import BELIEVED, PIPE, VESSEL, measurements_of
 
 
 @pytest.fixture
@@ -198,9 +187,7 @@ def test_a_simulated_record_is_estimated_as_in_its_environment(tmp_path, name, w
 def test_a_pipe_with_its_flow_has_the_transport_of_the_world():
     """The same step of any concentration, at the same nodes."""
     simulated = EstimationEnv("eitbench/Pipe2D-v0", world={"schedule": {"scored_steps": 4}})
-    pipe = {"kind": "rectangle", "length": 0.4, "width": 0.1, "electrodes": 16, "cover": 0.5,
-            "flow": {"mean_velocity": 4.5}}
-    task = MeasuredEnv(measurements_of(simulated, 0), read_vessel(pipe)).task
+    task = MeasuredEnv(measurements_of(simulated, 0), PIPE | {"flow": {"mean_velocity": 4.5}}).task
     ours, theirs = task.transport, simulated.task.transport
     np.testing.assert_allclose(ours.mesh.points, theirs.mesh.points, atol=1e-12)
     c = 30.0 + np.random.default_rng(1).normal(size=ours.mesh.n_nodes)

@@ -122,37 +122,25 @@ def test_tables_that_cannot_be_read(tmp_path, how, said):
         read(tmp_path / "comma.csv", **how)
 
 
-def test_what_is_no_record(tmp_path):
-    """Each says what it is."""
-    with pytest.raises(ValueError, match="there is none"):
-        read(tmp_path / "none.mat")
-    newer = tmp_path / "newer.mat"
-    newer.write_bytes(b"MATLAB 7.3 MAT-file, Platform: GLNXA64" + bytes(500))
-    with pytest.raises(ValueError, match=r"version 7\.3; save it with `-v7`"):
-        read(newer)
-    whole = tmp_path / "whole.mat"
-    savemat(whole, {"Inj": CURRENTS.T, "Mpat": MATRIX.T, "Uel": VALUES})
-    cut = tmp_path / "cut.mat"
-    cut.write_bytes(whole.read_bytes()[:300])
-    with pytest.raises(ValueError, match=r"cut\.mat must"):
-        read(cut)
-    empty = tmp_path / "empty.mat"
-    empty.write_bytes(b"")
-    with pytest.raises(ValueError, match=r"empty\.mat must"):
-        read(empty)
-    other = tmp_path / "other.mat"
-    savemat(other, {"Inj": CURRENTS.T, "Uel": VALUES})
-    with pytest.raises(ValueError, match="must hold Mpat; there are"):
-        read(other)
-    nothing = tmp_path / "nothing.mat"
-    savemat(nothing, {"Inj": CURRENTS.T, "Mpat": MATRIX.T, "Uel": np.full_like(VALUES, np.nan)})
-    with pytest.raises(ValueError, match=r"nothing\.mat: readings must hold numbers, got NaN only"):
-        read(nothing)
-    with pytest.raises(ValueError, match="must end in"):
-        (tmp_path / "a.jpg").write_bytes(b"x")
-        read(tmp_path / "a.jpg")
-    with pytest.raises(ValueError, match="format must be one of"):
-        read(whole, "excel")
+KTC = {"Inj": CURRENTS.T, "Mpat": MATRIX.T, "Uel": VALUES}
+
+
+@pytest.mark.parametrize(("content", "name", "format", "message"), [
+    (None, "a.mat", None, "there is none"),
+    (b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + bytes(500), "a.mat", None, "`save -v7` writes: .*v7.3"),
+    (b"", "a.mat", None, r"a\.mat must"),
+    (b"MATLAB 5.0 MAT-file" + bytes(300), "a.mat", None, r"a\.mat must"),
+    ({"Inj": CURRENTS.T, "Uel": VALUES}, "a.mat", None, "must hold Mpat; there are"),
+    (KTC | {"Uel": np.full_like(VALUES, np.nan)}, "a.mat", None, r"a\.mat: readings must hold numbers, got NaN only"),
+    (b"x", "a.jpg", None, "must end in"), (KTC, "a.mat", "excel", "format must be one of")])
+def test_other_files_are_refused(tmp_path, content, name, format, message):
+    path = tmp_path / name
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    elif content:
+        savemat(path, content)
+    with pytest.raises(ValueError, match=message):
+        read(path, format)
 
 
 @pytest.mark.parametrize(("case", "shape"), [

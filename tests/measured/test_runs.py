@@ -10,25 +10,12 @@ from eitbench.envs.measured import MeasuredEnv
 from eitbench.measured import Measurements
 from eitbench.measured.vessel import read_vessel
 from scipy.io import savemat
-from tanks import BELIEVED, CONTACTS, VESSEL, angle, centroid, instrument, measurements_of, moving
+from tanks import BELIEVED, CONTACTS, CYLINDER, PIPE, VESSEL, angle, centroid, instrument, measurements_of, moving
 
 from commands import eitbench
 
-PIPE = {"kind": "rectangle", "length": 0.3, "width": 0.1, "electrodes": 8, "cover": 0.5}
-CYLINDER = {"kind": "cylinder", "length": 0.2, "radius": 0.05, "rings": 2, "electrodes": 4, "height": 0.04,
-            "cover": 0.5}
-FLOW_PIPE = {"kind": "rectangle", "length": 0.4, "width": 0.1, "electrodes": 16, "cover": 0.5}
-ESTIMATED = FLOW_PIPE | {"flow": {"mean_velocity": 3.5, "velocity_std": 1.0, "velocity_walk": 0.02}}
-
-
-@pytest.fixture(scope="module")
-def record():
-    return moving(frames=6)
-
-
-@pytest.fixture(scope="module")
-def env(record):
-    return MeasuredEnv(record, VESSEL, withheld=0.15)
+SHORT_PIPE = PIPE | {"length": 0.3, "electrodes": 8}
+ESTIMATED = PIPE | {"flow": {"mean_velocity": 3.5, "velocity_std": 1.0, "velocity_walk": 0.02}}
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +82,7 @@ def pipe():
 
 
 def test_a_filter_with_the_known_flow_predicts_better(pipe):
-    env = MeasuredEnv(pipe, FLOW_PIPE | {"flow": {"mean_velocity": 4.5}})
+    env = MeasuredEnv(pipe, PIPE | {"flow": {"mean_velocity": 4.5}})
     rmse = [run_on_measurements(env, name).withheld_rmse for name in ("log_inflow_filter", "homogeneous")]
     assert rmse[0] < rmse[1] / 3
 
@@ -175,7 +162,7 @@ def test_bodies_in_files_of_kuopio_are_found(tmp_path, maker):
 
 
 @pytest.mark.parametrize(("vessel", "at", "radius", "tolerance"), [
-    (PIPE, [0.12, 0.02], 0.02, 0.02),
+    (SHORT_PIPE, [0.12, 0.02], 0.02, 0.02),
     pytest.param(CYLINDER, [0.02, 0.02, 0.08], 0.02, 0.03, marks=pytest.mark.slow)], ids=["pipe", "cylinder"])
 def test_bodies_in_other_vessels_are_found(tmp_path, vessel, at, radius, tolerance):
     """Few electrodes: within 2 cm in a pipe of 30 cm, and 3 cm in one of 20 cm."""

@@ -4,11 +4,8 @@ import numpy as np
 import pytest
 from eitbench.measured.vessel import read_vessel
 from eitbench.worlds.vessels import RoundTank
-from tanks import VESSEL
+from tanks import CYLINDER, PIPE, VESSEL
 
-PIPE = {"kind": "rectangle", "length": 0.4, "width": 0.1, "electrodes": 16, "cover": 0.5}
-CYLINDER = {"kind": "cylinder", "length": 0.2, "radius": 0.05, "rings": 2, "electrodes": 4, "height": 0.04,
-            "cover": 0.5}
 TANK = RoundTank(radius=0.1, n_electrodes=8, electrode_cover=0.4)
 
 

@@ -1,0 +1,194 @@
+"""The commands `bank`, `export`, `fit prior`, `fit model` and `train`: episodes to learn from, and
+what is learned from them."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from eitbench.cli import options
+
+Algorithm = StrEnum("Algorithm", ["ppo", "dqn", "sac", "recurrent_ppo", "maskable_ppo"])
+Format = StrEnum("Format", ["npz", "hdf5", "minari"])
+Link = StrEnum("Link", ["logarithm", "linear"])
+
+fit = typer.Typer(no_args_is_help=True, help="Fit priors and models to training episodes.")
+
+
+def bank(
+    env: Annotated[str, typer.Option(help="Environment id.")] = "eitbench/Pipe2D-v0",
+    seeds: Annotated[str, typer.Option(help="Episodes, such as train:0-999.")] = "train:0-99",
+    jobs: options.Jobs = options.CORES,
+    backend: options.Backends = options.Backend.loky,
+) -> None:
+    """Simulate many episodes ahead of training and keep what an environment needs of them.
+
+    They lie, memory-mapped, in the cache folder ($EITBENCH_CACHE). The same command again resumes.
+    """
+    import shutil
+
+    from eitbench.data.bank import fill, missing_seeds, recording_bytes
+    from eitbench.data.cache import folder
+    from eitbench.data.seeds import parse_seeds
+    from eitbench.worlds.registry import entry
+    with options.clear_errors():
+        numbers = parse_seeds(seeds)
+        world = entry(env).world
+    place = folder(world)
+    each = recording_bytes(world)
+    try:
+        place.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise typer.BadParameter(f"recordings cannot be kept in {place}: {error}") from error
+    missing = len(missing_seeds(world, numbers))
+    options.say(f"{len(numbers)} episodes, {len(numbers) * each / 1e6:.0f} MB in {place}; "
+                f"{missing} to simulate")
+    free = shutil.disk_usage(place).free
+    if missing * each > free:
+        raise typer.BadParameter(f"seeds need {missing * each / 1e9:.1f} GB more, and "
+                                 f"{free / 1e9:.1f} GB are free")
+    with options.clear_errors():
+        made = fill(world, numbers, n_jobs=jobs, backend=backend)
+    options.say(f"{made} simulated, {len(numbers) - made} were there")
+
+
+def export(
+    out: Annotated[str, typer.Option(
+        "--out", "-o", help="Folder of the files; for minari the name of the data set, such as "
+                            "eitbench/pipe2d/random-pair-v0.")],
+    env: Annotated[str, typer.Option(
+        help="Environment id; for minari of an injection environment.")] = "eitbench/Pipe2D-v0",
+    seeds: Annotated[str, typer.Option(help="Episodes, such as train:0-999.")] = "train:0-99",
+    format: Annotated[Format, typer.Option(
+        help="File format; hdf5 needs the extra export, minari the extra minari.")] = Format.npz,
+    policy: Annotated[str | None, typer.Option(
+        help="Policy that injects, for minari: a built-in one, or the path of a file, which runs "
+             "in this process.")] = None,
+    jobs: options.Jobs = options.CORES,
+    backend: options.Backends = options.Backend.loky,
+) -> None:
+    """Write episodes as files to learn from: voltages, currents and the truth, one file each, with
+    a README that describes them and their score; or the observations, actions and rewards of a
+    policy as a Minari data set.
+
+    Missing episodes are simulated. The same command again resumes; a Minari data set is written at
+    the end, and does not.
+    """
+    import eitbench
+    with options.clear_errors():
+        if (policy is not None) != (format is Format.minari):
+            raise ValueError("policy must be given with format minari, and with no other; got "
+                             f"policy {policy} and format {format.value}")
+        if policy is not None:
+            from eitbench.bench.minari_export import export_minari
+            written = export_minari(out, env, policy, seeds, n_jobs=jobs, backend=backend)
+            options.say(f"{written} episodes written; minari.load_dataset({out!r}) reads them")
+        else:
+            from eitbench.data.export import export as export_files
+            examples = eitbench.dataset(env, seeds)
+            written = export_files(examples, Path(out), format.value, n_jobs=jobs, backend=backend)
+            options.say(f"{written} episodes written to {out}, {len(examples) - written} were "
+                        "there")
+
+
+def train(
+    env: options.InjectionId,
+    algo: Annotated[Algorithm, typer.Option(
+        help="Algorithm of stable-baselines3 or sb3-contrib.")] = Algorithm.ppo,
+    config: Annotated[Path, typer.Option(
+        help="A YAML file such as those in baselines/rl.")] = Path("baselines/rl/ppo.yml"),
+    seed: Annotated[int, typer.Option(
+        min=0, help="Of the training; episodes are drawn from the train split.")] = 0,
+    steps: Annotated[int | None, typer.Option(
+        min=0, help="Steps in place of the configuration's total_steps.")] = None,
+    out: Annotated[Path | None, typer.Option(
+        "--out", "-o", help="Folder of the run. Default: results/training/ENV/ALGO/seedK.")] = None,
+) -> None:
+    """Train an agent to choose injections.
+
+    The same command again goes on from the last checkpoint. The folder receives model.zip,
+    config.json, monitor.csv, evaluations.npz (scores on dev episodes) and logs for TensorBoard.
+    """
+    from dataclasses import replace
+    with options.clear_errors():
+        from eitbench.rl import training
+        asked = training.read_config(config)
+        if steps is not None:
+            asked = replace(asked, total_steps=steps)
+        folder = out or Path("results/training") / env.replace("/", "-") / algo / f"seed{seed}"
+        model = training.train(env, algo.value, asked, seed, folder)
+    options.say(f"wrote {model}")
+
+
+@fit.command("prior")
+def fit_prior(
+    env: Annotated[str, typer.Option(help="Id of an environment whose world has an inflow.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="File to write, JSON.")],
+    seeds: Annotated[str, typer.Option(help="Episodes of the split train.")] = "train:0-199",
+    link: Annotated[Link, typer.Option(
+        help="What is Gaussian: the inflow's logarithm, or the inflow.")] = Link.logarithm,
+    nugget: Annotated[float, typer.Option(
+        min=0.0, max=1.0, help="Part of the variance that is white in time.")] = 0.01,
+    kept: Annotated[float, typer.Option(
+        min=0.0, max=1.0, help="Modes across the inlet of less than this part of the variance are "
+                               "left out; each makes filters slower.")] = 1e-4,
+    quiet: Annotated[float | None, typer.Option(
+        help="Learn how slugs begin and end too: a step is quiet if what is Gaussian is nowhere "
+             "beyond ± this.")] = None,
+) -> None:
+    """Learn what to expect of the inflow from training episodes, which are not simulated for it,
+    and write it as a prior for filters (`eitbench.estimation.InflowPrior`)."""
+    from eitbench.data.seeds import parse_seeds
+    from eitbench.estimation import learned_inflow_prior
+    from eitbench.worlds.registry import entry
+    regimes = {} if quiet is None else {"quiet": quiet}
+    with options.clear_errors():
+        prior = learned_inflow_prior(
+            entry(env).world, parse_seeds(seeds), link=link.value, nugget=nugget, kept=kept,
+            quiet=quiet, source={"environment": env, "seeds": seeds, "nugget": nugget,
+                                 "kept": kept, **regimes})
+        prior.save(out)
+    options.say(f"{out}: {prior.modes.shape[1]} modes across {len(prior.points)} nodes of the "
+                f"inlet, correlated over {prior.memory} steps of {prior.time_step:g} s")
+    if prior.regimes is not None:
+        options.say(f"slugs enter {prior.regimes.share:.0%} of the time and last "
+                    f"{1.0 / prior.regimes.ends:.1f} steps on average")
+
+
+@fit.command("model")
+def fit_model(
+    env: Annotated[str, typer.Option(help="Id of an environment whose world has an inflow.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="File to write, npz.")],
+    seeds: Annotated[str, typer.Option(help="Episodes of the split train.")] = "train:0-199",
+    modes: Annotated[int, typer.Option(
+        min=1, help="Of the concentration; more of them make filters slower.")] = 64,
+    correct: Annotated[bool, typer.Option(
+        "--correct", help="Believe the flow as told, and learn only what that is off: needs fewer "
+                          "episodes.")] = False,
+    linearised: Annotated[bool, typer.Option(
+        "--linearised", help="Linearise voltages once, about the homogeneous estimate, and learn "
+                             "how readings scatter about that.")] = False,
+) -> None:
+    """Learn from training episodes what an inflow leaves in the pipe, and by how much that and the
+    voltages are off, and write it for filters (`eitbench.estimation.IdentifiedModel`). Episodes
+    that are not there yet are simulated, on one core; `eitbench bank` does so on all."""
+    from tqdm import tqdm
+
+    import eitbench
+    from eitbench.estimation import identified_model
+    with options.clear_errors():
+        examples = eitbench.dataset(env, seeds)
+        model = identified_model(
+            examples, modes=modes, correct=correct, linearised=linearised,
+            progress=lambda each: tqdm(each, desc="learning", unit="episode", disable=None),
+            source={"environment": env, "seeds": seeds, "modes": modes}
+            | {name: True for name, said in (("correct", correct), ("linearised", linearised))
+               if said})
+        model.save(out)
+    left = float(model.spread.trace() / examples.mass.sum())
+    options.say(f"{out}: {modes} modes of the concentration, which remembers "
+                f"{model.weights.shape[1]} inflows; {100 * left**0.5:.2g} % (root mean square) "
+                "is left")
