@@ -9,14 +9,14 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "eitbench"
-BUDGETS = {"numerics": 1620, "scoring": 130, "physics": 1480, "worlds": 2600, "data": 1650, "estimation": 5510,
-           "measured": 1900, "envs": 1700, "bench": 5400, "report": 3460, "rl": 800, "cli": 1010}
+BUDGETS = {"numerics": 1620, "scoring": 130, "physics": 1480, "worlds": 2600, "data": 1620, "estimation": 5500,
+           "measured": 1870, "envs": 1700, "bench": 5300, "report": 3380, "rl": 800, "cli": 970}
 """Package (or module) -> lines of Python allowed, blank lines and docstrings included. Each imports only from those
 before it."""
 TOP = 600
 """Lines allowed in the other modules at the top: public names, argument checks, files, messages."""
 BASELINES = 2000
-TESTS = 22_720
+TESTS = 20_360
 MODULES = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
            for path in PACKAGE.rglob("*.py")}
 
