@@ -16,7 +16,7 @@ before it."""
 TOP = 600
 """Lines allowed in the other modules at the top: public names, argument checks, files, messages."""
 BASELINES = 2000
-TESTS = 20_360
+TESTS = 20_400
 MODULES = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
            for path in PACKAGE.rglob("*.py")}
 

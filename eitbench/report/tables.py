@@ -14,7 +14,7 @@ from markupsafe import Markup
 
 from eitbench.bench.table import NOTHING, Cell, Table, mean_cell, number_cell
 from eitbench.bench.table import Row as TableRow
-from eitbench.bench.text import number, with_interval
+from eitbench.bench.text import number, scores_by_seed, with_interval
 from eitbench.report import charts
 from eitbench.report.boards import errors_and_gains, errors_of
 from eitbench.report.model import (
@@ -192,20 +192,28 @@ def run_table(board: Board, *, title: str = "title", drawn: bool = False) -> Tab
     """Return the board of a user's own results.
 
     ``title`` is the field that names a method. Intervals are ``drawn``, or ± half the 95 % interval
-    of the mean error is written. Seeds have a column if they differ.
+    of the mean error is written. Measurements have the withheld RMSE in place of ẽ_c. Seeds have a
+    column if they differ.
     """
     axes = Axes.of(board)
     seeds = run_seeds(board)
+    others = [name for name in headings(measured=True) if name not in COSTS]
+    is_measured = board.of_class == "measured"
+    if is_measured:
+        others.remove("prediction_error")
     rows = []
     for row, played in zip(board.rows, seeds, strict=True):
         cells: dict[str, Cell | str] = {"method": row.cells[title]}
         if len(set(seeds)) > 1:
             cells["seeds"] = played
-        if drawn:
+        if is_measured:
+            residuals = scores_by_seed(row.record, "prediction_error") if row.record else {}
+            cells[columns(measured=True)["prediction_error"][0]] = mean_cell(residuals.values())
+        elif drawn:
             cells |= {heading: axes.cell(row, name) for name, (heading, _) in DRAWN.items()}
         else:
             cells["ẽ_c"] = mean_cell(errors_of(row.record).values())
-        cells |= _numbers(row, [name for name in headings(measured=True) if name not in COSTS])
+        cells |= _numbers(row, others)
         if row.cells["skill"] is None and row.cells.get("contrast_error") is not None:
             without = 1.0 - row.cells["contrast_error"]
             cells["skill"] = Cell(f"{number(without)}†", without)

@@ -13,7 +13,8 @@ from eitbench.report.charts import shortened
 from eitbench.report.model import Board
 from eitbench.report.tables import run_table, run_title
 
-COLUMN_PRIORITY = ("method", "ẽ_c", "skill", "seeds", "NIS/m", "ms/step", "contrast", "ẽ_v")
+COLUMN_PRIORITY = ("method", "ẽ_c", "withheld RMSE", "skill", "seeds", "NIS/m", "ms/step",
+                   "contrast", "ẽ_v")
 """Where a line is too short the last of these are left out, and all other columns before them."""
 MAX_LABEL_CHARS = 30
 

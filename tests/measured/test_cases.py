@@ -101,6 +101,19 @@ def test_unknown_and_incomplete_cases_are_named(tmp_path):
         read_case(tmp_path / "a.yml")
 
 
+def test_run_shows_the_withheld_rmse(folder):
+    """In place of ẽ_c, which measurements do not have."""
+    code, output, err = eitbench("run", "--env", ID, "--baseline", "homogeneous", "--seeds", "test:0-1", "--jobs", 1,
+                                 "--out", folder / "out")
+    assert code == 0, err
+    head, _, row = (line for line in output.splitlines() if line.startswith("|"))
+    (path,) = (folder / "out" / "records").glob("*.json")
+    rmse = [episode["scores"]["prediction_error"] for episode in read_record(path)["episodes"]]
+    shown = row.split("|")[[cell.strip() for cell in head.split("|")].index("withheld RMSE")]
+    assert float(shown.split("±")[0]) == pytest.approx(np.mean(rmse), rel=0.1)
+    assert "ẽ_c" not in head
+
+
 @pytest.fixture
 def results(folder):
     """Records of a naive baseline and of a third-party method."""
