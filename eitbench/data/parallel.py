@@ -54,12 +54,11 @@ def _with_joblib(function: Callable[..., Result], arguments: Sequence[tuple], n_
                  ) -> Iterator[Result]:
     from joblib import Parallel, delayed
     how = {"return_as": "generator_unordered", "batch_size": 1, "pre_dispatch": n_jobs}
+    # loky ends workers whose memory has grown, and starts others
+    warnings.filterwarnings("ignore", "A worker stopped while some jobs were given", UserWarning,
+                            r"joblib\.externals\.loky\.")
     try:
-        with (warnings.catch_warnings(), config or nullcontext(),
-              Parallel(n_jobs=n_jobs, **how) as parallel):
-            # loky ends workers whose memory has grown, and starts others
-            warnings.filterwarnings("ignore", "A worker stopped while some jobs were given",
-                                    UserWarning, r"joblib\.externals\.loky\.")
+        with config or nullcontext(), Parallel(n_jobs=n_jobs, **how) as parallel:
             told = registered_by_hand()
             here = os.getpid()
             yield from parallel(delayed(_watched)(here, told, function, *each)

@@ -39,7 +39,7 @@ COMMANDS = [
     (("golden", "eitbench/StationaryTank2D-v0", "homogeneous"), "homogeneous: same"),
     (("fit", "prior", "--env", "eitbench/Pipe2D-v0", "--seeds", "train:0-3", "-o", "prior.json"), "prior.json: "),
     (("fit", "model", "--env", "eitbench/Pipe2D-v0", "--seeds", "train:0-1", "-o", "model.npz"), "model.npz: "),
-    (("estimate", "--help"), "instrument"),
+    (("estimate", "--help"), "vessel"),
 ]
 """Words, and what is said when it has worked."""
 
