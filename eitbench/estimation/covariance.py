@@ -1,12 +1,160 @@
-"""The covariance without data, Π⁺ = F Π Fᵀ + Γ_w: what is uncertain when nothing is measured."""
+"""Covariances of a state: dense, or the open-loop covariance minus a matrix of low rank."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Protocol, Self
+
 import numpy as np
+from scipy.linalg import blas
+
+from eitbench import _check
+
+_BLOCK = 128
+"""columns copied at once when a triangle is mirrored: small enough for the processor's cache"""
+_PANEL = 64
+"""columns passed to a callable transition at once: they fit the cache, few calls are made"""
+
+Transition = np.ndarray | Callable[[np.ndarray], np.ndarray]
+"""F (n, n), or X (n, k) -> F X."""
 
 
-class FreeCovariance:
-    """Π_t, t = 0, 1, …, from which measurements subtract: P = Π − Z Zᵀ (``docs/methods.md``, 5).
+class Covariance(Protocol):
+    """Covariance P (n, n) of a state in one of several forms.
+
+    `propagate` and `subtract` return the covariance to go on with: the dense form changes in place,
+    the low-rank form leaves what it was.
+    """
+
+    def times(self, X: np.ndarray) -> np.ndarray:
+        """Return P X for X (k, m), whose rows belong to the first k entries of the state."""
+
+    def propagate(self, transition: Transition | None,
+                  noise: np.ndarray | None = None) -> Self:
+        """Return F P Fᵀ + Q."""
+
+    def subtract(self, root: np.ndarray) -> Self:
+        """Return P − G Gᵀ, with G (n, m)."""
+
+    def copy(self) -> Self:
+        """Return a covariance that changes on its own."""
+
+    def diagonal(self) -> np.ndarray:
+        """Return the variances (n,)."""
+
+    def variance_of(self, functionals: np.ndarray) -> np.ndarray:
+        """Return the variances (k,) of linear functionals (k, n) of the state."""
+
+
+class DenseCovariance:
+    """Covariance kept as a symmetric matrix P (n, n), written in place.
+
+    It serves transitions that change, F = I and windows. The diagonal is kept from falling below
+    zero. ``ValueError`` if the matrix is not square or not finite.
+    """
+
+    def __init__(self, covariance: np.ndarray) -> None:
+        n = len(covariance)
+        covariance = _check.array("covariance", covariance, (n, n))
+        self.array = np.ascontiguousarray(0.5 * (covariance + covariance.T))
+        self._work: np.ndarray | None = None
+
+    def copy(self) -> Self:
+        """Return a covariance that changes on its own."""
+        return type(self)(self.array)
+
+    def times(self, X: np.ndarray) -> np.ndarray:
+        """Return P X for X (k, m), whose rows belong to the first k entries of the state."""
+        return self.array[:, :len(X)] @ X
+
+    def propagate(self, transition: Transition | None, noise: np.ndarray | None = None) -> Self:
+        """Return F P Fᵀ + Q, in place; None: F = I, Q = 0.
+
+        A callable pays where F X costs far less than a product of full matrices, such as solves
+        with a sparse matrix: it is called twice for n columns.
+        """
+        if callable(transition):
+            self._transform_by_columns(transition)
+        elif transition is not None:
+            self._transform(transition)
+        if noise is not None:
+            self.array += noise
+        return self
+
+    def shift(self, weights: np.ndarray, new_variance: np.ndarray) -> Self:
+        """Advance a window of W values of d numbers each, the newest first, by one time step.
+
+        Each number follows from its own past by ``weights`` (W, d) or (W, 1) and an independent
+        part of variance ``new_variance`` (d,); the oldest value is dropped.
+        """
+        P = self.array
+        d = len(new_variance)
+        W = len(weights)
+        cross = (weights[:, :, None] * P.reshape(W, d, W * d)).sum(axis=0)             # (d, W·d)
+        variance = (cross.reshape(d, W, d) * weights).sum(axis=1)
+        after = np.empty_like(P)
+        after[d:, d:] = P[:-d, :-d]
+        after[:d, d:] = cross[:, :-d]
+        after[d:, :d] = cross[:, :-d].T
+        after[:d, :d] = 0.5 * (variance + variance.T) + np.diag(new_variance)
+        self.array = after
+        return self
+
+    def subtract(self, root: np.ndarray) -> Self:
+        """Return P − G Gᵀ, with G (n, m), in place."""
+        self.array -= np.matmul(root, root.T, out=self._scratch())
+        diagonal = np.einsum("ii->i", self.array)                                      # a view
+        np.maximum(diagonal, 0.0, out=diagonal)  # precise measurements leave rounding of any sign
+        return self
+
+    def diagonal(self) -> np.ndarray:
+        """Return the variances (n,)."""
+        return self.array.diagonal().copy()
+
+    def variance_of(self, functionals: np.ndarray) -> np.ndarray:
+        """Return the variances (m,) of linear functionals (m, k) of the first k entries."""
+        k = functionals.shape[1]
+        return ((functionals @ self.array[:k, :k]) * functionals).sum(axis=1)
+
+    def _scratch(self) -> np.ndarray:
+        if self._work is None:
+            self._work = np.empty_like(self.array)
+        return self._work
+
+    def _transform(self, F: np.ndarray) -> None:
+        """P ← F P Fᵀ by triangles: with P = L + Lᵀ and B = F L, half of B Fᵀ + F Bᵀ is computed."""
+        P, B = self.array, self._scratch()
+        diagonal = np.einsum("ii->i", P)
+        diagonal *= 0.5
+        np.copyto(B, F)
+        # BLAS is column-major and sees arrays transposed: Lᵀ Fᵀ, from the lower triangle of Pᵀ.
+        blas.dtrmm(1.0, P.T, B.T, lower=1, trans_a=1, overwrite_b=1)
+        blas.dsyr2k(1.0, np.asfortranarray(F.T), B.T, beta=0.0, c=P.T, trans=1, lower=1,
+                    overwrite_c=1)
+        _mirror(P)
+
+    def _transform_by_columns(self, apply: Callable[[np.ndarray], np.ndarray]) -> None:
+        """P ← F P Fᵀ as F (F P)ᵀ, of which the upper triangle is kept."""
+        P, B = self.array, self._scratch()
+        panels = [slice(begin, begin + _PANEL) for begin in range(0, len(P), _PANEL)]
+        for panel in panels:
+            B[:, panel] = apply(P[:, panel])
+        for panel in panels:
+            P[:panel.stop, panel] = apply(B[panel].T)[:panel.stop]
+        _mirror(P)
+
+
+def _mirror(P: np.ndarray) -> None:
+    """Copy the upper triangle of a square matrix to the lower one."""
+    for begin, end in pairwise([*range(0, len(P), _BLOCK), len(P)]):
+        P[begin:end, :begin] = P[:begin, begin:end].T
+        corner = np.triu(P[begin:end, begin:end])
+        P[begin:end, begin:end] = corner + np.triu(corner, 1).T
+
+
+class OpenLoopCovariance:
+    """Covariance Π_t, t = 0, 1, …, without measurements: Π⁺ = F Π Fᵀ + Q.
 
     Π_t depends on no data, so it is computed once and shared by all episodes. It is kept as Π_t =
     Π_∞ + U D Uᵀ with D = diag(±1): what is left of the initial covariance, U ← F U, loses rank
@@ -37,9 +185,9 @@ class FreeCovariance:
             left = _signed_factor(initial - self.limit, self._threshold)
         self._transients = [left]  # (U, D) at t = 0, 1, …
 
-    def scaled(self, factor: float) -> FreeCovariance:
+    def scaled(self, factor: float) -> OpenLoopCovariance:
         """The same sequence times ``factor``, sharing all matrices."""
-        other = object.__new__(FreeCovariance)
+        other = object.__new__(OpenLoopCovariance)
         other.__dict__ = self.__dict__ | {"scale": self.scale * factor}
         return other
 
@@ -67,6 +215,69 @@ class FreeCovariance:
                 U = Q @ W
             self._transients.append((U, signs))
         return self._transients[t]
+
+
+class LowRankCovariance:
+    """Covariance P_t = Π_t − Z Zᵀ: few readings of a large state, without n×n products.
+
+    Measurements add columns to Z (n, r), which moves with F and is truncated to its numerical rank,
+    far below n (``docs/methods.md``, 5).
+
+    Parameters
+    ----------
+    open_loop : OpenLoopCovariance
+        Π_t; Π_0 is the initial covariance.
+    rank_tolerance : float
+        Directions of Z shorter than this fraction of its longest are dropped; the covariance loses
+        the square of it.
+    """
+
+    def __init__(self, open_loop: OpenLoopCovariance, rank_tolerance: float = 1e-6, *,
+                 time: int = 0, assimilated: np.ndarray | None = None) -> None:
+        self.open_loop = open_loop
+        self.rank_tolerance = rank_tolerance
+        self.time = time
+        self.assimilated = (np.zeros((len(open_loop.limit), 0)) if assimilated is None
+                            else assimilated)
+        """(n, r) Z"""
+
+    def _with(self, time: int, assimilated: np.ndarray) -> Self:
+        return type(self)(self.open_loop, self.rank_tolerance, time=time, assimilated=assimilated)
+
+    def copy(self) -> Self:
+        """Return the same: it never changes."""
+        return self
+
+    def times(self, X: np.ndarray) -> np.ndarray:
+        """Return P X for X (n, m)."""
+        return self.open_loop.apply(self.time, X) - self.assimilated @ (self.assimilated.T @ X)
+
+    def propagate(self, transition: Transition | None, noise: np.ndarray | None = None) -> Self:
+        """Return F P Fᵀ + Q, with the F and Q of the open-loop covariance."""
+        return self._with(self.time + 1, self.open_loop.transition @ self.assimilated)
+
+    def subtract(self, root: np.ndarray) -> Self:
+        """Return P − G Gᵀ, with G (n, m)."""
+        columns = np.hstack([self.assimilated, root])
+        return self._with(self.time, truncate_columns(columns, self.rank_tolerance))
+
+    def diagonal(self) -> np.ndarray:
+        """Return the variances (n,)."""
+        return self.open_loop.diagonal(self.time) - (self.assimilated**2).sum(axis=1)
+
+    def variance_of(self, functionals: np.ndarray) -> np.ndarray:
+        """Return the variances (m,) of linear functionals (m, n) of the state."""
+        free = (functionals * self.open_loop.apply(self.time, functionals.T).T).sum(axis=1)
+        return free - ((functionals @ self.assimilated)**2).sum(axis=1)
+
+
+def truncate_columns(Z: np.ndarray, tolerance: float) -> np.ndarray:
+    """Return a matrix with fewer columns and the same Z Zᵀ up to (tolerance·‖Z‖)²."""
+    if Z.shape[1] == 0:
+        return Z
+    values, vectors = np.linalg.eigh(Z.T @ Z)
+    keep = values > tolerance**2 * values[-1]
+    return Z if keep.all() else Z @ vectors[:, keep]
 
 
 def _stationary(F: np.ndarray, noise: np.ndarray) -> np.ndarray:

@@ -15,6 +15,8 @@ import numpy as np
 
 from eitbench import _check
 from eitbench._files import write_atomically
+from eitbench.estimation.forward import Forward, about_prediction, about_reference
+from eitbench.estimation.gaussian import Observation
 from eitbench.estimation.inflow_prior import learned_in, nominal_worlds
 from eitbench.estimation.inflow_response import Response
 
@@ -105,6 +107,22 @@ class IdentifiedModel:
         """Of the injection among the `patterns`."""
         seen = np.flatnonzero(np.isclose(self.patterns, currents).all(axis=1))
         return int(seen[0]) if len(seen) else None
+
+    def forward(self, task: Task, level: float) -> Forward:
+        """Return the task's voltages with the model's errors, about each prediction, or linearised
+        once about ``level`` in mol/m³ where there is a `scatter`."""
+        linearise = about_prediction(task) if self.scatter is None else about_reference(task, level)
+
+        def measure(point: np.ndarray, voltages: np.ndarray, currents: np.ndarray) -> Observation:
+            matrix, value, variance, _ = linearise(point, voltages, currents)
+            std = np.sqrt(variance)
+            root = level * (matrix @ self.root)
+            if self.scatter is not None:
+                root = np.concatenate([root, self.error_root(currents, std)], axis=1)
+                variance = np.zeros_like(variance)
+            return Observation(matrix, value - self.mean_error(currents, std), variance, root)
+
+        return measure
 
     def suits(self, task: Task) -> bool:
         """Whether it was made for a task with this mesh, these injections and this told flow."""

@@ -2,114 +2,107 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import NamedTuple, Protocol
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
-from eitbench.estimation.gate import Filter
-from eitbench.estimation.kalman import (
-    FilterStep,
-    KalmanFilter,
-    Observation,
-    compressed,
-    kalman_filter,
-)
+from eitbench.estimation.covariance import Covariance, LowRankCovariance, truncate_columns
+from eitbench.estimation.filter import Filter, Step, kalman_filter
+from eitbench.estimation.gaussian import Observation
+from eitbench.estimation.nodal import Motion, NodalStates
+from eitbench.worlds.task import Estimate
 
 
-class Smoothed(NamedTuple):
-    """c_{t|T} and the diagonal of its covariance."""
+def fixed_interval_smoother(start: Filter, observations: Iterable[Observation]) -> list[Estimate]:
+    """Return c_{t|T} and its variances for t = 1 … T: filter the record, then go back over it.
 
-    mean: np.ndarray
-    """(n,)"""
-    variance: np.ndarray
-    """(n,)"""
-
-
-def fixed_interval_smoother(start: KalmanFilter,
-                            observations: Iterable[Observation]) -> list[Smoothed]:
-    """c_{t|T} for t = 1 … T: filter the record, then come back over it."""
+    ``start`` has a `LowRankCovariance` and a motion that does not change.
+    """
     steps = kalman_filter(start, observations)
-    return [_smoothed(start, step, later) for step, later in _backwards(start, steps)][::-1]
+    return [_smoothed(step, adjoint) for step, adjoint in _backwards(start, steps)][::-1]
 
 
-def smoothed_state(filter_: KalmanFilter, steps: Sequence[FilterStep]) -> Smoothed:
-    """The state of the first of consecutive ``steps``, given the measurements of all of them.
+def smoothed_state(filter_: Filter, steps: Sequence[Step]) -> Estimate:
+    """Return the state of the first of consecutive ``steps``, given the measurements of all.
 
     With the last k + 1 steps of ``filter_`` this is the fixed-lag smoother c_{t−k|t}.
     """
-    *_, (step, later) = _backwards(filter_, steps)
-    return _smoothed(filter_, step, later)
+    *_, (step, adjoint) = _backwards(filter_, steps)
+    return _smoothed(step, adjoint)
 
 
-class _Moving(Filter, Protocol):
-    """A filter that moves on by itself; after `predict` the others say what it did."""
-
-    mean: np.ndarray
-
-    @property
-    def transition(self) -> np.ndarray: ...
-    @property
-    def forcing(self) -> np.ndarray: ...
-    @property
-    def apply_noise(self) -> Callable[[np.ndarray], np.ndarray]: ...
-    def apply_initial(self, X: np.ndarray) -> np.ndarray: ...
-    def predict(self) -> None: ...
-
-
-def smoothed_means(start: _Moving, observations: Iterable[Observation]) -> np.ndarray:
-    """Means c_{t|T} (T, n) of a filter that stands at t = 0 and may move otherwise at each step.
+def smoothed_means(start: Filter, observations: Iterable[Observation]) -> np.ndarray:
+    """Return the means c_{t|T} (T, n) of a filter of `NodalStates`, whose motion may change.
 
     The adjoint λ_t = Hᵀ S⁻¹ ν + (I − K H)ᵀ Fᵀ_{t+1} λ_{t+1} runs back over the innovations, and the
     smoothed state follows forwards from c_{0|T} = c_{0|0} + Γ_{0|0} F₁ᵀ λ_1 as c_t = F_t c_{t−1} +
-    s_t + Γ_w λ_t (``docs/methods.md``, 6): without variances, and without a covariance being kept.
+    s_t + Γ_w λ_t (``docs/methods.md``, 6): without variances, and without storing covariances.
     """
-    mean = start.mean
-    steps = []
-    for observation in observations:
-        start.predict()
-        expected = start.expect(observation)
-        H = observation.matrix
-        start.take_in(H, *expected)
-        steps.append((H, expected, start.transition, start.forcing, start.apply_noise))
-    smoothed = np.empty((len(steps), len(mean)))
-    later = np.zeros_like(mean)
-    for t in range(len(steps) - 1, -1, -1):
-        H, (cross, innovation, S), F, *_ = steps[t]
-        smoothed[t] = later + H.T @ np.linalg.solve(S, innovation - cross.T @ later)  # λ_t
-        later = F.T @ smoothed[t]
-    state = mean + start.apply_initial(later[:, None])[:, 0]
-    for t, (*_, F, forcing, apply_noise) in enumerate(steps):
-        state = smoothed[t] = F @ state + forcing + apply_noise(smoothed[t])
+    assert isinstance(start.space, NodalStates)
+    motion = start.space.motion
+    state, initial = start.space.initial()
+    steps = kalman_filter(start, observations)
+    adjoints = np.empty((len(steps), len(state)))
+    later = np.zeros_like(state)
+    for k, step in reversed(list(enumerate(steps))):
+        factor = cho_factor(step.innovation_covariance, lower=True)
+        adjoints[k] = _before(step, factor, later) + step.matrix.T @ cho_solve(factor,
+                                                                               step.innovation)
+        later = _transposed(motion(step.time), adjoints[k])
+    state = state + initial.times(later[:, None])[:, 0]
+    smoothed = np.empty_like(adjoints)
+    for k, step in enumerate(steps):
+        move = motion(step.time)
+        state = smoothed[k] = move.apply(state) + move.forcing + _noise(move, initial, adjoints[k])
     return smoothed
 
 
-def _backwards(filter_: KalmanFilter,
-               steps: Sequence[FilterStep]) -> Iterator[tuple[FilterStep, np.ndarray]]:
-    """(step, [λ, B]) from the last step to the first: what its own and later measurements say.
+def _backwards(filter_: Filter, steps: Sequence[Step]) -> Iterator[tuple[Step, np.ndarray]]:
+    """Yield (step, [λ, B]) from the last step to the first: information of its own and later data.
 
     The adjoint λ and the information N = B Bᵀ obey, with S = L Lᵀ,
         λ_t = Hᵀ S⁻¹ ν + (I − K H)ᵀ Fᵀ λ_{t+1},        B_t = [Hᵀ L⁻ᵀ, (I − K H)ᵀ Fᵀ B_{t+1}].
-    B is compressed to its numerical rank like the filter's Z.
+    B is truncated to its numerical rank like the filter's Z.
     """
+    assert isinstance(filter_.space, NodalStates)
+    assert isinstance(filter_.covariance, LowRankCovariance)
     later = np.zeros((len(filter_.mean), 1))
     for step in reversed(steps):
         factor = cho_factor(step.innovation_covariance, lower=True)
         if step is not steps[-1]:
-            later = filter_.transition.T @ later
-            # (I − K H)ᵀ
-            later -= step.matrix.T @ cho_solve(factor, step.cross_covariance.T @ later)
+            later = _transposed(filter_.space.motion(step.time + 1), later)
+            later = _before(step, factor, later)
         adjoint = later[:, 0] + step.matrix.T @ cho_solve(factor, step.innovation)
         information = solve_triangular(factor[0], step.matrix, lower=True).T
-        information = compressed(np.hstack([later[:, 1:], information]), filter_.rank_tolerance)
+        information = truncate_columns(np.hstack([later[:, 1:], information]),
+                                       filter_.covariance.rank_tolerance)
         later = np.column_stack([adjoint, information])
         yield step, later
 
 
-def _smoothed(filter_: KalmanFilter, step: FilterStep, later: np.ndarray) -> Smoothed:
-    """c_{t|t−1} + Γ λ and the diagonal of Γ − Γ N Γ, with Γ = Γ_{t|t−1} = Π_t − Z Zᵀ."""
-    covariance = filter_.covariance
-    seen = covariance.apply(step.time, later) - step.known @ (step.known.T @ later)
-    prior = covariance.diagonal(step.time) - (step.known**2).sum(axis=1)
-    return Smoothed(step.predicted_mean + seen[:, 0], prior - (seen[:, 1:]**2).sum(axis=1))
+def _before(step: Step, factor: tuple[np.ndarray, bool], X: np.ndarray) -> np.ndarray:
+    """Return (I − K H)ᵀ X for X (n,) or (n, k)."""
+    return X - step.matrix.T @ cho_solve(factor, step.cross_covariance.T @ X)
+
+
+def _transposed(motion: Motion, X: np.ndarray) -> np.ndarray:
+    """Return Fᵀ X for X (n,) or (n, k)."""
+    F = motion.transition
+    if F is None:
+        return X
+    return (F(np.eye(len(X))) if callable(F) else F).T @ X
+
+
+def _noise(motion: Motion, initial: Covariance, x: np.ndarray) -> np.ndarray | float:
+    """Return Q x for x (n,)."""
+    if isinstance(initial, LowRankCovariance):
+        return initial.open_loop.apply_noise(x)
+    return 0.0 if motion.noise is None else motion.noise @ x
+
+
+def _smoothed(step: Step, adjoint: np.ndarray) -> Estimate:
+    """Return c_{t|t−1} + P λ and the diagonal of P − P N P, with P = P_{t|t−1}."""
+    weighted = step.predicted_covariance.times(adjoint)
+    variance = step.predicted_covariance.diagonal() - (weighted[:, 1:]**2).sum(axis=1)
+    return Estimate(step.predicted_mean + weighted[:, 0], variance)

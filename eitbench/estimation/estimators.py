@@ -1,0 +1,136 @@
+"""Estimators made of filters and smoothers: from the calibration frame to the last measurement."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+
+from eitbench.estimation.homogeneous import best_homogeneous
+from eitbench.worlds.task import Estimate, Task
+
+Measurement = tuple[np.ndarray, np.ndarray]
+"""Voltages (L,) in V and currents (L,) in A (A/m in 2D) of one injection."""
+
+
+class FirstFrame:
+    """Calibration frame: the first injections, which determine ĉ_bh and with it all of Table 5.1.
+
+    The frame lies within the warm-up, so that no scored estimate waits for it.
+    """
+
+    def __init__(self, task: Task) -> None:
+        self.task = task
+        self.length = task.calibration
+        self.measurements: list[Measurement] = []
+        self.c_bh = task.expected_concentration
+        """mol/m³; the task's rough level until the frame is complete, then ĉ_bh"""
+
+    @property
+    def complete(self) -> bool:
+        """Whether the whole frame has been measured."""
+        return len(self.measurements) >= self.length
+
+    def add(self, voltages: np.ndarray, currents: np.ndarray) -> bool:
+        """Add one measurement and return whether the frame is complete now."""
+        self.measurements.append((voltages, currents))
+        if self.complete:
+            task = self.task
+            V, I = (np.array(part) for part in zip(*self.measurements, strict=True))
+            self.c_bh = best_homogeneous(task.observation, task.noise, task.mesh.n_nodes, V, I,
+                                         self.c_bh)
+        return self.complete
+
+    @property
+    def mean(self) -> np.ndarray:
+        """(n,) homogeneous concentration: the estimate while the frame lasts."""
+        return np.full(self.task.mesh.n_nodes, self.c_bh)
+
+
+class Sequential(Protocol):
+    """Filter that assimilates one measurement at a time, such as `Filter`."""
+
+    def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> Any:
+        """Advance one time step and use its measurement."""
+
+    def estimate(self, lag: int = 0) -> Estimate:
+        """Return the state ``lag`` steps before the present."""
+
+
+class FilterEstimator:
+    """Filter as an estimator of each state, ``task.lag`` measurements later.
+
+    During the calibration frame it estimates homogeneous fluid; then the filter starts from t = 0
+    and assimilates the frame. After the last measurement the lag shrinks.
+
+    Parameters
+    ----------
+    task : Task
+    start : callable
+        ĉ_bh in mol/m³ -> filter at t = 0.
+    """
+
+    def __init__(self, task: Task, start: Callable[[float], Sequential]) -> None:
+        self.task = task
+        self.first = FirstFrame(task)
+        self._start = start
+        self._measured = 0
+        self._requested = -task.lag
+
+    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
+        """Return the state t − lag after measurement t, (L,) V and A each; None before the first.
+
+        After the last measurement the arguments are ignored.
+        """
+        self._requested += 1
+        if self._measured == self.task.n_steps:
+            return self._estimate()._replace(innovation=None, innovation_covariance=None)
+        self._measured += 1
+        if self.first.complete:
+            self.filter.assimilate(voltages, currents)
+        elif self.first.add(voltages, currents):
+            self.filter = self._start(self.first.c_bh)
+            for measurement in self.first.measurements:
+                self.filter.assimilate(*measurement)
+        elif self._requested > 0:
+            return Estimate(self.first.mean)
+        return self._estimate() if self._requested > 0 else None
+
+    def _estimate(self) -> Estimate:
+        estimate = self.filter.estimate(self._measured - self._requested)
+        if self.task.velocity is None:
+            return estimate._replace(velocity=None, velocity_variance=None)
+        return estimate
+
+
+class RecordEstimator:
+    """Smoother of a whole record as an estimator: it is silent until the last measurement.
+
+    Parameters
+    ----------
+    task : Task
+        Its lag is that of the smoothing board.
+    smooth : callable
+        ĉ_bh in mol/m³ and the measurements t = 1 … T -> the estimates of their states.
+    """
+
+    def __init__(self, task: Task,
+                 smooth: Callable[[float, Sequence[Measurement]], Sequence[Estimate]]) -> None:
+        self.task = task
+        self._smooth = smooth
+        self._record: list[Measurement] = []
+        self._requested = 0
+
+    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
+        """Return the states one by one, once the record, (L,) V and A at a time, is complete."""
+        if len(self._record) < self.task.n_steps:
+            self._record.append((voltages, currents))
+            if len(self._record) < self.task.n_steps:
+                return None
+            first = FirstFrame(self.task)
+            for measurement in self._record[:first.length]:
+                first.add(*measurement)
+            self._estimates = self._smooth(first.c_bh, self._record)
+        self._requested += 1
+        return self._estimates[self._requested - 1]

@@ -1,0 +1,173 @@
+"""Kalman filters: one recursion for every state space (thesis 5.1, docs/methods.md, 5)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+
+from eitbench.estimation.covariance import Covariance
+from eitbench.estimation.forward import Forward
+from eitbench.estimation.gaussian import Observation, condition, innovate
+from eitbench.worlds.task import Estimate
+
+
+class StateSpace:
+    """State x of a filter: its motion, and the concentration that follows from it.
+
+    Subclasses define how the mean and covariance move and the concentration; the other methods have
+    defaults for a state that is the concentration itself.
+    """
+
+    def initial(self) -> tuple[np.ndarray, Covariance]:
+        """Return mean and covariance at t = 0."""
+        raise NotImplementedError
+
+    def propagate(self, mean: np.ndarray, covariance: Covariance,
+                  time: int) -> tuple[np.ndarray, Covariance]:
+        """Return mean and covariance at ``time``, one step later."""
+        raise NotImplementedError
+
+    def concentration(self, mean: np.ndarray, lag: int = 0) -> np.ndarray:
+        """Return the concentration (n,) in mol/m³, ``lag`` steps before the present."""
+        return mean
+
+    def jacobian(self, mean: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+        """Return the derivatives (m, k) of ``matrix`` (m, n) times c by the first k entries of x."""
+        return matrix
+
+    def variance(self, mean: np.ndarray, covariance: Covariance, lag: int = 0) -> np.ndarray:
+        """Return the variances (n,) of the concentration in (mol/m³)²."""
+        return covariance.diagonal()
+
+    def constrain(self, mean: np.ndarray) -> np.ndarray:
+        """Return the nearest admissible mean after a measurement."""
+        return mean
+
+    def velocity(self, mean: np.ndarray,
+                 covariance: Covariance) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return the velocity parameters (k,) in m/s and their variances; None: not estimated."""
+        return None
+
+
+class Step(NamedTuple):
+    """Result of one filter step, and what the backward pass of a smoother needs."""
+
+    time: int
+    predicted_mean: np.ndarray
+    """(n,) x_{t|t−1}"""
+    predicted_covariance: Covariance
+    """P_{t|t−1}; in the dense form the filter's own, which has changed since"""
+    mean: np.ndarray
+    """(n,) x_{t|t}"""
+    matrix: np.ndarray
+    """(m, k) H, derivatives of the readings by the first k entries of x"""
+    innovation: np.ndarray
+    """(m,) ν"""
+    innovation_covariance: np.ndarray
+    """(m, m) S"""
+    cross_covariance: np.ndarray
+    """(n, m) P_{t|t−1} Hᵀ"""
+    accepted: np.ndarray
+    """(m,) bool: readings that passed the gate; the fields above are of all readings"""
+    variance: np.ndarray | None = None
+    """(n,) diagonal of P_{t|t}; only `kalman_filter` sets it"""
+
+
+class Filter:
+    """Kalman filter on a state space, extended where concentration or voltages are nonlinear.
+
+    Parameters
+    ----------
+    space : StateSpace
+    forward : callable, optional
+        Linearises voltages about a concentration; for `assimilate`.
+    gate : float
+        Readings further than this many standard deviations from the prediction are rejected.
+    iterated : bool
+        `assimilate` linearises each measurement once more, about the first estimate.
+
+    Attributes
+    ----------
+    mean, covariance
+        Of the present state.
+    """
+
+    def __init__(self, space: StateSpace, forward: Forward | None = None, *,
+                 gate: float = math.inf, iterated: bool = False) -> None:
+        self.space = space
+        self.forward = forward
+        self.gate = gate
+        self.iterated = iterated
+        self.time = 0
+        self.mean, self.covariance = space.initial()
+        self.step: Step | None = None
+
+    @property
+    def concentration(self) -> np.ndarray:
+        """(n,) mol/m³: the present mean, about which the next measurement is linearised."""
+        return self.space.concentration(self.mean)
+
+    def predict(self) -> None:
+        """Advance one time step."""
+        self.time += 1
+        self.mean, self.covariance = self.space.propagate(self.mean, self.covariance, self.time)
+
+    def update(self, observation: Observation) -> Step:
+        """Condition on a measurement that is linear in the concentration near the present one."""
+        H = self.space.jacobian(self.mean, observation.matrix)
+        residual = observation.value - observation.matrix @ self.concentration
+        return self._condition(observation, H, residual)
+
+    def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> Step:
+        """Predict, and condition on voltages (L,) in V for an injection (L,) in A."""
+        assert self.forward is not None, "forward must be given to assimilate voltages"
+        self.predict()
+        before = self.mean, self.covariance.copy() if self.iterated else self.covariance
+        step = self.update(self.forward(self.concentration, voltages, currents))
+        if not self.iterated:
+            return step
+        observation = self.forward(self.concentration, voltages, currents)
+        H = self.space.jacobian(self.mean, observation.matrix)
+        residual = (observation.value - observation.matrix @ self.concentration
+                    + H @ (self.mean - before[0])[:H.shape[1]])
+        self.mean, self.covariance = before
+        again = self._condition(observation, H, residual)
+        self.step = again._replace(innovation=step.innovation,
+                                   innovation_covariance=step.innovation_covariance)
+        return self.step
+
+    def _condition(self, observation: Observation, H: np.ndarray, residual: np.ndarray) -> Step:
+        innovation = innovate(self.covariance, H, residual, observation.noise_variance,
+                              observation.noise_root)
+        predicted = self.mean, self.covariance
+        mean, self.covariance, accepted = condition(*predicted, innovation, self.gate)
+        self.mean = self.space.constrain(mean)
+        self.step = Step(self.time, *predicted, self.mean, H, *innovation, accepted)
+        return self.step
+
+    @property
+    def variance(self) -> np.ndarray:
+        """(n,) (mol/m³)²: present variances of the concentration."""
+        return self.space.variance(self.mean, self.covariance)
+
+    def estimate(self, lag: int = 0) -> Estimate:
+        """Return the state ``lag`` steps before the present, with the last innovation."""
+        space = self.space
+        velocity = space.velocity(self.mean, self.covariance) or (None, None)
+        innovation = (None, None) if self.step is None else (
+            self.step.innovation, self.step.innovation_covariance)
+        return Estimate(space.concentration(self.mean, lag),
+                        space.variance(self.mean, self.covariance, lag), *innovation, *velocity)
+
+
+def kalman_filter(start: Filter, observations: Iterable[Observation]) -> list[Step]:
+    """Run ``start`` over a record: predict, then update, for each observation."""
+    steps = []
+    for observation in observations:
+        start.predict()
+        step = start.update(observation)
+        steps.append(step._replace(variance=start.covariance.diagonal()))
+    return steps

@@ -1,0 +1,79 @@
+"""Innovate, gate and condition a Gaussian: the recursion behind every filter (docs/methods.md, 5)."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import cholesky, solve_triangular
+
+from eitbench.estimation.covariance import Covariance
+
+
+class Observation(NamedTuple):
+    """Linear measurement: value = matrix x + v + N e, with independent v and e ~ N(0, I)."""
+
+    matrix: np.ndarray
+    """(m, n)"""
+    value: np.ndarray
+    """(m,)"""
+    noise_variance: np.ndarray
+    """(m,) of v"""
+    noise_root: np.ndarray | None = None
+    """(m, s) N, of errors that readings have in common; None: there are none"""
+
+
+class Innovation(NamedTuple):
+    """Measured minus predicted readings, and their predicted covariance."""
+
+    value: np.ndarray
+    """(m,) ν"""
+    covariance: np.ndarray
+    """(m, m) S = H P Hᵀ + R"""
+    cross_covariance: np.ndarray
+    """(n, m) P Hᵀ"""
+
+
+def innovate(covariance: Covariance, matrix: np.ndarray, residual: np.ndarray,
+             noise_variance: np.ndarray, noise_root: np.ndarray | None = None) -> Innovation:
+    """Return the innovation of readings whose derivatives by the first k entries of the state are
+    ``matrix`` (m, k), and which are ``residual`` (m,) above the prediction."""
+    cross = covariance.times(matrix.T)
+    S = matrix @ cross[:matrix.shape[1]]
+    if noise_root is not None:
+        S = S + noise_root @ noise_root.T
+    return Innovation(residual, 0.5 * (S + S.T) + np.diag(noise_variance), cross)
+
+
+def gate_mask(innovation: np.ndarray, variance: np.ndarray, gate: float) -> np.ndarray:
+    """Accept readings within ``gate`` predicted standard deviations of the prediction.
+
+    Where more than a third lie beyond, the injection itself has failed, and none is accepted.
+
+    Parameters
+    ----------
+    innovation, variance : (..., m)
+        Innovations and their predicted variances.
+    gate : float
+        > 0; infinite: all are accepted.
+    """
+    accepted = np.abs(innovation) <= gate * np.sqrt(variance)
+    failed = (~accepted).mean(axis=-1, keepdims=True) > 1 / 3
+    return accepted & ~failed
+
+
+def condition(mean: np.ndarray, covariance: Covariance, innovation: Innovation,
+              gate: float = math.inf) -> tuple[np.ndarray, Covariance, np.ndarray]:
+    """Return mean (n,) and covariance given the readings that pass the ``gate``, and which did
+    (m,)."""
+    value, S, cross = innovation
+    accepted = gate_mask(value, S.diagonal(), gate)
+    if not accepted.all():
+        value, S, cross = value[accepted], S[np.ix_(accepted, accepted)], cross[:, accepted]
+    if len(value):
+        root = cholesky(S, lower=True)
+        gain_root = solve_triangular(root, cross.T, lower=True).T                      # P Hᵀ L⁻ᵀ
+        mean = mean + gain_root @ solve_triangular(root, value, lower=True)
+        covariance = covariance.subtract(gain_root)
+    return mean, covariance, accepted

@@ -1,0 +1,166 @@
+"""Inflow window: the history of the inflow, from which the flow makes the concentration
+(docs/methods.md, 10)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from scipy.linalg import toeplitz
+
+from eitbench.estimation.covariance import Covariance, DenseCovariance
+from eitbench.estimation.filter import Filter, StateSpace
+from eitbench.estimation.forward import Forward, about_prediction
+from eitbench.estimation.inflow_response import Response, steady_response
+
+if TYPE_CHECKING:
+    from eitbench.estimation.identified import IdentifiedModel
+    from eitbench.estimation.inflow_prior import InflowPrior
+    from eitbench.worlds.task import Task
+
+
+class Regression(NamedTuple):
+    """Autoregressive model: the next value from the last W values, the newest first."""
+
+    weights: np.ndarray
+    """(W,)"""
+    variance: float
+    """of the remainder"""
+
+
+def stationary(covariance: np.ndarray) -> tuple[np.ndarray, Regression]:
+    """Return the covariance (W, W) of W values and the regression of the next one (Yule–Walker).
+
+    ``covariance`` (W + 1,) has the covariances of two values 0 … W steps apart.
+    """
+    before = toeplitz(covariance[:-1])
+    weights = np.linalg.solve(before, covariance[1:])
+    return before, Regression(weights, float(covariance[0] - weights @ covariance[1:]))
+
+
+class InflowWindow(StateSpace):
+    """Last inflows x_t … x_{t−W+1} (W·r,), the newest first, with u = E x the inflow's deviation.
+
+    In time they only move on, so that the prior is exact but for what lies more than W steps apart;
+    all nonlinearity is in the observation.
+
+    Parameters
+    ----------
+    transport : Transport
+        Only for the default of ``responses``.
+    prior : InflowPrior
+    level : float
+        ĉ_bh in mol/m³.
+    lag : int
+        The oldest state to be estimated, in steps before the present one.
+    responses : sequence of Response, optional
+        Of the states t = 1, 2, …, where the last holds from then on; default: that of the task's
+        flow for all.
+    residual : (q, q), optional
+        Covariance of the deviation from the response in its basis, relative to the level.
+    """
+
+    def __init__(self, task: Task, prior: InflowPrior, level: float, lag: int = 0, *,
+                 responses: Sequence[Response] | None = None,
+                 residual: np.ndarray | None = None) -> None:
+        prior.check_task(task)
+        self.prior = prior
+        self.level = level
+        self.residual = residual
+        self.responses = responses or [steady_response(task.transport)]
+        self.memory = self.responses[0].weights.shape[1]
+        """K, steps until the pipe has forgotten an inflow"""
+        self.modes = prior.modes.shape[1]
+        """r"""
+        self.window = self.memory + lag
+        """W"""
+        self.present = 0
+        """t"""
+        before, (weights, variance) = stationary(prior.time_covariance(self.window + 1))
+        self._prior_covariance = np.kron(before, np.eye(self.modes))
+        self.regression = weights[:, None], np.full(self.modes, variance)
+        """Weights (W, r) or (W, 1) and variances (r,) of the entries of the next x."""
+
+    def initial(self) -> tuple[np.ndarray, Covariance]:
+        return np.zeros(len(self._prior_covariance)), DenseCovariance(self._prior_covariance)
+
+    def propagate(self, mean: np.ndarray, covariance: Covariance,
+                  time: int) -> tuple[np.ndarray, Covariance]:
+        self.present = time
+        weights, variance = self.regression
+        assert isinstance(covariance, DenseCovariance)
+        return shifted(mean, weights), covariance.shift(weights, variance)
+
+    def response(self, lag: int = 0) -> Response:
+        """Return the response of the state ``lag`` steps ago."""
+        t = min(max(self.present - lag, 1), len(self.responses))
+        return self.responses[t - 1]
+
+    def concentration(self, mean: np.ndarray, lag: int = 0) -> np.ndarray:
+        return self.level * (1.0 + self.response(lag).basis @ self.coordinates(mean, lag))
+
+    def coordinates(self, mean: np.ndarray, lag: int = 0) -> np.ndarray:
+        """Return the deviation (q,) from the level in the response's basis, relative to it."""
+        deviation = self.prior.inflow(self._recent(mean, lag) @ self.prior.modes.T) - 1.0
+        return np.tensordot(self.response(lag).weights, deviation, 2)
+
+    def variance(self, mean: np.ndarray, covariance: Covariance, lag: int = 0) -> np.ndarray:
+        assert isinstance(covariance, DenseCovariance)
+        slope = self.slope(mean, lag)
+        here = slice(lag * self.modes, (lag + self.memory) * self.modes)
+        reduced = slope @ covariance.array[here, here] @ slope.T
+        if self.residual is not None:
+            reduced = reduced + self.level**2 * self.residual
+        basis = self.response(lag).basis
+        return ((basis @ reduced) * basis).sum(axis=1)
+
+    def jacobian(self, mean: np.ndarray, matrix: np.ndarray, lag: int = 0) -> np.ndarray:
+        basis, weights = self.response(lag)
+        return self._by_x(mean, np.tensordot(matrix @ basis, weights, 1), lag)
+
+    def slope(self, mean: np.ndarray, lag: int = 0) -> np.ndarray:
+        """Return the derivatives (q, K·r) of the concentration in the basis by x."""
+        return self._by_x(mean, self.response(lag).weights, lag)
+
+    def _by_x(self, mean: np.ndarray, by_inflow: np.ndarray, lag: int) -> np.ndarray:
+        """Return derivatives (m, K·r) by x from those by the inflows (m, K, n_inlet)."""
+        by_u = by_inflow * (self.level * self.prior.slope(self._recent(mean, lag)
+                                                          @ self.prior.modes.T))
+        # one product of matrices; of three dimensions it would be many small ones
+        by_x = by_u.reshape(-1, by_u.shape[-1]) @ self.prior.modes
+        return by_x.reshape(len(by_inflow), -1)
+
+    def _recent(self, mean: np.ndarray, lag: int) -> np.ndarray:
+        """Return the K inflows (K, r) that have made the state ``lag`` steps ago."""
+        return mean.reshape(-1, self.modes)[lag:lag + self.memory]
+
+
+def shifted(mean: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return the mean (W·d,) of a window one step later, by the weights of `Regression`."""
+    values = mean.reshape(len(weights), -1)
+    return np.concatenate([(weights * values).sum(axis=0)[None], values[:-1]]).ravel()
+
+
+def inflow_filter(task: Task, prior: InflowPrior, level: float, lag: int = 0, *,
+                  responses: Sequence[Response] | None = None,
+                  model: IdentifiedModel | None = None, iterated: bool = False) -> Filter:
+    """Return the extended Kalman filter of the inflow's history.
+
+    Parameters
+    ----------
+    task, prior, level, lag, responses
+        As in `InflowWindow`.
+    model : IdentifiedModel, optional
+        Its response and its errors take the place of the task's flow.
+    iterated : bool
+        Each measurement is linearised once more, about the first estimate.
+    """
+    forward: Forward = about_prediction(task)
+    if model is None:
+        space = InflowWindow(task, prior, level, lag, responses=responses)
+    else:
+        space = InflowWindow(task, prior, level, lag, responses=[model.response],
+                             residual=model.spread)
+        forward = model.forward(task, level)
+    return Filter(space, forward, iterated=iterated)

@@ -1,0 +1,226 @@
+"""Nodal state spaces: the concentration, or its logarithm, at the nodes; parameters of thesis
+Table 5.1, relative to ĉ_bh."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from eitbench.estimation.covariance import (
+    Covariance,
+    DenseCovariance,
+    LowRankCovariance,
+    OpenLoopCovariance,
+    Transition,
+)
+from eitbench.estimation.filter import Filter, StateSpace
+from eitbench.estimation.forward import Forward
+from eitbench.estimation.smoothness import smoothness_covariance
+from eitbench.estimation.walk import RandomWalk
+from eitbench.physics.rest import AtRest
+
+if TYPE_CHECKING:
+    from eitbench.numerics.mesh import Mesh
+    from eitbench.physics.transport import Transport
+    from eitbench.worlds.world import Prior
+
+RANK_TOLERANCE = 1e-4
+"""See `LowRankCovariance`: the estimates are those of the exact filter to 1e-7 of their standard
+deviation, in a quarter of the time where n = 3,003 (``docs/pipe3d.md``)."""
+
+
+class Motion(NamedTuple):
+    """x⁺ = F x + s + w, w ~ N(0, Q), in one time step."""
+
+    transition: Transition | None = None
+    """F (n, n), or X (n, k) -> F X; None: identity"""
+    forcing: np.ndarray | float = 0.0
+    """(n,) s"""
+    noise: np.ndarray | None = None
+    """(n, n) Q; None: zero"""
+
+    def apply(self, x: np.ndarray) -> np.ndarray:
+        """Return F x for x (n,)."""
+        F = self.transition
+        if F is None:
+            return x
+        return F(x[:, None])[:, 0] if callable(F) else F @ x
+
+
+class NodalStates(StateSpace):
+    """Concentration at the nodes, with a motion that is known beforehand.
+
+    Parameters
+    ----------
+    mean : (n,)
+        c_{0|0} in mol/m³.
+    covariance : Covariance
+        At t = 0; a `LowRankCovariance` must have the motion's F and Q.
+    motion : Motion or callable
+        Of each step, or t -> that of the step to t.
+    """
+
+    def __init__(self, mean: np.ndarray, covariance: Covariance,
+                 motion: Motion | Callable[[int], Motion]) -> None:
+        self._initial = mean, covariance
+        self._motion = motion
+
+    def motion(self, time: int) -> Motion:
+        """Return the motion of the step to ``time``."""
+        return self._motion(time) if callable(self._motion) else self._motion
+
+    def initial(self) -> tuple[np.ndarray, Covariance]:
+        mean, covariance = self._initial
+        return np.array(mean, dtype=float), covariance.copy()
+
+    def propagate(self, mean: np.ndarray, covariance: Covariance,
+                  time: int) -> tuple[np.ndarray, Covariance]:
+        motion = self.motion(time)
+        moved = motion.apply(mean) + motion.forcing
+        return moved, covariance.propagate(motion.transition, motion.noise)
+
+
+class LogStates(StateSpace):
+    """Logarithm of the concentration, c = ĉ_bh exp(E x_1), with x_1 the first entries of a state.
+
+    Parameters
+    ----------
+    states : NodalStates
+        Of x; its mean begins at zero.
+    c_ref : float
+        ĉ_bh in mol/m³.
+    modes : (n, K), optional
+        E; default: identity.
+    """
+
+    def __init__(self, states: NodalStates, c_ref: float, modes: np.ndarray | None = None) -> None:
+        self.states = states
+        self.c_ref = c_ref
+        self.modes = modes
+
+    def initial(self) -> tuple[np.ndarray, Covariance]:
+        mean, covariance = self.states.initial()
+        return np.zeros_like(mean), covariance
+
+    def propagate(self, mean: np.ndarray, covariance: Covariance,
+                  time: int) -> tuple[np.ndarray, Covariance]:
+        return self.states.propagate(mean, covariance, time)
+
+    def concentration(self, mean: np.ndarray, lag: int = 0) -> np.ndarray:
+        E = self.modes
+        return self.c_ref * np.exp(mean if E is None else E @ mean[:E.shape[1]])
+
+    def jacobian(self, mean: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+        by_logarithm = matrix * self.concentration(mean)
+        return by_logarithm if self.modes is None else by_logarithm @ self.modes
+
+    def variance(self, mean: np.ndarray, covariance: Covariance, lag: int = 0) -> np.ndarray:
+        variance = (covariance.diagonal() if self.modes is None
+                    else covariance.variance_of(self.modes))
+        return self.concentration(mean)**2 * variance
+
+
+def nodal_states(transport: Transport, prior: Prior, c_ref: float) -> NodalStates:
+    """Return the concentration of a target with a motion and the parameters of Table 5.1.
+
+    Where fluid flows through the vessel they are those of `table_5_1`. Where nothing flows in, the
+    covariance without data has no limit, and a dense covariance is kept.
+
+    Parameters
+    ----------
+    transport
+        The evolution model; `Task.transport`.
+    prior : Prior
+        `Task.prior`.
+    c_ref : float
+        Best homogeneous estimate ĉ_bh in mol/m³.
+    """
+    if len(transport.inlet) and not isinstance(transport, AtRest):
+        return _flowing_states(transport, prior, c_ref)
+    mean = np.full(transport.mesh.n_nodes, c_ref)
+    if isinstance(transport, RandomWalk):
+        motion = Motion(transport.step, noise=(c_ref * prior.nodal_std)**2 * transport.covariance)
+    elif isinstance(transport, AtRest):
+        walk = (c_ref * prior.nodal_std)**2
+        motion = Motion(noise=walk * np.eye(len(mean)) if walk else None)
+    else:
+        motion = Motion(transport.evolution_model().F,
+                        noise=c_ref**2 * _state_noise(transport, prior))
+    covariance = c_ref**2 * initial_covariance(transport.mesh, prior)
+    return NodalStates(mean, DenseCovariance(covariance), motion)
+
+
+def modal_states(count: int, std: float,
+                 motion: Callable[[int], tuple[np.ndarray, np.ndarray]]) -> NodalStates:
+    """Return independent weights of ``count`` modes that all move alike, of variance ``std``².
+
+    Each is the first of p numbers, such as a weight and its rate of change, which move by A (p, p)
+    with noise Q (p, p) for a variance of 1; ``motion`` gives both for the step to t.
+    """
+    order = len(motion(1)[0])
+
+    def motion_at(time: int) -> Motion:
+        A, Q = motion(time)
+
+        def apply(X: np.ndarray) -> np.ndarray:
+            return (A @ X.reshape(order, -1)).reshape(X.shape)
+
+        return Motion(apply, noise=np.kron(std**2 * Q, np.eye(count)))
+
+    covariance = DenseCovariance(std**2 * np.eye(order * count))
+    return NodalStates(np.zeros(order * count), covariance, motion_at)
+
+
+def starting_filter(transport: Transport, prior: Prior, c_ref: float,
+                    forward: Forward | None = None) -> Filter:
+    """Return a filter of `nodal_states` at t = 0."""
+    return Filter(nodal_states(transport, prior, c_ref), forward)
+
+
+def table_5_1(transport: Transport, prior: Prior, c_ref: float, *,
+              rank_tolerance: float = RANK_TOLERANCE) -> Filter:
+    """Return the Kalman filter of c⁺ = F c + Y c_in + w; arguments as in `nodal_states`.
+
+    Inflow and initial state have mean ĉ_bh; Γ_η and Γ_e are diagonal, Γ_{0|0} is diagonal or
+    smooth. As all of them scale with ĉ_bh², the covariance without data is computed once for a
+    transport model and serves every episode.
+    """
+    return Filter(_flowing_states(transport, prior, c_ref, rank_tolerance))
+
+
+def _flowing_states(transport: Transport, prior: Prior, c_ref: float,
+                    rank_tolerance: float = RANK_TOLERANCE) -> NodalStates:
+    F, Y, _ = transport.evolution_model()
+    covariance = LowRankCovariance(_open_loop(transport, prior).scaled(c_ref**2), rank_tolerance)
+    return NodalStates(np.full(len(F), c_ref), covariance, Motion(F, Y.sum(axis=1) * c_ref))
+
+
+def initial_covariance(mesh: Mesh, prior: Prior) -> np.ndarray:
+    """Γ_{0|0} (n, n) for ĉ_bh = 1: diagonal, or smooth over `Prior.initial_length`; read-only."""
+    if not prior.initial_length:
+        return prior.initial_std**2 * np.eye(mesh.n_nodes)
+    return _smooth(mesh, prior.initial_length, prior.initial_std)
+
+
+@lru_cache(maxsize=4)
+def _smooth(mesh: Mesh, length: float, std: float) -> np.ndarray:
+    from eitbench.numerics.fem import mass_matrix, stiffness_matrix
+    covariance = smoothness_covariance(mass_matrix(mesh), stiffness_matrix(mesh), length, std)
+    covariance.setflags(write=False)
+    return covariance
+
+
+@lru_cache(maxsize=12)
+def _open_loop(transport: Transport, prior: Prior) -> OpenLoopCovariance:
+    return OpenLoopCovariance(transport.evolution_model().F, _state_noise(transport, prior),
+                              initial_covariance(transport.mesh, prior))
+
+
+@lru_cache(maxsize=4)
+def _state_noise(transport: Transport, prior: Prior) -> np.ndarray:
+    """Γ_w (5.16) for ĉ_bh = 1."""
+    model = transport.evolution_model()
+    return model.state_noise_covariance(prior.inflow_std**2, prior.nodal_std**2)

@@ -1,0 +1,181 @@
+"""Velocity unknown: a few parameters that walk at random, estimated with the concentration
+(thesis ch. 6)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from eitbench import _check
+from eitbench.estimation.covariance import Covariance, DenseCovariance
+from eitbench.estimation.filter import StateSpace
+from eitbench.estimation.inflow_response import newest_inflow
+from eitbench.estimation.nodal import initial_covariance
+
+if TYPE_CHECKING:
+    from eitbench.physics.transport import ConvectionDiffusion, VelocityField
+    from eitbench.worlds.task import Task
+
+
+@dataclass(frozen=True, eq=False)
+class UnknownFlow:
+    """v = Σ θ_k v_k, with θ a random walk that begins at N(θ_0, diag(std²)).
+
+    ``ValueError`` naming what is of the wrong shape, or not positive for θ_0.
+    """
+
+    transport_at: Callable[[np.ndarray], ConvectionDiffusion]
+    """θ (k,) -> the model with that velocity; all with one mesh and one inlet"""
+    directions: Sequence[VelocityField]
+    """the k fields v_k"""
+    start: np.ndarray
+    """(k,) θ_0"""
+    start_std: np.ndarray
+    """(k,)"""
+    walk_std: np.ndarray
+    """(k,) of the steps of the walk, one a time step; zero for a constant velocity"""
+    profiles: np.ndarray
+    """(p, k) axial velocity of each v_k at p points across the flow, off the walls"""
+
+    bounds: tuple[float, float] = (0.05, 4.0)
+    """least and largest axial velocity at each point, relative to that of θ_0: points close to a
+    wall bind no more than others; 0 < least < 1 < largest"""
+
+    def __post_init__(self) -> None:
+        k = len(self.directions)
+        for name in ("start", "start_std", "walk_std"):
+            object.__setattr__(self, name, _check.array(name, getattr(self, name), (k,)))
+        profiles = _check.array("profiles", self.profiles, (None, k))
+        object.__setattr__(self, "profiles", profiles)
+        if not (profiles @ self.start > 0).all():
+            raise ValueError("profiles must give a positive velocity with start, "
+                             f"got {(profiles @ self.start).min():g}")
+        low, high = _check.array("bounds", self.bounds, (2,))
+        if not 0 < low < 1 < high:
+            raise ValueError("bounds must be a range 0 < least < 1 < largest, got "
+                             f"{self.bounds!r}")
+
+    def within_bounds(self, parameters: np.ndarray) -> np.ndarray:
+        """Return the parameters θ (k,), or the nearest point within the bounds on the line towards
+        θ_0."""
+        nominal = self.profiles @ self.start
+        change = self.profiles @ (parameters - self.start) / nominal
+        allowed = np.where(change < 0, *self.bounds) - 1.0
+        beyond = np.abs(change) > np.abs(allowed)
+        if not beyond.any():
+            return parameters
+        return self.start + (allowed[beyond] / change[beyond]).min() * (parameters - self.start)
+
+
+class VelocityStates(StateSpace):
+    """Concentration and velocity parameters, c⁺ = F(θ) c + Y(θ) c_in + w, θ⁺ = θ + ω.
+
+    Each step is linearised at the present mean: the covariance of (c, θ) moves with [[F, ∂c⁺/∂θ],
+    [0, I]], where F, Y and the derivative are those of the discrete step at θ̂. The noise is Γ_w =
+    Y(θ̂) Γ_η Y(θ̂)ᵀ + H Γ_e Hᵀ, of which only the nodal part H Γ_e Hᵀ is frozen at the nominal
+    velocity: H would cost as much as F, and the part is small.
+
+    After each measurement θ is moved back within the flow's bounds; concentration and covariance
+    stay what they are. ``ValueError`` naming the argument if it is out of range, of the wrong
+    shape, or not finite.
+
+    Parameters
+    ----------
+    flow : UnknownFlow
+        Prior of θ.
+    mean, covariance : (n,), (n, n)
+        Of the concentration at t = 0, in mol/m³ and its square.
+    inflow, inflow_std : float
+        c_in and the standard deviation of η in mol/m³; ĉ_bh and ĉ_bh/4 in the thesis.
+    nodal_noise : (n, n)
+        H Γ_e Hᵀ at the nominal velocity, (mol/m³)².
+    """
+
+    def __init__(self, flow: UnknownFlow, mean: np.ndarray, covariance: np.ndarray, *,
+                 inflow: float, inflow_std: float, nodal_noise: np.ndarray) -> None:
+        self.flow = flow
+        c = _check.array("mean", mean, (None,), units="mol/m³")
+        n = self._n = len(c)
+        k = len(flow.start)
+        self._inflow = _check.number("inflow", inflow, units="mol/m³")
+        self._inflow_std = _check.number("inflow_std", inflow_std, low=0.0, units="mol/m³")
+        self._nodal_noise = _check.array("nodal_noise", nodal_noise, (n, n))
+        self._mean = np.concatenate([c, flow.start])
+        self._covariance = np.zeros((n + k, n + k))
+        self._covariance[:n, :n] = _check.array("covariance", covariance, (n, n))
+        self._covariance[n:, n:] = np.diag(flow.start_std**2)
+
+    def initial(self) -> tuple[np.ndarray, Covariance]:
+        return self._mean.copy(), DenseCovariance(self._covariance)
+
+    def propagate(self, mean: np.ndarray, covariance: Covariance,
+                  time: int) -> tuple[np.ndarray, Covariance]:
+        n = self._n
+        c, theta = mean[:n], mean[n:]
+        transport = self.flow.transport_at(theta)
+        inlet = transport.inlet
+        after, by_theta = transport.velocity_derivatives(c, c[inlet], self._inflow,
+                                                         self.flow.directions)
+
+        def advance(X: np.ndarray) -> np.ndarray:
+            """[[F, ∂c⁺/∂θ], [0, I]] X; with its sparse matrices a step costs far less than F."""
+            moved = transport.step(X[:n], X[inlet], 0.0)
+            moved += by_theta @ X[n:]
+            return np.concatenate([moved, X[n:]])
+
+        Y = self._inflow_std * newest_inflow(transport)
+        noise = np.zeros_like(self._covariance)
+        noise[:n, :n] = Y @ Y.T + self._nodal_noise
+        noise[n:, n:] = np.diag(self.flow.walk_std**2)
+        return np.concatenate([after, theta]), covariance.propagate(advance, noise)
+
+    def concentration(self, mean: np.ndarray, lag: int = 0) -> np.ndarray:
+        return mean[:self._n]
+
+    def variance(self, mean: np.ndarray, covariance: Covariance, lag: int = 0) -> np.ndarray:
+        return covariance.diagonal()[:self._n]
+
+    def constrain(self, mean: np.ndarray) -> np.ndarray:
+        return np.concatenate([mean[:self._n], self.flow.within_bounds(mean[self._n:])])
+
+    def velocity(self, mean: np.ndarray,
+                 covariance: Covariance) -> tuple[np.ndarray, np.ndarray]:
+        return mean[self._n:].copy(), covariance.diagonal()[self._n:]
+
+
+def velocity_states(task: Task, c_ref: float, bounds: tuple[float, float]) -> VelocityStates:
+    """Return concentration and velocity with the parameters of Table 5.1 and the task's prior of
+    the velocity."""
+    prior = task.prior
+    nodal = task.evolution.state_noise_covariance(0.0, (prior.nodal_std * c_ref)**2)
+    return VelocityStates(asked_flow(task, bounds), np.full(task.mesh.n_nodes, c_ref),
+                          c_ref**2 * initial_covariance(task.mesh, prior), inflow=c_ref,
+                          inflow_std=prior.inflow_std * c_ref, nodal_noise=nodal)
+
+
+def asked_flow(task: Task, bounds: tuple[float, float] = (0.05, 4.0)) -> UnknownFlow:
+    """Return the prior of the velocity that a task asks for; ``ValueError`` if it asks for none."""
+    flow = task.velocity
+    if flow is None:
+        raise ValueError("task must ask for the flow, got one that does not")
+    return UnknownFlow(task.transport_at, flow.directions, np.array(flow.nominal),
+                       np.array(flow.initial_std), np.array(flow.walk_std), flow.profiles, bounds)
+
+
+def scaled_flow(task: Task, std: float, walk_std: float) -> UnknownFlow:
+    """Return the flow that a task specifies times a factor, which begins at 1 ± ``std`` and walks:
+    a prior for a nominal flow that may be wrong. ``ValueError`` if nothing flows."""
+    from eitbench.physics.transport import ConvectionDiffusion
+    transport = task.transport
+    if not isinstance(transport, ConvectionDiffusion):
+        raise ValueError(f"task must have a flow, got {type(transport).__name__}")
+    nominal = transport.velocity
+
+    def transport_at(factor: np.ndarray) -> ConvectionDiffusion:
+        return transport.with_velocity(lambda points: factor[0] * nominal(points))
+
+    return UnknownFlow(transport_at, [nominal], np.ones(1), np.array([std]), np.array([walk_std]),
+                       np.ones((1, 1)))
