@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from eitbench import Estimate, Task
-from eitbench.estimation import InflowTracker, suiting_models, suiting_priors
+from eitbench.estimation import FilterEstimator, inflow_filter, suiting_models, suiting_priors
 
 HERE = Path(__file__).parent
 LINK = "logarithm"
@@ -21,7 +21,9 @@ class Estimator:
 
     def __init__(self, task: Task) -> None:
         prior = suiting_priors(HERE / "priors", task, LINK)[0]
-        self.tracker = InflowTracker(task, prior, suiting_models(MODELS, task)[0])
+        model = suiting_models(MODELS, task)[0]
+        self.estimator = FilterEstimator(
+            task, lambda c_ref: inflow_filter(task, prior, c_ref, task.lag, model=model))
 
     @staticmethod
     def suits(task: Task) -> bool:
@@ -29,4 +31,4 @@ class Estimator:
         return task.velocity is None and known_inlet and bool(suiting_models(MODELS, task))
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
-        return self.tracker.update(voltages, currents)
+        return self.estimator.update(voltages, currents)

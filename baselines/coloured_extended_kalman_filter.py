@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from eitbench import Estimate, Task
-from eitbench.estimation import InflowTracker, suiting_priors
+from eitbench.estimation import FilterEstimator, inflow_filter, suiting_priors
 
 PRIORS = Path(__file__).with_name("priors")
 LINK = "linear"
@@ -19,7 +19,9 @@ class Estimator:
     boards = ("filter", "fixed-lag")
 
     def __init__(self, task: Task) -> None:
-        self.tracker = InflowTracker(task, suiting_priors(PRIORS, task, LINK)[0])
+        prior = suiting_priors(PRIORS, task, LINK)[0]
+        self.estimator = FilterEstimator(
+            task, lambda c_ref: inflow_filter(task, prior, c_ref, task.lag))
 
     @staticmethod
     def suits(task: Task) -> bool:
@@ -27,4 +29,4 @@ class Estimator:
         return known_flow and bool(suiting_priors(PRIORS, task, LINK))
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
-        return self.tracker.update(voltages, currents)
+        return self.estimator.update(voltages, currents)

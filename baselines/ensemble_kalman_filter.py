@@ -12,7 +12,8 @@ import numpy as np
 from eitbench import Estimate, Task
 from eitbench.estimation import (
     EnsembleFilter,
-    FirstFrame,
+    FilterEstimator,
+    about_prediction,
     asked_flow,
     scaled_flow,
     suiting_priors,
@@ -35,32 +36,17 @@ class Estimator:
         "members": MEMBERS, "lead_in": LEAD_IN, "bounds": list(BOUNDS), "seed": SEED}
 
     def __init__(self, task: Task) -> None:
-        self.task = task
-        self.prior = suiting_priors(PRIORS, task, LINK)[0]
-        self.asked = task.velocity is not None
-        self.flow = asked_flow(task) if self.asked else scaled_flow(task, 0.0, 0.0)
-        self.first = FirstFrame(task)
+        prior = suiting_priors(PRIORS, task, LINK)[0]
+        flow = (scaled_flow(task, 0.0, 0.0) if task.velocity is None
+                else asked_flow(task, BOUNDS))
+        self.estimator = FilterEstimator(task, lambda c_ref: EnsembleFilter(
+            task, prior, c_ref, flow, MEMBERS, LEAD_IN, np.random.default_rng(SEED),
+            about_prediction(task)))
 
     @staticmethod
     def suits(task: Task) -> bool:
         # a 3D inlet has more modes than an ensemble of this size can tell apart
         return task.mesh.dim == 2 and bool(suiting_priors(PRIORS, task, LINK))
 
-    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate:
-        if not self.first.complete:
-            if not self.first.add(voltages, currents):
-                return Estimate(self.first.mean)
-            self.filter = EnsembleFilter(
-                self.task, self.prior, self.first.c_bh, self.flow, MEMBERS, LEAD_IN,
-                np.random.default_rng(SEED), BOUNDS)
-            for earlier in self.first.measurements[:-1]:
-                self.filter.predict()
-                self.filter.update(*earlier)
-        self.filter.predict()
-        innovation, covariance = self.filter.update(voltages, currents)
-        estimate = Estimate(*self.filter.state(), innovation, covariance)
-        if not self.asked:
-            return estimate
-        theta = self.filter.parameters
-        return estimate._replace(velocity=theta.mean(axis=1),
-                                 velocity_variance=theta.var(axis=1, ddof=1))
+    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
+        return self.estimator.update(voltages, currents)

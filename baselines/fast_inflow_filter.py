@@ -12,8 +12,9 @@ import numpy as np
 
 from eitbench import Estimate, Task
 from eitbench.estimation import (
-    InflowTracker,
+    FilterEstimator,
     ScaledVoltages,
+    inflow_filter,
     reduced_response,
     steady_response,
     suiting_priors,
@@ -34,7 +35,9 @@ class Estimator:
         prior = suiting_priors(PRIORS, task, LINK)[0]
         response, fast = reduced(task.transport, task.observation, task.expected_concentration,
                                  prior)
-        self.tracker = InflowTracker(replace(task, observation=fast), prior, responses=[response])
+        task = replace(task, observation=fast)
+        self.estimator = FilterEstimator(
+            task, lambda c_ref: inflow_filter(task, prior, c_ref, responses=[response]))
 
     @staticmethod
     def suits(task: Task) -> bool:
@@ -42,7 +45,7 @@ class Estimator:
         return known_flow and bool(suiting_priors(PRIORS, task, LINK))
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
-        return self.tracker.update(voltages, currents)
+        return self.estimator.update(voltages, currents)
 
 
 @lru_cache(maxsize=2)

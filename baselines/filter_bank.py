@@ -11,7 +11,7 @@ from functools import lru_cache
 import numpy as np
 
 from eitbench import Estimate, Task
-from eitbench.estimation import FirstFrame, LinearisedObservations, starting_filter
+from eitbench.estimation import FilterEstimator, about_reference, starting_filter
 
 FACTORS = tuple(np.linspace(0.5, 1.5, 9).tolist())
 WINDOW = 16  # injections
@@ -22,41 +22,37 @@ class Estimator:
     parameters = {"factors": list(FACTORS), "window": WINDOW}  # noqa: RUF012 (as a record has it)
 
     def __init__(self, task: Task) -> None:
-        self.task = task
-        self.first = FirstFrame(task)
-        self.misfits: list[np.ndarray] = []
+        self.estimator = FilterEstimator(task, lambda c_ref: FilterBank(task, c_ref))
 
     @staticmethod
     def suits(task: Task) -> bool:
         return task.velocity is not None
 
-    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate:
-        if not self.first.complete:
-            if not self.first.add(voltages, currents):
-                return Estimate(self.first.mean)
-            self.filters = [starting_filter(transport, self.task.prior, self.first.c_bh)
-                            for transport in transports(self.task.transport, self.task.velocity)]
-            self.observations = LinearisedObservations(
-                self.task.observation, self.task.noise, self.first.mean)
-            for earlier in self.first.measurements[:-1]:
-                self.assimilate(*earlier)
-        return self.assimilate(voltages, currents)
+    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
+        return self.estimator.update(voltages, currents)
 
-    def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate:
-        observation = self.observations(voltages, currents)
-        steps = []
-        for filter_ in self.filters:
-            filter_.predict()
-            steps.append(filter_.update(observation))
+
+class FilterBank:
+    """Filters side by side, and how well each has fitted the last voltages."""
+
+    def __init__(self, task: Task, c_ref: float) -> None:
+        assert task.velocity is not None
+        self.nominal = np.array(task.velocity.nominal)
+        forward = about_reference(task, c_ref)
+        self.filters = [starting_filter(transport, task.prior, c_ref, forward)
+                        for transport in transports(task.transport, task.velocity)]
+        self.misfits: list[np.ndarray] = []
+
+    def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> None:
+        steps = [each.assimilate(voltages, currents) for each in self.filters]
         self.misfits.append(np.array([
             step.innovation @ np.linalg.solve(step.innovation_covariance, step.innovation)
             for step in steps]))
+
+    def estimate(self, lag: int = 0) -> Estimate:
         best = int(np.sum(self.misfits[-WINDOW:], axis=0).argmin())
-        step = steps[best]
-        flow = self.task.velocity
-        assert flow is not None
-        return Estimate(step.mean, step.variance, step.innovation, step.innovation_covariance,
-                        FACTORS[best] * np.array(flow.nominal))
+        estimate = self.filters[best].estimate()
+        return estimate._replace(velocity=FACTORS[best] * self.nominal)
 
 
 @lru_cache(maxsize=2)

@@ -10,7 +10,14 @@ from pathlib import Path
 import numpy as np
 
 from eitbench import Estimate, Task
-from eitbench.estimation import InflowSmoother, InflowTracker, suiting_models, suiting_priors
+from eitbench.estimation import (
+    FilterEstimator,
+    RecordEstimator,
+    inflow_filter,
+    map_inflow,
+    suiting_models,
+    suiting_priors,
+)
 
 HERE = Path(__file__).parent
 
@@ -21,9 +28,12 @@ class Estimator:
     def __init__(self, task: Task) -> None:
         prior = suiting_priors(HERE / "priors", task, "logarithm")[0]
         model = suiting_models(HERE / "models", task)[0]
-        whole = task.lag == task.n_steps - 1
-        self.estimator = (InflowSmoother(task, prior, model) if whole
-                          else InflowTracker(task, prior, model, iterated=True))
+        if task.lag == task.n_steps - 1:
+            self.estimator = RecordEstimator(task, lambda c_ref, record: map_inflow(
+                task, prior, c_ref, record, model=model))
+        else:
+            self.estimator = FilterEstimator(task, lambda c_ref: inflow_filter(
+                task, prior, c_ref, task.lag, model=model, iterated=True))
 
     @staticmethod
     def suits(task: Task) -> bool:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from eitbench import Estimate, Task
-from eitbench.estimation import InflowSmoother, suiting_priors
+from eitbench.estimation import RecordEstimator, map_inflow, suiting_priors
 
 PRIORS = Path(__file__).with_name("priors")
 
@@ -16,7 +16,9 @@ class Estimator:
     boards = ("smoothing",)
 
     def __init__(self, task: Task) -> None:
-        self.smoother = InflowSmoother(task, suiting_priors(PRIORS, task, "logarithm")[0])
+        prior = suiting_priors(PRIORS, task, "logarithm")[0]
+        self.estimator = RecordEstimator(
+            task, lambda c_ref, record: map_inflow(task, prior, c_ref, record))
 
     @staticmethod
     def suits(task: Task) -> bool:
@@ -24,4 +26,4 @@ class Estimator:
         return known_flow and bool(suiting_priors(PRIORS, task, "logarithm"))
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
-        return self.smoother.update(voltages, currents)
+        return self.estimator.update(voltages, currents)

@@ -10,8 +10,10 @@ import numpy as np
 
 from eitbench import Estimate, Task
 from eitbench.estimation import (
-    FirstFrame,
-    JointInflowFilter,
+    Filter,
+    FilterEstimator,
+    VelocityInflowWindow,
+    about_prediction,
     asked_flow,
     scaled_flow,
     suiting_priors,
@@ -35,32 +37,16 @@ class Estimator:
         "factor_walk": FACTOR_WALK}
 
     def __init__(self, task: Task) -> None:
-        self.task = task
-        self.prior = suiting_priors(PRIORS, task, LINK)[0]
-        self.asked = task.velocity is not None
-        self.flow = (asked_flow(task) if self.asked
-                     else scaled_flow(task, FACTOR_STD, FACTOR_WALK))
-        self.first = FirstFrame(task)
+        prior = suiting_priors(PRIORS, task, LINK)[0]
+        flow = (scaled_flow(task, FACTOR_STD, FACTOR_WALK) if task.velocity is None
+                else asked_flow(task, BOUNDS))
+        self.estimator = FilterEstimator(task, lambda c_ref: Filter(
+            VelocityInflowWindow(task, prior, c_ref, flow, WINDOW), about_prediction(task)))
 
     @staticmethod
     def suits(task: Task) -> bool:
         # a 3D inlet has four times the nodes, whose traces all have to be carried along
         return task.mesh.dim == 2 and bool(suiting_priors(PRIORS, task, LINK))
 
-    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate:
-        if not self.first.complete:
-            if not self.first.add(voltages, currents):
-                return Estimate(self.first.mean)
-            self.filter = JointInflowFilter(self.task, self.prior, self.first.c_bh, self.flow,
-                                            WINDOW, BOUNDS)
-            for earlier in self.first.measurements[:-1]:
-                self.filter.predict()
-                self.filter.update(*earlier)
-        self.filter.predict()
-        innovation, covariance = self.filter.update(voltages, currents)
-        mean, variance = self.filter.state()
-        estimate = Estimate(mean, variance, innovation, covariance)
-        if not self.asked:
-            return estimate
-        return estimate._replace(velocity=self.filter.parameters.copy(),
-                                 velocity_variance=self.filter.parameter_covariance.diagonal())
+    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
+        return self.estimator.update(voltages, currents)

@@ -11,8 +11,8 @@ import numpy as np
 
 from eitbench import Estimate, Task
 from eitbench.estimation import (
-    CorrectedTracker,
     FilterSeen,
+    corrected_estimator,
     load_network,
     network_suits,
     suiting_models,
@@ -31,7 +31,7 @@ class Estimator:
         network = load_network(HERE / NETWORK)
         prior = suiting_priors(HERE / "priors", task, "logarithm")[0]
         model = suiting_models(HERE / "models", task)[0]
-        self.tracker = CorrectedTracker(
+        self.estimator = corrected_estimator(
             task, network,
             lambda level: FilterSeen(task, prior, level, network["basis"], model=model))
 
@@ -44,4 +44,4 @@ class Estimator:
         return bool(known) and network_suits(HERE / NETWORK, task)
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
-        return self.tracker.update(voltages, currents)
+        return self.estimator.update(voltages, currents)

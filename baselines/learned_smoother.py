@@ -15,7 +15,7 @@ import numpy as np
 from eitbench import Estimate, Task
 from eitbench.estimation import (
     FilterSeen,
-    FirstFrame,
+    RecordEstimator,
     blank,
     corrected,
     load_network,
@@ -37,8 +37,7 @@ class Estimator:
     def __init__(self, task: Task) -> None:
         self.task = task
         self.network = load_network(HERE / NETWORK)
-        self.record: list[tuple[np.ndarray, np.ndarray]] = []
-        self.asked_for = 0
+        self.estimator = RecordEstimator(task, self.read)
 
     @staticmethod
     def suits(task: Task) -> bool:
@@ -49,28 +48,19 @@ class Estimator:
         return long_enough and known_inlet and network_suits(HERE / NETWORK, task)
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
-        if len(self.record) < self.task.n_steps:
-            self.record.append((voltages, currents))
-            if len(self.record) < self.task.n_steps:
-                return None
-            self.read()
-        self.asked_for += 1
-        t = self.asked_for - 1
-        return corrected(self.network, self.level, self.reduced[t], self.inputs[t], self.memory[t])
+        return self.estimator.update(voltages, currents)
 
-    def read(self) -> None:
-        """The record: what is seen of each state, and what the network remembers at each."""
-        first = FirstFrame(self.task)
-        for measurement in self.record[:first.length]:
-            first.add(*measurement)
-        self.level = first.c_bh
+    def read(self, c_ref: float, record) -> list[Estimate]:
+        """Return the corrected states of a whole record."""
         prior = suiting_priors(HERE / "priors", self.task, "logarithm")[0]
-        see = FilterSeen(self.task, prior, self.level, self.network["basis"], LAG)
-        seen, (self.reduced,) = see.record(self.record, LAG)
-        self.inputs = np.concatenate([seen, self.reduced], axis=1)
-        forward = list(self.memories(self.inputs, ""))
-        backward = list(self.memories(self.inputs[::-1], "backward_"))
-        self.memory = np.concatenate([forward, backward[::-1]], axis=1)
+        see = FilterSeen(self.task, prior, c_ref, self.network["basis"], LAG)
+        seen, (reduced,) = see.record(record, LAG)
+        inputs = np.concatenate([seen, reduced], axis=1)
+        forward = list(self.memories(inputs, ""))
+        backward = list(self.memories(inputs[::-1], "backward_"))
+        memories = np.concatenate([forward, backward[::-1]], axis=1)
+        return [corrected(self.network, c_ref, *each)
+                for each in zip(reduced, inputs, memories, strict=True)]
 
     def memories(self, inputs: np.ndarray, way: str) -> Iterator[np.ndarray]:
         """(h,) of each step."""

@@ -12,8 +12,8 @@ import numpy as np
 
 from eitbench import Estimate, Task
 from eitbench.estimation import (
-    CorrectedTracker,
     VoltagesSeen,
+    corrected_estimator,
     load_network,
     network_suits,
 )
@@ -28,7 +28,7 @@ class Estimator:
 
     def __init__(self, task: Task) -> None:
         network = load_network(HERE / NETWORK)
-        self.tracker = CorrectedTracker(
+        self.estimator = corrected_estimator(
             task, network, lambda level: VoltagesSeen(task, level, network["basis"]))
 
     @staticmethod
@@ -37,4 +37,4 @@ class Estimator:
         return network_suits(HERE / NETWORK, task)
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
-        return self.tracker.update(voltages, currents)
+        return self.estimator.update(voltages, currents)

@@ -13,9 +13,10 @@ import numpy as np
 
 from eitbench import Estimate, Task
 from eitbench.estimation import (
+    FilterEstimator,
     IdentifiedModel,
-    InflowTracker,
     QuadraticVoltages,
+    inflow_filter,
     suiting_models,
     suiting_priors,
 )
@@ -29,8 +30,9 @@ class Estimator:
     def __init__(self, task: Task) -> None:
         prior = suiting_priors(HERE / "priors", task, "logarithm")[0]
         model = suiting_models(HERE / "models", task)[0]
-        fast = quadratic(task.observation, model)
-        self.tracker = InflowTracker(replace(task, observation=fast), prior, model)
+        task = replace(task, observation=quadratic(task.observation, model))
+        self.estimator = FilterEstimator(
+            task, lambda c_ref: inflow_filter(task, prior, c_ref, model=model))
 
     @staticmethod
     def suits(task: Task) -> bool:
@@ -38,7 +40,7 @@ class Estimator:
         return task.velocity is None and known_inlet and bool(suiting_models(HERE / "models", task))
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
-        return self.tracker.update(voltages, currents)
+        return self.estimator.update(voltages, currents)
 
 
 @lru_cache(maxsize=2)

@@ -7,7 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from eitbench import Estimate, Task
-from eitbench.estimation import FirstFrame, SwitchingInflowFilter, suiting_priors
+from eitbench.estimation import (
+    FilterEstimator,
+    SwitchingInflowFilter,
+    about_prediction,
+    suiting_priors,
+)
 
 PRIORS = Path(__file__).with_name("priors")
 LINK = "logarithm"
@@ -20,23 +25,14 @@ class Estimator:
     parameters = {"level_std": LEVEL_STD}  # noqa: RUF012 (as a record has it)
 
     def __init__(self, task: Task) -> None:
-        self.task = task
-        self.prior = suiting_priors(PRIORS, task, LINK)[0]
-        self.first = FirstFrame(task)
+        prior = suiting_priors(PRIORS, task, LINK)[0]
+        self.estimator = FilterEstimator(task, lambda c_ref: SwitchingInflowFilter(
+            task, prior, c_ref, LEVEL_STD, about_prediction(task)))
 
     @staticmethod
     def suits(task: Task) -> bool:
         priors = suiting_priors(PRIORS, task, LINK)
         return task.velocity is None and bool(priors) and priors[0].regimes is not None
 
-    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate:
-        if not self.first.complete:
-            if not self.first.add(voltages, currents):
-                return Estimate(self.first.mean)
-            self.filter = SwitchingInflowFilter(self.task, self.prior, self.first.c_bh, LEVEL_STD)
-            for earlier in self.first.measurements[:-1]:
-                self.filter.predict()
-                self.filter.update(*earlier)
-        self.filter.predict()
-        innovation, covariance = self.filter.update(voltages, currents)
-        return Estimate(*self.filter.state(), innovation, covariance)
+    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
+        return self.estimator.update(voltages, currents)

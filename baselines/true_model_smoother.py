@@ -8,21 +8,22 @@ learned, it is the linearised fixed-interval smoother. It is no bound: what is l
 prior may do better.
 """
 
-from functools import partial
-from itertools import count
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
 from eitbench import Estimate, Task
 from eitbench.estimation import (
-    DenseKalmanFilter,
+    DenseCovariance,
+    Filter,
     FirstFrame,
     LinearisedObservations,
+    Motion,
+    NodalStates,
     changing_responses,
     initial_covariance,
-    most_probable_inflow,
-    smoothed_inflow,
+    map_inflow,
     smoothed_means,
     starting_filter,
     steady_response,
@@ -54,13 +55,12 @@ class Estimator:
     def from_inflows(self, task: Task, revealed, steady: bool, prior) -> np.ndarray:
         responses = ([steady_response(revealed.transport(1))] if steady
                      else changing_responses(revealed.transport, task.n_steps))
-        smoother = smoothed_inflow(task, prior, self.first.c_bh, self.record, responses)
-        most_probable_inflow(smoother, self.record)
-        return np.array([smoother.concentration(lag) for lag in reversed(range(task.n_steps))])
+        states = map_inflow(task, prior, self.first.c_bh, self.record, responses)
+        return np.array([state.mean for state in states])
 
     def from_states(self, task: Task, revealed, steady: bool) -> np.ndarray:
         start = (starting_filter(revealed.transport(1), task.prior, self.first.c_bh) if steady
-                 else ChangingFlow(task, revealed.transport, self.first.c_bh))
+                 else Filter(changing_states(task, revealed.transport, self.first.c_bh)))
         observations = LinearisedObservations(task.observation, task.noise, self.first.mean)
         return smoothed_means(start, [observations(*measurement) for measurement in self.record])
 
@@ -71,32 +71,23 @@ class Estimator:
         return Estimate(self.means[self.t - 1], velocity=self.velocities[self.t - 1])
 
 
-class ChangingFlow(DenseKalmanFilter):
-    """The filter of Table 5.1 in a flow that is another one at each step; of its noise the nodal
-    part is that of the flow believed at first, as in `JointFilter`."""
+def changing_states(task: Task, transport_at, c_ref: float) -> NodalStates:
+    """The states of Table 5.1 in a flow that changes at each step; the nodal part of the noise is
+    that of the nominal flow, as in `VelocityStates`."""
+    prior = task.prior
+    nodal = task.evolution.state_noise_covariance(0.0, (c_ref * prior.nodal_std)**2)
 
-    def __init__(self, task: Task, transport_at, c_bh: float) -> None:
-        prior = task.prior
-        super().__init__(np.full(task.mesh.n_nodes, c_bh),
-                         c_bh**2 * initial_covariance(task.mesh, prior))
-        self.transports = map(transport_at, count(1))
-        self.level = c_bh
-        self.initial = self.covariance.copy()
-        self.inflow_std = c_bh * prior.inflow_std
-        self.nodal = task.evolution.state_noise_covariance(0.0, (c_bh * prior.nodal_std)**2)
+    @lru_cache(maxsize=None)
+    def transition(time: int):
+        return transport_at(time).transition()
 
-    def predict(self) -> None:  # type: ignore[override]
-        self.transition, Y = next(self.transports).transition()
-        self.forcing = self.level * Y.sum(axis=1)
-        Y = self.inflow_std * Y
-        self.apply_noise = partial(self.noise, Y)
-        super().predict(self.transition, self.forcing, Y @ Y.T + self.nodal)
+    def motion(time: int) -> Motion:
+        F, Y = transition(time)
+        noise = (c_ref * prior.inflow_std)**2 * (Y @ Y.T) + nodal
+        return Motion(F, c_ref * Y.sum(axis=1), noise)
 
-    def noise(self, Y: np.ndarray, X: np.ndarray) -> np.ndarray:
-        return Y @ (Y.T @ X) + self.nodal @ X
-
-    def apply_initial(self, X: np.ndarray) -> np.ndarray:
-        return self.initial @ X
+    covariance = c_ref**2 * initial_covariance(task.mesh, prior)
+    return NodalStates(np.full(task.mesh.n_nodes, c_ref), DenseCovariance(covariance), motion)
 
 
 def closest(model, velocity: np.ndarray) -> np.ndarray:

@@ -1,26 +1,36 @@
-"""Floor 4: estimators; matrices in, estimates out."""
+"""Estimators: filters, smoothers and reconstructions; matrices in, estimates out."""
 
 from eitbench.estimation.correction import (
-    CorrectedTracker,
     FilterSeen,
     VoltagesSeen,
     blank,
     corrected,
+    corrected_estimator,
     load_network,
     network_suits,
     remember,
     said,
 )
-from eitbench.estimation.covariance import FreeCovariance
-from eitbench.estimation.dense import DenseKalmanFilter, Filtered
+from eitbench.estimation.covariance import (
+    DenseCovariance,
+    LowRankCovariance,
+    OpenLoopCovariance,
+)
 from eitbench.estimation.ensemble import EnsembleFilter
-from eitbench.estimation.first_frame import FirstFrame
+from eitbench.estimation.estimators import FilterEstimator, FirstFrame, RecordEstimator
+from eitbench.estimation.filter import Filter, StateSpace, Step, kalman_filter
+from eitbench.estimation.forward import (
+    LinearisedObservations,
+    about_prediction,
+    about_reference,
+    linearised,
+)
 from eitbench.estimation.gauss_newton import gauss_newton
+from eitbench.estimation.gaussian import Innovation, Observation, condition, innovate
 from eitbench.estimation.homogeneous import best_homogeneous
 from eitbench.estimation.identification import identified_model
 from eitbench.estimation.identified import IdentifiedModel, suiting_models
-from eitbench.estimation.inflow_history import InflowFilter
-from eitbench.estimation.inflow_map import most_probable_inflow, smoothed_inflow
+from eitbench.estimation.inflow_map import map_inflow, most_probable_inflow, smoothed_inflow
 from eitbench.estimation.inflow_prior import (
     InflowPrior,
     Regimes,
@@ -34,41 +44,47 @@ from eitbench.estimation.inflow_response import (
     reduced_response,
     steady_response,
 )
-from eitbench.estimation.inflow_tracker import InflowSmoother, InflowTracker
-from eitbench.estimation.joint import JointFilter, JointStep
-from eitbench.estimation.joint_inflow import JointInflowFilter
-from eitbench.estimation.kalman import (
-    FilterStep,
-    KalmanFilter,
-    LinearisedObservations,
-    Observation,
-    kalman_filter,
-    linearised,
+from eitbench.estimation.inflow_window import InflowWindow, inflow_filter
+from eitbench.estimation.joint_inflow import VelocityInflowWindow
+from eitbench.estimation.nodal import (
+    LogStates,
+    Motion,
+    NodalStates,
+    initial_covariance,
+    modal_states,
+    nodal_states,
+    starting_filter,
+    table_5_1,
 )
-from eitbench.estimation.parameters import initial_covariance, starting_filter, table_5_1
 from eitbench.estimation.quadratic_voltages import QuadraticVoltages, ScaledVoltages
 from eitbench.estimation.smoother import (
-    Smoothed,
     fixed_interval_smoother,
     smoothed_means,
     smoothed_state,
 )
 from eitbench.estimation.smoothness import smoothness_covariance
 from eitbench.estimation.switching_inflow import SwitchingInflowFilter
-from eitbench.estimation.unknown_flow import UnknownFlow, asked_flow, scaled_flow
+from eitbench.estimation.velocity import (
+    UnknownFlow,
+    VelocityStates,
+    asked_flow,
+    scaled_flow,
+    velocity_states,
+)
 
 __all__ = [
-    "CorrectedTracker", "DenseKalmanFilter", "EnsembleFilter", "FilterSeen", "FilterStep",
-    "Filtered", "FirstFrame", "FreeCovariance", "IdentifiedModel",
-    "InflowFilter", "InflowPrior", "InflowSmoother", "InflowTracker",
-    "JointFilter", "JointInflowFilter", "JointStep", "KalmanFilter", "LinearisedObservations",
-    "Observation", "QuadraticVoltages", "Regimes", "Response",
-    "ScaledVoltages", "Smoothed", "SwitchingInflowFilter", "UnknownFlow",
-    "VoltagesSeen", "asked_flow", "best_homogeneous", "blank", "changing_responses",
-    "corrected", "fit_inflow_prior", "fixed_interval_smoother", "gauss_newton",
-    "identified_model", "initial_covariance", "kalman_filter", "learned_inflow_prior",
-    "linearised", "load_network", "most_probable_inflow", "network_suits", "reduced_response",
-    "remember", "said", "scaled_flow", "smoothed_inflow", "smoothed_means", "smoothed_state",
-    "smoothness_covariance", "starting_filter", "steady_response", "suiting_models",
-    "suiting_priors", "table_5_1",
+    "DenseCovariance", "EnsembleFilter", "Filter", "FilterEstimator", "FilterSeen", "FirstFrame",
+    "IdentifiedModel", "InflowPrior", "InflowWindow", "Innovation", "LinearisedObservations",
+    "LogStates", "LowRankCovariance", "Motion", "NodalStates", "Observation", "OpenLoopCovariance",
+    "QuadraticVoltages", "RecordEstimator", "Regimes", "Response", "ScaledVoltages", "StateSpace",
+    "Step", "SwitchingInflowFilter", "UnknownFlow", "VelocityInflowWindow", "VelocityStates",
+    "VoltagesSeen", "about_prediction", "about_reference", "asked_flow", "best_homogeneous",
+    "blank", "changing_responses", "condition", "corrected", "corrected_estimator",
+    "fit_inflow_prior", "fixed_interval_smoother", "gauss_newton", "identified_model",
+    "inflow_filter", "initial_covariance", "innovate", "kalman_filter", "learned_inflow_prior",
+    "linearised", "load_network", "map_inflow", "modal_states", "most_probable_inflow",
+    "network_suits", "nodal_states", "reduced_response", "remember", "said", "scaled_flow",
+    "smoothed_inflow", "smoothed_means", "smoothed_state", "smoothness_covariance",
+    "starting_filter", "steady_response", "suiting_models", "suiting_priors", "table_5_1",
+    "velocity_states",
 ]

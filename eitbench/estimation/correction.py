@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from eitbench.estimation.first_frame import FirstFrame
+from eitbench.estimation.estimators import FilterEstimator, Measurement
 from eitbench.estimation.identified import told
-from eitbench.estimation.inflow_history import InflowFilter
+from eitbench.estimation.inflow_window import inflow_filter
 from eitbench.worlds.task import Estimate
 
 if TYPE_CHECKING:
@@ -101,7 +101,7 @@ def _sigmoid(x: np.ndarray) -> np.ndarray:
 
 
 class FilterSeen:
-    """What a network sees of an episode from the `InflowFilter`.
+    """What a network sees of an episode from the `InflowWindow`.
 
     Parameters
     ----------
@@ -122,16 +122,17 @@ class FilterSeen:
                  lag: int = 0, model: IdentifiedModel | None = None) -> None:
         self.task = task
         self.reduce = np.linalg.pinv(basis)
-        self.filter = InflowFilter(task, prior, level, lag, model=model)
-        self._update = self.filter.update if model is None else self.filter.update_again
+        self.level = level
+        self.filter = inflow_filter(task, prior, level, lag, model=model,
+                                    iterated=model is not None)
 
     def __call__(self, voltages: np.ndarray, currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Inputs (d,), and what the filter thinks after this measurement (q,): the innovation in
         parts of the noise, the filter's modes, what has changed in them, and which injection it
         is."""
-        self.filter.predict()
-        before = self.modes()
-        innovation = self._update(voltages, currents).value
+        step = self.filter.assimilate(voltages, currents)
+        before = self._modes(self.filter.space.concentration(step.predicted_mean))
+        innovation = step.innovation
         after = self.modes()
         std = self.task.noise.std(voltages - innovation)
         return np.concatenate([np.arcsinh(innovation / std), after, after - before,
@@ -139,9 +140,12 @@ class FilterSeen:
 
     def modes(self, lag: int = 0) -> np.ndarray:
         """(q,) of the filter's mean, ``lag`` steps ago."""
-        return self.reduce @ (self.filter.concentration(lag) / self.filter.level - 1.0)
+        return self._modes(self.filter.space.concentration(self.filter.mean, lag))
 
-    def record(self, record: Sequence[tuple[np.ndarray, np.ndarray]],
+    def _modes(self, concentration: np.ndarray) -> np.ndarray:
+        return self.reduce @ (concentration / self.level - 1.0)
+
+    def record(self, record: Sequence[Measurement],
                *lags: int) -> tuple[np.ndarray, list[np.ndarray]]:
         """Of T measurements, (L,) in V and in A each: the inputs (T, d), and for each of ``lags``
         what the filter thinks of each state so many measurements later, or at the end (T, q)."""
@@ -178,57 +182,55 @@ class VoltagesSeen:
 # -- from the first measurement to the last --------------------------------------------------------
 
 
-class CorrectedTracker:
-    """Estimates each state ``task.lag`` measurements later, as a network corrects it.
+class CorrectedFilter:
+    """Filter that a network corrects, for `FilterEstimator`.
 
-    While the first frame lasts it says what is homogeneous. When the record has ended, and the lag
-    shrinks, the filter stands alone.
+    After the last measurement, when the lag shrinks, it returns the estimates of the filter alone.
 
     Parameters
     ----------
-    task : Task
     network : mapping
-        As `load_network` gives it.
-    see : callable
-        ĉ_bh in mol/m³ -> what is seen, `FilterSeen` or, without a lag, `VoltagesSeen`.
+        As `load_network` returns it.
+    seen : FilterSeen or VoltagesSeen
+        Inputs of the network; `VoltagesSeen` has no lag.
+    lag : int
+        Of the task.
     """
 
-    def __init__(self, task: Task, network: Network,
-                 see: Callable[[float], FilterSeen | VoltagesSeen]) -> None:
-        self.task = task
+    def __init__(self, network: Network, seen: FilterSeen | VoltagesSeen, level: float,
+                 lag: int = 0) -> None:
         self.network = network
-        self.first = FirstFrame(task)
-        self._see = see
-        self.seen: FilterSeen | VoltagesSeen
+        self.seen = seen
+        self.level = level
+        self.lag = lag
         self._memory = blank(network)
         self._measured = 0
-        self._asked_for = -task.lag
 
-    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
-        """The state t − lag after measurement t, (L,) V and A each; None while there is none."""
-        self._asked_for += 1
-        if self._measured == self.task.n_steps:
-            assert isinstance(self.seen, FilterSeen)
-            return Estimate(*self.seen.filter.state(self._measured - self._asked_for))
-        if not self.first.complete:
-            if not self.first.add(voltages, currents):
-                return Estimate(self.first.mean) if self._asked_for > 0 else None
-            self.seen = self._see(self.first.c_bh)
-            for earlier in self.first.measurements[:-1]:
-                self._think(*earlier)
-        return self._think(voltages, currents)
-
-    def _think(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
+    def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> None:
+        """Show the network one more measurement, (L,) in V and in A."""
         inputs, reduced = self.seen(voltages, currents)
         self._measured += 1
-        lag = self.task.lag
-        if lag and isinstance(self.seen, FilterSeen):
-            if self._measured <= lag:
-                return None
-            reduced = self.seen.modes(lag)
+        if self.lag and isinstance(self.seen, FilterSeen):
+            if self._measured <= self.lag:
+                return
+            reduced = self.seen.modes(self.lag)
             inputs = np.concatenate([inputs, reduced])
         self._memory = remember(self.network, inputs, self._memory)
-        return corrected(self.network, self.first.c_bh, reduced, inputs, self._memory)
+        self._last = reduced, inputs
+
+    def estimate(self, lag: int = 0) -> Estimate:
+        """Return the state ``lag`` steps ago."""
+        if lag < self.lag:
+            assert isinstance(self.seen, FilterSeen)
+            return self.seen.filter.estimate(lag)
+        return corrected(self.network, self.level, *self._last, self._memory)
+
+
+def corrected_estimator(task: Task, network: Network,
+                        see: Callable[[float], FilterSeen | VoltagesSeen]) -> FilterEstimator:
+    """Return the estimator of a network; ``see`` maps ĉ_bh in mol/m³ to its inputs."""
+    return FilterEstimator(task, lambda level: CorrectedFilter(network, see(level), level,
+                                                               task.lag))
 
 
 def pattern(task: Task, currents: np.ndarray) -> np.ndarray:

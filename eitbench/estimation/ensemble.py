@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from eitbench import _check
-from eitbench.estimation.inflow_history import State
-from eitbench.estimation.joint import check_bounds, physical
-from eitbench.estimation.kalman import Observation, linearised
-from eitbench.estimation.moving_window import Innovation, stationary
+from eitbench.estimation.forward import Forward
+from eitbench.estimation.gaussian import Observation
+from eitbench.estimation.inflow_window import stationary
+from eitbench.worlds.task import Estimate
 
 if TYPE_CHECKING:
     from eitbench.estimation.inflow_prior import InflowPrior
-    from eitbench.estimation.unknown_flow import UnknownFlow
+    from eitbench.estimation.velocity import UnknownFlow
     from eitbench.worlds.task import Task
 
 NODES = 3.0**0.5
@@ -31,8 +31,8 @@ class EnsembleFilter:
     the mean concentration and moves mean and deviations by the symmetric square root (Hunt,
     Kostelich & Szunyogh, Physica D 230, 2007), without noise of its own.
 
-    The velocity stays physical in each member, as in `JointFilter`. ``ValueError`` naming the
-    argument if it is out of range, or the prior is of another inlet.
+    The velocity of each member stays within the flow's bounds. ``ValueError`` naming the argument
+    if it is out of range, or the prior is of another inlet.
 
     Parameters
     ----------
@@ -48,23 +48,22 @@ class EnsembleFilter:
     lead_in : int
         Time steps that the members' inflows have flowed before t = 0, ≥ 0.
     random : Generator
-    bounds : (float, float)
-        As in `JointFilter`.
+    forward : callable
+        Linearises voltages about a concentration; for `assimilate`.
     """
 
     def __init__(self, task: Task, prior: InflowPrior, level: float, flow: UnknownFlow,
                  members: int, lead_in: int, random: np.random.Generator,
-                 bounds: tuple[float, float]) -> None:
+                 forward: Forward) -> None:
         prior.check_task(task)
         N = _check.integer("members", members, low=2)
         _check.integer("lead_in", lead_in, low=0)
-        self._bounds = check_bounds(bounds)
-        self.task = task
         self.prior = prior
         self.level = level
         self.flow = flow
         self._random = random
-        self._profiles = flow.profiles / (flow.profiles @ flow.start)[:, None]
+        self._forward = forward
+        self._innovation: tuple[np.ndarray, np.ndarray] | tuple[None, None] = (None, None)
         covariance = prior.time_covariance(prior.memory + 2)
         before, (self._weights, self._variance) = stationary(covariance)
         independent = random.standard_normal((len(before), prior.modes.shape[1], N))
@@ -119,14 +118,13 @@ class EnsembleFilter:
             carried += 0.5 * s * (more - less) + 0.5 * s**2 * (more + less)
         return carried
 
-    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Innovation:
-        """Take in a measurement (L,) in V of the present state, for the injection (L,) in A."""
-        task = self.task
-        return self.take_in(linearised(task.observation, task.noise,
-                                       self.concentration.mean(axis=1), voltages, currents))
+    def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> None:
+        """Predict, and condition on voltages (L,) in V for an injection (L,) in A."""
+        self.predict()
+        self.update(self._forward(self.concentration.mean(axis=1), voltages, currents))
 
-    def take_in(self, observation: Observation) -> Innovation:
-        """Take in a measurement that is linear in the concentration near its mean."""
+    def update(self, observation: Observation) -> None:
+        """Condition on a measurement that is linear in the concentration near its mean."""
         N = self.concentration.shape[1]
         std = np.sqrt(observation.noise_variance)
         seen = observation.matrix @ self.concentration
@@ -142,14 +140,16 @@ class EnsembleFilter:
             deviations = part - part.mean(axis=-1, keepdims=True)
             part += (deviations @ Vt.T * shrinks) @ Vt + (deviations @ moves)[..., None]
         self._keep_physical()
-        covariance = seen @ seen.T / (N - 1.0) + np.diag(observation.noise_variance)
-        return Innovation(innovation, covariance)
+        self._innovation = (innovation,
+                            seen @ seen.T / (N - 1.0) + np.diag(observation.noise_variance))
 
     def _keep_physical(self) -> None:
-        """Move each member's θ back within its bounds."""
+        """Move each member's θ back within the bounds."""
         for member in self.parameters.T:
-            member[:] = physical(member, self.flow.start, self._profiles, self._bounds)
+            member[:] = self.flow.within_bounds(member)
 
-    def state(self) -> State:
-        """What is known of the present state."""
-        return State(self.concentration.mean(axis=1), self.concentration.var(axis=1, ddof=1))
+    def estimate(self, lag: int = 0) -> Estimate:
+        """Return the present state, with the last innovation."""
+        c, theta = self.concentration, self.parameters
+        return Estimate(c.mean(axis=1), c.var(axis=1, ddof=1), *self._innovation,
+                        theta.mean(axis=1), theta.var(axis=1, ddof=1))

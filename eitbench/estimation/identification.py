@@ -11,10 +11,10 @@ import numpy as np
 from eitbench import _check
 from eitbench.data.dataset import Dataset, Example
 from eitbench.data.seeds import SPLITS, name_seed
-from eitbench.estimation.first_frame import FirstFrame
+from eitbench.estimation.estimators import FirstFrame
+from eitbench.estimation.forward import LinearisedObservations
 from eitbench.estimation.identified import IdentifiedModel, told
 from eitbench.estimation.inflow_response import steady_response
-from eitbench.estimation.kalman import LinearisedObservations
 from eitbench.worlds.task import Task, make_task
 from eitbench.worlds.world import World
 

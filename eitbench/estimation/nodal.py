@@ -72,6 +72,22 @@ class NodalStates(StateSpace):
         """Return the motion of the step to ``time``."""
         return self._motion(time) if callable(self._motion) else self._motion
 
+    def transition_matrix(self, time: int) -> np.ndarray:
+        """Return F (n, n) of the step to ``time``."""
+        F = self.motion(time).transition
+        if F is None or callable(F):
+            identity = np.eye(len(self._initial[0]))
+            return identity if F is None else F(identity)
+        return F
+
+    def noise_times(self, time: int, X: np.ndarray) -> np.ndarray:
+        """Return Q X of the step to ``time``, for X (n,) or (n, k)."""
+        covariance = self._initial[1]
+        if isinstance(covariance, LowRankCovariance):
+            return covariance.open_loop.apply_noise(X)
+        noise = self.motion(time).noise
+        return np.zeros_like(X) if noise is None else noise @ X
+
     def initial(self) -> tuple[np.ndarray, Covariance]:
         mean, covariance = self._initial
         return np.array(mean, dtype=float), covariance.copy()

@@ -8,7 +8,6 @@ about a hundred states.
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Iterable
 from itertools import pairwise
@@ -17,9 +16,10 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 
-from eitbench.estimation.gate import believable
-from eitbench.estimation.kalman import KalmanFilter, Observation
-from eitbench.estimation.parameters import ClosedVesselFilter
+from eitbench.estimation.covariance import DenseCovariance, LowRankCovariance
+from eitbench.estimation.filter import Filter
+from eitbench.estimation.gaussian import Observation, gate_mask
+from eitbench.estimation.nodal import NodalStates
 
 
 class ReducedModel(NamedTuple):
@@ -35,15 +35,15 @@ class ReducedModel(NamedTuple):
     """(r, r) covariance of a at t = 0"""
 
 
-def reduced_model(start: KalmanFilter | ClosedVesselFilter, mass: np.ndarray,
+def reduced_model(start: Filter, mass: np.ndarray,
                   observations: Iterable[Observation], rank: int, *,
                   skip: int = 20) -> ReducedModel:
     """The model of ``start`` in the ``rank`` directions in which it learns most.
 
     Parameters
     ----------
-    start : KalmanFilter or ClosedVesselFilter
-        At t = 0; it is run over the record.
+    start : Filter
+        Of `NodalStates` at t = 0; it is run over the record.
     mass : (n, n)
         Mass matrix M in m² (m³ in 3D).
     observations
@@ -53,28 +53,37 @@ def reduced_model(start: KalmanFilter | ClosedVesselFilter, mass: np.ndarray,
     skip : int
         Steps at the beginning that do not count, since the initial uncertainty is not typical.
     """
+    space = start.space
+    assert isinstance(space, NodalStates)
+    initial = space.initial()[1]
+    F = space.transition_matrix(1)
     basis = main_directions(learnt_of(start, observations, skip), mass, rank)
-    transition, rotation = scipy.linalg.schur(basis.T @ mass @ start.transition @ basis)
+    transition, rotation = scipy.linalg.schur(basis.T @ mass @ F @ basis)
     basis = basis @ rotation
     weighted = mass @ basis
-    return ReducedModel(basis, transition, weighted.T @ start.apply_noise(weighted),
-                        weighted.T @ start.apply_initial(weighted))
+    return ReducedModel(basis, transition, weighted.T @ space.noise_times(1, weighted),
+                        weighted.T @ initial.times(weighted))
 
 
-def learnt_of(start: KalmanFilter | ClosedVesselFilter, observations: Iterable[Observation],
-              skip: int) -> np.ndarray:
-    """(n, n) by how much a record reduces the covariance, summed but for ``skip`` first steps."""
-    # never sees a measurement
-    blind = copy.deepcopy(start) if isinstance(start, ClosedVesselFilter) else None
-    learnt = np.zeros((len(start.mean), len(start.mean)))
+def learnt_of(start: Filter, observations: Iterable[Observation], skip: int) -> np.ndarray:
+    """Return the reduction (n, n) of the covariance by a record, summed after ``skip`` steps."""
+    open_loop = start.covariance.copy()
+    total = np.zeros((len(start.mean), len(start.mean)))
     for t, observation in enumerate(observations):
         start.predict()
         start.update(observation)
-        if blind is not None:
-            blind.predict()
-        if t >= skip:
-            learnt += _learnt(start, blind)
-    return learnt
+        if isinstance(start.covariance, LowRankCovariance):
+            Z = start.covariance.assimilated
+            reduction = Z @ Z.T if t >= skip else 0.0
+        else:
+            assert isinstance(start.space, NodalStates)
+            motion = start.space.motion(t + 1)
+            open_loop = open_loop.propagate(motion.transition, motion.noise)
+            assert isinstance(open_loop, DenseCovariance)
+            assert isinstance(start.covariance, DenseCovariance)
+            reduction = open_loop.array - start.covariance.array if t >= skip else 0.0
+        total += reduction
+    return total
 
 
 def main_directions(learnt: np.ndarray, mass: np.ndarray, rank: int) -> np.ndarray:
@@ -84,15 +93,6 @@ def main_directions(learnt: np.ndarray, mass: np.ndarray, rank: int) -> np.ndarr
     _, vectors = scipy.linalg.eigh(root.T @ learnt @ root, subset_by_index=[n - rank, n - 1])
     basis: np.ndarray = scipy.linalg.solve_triangular(root.T, vectors[:, ::-1], lower=False)
     return basis
-
-
-def _learnt(filter_: KalmanFilter | ClosedVesselFilter,
-            blind: ClosedVesselFilter | None) -> np.ndarray:
-    """(n, n) by how much the measurements have reduced the covariance."""
-    if isinstance(filter_, KalmanFilter):
-        return filter_.known @ filter_.known.T
-    assert blind is not None
-    return blind.covariance - filter_.covariance
 
 
 class ReducedFilter:
@@ -146,7 +146,7 @@ class ReducedFilter:
                gate: float = math.inf) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Take in residual = matrix·a + v: (B, m, r), (B, m), (B, m).
 
-        Readings that are not `believable` with this ``gate`` are left out. Returns of all of them
+        Readings that are not accepted with this ``gate`` are left out. Returns of all of them
         the innovations, their predicted variances and which were taken in, (B, m) each.
         """
         P = self.covariance
@@ -156,7 +156,7 @@ class ReducedFilter:
         S[:, np.arange(m), np.arange(m)] += noise_variance
         innovation = residual - (matrix @ self.mean[..., None])[..., 0]
         variance = S.diagonal(axis1=1, axis2=2).copy()
-        kept = believable(innovation, variance, gate)
+        kept = gate_mask(innovation, variance, gate)
         taken = innovation
         if not kept.all():  # a reading left out is one without a word on the state
             cross = cross * kept[..., None]

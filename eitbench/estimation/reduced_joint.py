@@ -1,6 +1,6 @@
 """Concentration and mean velocity estimated together in few coordinates, for very many records.
 
-`JointFilter` makes F(θ) anew at every step. Projected onto a basis Φ that serves all velocities
+`VelocityStates` makes F(θ) anew at every step. Projected onto a basis Φ that serves all velocities
 (see `eitbench.estimation.reduced`) F(θ) is a smooth function of θ with small values: a cubic spline
 through a few velocities gives it, and its derivative, at any other.
 """
@@ -64,7 +64,7 @@ class JointTables:
 
 
 class ReducedJointFilter(ReducedFilter):
-    """The extended Kalman filter of (a, θ), as `JointFilter`, for B records side by side.
+    """The extended Kalman filter of (a, θ), as `VelocityStates`, for B records side by side.
 
     The covariance moves with [[A, (dA/dθ) a], [0, 1]] at the present estimate. θ is kept within
     ``bounds``. A record's numbers do not depend on what is filtered beside it, to the bit.

@@ -7,10 +7,10 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
-from eitbench.estimation.covariance import Covariance, LowRankCovariance, truncate_columns
+from eitbench.estimation.covariance import LowRankCovariance, truncate_columns
 from eitbench.estimation.filter import Filter, Step, kalman_filter
 from eitbench.estimation.gaussian import Observation
-from eitbench.estimation.nodal import Motion, NodalStates
+from eitbench.estimation.nodal import NodalStates
 from eitbench.worlds.task import Estimate
 
 
@@ -40,8 +40,8 @@ def smoothed_means(start: Filter, observations: Iterable[Observation]) -> np.nda
     s_t + Γ_w λ_t (``docs/methods.md``, 6): without variances, and without storing covariances.
     """
     assert isinstance(start.space, NodalStates)
-    motion = start.space.motion
-    state, initial = start.space.initial()
+    space = start.space
+    state, initial = space.initial()
     steps = kalman_filter(start, observations)
     adjoints = np.empty((len(steps), len(state)))
     later = np.zeros_like(state)
@@ -49,12 +49,13 @@ def smoothed_means(start: Filter, observations: Iterable[Observation]) -> np.nda
         factor = cho_factor(step.innovation_covariance, lower=True)
         adjoints[k] = _before(step, factor, later) + step.matrix.T @ cho_solve(factor,
                                                                                step.innovation)
-        later = _transposed(motion(step.time), adjoints[k])
+        later = space.transition_matrix(step.time).T @ adjoints[k]
     state = state + initial.times(later[:, None])[:, 0]
     smoothed = np.empty_like(adjoints)
     for k, step in enumerate(steps):
-        move = motion(step.time)
-        state = smoothed[k] = move.apply(state) + move.forcing + _noise(move, initial, adjoints[k])
+        motion = space.motion(step.time)
+        state = smoothed[k] = (motion.apply(state) + motion.forcing
+                               + space.noise_times(step.time, adjoints[k]))
     return smoothed
 
 
@@ -71,8 +72,8 @@ def _backwards(filter_: Filter, steps: Sequence[Step]) -> Iterator[tuple[Step, n
     for step in reversed(steps):
         factor = cho_factor(step.innovation_covariance, lower=True)
         if step is not steps[-1]:
-            later = _transposed(filter_.space.motion(step.time + 1), later)
-            later = _before(step, factor, later)
+            F = filter_.space.transition_matrix(step.time + 1)
+            later = _before(step, factor, F.T @ later)
         adjoint = later[:, 0] + step.matrix.T @ cho_solve(factor, step.innovation)
         information = solve_triangular(factor[0], step.matrix, lower=True).T
         information = truncate_columns(np.hstack([later[:, 1:], information]),
@@ -84,21 +85,6 @@ def _backwards(filter_: Filter, steps: Sequence[Step]) -> Iterator[tuple[Step, n
 def _before(step: Step, factor: tuple[np.ndarray, bool], X: np.ndarray) -> np.ndarray:
     """Return (I − K H)ᵀ X for X (n,) or (n, k)."""
     return X - step.matrix.T @ cho_solve(factor, step.cross_covariance.T @ X)
-
-
-def _transposed(motion: Motion, X: np.ndarray) -> np.ndarray:
-    """Return Fᵀ X for X (n,) or (n, k)."""
-    F = motion.transition
-    if F is None:
-        return X
-    return (F(np.eye(len(X))) if callable(F) else F).T @ X
-
-
-def _noise(motion: Motion, initial: Covariance, x: np.ndarray) -> np.ndarray | float:
-    """Return Q x for x (n,)."""
-    if isinstance(initial, LowRankCovariance):
-        return initial.open_loop.apply_noise(x)
-    return 0.0 if motion.noise is None else motion.noise @ x
 
 
 def _smoothed(step: Step, adjoint: np.ndarray) -> Estimate:

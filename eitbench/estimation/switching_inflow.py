@@ -9,9 +9,12 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from eitbench import _check
-from eitbench.estimation.inflow_history import InflowFilter, State
-from eitbench.estimation.kalman import Observation, linearised
-from eitbench.estimation.moving_window import Innovation, stationary
+from eitbench.estimation.covariance import DenseCovariance
+from eitbench.estimation.filter import Filter, Step
+from eitbench.estimation.forward import Forward
+from eitbench.estimation.gaussian import Observation
+from eitbench.estimation.inflow_window import InflowWindow, stationary
+from eitbench.worlds.task import Estimate
 
 if TYPE_CHECKING:
     from eitbench.estimation.inflow_prior import InflowPrior
@@ -21,7 +24,7 @@ if TYPE_CHECKING:
 class SwitchingInflowFilter:
     """Interacting multiple models (Blom & Bar-Shalom 1988) of what enters: quiet, or a slug.
 
-    Two `InflowFilter` stand side by side. In a slug a new x follows by the prior's regression; in
+    Two filters of an `InflowWindow` run side by side. In a slug a new x follows by the prior's regression; in
     quiet it is independent and small. Before each step the two are mixed by the probabilities of
     the regimes that may have come before, by their first two moments; each measurement says how
     well it fits either. What is homogeneous but off from the level, as ĉ_bh is where a slug was in
@@ -35,10 +38,13 @@ class SwitchingInflowFilter:
     level : float
         ĉ_bh in mol/m³.
     level_std : float
-        Of what enters between slugs, in parts of ĉ_bh, > 0.
+        Of what enters between slugs, relative to ĉ_bh, > 0.
+    forward : callable
+        Linearises voltages about a concentration; for `assimilate`.
     """
 
-    def __init__(self, task: Task, prior: InflowPrior, level: float, level_std: float) -> None:
+    def __init__(self, task: Task, prior: InflowPrior, level: float, level_std: float,
+                 forward: Forward) -> None:
         if prior.regimes is None:
             raise ValueError("prior must have regimes, got one without; make one by "
                              "`eitbench fit prior --quiet`")
@@ -47,77 +53,78 @@ class SwitchingInflowFilter:
         flat = np.full((len(prior.points), 1), level_std)
         modes = np.concatenate([prior.modes / np.sqrt(regimes.variance), flat], axis=1)
         within = replace(prior, modes=modes)
-        self.task = task
-        self.filters = [InflowFilter(task, within, level) for _ in range(2)]
-        """in quiet, in a slug"""
+        spaces = [InflowWindow(task, within, level) for _ in range(2)]
         self.probabilities = np.array([1.0 - regimes.share, regimes.share])
         """(2,) that the present regime is quiet, or a slug"""
         self._transitions = np.array([[1.0 - regimes.begins, regimes.begins],
                                       [regimes.ends, 1.0 - regimes.ends]])
         r = modes.shape[1]
-        W = self.filters[0].window
+        W = spaces[0].window
         before, (weights, variance) = stationary(prior.time_covariance(W + 1))
         quiet = np.zeros((W, r))
         quiet[0, -1] = 1.0
         slug = quiet.copy()
         slug[:, :-1] = weights[:, None]
         stays = np.eye(r)[-1]
-        self._moves = [(quiet, regimes.quiet * (1.0 - stays)), (slug, variance * (1.0 - stays))]
-        covariance = np.kron(regimes.variance * before, np.diag(1.0 - stays))
+        leaves = 1.0 - stays
+        spaces[0].regression = quiet, regimes.quiet * leaves
+        spaces[1].regression = slug, variance * leaves
+        self.filters = [Filter(space) for space in spaces]
+        """in quiet, in a slug"""
+        covariance = np.kron(regimes.variance * before, np.diag(leaves))
         covariance += np.kron(np.ones((W, W)), np.diag(stays))
         for each in self.filters:
-            each.covariance = covariance
+            each.covariance = DenseCovariance(covariance)
+        self._forward = forward
+        self._innovation: tuple[np.ndarray, np.ndarray] | tuple[None, None] = (None, None)
 
     def predict(self) -> None:
-        """Move one time step on: either regime may have come from both."""
+        """Advance one time step: either regime may have come from both."""
         joint = self._transitions * self.probabilities[:, None]
         self.probabilities = joint.sum(axis=0)
         quiet, slug = self.filters
         apart = slug.mean - quiet.mean
         between = np.outer(apart, apart)
-        mixed = []
-        for a, b in (joint / self.probabilities).T:
-            mixed.append((quiet.mean + b * apart,
-                          a * quiet.covariance + b * slug.covariance + a * b * between))
-        for each, moments, move in zip(self.filters, mixed, self._moves, strict=True):
-            each.mean, each.covariance = moments
-            each.move(*move)
+        P, Q = (each.covariance.array for each in self.filters)
+        mixed = [(quiet.mean + b * apart, DenseCovariance(a * P + b * Q + a * b * between))
+                 for a, b in (joint / self.probabilities).T]
+        for each, (mean, covariance) in zip(self.filters, mixed, strict=True):
+            each.mean, each.covariance = mean, covariance
+            each.predict()
 
-    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Innovation:
-        """Take in a measurement (L,) in V of the present state, for the injection (L,) in A.
+    def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> None:
+        """Predict, and condition on voltages (L,) in V for an injection (L,) in A.
 
-        It is linearised once, about the mean of both regimes.
+        They are linearised once, about the mean of both regimes.
         """
-        task = self.task
-        points = [each.concentration() for each in self.filters]
-        observation = linearised(task.observation, task.noise, self.probabilities @ points,
-                                 voltages, currents)
-        return self.take_in(observation, points)
+        self.predict()
+        mean = self.probabilities @ [each.concentration for each in self.filters]
+        self.update(self._forward(mean, voltages, currents))
 
-    def take_in(self, observation: Observation, points: list[np.ndarray]) -> Innovation:
-        """Take in a measurement that is linear in the concentration near ``points``, of each
-        regime."""
-        told = [each.take_in(observation, point)
-                for each, point in zip(self.filters, points, strict=True)]
+    def update(self, observation: Observation) -> None:
+        """Condition on a measurement that is linear in the concentration near both means."""
+        steps = [each.update(observation) for each in self.filters]
         expected = self.probabilities
-        likelihoods = np.array([_log_density(each) for each in told])
+        likelihoods = np.array([_log_density(step) for step in steps])
         fits = expected * np.exp(likelihoods - likelihoods.max())
         self.probabilities = fits / fits.sum()
-        innovation = expected @ [each.value for each in told]
-        covariance = sum(p * (each.covariance + np.outer(each.value - innovation,
-                                                         each.value - innovation))
-                         for p, each in zip(expected, told, strict=True))
-        return Innovation(innovation, covariance)
+        innovation = expected @ [step.innovation for step in steps]
+        covariance = sum(p * (step.innovation_covariance
+                              + np.outer(step.innovation - innovation, step.innovation - innovation))
+                         for p, step in zip(expected, steps, strict=True))
+        self._innovation = innovation, covariance
 
-    def state(self) -> State:
-        """What is known of the present state: mean and variance of the mixture."""
-        means, variances = zip(*(each.state() for each in self.filters), strict=True)
+    def estimate(self, lag: int = 0) -> Estimate:
+        """Return mean and variance of the mixture, with the last innovation."""
+        means = np.array([each.concentration for each in self.filters])
         mean = self.probabilities @ means
-        return State(mean, self.probabilities @ (variances + np.square(means - mean)))
+        variances = np.array([each.variance for each in self.filters])
+        return Estimate(mean, self.probabilities @ (variances + (means - mean)**2),
+                        *self._innovation)
 
 
-def _log_density(innovation: Innovation) -> float:
-    """ln N(ν; 0, S), but for a constant."""
-    factor = np.linalg.cholesky(innovation.covariance)
-    whitened = solve_triangular(factor, innovation.value, lower=True)
-    return float(-0.5 * whitened @ whitened - np.log(factor.diagonal()).sum())
+def _log_density(step: Step) -> float:
+    """Return ln N(ν; 0, S) up to a constant."""
+    root = np.linalg.cholesky(step.innovation_covariance)
+    whitened = solve_triangular(root, step.innovation, lower=True)
+    return float(-0.5 * whitened @ whitened - np.log(root.diagonal()).sum())

@@ -11,8 +11,9 @@ import numpy as np
 from scipy.optimize import minimize, minimize_scalar
 
 from eitbench import _check
-from eitbench.estimation.kalman import LinearisedObservations
-from eitbench.estimation.modes import ModesFilter
+from eitbench.estimation.forward import LinearisedObservations
+from eitbench.estimation.gaussian import condition, innovate
+from eitbench.estimation.nodal import modal_states
 from eitbench.estimation.walk import RandomWalk, smooth_modes, steady
 from eitbench.measured.calibration import Calibration
 from eitbench.measured.measurements import Measurements
@@ -189,17 +190,20 @@ class _NegTwoLogEvidence:
         linear = LinearisedObservations(task.observation, task.noise, point)
         self._data = []
         for voltages, currents in (visible_reading(model, measurements, t) for t in used):
-            H, value, variance = linear(voltages, currents)
+            H, value, variance, _ = linear(voltages, currents)
             seen = H.any(axis=1)
             self._data.append((H[seen] @ modes, (value - H @ point)[seen], variance[seen]))
 
     def __call__(self, noise: float, initial: float,
                  motion: Callable[[int], tuple[np.ndarray, np.ndarray]]) -> float:
-        filter = ModesFilter(self._data[0][0].shape[1], initial, len(motion(1)[0]))
+        states = modal_states(self._data[0][0].shape[1], initial, motion)
+        mean, covariance = states.initial()
         total = 0.0
         for steps, (H, value, variance) in zip(self._steps, self._data, strict=True):
-            filter.predict(*motion(int(steps)))
-            innovation, S = filter.update(H, value - H @ filter.mean, noise**2 * variance)
-            total += float(innovation @ np.linalg.solve(S, innovation))
+            mean, covariance = states.propagate(mean, covariance, int(steps))
+            innovation = innovate(covariance, H, value - H @ mean[:H.shape[1]], noise**2 * variance)
+            mean, covariance, _ = condition(mean, covariance, innovation)
+            S = innovation.covariance
+            total += float(innovation.value @ np.linalg.solve(S, innovation.value))
             total += float(np.linalg.slogdet(S)[1])
         return total

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from eitbench.estimation.onboard.inflow_operator import InflowFullOperator, InflowOperator
-from eitbench.estimation.onboard.joint_operator import JointFullOperator, JointReducedOperator
+from eitbench.estimation.onboard.joint_operator import JointReducedOperator
 from eitbench.estimation.onboard.operator import FullOperator
 from eitbench.estimation.onboard.reduced_operator import ReducedOperator
 
@@ -20,7 +20,7 @@ OPERATORS: dict[tuple[str, str], type[Operator]] = {
     ("learned", "reduced"): InflowOperator, ("learned", "full"): InflowFullOperator}
 """By what is believed of the inflow, and by name, where the flow is known."""
 JOINT: dict[tuple[str, str], type[Operator]] = {
-    ("white", "reduced"): JointReducedOperator, ("white", "full"): JointFullOperator}
+    ("white", "reduced"): JointReducedOperator, ("white", "full"): FullOperator}
 """The same where the mean of the flow is to be estimated too."""
 
 

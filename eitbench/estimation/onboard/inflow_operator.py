@@ -17,12 +17,11 @@ import numpy as np
 
 from eitbench._notice import say
 from eitbench.data.seeds import SPLITS
-from eitbench.estimation.gate import believable
-from eitbench.estimation.inflow_history import InflowFilter
+from eitbench.estimation.filter import Filter, Step
+from eitbench.estimation.gaussian import Observation
 from eitbench.estimation.inflow_prior import InflowPrior, learned_inflow_prior
 from eitbench.estimation.inflow_response import Response, reduced_response, steady_response
-from eitbench.estimation.kalman import Observation
-from eitbench.estimation.moving_window import stationary
+from eitbench.estimation.inflow_window import InflowWindow, stationary
 from eitbench.estimation.onboard.operator import BROKEN, Innovation, Linearisation, spread
 from eitbench.estimation.onboard.reduced_operator import ReducedOperator, Shared
 from eitbench.estimation.quadratic_voltages import ScaledVoltages
@@ -65,11 +64,12 @@ class InflowOperator(ReducedOperator):
         for k, currents in enumerate(world.currents):
             self.assimilate(frames[:, k], np.repeat(currents[None], len(frames), axis=0))
 
-    def _start(self) -> list[InflowFilter]:
+    def _start(self) -> list[Filter]:
         """Filters at t = 0."""
         shared = self._shared
-        return [InflowFilter(shared.levels.task, shared.prior, float(level),
-                             responses=[shared.model]) for level in self.concentration]
+        self._spaces = [InflowWindow(shared.levels.task, shared.prior, float(level),
+                                     responses=[shared.model]) for level in self.concentration]
+        return [Filter(space, gate=self._gate) for space in self._spaces]
 
     @staticmethod
     def _share(world: World) -> InflowShared:
@@ -79,7 +79,7 @@ class InflowOperator(ReducedOperator):
         """Of the filters what they know, without what all episodes share."""
         known = [(each.mean, each.covariance) for each in self._filters]
         return {name: value for name, value in vars(self).items()
-                if name not in ("_filters", "_ahead")} | {"known": known}
+                if name not in ("_filters", "_spaces", "_ahead")} | {"known": known}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         known = state.pop("known")
@@ -99,42 +99,40 @@ class InflowOperator(ReducedOperator):
             filter_.predict()
             if not currents[b].any():
                 continue
-            value, covariance = self._take_in(filter_, voltages[b], currents[b])
-            variance = covariance.diagonal()
-            kept[b] = used = believable(value, variance, self._gate)
-            innovations[b] = value / np.sqrt(variance)
-            if used.any():
-                self._taken[b] = Innovation(value[used], covariance[np.ix_(used, used)])
+            step = self._condition(filter_, voltages[b], currents[b])
+            value, S, kept[b] = step.innovation, step.innovation_covariance, step.accepted
+            innovations[b] = value / np.sqrt(S.diagonal())
+            if kept[b].any():
+                self._taken[b] = Innovation(value[kept[b]], S[np.ix_(kept[b], kept[b])])
         return innovations, kept
 
-    def _take_in(self, filter_: InflowFilter, voltages: np.ndarray,
-                 currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Take in a measurement (L,) of the predicted state: innovation and its covariance in V."""
-        point = filter_.concentration()
+    def _condition(self, filter_: Filter, voltages: np.ndarray, currents: np.ndarray) -> Step:
+        """Condition on a measurement (L,) of the predicted state."""
+        point = filter_.concentration
         computed, matrix = (array[0] for array in
                             self._shared.voltages.linearise(point, currents[None]))
         std = self._shared.levels.noise_std(computed, self._floor)
-        observation = Observation(matrix, voltages - computed + matrix @ point, std**2)
-        return filter_.take_in(observation, point, self._gate)
+        return filter_.update(Observation(matrix, voltages - computed + matrix @ point, std**2))
 
     def innovations(self) -> list[Innovation | None]:
         return self._taken
 
     @cached_property
-    def _ahead(self) -> InflowFilter:
+    def _ahead(self) -> Filter:
         """The first episode's filter one step on, before its measurement; a new one each step."""
         ahead = copy.copy(self._filters[0])
+        ahead.covariance = ahead.covariance.copy()
         ahead.predict()
         return ahead
 
     @property
     def linearised(self) -> Linearisation:
         """About what is predicted of the first episode."""
-        point = self._ahead.concentration()
+        point = self._ahead.concentration
         L = self._shared.world.currents.shape[1]
         each = np.eye(L) - 1.0 / L  # a potential that all share does not count
         resistance, by_c = self._shared.voltages.linearise(point, each)
-        by_state = self._ahead.by_inflow(by_c.reshape(L * L, -1))
+        by_state = self._spaces[0].jacobian(self._ahead.mean, by_c.reshape(L * L, -1))
         return Linearisation(float(self.concentration[0]), resistance, by_state.reshape(L, L, -1))
 
     def relinearised(self) -> np.ndarray:
@@ -143,25 +141,28 @@ class InflowOperator(ReducedOperator):
 
     @property
     def state(self) -> np.ndarray:
-        return np.array([each.coordinates() for each in self._filters])
+        return np.array([space.coordinates(each.mean)
+                         for space, each in zip(self._spaces, self._filters, strict=True)])
 
     @property
     def state_covariance(self) -> np.ndarray:
-        slopes = [each.slope() / each.level for each in self._filters]
-        return np.array([slope @ each.covariance @ slope.T
-                         for slope, each in zip(slopes, self._filters, strict=True)])
+        return np.array([slope @ P @ slope.T
+                         for slope, P in zip(self._slopes(), self.covariance, strict=True)])
 
     @property
     def covariance(self) -> np.ndarray:
-        return np.array([each.covariance for each in self._filters])
+        return np.array([each.covariance.array for each in self._filters])
+
+    def _slopes(self) -> list[np.ndarray]:
+        """Derivatives (q, s) of each concentration, relative to its level, by the window."""
+        return [space.slope(each.mean) / space.level
+                for space, each in zip(self._spaces, self._filters, strict=True)]
 
     def grid(self) -> tuple[np.ndarray, np.ndarray]:
         patches = self._shared.patches
         mean = 1.0 + (patches @ self.state[..., None])[..., 0]
-        variance = []
-        for each in self._filters:
-            by_state = patches @ each.slope() / each.level
-            variance.append(((by_state @ each.covariance) * by_state).sum(axis=1))
+        variance = [each.covariance.variance_of(patches @ slope)
+                    for slope, each in zip(self._slopes(), self._filters, strict=True)]
         level = self.concentration[:, None]
         return level * mean, level * spread(np.array(variance))
 
@@ -173,7 +174,7 @@ class InflowOperator(ReducedOperator):
     @property
     def weight(self) -> np.ndarray:
         """About what is predicted of the first episode."""
-        slope = self._ahead.slope() / self._ahead.level
+        slope = self._spaces[0].slope(self._ahead.mean) / self._spaces[0].level
         return np.asarray(slope.T @ self._shared.mass[1:, 1:] @ slope)
 
     def truth(self, entries: np.ndarray) -> np.ndarray:

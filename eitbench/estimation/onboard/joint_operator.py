@@ -1,10 +1,8 @@
-"""The estimators inside an injection environment where the flow is unknown: concentration and mean
-velocity together.
+"""The estimator of reduced order inside an injection environment with an unknown mean velocity.
 
-Both are the joint extended Kalman filter of `baselines/joint_extended_kalman_filter.py`, but for
-two things. Voltages are linearised about the level of the first frame, as in the other injection
-environments, not about each estimate. And the velocity is kept within narrower bounds, so that a
-table of few velocities serves the one of reduced order.
+It is the joint extended Kalman filter of `baselines/joint_extended_kalman_filter.py`, but for two
+things: voltages are linearised about the level of the first frame, and the velocity has narrower
+bounds.
 """
 
 from __future__ import annotations
@@ -13,8 +11,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from eitbench.estimation import FreeCovariance, JointFilter, KalmanFilter, initial_covariance
-from eitbench.estimation.onboard.operator import FullOperator, spread
+from eitbench.estimation.covariance import LowRankCovariance, OpenLoopCovariance
+from eitbench.estimation.filter import Filter
+from eitbench.estimation.nodal import (
+    RANK_TOLERANCE,
+    Motion,
+    NodalStates,
+    initial_covariance,
+)
+from eitbench.estimation.onboard.operator import BOUNDS, one_velocity, spread
 from eitbench.estimation.onboard.reduced_operator import (
     RANK,
     ReducedOperator,
@@ -22,7 +27,6 @@ from eitbench.estimation.onboard.reduced_operator import (
     record_of_any,
     stored_model,
 )
-from eitbench.estimation.parameters import RANK_TOLERANCE
 from eitbench.estimation.reduced import ReducedFilter, learnt_of, main_directions
 from eitbench.estimation.reduced_joint import (
     JointModel,
@@ -34,55 +38,12 @@ from eitbench.estimation.reduced_joint import (
 from eitbench.worlds.task import make_task
 
 if TYPE_CHECKING:
-    from eitbench.physics.profiles import VelocityModel
-    from eitbench.worlds.task import Task
     from eitbench.worlds.world import World
 
-BOUNDS = (1 / 3, 2.0)
-"""Least and largest mean velocity that is believed, in parts of the one believed at first."""
 TABLE = 16
 """Velocities within the bounds, evenly spaced, for which the reduced model is computed."""
 LEARNING = (0.6, 1.0, 1.4)
 """Velocities, in parts of the one believed at first, at which the basis is learnt."""
-
-
-class JointFullOperator(FullOperator):
-    """Joint extended Kalman filters with their exact covariance, some 0.15 s a step each: what
-    scored runs use."""
-
-    def _start(self, episodes: int) -> list[Any]:
-        task = self._shared.task
-        flow = one_velocity(task)
-        prior = task.prior
-        nodal = task.evolution.state_noise_covariance(0.0, prior.nodal_std**2)
-        return [JointFilter(
-            task.transport_at, flow.directions,
-            mean=np.ones(task.mesh.n_nodes), covariance=initial_covariance(task.mesh, prior),
-            parameters=np.array(flow.nominal),
-            parameter_covariance=np.diag(np.square(flow.initial_std)),
-            walk_std=np.array(flow.walk_std), inflow=1.0, inflow_std=prior.inflow_std,
-            nodal_noise=nodal, profiles=flow.profiles, bounds=BOUNDS) for _ in range(episodes)]
-
-    def grid(self) -> tuple[np.ndarray, np.ndarray]:
-        patches = self._patches
-        n = self._patches.shape[1]
-        variance = np.array([((patches @ filter_.covariance[:n, :n]) * patches).sum(axis=1)
-                             for filter_ in self._filters])
-        return self._patch_means(), self.concentration[:, None] * spread(variance)
-
-    def means(self) -> np.ndarray:
-        relative = np.array([filter_.concentration for filter_ in self._filters])
-        return self.concentration[:, None] * relative
-
-    def spreads(self) -> np.ndarray:
-        n = self._patches.shape[1]
-        variance = np.array([filter_.covariance.diagonal()[:n] for filter_ in self._filters])
-        return self.concentration[:, None] * spread(variance)
-
-    def flow(self) -> tuple[np.ndarray, np.ndarray] | None:
-        n = self._patches.shape[1]
-        variance = np.array([filter_.covariance.diagonal()[n:] for filter_ in self._filters])
-        return np.array([filter_.parameters for filter_ in self._filters]), spread(variance)
 
 
 class JointReducedOperator(ReducedOperator):
@@ -160,14 +121,6 @@ class JointShared(Shared):
                                   (BOUNDS[0] * nominal, BOUNDS[1] * nominal))
 
 
-def one_velocity(task: Task) -> VelocityModel:
-    """The flow that is asked for; ``ValueError`` unless it has one parameter."""
-    if task.velocity is None or task.velocity.size != 1:
-        raise ValueError("world must have a flow with one unknown parameter, its mean velocity, "
-                         f"got {task.velocity!r}")
-    return task.velocity
-
-
 def make_model(world: World) -> JointModel:
     """The model in double precision; some 45 s."""
     from eitbench.numerics.fem import mass_matrix
@@ -181,16 +134,16 @@ def make_model(world: World) -> JointModel:
 
     def step(part: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """F, Y and Γ_w at a velocity; of the noise the nodal part stays what it is at first, as in
-        `JointFilter`."""
+        `VelocityStates`."""
         F, Y = task.transport_at(np.array([part * flow.nominal[0]])).transition()
         return F, Y, prior.inflow_std**2 * (Y @ Y.T) + nodal
 
     learnt = np.zeros_like(mass)
     for part in LEARNING:
         F, Y, noise = step(part)
-        filter_ = KalmanFilter(F, Y.sum(axis=1), np.ones(len(F)), FreeCovariance(F, noise),
-                               rank_tolerance=RANK_TOLERANCE)
-        learnt += learnt_of(filter_, record, 10)
+        covariance = LowRankCovariance(OpenLoopCovariance(F, noise), RANK_TOLERANCE)
+        states = NodalStates(np.ones(len(F)), covariance, Motion(F, Y.sum(axis=1)))
+        learnt += learnt_of(Filter(states), record, 10)
     parts = np.linspace(*BOUNDS, TABLE)
     basis = main_directions(learnt, mass, min(RANK, len(mass)))
     return joint_model(basis, mass, initial, parts * flow.nominal[0],

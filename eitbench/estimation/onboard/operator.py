@@ -16,18 +16,25 @@ import numpy as np
 
 from eitbench.data.recordings import step_error
 from eitbench.data.regions import score_mass
-from eitbench.estimation import Observation, starting_filter
-from eitbench.estimation.gate import gated_update
+from eitbench.estimation.filter import Filter
+from eitbench.estimation.gaussian import Observation
+from eitbench.estimation.nodal import nodal_states
+from eitbench.estimation.velocity import velocity_states
 from eitbench.worlds.task import make_task
 
 if TYPE_CHECKING:
     from eitbench.numerics.mesh import Mesh
+    from eitbench.physics.profiles import VelocityModel
+    from eitbench.worlds.task import Task
     from eitbench.worlds.world import World
 
 LEVEL_STEP = 0.02
 """ĉ_bh is rounded to steps of 2 %, so that what is linearised there serves many episodes."""
 LEVELS = np.arange(-50, 51)
 """Numbers of steps from the expected concentration: from a third of it to three times as much."""
+BOUNDS = (1 / 3, 2.0)
+"""Least and largest mean velocity, relative to the nominal one: narrower than in the baselines, so
+that a table of few velocities serves the filter of reduced order."""
 BROKEN = 30.0
 """Standard deviations from a homogeneous liquid's voltage beyond which a reading says nothing of
 the level, where the instrument may be faulty."""
@@ -201,7 +208,11 @@ def levels_of(world: World) -> Levels:
 
 
 class FullOperator:
-    """The Kalman filter of the baselines with its exact covariance: what scored runs use."""
+    """Kalman filters of the baselines with their exact covariance, which scored runs use.
+
+    Where the velocity is unknown they estimate it too. Voltages are linearised about the level of
+    the first frame.
+    """
 
     def __init__(self, world: World, frames: np.ndarray, *, gate: float,
                  noise_floor: float) -> None:
@@ -229,10 +240,15 @@ class FullOperator:
         self._levels = [self._shared.linearised(number) for number in self._numbers]
         self._patches = self._shared.patches
 
-    def _start(self, episodes: int) -> list[Any]:
+    def _start(self, episodes: int) -> list[Filter]:
         """Filters at t = 0."""
         task = self._shared.task
-        return [starting_filter(task.transport, task.prior, 1.0) for _ in range(episodes)]
+        if task.velocity is None:
+            space: Any = nodal_states(task.transport, task.prior, 1.0)
+        else:
+            one_velocity(task)
+            space = velocity_states(task, 1.0, BOUNDS)
+        return [Filter(space, gate=self._gate) for _ in range(episodes)]
 
     def assimilate(self, voltages: np.ndarray,
                    currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -248,22 +264,21 @@ class FullOperator:
             # the state is 1 where nothing deviates
             value = (voltages[b] - computed) / std + matrix.sum(axis=1)
             observation = Observation(matrix, value, np.ones(len(value)))
-            innovation, covariance, kept[b] = gated_update(filter_, observation, self._gate)
-            innovations[b] = innovation / np.sqrt(covariance.diagonal())
-            self._last[b] = innovation, covariance, std, kept[b]
+            step = filter_.update(observation)
+            kept[b] = step.accepted
+            innovations[b] = step.innovation / np.sqrt(step.innovation_covariance.diagonal())
+            self._last[b] = step.innovation, step.innovation_covariance, std, kept[b]
         return innovations, kept
 
     def innovations(self) -> list[Innovation | None]:
         return [None if last is None else Innovation.of(*last) for last in self._last]
 
     def grid(self) -> tuple[np.ndarray, np.ndarray]:
-        variance = np.array([filter_.variance_of(self._patches) for filter_ in self._filters])
-        return self._patch_means(), self.concentration[:, None] * spread(variance)
-
-    def _patch_means(self) -> np.ndarray:
         # Episode by episode: the bits of one product of matrices would depend on how many play side
         # by side.
-        return (self._patches @ self.means()[..., None])[..., 0]
+        mean = (self._patches @ self.means()[..., None])[..., 0]
+        variance = np.array([each.covariance.variance_of(self._patches) for each in self._filters])
+        return mean, self.concentration[:, None] * spread(variance)
 
     def errors(self, moments: np.ndarray, deviations: np.ndarray,
                squares: np.ndarray) -> np.ndarray:
@@ -271,18 +286,31 @@ class FullOperator:
         return step_error(score_mass(self._world), estimate, moments, deviations, squares)
 
     def means(self) -> np.ndarray:
-        return self.concentration[:, None] * np.array([filter_.mean for filter_ in self._filters])
+        return self.concentration[:, None] * np.array([each.concentration
+                                                       for each in self._filters])
 
     def spreads(self) -> np.ndarray:
-        variance = np.array([filter_.variances() for filter_ in self._filters])
+        variance = np.array([each.variance for each in self._filters])
         return self.concentration[:, None] * spread(variance)
 
     def flow(self) -> tuple[np.ndarray, np.ndarray] | None:
-        return None
+        found = [each.space.velocity(each.mean, each.covariance) for each in self._filters]
+        if None in found:
+            return None
+        theta, variance = (np.array(part) for part in zip(*found, strict=True))
+        return theta, spread(variance)
 
     @staticmethod
     def project(world: World, moment: np.ndarray) -> np.ndarray:
         return np.asarray(moment)
+
+
+def one_velocity(task: Task) -> VelocityModel:
+    """Return the velocity model; ``ValueError`` unless it has one parameter."""
+    if task.velocity is None or task.velocity.size != 1:
+        raise ValueError("world must have a flow with one unknown parameter, its mean velocity, "
+                         f"got {task.velocity!r}")
+    return task.velocity
 
 
 def spread(variance: np.ndarray) -> np.ndarray:
