@@ -81,7 +81,7 @@ class InjectionEnv(EpisodeEnv):
 
     def _picture(self) -> tuple[int, np.ndarray, np.ndarray | None, np.ndarray]:
         mean, spread = self.core.estimate()
-        return self.core.t, mean[0], spread[0], self.core.last_currents[0]
+        return self.core.t, mean[0], spread[0], self.core.currents[0]
 
     def action_masks(self) -> np.ndarray:
         """(actions,) bool: numbered actions that have an effect; with the budget spent only the

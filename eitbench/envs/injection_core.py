@@ -120,12 +120,15 @@ class InjectionCore(EpisodeCore):
         B = len(seeds)
         L = world.currents.shape[1]
         T = world.n_steps
-        self._t = self.first
-        self._spent = np.zeros(B, dtype=int)
+        self.t = self.first
+        """injections so far, including those of the first frame"""
+        self.spent = np.zeros(B, dtype=int)
+        """(B,) injections that the agents have made of a budget"""
         self._resistance = np.empty((T, B, L, L))
         self._draws = np.empty((T, B, L))
         self._deviations, self._squares, self._totals = np.empty((3, B, T))
-        self._voltages, self._currents = np.zeros((2, B, L))
+        self._voltages, self.currents = np.zeros((2, B, L))
+        """V and A (A/m in 2D), (B, L) each, of the last injections"""
         self._recent = np.zeros((B, RECENT, L))
         self._homogeneous: np.ndarray | None = None
         faults = [faults_of(world, seed) for seed in seeds]
@@ -139,7 +142,7 @@ class InjectionCore(EpisodeCore):
         self._console = Console(self._operator_type, self.rules, self._frames)
         self._operator = self._console.operator
         self._voltages = self._frames[:, -1].copy()
-        self._currents = np.repeat(world.currents[-1:], B, axis=0)
+        self.currents = np.repeat(world.currents[-1:], B, axis=0)
         for k in range(RECENT):
             self._recent[:, k] = world.currents[(self.first - 1 - k) % self.first]
 
@@ -179,32 +182,32 @@ class InjectionCore(EpisodeCore):
         """Inject the currents of actions (B,) or (B, L), and return the rewards (B,)."""
         currents = self.rules.currents(actions) if self._table is None else self._table[actions]
         if self.rules.budget is not None:
-            currents = currents * (self._spent < self.rules.budget)[:, None]
-            self._spent += currents.any(axis=1)
-        self._currents = currents
-        self.load_until(self._t + 1)
-        self._voltages = self._measure(self._t, currents)
+            currents = currents * (self.spent < self.rules.budget)[:, None]
+            self.spent += currents.any(axis=1)
+        self.currents = currents
+        self.load_until(self.t + 1)
+        self._voltages = self._measure(self.t, currents)
         self._recent = np.concatenate([currents[:, None], self._recent[:, :-1]], axis=1)
-        self._t += 1
+        self.t += 1
         if not self._operator_type:
             return np.zeros(len(currents))
         self._console.take_in(self._voltages, currents)
-        if self._t <= self.world.warm_up:
+        if self.t <= self.world.warm_up:
             return np.zeros(len(currents))
-        rewards = self.homogeneous_errors()[:, self._t - 1] - self.errors()
+        rewards = self.homogeneous_errors()[:, self.t - 1] - self.errors()
         if not np.isfinite(rewards).all():
             broken = [seed for seed, reward in zip(self.seeds, rewards, strict=True)
                       if not np.isfinite(reward)]
-            raise FloatingPointError(f"the estimate of state {self._t} is not finite in the "
+            raise FloatingPointError(f"the estimate of state {self.t} is not finite in the "
                                      f"episodes {broken}")
         return np.asarray(rewards)
 
     def errors(self) -> np.ndarray:
         """(B,) relative errors (5.12) of the present estimates, NaN where the state is not scored
         or there is no estimator."""
-        if self._t <= self.world.warm_up or not self._operator_type:
-            return np.full(len(self._spent), np.nan)
-        k = self._t - 1
+        if self.t <= self.world.warm_up or not self._operator_type:
+            return np.full(len(self.spent), np.nan)
+        k = self.t - 1
         return self._operator.errors(self._moments[:, k], self._deviations[:, k],
                                      self._squares[:, k])
 
@@ -212,29 +215,14 @@ class InjectionCore(EpisodeCore):
         """Present means and standard deviations (B, n) in mol/m³; without an estimator the expected
         concentration and zero."""
         if not self._operator_type:
-            shape = (len(self._spent), outline(self.world).mass.shape[0])
+            shape = (len(self.spent), outline(self.world).mass.shape[0])
             return np.full(shape, self.world.expected_concentration), np.zeros(shape)
         return self._operator.means(), self._operator.spreads()
 
     def innovations(self) -> list[Innovation | None]:
         """Innovations of the measurements that the filters accepted last, by episode; for scores,
         never for agents. None without an injection, an accepted measurement or an estimator."""
-        return self._operator.innovations() if self._operator_type else [None] * len(self._spent)
-
-    @property
-    def t(self) -> int:
-        """Injections so far, including those of the first frame."""
-        return self._t
-
-    @property
-    def spent(self) -> np.ndarray:
-        """(B,) injections that the agents have made of a budget."""
-        return self._spent.copy()
-
-    @property
-    def last_currents(self) -> np.ndarray:
-        """(B, L) A (A/m in 2D) of the last injections."""
-        return self._currents
+        return self._operator.innovations() if self._operator_type else [None] * len(self.spent)
 
     def action_masks(self) -> np.ndarray:
         """(B, actions) bool: numbered actions that have an effect; with the budget spent only the
@@ -242,20 +230,20 @@ class InjectionCore(EpisodeCore):
         if self._table is None:
             raise ValueError("action_masks is for environments whose actions are numbers; here "
                              "they are currents")
-        masks = np.ones((len(self._spent), len(self._table)), dtype=bool)
+        masks = np.ones((len(self.spent), len(self._table)), dtype=bool)
         if self.rules.budget is not None:
-            masks[self._spent >= self.rules.budget, :-1] = False
+            masks[self.spent >= self.rules.budget, :-1] = False
         return masks
 
     def observe(self) -> Observation:
         """Return the last measurement and, with an estimator, its state on a grid; (B, …)."""
-        shown = {"voltages": self._voltages.copy(), "currents": self._currents.copy()}
+        shown = {"voltages": self._voltages.copy(), "currents": self.currents.copy()}
         if self._operator_type:
             shown |= {"recent": self._recent.copy(), "frame": self._frames.copy()}
             shown |= self._console.shown()
-        left = [np.full(len(self._spent), float(self.world.n_steps - self._t))]
+        left = [np.full(len(self.spent), float(self.world.n_steps - self.t))]
         if self.rules.budget is not None:
-            left.append(self.rules.budget - self._spent.astype(float))
+            left.append(self.rules.budget - self.spent.astype(float))
         return shown | {"left": np.stack(left, axis=1)}
 
     def format(self) -> Any:
