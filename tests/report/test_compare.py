@@ -13,8 +13,7 @@ from eitbench.bench.statistics import (
 )
 from eitbench.bench.text import scores_by_seed
 from eitbench.report.boards import boards
-from eitbench.report.compare import SHIPPED, compare, find, floors, html, in_terminal, names, shown
-from pages import Page, text_of
+from eitbench.report.compare import SHIPPED, compare, find, floors, in_terminal, names, shown
 
 from tables import said
 from tiny import record, sha
@@ -143,22 +142,6 @@ def test_words_follow_from_the_intervals():
         cell in lines[3] for cell in text.iloc[1])
     few = said(shown(compare([record("a", [0.1])], [record("b", [0.4])]), "a", "b"))
     assert (few["verdict"][0], few["a better"][0], few["difference"][0]) == ("–", "100 %", "-0.3")
-
-
-def test_the_page_has_the_table():
-    """Offline, well-formed, with every number of the table; names are text that may break after underscores."""
-    a, b = two_methods()
-    table, evil = compare(a, b), "<script>my_name"
-    page = html(table, evil, "yours")
-    assert page.count("<script") == 1 and all(address.startswith("data:") for address in Page(page).attributes("href"))
-    assert ">ẽ_c of &lt;script&gt;my_<wbr/>name</th>" in page
-    rows = re.findall(r"<tr>(<td.*?)</tr>", page)
-    found = [[text_of(cell) for cell in re.findall(r"<td.*?</td>", row)] for row in rows]
-    assert found == said(shown(table, evil, "yours")).to_numpy().tolist()
-    circles = [float(x) for x in re.findall(r'<circle cx="([\d.]+)"', page)]
-    assert [x < 48 for x in circles] == [difference < 0 for difference in table["difference"]]
-    few = html(compare([record("a", [0.1])], [record("b", [0.4])]), "a", "b")
-    assert '<line x1="4.0" x2="4.0"' in few            # no interval, and the only difference
 
 
 def test_who_is_not_in_the_folder_comes_with_the_package(tmp_path):
