@@ -150,7 +150,7 @@ def _axis(rows: Iterable[Row], name: str) -> charts.Axis:
     `WORST_GAIN`, else logarithmic."""
     ends = [end for row in rows for end in row.three(name) if math.isfinite(end)]
     if name == "gain":
-        low, high = max(min(ends, default=0.0), WORST_GAIN), 1.0
+        low, high = max(min([0.0, *ends]), WORST_GAIN), 1.0
     else:
         positive = [end for end in ends if end > 0] or [1.0]
         low, high = min(positive), max(positive)
@@ -282,7 +282,8 @@ def run_table(board: Board, *, title: str = "title", drawn: bool = False) -> Tab
             without = 1.0 - row.cells["contrast_error"]
             cells["skill"] = Cell(f"{number(without)}†", without)
         rows.append(cells)
-    return Table.of(rows, label=board.title, keep=["ẽ_c", "skill"])
+    keep = ["ẽ_c"] if board.of_class == "injection" else ["ẽ_c", "skill"]
+    return Table.of(rows, label=board.title, keep=keep)
 
 
 def run_seeds(board: Board) -> list[str]:
