@@ -49,7 +49,8 @@ def innovate(covariance: Covariance, matrix: np.ndarray, residual: np.ndarray,
 def gate_mask(innovation: np.ndarray, variance: np.ndarray, gate: float) -> np.ndarray:
     """Accept readings within ``gate`` predicted standard deviations of the prediction.
 
-    Where more than a third lie beyond, the injection itself has failed, and none is accepted.
+    Missing readings, NaN, are rejected. Where more than a third of the others lie beyond, the
+    injection itself has failed, and none is accepted.
 
     Parameters
     ----------
@@ -59,8 +60,9 @@ def gate_mask(innovation: np.ndarray, variance: np.ndarray, gate: float) -> np.n
         > 0; infinite: all are accepted.
     """
     accepted = np.abs(innovation) <= gate * np.sqrt(variance)
-    failed = (~accepted).mean(axis=-1, keepdims=True) > 1 / 3
-    return accepted & ~failed
+    measured = ~np.isnan(innovation)
+    rejected = (measured & ~accepted).sum(axis=-1, keepdims=True)
+    return accepted & (3 * rejected <= measured.sum(axis=-1, keepdims=True))
 
 
 def condition(mean: np.ndarray, covariance: Covariance, innovation: Innovation,

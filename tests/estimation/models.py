@@ -5,17 +5,21 @@ from typing import NamedTuple
 
 import numpy as np
 from eitbench.estimation import (
-    FreeCovariance,
+    Filter,
     InflowPrior,
-    KalmanFilter,
     LinearisedObservations,
+    LowRankCovariance,
+    Motion,
+    NodalStates,
     Observation,
+    OpenLoopCovariance,
     table_5_1,
 )
 from eitbench.numerics.mesh import rectangle_mesh
 from eitbench.physics.transport import ConvectionDiffusion
 from eitbench.worlds.catalogue import PIPE_2D
 from eitbench.worlds.task import make_task
+from scipy.linalg import block_diag
 
 from tiny_worlds import TINY
 
@@ -30,9 +34,9 @@ class LinearGaussian(NamedTuple):
     covariance: np.ndarray
 
     def filter(self):
-        """The package's filter of this model."""
-        covariance = FreeCovariance(self.F, self.Q, self.covariance)
-        return KalmanFilter(self.F, self.s, self.mean, covariance)
+        """The package's filter of this model, its covariance Π − Z Zᵀ."""
+        covariance = LowRankCovariance(OpenLoopCovariance(self.F, self.Q, self.covariance))
+        return Filter(NodalStates(self.mean, covariance, Motion(self.F, self.s)))
 
 
 class Gaussian(NamedTuple):
@@ -79,7 +83,7 @@ def draw(model, design, rng):
 def dense_filter(model, observations):
     """The Kalman recursion with n×n covariances: [(predicted, filtered)] for t = 1 … T."""
     now, steps = Gaussian(model.mean, model.covariance), []
-    for H, value, variance in observations:
+    for H, value, variance, _ in observations:
         predicted = Gaussian(model.F @ now.mean + model.s, model.F @ now.covariance @ model.F.T + model.Q)
         P = predicted.covariance
         K = np.linalg.solve(H @ P @ H.T + np.diag(variance), H @ P).T
@@ -99,23 +103,30 @@ def rauch_tung_striebel(model, steps):
     return smoothed[::-1]
 
 
-def joint_posterior(model, observations):
-    """All states c₁ … c_T given all measurements at once, from their joint Gaussian without any recursion."""
-    n, T = len(model.mean), len(observations)
-    # c = A (offset + w), where A holds the powers of F and w the independent noises, c₀ being the
-    # first of them.
-    A = np.linalg.inv(np.eye((T + 1) * n) - np.kron(np.eye(T + 1, k=-1), model.F))
-    noise, H = np.zeros_like(A), []
-    for t in range(T + 1):
-        noise[t * n:(t + 1) * n, t * n:(t + 1) * n] = model.Q if t else model.covariance
-    mean, C = A @ np.concatenate([model.mean] + [model.s] * T), A @ noise @ A.T
-    for t, observation in enumerate(observations, start=1):
-        H.append(np.zeros((len(observation.value), (T + 1) * n)))
-        H[-1][:, t * n:(t + 1) * n] = observation.matrix
-    H = np.concatenate(H)
-    S = H @ C @ H.T + np.diag(np.concatenate([o.noise_variance for o in observations]))
-    K = np.linalg.solve(S, H @ C).T
-    mean, C = mean + K @ (np.concatenate([o.value for o in observations]) - H @ mean), C - K @ H @ C
+def stacked(models, observations):
+    """States x₁ … x_T given all measurements, from their joint Gaussian without any recursion: [Gaussian] for t = 1 … T.
+
+    ``models`` are of the step to each t, the first with the state at t = 0; correlated errors are those of `noise_root`.
+    """
+    n, T = len(models[0].mean), len(observations)
+    # x = A (offset + w), where A holds products of transitions and w the independent noises, x₀ being the first.
+    back = np.zeros(((T + 1) * n, (T + 1) * n))
+    noise = np.zeros_like(back)
+    noise[:n, :n] = models[0].covariance
+    for t, model in enumerate(models, start=1):
+        here = slice(t * n, (t + 1) * n)
+        back[here, (t - 1) * n:t * n] = model.F
+        noise[here, here] = model.Q
+    A = np.linalg.inv(np.eye(len(back)) - back)
+    mean, C = A @ np.concatenate([models[0].mean, *[model.s for model in models]]), A @ noise @ A.T
+    H, R = [], []
+    for t, (matrix, value, variance, root) in enumerate(observations, start=1):
+        H.append(np.zeros((len(value), (T + 1) * n)))
+        H[-1][:, t * n:t * n + matrix.shape[1]] = matrix
+        R.append(np.diag(variance) + (0.0 if root is None else root @ root.T))
+    H, R = np.concatenate(H), block_diag(*R)
+    gain = np.linalg.solve(H @ C @ H.T + R, H @ C).T
+    mean, C = mean + gain @ (np.concatenate([o.value for o in observations]) - H @ mean), C - gain @ H @ C
     return [Gaussian(mean[i:i + n], C[i:i + n, i:i + n]) for i in range(n, (T + 1) * n, n)]
 
 

@@ -1,21 +1,24 @@
-"""The covariance without data against the dense recursion Π⁺ = F Π Fᵀ + Γ_w."""
+"""Forms of the covariance: what they hold, and what they refuse; claims of the filter against chance."""
 
 import numpy as np
 import pytest
 import scipy.linalg
-from eitbench.estimation import FreeCovariance
-from models import pipe, random_model
+from eitbench.estimation import (
+    DenseCovariance,
+    Filter,
+    Motion,
+    NodalStates,
+    Observation,
+    OpenLoopCovariance,
+    kalman_filter,
+    linearised,
+)
+from eitbench.physics.observation import VoltageNoise
+from eitbench.scoring import normalised_innovations
+from models import QuadraticModel, draw, random_design, random_model
+from scipy.stats import chi2
 
 TIMES = [0, 1, 2, 3, 7, 8, 20, 60, 200]
-
-
-def dense(model, times):
-    """Π_t by plain recursion."""
-    covariance, result = model.covariance, {}
-    for t in range(max(times) + 1):
-        result[t] = covariance
-        covariance = model.F @ covariance @ model.F.T + model.Q
-    return [result[t] for t in times]
 
 
 @pytest.fixture
@@ -23,60 +26,123 @@ def model():
     return random_model(np.random.default_rng(0))
 
 
-def free(model, **options):
-    return FreeCovariance(model.F, model.Q, model.covariance, **options)
+def open_loop(model, **options):
+    return OpenLoopCovariance(model.F, model.Q, model.covariance, **options)
 
 
-def test_equals_the_dense_recursion(model):
-    """Π_t X and the variances at many times, asked in any order, to 1e-10 of the largest entry."""
-    covariance, X = free(model), np.random.default_rng(1).normal(size=(14, 4))
-    reference = dense(model, TIMES)
-    scale = max(np.abs(P).max() for P in reference)
-    for t, P in reversed(list(zip(TIMES, reference, strict=True))):
-        np.testing.assert_allclose(covariance.apply(t, X), P @ X, atol=1e-10 * scale)
-        np.testing.assert_allclose(covariance.diagonal(t), P.diagonal(), atol=1e-10 * scale)
+def recursion(model):
+    """Π_t by plain recursion."""
+    covariance, result = model.covariance, {}
+    for t in range(max(TIMES) + 1):
+        result[t] = covariance
+        covariance = model.F @ covariance @ model.F.T + model.Q
+    return [(t, result[t]) for t in TIMES]
 
 
-def test_limit_solves_the_lyapunov_equation(model):
-    """Π_∞ = F Π_∞ Fᵀ + Γ_w, as scipy's direct solver finds it, and Π_t tends to it."""
-    covariance = free(model)
+def test_open_loop_covariance_is_the_dense_recursion(model):
+    """Π_t X and the variances, in any order; its limit solves the Lyapunov equation; a coarse tolerance loses that part."""
+    covariance, X = open_loop(model), np.random.default_rng(1).normal(size=(14, 4))
+    coarse, off = open_loop(model, tolerance=1e-4), []
+    for t, P in reversed(recursion(model)):
+        np.testing.assert_allclose(covariance.apply(t, X), P @ X, atol=1e-10 * np.abs(P).max())
+        np.testing.assert_allclose(covariance.diagonal(t), P.diagonal(), atol=1e-10 * np.abs(P).max())
+        off.append(np.abs(coarse.apply(t, np.eye(14)) - P).max() / np.abs(covariance.limit).max())
+    assert 1e-8 < max(off) < 1e-2
     limit = scipy.linalg.solve_discrete_lyapunov(model.F, model.Q)
     np.testing.assert_allclose(covariance.limit, limit, atol=1e-10 * np.abs(limit).max())
-    np.testing.assert_allclose(covariance.apply(500, np.eye(14)), limit, atol=1e-10 * np.abs(limit).max())
-
-
-def test_tolerance_drops_only_what_is_small(model):
-    """A coarse tolerance loses about that part of Π, no more; zero initial covariance is fine."""
-    reference = dense(model, TIMES)
-    covariance = free(model, tolerance=1e-4)
-    errors = [np.abs(covariance.apply(t, np.eye(14)) - P).max() / np.abs(covariance.limit).max()
-              for t, P in zip(TIMES, reference, strict=True)]
-    assert 1e-8 < max(errors) < 1e-2
-    nothing = model._replace(covariance=np.zeros((14, 14)))
-    np.testing.assert_allclose(free(nothing).apply(1, np.eye(14)), model.Q, atol=1e-10 * np.abs(model.Q).max())
 
 
 @pytest.mark.parametrize("radius", [1.0, 1.02, 3.0])
 def test_a_state_that_never_settles_has_no_limit(radius):
-    """Spectral radius ≥ 1 with noise: the covariance grows without end, which is an error."""
     with pytest.raises(ValueError, match="spectral radius below one"), np.errstate(over="ignore", invalid="ignore"):
-        free(random_model(np.random.default_rng(2), radius=radius))
+        open_loop(random_model(np.random.default_rng(2), radius=radius))
 
 
 def test_a_target_at_rest_keeps_its_covariance(model):
-    """F = I without noise, the stationary target of thesis 7.2: Π_t = Γ_{0|0} for ever."""
-    at_rest = FreeCovariance(np.eye(14), np.zeros((14, 14)), model.covariance)
+    """F = I without noise, the stationary target of thesis 7.2."""
+    at_rest = OpenLoopCovariance(np.eye(14), np.zeros((14, 14)), model.covariance)
     for t in (0, 1, 9):
         np.testing.assert_allclose(at_rest.apply(t, np.eye(14)), model.covariance,
                                    atol=1e-12 * np.abs(model.covariance).max())
 
 
-def test_equals_the_dense_recursion_in_the_pipe():
-    """n = 1701, where the initial covariance is washed out: variances at t = 3 and after, to 1e-9 of the largest."""
-    model, make_filter, _, _ = pipe()
-    covariance = make_filter().covariance
-    P = model.covariance
-    for t in range(1, 7):
-        P = model.F @ P @ model.F.T + model.Q
-        if t in (3, 6):
-            np.testing.assert_allclose(covariance.diagonal(t), P.diagonal(), atol=1e-9 * P.diagonal().max())
+def test_arguments_stay_as_they_are(model):
+    """The covariance is written in place, but in its own array; F in any memory layout."""
+    kept = [array.copy() for array in model]
+    for F in (model.F, np.asfortranarray(model.F), np.repeat(model.F, 2, axis=1)[:, ::2]):
+        covariance = DenseCovariance(model.covariance).propagate(F, model.Q)
+        np.testing.assert_allclose(covariance.array, model.F @ model.covariance @ model.F.T + model.Q, atol=1e-12)
+    for array, copy in zip(model, kept, strict=True):
+        np.testing.assert_array_equal(array, copy)
+
+
+def test_variances_are_never_negative():
+    """Each state measured so precisely that only rounding is left of its variance: not below zero."""
+    n = 30
+    root = np.random.default_rng(9).normal(size=(n, n))
+    covariance = DenseCovariance(1e6 * (root @ root.T + np.eye(n)))
+    filter_ = Filter(NodalStates(np.zeros(n), covariance, Motion()))
+    filter_.update(Observation(np.eye(n), np.zeros(n), np.full(n, 1e-12)))
+    assert 0.0 <= filter_.variance.min() <= filter_.variance.max() < 1e-6
+
+
+@pytest.mark.parametrize("covariance", [np.ones((3, 2)), np.ones(3), np.full((3, 3), np.inf)])
+def test_errors_name_the_argument(covariance):
+    with pytest.raises(ValueError, match="^covariance"):
+        DenseCovariance(covariance)
+
+
+def twin(noise_factor):
+    """NIS and projected NEES, each over its degrees of freedom, of 100 episodes drawn from the model itself.
+
+    ``noise_factor`` multiplies the noise variances that the filter assumes. The error at the end is projected on
+    the first three measured directions: (Aᵀe)ᵀ (AᵀPA)⁻¹ (Aᵀe), which is χ² with three degrees of freedom.
+    """
+    rng = np.random.default_rng(2025)
+    n, m, T, episodes = 14, 3, 30, 100
+    model, design = random_model(rng, n), random_design(rng, n, T, m)
+    A = design[-1][0].T
+    space = model.filter().space
+    nis, nees = [], []
+    for _ in range(episodes):
+        truth, observations = draw(model, design, rng)
+        assumed = [o._replace(noise_variance=noise_factor * o.noise_variance) for o in observations]
+        filter_ = Filter(space)
+        steps = kalman_filter(filter_, assumed)
+        nis.append(normalised_innovations(np.array([step.innovation for step in steps]),
+                                          np.array([step.innovation_covariance for step in steps])))
+        error = A.T @ (truth[-1] - filter_.mean)
+        nees.append(error @ np.linalg.solve(A.T @ filter_.covariance.times(A), error) / m)
+    return (np.mean(nis), episodes * T * m), (np.mean(nees), episodes * m)
+
+
+def within_band(mean, freedoms):
+    """Whether a χ²-sum over its degrees of freedom lies within its central 99 %."""
+    low, high = chi2.ppf([0.005, 0.995], freedoms) / freedoms
+    return low < mean < high
+
+
+def test_filter_is_consistent_on_its_own_model():
+    """Innovations and errors are as large as the filter predicts; with half the noise they are not, and it shows."""
+    assert all(within_band(*each) for each in twin(noise_factor=1.0))
+    nis, nees = twin(noise_factor=0.5)
+    assert not within_band(*nis) and not within_band(*nees)
+    assert min(nis[0], nees[0]) > 1.0
+
+
+def test_linearised_observation_is_the_tangent():
+    """V − R(c*) + J c* = J c + v: near c* the misfit of the tangent is of second order."""
+    rng = np.random.default_rng(8)
+    model, point, current, voltages = QuadraticModel(rng), rng.uniform(1.0, 2.0, 6), rng.normal(size=4), rng.normal(size=4)
+    noise = VoltageNoise(0.01, 0.001)
+    J, value, variance, _ = linearised(model, noise, point, voltages, current)
+    at_point = model.voltages(point, current[None])[0]
+    np.testing.assert_allclose(value, voltages - at_point + J @ point, rtol=1e-14)
+    np.testing.assert_allclose(variance, noise.std(at_point)**2, rtol=1e-14)
+    away = np.random.default_rng(9).normal(size=6)
+    misfits = []
+    for h in (1e-2, 1e-3):
+        exact = model.voltages(point + h * away, current[None])[0]
+        observation = linearised(model, noise, point, exact, current)
+        misfits.append(np.abs(observation.value - J @ (point + h * away)).max())
+    assert misfits[0] / misfits[1] == pytest.approx(100.0, rel=1e-3)

@@ -1,0 +1,354 @@
+"""Every state space and covariance form against one Gaussian of all states, conditioned at once on all measurements."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from eitbench.estimation import (
+    DenseCovariance,
+    Filter,
+    InflowWindow,
+    LogStates,
+    Motion,
+    NodalStates,
+    Observation,
+    UnknownFlow,
+    VelocityInflowWindow,
+    VelocityStates,
+    fixed_interval_smoother,
+    kalman_filter,
+    modal_states,
+    smoothed_means,
+    smoothed_state,
+    steady_response,
+)
+from eitbench.estimation.inflow_window import stationary
+from eitbench.estimation.walk import steady
+from eitbench.worlds.task import make_task
+from models import (
+    MESH,
+    Gaussian,
+    LinearGaussian,
+    coarse_transport,
+    dense_filter,
+    directions,
+    draw,
+    pipe,
+    random_design,
+    random_model,
+    rauch_tung_striebel,
+    shapes,
+    stacked,
+    two_modes,
+)
+
+from tiny_worlds import TINY
+
+T, LEVEL = 6, 29.0
+THETA = np.array([4.0, 0.5])
+
+
+def nodal(covariance, motions):
+    """A filter of `NodalStates` whose motions are those of models."""
+    def motion(time):
+        model = motions[time - 1]
+        return Motion(model.F, model.s, model.Q)
+    return Filter(NodalStates(motions[0].mean, covariance, motion))
+
+
+def low_rank():
+    model = random_model(np.random.default_rng(3))
+    return model.filter(), [model] * T
+
+
+def dense():
+    models = [random_model(np.random.default_rng(3))] * T
+    return nodal(DenseCovariance(models[0].covariance), models), models
+
+
+def dense_changing():
+    models = [random_model(np.random.default_rng(seed)) for seed in range(T)]
+    return nodal(DenseCovariance(models[0].covariance), models), models
+
+
+def dense_by_columns():
+    """F as a callable."""
+    filter_, models = dense_changing()
+    motion = filter_.space.motion
+    space = NodalStates(models[0].mean, DenseCovariance(models[0].covariance),
+                        lambda time: motion(time)._replace(transition=lambda X: models[time - 1].F @ X))
+    return Filter(space), models
+
+
+def at_rest():
+    model = random_model(np.random.default_rng(5))
+    still = model._replace(F=np.eye(14), s=np.zeros(14), Q=np.zeros((14, 14)))
+    return Filter(NodalStates(still.mean, DenseCovariance(still.covariance), Motion())), [still] * T
+
+
+def modal():
+    """Weights and their rates of change."""
+    A, Q = steady(0.3)
+    model = LinearGaussian(np.kron(A, np.eye(5)), np.zeros(10), 0.49 * np.kron(Q, np.eye(5)), np.zeros(10),
+                           0.49 * np.eye(10))
+    return Filter(modal_states(5, 0.7, lambda time: (A, Q))), [model] * T
+
+
+def coarse_task():
+    return replace(make_task(TINY), transport=coarse_transport(THETA, 1e-2))
+
+
+def window_model(weights, variances, before):
+    """A window of values, the newest first, as a linear model."""
+    W, d = weights.shape
+    F, Q = np.eye(W * d, k=-d), np.zeros((W * d, W * d))
+    F[:d] = np.concatenate([np.diag(row) for row in weights], axis=1)
+    Q[:d, :d] = np.diag(variances)
+    return LinearGaussian(F, np.zeros(W * d), Q, np.zeros(W * d), before)
+
+
+def inflow_window():
+    task, prior = coarse_task(), two_modes(MESH.points[:7], link="linear")
+    space = InflowWindow(task, prior, LEVEL, lag=T)
+    before, (weights, variance) = stationary(prior.time_covariance(space.window + 1))
+    model = window_model(np.repeat(weights[:, None], 2, axis=1), np.full(2, variance), np.kron(before, np.eye(2)))
+    return Filter(space), [model] * T
+
+
+def known_flow(k=2):
+    return UnknownFlow(lambda theta: coarse_transport(theta, 1e-2), directions(k), THETA[:k], np.zeros(k), np.zeros(k),
+                       shapes(k))
+
+
+def velocity():
+    """With θ known; the state ends with θ."""
+    F, Y = coarse_transport(THETA, 1e-2).transition()
+    n, root = len(F), np.random.default_rng(0).normal(size=(len(F), 20))
+    nodal_noise, P = 0.01 * root @ root.T, 50.0 * np.eye(n)
+    space = VelocityStates(known_flow(), np.full(n, LEVEL), P, inflow=LEVEL, inflow_std=7.0, nodal_noise=nodal_noise)
+    full, Q, covariance = np.eye(n + 2), np.zeros((n + 2, n + 2)), np.zeros((n + 2, n + 2))
+    full[:n, :n], Q[:n, :n], covariance[:n, :n] = F, 49.0 * Y @ Y.T + nodal_noise, P
+    model = LinearGaussian(full, np.concatenate([LEVEL * Y.sum(axis=1), np.zeros(2)]), Q,
+                           np.concatenate([np.full(n, LEVEL), THETA]), covariance)
+    return Filter(space), [model] * T
+
+
+FORMS = [low_rank, dense, dense_changing, dense_by_columns, at_rest, modal, inflow_window, velocity]
+every = pytest.mark.parametrize("form", FORMS)
+nodal_forms = pytest.mark.parametrize("form", [low_rank, dense, dense_changing, dense_by_columns, at_rest])
+
+
+def measured(filter_, models, m=3, noise=(0.1, 1.0), root=False):
+    """Observations of the concentration, and the same of the state."""
+    rng = np.random.default_rng(7)
+    space, mean = filter_.space, filter_.mean
+    n = len(filter_.concentration)
+    seen, of_state = [], []
+    for _ in models:
+        H = rng.normal(size=(m, n)) / np.sqrt(n)
+        offset = H @ filter_.concentration
+        common = 0.5 * rng.normal(size=(m, 2)) if root else None
+        observation = Observation(H, offset + rng.normal(size=m), rng.uniform(*noise, m), common)
+        slope = space.jacobian(mean, H)
+        seen.append(observation)
+        of_state.append(observation._replace(
+            matrix=slope, value=observation.value - offset + slope @ mean[:slope.shape[1]]))
+    return seen, of_state
+
+
+def assert_close(ours, theirs, tolerance=1e-9):
+    np.testing.assert_allclose(ours, theirs, rtol=0, atol=tolerance * np.abs(theirs).max())
+
+
+def assert_state(filter_, expected, tolerance=1e-9):
+    """Mean and variances of the whole state."""
+    assert_close(filter_.mean, expected.mean, tolerance)
+    assert_close(filter_.covariance.diagonal(), expected.variance, tolerance)
+
+
+def run(filter_, observations):
+    for observation in observations:
+        filter_.predict()
+        filter_.update(observation)
+    return filter_
+
+
+@every
+@pytest.mark.parametrize("root", [False, True], ids=["independent", "correlated"])
+def test_filter_is_conditioning(form, root):
+    """Mean and variances after the first, the third and the last measurement, and the innovations."""
+    filter_, models = form()
+    seen, of_state = measured(filter_, models, root=root)
+    for t, observation in enumerate(seen, start=1):
+        filter_.predict()
+        step = filter_.update(observation)
+        if t in (1, 3, T):
+            assert_state(filter_, stacked(models[:t], of_state[:t])[-1])
+        if t == 3:
+            blind = of_state[t - 1]._replace(noise_variance=np.full(3, 1e12), noise_root=None)
+            predicted = stacked(models[:t], [*of_state[:t - 1], blind])[-1]
+            H = of_state[t - 1].matrix
+            k = H.shape[1]
+            S = H @ predicted.covariance[:k, :k] @ H.T + np.diag(observation.noise_variance)
+            S += 0.0 if observation.noise_root is None else observation.noise_root @ observation.noise_root.T
+            assert_close(step.innovation_covariance, S, 1e-8)
+            np.testing.assert_allclose(step.innovation, of_state[t - 1].value - H @ predicted.mean[:k], atol=1e-7)
+
+
+@every
+def test_missing_readings_are_fewer_readings(form):
+    """NaN in place of a reading, and a reading beyond the gate, are as if they had not been measured."""
+    lost, _ = form()
+    fewer, models = form()
+    seen, _ = measured(lost, models, m=4)
+    keep = np.array([True, False, True, True])
+    for observation in seen:
+        value = observation.value.copy()
+        value[1] = np.nan
+        lost.predict()
+        step = lost.update(observation._replace(value=value))
+        np.testing.assert_array_equal(step.accepted, keep)
+        fewer.predict()
+        fewer.update(Observation(observation.matrix[keep], observation.value[keep], observation.noise_variance[keep]))
+    assert_close(lost.mean, fewer.mean)
+    assert_close(lost.covariance.diagonal(), fewer.covariance.diagonal())
+
+
+@every
+def test_gate(form):
+    """A wide gate is none; a reading far off is rejected alone; where half of them are, all are."""
+    filters = [form()[0] for _ in range(3)]
+    _, models = form()
+    wide, plain, gated = filters
+    wide.gate, gated.gate = 1e6, 20.0
+    seen, _ = measured(plain, models, m=4)
+    assert_close(run(wide, seen).mean, run(plain, seen).mean, 1e-15)
+    gated.predict()
+    before = gated.mean.copy()
+    far = seen[0]._replace(value=seen[0].value + [1e4, 0.0, 1e4, 0.0])
+    assert not gated.update(far).accepted.any()
+    np.testing.assert_array_equal(gated.mean, before)
+    one = seen[0]._replace(value=seen[0].value + [0.0, 1e4, 0.0, 0.0])
+    np.testing.assert_array_equal(gated.update(one).accepted, [True, False, True, True])
+
+
+@every
+def test_iterating_changes_nothing_where_all_is_linear(form):
+    once, models = form()
+    again, _ = form()
+    seen, _ = measured(once, models)
+    numbers = iter(seen), iter(np.repeat(np.arange(T), 2))
+    once.forward = lambda point, voltages, currents: next(numbers[0])
+    again.forward, again.iterated = (lambda point, voltages, currents: seen[next(numbers[1])]), True
+    for _ in seen:
+        first, second = (filter_.assimilate(np.zeros(3), np.zeros(3)) for filter_ in (once, again))
+        np.testing.assert_allclose(first.innovation, second.innovation, atol=1e-8)
+    assert_close(again.mean, once.mean)
+    assert_close(again.covariance.diagonal(), once.covariance.diagonal())
+
+
+@nodal_forms
+def test_smoothed_means(form):
+    filter_, models = form()
+    seen, of_state = measured(filter_, models)
+    expected = np.array([state.mean for state in stacked(models, of_state)])
+    assert_close(smoothed_means(filter_, seen), expected)
+
+
+def test_fixed_interval_and_fixed_lag_smoother():
+    """With variances: all states given all measurements, and each given those of the next few."""
+    filter_, models = low_rank()
+    seen, of_state = measured(filter_, models)
+    for ours, theirs in zip(fixed_interval_smoother(filter_, seen), stacked(models, of_state), strict=True):
+        assert_close(ours.mean, theirs.mean)
+        assert_close(ours.variance, theirs.variance)
+    filter_, _ = low_rank()
+    steps = kalman_filter(filter_, seen)
+    for lag in (0, 1, 4):
+        for t in (lag, 5):
+            state, expected = smoothed_state(filter_, steps[t - lag:t + 1]), stacked(models[:t + 1], of_state[:t + 1])
+            assert_close(state.mean, expected[t - lag].mean)
+            assert_close(state.variance, expected[t - lag].variance)
+
+
+def test_a_window_is_its_own_smoother():
+    """`estimate` with a lag: the states t = 1 … T given all measurements, from the window's Gaussian."""
+    filter_, models = inflow_window()
+    seen, of_state = measured(filter_, models)
+    posterior = stacked(models, of_state)[-1]
+    run(filter_, seen)
+    space = filter_.space
+    basis, weights = space.response()
+    by_x = LEVEL * basis @ (weights @ space.prior.modes).reshape(len(weights), -1)
+    for lag in range(T):
+        here = slice(2 * lag, 2 * lag + by_x.shape[1])
+        estimate = filter_.estimate(lag)
+        assert_close(estimate.mean, LEVEL + by_x @ posterior.mean[here])
+        assert_close(estimate.variance, ((by_x @ posterior.covariance[here, here]) * by_x).sum(axis=1))
+
+
+def test_windows_with_a_known_velocity_are_the_inflow_window():
+    """Where the other one drops next to nothing: to 1e-3 of the deviation, which it has forgotten."""
+    task, prior = coarse_task(), two_modes(MESH.points[:7], link="linear")
+    other = Filter(InflowWindow(task, prior, LEVEL))
+    filter_ = Filter(VelocityInflowWindow(task, prior, LEVEL, known_flow(), other.space.window))
+    seen, _ = measured(other, range(4))
+    for each in (filter_, other):
+        run(each, seen)
+    off = np.linalg.norm(filter_.concentration - other.concentration)
+    assert off < 0.02 * np.linalg.norm(other.concentration - LEVEL)
+    theta, variance = filter_.space.velocity(filter_.mean, filter_.covariance)
+    np.testing.assert_array_equal(theta, THETA)
+    assert not variance.any()
+
+
+def test_logarithms_are_linearised_where_they_are():
+    """Derivatives of c = ĉ exp(E x) by differences, and variances by them."""
+    rng = np.random.default_rng(1)
+    modes = 0.3 * rng.normal(size=(8, 5))
+    for E, size in ((None, 8), (modes, 10)):
+        states = NodalStates(np.ones(size), DenseCovariance(0.04 * np.eye(size)), Motion())
+        space = LogStates(states, LEVEL, E)
+        mean = 0.2 * rng.normal(size=size)
+        slope = space.jacobian(mean, np.eye(8))
+        for k in range(slope.shape[1]):
+            step = 1e-6 * np.eye(size)[k]
+            difference = (space.concentration(mean + step) - space.concentration(mean - step)) / 2e-6
+            np.testing.assert_allclose(slope[:, k], difference, atol=1e-7 * LEVEL)
+        np.testing.assert_allclose(space.variance(mean, space.initial()[1]), 0.04 * (slope**2).sum(axis=1))
+        assert not space.initial()[0].any()
+
+
+def test_the_pipe_of_the_thesis():
+    """n = 1701, five injections, the parameters of Table 5.1: filter and smoother with full matrices."""
+    model, make_filter, observations, exact = pipe()
+    for step, (predicted, filtered) in zip(kalman_filter(make_filter(), observations), exact, strict=True):
+        assert_close(step.predicted_mean, predicted.mean)
+        assert_close(step.mean, filtered.mean)
+        np.testing.assert_allclose(step.variance, filtered.variance, atol=1e-9 * predicted.variance.max())
+    smoothed = fixed_interval_smoother(make_filter(), observations)
+    for state, expected in zip(smoothed, rauch_tung_striebel(model, exact), strict=True):
+        assert_close(state.mean, expected.mean)
+        assert_close(state.variance, expected.variance)
+
+
+def test_several_blocks_of_a_dense_covariance():
+    """n = 300 and 530, where triangles are mirrored in blocks: symmetric to the bit, and the dense recursion's."""
+    for n, steps in ((300, 3), (530, 2)):
+        rng = np.random.default_rng(10)
+        model = random_model(rng, n)
+        _, observations = draw(model, random_design(rng, n, steps), rng)
+        matrix, columns = (DenseCovariance(model.covariance) for _ in range(2))
+        filters = [Filter(NodalStates(model.mean, matrix, Motion(model.F, model.s, model.Q))),
+                   Filter(NodalStates(model.mean, columns, Motion(lambda X, F=model.F: F @ X, model.s, model.Q)))]
+        for observation, (_, now) in zip(observations, dense_filter(model, observations), strict=True):
+            for filter_ in filters:
+                filter_.predict()
+                filter_.update(observation)
+                np.testing.assert_array_equal(filter_.covariance.array, filter_.covariance.array.T)
+                assert_state(filter_, Gaussian(now.mean, now.covariance), 1e-10)
+
+
+def test_response_of_a_window_is_the_tasks_flow():
+    space = InflowWindow(coarse_task(), two_modes(MESH.points[:7]), LEVEL)
+    assert space.memory == steady_response(coarse_transport(THETA, 1e-2)).weights.shape[1]
