@@ -6,6 +6,7 @@ import numpy as np
 from eitbench import Estimate, Task
 from eitbench.estimation import FilterEstimator, about_prediction, starting_filter
 
+
 class Estimator:
     boards = ("filter",)
 

@@ -13,6 +13,7 @@ from eitbench.estimation import (
     table_5_1,
 )
 
+
 class Estimator:
     boards = ("smoothing",)
 

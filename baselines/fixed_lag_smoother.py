@@ -11,6 +11,7 @@ from eitbench.estimation import (
     starting_filter,
 )
 
+
 class Estimator:
     boards = ("fixed-lag",)
 

@@ -28,6 +28,7 @@ class Estimator:
     def __init__(self, task: Task) -> None:
         prior = suiting_priors(HERE / "priors", task, "logarithm")[0]
         model = suiting_models(HERE / "models", task)[0]
+        self.estimator: FilterEstimator | RecordEstimator
         if task.lag == task.n_steps - 1:
             self.estimator = RecordEstimator(task, lambda c_ref, record: map_inflow(
                 task, prior, c_ref, record, model=model))

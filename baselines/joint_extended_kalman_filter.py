@@ -12,6 +12,7 @@ from eitbench.estimation import Filter, FilterEstimator, about_prediction, veloc
 
 BOUNDS = (0.05, 4.0)
 
+
 class Estimator:
     boards = ("filter",)
     parameters = {"bounds": list(BOUNDS)}  # noqa: RUF012 (as a record has it)

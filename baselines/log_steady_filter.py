@@ -18,6 +18,7 @@ from eitbench.estimation import (
 from eitbench.estimation.walk import RandomWalk, smooth_modes, steady
 from eitbench.physics.rest import AtRest
 
+
 class Estimator:
     boards = ("filter",)
 

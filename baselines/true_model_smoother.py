@@ -8,7 +8,7 @@ learned, it is the linearised fixed-interval smoother. It is no bound: what is l
 prior may do better.
 """
 
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -77,7 +77,7 @@ def changing_states(task: Task, transport_at, c_ref: float) -> NodalStates:
     prior = task.prior
     nodal = task.evolution.state_noise_covariance(0.0, (c_ref * prior.nodal_std)**2)
 
-    @lru_cache(maxsize=None)
+    @cache
     def transition(time: int):
         return transport_at(time).transition()
 

@@ -18,12 +18,8 @@ import numpy as np
 from common import Row, compare, in_fresh_process, of_flops, peak_growth, peer, quantity
 from pipe_record import CELLS, RECORD, STEPS, WARM_UP, Problem, problem, same, textbook
 
-from eitbench.estimation.kalman import (
-    KalmanFilter,
-    Observation,
-    kalman_filter,
-)
-from eitbench.estimation.smoother import _backwards, fixed_interval_smoother
+from eitbench.estimation import Filter, Observation, fixed_interval_smoother, kalman_filter
+from eitbench.estimation.smoother import _backwards
 
 
 @dataclass
@@ -31,7 +27,7 @@ class Settled:
     """The problem after `WARM_UP` steps, with `STEPS` more to come."""
 
     problem: Problem
-    ours: KalmanFilter
+    ours: Filter
     mean: np.ndarray
     covariance: np.ndarray
     """(n, n), of the textbook recursion"""
@@ -61,7 +57,7 @@ def settle(problem: Problem) -> Settled:
     ours = copy.copy(problem.start)
     kalman_filter(ours, problem.observations[:WARM_UP])
     n = problem.n
-    mean, P = problem.start.mean, problem.start.covariance.apply(0, np.eye(n))
+    mean, P = problem.start.mean, problem.start.covariance.times(np.eye(n))
     for observation in problem.observations[:WARM_UP]:
         mean, P = textbook(problem, mean, P, observation)
     same(ours.mean, mean)
@@ -94,7 +90,7 @@ def against_textbook(settled: Settled) -> Row:
     same(ours(), theirs())
     seconds = compare({"ours": ours, "theirs": theirs}, 3, warm_up=False)
     step, reference = (s / len(observations) for s in seconds.values())
-    rank, n = settled.ours.known.shape[1], problem.n
+    rank, n = settled.ours.covariance.assimilated.shape[1], problem.n
     return Row("filtering", f"Kalman filter step, n = {n}, m = 16, varying injection, rank {rank}",
                f"numpy {np.__version__}: F P Fᵀ + Q, S, K, P − K (H P)", step, reference,
                "≤ 0.15" if n == 1701 else "", "flops: F Z, and the eigenvectors of ZᵀZ",
@@ -125,10 +121,10 @@ def filterpy(problem: Problem, mean: np.ndarray, covariance: np.ndarray,
     level = problem.start.mean
     them = Peer(dim_x=problem.n, dim_z=16)
     them.x, them.P = (mean - level)[:, None], covariance.copy()
-    them.F, them.Q = problem.start.transition, problem.noise
+    them.F, them.Q = problem.motion.transition, problem.noise
     means, covariances = [], []
     begin = time.perf_counter()
-    for H, value, variance in observations:
+    for H, value, variance, _ in observations:
         them.predict()
         them.update((value - H @ level)[:, None], R=np.diag(variance), H=H)
         means.append(them.x)
@@ -154,10 +150,11 @@ def against_dynamax(settled: Settled) -> Iterator[Row]:
     else:
         # It adds 1e-9 to the diagonal of what it solves with: units in which this is nothing, and
         # white noise.
-        F = settled.problem.start.transition
+        F = settled.problem.motion.transition
         level = settled.problem.start.mean
         units = 1e-4
-        H, values, variances = (np.stack(part) for part in zip(*settled.observations, strict=True))
+        H, values, variances = (
+            np.stack(part) for part in list(zip(*settled.observations, strict=True))[:3])
         std = np.sqrt(variances)
         noise = settled.problem.noise / units**2
         parameters = make_lgssm_params(
@@ -203,7 +200,7 @@ def against_peer(settled: Settled, theirs: dict[str, float | None], name: str, f
              "smoother": lambda: fixed_interval_smoother(copy.copy(settled.ours),
                                                          settled.observations)}
     seconds = compare(works, 3)
-    n, rank = settled.problem.n, settled.ours.known.shape[1]
+    n, rank = settled.problem.n, settled.ours.covariance.assimilated.shape[1]
     flops = {"filter": step_flops(n, rank), "smoother": step_flops(n, rank)
              + way_back_flops(settled)}
     for task, words in (("filter", filtering), ("smoother", smoothing)):
@@ -220,7 +217,7 @@ def way_back_flops(settled: Settled) -> float:
     n = settled.problem.n
     steps = kalman_filter(copy.copy(settled.ours), settled.observations)
     ranks = [later.shape[1] for _, later in _backwards(settled.ours, steps)]
-    known = settled.ours.known.shape[1]
+    known = settled.ours.covariance.assimilated.shape[1]
     return sum(4.0 * n**2 * rank + 4.0 * n * known * rank + 4.0 * n * (rank + 16)**2
                for rank in ranks) / STEPS
 

@@ -7,12 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from eitbench.estimation.kalman import (
-    KalmanFilter,
-    LinearisedObservations,
-    Observation,
-)
-from eitbench.estimation.parameters import table_5_1
+from eitbench.estimation import Filter, LinearisedObservations, Motion, Observation, table_5_1
 from eitbench.numerics.mesh import rectangle_mesh
 from eitbench.physics.observation import ObservationModel
 from eitbench.physics.transport import ConvectionDiffusion
@@ -29,7 +24,7 @@ WARM_UP, STEPS, RECORD = 60, 8, 98
 class Problem:
     """A linear Gaussian model, and a record of it."""
 
-    start: KalmanFilter
+    start: Filter
     """at t = 0"""
     noise: np.ndarray
     """(n, n) Γ_w"""
@@ -38,6 +33,10 @@ class Problem:
     @property
     def n(self) -> int:
         return len(self.start.mean)
+
+    @property
+    def motion(self) -> Motion:
+        return self.start.space.motion(1)
 
 
 def problem(cells: tuple[int, int], steps: int = WARM_UP + STEPS) -> Problem:
@@ -55,7 +54,7 @@ def problem(cells: tuple[int, int], steps: int = WARM_UP + STEPS) -> Problem:
     currents = PIPE_2D.currents
     for t in range(steps):
         state = evolution.F @ state + evolution.Y @ inflow(at_inlet, t * PIPE_2D.time_step)
-        H, _, variance = linearised(np.zeros(16), currents[t % len(currents)])
+        H, _, variance, _ = linearised(np.zeros(16), currents[t % len(currents)])
         observations.append(Observation(H, H @ state + np.sqrt(variance)
                                         * rng.standard_normal(len(H)), variance))
     noise = level**2 * evolution.state_noise_covariance(PIPE_2D.prior.inflow_std**2,
@@ -83,8 +82,8 @@ def pipe_model(cells: tuple[int, int]) -> Discretisation:
 def textbook(problem: Problem, mean: np.ndarray, P: np.ndarray, observation: Observation
              ) -> tuple[np.ndarray, np.ndarray]:
     """One step with full matrices; (I − K H) P as P − K (H P), which saves a third of the work."""
-    F, (H, value, variance) = problem.start.transition, observation
-    mean, P = F @ mean + problem.start.forcing, F @ P @ F.T + problem.noise
+    F, (H, value, variance, _) = problem.motion.transition, observation
+    mean, P = F @ mean + problem.motion.forcing, F @ P @ F.T + problem.noise
     seen = H @ P
     K = np.linalg.solve(seen @ H.T + np.diag(variance), seen).T
     return mean + K @ (value - H @ mean), P - K @ seen

@@ -17,7 +17,7 @@ from pipe_record import STEPS, WARM_UP, problem
 from stepping import COUNTS, environments
 
 from eitbench._files import write_atomically
-from eitbench.estimation.kalman import kalman_filter
+from eitbench.estimation import kalman_filter
 
 EIT_CELLS = ((5, 13), (7, 20), (11, 32), (16, 48), (23, 68))
 """cells at an electrode and across: 4,300 to 100,000 unknowns"""
@@ -88,8 +88,8 @@ def kalman_step(cells: tuple[int, int]) -> tuple[float, float, float]:
     def steps() -> None:
         kalman_filter(copy.copy(ours), record.observations[WARM_UP:])
 
-    covariance = record.start.covariance
-    held = (ours.transition.nbytes + covariance.limit.nbytes
+    covariance = record.start.covariance.open_loop
+    held = (record.motion.transition.nbytes + covariance.limit.nbytes
             + sum(U.nbytes for U, _ in covariance._transients))
     seconds = best_of(steps, 5) / STEPS
     step = peak_growth(lambda: kalman_filter(copy.copy(ours), record.observations[-1:]))

@@ -15,7 +15,16 @@ from threadpoolctl import threadpool_limits
 
 from eitbench.data.recordings import cycle_voltages, recording, score_operators
 from eitbench.envs.estimation import EstimationEnv
-from eitbench.estimation import DenseKalmanFilter, FirstFrame, LinearisedObservations, table_5_1
+from eitbench.estimation import (
+    DenseCovariance,
+    Filter,
+    FirstFrame,
+    LinearisedObservations,
+    Motion,
+    NodalStates,
+    kalman_filter,
+    table_5_1,
+)
 from eitbench.scoring import relative_error
 
 TOLERANCES = (1e-6, 1e-4, 1e-3, 1e-2, 1e-1)
@@ -49,13 +58,12 @@ def main() -> None:
               flush=True)
 
     n = task.mesh.n_nodes
-    dense = DenseKalmanFilter(start.mean, start.covariance.apply(0, np.eye(n)))
-    noise = start.covariance.apply_noise(np.eye(n))
-    steps = []
+    motion = start.space.motion(1)
+    dense = Filter(NodalStates(
+        start.mean, DenseCovariance(start.covariance.times(np.eye(n))),
+        Motion(motion.transition, motion.forcing, start.space.noise_times(1, np.eye(n)))))
     begin = time.perf_counter()
-    for observation in observations:
-        dense.predict(start.transition, start.forcing, noise)
-        steps.append(dense.update(observation))
+    steps = kalman_filter(dense, observations)
     seconds = (time.perf_counter() - begin) / len(steps)
     exact = np.array([s.mean for s in steps]), np.array([s.variance for s in steps])
     inner = np.setdiff1d(np.arange(n), task.transport.inlet)
@@ -65,13 +73,10 @@ def main() -> None:
     row("full, n × n", steps, seconds, n)
     for tolerance in TOLERANCES:
         filter_ = table_5_1(task.transport, task.prior, first.c_bh, rank_tolerance=tolerance)
-        steps = []
         begin = time.perf_counter()
-        for observation in observations:
-            filter_.predict()
-            steps.append(filter_.update(observation))
+        steps = kalman_filter(filter_, observations)
         row(f"Π − ZZᵀ, tolerance {tolerance:g}", steps, (time.perf_counter() - begin) / len(steps),
-            filter_.known.shape[1])
+            filter_.covariance.assimilated.shape[1])
     print(f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6:.1f} GB")
 
 

@@ -22,9 +22,9 @@ import eitbench
 from eitbench.data.dataset import Example
 from eitbench.data.seeds import parse_seeds
 from eitbench.estimation import (
-    InflowFilter,
     Observation,
     best_homogeneous,
+    inflow_filter,
     suiting_models,
     suiting_priors,
 )
@@ -135,19 +135,18 @@ class Budget:
                                  np.concatenate([currents for _, currents in first]),
                                  task.expected_concentration)
         known = {"responses": [self.model.response]} if own else {"model": self.model}
-        filter_ = InflowFilter(task, self.prior, level, **known)
+        filter_ = inflow_filter(task, self.prior, level, iterated=times == 2, **known)
         for voltages, currents in record:
-            filter_.predict()
             if len(currents) == 1:
-                update = filter_.update_again if times == 2 else filter_.update
-                update(voltages[0], currents[0])
+                filter_.assimilate(voltages[0], currents[0])
             else:
-                point = filter_.concentration()
+                filter_.predict()
+                point = filter_.concentration
                 computed, by_c = task.observation.linearise(point, currents)
                 matrix = by_c.reshape(-1, by_c.shape[-1])
                 value = (voltages - computed).ravel() + matrix @ point
-                filter_.take_in(Observation(matrix, value, noise.std(computed).ravel()**2), point)
-            yield filter_.state()
+                filter_.update(Observation(matrix, value, noise.std(computed).ravel()**2))
+            yield filter_.concentration, filter_.variance
 
     def score(self, estimates: Iterator[tuple[np.ndarray, np.ndarray]], truth: np.ndarray,
               unresolved: np.ndarray, square: np.ndarray) -> Played:

@@ -14,7 +14,7 @@ from tqdm import tqdm
 import eitbench
 from eitbench.bench.text import mean_and_interval, rounded
 from eitbench.data.seeds import parse_seeds
-from eitbench.estimation import InflowPrior, InflowTracker, learned_inflow_prior
+from eitbench.estimation import FilterEstimator, InflowPrior, inflow_filter, learned_inflow_prior
 from eitbench.worlds.registry import entry
 
 ID = "eitbench/Pipe2D-v0"
@@ -26,11 +26,11 @@ def play(prior: InflowPrior, seed: int) -> tuple[float, float]:
     """Mean relative error, and NIS per reading, of the states that are scored."""
     env = gym.make(ID).unwrapped
     task: eitbench.Task = env.task
-    tracker = InflowTracker(task, prior)
+    estimator = FilterEstimator(task, lambda c_ref: inflow_filter(task, prior, c_ref))
     observation, _ = env.reset(seed=seed)
     rewards, surprises = [], []
     for _ in range(task.n_steps):
-        estimate = tracker.update(**observation)
+        estimate = estimator.update(**observation)
         if estimate.innovation is not None:
             whitened = np.linalg.solve(estimate.innovation_covariance, estimate.innovation)
             surprises.append(estimate.innovation @ whitened / len(whitened))

@@ -27,6 +27,10 @@ class Covariance(Protocol):
     the low-rank form leaves what it was.
     """
 
+    @property
+    def array(self) -> np.ndarray:
+        """(n, n) P."""
+
     def times(self, X: np.ndarray) -> np.ndarray:
         """Return P X for X (k, m), whose rows belong to the first k entries of the state."""
 
@@ -57,16 +61,21 @@ class DenseCovariance:
     def __init__(self, covariance: np.ndarray) -> None:
         n = len(covariance)
         covariance = _check.array("covariance", covariance, (n, n))
-        self.array = np.ascontiguousarray(0.5 * (covariance + covariance.T))
+        self._array = np.ascontiguousarray(0.5 * (covariance + covariance.T))
         self._work: np.ndarray | None = None
+
+    @property
+    def array(self) -> np.ndarray:
+        """(n, n) P."""
+        return self._array
 
     def copy(self) -> Self:
         """Return a covariance that changes on its own."""
-        return type(self)(self.array)
+        return type(self)(self._array)
 
     def times(self, X: np.ndarray) -> np.ndarray:
         """Return P X for X (k, m), whose rows belong to the first k entries of the state."""
-        return self.array[:, :len(X)] @ X
+        return self._array[:, :len(X)] @ X
 
     def propagate(self, transition: Transition | None, noise: np.ndarray | None = None) -> Self:
         """Return F P Fᵀ + Q, in place; None: F = I, Q = 0.
@@ -79,7 +88,7 @@ class DenseCovariance:
         elif transition is not None:
             self._transform(transition)
         if noise is not None:
-            self.array += noise
+            self._array += noise
         return self
 
     def shift(self, weights: np.ndarray, new_variance: np.ndarray) -> Self:
@@ -88,7 +97,7 @@ class DenseCovariance:
         Each number follows from its own past by ``weights`` (W, d) or (W, 1) and an independent
         part of variance ``new_variance`` (d,); the oldest value is dropped.
         """
-        P = self.array
+        P = self._array
         d = len(new_variance)
         W = len(weights)
         cross = (weights[:, :, None] * P.reshape(W, d, W * d)).sum(axis=0)             # (d, W·d)
@@ -98,33 +107,33 @@ class DenseCovariance:
         after[:d, d:] = cross[:, :-d]
         after[d:, :d] = cross[:, :-d].T
         after[:d, :d] = 0.5 * (variance + variance.T) + np.diag(new_variance)
-        self.array = after
+        self._array = after
         return self
 
     def subtract(self, root: np.ndarray) -> Self:
         """Return P − G Gᵀ, with G (n, m), in place."""
-        self.array -= np.matmul(root, root.T, out=self._scratch())
-        diagonal = np.einsum("ii->i", self.array)                                      # a view
+        self._array -= np.matmul(root, root.T, out=self._scratch())
+        diagonal = np.einsum("ii->i", self._array)                                      # a view
         np.maximum(diagonal, 0.0, out=diagonal)  # precise measurements leave rounding of any sign
         return self
 
     def diagonal(self) -> np.ndarray:
         """Return the variances (n,)."""
-        return self.array.diagonal().copy()
+        return self._array.diagonal().copy()
 
     def variance_of(self, functionals: np.ndarray) -> np.ndarray:
         """Return the variances (m,) of linear functionals (m, k) of the first k entries."""
         k = functionals.shape[1]
-        return ((functionals @ self.array[:k, :k]) * functionals).sum(axis=1)
+        return ((functionals @ self._array[:k, :k]) * functionals).sum(axis=1)
 
     def _scratch(self) -> np.ndarray:
         if self._work is None:
-            self._work = np.empty_like(self.array)
+            self._work = np.empty_like(self._array)
         return self._work
 
     def _transform(self, F: np.ndarray) -> None:
         """P ← F P Fᵀ by triangles: with P = L + Lᵀ and B = F L, half of B Fᵀ + F Bᵀ is computed."""
-        P, B = self.array, self._scratch()
+        P, B = self._array, self._scratch()
         diagonal = np.einsum("ii->i", P)
         diagonal *= 0.5
         np.copyto(B, F)
@@ -136,7 +145,7 @@ class DenseCovariance:
 
     def _transform_by_columns(self, apply: Callable[[np.ndarray], np.ndarray]) -> None:
         """P ← F P Fᵀ as F (F P)ᵀ, of which the upper triangle is kept."""
-        P, B = self.array, self._scratch()
+        P, B = self._array, self._scratch()
         panels = [slice(begin, begin + _PANEL) for begin in range(0, len(P), _PANEL)]
         for panel in panels:
             B[:, panel] = apply(P[:, panel])
@@ -243,6 +252,11 @@ class LowRankCovariance:
 
     def _with(self, time: int, assimilated: np.ndarray) -> Self:
         return type(self)(self.open_loop, self.rank_tolerance, time=time, assimilated=assimilated)
+
+    @property
+    def array(self) -> np.ndarray:
+        """(n, n) P, computed anew."""
+        return self.times(np.eye(len(self.assimilated)))
 
     def copy(self) -> Self:
         """Return the same: it never changes."""

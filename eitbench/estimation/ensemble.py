@@ -151,5 +151,5 @@ class EnsembleFilter:
     def estimate(self, lag: int = 0) -> Estimate:
         """Return the present state, with the last innovation."""
         c, theta = self.concentration, self.parameters
-        return Estimate(c.mean(axis=1), c.var(axis=1, ddof=1), *self._innovation,
-                        theta.mean(axis=1), theta.var(axis=1, ddof=1))
+        return Estimate(c.mean(axis=1), c.var(axis=1, ddof=1), *self._innovation)._replace(
+            velocity=theta.mean(axis=1), velocity_variance=theta.var(axis=1, ddof=1))

@@ -75,6 +75,7 @@ class FilterEstimator:
         self.task = task
         self.first = FirstFrame(task)
         self._start = start
+        self.filter: Sequential
         self._measured = 0
         self._requested = -task.lag
 

@@ -35,7 +35,7 @@ class StateSpace:
         return mean
 
     def jacobian(self, mean: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-        """Return the derivatives (m, k) of ``matrix`` (m, n) times c by the first k entries of x."""
+        """Return the derivatives (m, k) of ``matrix`` (m, n) c by the first k entries of x."""
         return matrix
 
     def variance(self, mean: np.ndarray, covariance: Covariance, lag: int = 0) -> np.ndarray:

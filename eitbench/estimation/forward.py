@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from eitbench.worlds.task import Task
 
 Forward = Callable[[np.ndarray, np.ndarray, np.ndarray], Observation]
-"""Concentration (n,), voltages (L,) and currents (L,) -> linear measurement of the concentration."""
+"""Concentration (n,), voltages (L,), currents (L,) -> linear measurement of the concentration."""
 
 
 def linearised(model: VoltageModel, noise: VoltageNoise, point: np.ndarray,

@@ -1,4 +1,4 @@
-"""Innovate, gate and condition a Gaussian: the recursion behind every filter (docs/methods.md, 5)."""
+"""Innovate, gate and condition: the recursion behind every filter (docs/methods.md, 5)."""
 
 from __future__ import annotations
 

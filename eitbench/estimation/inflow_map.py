@@ -89,7 +89,8 @@ class _Posterior:
         self.observation = task.observation
         voltages, currents = (np.array(part) for part in zip(*record, strict=True))
         self.by_lag = list(zip(reversed(range(len(record))), currents, strict=True))
-        self.root = np.linalg.cholesky(toeplitz(self.space.prior.time_covariance(self.space.window)))
+        covariance = toeplitz(self.space.prior.time_covariance(self.space.window))
+        self.root = np.linalg.cholesky(covariance)
         errors = [_errors(task, model, self.space.level,
                           self.space.concentration(smoother.mean, lag), each)
                   for lag, each in self.by_lag]
@@ -100,8 +101,8 @@ class _Posterior:
     def value(self, z: np.ndarray) -> float:
         """Return the function to be minimised."""
         mean = (self.root @ z).ravel()
-        computed = [self.observation.voltages(self.space.concentration(mean, lag), currents[None])[0]
-                    for lag, currents in self.by_lag]
+        voltages, at = self.observation.voltages, self.space.concentration
+        computed = [voltages(at(mean, lag), currents[None])[0] for lag, currents in self.by_lag]
         residual = np.einsum("tij,tj->ti", self.whitener, self.voltages - np.array(computed))
         return float((z**2).sum() + (residual**2).sum())
 

@@ -106,7 +106,6 @@ class InflowWindow(StateSpace):
         return np.tensordot(self.response(lag).weights, deviation, 2)
 
     def variance(self, mean: np.ndarray, covariance: Covariance, lag: int = 0) -> np.ndarray:
-        assert isinstance(covariance, DenseCovariance)
         slope = self.slope(mean, lag)
         here = slice(lag * self.modes, (lag + self.memory) * self.modes)
         reduced = slope @ covariance.array[here, here] @ slope.T

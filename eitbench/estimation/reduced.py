@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 
-from eitbench.estimation.covariance import DenseCovariance, LowRankCovariance
+from eitbench.estimation.covariance import LowRankCovariance
 from eitbench.estimation.filter import Filter
 from eitbench.estimation.gaussian import Observation, gate_mask
 from eitbench.estimation.nodal import NodalStates
@@ -79,8 +79,6 @@ def learnt_of(start: Filter, observations: Iterable[Observation], skip: int) -> 
             assert isinstance(start.space, NodalStates)
             motion = start.space.motion(t + 1)
             open_loop = open_loop.propagate(motion.transition, motion.noise)
-            assert isinstance(open_loop, DenseCovariance)
-            assert isinstance(start.covariance, DenseCovariance)
             reduction = open_loop.array - start.covariance.array if t >= skip else 0.0
         total += reduction
     return total

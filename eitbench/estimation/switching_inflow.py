@@ -24,11 +24,11 @@ if TYPE_CHECKING:
 class SwitchingInflowFilter:
     """Interacting multiple models (Blom & Bar-Shalom 1988) of what enters: quiet, or a slug.
 
-    Two filters of an `InflowWindow` run side by side. In a slug a new x follows by the prior's regression; in
-    quiet it is independent and small. Before each step the two are mixed by the probabilities of
-    the regimes that may have come before, by their first two moments; each measurement says how
-    well it fits either. What is homogeneous but off from the level, as ĉ_bh is where a slug was in
-    the first frame, is a mode of its own, which stays what it is.
+    Two filters of an `InflowWindow` run side by side. In a slug a new x follows by the prior's
+    regression; in quiet it is independent and small. Before each step the first two moments of
+    both are mixed by the probabilities of the preceding regimes, which each measurement updates by
+    its likelihood. A homogeneous deviation from the level, which remains where a slug was in the
+    first frame, is a separate mode that does not change.
 
     Parameters
     ----------
@@ -108,11 +108,11 @@ class SwitchingInflowFilter:
         likelihoods = np.array([_log_density(step) for step in steps])
         fits = expected * np.exp(likelihoods - likelihoods.max())
         self.probabilities = fits / fits.sum()
-        innovation = expected @ [step.innovation for step in steps]
-        covariance = sum(p * (step.innovation_covariance
-                              + np.outer(step.innovation - innovation, step.innovation - innovation))
-                         for p, step in zip(expected, steps, strict=True))
-        self._innovation = innovation, covariance
+        values = np.array([step.innovation for step in steps])
+        innovation = expected @ values
+        apart = values - innovation
+        within = np.tensordot(expected, [step.innovation_covariance for step in steps], 1)
+        self._innovation = innovation, within + (expected * apart.T) @ apart
 
     def estimate(self, lag: int = 0) -> Estimate:
         """Return mean and variance of the mixture, with the last innovation."""

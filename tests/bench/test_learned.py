@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from eitbench.bench.methods import load_method
-from eitbench.estimation import FirstFrame, InflowFilter, corrected, remember, suiting_priors
+from eitbench.estimation import FirstFrame, corrected, inflow_filter, remember, suiting_priors
 from eitbench.worlds import entry
 from eitbench.worlds.task import make_task
 
@@ -120,16 +120,15 @@ def test_what_is_thought_later_is_of_the_same_state(study, short, monkeypatch):
     found = study.features(examples, example, basis)
     task = make_task(examples.world)
     prior = suiting_priors(ROOT / "baselines" / "priors", task, "logarithm")[0]
-    filter = InflowFilter(task, prior, level, lag=2)
+    filter = inflow_filter(task, prior, level, lag=2)
     modes = np.linalg.pinv(basis)
     T = len(example.voltages)
     for t, measurement in enumerate(zip(example.voltages, example.currents, strict=True)):
-        filter.predict()
-        filter.update(*measurement)
+        filter.assimilate(*measurement)
         for state in [t - 2] if t < T - 1 else range(T - 3, T):
             if state >= 0:
                 np.testing.assert_allclose(found["reduced 2"][state],
-                                           modes @ (filter.concentration(t - state) / level - 1.0), rtol=1e-10)
+                                           modes @ (filter.estimate(t - state).mean / level - 1.0), rtol=1e-10)
     lesson = replace(study.LESSONS["lag"], lag=2)
     seen = study.asked(lesson, found)
     np.testing.assert_array_equal(seen["truth"], found["truth"][:-2])

@@ -5,7 +5,6 @@ import copy
 import numpy as np
 import pytest
 from eitbench.bench.scores import Outcome, scored
-from eitbench.estimation import KalmanFilter
 from eitbench.estimation.onboard.operator import Levels
 from eitbench.estimation.onboard.reduced_operator import ReducedOperator
 
@@ -20,10 +19,7 @@ def predicted(filter_, estimator: str, n: int):
         r = moved.mean.shape[1] - (not hasattr(moved, "model"))     # behind it the velocity
         covariance = moved.covariance[0, :r, :r].astype(float)
         return moved.mean[0, :r].astype(float), lambda X: covariance @ X
-    if isinstance(moved, KalmanFilter):
-        return moved.mean, moved.apply_covariance
-    mean = moved.concentration if hasattr(moved, "concentration") else moved.mean
-    return mean, lambda X: moved.covariance[:n, :n] @ X
+    return moved.concentration, lambda X: moved.covariance.times(X)[:n]
 
 
 @pytest.mark.parametrize(("name", "estimator"), [

@@ -1,8 +1,6 @@
 """Choosing injections where the mean velocity drifts and only a region counts."""
 
 import dataclasses
-import importlib.util
-from pathlib import Path
 
 import eitbench
 import gymnasium as gym
@@ -13,7 +11,7 @@ from eitbench.data.cache import CACHE_VARIABLE
 from eitbench.data.recordings import cycle_voltages, outline, recording
 from eitbench.data.regions import integrals, make_integrals, mass_between, score_mass
 from eitbench.envs.injection_core import scaled
-from eitbench.estimation import LinearisedObservations
+from eitbench.estimation import Filter, about_reference, velocity_states
 from eitbench.estimation.onboard import joint_operator
 from eitbench.estimation.onboard.belief import Belief
 from eitbench.estimation.onboard.operator import electrode_pairs
@@ -25,8 +23,6 @@ from eitbench.worlds.task import make_task
 from choosing import FLOW, NAME, filter_of, make, some_pairs
 from short import WANDERING
 
-ROOT = Path(__file__).parents[2]
-BASELINE = ROOT / "baselines" / "joint_extended_kalman_filter.py"
 WALK = 0.1
 """m/s a time step, of the world and of the estimators' belief."""
 
@@ -163,29 +159,21 @@ def test_full_operator_is_the_joint_filter_of_the_baselines():
     task = env.task
     pairs = electrode_pairs(16).tolist()
     env.reset(seed=5)
-    spec = importlib.util.spec_from_file_location("joint", BASELINE)
-    baseline = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(baseline)
-    baseline.BOUNDS = joint_operator.BOUNDS
-    estimator = baseline.Estimator(task)
-    estimator.first.c_bh = level = filter_of(env).concentration[0]
-    filter_ = estimator.start(level)
-    nodes = np.full(task.mesh.n_nodes, level)
-    linear = LinearisedObservations(task.observation, task.noise, nodes)
+    level = filter_of(env).concentration[0]
+    filter_ = Filter(velocity_states(task, level, joint_operator.BOUNDS), about_reference(task, level))
     for t, voltages in enumerate(cycle_voltages(world, 5, recording(world, 5))):
         current = world.currents[t % 16]
-        filter_.predict()
-        step = filter_.update(linear(voltages, current))
+        filter_.assimilate(voltages, current)
         if t < 16:
             continue
         action = pairs.index([int(current.argmax()), int(current.argmin())])
         seen = env.step(action)[0]
         means, spreads = env.core.estimate()
-        np.testing.assert_allclose(means[0], step.mean, rtol=1e-7)
-        np.testing.assert_allclose(spreads[0]**2, step.variance, rtol=1e-5, atol=1e-9)
-        np.testing.assert_allclose(seen["velocity"], step.parameters, rtol=1e-7)
-        variance = step.parameter_covariance.diagonal()
-        np.testing.assert_allclose(seen["velocity_std"]**2, variance, rtol=1e-6)
+        expected = filter_.estimate()
+        np.testing.assert_allclose(means[0], expected.mean, rtol=1e-7)
+        np.testing.assert_allclose(spreads[0]**2, expected.variance, rtol=1e-5, atol=1e-9)
+        np.testing.assert_allclose(seen["velocity"], expected.velocity, rtol=1e-7)
+        np.testing.assert_allclose(seen["velocity_std"]**2, expected.velocity_variance, rtol=1e-6)
 
 
 def test_observation_shows_the_velocity(env):

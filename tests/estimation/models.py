@@ -104,12 +104,12 @@ def rauch_tung_striebel(model, steps):
 
 
 def stacked(models, observations):
-    """States x₁ … x_T given all measurements, from their joint Gaussian without any recursion: [Gaussian] for t = 1 … T.
+    """States x₁ … x_T given all measurements, [Gaussian], from their joint Gaussian without any recursion.
 
-    ``models`` are of the step to each t, the first with the state at t = 0; correlated errors are those of `noise_root`.
+    ``models`` are of the step to each t, the first with the state at t = 0.
     """
     n, T = len(models[0].mean), len(observations)
-    # x = A (offset + w), where A holds products of transitions and w the independent noises, x₀ being the first.
+    # x = A (offset + w): A holds products of transitions and w the independent noises, x₀ being the first.
     back = np.zeros(((T + 1) * n, (T + 1) * n))
     noise = np.zeros_like(back)
     noise[:n, :n] = models[0].covariance

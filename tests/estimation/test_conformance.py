@@ -225,10 +225,10 @@ def test_gate(form):
     assert_close(run(wide, seen).mean, run(plain, seen).mean, 1e-15)
     gated.predict()
     before = gated.mean.copy()
-    far = seen[0]._replace(value=seen[0].value + [1e4, 0.0, 1e4, 0.0])
+    far = seen[0]._replace(value=seen[0].value + 1e4 * np.eye(4)[[0, 2]].sum(axis=0))
     assert not gated.update(far).accepted.any()
     np.testing.assert_array_equal(gated.mean, before)
-    one = seen[0]._replace(value=seen[0].value + [0.0, 1e4, 0.0, 0.0])
+    one = seen[0]._replace(value=seen[0].value + 1e4 * np.eye(4)[1])
     np.testing.assert_array_equal(gated.update(one).accepted, [True, False, True, True])
 
 

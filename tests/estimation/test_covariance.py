@@ -40,7 +40,7 @@ def recursion(model):
 
 
 def test_open_loop_covariance_is_the_dense_recursion(model):
-    """Π_t X and the variances, in any order; its limit solves the Lyapunov equation; a coarse tolerance loses that part."""
+    """Π_t X and variances in any order; the limit solves the Lyapunov equation; a coarse tolerance loses that part."""
     covariance, X = open_loop(model), np.random.default_rng(1).normal(size=(14, 4))
     coarse, off = open_loop(model, tolerance=1e-4), []
     for t, P in reversed(recursion(model)):
@@ -88,7 +88,7 @@ def test_variances_are_never_negative():
 
 @pytest.mark.parametrize("covariance", [np.ones((3, 2)), np.ones(3), np.full((3, 3), np.inf)])
 def test_errors_name_the_argument(covariance):
-    with pytest.raises(ValueError, match="^covariance"):
+    with pytest.raises(ValueError, match=r"^covariance"):
         DenseCovariance(covariance)
 
 
@@ -133,7 +133,8 @@ def test_filter_is_consistent_on_its_own_model():
 def test_linearised_observation_is_the_tangent():
     """V − R(c*) + J c* = J c + v: near c* the misfit of the tangent is of second order."""
     rng = np.random.default_rng(8)
-    model, point, current, voltages = QuadraticModel(rng), rng.uniform(1.0, 2.0, 6), rng.normal(size=4), rng.normal(size=4)
+    model, point, current = QuadraticModel(rng), rng.uniform(1.0, 2.0, 6), rng.normal(size=4)
+    voltages = rng.normal(size=4)
     noise = VoltageNoise(0.01, 0.001)
     J, value, variance, _ = linearised(model, noise, point, voltages, current)
     at_point = model.voltages(point, current[None])[0]

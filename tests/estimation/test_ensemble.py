@@ -6,7 +6,15 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from eitbench.estimation import EnsembleFilter, InflowFilter, Observation, UnknownFlow, inflow_response
+from eitbench.estimation import (
+    EnsembleFilter,
+    Filter,
+    InflowWindow,
+    Observation,
+    UnknownFlow,
+    about_prediction,
+    inflow_response,
+)
 from eitbench.numerics.mesh import rectangle_mesh
 from eitbench.physics.transport import ConvectionDiffusion
 from eitbench.worlds.task import make_task
@@ -17,7 +25,6 @@ from tiny_worlds import TINY
 R, LEVEL = 0.05, 29.0
 MESH = rectangle_mesh(np.linspace(0.0, 0.4, 17), np.linspace(-R, R, 5))
 """85 nodes, five at the inlet."""
-BOUNDS = (0.05, 4.0)
 
 
 def parabola(points):
@@ -41,7 +48,8 @@ def prior(link):
 def ensemble(link="logarithm", members=40, std=0.5, lead_in=24):
     flow = UnknownFlow(transport_at, [parabola], np.array([4.5]), np.array([std]), np.array([0.1 * std]),
                        np.ones((1, 1)))
-    return EnsembleFilter(task(), prior(link), LEVEL, flow, members, lead_in, np.random.default_rng(0), BOUNDS)
+    return EnsembleFilter(task(), prior(link), LEVEL, flow, members, lead_in, np.random.default_rng(0),
+                          about_prediction(task()))
 
 
 def observation(seed=5, m=6, variance=0.1):
@@ -62,7 +70,9 @@ def test_a_measurement_is_the_kalman_update_of_the_members_moments():
     filter_.predict()
     before = together(filter_)
     seen = observation()
-    innovation, covariance = filter_.take_in(seen)
+    filter_.update(seen)
+    estimate = filter_.estimate()
+    innovation, covariance = estimate.innovation, estimate.innovation_covariance
     n = len(MESH.points)
     P = np.cov(before)
     S = seen.matrix @ P[:n, :n] @ seen.matrix.T + np.diag(seen.noise_variance)
@@ -73,7 +83,7 @@ def test_a_measurement_is_the_kalman_update_of_the_members_moments():
     after = together(filter_)
     np.testing.assert_allclose(after.mean(axis=1), before.mean(axis=1) + gain @ expected, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(np.cov(after), P - gain @ S @ gain.T, atol=1e-9 * np.abs(P).max())
-    np.testing.assert_allclose(filter_.state().variance, np.cov(after).diagonal()[:n], rtol=1e-9)
+    np.testing.assert_allclose(estimate.variance, np.cov(after).diagonal()[:n], rtol=1e-9)
 
 
 def test_members_move_with_their_own_flow():
@@ -95,14 +105,14 @@ def test_many_members_give_the_kalman_filter(monkeypatch):
     measurements the mean to a tenth (rms) of how far it has moved, variances to 15 %, five standard errors of 2,000."""
     monkeypatch.setattr(inflow_response, "FORGOTTEN", 1e-6)
     filter_ = ensemble("linear", 2000, std=0.0, lead_in=60)
-    exact = InflowFilter(task(), prior("linear"), LEVEL)
+    exact = Filter(InflowWindow(task(), prior("linear"), LEVEL))
     for seed in range(4):
         for each in (filter_, exact):
             each.predict()
         seen = observation(seed, m=2, variance=1.0)
-        filter_.take_in(seen)
-        exact.take_in(seen, exact.concentration())
-    ours, theirs = filter_.state(), exact.state()
+        filter_.update(seen)
+        exact.update(seen)
+    ours, theirs = filter_.estimate(), exact.estimate()
     assert np.linalg.norm(ours.mean - theirs.mean) < 0.1 * np.linalg.norm(theirs.mean - LEVEL)
     np.testing.assert_allclose(ours.variance, theirs.variance, rtol=0.15)
     np.testing.assert_array_equal(filter_.parameters, 4.5)
@@ -113,4 +123,4 @@ def test_mistakes_are_told():
         ensemble(members=1)
     with pytest.raises(ValueError, match="the prior must be of the task's inlet"):
         EnsembleFilter(make_task(TINY), prior("linear"), LEVEL, ensemble().flow, 10, 2, np.random.default_rng(0),
-                       BOUNDS)
+                       about_prediction(task()))

@@ -1,6 +1,7 @@
 """A model that training episodes have shown: against episodes it never saw, against one Gaussian conditioned at once,
 and against the density that it stands for."""
 
+import copy
 from dataclasses import replace
 from functools import lru_cache
 
@@ -11,15 +12,16 @@ from eitbench.data.seeds import parse_seeds
 from eitbench.estimation import (
     FirstFrame,
     IdentifiedModel,
-    InflowFilter,
+    Observation,
     QuadraticVoltages,
     identified_model,
+    inflow_filter,
+    linearised,
     most_probable_inflow,
     smoothed_inflow,
     steady_response,
     suiting_models,
 )
-from eitbench.estimation.kalman import Observation, linearised
 from eitbench.worlds.catalogue import PIPE_2D
 from eitbench.worlds.task import make_task
 from models import tiny_task as task
@@ -139,23 +141,24 @@ def test_filter_linearises_once_if_the_model_says_so():
     """Two measurements: the innovations and their covariance are those of voltages linearised about the level, with the
     model's error in place of the noise."""
     (example,) = examples("train:0")
-    filter_ = InflowFilter(task(), prior(), LEVEL, model=once())
+    filter_ = inflow_filter(task(), prior(), LEVEL, model=once())
     level = np.full(task().mesh.n_nodes, LEVEL)
     for voltages, currents in zip(example.voltages[:2], example.currents[:2], strict=True):
-        filter_.predict()
+        before = copy.deepcopy(filter_.mean), filter_.covariance.copy()
+        step = filter_.assimilate(voltages, currents)
+        mean, covariance = filter_.space.propagate(*before, filter_.time)
         at = linearised(task().observation, task().noise, level, voltages, currents)
         std = np.sqrt(at.noise_variance)
-        slope = filter_.by_inflow(at.matrix)
-        known = filter_.covariance[:slope.shape[1], :slope.shape[1]]
+        slope = filter_.space.jacobian(mean, at.matrix)
+        known = covariance.array[:slope.shape[1], :slope.shape[1]]
         flow = LEVEL * at.matrix @ once().basis
         number = int(np.flatnonzero(np.isclose(once().patterns, currents).all(axis=1))[0])
         S = (slope @ known @ slope.T + flow @ once().spread @ flow.T + std[:, None] * once().scatter[number] * std)
-        expected = at.value - at.matrix @ filter_.concentration() - std * once().bias[number]
-        told = filter_.update(voltages, currents)
-        np.testing.assert_allclose(told.covariance, S, rtol=1e-9, atol=1e-12 * S.max())
-        np.testing.assert_allclose(told.value, expected, atol=1e-12)
-    with pytest.raises(ValueError, match="smoother must have a model whose voltages are linearised anew"):
-        most_probable_inflow(filter_, [])
+        expected = at.value - at.matrix @ filter_.space.concentration(mean) - std * once().bias[number]
+        np.testing.assert_allclose(step.innovation_covariance, S, rtol=1e-9, atol=1e-12 * S.max())
+        np.testing.assert_allclose(step.innovation, expected, atol=1e-12)
+    with pytest.raises(ValueError, match="model must have voltages that are linearised anew"):
+        most_probable_inflow(filter_, task(), [], once())
 
 
 def test_learns_from_train_alone():
@@ -170,15 +173,16 @@ def test_learns_from_train_alone():
 def test_filter_is_gaussian_conditioning():
     """Three measurements of linear inflows, whose states are off by independent errors of its spread."""
     linear = replace(prior(), link="linear")
-    filter_ = InflowFilter(task(), linear, LEVEL, model=model())
+    filter_ = inflow_filter(task(), linear, LEVEL, model=model())
     random = np.random.default_rng(3)
     n = task().mesh.n_nodes
     noise = np.array([0.01, 0.02, 0.1])
     seen = [Observation(random.normal(size=(3, n)) / n, LEVEL + 0.3 * random.normal(size=3), noise) for _ in range(3)]
     for observation in seen:
         filter_.predict()
-        told = filter_.take_in(observation, filter_.concentration())
-    K, r = filter_.memory, filter_.mean.shape[1]
+        root = LEVEL * observation.matrix @ model().root
+        step = filter_.update(observation._replace(noise_root=root))
+    K, r = filter_.space.memory, filter_.space.modes
     basis, weights = model().response
     part = LEVEL * basis @ (weights @ linear.modes).reshape(len(weights), -1)
     G = np.zeros((3, n, (3 + K - 1) * r))
@@ -194,38 +198,34 @@ def test_filter_is_gaussian_conditioning():
         S[here, here] += off + np.diag(o.noise_variance)
     gain = np.linalg.solve(S, H @ covariance).T
     rest = covariance - gain @ H @ covariance
-    state = filter_.state()
+    state = filter_.estimate()
     np.testing.assert_allclose(state.mean, LEVEL + G[-1] @ gain @ y, atol=1e-4 * LEVEL)
     variance = np.einsum("ij,jk,ik->i", G[-1], rest, G[-1])
     variance += LEVEL**2 * np.einsum("ij,jk,ik->i", basis, model().spread, basis)
     np.testing.assert_allclose(state.variance, variance, atol=1e-4 * variance.max())
     Sb = S[6:, 6:] - S[6:, :6] @ np.linalg.solve(S[:6, :6], S[:6, 6:])
-    np.testing.assert_allclose(told.covariance, Sb, atol=1e-3 * Sb.max())
+    np.testing.assert_allclose(step.innovation_covariance, Sb, atol=1e-3 * Sb.max())
 
 
-def surprise(filter_, before, covariance, x, voltages, currents):
+def surprise(space, before, covariance, x, voltages, currents):
     """−2 ln of the density of the newest inflows x given what was known before, and the readings."""
-    away = (x - before).ravel()
-    filter_.mean = x
-    observation = linearised(task().observation, task().noise, filter_.concentration(), voltages, currents)
-    predicted = observation.matrix @ filter_.concentration()
-    off = (observation.value - predicted) / np.sqrt(observation.noise_variance)
-    return away @ np.linalg.solve(covariance, away) + (off**2).sum()
+    concentration = space.concentration(x)
+    observation = linearised(task().observation, task().noise, concentration, voltages, currents)
+    off = (observation.value - observation.matrix @ concentration) / np.sqrt(observation.noise_variance)
+    return (x - before) @ np.linalg.solve(covariance, x - before) + (off**2).sum()
 
 
 def test_a_second_linearisation_is_nearer_to_the_most_probable():
     """Of the inflows given one measurement; and the innovation is the first one's."""
     (example,) = examples("train:0")
-    once, again = (InflowFilter(task(), prior(), LEVEL) for _ in range(2))
-    for filter_ in (once, again):
-        filter_.predict()
-    before, covariance = once.mean.copy(), once.covariance.copy()
-    first = once.update(example.voltages[0], example.currents[0])
-    second = again.update_again(example.voltages[0], example.currents[0])
-    np.testing.assert_array_equal(first.value, second.value)
-    np.testing.assert_array_equal(first.covariance, second.covariance)
-    values = [surprise(InflowFilter(task(), prior(), LEVEL), before, covariance, filter_.mean, example.voltages[0],
-                       example.currents[0]) for filter_ in (once, again)]
+    filters = [inflow_filter(task(), prior(), LEVEL, iterated=iterated) for iterated in (False, True)]
+    space = filters[0].space
+    before, covariance = space.propagate(*space.initial(), 1)
+    measurement = example.voltages[0], example.currents[0]
+    first, second = (each.assimilate(*measurement) for each in filters)
+    np.testing.assert_array_equal(first.innovation, second.innovation)
+    np.testing.assert_array_equal(first.innovation_covariance, second.innovation_covariance)
+    values = [surprise(space, before, covariance.array, each.mean, *measurement) for each in filters]
     assert values[1] < values[0]
 
 
@@ -235,13 +235,13 @@ def test_smoother_takes_out_the_mean_error():
     plain = replace(model(), bias=np.zeros_like(model().bias))
     first = list(zip(example.voltages, example.currents, strict=True))
     without = smoothed_inflow(task(), prior(), LEVEL, first, model=plain)
-    most_probable_inflow(without, first)
+    most_probable_inflow(without, task(), first, plain)
     last = len(first) - 1
-    stds = [task().noise.std(task().observation.voltages(without.concentration(last - t), I[None])[0])
+    stds = [task().noise.std(task().observation.voltages(without.estimate(last - t).mean, I[None])[0])
             for t, (_, I) in enumerate(first)]
     shifted = [(V + model().mean_error(I, std), I) for (V, I), std in zip(first, stds, strict=True)]
     with_error = smoothed_inflow(task(), prior(), LEVEL, shifted, model=model())
-    most_probable_inflow(with_error, shifted)
+    most_probable_inflow(with_error, task(), shifted, model())
     np.testing.assert_allclose(with_error.mean, without.mean, atol=0.02)
 
 

@@ -1,10 +1,9 @@
-"""The joint filter of concentration and velocity against the textbook, differences, and a known truth."""
+"""Concentration and velocity as one state against the textbook, differences, and a known truth."""
 
 import numpy as np
 import pytest
-from eitbench.estimation.joint import JointFilter
-from eitbench.estimation.kalman import Observation
-from models import MESH, LinearGaussian, averages, coarse_transport, dense_filter, directions, shapes
+from eitbench.estimation import Filter, Observation, UnknownFlow, VelocityStates
+from models import MESH, averages, coarse_transport, directions, shapes
 
 C_BH, N = 30.0, 147
 NOMINAL, STD = np.array([4.5, 0.0, 0.0]), np.array([1.0, 2.0, 0.5])
@@ -25,11 +24,17 @@ def nodal_noise():
 
 
 def joint_filter(k=1, **changes):
-    settings = {"mean": np.full(N, C_BH), "covariance": 50.0 * np.eye(N), "parameters": NOMINAL[:k],
-                "parameter_covariance": np.diag(STD[:k]**2), "walk_std": np.full(k, 0.02), "inflow": C_BH,
-                "inflow_std": C_BH / 4, "nodal_noise": nodal_noise(), "profiles": shapes(k),
-                "bounds": (0.01, 4.0)} | changes
-    return JointFilter(transport_at, directions(k), **settings)
+    given = {"start": NOMINAL[:k], "start_std": STD[:k], "walk_std": np.full(k, 0.02), "profiles": shapes(k),
+             "bounds": (0.01, 4.0), "mean": np.full(N, C_BH), "covariance": 50.0 * np.eye(N), "inflow": C_BH,
+             "inflow_std": C_BH / 4, "nodal_noise": nodal_noise()} | changes
+    flow = UnknownFlow(transport_at, directions(k), *(given.pop(name) for name in (
+        "start", "start_std", "walk_std", "profiles", "bounds")))
+    return Filter(VelocityStates(flow, **given))
+
+
+def theta_of(filter_):
+    """Present parameters and their variances."""
+    return filter_.space.velocity(filter_.mean, filter_.covariance)
 
 
 def sensors(rng, m=16):
@@ -54,30 +59,10 @@ def textbook_update(mean, P, observation, k):
     return mean + K @ (observation.value - H @ mean), P - K @ H @ P, S
 
 
-def test_a_known_velocity_gives_the_kalman_filter():
-    """Γ_θ = 0 and no walk: twenty steps equal those of the textbook's linear filter to 1e-10, and θ stays."""
-    rng, theta = np.random.default_rng(1), np.array([4.0, 0.5, -0.3])
-    F, Y = transport_at(theta).transition()
-    model = LinearGaussian(F, Y.sum(axis=1) * C_BH, (C_BH / 4)**2 * Y @ Y.T + nodal_noise(), np.full(N, C_BH),
-                           50.0 * np.eye(N))
-    observations = [Observation(sensors(rng), C_BH + 5 * rng.normal(size=16), rng.uniform(0.01, 1.0, 16))
-                    for _ in range(20)]
-    filter_ = joint_filter(3, parameters=theta, parameter_covariance=np.zeros((3, 3)), walk_std=np.zeros(3))
-    for observation, (predicted, filtered) in zip(observations, dense_filter(model, observations), strict=True):
-        filter_.predict()
-        step = filter_.update(observation)
-        np.testing.assert_allclose(step.mean, filtered.mean, atol=1e-10 * C_BH)
-        np.testing.assert_allclose(step.variance, filtered.variance, atol=1e-10 * 50)
-        np.testing.assert_allclose(step.innovation, observation.value - observation.matrix @ predicted.mean,
-                                   atol=1e-10 * C_BH)
-        np.testing.assert_array_equal(step.parameters, theta)
-        np.testing.assert_array_equal(step.parameter_covariance, 0.0)
-
-
 def test_one_step_is_that_of_the_textbook():
     """Predict and update with full matrices [[F, ∂c⁺/∂θ], [0, I]] put together here: mean and covariance to 1e-10."""
     filter_, observation = started(np.random.default_rng(2))
-    c, theta, P = filter_.concentration.copy(), filter_.parameters.copy(), filter_.covariance.copy()
+    c, theta, P = filter_.mean[:N].copy(), filter_.mean[N:].copy(), filter_.covariance.array.copy()
     transport = transport_at(theta)
     F, Y = transport.transition()
     after, by_theta = transport.velocity_derivatives(c, c[:7], C_BH, directions(3))
@@ -89,16 +74,16 @@ def test_one_step_is_that_of_the_textbook():
 
     filter_.predict()
     np.testing.assert_allclose(filter_.concentration, F @ c + Y @ np.full(7, C_BH), atol=1e-10 * C_BH)
-    np.testing.assert_array_equal(filter_.parameters, theta)
-    np.testing.assert_allclose(filter_.covariance, P, atol=1e-10 * P.max())
+    np.testing.assert_array_equal(theta_of(filter_)[0], theta)
+    np.testing.assert_allclose(filter_.covariance.array, P, atol=1e-10 * P.max())
 
     mean, P, S = textbook_update(mean, P, observation, 3)
     assert 0.01 < (relative(3) @ mean[N:]).min() < (relative(3) @ mean[N:]).max() < 4.0  # nothing to be held back
     step = filter_.update(observation)
-    np.testing.assert_allclose(np.concatenate([step.mean, step.parameters]), mean, atol=1e-10 * C_BH)
-    np.testing.assert_allclose(filter_.covariance, P, atol=1e-10 * P.max())
-    np.testing.assert_allclose(step.variance, P.diagonal()[:N], atol=1e-10 * P.max())
-    np.testing.assert_allclose(step.parameter_covariance, P[N:, N:], atol=1e-10 * P.max())
+    np.testing.assert_allclose(step.mean, mean, atol=1e-10 * C_BH)
+    np.testing.assert_allclose(filter_.covariance.array, P, atol=1e-10 * P.max())
+    np.testing.assert_allclose(filter_.variance, P.diagonal()[:N], atol=1e-10 * P.max())
+    np.testing.assert_allclose(theta_of(filter_)[1], P.diagonal()[N:], atol=1e-10 * P.max())
     np.testing.assert_allclose(step.innovation_covariance, S, atol=1e-10 * S.max())
 
 
@@ -109,20 +94,20 @@ def test_covariance_moves_with_the_derivative_of_the_prediction():
     quiet = {"nodal_noise": np.zeros((N, N)), "inflow_std": 0.0, "walk_std": np.zeros(k)}
 
     def predicted(state):
-        filter_ = joint_filter(k, mean=state[:N], parameters=state[N:], **quiet)
+        filter_ = joint_filter(k, mean=state[:N], start=state[N:], **quiet)
         filter_.predict()
-        return np.concatenate([filter_.concentration, filter_.parameters])
+        return filter_.mean
 
     start = np.concatenate([c, theta])
     A = np.stack([(predicted(start + e) - predicted(start - e)) / (2 * h) for e in h * np.eye(N + k)], axis=1)
-    root, spread = rng.normal(size=(N, N)), np.diag([1.0, 0.5, 0.2])
-    filter_ = joint_filter(k, mean=c, parameters=theta, covariance=root @ root.T / N, parameter_covariance=spread,
+    root = rng.normal(size=(N, N))
+    filter_ = joint_filter(k, mean=c, start=theta, covariance=root @ root.T / N, start_std=np.array([1.0, 0.7, 0.4]),
                            **quiet)
-    before = filter_.covariance.copy()
+    before = filter_.covariance.array.copy()
     filter_.predict()
     expected = A @ before @ A.T
     assert np.abs(expected[:N, N:]).max() > 0.1                                         # the velocity shows
-    np.testing.assert_allclose(filter_.covariance, expected, atol=1e-7 * np.abs(expected).max())
+    np.testing.assert_allclose(filter_.covariance.array, expected, atol=1e-7 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("truth", [[3.2], [5.8], [4.0, 1.2, 0.4]], ids=["slow", "fast", "skew"])
@@ -136,8 +121,9 @@ def test_velocity_is_found(truth):
         c = transport.step(c, c[:7], C_BH + C_BH / 4 * rng.normal(size=7))
         H = sensors(rng)
         filter_.predict()
-        step = filter_.update(Observation(H, H @ c + 0.3 * rng.normal(size=16), np.full(16, 0.09)))
-    miss, std = step.parameters - truth, np.sqrt(step.parameter_covariance.diagonal())
+        filter_.update(Observation(H, H @ c + 0.3 * rng.normal(size=16), np.full(16, 0.09)))
+    theta, variance = theta_of(filter_)
+    miss, std = theta - truth, np.sqrt(variance)
     assert (np.abs(miss) < 3 * std).all()
     assert (std < 0.1).all()
     assert np.linalg.norm(shapes(k) @ miss) < 0.05 * np.linalg.norm(shapes(k) @ truth)
@@ -149,30 +135,30 @@ def test_velocity_stays_within_its_bounds(k, far):
     """Where a measurement says otherwise, θ stops at the bound on the line from θ_0; c moves as if there were none."""
     filter_, observation = started(np.random.default_rng(5), k)
     filter_.predict()
-    mean, P = np.concatenate([filter_.concentration, filter_.parameters]), filter_.covariance.copy()
+    mean, P = filter_.mean.copy(), filter_.covariance.array.copy()
     # What must be measured so that the mean velocity would become ``far``.
     expected, push = observation.matrix @ mean[:N], observation.matrix @ P[:N, N]
     gained = textbook_update(mean, P, observation._replace(value=expected + push), k)[0][N] - mean[N]
     observation = observation._replace(value=expected + push * (far - mean[N]) / gained)
     free = textbook_update(mean, P, observation, k)[0]
     assert free[N] == pytest.approx(far)
-    step = filter_.update(observation)
-    speed = relative(k) @ step.parameters
+    filter_.update(observation)
+    theta = theta_of(filter_)[0]
+    speed = relative(k) @ theta
     assert min(abs(speed.min() - 0.01), abs(speed.max() - 4.0)) < 1e-9                  # at one of the bounds
     assert speed.min() > 0.01 - 1e-9
     assert speed.max() < 4.0 + 1e-9
-    part = (step.parameters - NOMINAL[:k]) @ (free[N:] - NOMINAL[:k]) / ((free[N:] - NOMINAL[:k])**2).sum()
+    part = (theta - NOMINAL[:k]) @ (free[N:] - NOMINAL[:k]) / ((free[N:] - NOMINAL[:k])**2).sum()
     assert 0.0 < part < 1.0
-    np.testing.assert_allclose(step.parameters, NOMINAL[:k] + part * (free[N:] - NOMINAL[:k]), atol=1e-9)
-    np.testing.assert_allclose(step.mean, free[:N], atol=1e-9 * np.abs(free).max())
-    np.testing.assert_array_equal(filter_.parameters, step.parameters)
+    np.testing.assert_allclose(theta, NOMINAL[:k] + part * (free[N:] - NOMINAL[:k]), atol=1e-9)
+    np.testing.assert_allclose(filter_.concentration, free[:N], atol=1e-9 * np.abs(free).max())
     filter_.predict()                                                                   # it goes on from there
     assert np.isfinite(filter_.concentration).all()
 
 
 @pytest.mark.parametrize(("changes", "name"), [
     ({"mean": np.zeros((N, 1))}, "^mean"), ({"covariance": np.eye(N - 1)}, "^covariance"),
-    ({"parameters": np.array([4.5, 0.0])}, "^parameters"), ({"parameters": np.array([np.nan])}, "^parameters"),
+    ({"start": np.array([4.5, 0.0])}, "^start"), ({"start": np.array([np.nan])}, "^start"),
     ({"inflow_std": -1.0}, "^inflow_std"), ({"nodal_noise": np.ones(N)}, "^nodal_noise"),
     ({"profiles": np.ones((5, 2))}, "^profiles"), ({"profiles": np.zeros((5, 1))}, "^profiles"),
     ({"bounds": (0.0, 5.0)}, "^bounds"), ({"bounds": (0.1, 0.9)}, "^bounds"), ({"bounds": (1.5, 2.0)}, "^bounds"),

@@ -7,13 +7,12 @@ from functools import lru_cache
 import numpy as np
 import pytest
 from eitbench.estimation import (
-    InflowFilter,
-    JointFilter,
-    JointInflowFilter,
+    Filter,
     Observation,
     UnknownFlow,
+    VelocityInflowWindow,
+    VelocityStates,
     asked_flow,
-    inflow_response,
     scaled_flow,
 )
 from eitbench.worlds.catalogue import PIPE_2D_SKEWED, STATIONARY_TANK_2D
@@ -23,7 +22,6 @@ from models import MESH, averages, coarse_transport, directions, shapes, two_mod
 from tiny_worlds import TINY
 
 LEVEL, N = 29.0, 147
-BOUNDS = (0.05, 4.0)
 
 
 DIRECTIONS = directions(2)
@@ -36,6 +34,15 @@ def transport_at(theta):
 def flow(std=(1.0, 2.0), walk=(0.05, 0.02)):
     """v = θ_1 v_1 + θ_2 v_2 with a mean of 4.5 m/s at first, which passes the pipe in 18 steps."""
     return UnknownFlow(transport_at, DIRECTIONS, np.array([4.5, 0.0]), np.array(std), np.array(walk), shapes(2))
+
+
+def started(belief, window, law=None):
+    return Filter(VelocityInflowWindow(task(), law or prior(), LEVEL, belief, window))
+
+
+def theta_of(filter_):
+    """Present parameters and their variances."""
+    return filter_.space.velocity(filter_.mean, filter_.covariance)
 
 
 @lru_cache(maxsize=1)
@@ -74,15 +81,15 @@ def test_concentration_and_derivatives_are_those_of_the_transport():
     """Four steps from other inflows than the expected ones: the concentration to 1e-10, and its derivatives by inflows
     and by the velocity of each step to 1e-6 of the largest, by central differences."""
     W, steps, h = 12, 4, 1e-4
-    filter_ = JointInflowFilter(task(), prior(), LEVEL, flow(), W, BOUNDS)
-    start = filter_.mean.copy()
+    filter_ = started(flow(), W)
+    start = filter_.mean.reshape(W, 4).copy()
     start[:, :2] = 0.5 * np.random.default_rng(1).standard_normal((W, 2))
-    filter_.mean = start.copy()
+    filter_.mean = start.ravel()
     for _ in range(steps):
         filter_.predict()
-    z = np.concatenate([start[::-1], filter_.mean[:steps][::-1]])
-    near(filter_.concentration(), stepped(z, steps), 1e-10)
-    slope = filter_.slope().reshape(N, W, 4)
+    z = np.concatenate([start[::-1], filter_.mean.reshape(W, 4)[:steps][::-1]])
+    near(filter_.concentration, stepped(z, steps), 1e-10)
+    slope = filter_.space.jacobian(filter_.mean, np.eye(N)).reshape(N, W, 4)
     for k, part in [(0, 0), (3, 1), (6, 0), (0, 2), (0, 3), (1, 2), (3, 2), (3, 3)]:
         change = np.zeros_like(z)
         change[-1 - k, part] = h
@@ -91,51 +98,25 @@ def test_concentration_and_derivatives_are_those_of_the_transport():
         near(slope[:, k, part], difference, 1e-6)
 
 
-@pytest.mark.parametrize("link", ["linear", "logarithm"])
-def test_a_known_velocity_gives_the_filter_of_the_inflow(link, monkeypatch):
-    """Without any doubt of θ, where the other filter drops next to nothing: to 1e-4."""
-    monkeypatch.setattr(inflow_response, "FORGOTTEN", 1e-6)
-    monkeypatch.setattr(inflow_response, "DROPPED", 1e-7)
-    other = InflowFilter(task(), prior(link), LEVEL)
-    filter_ = JointInflowFilter(task(), prior(link), LEVEL, flow((0.0, 0.0), (0.0, 0.0)), other.window, BOUNDS)
-    for observation in observations(12):
-        other.predict()
-        filter_.predict()
-        theirs = other.take_in(observation, other.concentration())
-        ours = filter_.take_in(observation)
-        near(ours.value, theirs.value, 1e-4)
-        near(ours.covariance, theirs.covariance, 1e-4)
-    near(filter_.concentration() - LEVEL, other.concentration() - LEVEL, 1e-4)
-    near(filter_.state().variance, other.state().variance, 1e-4)
-    np.testing.assert_array_equal(filter_.parameters, [4.5, 0.0])
-    assert not filter_.parameter_covariance.any()
-
-
 def test_a_white_inflow_gives_the_joint_filter():
     """From the same covariance of c, of all inflows before, and with a constant velocity: means, covariances and
     innovations of ten steps to 1e-7, which is what inflows have left that fell out of the window. (Where θ walks, a
     step moves the fluid at once here, and one time step later there.)"""
     belief = flow(walk=(0.0, 0.0))
-    filter_ = JointInflowFilter(task(), white_inflow(task()), LEVEL, belief, 90, BOUNDS)
-    slope = filter_.slope()
-    joint = JointFilter(transport_at, DIRECTIONS, mean=np.full(N, LEVEL),
-                        covariance=slope @ filter_.covariance @ slope.T, parameters=belief.start,
-                        parameter_covariance=np.diag(belief.start_std**2), walk_std=belief.walk_std, inflow=LEVEL,
-                        inflow_std=task().prior.inflow_std * LEVEL, nodal_noise=np.zeros((N, N)),
-                        profiles=belief.profiles, bounds=BOUNDS)
+    filter_ = started(belief, 90, white_inflow(task()))
+    slope = filter_.space.jacobian(filter_.mean, np.eye(N))
+    joint = Filter(VelocityStates(belief, np.full(N, LEVEL), slope @ filter_.covariance.array @ slope.T, inflow=LEVEL,
+                                  inflow_std=task().prior.inflow_std * LEVEL, nodal_noise=np.zeros((N, N))))
     for observation in observations(10):
-        filter_.predict()
-        joint.predict()
-        ours = filter_.take_in(observation)
-        theirs = joint.update(observation)
-        state = filter_.state()
-        near(ours.value, theirs.innovation, 1e-7)
-        near(ours.covariance, theirs.innovation_covariance, 1e-7)
-        near(state.mean, theirs.mean, 1e-7)
-        near(state.variance, theirs.variance, 1e-7)
-        near(filter_.parameters, theirs.parameters, 1e-7)
-        near(filter_.parameter_covariance, theirs.parameter_covariance, 1e-7)
-    assert np.linalg.norm(filter_.parameters - belief.start) > 0.1
+        found = []
+        for each in (filter_, joint):
+            each.predict()
+            step = each.update(observation)
+            found.append([step.innovation, step.innovation_covariance, each.concentration, each.variance,
+                          *theta_of(each)])
+        for ours, theirs in zip(*found, strict=True):
+            near(ours, theirs, 1e-7)
+    assert np.linalg.norm(theta_of(filter_)[0] - belief.start) > 0.1
 
 
 @pytest.mark.parametrize("truth", [[3.4, 0.0], [5.0, 1.2]], ids=["slow", "skew"])
@@ -144,7 +125,7 @@ def test_velocity_is_found(truth):
     random = np.random.default_rng(3)
     process = np.linalg.cholesky(np.array([[prior().time_covariance(80)[abs(i - j)] for i in range(80)]
                                            for j in range(80)])) @ random.standard_normal((80, 2))
-    filter_ = JointInflowFilter(task(), prior(), LEVEL, flow(walk=(0.0, 0.0)), 30, BOUNDS)
+    filter_ = started(flow(walk=(0.0, 0.0)), 30)
     transport = transport_at(truth)
     c, before = np.full(N, LEVEL), LEVEL
     for t, x in enumerate(process):
@@ -155,26 +136,28 @@ def test_velocity_is_found(truth):
             continue
         (seen,) = observations(1, seed=t)
         filter_.predict()
-        filter_.take_in(seen._replace(value=seen.matrix @ c + 0.3 * random.normal(size=len(seen.value))))
-    off, std = filter_.parameters - truth, np.sqrt(filter_.parameter_covariance.diagonal())
+        filter_.update(seen._replace(value=seen.matrix @ c + 0.3 * random.normal(size=len(seen.value))))
+    theta, variance = theta_of(filter_)
+    off, std = theta - truth, np.sqrt(variance)
     assert (np.abs(off) < 3 * std).all()
     assert np.linalg.norm(off) < 0.05 * np.linalg.norm(truth)
 
 
 def test_velocity_stays_within_its_bounds():
     """A measurement that says the fluid flows back moves the velocity to the least that is possible."""
-    filter_ = JointInflowFilter(task(), prior(), LEVEL, flow((3.0, 0.0), (0.05, 0.0)), 12, BOUNDS)
+    filter_ = started(flow((3.0, 0.0), (0.05, 0.0)), 12)
     for observation in observations(4):
         filter_.predict()
-        filter_.take_in(observation)
+        filter_.update(observation)
     filter_.predict()
     (observation,) = observations(1, seed=8)
-    by_theta = filter_.slope(observation.matrix) @ filter_.covariance[:, 2]     # how readings vary with θ_1
-    value = observation.matrix @ filter_.concentration() - 1e3 * by_theta
-    filter_.take_in(observation._replace(value=value))
-    assert filter_.parameters[0] == pytest.approx(0.05 * 4.5)
+    slope = filter_.space.jacobian(filter_.mean, observation.matrix)
+    by_theta = slope @ filter_.covariance.array[:, 2]                           # how readings vary with θ_1
+    value = observation.matrix @ filter_.concentration - 1e3 * by_theta
+    filter_.update(observation._replace(value=value))
+    assert theta_of(filter_)[0][0] == pytest.approx(0.05 * 4.5)
     filter_.predict()
-    assert np.isfinite(filter_.concentration()).all()
+    assert np.isfinite(filter_.concentration).all()
 
 
 def test_flows_of_a_task():
@@ -200,8 +183,8 @@ def test_what_does_not_fit_is_told():
     with pytest.raises(ValueError, match=r"profiles must give a positive velocity with start, got -4\.5"):
         replace(flow(), profiles=-np.ones((3, 2)))
     with pytest.raises(ValueError, match="window"):
-        JointInflowFilter(task(), prior(), LEVEL, flow(), 0, BOUNDS)
+        started(flow(), 0)
     with pytest.raises(ValueError, match="bounds must be a range"):
-        JointInflowFilter(task(), prior(), LEVEL, flow(), 12, (0.5, 0.9))
+        replace(flow(), bounds=(0.5, 0.9))
     with pytest.raises(ValueError, match="the prior must be of the task's inlet"):
-        JointInflowFilter(make_task(TINY), prior(), LEVEL, flow(), 12, BOUNDS)
+        VelocityInflowWindow(make_task(TINY), prior(), LEVEL, flow(), 12)

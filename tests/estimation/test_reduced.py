@@ -48,7 +48,7 @@ def test_three_records_side_by_side_are_the_textbook(world):
         for t, (predicted, now) in enumerate(dense_filter(model, record)):
             assert_close(means[t, b], now.mean, 1e-10)
             assert_close(covariances[t, b], now.covariance, 1e-10)
-            H, value, variance = record[t]
+            H, value, variance, _ = record[t]
             assert_close(innovations[t, b], value - H @ predicted.mean, 1e-10)
             assert_close(S[t, b], (H @ predicted.covariance @ H.T).diagonal() + variance, 1e-10)
 
@@ -74,7 +74,7 @@ def test_in_all_directions_it_is_the_full_filter(world):
     assert_close(basis.T @ mass @ basis, np.eye(14), 1e-10)
     assert np.abs(np.tril(reduced.transition, -2)).max() == 0.0
     filter_ = ReducedFilter(reduced, np.zeros((1, 14)), reduced.initial[None])
-    projected = [Observation(H @ basis, value, variance) for H, value, variance in record]
+    projected = [Observation(H @ basis, value, variance) for H, value, variance, _ in record]
     means, covariances, _, _ = run(filter_, [projected])
     for t, step in enumerate(kalman_filter(model.filter(), record)):
         assert_close(basis @ means[t, 0], step.mean, 1e-8)
@@ -88,7 +88,7 @@ def test_the_directions_are_those_in_which_the_filter_learns(world):
     for observation in records[0]:
         filter_.predict()
         filter_.update(observation)
-        learnt = learnt + filter_.known @ filter_.known.T
+        learnt = learnt + filter_.covariance.assimilated @ filter_.covariance.assimilated.T
     basis = reduced_model(model.filter(), np.eye(14), records[0], 5, skip=0).basis
     held = np.trace(basis.T @ learnt @ basis)
     assert held == pytest.approx(np.linalg.eigvalsh(learnt)[-5:].sum(), rel=1e-8)

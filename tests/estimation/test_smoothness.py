@@ -106,7 +106,7 @@ def filtered(order):
     for k in order:
         filter_.predict()
         filter_.update(observe(voltages[k], task.currents[k]))
-    return filter_.mean, filter_.covariance
+    return filter_.mean, filter_.covariance.array
 
 
 def prior():

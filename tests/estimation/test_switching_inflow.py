@@ -9,6 +9,7 @@ from eitbench.estimation import (
     Observation,
     Regimes,
     SwitchingInflowFilter,
+    about_prediction,
     fit_inflow_prior,
 )
 from models import tiny_task as task
@@ -26,7 +27,7 @@ def prior(begins, ends):
 
 
 def switching(begins, ends):
-    return SwitchingInflowFilter(task(), prior(begins, ends), LEVEL, level_std=0.03)
+    return SwitchingInflowFilter(task(), prior(begins, ends), LEVEL, 0.03, about_prediction(task()))
 
 
 def observations(count, slug=2.5):
@@ -44,13 +45,14 @@ def enumerated(filter_, regimes, measured):
     """Probability that the last regime is a slug, mean and variance of the last concentration: every sequence of
     regimes with a textbook Kalman filter of its own, from the same beginning, weighed by its prior and its fit."""
     quiet, _ = filter_.filters
-    W, r = quiet.mean.shape
-    basis, weights = quiet.response()
+    space = quiet.space
+    W, r = space.window, space.modes
+    basis, weights = space.response()
     # (n, W·r) what the window makes of itself, by the response's own columns
-    G = LEVEL * basis @ np.tensordot(weights, quiet.prior.modes, 1).reshape(len(weights), -1)
+    G = LEVEL * basis @ np.tensordot(weights, space.prior.modes, 1).reshape(len(weights), -1)
     G = np.concatenate([G, np.zeros((len(G), (W - weights.shape[1]) * r))], axis=1)
     steps = []
-    for move, variance in filter_._moves:
+    for move, variance in (each.space.regression for each in filter_.filters):
         A = np.eye(W * r, k=-r)
         A[:r] = np.concatenate([np.diag(row) for row in np.broadcast_to(move, (W, r))], axis=1)
         Q = np.zeros((W * r, W * r))
@@ -61,7 +63,7 @@ def enumerated(filter_, regimes, measured):
     found = []
     for sequence in itertools.product([0, 1], repeat=len(measured) + 1):
         log = np.log(start[sequence[0]])
-        m, P = np.zeros(W * r), quiet.covariance
+        m, P = np.zeros(W * r), quiet.covariance.array
         for before, now, seen in zip(sequence, sequence[1:], measured, strict=False):
             A, Q = steps[now]
             m, P = A @ m, A @ P @ A.T + Q
@@ -82,8 +84,8 @@ def enumerated(filter_, regimes, measured):
 def filtered(filter_, measured):
     for seen in measured:
         filter_.predict()
-        filter_.take_in(seen, [each.concentration() for each in filter_.filters])
-    return filter_.probabilities[1], *filter_.state()
+        filter_.update(seen)
+    return filter_.probabilities[1], *filter_.estimate()[:2]
 
 
 @pytest.mark.parametrize("begins, ends, steps", [(0.2, 0.3, 1), (1e-13, 2e-13, 5)], ids=["one step", "no change"])
@@ -115,14 +117,16 @@ def test_innovations_are_those_of_the_mixture():
     filtered(filter_, [first])
     filter_.predict()
     p = filter_.probabilities
-    points = [each.concentration() for each in filter_.filters]
+    points = [each.concentration for each in filter_.filters]
     expected = second.value - second.matrix @ (p[0] * points[0] + p[1] * points[1])
-    slopes = [each.by_inflow(second.matrix) for each in filter_.filters]
+    slopes = [each.space.jacobian(each.mean, second.matrix) for each in filter_.filters]
     seen = slopes[0].shape[1]
-    S = sum(q * H @ each.covariance[:seen, :seen] @ H.T for q, H, each in zip(p, slopes, filter_.filters, strict=True))
+    S = sum(q * H @ each.covariance.array[:seen, :seen] @ H.T
+            for q, H, each in zip(p, slopes, filter_.filters, strict=True))
     apart = second.matrix @ (points[0] - points[1])
     S += p[0] * p[1] * np.outer(apart, apart) + np.diag(second.noise_variance)
-    innovation, covariance = filter_.take_in(second, points)
+    filter_.update(second)
+    _, _, innovation, covariance, *_ = filter_.estimate()
     np.testing.assert_allclose(innovation, expected, rtol=1e-9)
     np.testing.assert_allclose(covariance, S, rtol=1e-9)
 
@@ -142,9 +146,9 @@ def test_regimes_are_counted():
 def test_mistakes_are_told(tmp_path):
     with pytest.raises(ValueError, match="prior must have regimes"):
         SwitchingInflowFilter(task(), InflowPrior("linear", prior(0.1, 0.1).points, prior(0.1, 0.1).modes, np.ones(1),
-                                                  task().transport.time_step), LEVEL, level_std=0.1)
+                                                  task().transport.time_step), LEVEL, 0.1, about_prediction(task()))
     with pytest.raises(ValueError, match="level_std must be"):
-        SwitchingInflowFilter(task(), prior(0.1, 0.1), LEVEL, level_std=0.0)
+        SwitchingInflowFilter(task(), prior(0.1, 0.1), LEVEL, 0.0, about_prediction(task()))
     with pytest.raises(ValueError, match="begins must be"):
         Regimes(0.0, 0.1, 0.1)
     with pytest.raises(ValueError, match="quiet must be a size that some steps exceed"):

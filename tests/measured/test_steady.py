@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from eitbench.bench.playing import run_on_measurements
 from eitbench.envs.measured import MeasuredEnv
-from eitbench.estimation.modes import ModesFilter
 from eitbench.estimation.walk import smooth_modes, steady
 from tanks import BELIEVED, VESSEL, moving
 
@@ -26,29 +25,6 @@ def test_what_is_new_is_what_white_noise_leaves():
     s = (np.arange(20_000) + 0.5) / 20_000 * phase
     moved = np.array([steady(each)[0] @ [0.0, 1.0] for each in s])
     np.testing.assert_allclose(steady(phase)[1], 4 * moved.T @ moved * phase / len(s), rtol=1e-6, atol=1e-9)
-
-
-def test_filter_is_that_of_the_stacked_state():
-    """A plain Kalman filter of weights and changes, (2K, 2K)."""
-    random = np.random.default_rng(0)
-    K, M = 5, 3
-    filter = ModesFilter(K, 0.7, 2)
-    mean, P = np.zeros(2 * K), 0.49 * np.eye(2 * K)
-    A, Q = steady(0.3)
-    F, W = np.kron(A, np.eye(K)), 0.49 * np.kron(Q, np.eye(K))
-    for _ in range(6):
-        H, reading, variance = random.normal(size=(M, K)), random.normal(size=M), random.uniform(0.1, 1, M)
-        filter.predict(A, Q)
-        innovation, S = filter.update(H, reading - H @ filter.mean, variance)
-        mean, P = F @ mean, F @ P @ F.T + W
-        both = np.hstack([H, np.zeros((M, K))])
-        expected = both @ P @ both.T + np.diag(variance)
-        gain = P @ both.T @ np.linalg.inv(expected)
-        np.testing.assert_allclose(innovation, reading - both @ mean)
-        np.testing.assert_allclose(S, expected)
-        mean, P = mean + gain @ (reading - both @ mean), P - gain @ both @ P
-        np.testing.assert_allclose(filter.mean, mean[:K])
-        np.testing.assert_allclose(filter.covariance, P[:K, :K], atol=1e-12)
 
 
 def test_modes_make_the_fields_covariance():

@@ -33,5 +33,6 @@ class Estimator:
 
     def take_in(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate:
         self.filter.predict()
-        step = self.filter.update(self.linear(voltages, currents))
-        return Estimate(np.clip(step.mean, 0.0, 1.05 * self.first.c_bh), step.variance)
+        self.filter.update(self.linear(voltages, currents))
+        c = np.clip(self.filter.concentration, 0.0, 1.05 * self.first.c_bh)
+        return Estimate(c, self.filter.variance)
