@@ -1,0 +1,93 @@
+"""Automatic choice: the state space and the linearisation follow from what the task specifies.
+
+A requested velocity is estimated with the inflow; a flow that training episodes have identified
+takes the place of the nominal one; where there is only a prior of the inflow, the nominal velocity
+may be off by a factor; rare slugs get two regimes; a target at rest is estimated by its logarithm.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from eitbench import Estimate, Task
+from eitbench.estimation import (
+    Filter,
+    FilterEstimator,
+    LogStates,
+    RecordEstimator,
+    SwitchingInflowFilter,
+    VelocityInflowWindow,
+    about_prediction,
+    about_reference,
+    asked_flow,
+    inflow_filter,
+    map_inflow,
+    nodal_states,
+    scaled_flow,
+    suiting_models,
+    suiting_priors,
+    velocity_states,
+)
+from eitbench.estimation.inflow_prior import learned_in, nominal_worlds
+from eitbench.estimation.walk import RandomWalk
+from eitbench.physics.rest import AtRest
+
+HERE = Path(__file__).parent
+BOUNDS = (0.05, 4.0)
+"""Of the axial velocity, relative to the nominal one."""
+WINDOW = 30
+"""Time steps of a window of inflows and velocities."""
+FACTOR_STD = 0.3
+"""Of the nominal velocity where no model was identified."""
+LEVEL_STD = 0.05
+"""Of the inflow between rare slugs, relative to the best homogeneous estimate."""
+
+
+class Estimator:
+    boards = ("filter", "fixed-lag", "smoothing")
+    parameters = {  # noqa: RUF012 (as a record has it)
+        "bounds": list(BOUNDS), "window": WINDOW, "factor_std": FACTOR_STD, "level_std": LEVEL_STD}
+
+    def __init__(self, task: Task) -> None:
+        prior = next(iter(suiting_priors(HERE / "priors", task, "logarithm")), None)
+        models = [model for model in suiting_models(HERE / "models", task)
+                  if learned_in(model.source) in nominal_worlds(task.world)]
+        model = models[0] if models else None
+        self.estimator: FilterEstimator | RecordEstimator
+        if prior is not None and task.velocity is None and task.lag == task.n_steps - 1:
+            self.estimator = RecordEstimator(task, lambda c_ref, record: map_inflow(
+                task, prior, c_ref, record, model=model))
+        else:
+            self.estimator = FilterEstimator(task, lambda c_ref: choose(task, c_ref, prior, model))
+
+    @staticmethod
+    def suits(task: Task) -> bool:
+        """Return whether present states are requested, or a prior allows to look back."""
+        return not task.lag or (task.velocity is None
+                                and bool(suiting_priors(HERE / "priors", task, "logarithm")))
+
+    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
+        return self.estimator.update(voltages, currents)
+
+
+def choose(task: Task, c_ref: float, prior, model):
+    """Return the filter at t = 0."""
+    extended = about_prediction(task)
+    if isinstance(task.transport, AtRest | RandomWalk):
+        return Filter(LogStates(nodal_states(task.transport, task.prior, 1.0), c_ref), extended)
+    if prior is None and task.velocity is None:
+        states = nodal_states(task.transport, task.prior, c_ref)
+        return Filter(states, about_reference(task, c_ref))
+    if prior is None:
+        return Filter(velocity_states(task, c_ref, BOUNDS), extended)
+    if task.velocity is not None:
+        flow = asked_flow(task, BOUNDS)
+        return Filter(VelocityInflowWindow(task, prior, c_ref, flow, WINDOW), extended)
+    if model is not None:
+        return inflow_filter(task, prior, c_ref, task.lag, model=model, iterated=True)
+    if prior.regimes is not None and not task.lag:
+        return SwitchingInflowFilter(task, prior, c_ref, LEVEL_STD, extended)
+    if task.mesh.dim == 2 and not task.lag:
+        flow = scaled_flow(task, FACTOR_STD, 0.0)
+        return Filter(VelocityInflowWindow(task, prior, c_ref, flow, WINDOW), extended)
+    return inflow_filter(task, prior, c_ref, task.lag)
