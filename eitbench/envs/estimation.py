@@ -12,10 +12,18 @@ from gymnasium import spaces
 
 from eitbench import _check
 from eitbench._extras import needed_by
-from eitbench.data.beginnings import Script, concentration_at, script, script_so_far
-from eitbench.data.pool import Pool
-from eitbench.data.recordings import cycle_voltages, outline, step_error, velocity_error
-from eitbench.data.regions import score_mass
+from eitbench.data.bank import Pool
+from eitbench.data.recordings import (
+    concentration_at,
+    cycle_voltages,
+    integrals,
+    outline,
+    recording,
+    recording_so_far,
+    score_mass,
+    step_error,
+    velocity_error,
+)
 from eitbench.data.seeds import warn_of_reserved
 from eitbench.envs.spec import KnowsItsLength
 from eitbench.worlds.registry import entry
@@ -128,7 +136,7 @@ class EstimationEnv(KnowsItsLength, gym.Env[Observation, np.ndarray]):  # type: 
             self.pool.restart()
         self._seed = self.pool.draw(self.np_random) if seed is None else seed
         warn_of_reserved([self._seed])
-        self._read(script_so_far(self.world, self._seed, 1))
+        self._read(recording_so_far(self.world, self._seed, 1))
         self._step = 1
         self.spread = None
         self._last: np.ndarray | None = None
@@ -160,10 +168,11 @@ class EstimationEnv(KnowsItsLength, gym.Env[Observation, np.ndarray]):  # type: 
         ended = self._step > self.episode_steps
         return self._observe(), reward, ended, False, {"step": self._step}
 
-    def _read(self, script: Script) -> None:
+    def _read(self, entries: np.ndarray) -> None:
         """Play from this; of a beginning the rest is asked for when it is needed."""
         assert self._seed is not None
-        self._entries, self._integrals = script
+        self._entries = entries
+        self._integrals = integrals(self.world, entries)
         self._voltages = np.zeros_like(self._currents)
         self._voltages[:len(self._entries)] = cycle_voltages(self.world, self._seed, self._entries)
 
@@ -172,7 +181,7 @@ class EstimationEnv(KnowsItsLength, gym.Env[Observation, np.ndarray]):  # type: 
         if len(self._entries) < min(steps, self.world.n_steps):
             assert self._seed is not None
             self.pool.provide(self.world, self._seed)
-            self._read(script(self.world, self._seed))
+            self._read(recording(self.world, self._seed))
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
         """(height, width, 3) uint8: truth, last estimate, its spread, electrodes, active pair."""

@@ -6,8 +6,15 @@ from typing import Any
 
 import numpy as np
 
-from eitbench.data.recordings import cycle_voltages, outline, recording, step_error, velocity_error
-from eitbench.data.regions import integrals, score_mass
+from eitbench.data.recordings import (
+    cycle_voltages,
+    integrals,
+    outline,
+    recording,
+    score_mass,
+    step_error,
+    velocity_error,
+)
 from eitbench.envs.estimation import (
     Observation,
     asked_for,
@@ -45,7 +52,7 @@ class EstimationVectorEnv(LockstepVectorEnv):
         for k, seed in enumerate(seeds):
             entries = recording(world, seed)
             self._voltages[:world.n_steps, k] = cycle_voltages(world, seed, entries)
-            moments, self._deviations[:, k], self._squares[:, k] = integrals(world, seed, entries)
+            moments, self._deviations[:, k], self._squares[:, k] = integrals(world, entries)
             self._moments.append(moments[world.warm_up:].copy())
             if world.velocity_model is not None:
                 self._flows.append((entries["velocity_moment"].copy(),

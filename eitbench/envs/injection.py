@@ -12,7 +12,7 @@ from gymnasium import spaces
 
 from eitbench import _check
 from eitbench._extras import needed_by
-from eitbench.data.pool import Pool
+from eitbench.data.bank import Pool
 from eitbench.data.seeds import warn_of_reserved
 from eitbench.envs.estimation import RESET_NEEDED
 from eitbench.envs.injection_core import FURTHEST, InjectionCore, scaled
@@ -142,8 +142,8 @@ class InjectionEnv(KnowsItsLength, gym.Env[Any, Any]):  # type: ignore[misc]
             return None
         if self._step == 0:
             raise gym.error.ResetNeeded("call reset() before render()")
-        from eitbench.data.beginnings import concentration_at
         from eitbench.data.episodes import truth_discretisation
+        from eitbench.data.recordings import concentration_at
         with needed_by("render()"):
             from eitbench.envs.rendering import draw_frame
         mean, spread = self._core.estimate()

@@ -8,9 +8,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from gymnasium import spaces
 
-from eitbench.data.beginnings import Script, script, script_so_far
-from eitbench.data.recordings import faults_of, outline
-from eitbench.data.regions import score_mass
+from eitbench.data.recordings import (
+    faults_of,
+    integrals,
+    outline,
+    recording,
+    recording_so_far,
+    score_mass,
+)
 from eitbench.estimation.onboard.choice import operator_type
 from eitbench.estimation.onboard.console import Console
 from eitbench.estimation.onboard.operator import Innovation
@@ -125,9 +130,9 @@ class InjectionCore:
         faults = [faults_of(world, seed) for seed in seeds]
         self._faults = Faults(*(np.array(part) for part in zip(*faults, strict=True)))
         if provide is None:
-            self._read([script(world, seed) for seed in seeds])
+            self._read([recording(world, seed) for seed in seeds])
         else:
-            self._read([script_so_far(world, seed, self.first + 1) for seed in seeds])
+            self._read([recording_so_far(world, seed, self.first + 1) for seed in seeds])
         if not self._operator_type:
             return
         self._frames = np.stack([self._measure(k, np.repeat(cycle[None], B, axis=0))
@@ -140,23 +145,24 @@ class InjectionCore:
             self._recent[:, k] = world.currents[(self.first - 1 - k) % self.first]
         self._weigh()
 
-    def _read(self, scripts: Sequence[Script]) -> None:
+    def _read(self, recordings: Sequence[np.ndarray]) -> None:
         """Take in what is known of the episodes."""
         moments = []
-        self._known = min(len(entries) for entries, _ in scripts)
+        self._known = min(map(len, recordings))
         """Injections that can be made before more has to be read."""
         k = slice(self._known)
         # all is copied: a mapped file is open, and there may be more than may be
-        for b, (entries, integrals) in enumerate(scripts):
+        for b, entries in enumerate(recordings):
+            counted = integrals(self.world, entries)
             self._resistance[k, b] = entries["transfer_resistance"][k]
             self._draws[k, b] = entries["noise"][k]
-            self._deviations[b, k] = integrals.deviation[k]
-            self._squares[b, k] = integrals.square[k]
-            self._totals[b, k] = integrals.moment[k].sum(axis=1, dtype=float)
+            self._deviations[b, k] = counted.deviation[k]
+            self._squares[b, k] = counted.square[k]
+            self._totals[b, k] = counted.moment[k].sum(axis=1, dtype=float)
             if self._operator_type:
                 # All rows, so that the bits of a product of matrices do not depend on their number.
-                moment = np.zeros((self.world.n_steps, integrals.moment.shape[1]), np.float32)
-                moment[k] = integrals.moment[k]
+                moment = np.zeros((self.world.n_steps, counted.moment.shape[1]), np.float32)
+                moment[k] = counted.moment[k]
                 moments.append(self._operator_type.project(self.world, moment))
         self._moments = np.array(moments)
 
@@ -167,7 +173,7 @@ class InjectionCore:
         assert self._provide is not None
         for seed in self.seeds:
             self._provide(self.world, seed)
-        self._read([script(self.world, seed) for seed in self.seeds])
+        self._read([recording(self.world, seed) for seed in self.seeds])
         if self._operator_type:
             self._weigh()
 

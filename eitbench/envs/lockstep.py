@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from eitbench import _check
-from eitbench.data.pool import Pool
+from eitbench.data.bank import Pool
 from eitbench.data.seeds import warn_of_reserved
 from eitbench.envs.estimation import Observation
 from eitbench.worlds.world import World
@@ -30,7 +30,7 @@ class LockstepVectorEnv(gym.vector.VectorEnv[Observation, np.ndarray, np.ndarray
     num_envs : int
     episodes : int, optional
         How many training episodes an unseeded reset draws from; default: a growing number, see
-        `eitbench.data.pool.Pool`.
+        `eitbench.data.bank.Pool`.
 
     Those of our environments also take ``max_episode_steps``, which gymnasium hands over from a
     spec: the steps of an episode, which it does not change.

@@ -200,7 +200,6 @@ def test_keys_depend_on_the_declared_version_and_not_on_the_code(monkeypatch):
 
     def fresh(world=TINY):
         cache.world_digest.cache_clear()
-        cache._episode_folder.cache_clear()
         return folder(world)
 
     with monkeypatch.context() as patch:
