@@ -1,4 +1,4 @@
-"""Episodes simulated ahead of training: a bank of recordings, and the pool that resets draw from."""
+"""Episodes simulated ahead of training: a bank of recordings, and the pool resets draw from."""
 
 from __future__ import annotations
 
