@@ -13,8 +13,7 @@ from __future__ import annotations
 import numpy as np
 import scipy.sparse as sp
 
-from eitbench.numerics.compiled import compiled_kernels
-from eitbench.numerics.memory import scratch
+from eitbench.numerics.compiled import compiled_kernels, scratch
 from eitbench.numerics.sparse_lu import eliminated
 
 _LEAF = 200

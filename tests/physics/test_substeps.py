@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from eitbench.numerics.memory import scratch
+from eitbench.numerics.compiled import scratch
 from eitbench.numerics.mesh import rectangle_mesh
 from eitbench.physics.flow import PlaneChannelFlow
 from eitbench.physics.transport import MANY, ConvectionDiffusion, _supg_matrices
