@@ -36,11 +36,25 @@ class PipeFlow(Flow):
         return world.vessel.laminar(self.mean_velocity)
 
     def check_assumed(self, world: World, assumed: Mapping[str, Any]) -> None:
-        """Accept ``mean_velocity`` in m/s, and in a plane pipe ``profile``, one of `PROFILES`."""
-        laminar_assumption(world, self.mean_velocity, assumed)
+        self.believed(world, **assumed)
 
     def believed(self, world: World, **assumed: Any) -> VelocityField:
-        return laminar_assumption(world, self.mean_velocity, assumed)
+        """``mean_velocity`` in m/s, and in a plane pipe ``profile``, one of `PROFILES`."""
+        plane = isinstance(world.vessel, PlanePipe)
+        refuse_assumptions(assumed, ("mean_velocity", "profile") if plane else ("mean_velocity",))
+        mean = assumed.get("mean_velocity")
+        mean = _check.number("assume.mean_velocity", self.mean_velocity if mean is None else mean,
+                             low=0.0, units="m/s")
+        profile = assumed.get("profile") or "parabolic"
+        if profile not in PROFILES:
+            known = ", ".join(PROFILES)
+            raise ValueError(f"assume.profile must be one of {known}, got {profile!r}")
+        if profile == "plug":
+            return PlugFlow(mean)
+        if profile == "power-law":
+            return PowerLawFlow(mean, world.vessel.half_width)
+        laminar: VelocityField = world.vessel.laminar(mean)
+        return laminar
 
     def flush_steps(self, world: World) -> int:
         return steps_through(world, self.mean_velocity)
@@ -179,7 +193,7 @@ class WanderingFlow(PipeFlow):
 
 
 @dataclass(frozen=True)
-class FlowPastBulge(Flow):
+class FlowPastBulge(PipeFlow):
     """The steady Navier–Stokes flow through a plane pipe with a bulge, behind which it separates.
 
     Better fluid models are what the thesis names as its next step (5.1.1). Estimators know the
@@ -214,9 +228,6 @@ class FlowPastBulge(Flow):
         if assumed.get("flow") == "real":
             return self.nominal(world, fine=False)
         return LocalParabola(self.mean_velocity, world.vessel.half_width, world.vessel.bulge)
-
-    def flush_steps(self, world: World) -> int:
-        return steps_through(world, self.mean_velocity)
 
     def true_transport(self, world: World, model: Discretisation, random: np.random.Generator,
                        ) -> Callable[[int], Transport]:
@@ -293,25 +304,6 @@ class LocalParabola:
 def steps_through(world: World, velocity: float) -> int:
     """Time steps in which a fluid of this velocity in m/s passes through a pipe."""
     return math.ceil(world.vessel.length / (velocity * world.time_step))
-
-
-def laminar_assumption(world: World, mean_velocity: float,
-                       assumed: Mapping[str, Any]) -> VelocityField:
-    """What a model of a pipe is told to believe; ``ValueError`` for another name or value."""
-    plane = isinstance(world.vessel, PlanePipe)
-    refuse_assumptions(assumed, ("mean_velocity", "profile") if plane else ("mean_velocity",))
-    mean = assumed.get("mean_velocity")
-    if mean is None:
-        mean = mean_velocity
-    mean = _check.number("assume.mean_velocity", mean, low=0.0, units="m/s")
-    profile = assumed.get("profile") or "parabolic"
-    if profile not in PROFILES:
-        raise ValueError(f"assume.profile must be one of {', '.join(PROFILES)}, got {profile!r}")
-    if profile == "plug":
-        return PlugFlow(mean)
-    if profile == "power-law":
-        return PowerLawFlow(mean, world.vessel.half_width)
-    return world.vessel.laminar(mean)
 
 
 @lru_cache(maxsize=1)
