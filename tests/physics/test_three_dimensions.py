@@ -22,11 +22,6 @@ RINGS = np.array([[0.03, 0.06], [0.10, 0.13]])
 both_orders = pytest.mark.parametrize("order", [1, 2])
 
 
-def section_at(mesh: Mesh, z: float) -> np.ndarray:
-    """Boundary facets all of whose nodes have this third coordinate."""
-    return mesh.facets_where(lambda p: np.abs(p[:, 2] - z) < 1e-12)
-
-
 @cache
 def pipe(order: int) -> CompleteElectrodeModel:
     """Two rings of four electrodes on a short pipe, the second ring the first one's mirror image."""
