@@ -151,6 +151,7 @@ def test_closed_vessel_keeps_its_content():
         after = cd.step(after, 0.0, 0.0)
     assert weights @ after == pytest.approx(weights @ c, rel=1e-13)
     np.testing.assert_allclose(after, weights @ c, rtol=1e-3)                           # the square's area is 1
+    assert [matrix.shape for matrix in cd.evolution_model()] == [(81, 81), (81, 0), (81, 81)]
 
 
 def test_discrete_fluxes_pass_through_the_boundary_only():
@@ -219,7 +220,7 @@ def test_supg_matrices_are_those_of_brooks_and_hughes():
 
 
 @pytest.mark.parametrize(("substeps", "columns"), [
-    (1, 1), (4, 1), *((3, k) for k in (MANY, 31, 32, 33, 70))])
+    (1, 1), (4, 1), *((3, k) for k in (7, 8, 9, MANY, 31, 32, 33, 70))])
 def test_step_is_the_stated_scheme(substeps, columns):
     """Equal to a dense implementation of two backward-Euler halves and Crank–Nicolson, with a moving inlet value. Of
     many columns, in panels that are full and ones that are not, each has the bits that it has alone, whatever was in

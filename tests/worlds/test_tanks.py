@@ -139,7 +139,7 @@ def test_flow_has_nearly_no_divergence():
         assert abs((stirred(24)(radius * outwards) * outwards).sum(axis=1).mean()) < 1e-3
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, 2])
 def test_ball_goes_round_on_an_orbit_of_the_flow(seed):
     """Its centre moves with the mean velocity over the disc: an integral over 192 points, solved to high accuracy.
 
@@ -253,24 +253,6 @@ def test_frame_of_the_tank_at_rest_measures_sixteen_things():
     np.testing.assert_array_equal(currents[:8], -np.roll(currents[:8], 8, axis=1))
     pairs = {frozenset(np.flatnonzero(row).tolist()) for row in currents}
     assert len(pairs) == 16                                              # none is another's reverse
-
-
-@pytest.mark.parametrize(("world", "part", "change", "message"), [
-    (ROTATING, "vessel", {"radius": 0.0}, "radius must be"),
-    (ROTATING, "vessel", {"electrode_cover": 1.0}, "electrode_cover"),
-    (ROTATING, "flow", {"viscosity": -1.0}, "viscosity"),
-    (ROTATING, "flow", {"stirrer_position": (np.nan, 0.0)}, "stirrer_position must be"),
-    (ROTATING, "target", {"start_radius": (0.5, 0.9)}, "start_radius must be a range .* keeps the ball inside"),
-    (STATIONARY, "vessel", {"n_electrodes": 7}, "n_electrodes must be an integer of at least 8"),
-    (STATIONARY, "target", {"gap": 0.12}, "gap must leave room"),
-    (STATIONARY, "target", {"metal": 0.0}, "metal must be"),
-    (STATIONARY, "target", {"small_radius": (0.018, 0.035)}, "small_radius must not reach beyond large_radius"),
-    (STATIONARY, "target", {"small_radius": 0.02}, r"small_radius must have shape \(2,\)"),
-], ids=str)
-def test_wrong_numbers_are_named(world, part, change, message):
-    """The part, the number, what came, and what was expected."""
-    with pytest.raises(ValueError, match=f"^world.*{part}.*{message}"):
-        world.changed({part: change})
 
 
 @pytest.mark.parametrize("radius", [0.01, 0.02, 0.04])
