@@ -83,6 +83,7 @@ def test_every_number_can_be_named(id):
     (ROTATING_TANK_2D, {"target": {"start_radius": (0.5, 0.9)}}, "start_radius must be a range .* keeps the ball"),
     (STATIONARY_TANK_2D, {"vessel": {"n_electrodes": 7}}, "n_electrodes must be an integer of at least 8"),
     (STATIONARY_TANK_2D, {"target": {"gap": 0.12}}, "gap must leave room"),
+    (STATIONARY_TANK_2D, {"target": {"furthest": 0.8}}, "furthest must be"),
     (STATIONARY_TANK_2D, {"target": {"metal": 0.0}}, "^world.target: metal must be"),
     (STATIONARY_TANK_2D, {"target": {"small_radius": (0.018, 0.035)}}, "small_radius must not reach beyond large"),
     (STATIONARY_TANK_2D, {"target": {"small_radius": 0.02}}, r"small_radius must have shape \(2,\)"),
