@@ -27,10 +27,17 @@ BELIEVED_PAST_A_BULGE = ("parabolic", "real")
 """What a model of the flow past a bulge may assume."""
 
 
+@dataclass(frozen=True)
 class PipeFlow(Flow):
     """Flow through a straight pipe whose estimators are told a laminar one of ``mean_velocity``."""
 
-    mean_velocity: float
+    mean_velocity: float = 4.5
+    """v̄ in m/s [T], as estimators are told it"""
+    diffusivity: float = 5e-4
+    """κ in m²/s [ours]: small, yet resolved by the model's mesh"""
+
+    def __post_init__(self) -> None:
+        check_positive(self, mean_velocity="m/s", diffusivity="m²/s")
 
     def nominal(self, world: World, fine: bool) -> VelocityField:
         return world.vessel.laminar(self.mean_velocity)
@@ -64,14 +71,6 @@ class PipeFlow(Flow):
 class LaminarFlow(PipeFlow):
     """Laminar flow with a known mean velocity; [T]: the thesis' number; [ours]: our choice."""
 
-    mean_velocity: float = 4.5
-    """v̄ in m/s [T]"""
-    diffusivity: float = 5e-4
-    """κ in m²/s [ours]: small, yet resolved by the model's mesh"""
-
-    def __post_init__(self) -> None:
-        check_positive(self, mean_velocity="m/s", diffusivity="m²/s")
-
 
 @dataclass(frozen=True)
 class DrawnFlow(PipeFlow):
@@ -81,10 +80,6 @@ class DrawnFlow(PipeFlow):
     told of a laminar one.
     """
 
-    mean_velocity: float = 4.5
-    """m/s; what estimators are told, as in the thesis"""
-    diffusivity: float = 5e-4
-    """κ in m²/s [ours]"""
     velocity_range: tuple[float, float] = (2.5, 7.0)
     """m/s, of the true mean, drawn evenly; the thesis assumes 2 and 7 for a true 4.5 [ours]"""
     swing_range: tuple[float, float] = (0.0, 0.0)
@@ -101,7 +96,7 @@ class DrawnFlow(PipeFlow):
     """m/s a time step, standard deviation of the believed random walk [ours]"""
 
     def __post_init__(self) -> None:
-        check_positive(self, mean_velocity="m/s", diffusivity="m²/s")
+        super().__post_init__()
         check_range(self, "velocity_range", "m/s")
         check_range(self, "swing_range", open_low=False)
         check_range(self, "period_range", "s")
@@ -152,10 +147,6 @@ class WanderingFlow(PipeFlow):
     estimators are told of; at the ends of ``velocity_range`` it turns back.
     """
 
-    mean_velocity: float = 4.5
-    """m/s; what is believed at first"""
-    diffusivity: float = 5e-4
-    """κ in m²/s"""
     velocity_range: tuple[float, float] = (2.5, 6.5)
     """m/s; the mean velocity stays within it, and begins anywhere in it"""
     velocity_std: float = 1.0
@@ -164,7 +155,8 @@ class WanderingFlow(PipeFlow):
     """m/s a time step: 0.4 m/s (std) while the fluid passes through the pipe"""
 
     def __post_init__(self) -> None:
-        check_positive(self, mean_velocity="m/s", diffusivity="m²/s", velocity_walk="m/s")
+        super().__post_init__()
+        check_positive(self, velocity_walk="m/s")
         _check.number("velocity_std", self.velocity_std, low=0.0, units="m/s")
         check_range(self, "velocity_range", "m/s")
 
@@ -201,15 +193,12 @@ class FlowPastBulge(PipeFlow):
     the real one. All numbers are ours.
     """
 
-    mean_velocity: float = 4.5
-    """v̄ in m/s at the inlet"""
-    diffusivity: float = 5e-4
-    """κ in m²/s"""
     viscosity: float = 5e-4
     """m²/s, the eddy viscosity; as κ, a turbulent Schmidt number of one. Re = v̄·2R/ν = 900"""
 
     def __post_init__(self) -> None:
-        check_positive(self, mean_velocity="m/s", diffusivity="m²/s", viscosity="m²/s")
+        super().__post_init__()
+        check_positive(self, viscosity="m²/s")
 
     def nominal(self, world: World, fine: bool) -> SteadyFlow:
         """The real flow, by so many cells along and across the pipe; computed once a process."""
