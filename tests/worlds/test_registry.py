@@ -104,8 +104,8 @@ def test_ids_of_another_form_are_refused(id):
 
 
 @pytest.mark.parametrize(("settings", "message"), [
-    ({"gate": 3.0}, "settings of the track estimation are lag, assume; got gate"),
-    ({"track": "injection", "lag": 3, "assume": {}}, "injection are gate, inflow; got assume, lag"),
+    ({"gate": 3.0}, "settings of the track estimation must be among lag, assume; got gate"),
+    ({"track": "injection", "lag": 3, "assume": {}}, "injection must be among gate, inflow; got assume, lag"),
     ({"track": "guessing"}, "track must be one of estimation, injection, got 'guessing'"),
     ({"assume": {"mean_velocity": {1.0}}}, "not JSON"),
 ])
