@@ -26,7 +26,7 @@ REFERENCE = {
                          "eitbench.physics.observation", "eitbench.physics.flow",
                          "eitbench.physics.navier_stokes", "eitbench.numerics.mesh"],
     "eitbench.worlds": ["eitbench.worlds.world", "eitbench.worlds.vessels",
-                        "eitbench.worlds.mesh_vessel", "eitbench.worlds.flows",
+                        "eitbench.worlds.flows",
                         "eitbench.worlds.slugs", "eitbench.worlds.bodies",
                         "eitbench.worlds.instrument", "eitbench.worlds.schedule",
                         "eitbench.worlds.world"],

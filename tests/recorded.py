@@ -1,14 +1,14 @@
 """What makes two recordings the same, and what a process forgets of them."""
 
 
-from eitbench.data import beginnings, cache, regions
+from eitbench.data import cache, recordings
 
 
 def forget():
     """Forget what a new process does not know: verified files, outlines and beginnings."""
     cache._sound.clear()
-    regions._outline.cache_clear()
-    beginnings._beginning.cache_clear()
+    recordings.outline.__wrapped__.cache_clear()
+    recordings._beginning.cache_clear()
 
 
 def forget_made(module):

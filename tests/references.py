@@ -107,7 +107,7 @@ class NumpySensitivity:
 
 
 class AllColumns:
-    """`eitbench.physics.substeps.WideSubsteps` by the flow's own sub-steps, of all columns at once."""
+    """`ConvectionDiffusion._advance_wide` by the flow's own sub-steps, of all columns at once."""
 
     def __init__(self, flow: transport.ConvectionDiffusion) -> None:
         self._flow = flow
@@ -149,5 +149,5 @@ def reference_flow(*arguments, **options) -> transport.ConvectionDiffusion:
     """A `ConvectionDiffusion` without compiled kernels."""
     with references():
         flow = transport.ConvectionDiffusion(*arguments, **options)
-    flow._wide = AllColumns(flow)
+    flow._advance_wide = AllColumns(flow).advance
     return flow

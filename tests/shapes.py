@@ -18,14 +18,15 @@ from scipy.special import roots_jacobi, spherical_jn
 
 def shaken_rectangle(width: float, height: float, cells: tuple[int, int], rng: np.random.Generator) -> Mesh:
     """A rectangle with its corner at the origin whose inner nodes are moved at random: no two cells are alike."""
-    flat = rectangle_mesh(np.linspace(0.0, width, cells[0] + 1), np.linspace(0.0, height, cells[1] + 1))
-    return _shaken(flat, np.array([width, height]), np.array(cells), rng)
+    return _shaken(box_mesh((width, height), cells), np.array([width, height]), np.array(cells), rng)
 
 
-def shaken_box(size: Sequence[float], cells: Sequence[int], rng: np.random.Generator) -> Mesh:
-    """A box with its corner at the origin; every brick is split into the six tetrahedra along one diagonal."""
-    size, cells = np.asarray(size, dtype=float), np.asarray(cells)
-    shape = cells + 1
+def box_mesh(size: Sequence[float], cells: Sequence[int]) -> Mesh:
+    """A rectangle or a box with its corner at the origin; every brick is split into the six tetrahedra along one
+    diagonal."""
+    if len(size) == 2:
+        return rectangle_mesh(*(np.linspace(0.0, length, n + 1) for length, n in zip(size, cells, strict=True)))
+    shape = np.asarray(cells) + 1
     grid = [np.linspace(0.0, length, n) for length, n in zip(size, shape, strict=True)]
     points = np.stack(np.meshgrid(*grid, indexing="ij"), axis=-1).reshape(-1, 3)
     corner = np.ravel_multi_index(np.indices(cells).reshape(3, -1), shape)
@@ -33,7 +34,12 @@ def shaken_box(size: Sequence[float], cells: Sequence[int], rng: np.random.Gener
     # Each order of the three axes is a path along brick edges from the lowest corner to the highest: one tetrahedron.
     tetrahedra = [corner[:, None] + np.concatenate([[0], np.cumsum(stride[list(path)])])
                   for path in permutations(range(3))]
-    return _shaken(Mesh(points, np.concatenate(tetrahedra)), size, cells, rng)
+    return Mesh(points, np.concatenate(tetrahedra))
+
+
+def shaken_box(size: Sequence[float], cells: Sequence[int], rng: np.random.Generator) -> Mesh:
+    """A box whose inner nodes are moved at random."""
+    return _shaken(box_mesh(size, cells), np.asarray(size, dtype=float), np.asarray(cells), rng)
 
 
 def _shaken(mesh: Mesh, size: np.ndarray, cells: np.ndarray, rng: np.random.Generator) -> Mesh:

@@ -32,8 +32,14 @@ from eitbench.bench.methods import (
 )
 from eitbench.bench.scores import scored, scores
 from eitbench.data.episodes import Episode, truth_discretisation
-from eitbench.data.recordings import cycle_voltages, faults_of, make_recording, step_error
-from eitbench.data.regions import make_integrals, score_mass
+from eitbench.data.recordings import (
+    cycle_voltages,
+    faults_of,
+    integrals,
+    make_recording,
+    score_mass,
+    step_error,
+)
 from eitbench.data.seeds import name_seed, parse_seeds
 from eitbench.estimation import best_homogeneous
 from eitbench.worlds.registry import entry
@@ -197,9 +203,8 @@ def _episode_numbers(world: World, name: str) -> dict[str, Any]:
     episode = _episode(world.fluid, name)
     task = make_task(world.fluid)
     L = world.vessel.n_electrodes
-    entries = make_recording(world, seed, episode)
-    moments, deviations, squares = make_integrals(world, episode) if world.region else (
-        entries["moment"], entries["deviation"], entries["square"])
+    entries = make_recording(world, episode)
+    moments, deviations, squares = integrals(world, entries)
     voltages = cycle_voltages(world, seed, entries)
     sound = cycle_voltages(world.sound, seed, entries)[:world.calibration]
     cycle = world.currents[np.arange(world.calibration) % len(world.currents)]

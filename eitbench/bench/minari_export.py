@@ -15,8 +15,8 @@ from eitbench.bench.playing import policys_random
 from eitbench.bench.tracks import check_track
 from eitbench.data.bank import fill
 from eitbench.data.dataset import asked_seeds
-from eitbench.data.export import WARNING, seed_ranges
-from eitbench.data.seeds import for_scores, is_test, name_seed
+from eitbench.data.export import WARNING
+from eitbench.data.seeds import for_scores, is_test, name_seed, seed_ranges
 
 if TYPE_CHECKING:
     from minari.data_collector import EpisodeBuffer
@@ -113,7 +113,6 @@ def _run(env: gym.Env[Any, Any], policy: Method, seed: int, number: int) -> Epis
 
 def _description(env: str, policy: Method, seeds: Sequence[int]) -> str:
     from eitbench import __version__
-    held = seed_ranges(name_seed(seed).replace(":", "-") for seed in seeds)
     return DESCRIPTION.format(
-        env=env, policy=policy.name, title=policy.title, seeds="; ".join(held),
+        env=env, policy=policy.name, title=policy.title, seeds=seed_ranges(map(name_seed, seeds)),
         version=__version__, warning=WARNING if any(map(is_test, seeds)) else "").strip()

@@ -12,7 +12,7 @@ import numpy as np
 from eitbench import scoring
 from eitbench.bench.scores import Outcome
 from eitbench.data.episodes import simulate, truth_discretisation
-from eitbench.data.regions import region_operators
+from eitbench.data.recordings import region_operators
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.estimation import best_homogeneous
 from eitbench.estimation.onboard.operator import Innovation

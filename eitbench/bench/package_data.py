@@ -3,15 +3,13 @@ models, and the first steps of the first training episode."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from typing import NamedTuple
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
 from eitbench.bench.tracks import own_ids
-from eitbench.data.beginnings import make_beginning, shipped_key
-from eitbench.data.cache import PACKAGE_DATA, Arrays, Key, load_shipped, ship
-from eitbench.data.regions import csr_of, make_outline, make_region, outline_key, region_key
+from eitbench.data.cache import PACKAGE_DATA, Arrays, File, load_shipped, ship
+from eitbench.data.recordings import beginning_file, csr_of, outline_file, region_file
 from eitbench.estimation.onboard import joint_operator, reduced_operator
 from eitbench.estimation.onboard.packing import unpacked
 from eitbench.estimation.onboard.reduced_operator import pack_model, stored_model_key
@@ -21,33 +19,26 @@ TOLERANCE = 1e-5
 """Accepted difference relative to an array's largest entry: models are kept in single precision."""
 
 
-class ShippedFile(NamedTuple):
-    """A file that the package ships."""
-
-    key: Key
-    build: Callable[[], Arrays]
-
-
-def expected_files(ids: Iterable[str]) -> list[ShippedFile]:
+def expected_files(ids: Iterable[str]) -> list[File]:
     """Return the files that these ids need, each once."""
     files = {file.key: file for id in ids for file in _files(entry(id))}
     return list(files.values())
 
 
-def _files(registered: Entry) -> Iterator[ShippedFile]:
+def _files(registered: Entry) -> Iterator[File]:
     world = registered.world
-    yield ShippedFile(outline_key(world), lambda: make_outline(world))
+    yield outline_file(world)
     if world.region is not None:
-        yield ShippedFile(region_key(world), lambda: make_region(world))
+        yield region_file(world)
     needed = max(_needed_steps(each) for each in entries().values()
                  if each.world.fluid == world.fluid)
     if needed <= world.warm_up:
-        yield ShippedFile(shipped_key(world), lambda: make_beginning(world, needed))
+        yield beginning_file(world, needed)
     if registered.track == "injection":
         joint = world.velocity_model is not None
         make = joint_operator.make_model if joint else reduced_operator.make_model
-        yield ShippedFile(stored_model_key(world, "joint" if joint else "reduced"),
-                          lambda: pack_model(lambda: make(world.sound)))
+        yield File(stored_model_key(world, "joint" if joint else "reduced"),
+                   lambda: pack_model(lambda: make(world.sound)))
 
 
 def _needed_steps(registered: Entry) -> int:

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.stats import t as student
 
 from eitbench.bench.scores import scores
+from eitbench.data.seeds import seed_ranges as seed_ranges  # for users of this module too
 
 
 def mean_and_interval(values: list[float]) -> tuple[float, float]:
@@ -53,20 +54,6 @@ def scores_by_seed(record: dict[str, Any], name: str) -> dict[str, float]:
     known = scores()
     factor = known[name].factor if name in known else 1.0
     return {seed: value * factor for seed, value in values.items() if value is not None}
-
-
-def seed_ranges(seeds: list[str]) -> str:
-    """``test:0-3,7`` for test:0, test:1, test:2, test:3 and test:7."""
-    split = seeds[0].rpartition(":")[0]
-    numbers = sorted(int(seed.rpartition(":")[2]) for seed in seeds)
-    ranges: list[list[int]] = []
-    for number in numbers:
-        if ranges and number == ranges[-1][1] + 1:
-            ranges[-1][1] = number
-        else:
-            ranges.append([number, number])
-    text = ",".join(f"{a}" if a == b else f"{a}-{b}" for a, b in ranges)
-    return f"{split}:{text}" if split else text
 
 
 def number(value: float) -> str:

@@ -1,25 +1,36 @@
-"""Simulate many episodes ahead of training and keep their recordings in the cache."""
+"""Episodes simulated ahead of training: a bank of recordings, and the pool resets draw from."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import numpy as np
 from tqdm import tqdm
 
 from eitbench import _check
 from eitbench.data import cache
 from eitbench.data.episodes import simulate_together
 from eitbench.data.parallel import in_parallel
-from eitbench.data.recordings import is_recorded, make_recording, recording_key, recording_type
-from eitbench.data.regions import outline
-
-if TYPE_CHECKING:
-    from eitbench.worlds.world import World
+from eitbench.data.recordings import (
+    is_recorded,
+    make_recording,
+    outline,
+    recording_key,
+    recording_type,
+)
+from eitbench.worlds.world import Flow, World
 
 TOGETHER = 8
 """Episodes that are simulated together."""
+MOST = 1000
+"""Training episodes that a growing pool ends with."""
+ALONE = 4
+"""First resets, which play ``train:0``."""
+RESETS = 8
+"""Resets per episode at which a pool doubles: simulation takes little of the training time."""
+LARGE = 2500
+"""Nodes from which on episodes are simulated only when they are needed."""
 
 
 def recording_bytes(world: World) -> int:
@@ -63,6 +74,56 @@ def _record(world: World, seeds: Sequence[int], place: Path, progress: bool = Fa
     """Simulate and store recordings, and return their number."""
     with cache.cache_in(place):
         for seed, episode in zip(seeds, simulate_together(world, seeds, progress), strict=True):
-            entries = make_recording(world, seed, episode)
-            cache.store(recording_key(world, seed), {"steps": entries})
+            cache.store(recording_key(world, seed), {"steps": make_recording(world, episode)})
     return len(seeds)
+
+
+class Pool:
+    """The training episodes that unseeded resets draw from: few at first, more later, so that
+    training starts before a thousand episodes are simulated.
+
+    There are ``episodes`` of them. Without that number there is 1 for the first `ALONE` resets
+    since the last seeded one, then 8, and from then on the largest power of two that is at most 1/8
+    of the number of resets, up to `MOST`, whatever has been simulated.
+    """
+
+    def __init__(self, episodes: int | None) -> None:
+        self.grows = episodes is None
+        self.most = MOST if episodes is None else _check.integer("episodes", episodes, low=1)
+        self._can_be_kept = True
+        self.restart()
+
+    @property
+    def size(self) -> int:
+        """Number of episodes that the next reset draws from."""
+        if not self.grows:
+            return self.most
+        if self._resets < ALONE:
+            return 1
+        earned = self._resets // RESETS
+        return min(self.most, max(TOGETHER, 1 << earned.bit_length() >> 1))
+
+    def draw(self, random: np.random.Generator) -> int:
+        """Return the seed of the next episode."""
+        self._drawn_from = self.size
+        self._resets += 1
+        return int(random.integers(self._drawn_from))
+
+    def restart(self) -> None:
+        """Forget all resets, after a seeded one."""
+        self._resets = 0
+        self._drawn_from = 0
+
+    def provide(self, world: World, seed: int) -> None:
+        """Simulate all missing episodes of a growing pool, if this is one of them; with the first
+        the other seven, where eight take the time of two."""
+        wanted = self.grows and seed < self._drawn_from and self._can_be_kept
+        if not wanted or is_recorded(world, seed):
+            return
+        shares_its_flow = type(world.flow).draw is Flow.draw and world.target.is_carried
+        is_cheap = shares_its_flow and outline(world).mass.shape[0] < LARGE
+        try:
+            fill_here(world, range(max(self._drawn_from, TOGETHER * is_cheap)))
+        except OSError as error:
+            self._can_be_kept = False
+            cache.warn_not_kept(cache.folder(world), error)

@@ -60,9 +60,17 @@ class Key(NamedTuple):
         return PACKAGE_DATA / f"{self.name}.xz"
 
 
+class File(NamedTuple):
+    """Arrays of a key, and what builds them: arguments of `cached`."""
+
+    key: Key
+    build: Callable[[], Arrays]
+
+
 def episode_key(world: World, name: str) -> Key:
     """Return the key of arrays that depend on `World.fluid` and, by ``name``, on a seed."""
-    return Key(_episode_folder(world.fluid), name)
+    fluid = world.fluid
+    return Key(f"{fluid.name}-{world_digest(fluid)[:16]}", name)
 
 
 def model_key(name: str, configuration: Any, version: int) -> Key:
@@ -114,7 +122,8 @@ def load_shipped(key: Key) -> dict[str, np.ndarray] | None:
         content = regrouped.reshape(packed[0], -1).T.tobytes()
     except (FileNotFoundError, lzma.LZMAError, ValueError, IndexError):
         return None
-    return _fields(np.load(io.BytesIO(content))) if _is_sound(key, content) else None
+    is_sound = _checksum(key, content[:-WORD]) == content[-WORD:]
+    return _fields(np.load(io.BytesIO(content))) if is_sound else None
 
 
 def warn_not_kept(place: Path, error: OSError) -> None:
@@ -174,11 +183,6 @@ def world_digest(world: World) -> str:
     return _digest([described(world), SIMULATION])
 
 
-@lru_cache(maxsize=64)
-def _episode_folder(world: World) -> str:
-    return f"{world.name}-{world_digest(world)[:16]}"
-
-
 def _digest(configuration: Any) -> str:
     return hashlib.sha256(json.dumps(configuration, sort_keys=True).encode()).hexdigest()
 
@@ -199,10 +203,6 @@ def _encode(key: Key, arrays: Arrays) -> bytes:
 
 def _checksum(key: Key, content: bytes) -> bytes:
     return zlib.crc32(content, zlib.crc32("/".join(key).encode())).to_bytes(WORD, "little")
-
-
-def _is_sound(key: Key, content: bytes) -> bool:
-    return _checksum(key, content[:-WORD]) == content[-WORD:]
 
 
 def _record(arrays: Arrays) -> np.ndarray:
@@ -238,7 +238,8 @@ def _load(key: Key) -> dict[str, np.ndarray] | None:
         status = os.stat(path)
         stamp = (status.st_size, status.st_mtime_ns)
         if _sound.get(path) != stamp:
-            if not _is_sound(key, path.read_bytes()):
+            content = path.read_bytes()
+            if _checksum(key, content[:-WORD]) != content[-WORD:]:
                 return None
             _sound[path] = stamp
         return _fields(np.load(path, mmap_mode="r"))

@@ -1,7 +1,7 @@
 """Episodes as examples to learn from: measurements, and the true concentration.
 
 The truth is given on the estimators' nodes, as the concentration p_t nearest to it in the norm of
-the score. With M̃ and b_t as in `eitbench.data.regions`, M̃ p_t = b_t, and for every ĉ on these nodes
+the score. With M̃ and b_t of `eitbench.data.recordings`, M̃ p_t = b_t, and for every ĉ on these nodes
     ∫(ĉ − c_t)² = (ĉ − p_t)ᵀ M̃ (ĉ − p_t) + ∫(p_t − c_t)².
 In reduced coordinates, ĉ = c̄ + B â and G = Bᵀ M̃ B, with a_t nearest to the truth, likewise
     ∫(c̄ + B â − c_t)² = (â − a_t)ᵀ G (â − a_t) + ∫(c̄ + B a_t − c_t)².
@@ -15,22 +15,21 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+import scipy.sparse as sp
+from scipy.sparse.linalg import splu
 from tqdm import tqdm
 
 from eitbench import _check
 from eitbench._extras import needed_by
 from eitbench.data.bank import TOGETHER, fill_here
 from eitbench.data.episodes import once
-from eitbench.data.recordings import cycle_voltages, recording
-from eitbench.data.regions import integrals, outline, score_mass
+from eitbench.data.recordings import cycle_voltages, integrals, outline, recording, score_mass
 from eitbench.data.seeds import is_test, name_seed, parse_seeds
 from eitbench.worlds.registry import entry
 from eitbench.worlds.world import World
 
 if TYPE_CHECKING:
-    import scipy.sparse as sp
-
-    from eitbench.numerics.mesh import Mesh
+    from eitbench.numerics.mesh import Mesh  # finite elements: not needed to read examples
 
 MIN_MASS = 1e-9
 """Fraction of the largest diagonal mass below which a node only touches a region by rounding."""
@@ -92,12 +91,13 @@ class Dataset:
         """Return the example of one episode, which is simulated if the cache does not hold it."""
         world = self.world
         entries = recording(world, seed)
-        truth, unresolved, square = _projected(world, seed, entries)
         cycle = world.currents
+        velocity = world.velocity_model
+        flow = np.empty((len(entries), 0)) if velocity is None else (
+            np.linalg.solve(velocity.gram, entries["velocity_moment"].T).T)
         nodal = Example(seed, cycle_voltages(world, seed, entries),
-                        cycle[np.arange(world.n_steps) % len(cycle)],
-                        (world.background + truth).astype(np.float32), unresolved, square,
-                        _fitted_flow(world, entries))
+                        cycle[np.arange(world.n_steps) % len(cycle)], *_projected(world, entries),
+                        flow)
         return nodal if self.basis is None else self.of(nodal)
 
     def of(self, example: Example) -> Example:
@@ -188,8 +188,7 @@ class Dataset:
 
     @cached_property
     def _weighted(self) -> np.ndarray:
-        weighted: np.ndarray = self._nodal_mass @ self._columns
-        return weighted
+        return np.asarray(self._nodal_mass @ self._columns)
 
 
 class TorchDataset:
@@ -270,40 +269,28 @@ def strongest(examples: Dataset, q: int) -> tuple[np.ndarray, np.ndarray]:
     return basis, np.maximum(left, 0.0)
 
 
-def _fitted_flow(world: World, entries: np.ndarray) -> np.ndarray:
-    """Return the flow parameters (T, k) in m/s that fit a recording best."""
-    velocity = world.velocity_model
-    if velocity is None:
-        return np.empty((len(entries), 0))
-    gram = velocity.profiles.T @ (velocity.weights[:, None] * velocity.profiles)
-    return np.linalg.solve(gram, entries["velocity_moment"].T).T
-
-
-def _projected(world: World, seed: int,
-               entries: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return p_t less the background (T, n), ∫(p_t − c_t)² and ∫c_t² (T,). With a region these are
-    of the region; nodes beyond it have the projection of the whole vessel."""
+def _projected(world: World, entries: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return p_t (T, n) in mol/m³, ∫(p_t − c_t)² and ∫c_t² (T,). With a region these are of the
+    region; nodes beyond it have the projection of the whole vessel."""
     truth = _solver(world)(entries["moment"].astype(float).T).T
-    counted = integrals(world, seed, entries)
+    counted = integrals(world, entries)
     moment = counted.moment.astype(float)
     if world.region is not None:
         inside, solve = _region_solver(world)
         truth[:, inside] = solve(moment[:, inside].T).T
     unresolved = counted.deviation - np.einsum("tn,tn->t", moment, truth)
-    return truth, unresolved, np.array(counted.square)
+    return (world.background + truth).astype(np.float32), unresolved, np.array(counted.square)
 
 
 @once(4)
 def _solver(world: World) -> Any:
     """Return b (n, T) -> M̃⁻¹ b over the whole vessel."""
-    from scipy.sparse.linalg import splu
     return splu(_symmetric(outline(world).mass).tocsc()).solve
 
 
 @once(4)
 def _region_solver(world: World) -> tuple[np.ndarray, Any]:
     """Return the nodes that the world's region touches, and M̃⁻¹ of them."""
-    from scipy.sparse.linalg import splu
     mass = _symmetric(score_mass(world))
     diagonal = mass.diagonal()
     inside = np.flatnonzero(diagonal > MIN_MASS * diagonal.max())

@@ -84,7 +84,7 @@ def once(many: int) -> Callable[[Callable[[World], Made]], Callable[[World], Mad
     `World.fluid`, and results of ``many`` are kept."""
     def decorated(make: Callable[[World], Made]) -> Callable[[World], Made]:
         kept = lru_cache(maxsize=many)(make)
-        return wraps(make)(lambda world: kept(world.fluid))
+        return wraps(kept)(lambda world: kept(world.fluid))
 
     return decorated
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from tqdm import tqdm
@@ -15,24 +15,17 @@ from eitbench._extras import needed_by
 from eitbench._files import PACKAGE, write_atomically
 from eitbench.data.bank import fill
 from eitbench.data.cache import described, world_digest
-from eitbench.data.regions import SPARSE
-from eitbench.data.seeds import is_test, name_seed, parse_seeds
-
-if TYPE_CHECKING:
-    from eitbench.data.dataset import Dataset
+from eitbench.data.dataset import Dataset
+from eitbench.data.recordings import SPARSE
+from eitbench.data.seeds import is_test, name_seed, parse_seeds, seed_ranges
 
 SUFFIXES = {"npz": "npz", "hdf5": "h5"}
 """Format -> suffix of its files."""
-MANIFEST = "dataset.json"
-"""File that identifies the environment, format and version of an export."""
 MESH = "mesh.npz"
-
 INTEGRAL = "(mol/m³)²·m² (m³ in 3D)"
 UNITS = {"seed": "", "voltages": "V", "currents": "A (A/m in 2D)", "truth": "mol/m³",
          "unresolved": INTEGRAL, "square": INTEGRAL, "velocity": "m/s"}
 """Unit of each field."""
-README = PACKAGE / "data" / "export_readme.md"
-"""Template of the description of an export."""
 WARNING = "Test episodes are among them: report on them, and neither learn nor choose."
 
 
@@ -62,7 +55,8 @@ def export(examples: Dataset, folder: Path, format: str = "npz", *, n_jobs: int 
     encode = _hdf5 if format == "hdf5" else _npz
     about = _about(examples, format)
     _claim(folder, json.dumps(about, indent=1) + "\n")
-    paths = {seed: folder / f"{name_seed(seed).replace(':', '-')}.{SUFFIXES[format]}"
+    suffix = SUFFIXES[format]
+    paths = {seed: folder / f"{name_seed(seed).replace(':', '-')}.{suffix}"
              for seed in examples.seeds}
     missing = [seed for seed, path in paths.items() if not path.exists()]
     fill(examples.world, missing, n_jobs=n_jobs, backend=backend)
@@ -71,9 +65,14 @@ def export(examples: Dataset, folder: Path, format: str = "npz", *, n_jobs: int 
         {"points": examples.mesh.points, "cells": examples.mesh.cells}
         | {f"mass_{name}": getattr(mass, name) for name in SPARSE}))
     for seed in tqdm(missing, desc="writing", unit="episode", disable=None):
-        fields = examples.example(seed)._asdict()
-        write_atomically(paths[seed], encode(fields))
-    write_atomically(folder / "README.md", _readme(folder, about).encode())
+        write_atomically(paths[seed], encode(examples.example(seed)._asdict()))
+    held = [path.stem.replace("-", ":") for path in folder.glob(f"[!.]*.{suffix}")
+            if path.name != MESH]
+    tests = any(is_test(parse_seeds(name)[0]) for name in held)
+    readme = (PACKAGE / "data" / "export_readme.md").read_text(encoding="utf-8").format(
+        held=seed_ranges(held), warning=WARNING if tests else "", ms=1e3 * about["time_step"],
+        numbers=json.dumps(about["world"], indent=1), units=UNITS, **about)
+    write_atomically(folder / "README.md", readme.encode())
     return len(missing)
 
 
@@ -91,7 +90,7 @@ def _about(examples: Dataset, format: str) -> dict[str, Any]:
 
 def _claim(folder: Path, manifest: str) -> None:
     """Write the manifest into a new folder; ``ValueError`` if the folder holds other files."""
-    path = folder / MANIFEST
+    path = folder / "dataset.json"
     if path.exists():
         if path.read_text(encoding="utf-8") != manifest:
             raise ValueError(f"out must be another folder: {path} is of another environment, "
@@ -100,32 +99,6 @@ def _claim(folder: Path, manifest: str) -> None:
         raise ValueError(f"out must be a new or empty folder, or one of an export; got {folder}")
     else:
         write_atomically(path, manifest.encode())
-
-
-def _readme(folder: Path, about: dict[str, Any]) -> str:
-    """Return a description of the files that the folder holds."""
-    held = seed_ranges(path.stem for path in folder.glob(f"[!.]*.{SUFFIXES[about['format']]}")
-                       if path.name != MESH)
-    tests = any(is_test(parse_seeds(each)[0]) for each in held)
-    return README.read_text(encoding="utf-8").format(
-        held="; ".join(held), warning=WARNING if tests else "", ms=1e3 * about["time_step"],
-        numbers=json.dumps(about["world"], indent=1), units=UNITS, **about)
-
-
-def seed_ranges(names: Iterable[str]) -> list[str]:
-    """Return ``train:0-99,200`` and so on, from ``train-0``, ``train-1`` …"""
-    numbers: dict[str, set[int]] = {}
-    for name in names:
-        split, _, number = name.rpartition("-")
-        numbers.setdefault(split, set()).add(int(number))
-    return [f"{split}:{_runs(each)}" if split else _runs(each)
-            for split, each in sorted(numbers.items())]
-
-
-def _runs(numbers: set[int]) -> str:
-    begins = sorted(number for number in numbers if number - 1 not in numbers)
-    ends = sorted(number for number in numbers if number + 1 not in numbers)
-    return ",".join(str(a) if a == b else f"{a}-{b}" for a, b in zip(begins, ends, strict=True))
 
 
 def _npz(arrays: Mapping[str, Any]) -> bytes:

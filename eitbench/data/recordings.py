@@ -1,34 +1,73 @@
-"""Recordings: the part of a simulated episode that environments play and score it from.
+"""Recordings: what environments play and score an episode from, of all steps or of the first ones.
 
-Scores need of the truth only two integrals a step and one vector on the estimators' nodes
-(`eitbench.data.regions`), and none of its meshes.
+Scores need of the truth two integrals a step and one vector on the estimators' nodes, and none of
+its meshes. With P the interpolation from those nodes to the truth's, M the truth's mass matrix over
+what counts, and all concentrations relative to the world's background,
+    ∫(ĉ − c)² = ĉᵀ M̃ ĉ − 2 ĉᵀ b_t + d_t,      M̃ = Pᵀ M P,   b_t = Pᵀ M c_t,   d_t = c_tᵀ M c_t.
+A world with a ``region`` counts errors between two cross-sections only.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import lru_cache
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+import scipy.sparse as sp
 
 from eitbench import _check
 from eitbench.data import cache
-from eitbench.data.episodes import Episode, simulate
-from eitbench.data.regions import (  # noqa: F401 (outline, score_operators: for users of both)
-    integrate,
-    make_integrals,
-    outline,
-    score_operators,
+from eitbench.data.episodes import (
+    Episode,
+    is_simulated,
+    once,
+    simulate,
+    simulate_together,
+    truth_discretisation,
 )
+from eitbench.physics.profiles import VelocityModel
+from eitbench.worlds.instrument import Faults, Instrument
 from eitbench.worlds.streams import randomness
+from eitbench.worlds.task import make_task
+from eitbench.worlds.world import World
 
 if TYPE_CHECKING:
-    from pathlib import Path
+    from eitbench.numerics.mesh import Mesh  # finite elements: not needed to play recordings
 
-    import scipy.sparse as sp
+OUTLINE = 1
+"""Version of the outlines and region masses that are kept."""
+MARGIN = 12
+"""Steps simulated beyond those that the first observation needs: environment checkers take ten."""
+SHIPPED_SEED = 0
+"""Seed of the episode whose first steps are shipped: a growing pool starts with it."""
+SPARSE = ("data", "indices", "indptr")
+"""Arrays that hold a sparse matrix."""
 
-    from eitbench.physics.profiles import VelocityModel
-    from eitbench.worlds.instrument import Faults
-    from eitbench.worlds.world import World
+
+class Outline(NamedTuple):
+    """The scoring constants that all episodes of a world share."""
+
+    mass: sp.csr_array
+    """(n, n) upper triangle of M̃ over the whole vessel, m² (m³ in 3D), doubled off the diagonal:
+    ĉᵀ·mass·ĉ = ĉᵀM̃ĉ."""
+    largest_voltage: float
+    """V, of the cycle's injections into liquid of the expected concentration."""
+
+
+class Integrals(NamedTuple):
+    """The integrals that score an episode, t = 1 … T, over what counts."""
+
+    moment: np.ndarray
+    """(T, n) float32, b_t"""
+    deviation: np.ndarray
+    """(T,) ∫(c_t − background)²"""
+    square: np.ndarray
+    """(T,) ∫c_t²"""
+
+
+# -- recordings --
 
 
 def recording(world: World, seed: int) -> np.ndarray:
@@ -50,9 +89,34 @@ def recording(world: World, seed: int) -> np.ndarray:
     seed = _check.integer("seed", seed, low=0)
 
     def build() -> dict[str, np.ndarray]:
-        return {"steps": make_recording(world, seed, simulate(world, seed))}
+        return {"steps": make_recording(world, simulate(world, seed))}
 
     return cache.cached(recording_key(world, seed), build)["steps"]
+
+
+def recording_so_far(world: World, seed: int, needed: int) -> np.ndarray:
+    """Return the recording of the whole episode if the cache holds it, else of the ``needed`` first
+    steps and some more, in a quarter of the time."""
+    last = needed + MARGIN
+    if last >= world.n_steps or is_recorded(world, seed):
+        return recording(world, seed)
+    entries = _shipped(world.fluid) if seed == SHIPPED_SEED else None
+    if entries is None or len(entries) < needed:
+        entries = make_recording(world, _beginning(world.fluid, seed, last))
+    return entries
+
+
+def concentration_at(world: World, seed: int, t: int, needed: int) -> np.ndarray:
+    """Return c_t (n_truth,) in mol/m³ on the truth's mesh; ``needed`` as in `recording_so_far`."""
+    last = needed + MARGIN
+    is_early = t <= last < world.n_steps and not is_simulated(world, seed)
+    episode = _beginning(world.fluid, seed, last) if is_early else simulate(world, seed)
+    return episode.concentration[t].astype(float)
+
+
+@lru_cache(maxsize=8)
+def _beginning(fluid: World, seed: int, last: int) -> Episode:
+    return next(simulate_together(fluid, [seed], last=last))
 
 
 def recording_key(world: World, seed: int) -> cache.Key:
@@ -60,28 +124,23 @@ def recording_key(world: World, seed: int) -> cache.Key:
     return cache.episode_key(world, str(seed))
 
 
-def recording_path(world: World, seed: int) -> Path:
-    """Return the file of an episode's recording in the cache."""
-    return recording_key(world, seed).path
-
-
 def is_recorded(world: World, seed: int) -> bool:
     """Return whether the cache holds a sound recording."""
     return cache.is_cached(recording_key(world, seed))
 
 
-def make_recording(world: World, seed: int, episode: Episode) -> np.ndarray:
-    """Compute the recording of ``episode``, which `simulate` returns for this seed."""
-    operators = score_operators(world)
-    velocity = world.velocity_model
-    entries = np.zeros(len(episode.noise), recording_type(world, operators[0].shape[1]))
+def make_recording(world: World, episode: Episode) -> np.ndarray:
+    """Compute the recording of an episode, or of its beginning."""
+    operators = {"": score_operators(world)}
+    if world.region is not None:
+        operators["region_"] = region_operators(world)
+    entries = np.zeros(len(episode.noise), recording_type(world, operators[""][0].shape[1]))
     entries["transfer_resistance"] = episode.transfer_resistance
     entries["noise"] = episode.noise
-    for name, array in integrate(episode, world.background, *operators)._asdict().items():
-        entries[name] = array
-    if world.region is not None:
-        for name, array in make_integrals(world, episode)._asdict().items():
-            entries[f"region_{name}"] = array
+    for prefix, over in operators.items():
+        for name, array in integrate(episode, world.background, *over)._asdict().items():
+            entries[prefix + name] = array
+    velocity = world.velocity_model
     if velocity is not None:
         entries["velocity_moment"] = (episode.velocity * velocity.weights) @ velocity.profiles
         entries["velocity_square"] = episode.velocity**2 @ velocity.weights
@@ -102,6 +161,40 @@ def recording_type(world: World, n_nodes: int) -> np.dtype:
                      *scores, *flow])
 
 
+def beginning_file(world: World, needed: int = 0) -> cache.File:
+    """Return the shipped beginning: the transfer resistances of the first steps that are not
+    scored; the ``needed`` ones must be among them."""
+    def build() -> dict[str, np.ndarray]:
+        steps = min(needed + MARGIN, world.warm_up)
+        (episode,) = simulate_together(world.fluid, [SHIPPED_SEED], False, steps)
+        return {"transfer_resistance": episode.transfer_resistance}
+
+    key = cache.model_key("beginning", cache.described(world.fluid), cache.SIMULATION)
+    return cache.File(key, build)
+
+
+@once(4)
+def _shipped(world: World) -> np.ndarray | None:
+    """Return the shipped steps as entries of a recording; their integrals, which no score needs,
+    are not those of the truth."""
+    arrays = cache.load_shipped(beginning_file(world).key)
+    if arrays is None:
+        return None
+    resistance = arrays["transfer_resistance"]
+    noise = randomness(SHIPPED_SEED).noise.standard_normal((world.n_steps, resistance.shape[1]))
+    entries = np.zeros(len(resistance), recording_type(world, outline(world).mass.shape[0]))
+    entries["transfer_resistance"] = resistance
+    entries["noise"] = noise[:len(resistance)]
+    for name in entries.dtype.names or ():
+        if name.endswith("square"):
+            entries[name] = 1.0  # relative errors divide by it
+    entries.setflags(write=False)
+    return entries
+
+
+# -- voltages and scores --
+
+
 def faults_of(world: World, seed: int) -> Faults:
     """Return the faults of the instrument in an episode."""
     return world.instrument.draw(randomness(seed).faults, world.vessel.n_electrodes, world.n_steps)
@@ -114,6 +207,23 @@ def cycle_voltages(world: World, seed: int, entries: np.ndarray) -> np.ndarray:
     return world.instrument.measure(faults_of(world, seed), steps + 1,
                                     entries["transfer_resistance"], cycle[steps % len(cycle)],
                                     entries["noise"])
+
+
+def integrals(world: World, entries: np.ndarray) -> Integrals:
+    """Return the integrals of a recording over what counts."""
+    prefix = "" if world.region is None else "region_"
+    return Integrals(*(entries[f"{prefix}{name}"] for name in Integrals._fields))
+
+
+def integrate(episode: Episode, background: float, interpolation: sp.csr_array,
+              mass: sp.csr_array) -> Integrals:
+    """Compute the integrals of an episode for these P and M."""
+    c = episode.concentration[1:].astype(float)
+    deviation = c - background
+    weighted = mass @ deviation.T
+    return Integrals((interpolation.T @ weighted).T.astype(np.float32),
+                     np.einsum("tn,nt->t", deviation, weighted),
+                     np.einsum("tn,nt->t", c, mass @ c.T))
 
 
 def step_error(mass: sp.csr_array, estimate: np.ndarray, moment: np.ndarray,
@@ -129,6 +239,87 @@ def velocity_error(velocity: VelocityModel, parameters: np.ndarray, moment: np.n
                    square: np.ndarray | float) -> np.ndarray:
     """Return ∫(v̂_t − v_t)² / ∫v_t² across the pipe of ``parameters`` (..., k) in m/s, by a
     recording."""
-    gram = velocity.profiles.T @ (velocity.weights[:, None] * velocity.profiles)
-    quadratic = np.einsum("...k,kl,...l->...", parameters, gram, parameters)
+    quadratic = np.einsum("...k,kl,...l->...", parameters, velocity.gram, parameters)
     return (quadratic - 2.0 * np.einsum("...k,...k->...", parameters, moment) + square) / square
+
+
+# -- constants of a world --
+
+
+@once(4)
+def outline(world: World) -> Outline:
+    """Return the outline of a world, shipped, cached or computed."""
+    arrays = cache.cached(*outline_file(world))
+    return Outline(csr_of(arrays), float(arrays["largest"]))
+
+
+def outline_file(world: World) -> cache.File:
+    """Return the arrays of a world's outline, which neither flow, target nor contacts change."""
+    def build() -> dict[str, np.ndarray]:
+        task = make_task(world.fluid)
+        level = np.full(task.mesh.n_nodes, world.expected_concentration)
+        largest = np.abs(task.observation.voltages(level, world.fluid.currents)).max()
+        return _half_mass(*score_operators(world)) | {"largest": np.array(largest)}
+
+    instrument = Instrument(current=world.instrument.current)
+    fluid = cache.described(replace(world.fluid, instrument=instrument))
+    numbers = {name: fluid[name] for name in ("vessel", "instrument", "prior")}
+    numbers["pattern"] = fluid["schedule"]["pattern"]
+    return cache.File(cache.model_key("outline", numbers, OUTLINE), build)
+
+
+@once(4)
+def score_mass(world: World) -> sp.csr_array:
+    """Return M̃ (n, n) of what counts, one triangle with doubled entries as `Outline.mass`."""
+    if world.region is None:
+        return outline(world).mass
+    return csr_of(cache.cached(*region_file(world)))
+
+
+def region_file(world: World) -> cache.File:
+    """Return the arrays of the mass matrix of a world's region."""
+    key = cache.model_key("region", [cache.described(world.vessel), world.region], OUTLINE)
+    return cache.File(key, lambda: _half_mass(*region_operators(world)))
+
+
+@once(2)
+def score_operators(world: World) -> tuple[sp.csr_array, sp.csr_array]:
+    """Return P and M over the whole vessel."""
+    from eitbench.numerics.fem import mass_matrix
+    truth = truth_discretisation(world).transport.mesh
+    return world.vessel.carrier(fine=False)[0].interpolation_to(truth.points), mass_matrix(truth)
+
+
+@once(2)
+def region_operators(world: World) -> tuple[sp.csr_array, sp.csr_array]:
+    """Return P and M over what counts."""
+    interpolation, mass = score_operators(world)
+    if world.region is not None:
+        mass = mass_between(truth_discretisation(world).transport.mesh, *world.region)
+    return interpolation, mass
+
+
+def mass_between(mesh: Mesh, begin: float, end: float) -> sp.csr_array:
+    """Return the P1 mass matrix (n, n) in m² (m³ in 3D) of the cells with centroids in
+    begin < x < end (m)."""
+    middle = mesh.points[mesh.cells][:, :, 0].mean(axis=1)
+    inside = (begin < middle) & (middle < end)
+    cells = mesh.cells[inside]
+    corners = mesh.dim + 1
+    local = mesh.volumes[inside, None, None] * (1.0 + np.eye(corners)) / (corners * (corners + 1))
+    rows = np.repeat(cells, corners, axis=1).ravel()
+    columns = np.tile(cells, corners).ravel()
+    return sp.csr_array((local.ravel(), (rows, columns)), shape=(mesh.n_nodes,) * 2)
+
+
+def _half_mass(interpolation: sp.csr_array, mass: sp.csr_array) -> dict[str, np.ndarray]:
+    """Return M̃'s upper triangle with doubled entries off the diagonal as `SPARSE` arrays."""
+    full = interpolation.T @ mass @ interpolation
+    half = sp.csr_array(sp.triu(full) + sp.triu(full, 1))
+    return {name: getattr(half, name) for name in SPARSE}
+
+
+def csr_of(arrays: Mapping[str, np.ndarray]) -> sp.csr_array:
+    """Return the square matrix of `SPARSE` arrays."""
+    data, indices, indptr = (arrays[name] for name in SPARSE)
+    return sp.csr_array((data, indices, indptr), shape=(len(indptr) - 1,) * 2)

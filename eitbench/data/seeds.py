@@ -46,6 +46,21 @@ def name_seed(seed: int) -> str:
     return str(seed)
 
 
+def seed_ranges(names: Iterable[str]) -> str:
+    """``test:0-3,7`` for test:0, test:1, test:2, test:3 and test:7; ``;`` between splits."""
+    numbers: dict[str, set[int]] = {}
+    for name in names:
+        split, _, number = name.rpartition(":")
+        numbers.setdefault(split, set()).add(int(number))
+    texts = []
+    for split, held in sorted(numbers.items()):
+        begins = sorted(number for number in held if number - 1 not in held)
+        ends = sorted(number for number in held if number + 1 not in held)
+        runs = ",".join(f"{a}" if a == b else f"{a}-{b}" for a, b in zip(begins, ends, strict=True))
+        texts.append(f"{split}:{runs}" if split else runs)
+    return "; ".join(texts)
+
+
 def is_test(seed: int) -> bool:
     """Return whether scores are reported of this episode."""
     return seed in SPLITS["test"]

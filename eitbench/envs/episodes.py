@@ -20,8 +20,8 @@ from gymnasium.vector.utils import batch_space
 
 from eitbench import _check
 from eitbench._extras import needed_by
-from eitbench.data.beginnings import Script, concentration_at, script, script_so_far
-from eitbench.data.pool import Pool
+from eitbench.data.bank import Pool
+from eitbench.data.recordings import concentration_at, recording, recording_so_far
 from eitbench.data.seeds import warn_of_reserved
 from eitbench.worlds.task import Task, make_task
 
@@ -66,14 +66,14 @@ class EpisodeCore(ABC):
         self.seeds = tuple(seeds)
         self._provide = provide
         if provide is None:
-            self._load([script(self.world, seed) for seed in seeds])
+            self._load([recording(self.world, seed) for seed in seeds])
         else:
-            self._load([script_so_far(self.world, seed, self.first + 1) for seed in seeds])
+            self._load([recording_so_far(self.world, seed, self.first + 1) for seed in seeds])
 
-    def _load(self, scripts: Sequence[Script]) -> None:
-        self._known = min(len(entries) for entries, _ in scripts)
+    def _load(self, recordings: Sequence[np.ndarray]) -> None:
+        self._known = min(map(len, recordings))
         """steps that are loaded"""
-        self._read(scripts)
+        self._read(recordings)
 
     def load_until(self, t: int) -> None:
         """Load at least the steps 1 … t of each episode."""
@@ -81,11 +81,11 @@ class EpisodeCore(ABC):
             assert self._provide is not None
             for seed in self.seeds:
                 self._provide(self.world, seed)
-            self._load([script(self.world, seed) for seed in self.seeds])
+            self._load([recording(self.world, seed) for seed in self.seeds])
 
     @abstractmethod
-    def _read(self, scripts: Sequence[Script]) -> None:
-        """Copy the arrays of the episodes; a script may be mapped from a file, which stays open."""
+    def _read(self, recordings: Sequence[np.ndarray]) -> None:
+        """Copy the arrays of the episodes; a recording is mapped from a file, which stays open."""
 
     @abstractmethod
     def act(self, actions: np.ndarray) -> np.ndarray:

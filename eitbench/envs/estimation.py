@@ -9,9 +9,14 @@ import numpy as np
 from gymnasium import spaces
 
 from eitbench import _check
-from eitbench.data.beginnings import Script
-from eitbench.data.recordings import cycle_voltages, outline, step_error, velocity_error
-from eitbench.data.regions import score_mass
+from eitbench.data.recordings import (
+    cycle_voltages,
+    integrals,
+    outline,
+    score_mass,
+    step_error,
+    velocity_error,
+)
 from eitbench.envs.episodes import EpisodeCore, EpisodeEnv, EpisodeVectorEnv, Observation
 from eitbench.worlds.registry import entry
 from eitbench.worlds.streams import randomness
@@ -65,19 +70,20 @@ class EstimationCore(EpisodeCore):
         self._step = 1
         super().begin(seeds, provide)
 
-    def _read(self, scripts: Sequence[Script]) -> None:
+    def _read(self, recordings: Sequence[np.ndarray]) -> None:
         world = self.world
-        self.voltages = np.zeros((self.length + 1, len(scripts), self.currents.shape[1]))
+        self.voltages = np.zeros((self.length + 1, len(recordings), self.currents.shape[1]))
         """(T + lag + 1, B, L) V of the steps that are loaded, else 0"""
         k = slice(self._known)
-        self._deviations, self._squares = np.empty((2, self._known, len(scripts)))
+        self._deviations, self._squares = np.empty((2, self._known, len(recordings)))
         self._moments: list[np.ndarray] = []
         self._flows: list[tuple[np.ndarray, np.ndarray]] = []
-        for b, (seed, (entries, integrals)) in enumerate(zip(self.seeds, scripts, strict=True)):
+        for b, (seed, entries) in enumerate(zip(self.seeds, recordings, strict=True)):
+            counted = integrals(world, entries)
             self.voltages[k, b] = cycle_voltages(world, seed, entries[k])
-            self._deviations[:, b] = integrals.deviation[k]
-            self._squares[:, b] = integrals.square[k]
-            self._moments.append(integrals.moment[world.warm_up:].copy())
+            self._deviations[:, b] = counted.deviation[k]
+            self._squares[:, b] = counted.square[k]
+            self._moments.append(counted.moment[world.warm_up:].copy())
             if world.velocity_model is not None:
                 self._flows.append((entries["velocity_moment"].copy(),
                                     entries["velocity_square"].copy()))

@@ -8,9 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from gymnasium import spaces
 
-from eitbench.data.beginnings import Script
-from eitbench.data.recordings import faults_of, outline
-from eitbench.data.regions import score_mass
+from eitbench.data.recordings import faults_of, integrals, outline, score_mass
 from eitbench.envs.episodes import EpisodeCore, Observation
 from eitbench.estimation.onboard.choice import operator_type
 from eitbench.estimation.onboard.console import Console
@@ -146,19 +144,20 @@ class InjectionCore(EpisodeCore):
         for k in range(RECENT):
             self._recent[:, k] = world.currents[(self.first - 1 - k) % self.first]
 
-    def _read(self, scripts: Sequence[Script]) -> None:
+    def _read(self, recordings: Sequence[np.ndarray]) -> None:
         moments = []
         k = slice(self._known)
-        for b, (entries, integrals) in enumerate(scripts):
+        for b, entries in enumerate(recordings):
+            counted = integrals(self.world, entries)
             self._resistance[k, b] = entries["transfer_resistance"][k]
             self._draws[k, b] = entries["noise"][k]
-            self._deviations[b, k] = integrals.deviation[k]
-            self._squares[b, k] = integrals.square[k]
-            self._totals[b, k] = integrals.moment[k].sum(axis=1, dtype=float)
+            self._deviations[b, k] = counted.deviation[k]
+            self._squares[b, k] = counted.square[k]
+            self._totals[b, k] = counted.moment[k].sum(axis=1, dtype=float)
             if self._operator_type:
                 # all rows, so that the bits of a product of matrices do not depend on their number
-                moment = np.zeros((self.world.n_steps, integrals.moment.shape[1]), np.float32)
-                moment[k] = integrals.moment[k]
+                moment = np.zeros((self.world.n_steps, counted.moment.shape[1]), np.float32)
+                moment[k] = counted.moment[k]
                 moments.append(self._operator_type.project(self.world, moment))
         self._moments = np.array(moments)
         self._homogeneous = None

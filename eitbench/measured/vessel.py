@@ -15,8 +15,7 @@ from eitbench import _check
 from eitbench.measured.readers import load_yaml
 from eitbench.numerics.mesh import Mesh
 from eitbench.physics.cem import CompleteElectrodeModel
-from eitbench.worlds.mesh_vessel import MeshVessel
-from eitbench.worlds.vessels import PlanePipe, RoundPipe, RoundTank
+from eitbench.worlds.vessels import MeshVessel, PlanePipe, RoundPipe, RoundTank
 
 DIRECTIONS = ("counter-clockwise", "clockwise")
 MAX_COVERAGE = 0.95

@@ -13,8 +13,7 @@ from __future__ import annotations
 import numpy as np
 import scipy.sparse as sp
 
-from eitbench.numerics.compiled import compiled_kernels
-from eitbench.numerics.memory import scratch
+from eitbench.numerics.compiled import compiled_kernels, scratch
 from eitbench.numerics.sparse_lu import eliminated
 
 _LEAF = 200
@@ -47,7 +46,9 @@ class Condensation:
                  places: np.ndarray | None = None) -> None:
         self.n = pattern.shape[0]
         self.n_ports = n_ports
-        place = _ordered(pattern, n_ports, places)
+        inner = pattern[:-n_ports, :-n_ports]
+        place = _minimum_degree(inner) if places is None else _nested_dissection(inner, places)
+        place = np.append(place, np.arange(self.n - n_ports, self.n))
         filled = _filled(_permuted(pattern, place))
         rank = _postorder(_parents(filled), n_ports)
         place = rank[place]
@@ -192,14 +193,6 @@ def _multifrontal_sizes(start: np.ndarray, first_row: np.ndarray, rows: np.ndarr
         total += own
         fullest = max(fullest, total)
     return children, int(height.max()**2), fullest + 1
-
-
-def _ordered(pattern: sp.csc_array, n_ports: int, places: np.ndarray | None) -> np.ndarray:
-    """Position of each unknown, the ports last."""
-    n = pattern.shape[0]
-    inner = pattern[:-n_ports, :-n_ports]
-    place = _minimum_degree(inner) if places is None else _nested_dissection(inner, places)
-    return np.append(place, np.arange(n - n_ports, n))
 
 
 def _nested_dissection(pattern: sp.csc_array, places: np.ndarray) -> np.ndarray:

@@ -51,6 +51,14 @@ def integral(v, _w):
     return v
 
 
+def facet_numbers(mesh: skfem.Mesh, facets: np.ndarray) -> np.ndarray:
+    """(...) number in a scikit-fem mesh of each of the facets (..., d), given by their nodes."""
+    sides = np.sort(mesh.facets, axis=0).T.tolist()
+    number = {tuple(side): i for i, side in enumerate(sides)}
+    flat = np.sort(facets, axis=-1).reshape(-1, mesh.dim())
+    return np.array([number[tuple(facet)] for facet in flat.tolist()]).reshape(facets.shape[:-1])
+
+
 def mass_matrix(mesh: Mesh) -> sp.csr_array:
     """(n, n) P1 mass matrix ∫φᵢφⱼ in m^d."""
     return sp.csr_array(product.assemble(basis(mesh, 1, intorder=2)))

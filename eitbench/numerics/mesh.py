@@ -92,7 +92,10 @@ class Mesh:
 
     def facets_where(self, predicate: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
         """(n_facets, d): boundary facets with all nodes in ``predicate(points) -> bool (k,)``."""
-        inside = np.asarray(predicate(self.points), dtype=bool)
+        return self.facets_of(np.asarray(predicate(self.points), dtype=bool))
+
+    def facets_of(self, inside: np.ndarray) -> np.ndarray:
+        """(n_facets, d): boundary facets with all nodes ``inside``, (n_nodes,) bool."""
         return self.boundary_facets[inside[self.boundary_facets].all(axis=1)]
 
     @cached_property

@@ -12,7 +12,6 @@ save it as a .msh file::
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
 from contextlib import redirect_stderr, redirect_stdout
 from io import StringIO
 from os import PathLike
@@ -133,19 +132,8 @@ def _facet_groups(path: Path, content: Any, dim: int) -> dict[str, np.ndarray]:
     """Return the facets (k, d) of each named group, in node numbers of the file."""
     names = {int(tag): name for name, (tag, of_dim) in content.field_data.items()
              if of_dim == dim - 1}
-    parts: dict[str, list[np.ndarray]] = {}
-    for name, facets in _named_facets(path, content, dim, names):
-        if len(facets):
-            parts.setdefault(name, []).append(facets)
-    if empty := sorted(set(names.values()) - set(parts)):
-        raise ValueError(f"{path}: group {empty[0]!r} must hold facets, got none; in gmsh, mesh "
-                         "them and save without Mesh.SaveAll")
-    return {name: np.concatenate(facets) for name, facets in parts.items()}
-
-
-def _named_facets(path: Path, content: Any, dim: int, names: dict[int, str],
-                  ) -> Iterator[tuple[str, np.ndarray]]:
     tags = content.cell_data.get("gmsh:physical")
+    parts: dict[str, list[np.ndarray]] = {}
     for number, block in enumerate(content.cells):
         if block.type != _FACET[dim]:
             continue
@@ -155,7 +143,11 @@ def _named_facets(path: Path, content: Any, dim: int, names: dict[int, str],
             if tag not in names:
                 raise ValueError(f"{path}: groups of boundary facets must have a name, which no "
                                  f"group of another dimension has, got group {tag} without one")
-            yield names[tag], block.data[own == tag]
+            parts.setdefault(names[tag], []).append(block.data[own == tag])
         for name, sets in content.cell_sets.items():          # all groups of a facet, in gmsh 4.1
-            if not name.startswith("gmsh:") and sets[number] is not None:
-                yield name, block.data[np.asarray(sets[number], dtype=int)]
+            if not name.startswith("gmsh:") and sets[number] is not None and len(sets[number]):
+                parts.setdefault(name, []).append(block.data[np.asarray(sets[number], dtype=int)])
+    if empty := sorted(set(names.values()) - set(parts)):
+        raise ValueError(f"{path}: group {empty[0]!r} must hold facets, got none; in gmsh, mesh "
+                         "them and save without Mesh.SaveAll")
+    return {name: np.concatenate(facets) for name, facets in parts.items()}

@@ -8,8 +8,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import SuperLU, splu
 
-from eitbench.numerics.compiled import compiled_kernels
-from eitbench.numerics.memory import scratch
+from eitbench.numerics.compiled import compiled_kernels, scratch
 
 ByRows = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Pointers, indices and values of a sparse matrix, as the kernels want it."""

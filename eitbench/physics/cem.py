@@ -19,7 +19,7 @@ from skfem.helpers import dot, grad
 from eitbench import _check
 from eitbench.numerics.condensation import Condensation
 from eitbench.numerics.fem import basis as basis_on
-from eitbench.numerics.fem import element, integral, product
+from eitbench.numerics.fem import element, facet_numbers, integral, product
 from eitbench.numerics.mesh import Mesh, as_set, checked_facets
 from eitbench.physics.sensitivity import Sensitivity
 
@@ -216,11 +216,9 @@ class _Wall(NamedTuple):
 
 def _walls(basis: skfem.CellBasis, electrodes: Sequence[np.ndarray], order: int) -> list[_Wall]:
     mesh = basis.mesh
-    sides = np.sort(mesh.facets, axis=0).T.tolist()
-    number = {tuple(side): i for i, side in enumerate(sides)}
+    ends = np.cumsum([len(facets) for facets in electrodes])
     walls = []
-    for facets in electrodes:
-        numbers = np.array([number[tuple(facet)] for facet in facets.tolist()])
+    for numbers in np.split(facet_numbers(mesh, np.concatenate(electrodes)), ends[:-1]):
         wall = skfem.FacetBasis(mesh, element(mesh.dim(), order), intorder=2 * order,
                                 facets=numbers)
         walls.append(_Wall(sp.csr_array(product.assemble(wall)), integral.assemble(wall)))

@@ -15,7 +15,7 @@ from skfem.helpers import grad
 
 from eitbench import _check
 from eitbench.numerics.fem import basis as basis_on
-from eitbench.numerics.fem import integral, laplace
+from eitbench.numerics.fem import facet_numbers, integral, laplace
 from eitbench.numerics.mesh import Mesh, as_set, checked_facets
 from eitbench.physics.transport import VelocityField
 
@@ -162,7 +162,7 @@ def _discretise(mesh: Mesh, walls: Sequence[tuple[np.ndarray, VelocityField]],
         source = -net / weights.sum() * weights
         fixed.append(np.array([2 * n]))
     free = np.setdiff1d(np.arange(len(given)), np.concatenate(fixed))
-    middles = _middle_dofs(basis, mesh.cells[:, _EDGES])
+    middles = basis.facet_dofs[0][facet_numbers(basis.mesh, mesh.cells[:, _EDGES])]
     cell_dofs = np.concatenate([basis.nodal_dofs[0][mesh.cells], middles], axis=1)
     return _Equations(basis, sp.csr_array(laplace.assemble(basis)), divergence, load, source,
                       given, free, weights, closed, cell_dofs)
@@ -185,25 +185,13 @@ def _wall_values(mesh: Mesh, basis: skfem.Basis,
             raise ValueError(f"walls[{i}] must hold facets of the boundary, "
                              f"got {min(here - boundary)}")
         rest -= here
-        dofs = np.concatenate([basis.nodal_dofs[0][facets].ravel(), _middle_dofs(basis, facets)])
+        middles = basis.facet_dofs[0][facet_numbers(basis.mesh, facets)]
+        dofs = np.concatenate([basis.nodal_dofs[0][facets].ravel(), middles])
         ends = mesh.points[facets]
         points = np.concatenate([ends.reshape(-1, 2), ends.mean(axis=1)])
         value[dofs] = _sample(f"walls[{i}] velocity", velocity, points)
         on_wall[dofs] = True
     return value, np.flatnonzero(on_wall), not rest
-
-
-def _middle_dofs(basis: skfem.Basis, edges: np.ndarray) -> np.ndarray:
-    """The P2 unknowns at the middles of ``edges`` (..., 2), given by their node numbers."""
-    n = basis.mesh.nvertices
-
-    def key(ends: np.ndarray) -> np.ndarray:
-        low, high = np.moveaxis(np.sort(ends.astype(np.int64), axis=-1), -1, 0)
-        return low * n + high
-
-    known = key(basis.mesh.facets.T)
-    order = np.argsort(known)
-    return basis.facet_dofs[0][order[np.searchsorted(known, key(edges), sorter=order)]]
 
 
 def _sample(name: str, field: VelocityField, points: np.ndarray) -> np.ndarray:

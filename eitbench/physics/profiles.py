@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.polynomial.polynomial import polyval
@@ -91,6 +92,11 @@ class VelocityModel:
     def profiles(self) -> np.ndarray:
         """(p, k) φ_k at `points`."""
         return np.stack([polyval(_ETA, shape) for shape in self.basis], axis=1)
+
+    @cached_property
+    def gram(self) -> np.ndarray:
+        """(k, k) ∫φ_k φ_l across the pipe in m."""
+        return self.profiles.T @ (self.weights[:, None] * self.profiles)
 
     @property
     def directions(self) -> list[PolynomialFlow]:

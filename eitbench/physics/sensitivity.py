@@ -8,8 +8,7 @@ from __future__ import annotations
 import numpy as np
 import skfem
 
-from eitbench.numerics.compiled import compiled_kernels
-from eitbench.numerics.memory import aligned_zeros, scratch
+from eitbench.numerics.compiled import aligned_zeros, compiled_kernels, scratch
 
 
 class Sensitivity:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cached_property, lru_cache
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import scipy.sparse as sp
@@ -15,11 +15,11 @@ import skfem
 from skfem.helpers import dot, grad
 
 from eitbench import _check
+from eitbench.numerics.compiled import compiled_kernels, scratch
 from eitbench.numerics.fem import basis as basis_on
 from eitbench.numerics.fem import element, to_skfem
 from eitbench.numerics.mesh import Mesh
 from eitbench.numerics.sparse_lu import SparseLU
-from eitbench.physics.substeps import WideSubsteps
 
 VelocityField = Callable[[np.ndarray], np.ndarray]
 MANY = 16
@@ -175,7 +175,7 @@ class ConvectionDiffusion:
         before = self._inflow("inflow_before", inflow_before, 1)
         after = self._inflow("inflow_after", inflow_after, 1)
         changes = _supg_derivatives(self.mesh, self.velocity, self.diffusivity, directions)
-        substeps = self._substeps(c, before, after, self._no_loads())
+        substeps = self._substeps(c, before, after, [0.0] * (self.substeps + 1))
         states = np.hstack([state.copy() for state in substeps])
         # A sub-step solves M (c⁺ − c)/Δt + K (c⁺ + c)/2 = 0, backward Euler the same with K c⁺/2.
         # By the product rule what M and K change by is a load in the equation for the derivative.
@@ -196,11 +196,6 @@ class ConvectionDiffusion:
     def transition(self) -> tuple[np.ndarray, np.ndarray]:
         """F (n, n) and Y (n, n_inlet) of `evolution_model`, in half the time; computed once."""
         return self._transition
-
-    @cached_property
-    def _wide(self) -> WideSubsteps:
-        return WideSubsteps(self._solver, self._mass, self._explicit, self._implicit_inlet,
-                            self._free, self.inlet, self.substeps, self.substeps / self.time_step)
 
     @cached_property
     def _transition(self) -> tuple[np.ndarray, np.ndarray]:
@@ -225,17 +220,54 @@ class ConvectionDiffusion:
     def _advance(self, c: np.ndarray, before: np.ndarray, after: np.ndarray,
                  source: np.ndarray | None = None) -> np.ndarray:
         """All sub-steps on (n, batch) columns, perhaps with a ``source`` added to c a second."""
-        loads: Iterable[np.ndarray | float] = self._no_loads()
         load = None if source is None else self._mass @ source
         if c.shape[1] >= MANY:
-            return self._wide.advance(c, before, after, load)
-        if load is not None:
-            loads = [0.5 * load, 0.5 * load] + [load] * (self.substeps - 1)
+            return self._advance_wide(c, before, after, load)
+        f = 0.0 if load is None else load
+        loads = [0.5 * f, 0.5 * f] + [f] * (self.substeps - 1)
         *_, last = self._substeps(c, before, after, loads)
         return last
 
-    def _no_loads(self) -> list[float]:
-        return [0.0] * (self.substeps + 1)
+    @cached_property
+    def _kernel_arguments(self) -> tuple[Any, ...]:
+        """Matrices by rows, factors, nodes and rate, as `eitbench.numerics.kernels` wants them."""
+        row_place, column_place, lower, upper, scale = self._solver.factors
+        matrices = [(each.indptr, each.indices, each.data)
+                    for each in (self._mass, self._explicit, self._implicit_inlet)]
+        unknown = self._free[np.argsort(column_place)]
+        return (*matrices, lower, upper, scale, row_place, unknown, self.inlet, self.substeps,
+                self.substeps / self.time_step)
+
+    def _advance_wide(self, c: np.ndarray, before: np.ndarray, after: np.ndarray,
+                      load: np.ndarray | None = None) -> np.ndarray:
+        """All sub-steps on (n, batch) columns, perhaps with a ``load`` (n_free, batch).
+
+        A few columns at a time go through all of them, so that they stay in the processor's cache,
+        and a substitution takes all of them at once. Each becomes what `_substeps` makes of it, to
+        the bit.
+        """
+        kernels = compiled_kernels()
+        width = kernels.WIDE
+        n_free, n_inlet = len(self._free), len(self.inlet)
+        rows = np.array([len(c), n_inlet, n_inlet, n_inlet, n_free, n_free])
+        memory = scratch(rows.sum() * width).reshape(-1, width)
+        blocks = np.split(memory, np.cumsum(rows)[:-1])
+        state, first, slope, _, source, _ = blocks
+        flat = [block.reshape(-1) for block in blocks]
+        result = np.empty(c.shape)
+        for begin in range(0, c.shape[1], width):
+            panel = slice(begin, begin + width)
+            used = slice(min(width, c.shape[1] - begin))
+            state[:, used] = c[:, panel]
+            state[self.inlet, used] = before[:, panel]
+            first[:, used] = before[:, panel]
+            slope[:, used] = (after[:, panel] - before[:, panel]) / self.substeps
+            if load is not None:
+                source[:, used] = load[:, panel]
+            kernels.advance_wide(*self._kernel_arguments, *flat[:5], load is not None, flat[5])
+            state[self.inlet, used] = after[:, panel]
+            result[:, panel] = state[:, used]
+        return result
 
     def _substeps(self, c: np.ndarray, before: np.ndarray, after: np.ndarray,
                   loads: Iterable[np.ndarray | float]) -> Iterator[np.ndarray]:

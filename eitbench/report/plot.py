@@ -18,7 +18,7 @@ from eitbench.bench.playing import can_play, estimates, injections
 from eitbench.bench.scores import scores
 from eitbench.bench.text import mean_and_interval
 from eitbench.data.episodes import simulate, truth_discretisation
-from eitbench.data.regions import region_operators
+from eitbench.data.recordings import region_operators
 from eitbench.data.seeds import name_seed, parse_seeds
 from eitbench.envs.injection import InjectionEnv
 from eitbench.envs.rendering import colour_range, draw_electrodes, draw_field

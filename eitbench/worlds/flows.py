@@ -27,20 +27,41 @@ BELIEVED_PAST_A_BULGE = ("parabolic", "real")
 """What a model of the flow past a bulge may assume."""
 
 
+@dataclass(frozen=True)
 class PipeFlow(Flow):
     """Flow through a straight pipe whose estimators are told a laminar one of ``mean_velocity``."""
 
-    mean_velocity: float
+    mean_velocity: float = 4.5
+    """v̄ in m/s [T], as estimators are told it"""
+    diffusivity: float = 5e-4
+    """κ in m²/s [ours]: small, yet resolved by the model's mesh"""
+
+    def __post_init__(self) -> None:
+        check_positive(self, mean_velocity="m/s", diffusivity="m²/s")
 
     def nominal(self, world: World, fine: bool) -> VelocityField:
         return world.vessel.laminar(self.mean_velocity)
 
     def check_assumed(self, world: World, assumed: Mapping[str, Any]) -> None:
-        """Accept ``mean_velocity`` in m/s, and in a plane pipe ``profile``, one of `PROFILES`."""
-        laminar_assumption(world, self.mean_velocity, assumed)
+        self.believed(world, **assumed)
 
     def believed(self, world: World, **assumed: Any) -> VelocityField:
-        return laminar_assumption(world, self.mean_velocity, assumed)
+        """``mean_velocity`` in m/s, and in a plane pipe ``profile``, one of `PROFILES`."""
+        plane = isinstance(world.vessel, PlanePipe)
+        refuse_assumptions(assumed, ("mean_velocity", "profile") if plane else ("mean_velocity",))
+        mean = assumed.get("mean_velocity")
+        mean = _check.number("assume.mean_velocity", self.mean_velocity if mean is None else mean,
+                             low=0.0, units="m/s")
+        profile = assumed.get("profile") or "parabolic"
+        if profile not in PROFILES:
+            known = ", ".join(PROFILES)
+            raise ValueError(f"assume.profile must be one of {known}, got {profile!r}")
+        if profile == "plug":
+            return PlugFlow(mean)
+        if profile == "power-law":
+            return PowerLawFlow(mean, world.vessel.half_width)
+        laminar: VelocityField = world.vessel.laminar(mean)
+        return laminar
 
     def flush_steps(self, world: World) -> int:
         return steps_through(world, self.mean_velocity)
@@ -49,14 +70,6 @@ class PipeFlow(Flow):
 @dataclass(frozen=True)
 class LaminarFlow(PipeFlow):
     """Laminar flow with a known mean velocity; [T]: the thesis' number; [ours]: our choice."""
-
-    mean_velocity: float = 4.5
-    """v̄ in m/s [T]"""
-    diffusivity: float = 5e-4
-    """κ in m²/s [ours]: small, yet resolved by the model's mesh"""
-
-    def __post_init__(self) -> None:
-        check_positive(self, mean_velocity="m/s", diffusivity="m²/s")
 
 
 @dataclass(frozen=True)
@@ -67,10 +80,6 @@ class DrawnFlow(PipeFlow):
     told of a laminar one.
     """
 
-    mean_velocity: float = 4.5
-    """m/s; what estimators are told, as in the thesis"""
-    diffusivity: float = 5e-4
-    """κ in m²/s [ours]"""
     velocity_range: tuple[float, float] = (2.5, 7.0)
     """m/s, of the true mean, drawn evenly; the thesis assumes 2 and 7 for a true 4.5 [ours]"""
     swing_range: tuple[float, float] = (0.0, 0.0)
@@ -87,7 +96,7 @@ class DrawnFlow(PipeFlow):
     """m/s a time step, standard deviation of the believed random walk [ours]"""
 
     def __post_init__(self) -> None:
-        check_positive(self, mean_velocity="m/s", diffusivity="m²/s")
+        super().__post_init__()
         check_range(self, "velocity_range", "m/s")
         check_range(self, "swing_range", open_low=False)
         check_range(self, "period_range", "s")
@@ -138,10 +147,6 @@ class WanderingFlow(PipeFlow):
     estimators are told of; at the ends of ``velocity_range`` it turns back.
     """
 
-    mean_velocity: float = 4.5
-    """m/s; what is believed at first"""
-    diffusivity: float = 5e-4
-    """κ in m²/s"""
     velocity_range: tuple[float, float] = (2.5, 6.5)
     """m/s; the mean velocity stays within it, and begins anywhere in it"""
     velocity_std: float = 1.0
@@ -150,7 +155,8 @@ class WanderingFlow(PipeFlow):
     """m/s a time step: 0.4 m/s (std) while the fluid passes through the pipe"""
 
     def __post_init__(self) -> None:
-        check_positive(self, mean_velocity="m/s", diffusivity="m²/s", velocity_walk="m/s")
+        super().__post_init__()
+        check_positive(self, velocity_walk="m/s")
         _check.number("velocity_std", self.velocity_std, low=0.0, units="m/s")
         check_range(self, "velocity_range", "m/s")
 
@@ -179,7 +185,7 @@ class WanderingFlow(PipeFlow):
 
 
 @dataclass(frozen=True)
-class FlowPastBulge(Flow):
+class FlowPastBulge(PipeFlow):
     """The steady Navier–Stokes flow through a plane pipe with a bulge, behind which it separates.
 
     Better fluid models are what the thesis names as its next step (5.1.1). Estimators know the
@@ -187,15 +193,12 @@ class FlowPastBulge(Flow):
     the real one. All numbers are ours.
     """
 
-    mean_velocity: float = 4.5
-    """v̄ in m/s at the inlet"""
-    diffusivity: float = 5e-4
-    """κ in m²/s"""
     viscosity: float = 5e-4
     """m²/s, the eddy viscosity; as κ, a turbulent Schmidt number of one. Re = v̄·2R/ν = 900"""
 
     def __post_init__(self) -> None:
-        check_positive(self, mean_velocity="m/s", diffusivity="m²/s", viscosity="m²/s")
+        super().__post_init__()
+        check_positive(self, viscosity="m²/s")
 
     def nominal(self, world: World, fine: bool) -> SteadyFlow:
         """The real flow, by so many cells along and across the pipe; computed once a process."""
@@ -214,9 +217,6 @@ class FlowPastBulge(Flow):
         if assumed.get("flow") == "real":
             return self.nominal(world, fine=False)
         return LocalParabola(self.mean_velocity, world.vessel.half_width, world.vessel.bulge)
-
-    def flush_steps(self, world: World) -> int:
-        return steps_through(world, self.mean_velocity)
 
     def true_transport(self, world: World, model: Discretisation, random: np.random.Generator,
                        ) -> Callable[[int], Transport]:
@@ -293,25 +293,6 @@ class LocalParabola:
 def steps_through(world: World, velocity: float) -> int:
     """Time steps in which a fluid of this velocity in m/s passes through a pipe."""
     return math.ceil(world.vessel.length / (velocity * world.time_step))
-
-
-def laminar_assumption(world: World, mean_velocity: float,
-                       assumed: Mapping[str, Any]) -> VelocityField:
-    """What a model of a pipe is told to believe; ``ValueError`` for another name or value."""
-    plane = isinstance(world.vessel, PlanePipe)
-    refuse_assumptions(assumed, ("mean_velocity", "profile") if plane else ("mean_velocity",))
-    mean = assumed.get("mean_velocity")
-    if mean is None:
-        mean = mean_velocity
-    mean = _check.number("assume.mean_velocity", mean, low=0.0, units="m/s")
-    profile = assumed.get("profile") or "parabolic"
-    if profile not in PROFILES:
-        raise ValueError(f"assume.profile must be one of {', '.join(PROFILES)}, got {profile!r}")
-    if profile == "plug":
-        return PlugFlow(mean)
-    if profile == "power-law":
-        return PowerLawFlow(mean, world.vessel.half_width)
-    return world.vessel.laminar(mean)
 
 
 @lru_cache(maxsize=1)

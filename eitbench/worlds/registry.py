@@ -81,8 +81,8 @@ def register(world: World, id: str, *, track: str = "estimation", about: str = "
     if track not in CLASSES:
         raise ValueError(f"track must be one of {', '.join(CLASSES)}, got {track!r}")
     if unknown := sorted(set(settings) - set(SETTINGS[track])):
-        raise ValueError(f"settings of the track {track} are {', '.join(SETTINGS[track])}; "
-                         f"got {', '.join(unknown)}")
+        raise ValueError(f"settings of the track {track} must be among "
+                         f"{', '.join(SETTINGS[track])}; got {', '.join(unknown)}")
     try:
         json.dumps(settings, allow_nan=False)
     except (TypeError, ValueError) as error:

@@ -38,13 +38,10 @@ class AcrossAndAslant:
 
     def __call__(self, vessel: PlanePipe) -> np.ndarray:
         per_wall = vessel.electrodes_per_wall
-        currents = np.zeros((self.frame, 2 * per_wall))
-        for k in range(self.frame):
-            lower = (3 * (k // 2) + 4 * (k % 2)) % per_wall
-            upper = per_wall + (lower + 3 * (k % 2)) % per_wall
-            currents[k, lower] = 1.0
-            currents[k, upper] = -1.0
-        return currents
+        k = np.arange(self.frame)
+        lower = (3 * (k // 2) + 4 * (k % 2)) % per_wall
+        upper = per_wall + (lower + 3 * (k % 2)) % per_wall
+        return _pairs(lower, upper, vessel.n_electrodes)
 
 
 @dataclass(frozen=True)
@@ -62,16 +59,13 @@ class RingsInTurn:
         _check.integer("frame", self.frame, low=1)
 
     def __call__(self, vessel: RoundPipe) -> np.ndarray:
-        per_ring = vessel.electrodes_per_ring
-        rings = vessel.electrode_rings
-        currents = np.zeros((self.frame, per_ring * rings))
-        for k in range(self.frame):
-            ring = (k // 2 + (k % 2) * (rings // 2)) % rings
-            place = 3 * k % per_ring
-            further = (ring + k % 2) % rings
-            currents[k, ring * per_ring + place] += 1.0
-            currents[k, further * per_ring + (place + per_ring // 2) % per_ring] -= 1.0
-        return currents
+        per_ring, rings = vessel.electrodes_per_ring, vessel.electrode_rings
+        k = np.arange(self.frame)
+        ring = (k // 2 + (k % 2) * (rings // 2)) % rings
+        place = 3 * k % per_ring
+        further = (ring + k % 2) % rings
+        return _pairs(ring * per_ring + place,
+                      further * per_ring + (place + per_ring // 2) % per_ring, vessel.n_electrodes)
 
 
 @dataclass(frozen=True)
@@ -79,7 +73,7 @@ class OnePair:
     """The same pair all the time: electrode 0, and the one opposite [T: one pair; ours: which]."""
 
     def __call__(self, vessel: RoundTank) -> np.ndarray:
-        return _pair(vessel, 0, vessel.n_electrodes // 2)[None]
+        return _pairs(np.array([0]), np.array([vessel.n_electrodes // 2]), vessel.n_electrodes)
 
 
 @dataclass(frozen=True)
@@ -88,16 +82,17 @@ class AroundTheTank:
 
     def __call__(self, vessel: RoundTank) -> np.ndarray:
         half = vessel.n_electrodes // 2
-        across = [_pair(vessel, 3 * k, 3 * k + half) for k in range(8)]
-        aslant = [_pair(vessel, 6 * k + k // 4, 6 * k + k // 4 + half - 3) for k in range(8)]
-        return np.array(across + aslant)
+        k = np.arange(8)
+        sources = np.concatenate([3 * k, 6 * k + k // 4])
+        return _pairs(sources, sources + np.repeat([half, half - 3], 8), vessel.n_electrodes)
 
 
-def _pair(vessel: RoundTank, source: int, sink: int) -> np.ndarray:
-    """(L,): current enters at one electrode and leaves at another, numbers modulo L."""
-    currents = np.zeros(vessel.n_electrodes)
-    currents[source % vessel.n_electrodes] += 1.0
-    currents[sink % vessel.n_electrodes] -= 1.0
+def _pairs(sources: np.ndarray, sinks: np.ndarray, n_electrodes: int) -> np.ndarray:
+    """(K, L): current enters at one electrode and leaves at another, numbers modulo L."""
+    k = np.arange(len(sources))
+    currents = np.zeros((len(k), n_electrodes))
+    currents[k, sources % n_electrodes] += 1.0
+    currents[k, sinks % n_electrodes] -= 1.0
     return currents
 
 

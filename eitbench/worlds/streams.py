@@ -25,13 +25,9 @@ class Randomness(NamedTuple):
     """how well electrodes touch the liquid"""
 
 
-STREAMS = Randomness._fields
-"""In the order in which a seed gives them."""
-
-
 def randomness(seed: int) -> Randomness:
     """The streams of the episode with this seed."""
-    children = np.random.SeedSequence(seed).spawn(len(STREAMS))
+    children = np.random.SeedSequence(seed).spawn(len(Randomness._fields))
     return Randomness(*map(np.random.default_rng, children))
 
 

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from eitbench import _check
-from eitbench._html import small_table
 from eitbench.worlds.world import Discretisation, Prior, Vessel, World
 
 if TYPE_CHECKING:
@@ -34,11 +33,6 @@ class Estimate(NamedTuple):
     """(k,) the flow's parameters in m/s if `Task.velocity` asks; None: as believed at first."""
     velocity_variance: np.ndarray | None = None
     """(k,) their error variance, m²/s²."""
-
-    def _repr_html_(self) -> str:
-        """Shapes and ranges of what is claimed."""
-        return small_table("Estimate", {name: _range(value)
-                                        for name, value in self._asdict().items()})
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,20 +65,6 @@ class Task:
     world: str = ""
     """its name, by which what was learned in it is found"""
 
-    def _repr_html_(self) -> str:
-        """Its numbers, and what is asked for."""
-        asked = "c" if self.velocity is None else f"c and {self.velocity.size} of the flow"
-        K, L = self.currents.shape
-        return small_table("Task", {
-            "asks for": f"{asked}, at measurement t of the state t − {self.lag}",
-            "states": f"{self.n_steps}, the first {self.warm_up} not scored; "
-                      f"{1e3 * self.transport.time_step:g} ms each",
-            "mesh": f"{self.mesh.n_nodes} nodes in {self.mesh.dim}D",
-            "electrodes": f"{L}, a cycle of {K} injections",
-            "transport": type(self.transport).__name__, "noise": str(self.noise),
-            "expected concentration": f"{self.expected_concentration:g} mol/m³",
-            "prior": str(self.prior)})
-
     @property
     def mesh(self) -> Mesh:
         """Where estimates live: the CD mesh."""
@@ -101,15 +81,6 @@ class Task:
     def evolution(self) -> EvolutionModel:
         """F, Y, H of the transport; made on first use, shared by all tasks with the same model."""
         return self.transport.evolution_model()
-
-
-def _range(value: Any) -> str:
-    """Shape of an array, and what its numbers lie between."""
-    if value is None:
-        return "no claim"
-    numbers = np.asarray(value, dtype=float)
-    ends = f", {numbers.min():.4g} to {numbers.max():.4g}" if numbers.size else ""
-    return f"{numbers.shape}{ends}"
 
 
 def make_task(world: World, lag: int | str = 0, **assumed: Any) -> Task:

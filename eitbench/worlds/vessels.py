@@ -1,8 +1,9 @@
-"""What holds the liquid: plane and round pipes, and flat round tanks, with electrodes on walls."""
+"""What holds the liquid: plane and round pipes, flat round tanks, and any shape from mesh files."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,6 +14,7 @@ from eitbench.worlds.fields import check_positive
 
 if TYPE_CHECKING:
     from eitbench.numerics.mesh import Mesh
+    from eitbench.numerics.mesh_files import MeshFile
     from eitbench.physics.cem import CompleteElectrodeModel
 
 
@@ -66,9 +68,8 @@ class PlanePipe:
     lines = 40  # parts of its length whose ends are lines of both carriers' meshes
 
     def __post_init__(self) -> None:
-        check_positive(self, length="m", half_width="m", contact_impedance="Ω·m²",
-                       molar_conductivity="S·m²/mol")
-        _check.number("electrode_cover", self.electrode_cover, low=0.0, high=0.95, open_low=True)
+        check_positive(self, length="m", half_width="m")
+        _check_electrodes(self)
         _check.integer("electrodes_per_wall", self.electrodes_per_wall, low=2)
         if self.bulge is not None:
             _check.number("bulge.height", self.bulge.height, high=self.half_width, units="m")
@@ -91,7 +92,7 @@ class PlanePipe:
         x, y = mesh.points.T
         walls = [np.abs(y - wall) < tiny for wall in (-self.half_width, self.half_width)]
         spans = [(x > begin - tiny) & (x < end + tiny) for begin, end in self.electrode_spans]
-        return [_facets(mesh, wall & span) for wall in walls for span in spans]
+        return [mesh.facets_of(wall & span) for wall in walls for span in spans]
 
     def laminar(self, mean_velocity: float) -> PlaneChannelFlow:
         """Laminar flow through the straight pipe with this mean velocity in m/s."""
@@ -142,7 +143,7 @@ class PlanePipe:
         from eitbench.numerics.mesh import Mesh
         x, y = mesh.points.T
         R = self.half_width
-        low = self.bulge(x) - R
+        low = self.lower_wall(x)
         return Mesh(np.stack([x, low + (y + R) * (R - low) / (2.0 * R)], axis=1), mesh.cells)
 
 
@@ -178,9 +179,8 @@ class RoundPipe:
     parts_of_a_step = 2
 
     def __post_init__(self) -> None:
-        check_positive(self, length="m", radius="m", electrode_length="m", contact_impedance="Ω·m²",
-                       molar_conductivity="S·m²/mol")
-        _check.number("electrode_cover", self.electrode_cover, low=0.0, high=0.95, open_low=True)
+        check_positive(self, length="m", radius="m", electrode_length="m")
+        _check_electrodes(self)
         _check.integer("electrode_rings", self.electrode_rings, low=1)
         _check.integer("electrodes_per_ring", self.electrodes_per_ring, low=4)
         _check.integer("potential_order", self.potential_order, low=1, high=2)
@@ -275,8 +275,8 @@ class RoundTank:
     parts_of_a_step = 1
 
     def __post_init__(self) -> None:
-        check_positive(self, radius="m", contact_impedance="Ω·m²", molar_conductivity="S·m²/mol")
-        _check.number("electrode_cover", self.electrode_cover, low=0.0, high=0.95, open_low=True)
+        check_positive(self, radius="m")
+        _check_electrodes(self)
         _check.integer("n_electrodes", self.n_electrodes, low=4)
 
     @property
@@ -305,6 +305,76 @@ class RoundTank:
         return CompleteElectrodeModel(mesh, self.electrodes(mesh), self.contact_impedance)
 
 
+@dataclass(frozen=True)
+class MeshVessel:
+    """A vessel whose meshes are drawn elsewhere, with gmsh say; see `eitbench.numerics.mesh_files`.
+
+    Concentration and potential live on the same mesh. The truth has a finer one than the
+    estimators' model: no inverse crime. Boundary facets of electrode l = 0 … L−1 form the group
+    "electrode l", those through which the fluid enters the group "inlet", if there is one.
+    """
+
+    fine_file: str
+    """path of the truth's mesh"""
+    fine_sha256: str
+    """of that file, in hexadecimal digits: another file is another world"""
+    coarse_file: str
+    """path of the model's mesh"""
+    coarse_sha256: str
+    """of that file"""
+    n_electrodes: int
+    """L"""
+    scale: float = 1.0
+    """m in a unit of the files; 1e-3 for mm"""
+    contact_impedance: float = 2e-3
+    """z in Ω·m²"""
+    molar_conductivity: float = 0.01
+    """Λ in S·m²/mol; σ = Λc"""
+    patches: tuple[int, int] = (6, 6)
+    """along x and y: the coarse grid on which an agent sees an estimate"""
+    is_long: bool = False
+    """whether pictures of it are laid one below the other"""
+
+    parts_of_a_step = 2
+
+    def __post_init__(self) -> None:
+        check_positive(self, scale="m", contact_impedance="Ω·m²", molar_conductivity="S·m²/mol")
+        _check.integer("n_electrodes", self.n_electrodes, low=2)
+        for count in self.patches:
+            _check.integer("each entry of patches", count, low=1)
+
+    def substeps(self, fine: bool) -> int:
+        return 16 if fine else 8
+
+    def carrier(self, fine: bool) -> tuple[Mesh, np.ndarray]:
+        mesh, groups = self._read(fine)
+        return mesh, np.unique(groups.get("inlet", np.empty(0, dtype=int)))
+
+    def electrode_model(self, fine: bool) -> CompleteElectrodeModel:
+        from eitbench.physics.cem import CompleteElectrodeModel  # not needed to play recordings
+        mesh, groups = self._read(fine)
+        names = [f"electrode {number}" for number in range(self.n_electrodes)]
+        if missing := [name for name in names if name not in groups]:
+            raise ValueError(f"{self._file(fine)[0]}: must have a group for each electrode, got "
+                             f"none for {', '.join(missing)}; there are {', '.join(groups)}")
+        electrodes = [groups[name] for name in names]
+        return CompleteElectrodeModel(mesh, electrodes, self.contact_impedance)
+
+    def _file(self, fine: bool) -> tuple[str, str]:
+        if fine:
+            return self.fine_file, self.fine_sha256
+        return self.coarse_file, self.coarse_sha256
+
+    def _read(self, fine: bool) -> MeshFile:
+        return _read(*self._file(fine), self.scale)
+
+
+def _check_electrodes(vessel: PlanePipe | RoundPipe | RoundTank) -> None:
+    """``ValueError`` unless these numbers of its electrodes and liquid are within their ranges."""
+    check_positive(vessel, contact_impedance="Ω·m²", molar_conductivity="S·m²/mol")
+    _check.number("electrode_cover", vessel.electrode_cover, low=0.0, high=0.95, open_low=True)
+
+
 def _spans_around(count: int, cover: float) -> np.ndarray:
     """(count, 2) first and last angle in rad of electrodes evenly spaced around a wall."""
     pitch = 2.0 * np.pi / count
@@ -320,10 +390,11 @@ def _electrodes_around(mesh: Mesh, radius: float, spans: np.ndarray,
     facets = []
     for first, last in spans:
         off_centre = np.abs(np.mod(angle - 0.5 * (first + last) + np.pi, 2.0 * np.pi) - np.pi)
-        facets.append(_facets(mesh, wall & (off_centre < 0.5 * (last - first) + 1e-9)))
+        facets.append(mesh.facets_of(wall & (off_centre < 0.5 * (last - first) + 1e-9)))
     return facets
 
 
-def _facets(mesh: Mesh, inside: np.ndarray) -> np.ndarray:
-    """The boundary facets with all nodes ``inside`` (n_nodes,)."""
-    return mesh.facets_where(lambda points: inside)
+@lru_cache(maxsize=4)
+def _read(path: str, sha256: str, scale: float) -> MeshFile:
+    from eitbench.numerics.mesh_files import read_mesh
+    return read_mesh(path, sha256, scale=scale)

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 import numpy as np
 
 from eitbench import _check
-from eitbench._html import small_table
 from eitbench.physics.observation import LinearConductivity, ObservationModel, VoltageNoise
 from eitbench.worlds.fields import check_positive
 from eitbench.worlds.instrument import Instrument
@@ -371,15 +370,6 @@ class World:
     def __getstate__(self) -> dict[str, Any]:
         """Without what is derived: a hash holds in its own process only."""
         return {each.name: getattr(self, each.name) for each in fields(self)}
-
-    def _repr_html_(self) -> str:
-        """Every number of each part."""
-        parts = {each.name: getattr(self, each.name) for each in fields(self)}
-        name = parts.pop("name")
-        rows = {part: f"{type(value).__name__}: " + ", ".join(
-                    f"{each.name} = {getattr(value, each.name)}" for each in fields(value))
-                if is_dataclass(value) else str(value) for part, value in parts.items()}
-        return small_table(f"World {name}", rows)
 
     # -- variants --
 

@@ -11,7 +11,7 @@ from eitbench.bench.methods import load_method
 from eitbench.bench.scores import Outcome, scored, scores
 from eitbench.bench.tracks import TRACKS, Environment
 from eitbench.bench.verify import differences_of
-from eitbench.data.regions import mass_between
+from eitbench.data.recordings import mass_between
 from eitbench.numerics.fem import mass_matrix
 from eitbench.report.boards import run_boards
 from eitbench.report.site import collect, render

@@ -6,16 +6,15 @@ import pytest
 from eitbench.bench.package_data import difference, expected_files, unused_files
 from eitbench.bench.tracks import own_ids
 from eitbench.data import cache, episodes
-from eitbench.data.beginnings import shipped_key
 from eitbench.data.cache import load_shipped
-from eitbench.data.regions import outline_key, region_key
+from eitbench.data.recordings import beginning_file, outline_file, region_file
 from eitbench.estimation.onboard.packing import packed, unpacked
 from eitbench.estimation.onboard.reduced_operator import stored_model_key
 from eitbench.estimation.reduced import ReducedModel
 from eitbench.worlds import entry
 
 EXPECTED = expected_files(own_ids())
-CHEAP = {key(entry("eitbench/Pipe2D-v0").world) for key in (outline_key, shipped_key)}
+CHEAP = {file(entry("eitbench/Pipe2D-v0").world).key for file in (outline_file, beginning_file)}
 
 
 def test_exactly_the_needed_files_are_shipped():
@@ -46,12 +45,12 @@ def test_models_are_compared_in_one_basis():
 
 
 @pytest.mark.parametrize(("key", "same", "other"), [
-    (outline_key,
+    (lambda world: outline_file(world).key,
      [{"flow": {"mean_velocity": 4.0}}, {"instrument": {"noise_relative": 0.1}}, {"region": None},
       {"instrument": {"contact_spread": 0.5, "untold_noise": 2.0}}, {"target": {"reach": [0.0, 0.5]}}],
      [{"vessel": {"electrodes_per_wall": 4}}, {"prior": {"expected_concentration": 24.0}},
       {"instrument": {"current": 0.2}}]),
-    (region_key,
+    (lambda world: region_file(world).key,
      [{"schedule": {"scored_steps": 3}}], [{"region": [0.1, 0.2]}, {"vessel": {"electrodes_per_wall": 4}}]),
     (lambda world: stored_model_key(world, "joint"),
      [{"schedule": {"budget": 3, "scored_steps": 9}}, {"instrument": {"dead": [1, 1]}}],

@@ -1,17 +1,30 @@
-"""Recordings: they score as the truth does, they are bit for bit the simulation's."""
+"""Recordings: they score as the truth does, and are bit for bit the simulation's. Of the first steps alone they are
+those of the whole, and the rest comes when it is needed."""
 
 import subprocess
 import sys
 
-import eitbench  # noqa: F401 (registers)
+import gymnasium as gym
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from eitbench.data.episodes import truth_discretisation
-from eitbench.data.recordings import cycle_voltages, faults_of, recording, step_error
-from eitbench.data.regions import outline
+from eitbench.data import cache
+from eitbench.data.episodes import simulate, truth_discretisation
+from eitbench.data.recordings import (
+    MARGIN,
+    concentration_at,
+    cycle_voltages,
+    faults_of,
+    is_recorded,
+    outline,
+    recording,
+    recording_so_far,
+    step_error,
+)
+from eitbench.worlds import entry
 
 from recorded import bits
+from short import merged, short
 from tiny_worlds import CHANGES, TINY
 
 pytestmark = pytest.mark.usefixtures("place")
@@ -131,3 +144,54 @@ def test_playing_what_is_stored_needs_no_finite_elements(episode):
                "print(rewards[-1] < 0.0, sorted(heavy & set(sys.modules)))")
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout == "True []\n"
+
+
+def longer(id):
+    """Changes to a world of some 20 steps; that of the tank keeps its electrodes, for which a filter is shipped."""
+    if "Tank" in id:
+        return {"schedule": {"warm_up": 1, "scored_steps": 18}}
+    return merged(short(id)["world"], {"schedule": {"scored_steps": 18}})
+
+
+@pytest.mark.parametrize("id", ["eitbench/Pipe2DFixedLag-v0", "eitbench/Pipe2DInjectionFlow-v0",
+                                "eitbench/RotatingTankInjection-v0", "eitbench/StationaryTank2D-v0"])
+def test_first_steps_have_the_bits_of_the_whole(id):
+    world = entry(id).world.changed(longer(id))
+    begun = recording_so_far(world, 3, 1)
+    assert len(begun) == 1 + MARGIN and not is_recorded(world, 3)
+    states = [concentration_at(world, 3, t, 1) for t in (0, 1 + MARGIN)]
+    assert not list(cache.folder(world).glob("3.*"))                       # nothing is left behind
+    whole = recording(world, 3)
+    assert begun.tobytes() == whole[:1 + MARGIN].tobytes()
+    truth = simulate(world, 3).concentration
+    for t, state in zip((0, 1 + MARGIN), states, strict=True):
+        assert (state == truth[t]).all()
+    assert len(recording_so_far(world, 3, 1)) == world.n_steps
+
+
+@pytest.mark.parametrize(("id", "kwargs"), [
+    ("eitbench/Pipe2DFixedLag-v0", {"lag": 2}), ("eitbench/Pipe2DInjectionFlow-v0", {"estimator": "none"}),
+    ("eitbench/RotatingTankInjection-v0", {})])
+def test_playing_is_the_same_whether_it_was_recorded_before(id, kwargs):
+    """Observations and rewards, to the bit; nothing is recorded before a step needs it."""
+    world = entry(id).world.changed(longer(id))
+
+    def played():
+        env = gym.make(id, world=longer(id), **kwargs)
+        observation, _ = env.reset(seed=4)
+        env.action_space.seed(0)
+        seen = [observation]
+        ended = False
+        recorded = [is_recorded(world, 4)]
+        while not ended:
+            observation, reward, ended, _, _ = env.step(env.action_space.sample())
+            seen += [observation, reward]
+            recorded.append(is_recorded(world, 4))
+        return seen, recorded
+
+    first, recorded = played()
+    assert not any(recorded[:MARGIN]) and recorded[-1]
+    again, recorded = played()
+    assert all(recorded)
+    for one, other in zip(first, again, strict=True):
+        np.testing.assert_equal(one, other)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from eitbench.data.regions import score_mass
+from eitbench.data.recordings import score_mass
 from eitbench.estimation import inflow_filter
 from eitbench.estimation.onboard.belief import Belief
 from eitbench.estimation.onboard.inflow_operator import InflowOperator, prior_of

@@ -8,8 +8,16 @@ import numpy as np
 import pytest
 from eitbench.data.bank import fill
 from eitbench.data.cache import CACHE_VARIABLE
-from eitbench.data.recordings import cycle_voltages, outline, recording
-from eitbench.data.regions import integrals, make_integrals, mass_between, score_mass
+from eitbench.data.recordings import (
+    cycle_voltages,
+    integrals,
+    integrate,
+    mass_between,
+    outline,
+    recording,
+    region_operators,
+    score_mass,
+)
 from eitbench.envs.injection_core import scaled
 from eitbench.estimation import Filter, about_reference, velocity_states
 from eitbench.estimation.onboard import joint_operator
@@ -78,7 +86,7 @@ def test_without_a_region_all_counts(env):
     """Then integrals are the recording's own, to the bit; and over all cells both mass matrices are the same."""
     whole = dataclasses.replace(env.world, region=None)
     entries = recording(whole, 3)
-    for name, array in integrals(whole, 3, entries)._asdict().items():
+    for name, array in integrals(whole, entries)._asdict().items():
         np.testing.assert_array_equal(array, entries[name])
     assert score_mass(whole) is outline(whole).mass
     mesh = make_task(whole).mesh
@@ -96,8 +104,8 @@ def test_recordings_hold_the_integrals(monkeypatch, tmp_path):
     narrow = {"flow": {"velocity_range": [44.5, 45.5]}, "schedule": {"scored_steps": 3}}
     world = PIPE_2D_DRIFTING.changed(WANDERING).changed(narrow)
     assert fill(world, [1, 2]) == 2
-    made = make_integrals(world, eitbench.simulate(world, 2, cache=False))
-    for one, other in zip(integrals(world, 2, recording(world, 2)), made, strict=True):
+    made = integrate(eitbench.simulate(world, 2, cache=False), world.background, *region_operators(world))
+    for one, other in zip(integrals(world, recording(world, 2)), made, strict=True):
         np.testing.assert_array_equal(one, other)
 
 

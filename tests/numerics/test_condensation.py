@@ -94,17 +94,6 @@ def test_nested_dissection(kind, shape):
     assert_allclose(system.port_columns(values), exact[:, -2:], rtol=0, atol=1e-12 * exact.max())
 
 
-def test_nested_dissection_pays_in_a_box():
-    """The Cholesky factor of a cube's grid takes fewer operations than by minimum degree."""
-    pattern, places = box_pattern((14, 14, 14), 2)
-    work = []
-    for where in (None, places):
-        place = condensation._ordered(pattern, 2, where)
-        filled = condensation._filled(condensation._permuted(pattern, place))
-        work.append(np.square(np.diff(filled.indptr).astype(float)).sum())
-    assert work[1] < 0.9 * work[0]
-
-
 def test_wide_fronts_are_taken_one_by_one(monkeypatch):
     """Where eight matrices would not fit side by side, each is factorised alone, equally well."""
     pattern = random_pattern(180, 7, seed=2)

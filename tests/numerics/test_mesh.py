@@ -106,23 +106,6 @@ def test_interpolation_is_exact_for_linear_functions(dim, seed, candidates, a):
 
 
 @in_both_dimensions
-def test_interpolation_at_nodes_takes_their_values(dim):
-    """At the mesh's own nodes the matrix is the identity."""
-    mesh = MESHES[dim]
-    assert_allclose(mesh.interpolation_to(mesh.points).toarray(), np.eye(mesh.n_nodes), atol=1e-12)
-
-
-@in_both_dimensions
-def test_interpolation_is_local(dim):
-    """A node contributes only to points inside a cell that it belongs to."""
-    mesh = MESHES[dim]
-    centres = mesh.points[mesh.cells].mean(axis=1)
-    matrix = mesh.interpolation_to(centres)
-    assert_array_equal(np.sort(matrix.indices.reshape(-1, dim + 1), axis=1), np.sort(mesh.cells, axis=1))
-    assert_allclose(matrix.data, 1 / (dim + 1), rtol=1e-10)
-
-
-@in_both_dimensions
 def test_points_just_outside_take_the_value_at_the_wall(dim):
     """Outside by a millionth, as after rounding, a convex combination of the wall's nodes is taken."""
     mesh = MESHES[dim]

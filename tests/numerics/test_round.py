@@ -154,16 +154,6 @@ def test_extruded_mesh_is_its_own_mirror_image():
     assert not np.allclose(one_way[np.ix_(swapped, swapped)], one_way, rtol=1e-3)      # a single layer is not
 
 
-@each_section
-def test_interpolation_is_exact_for_linear_functions(section):
-    """a₀ + a·x is reproduced to rounding at random points inside a body whose cells overlap nowhere."""
-    body, rng = extrude(section, Z), np.random.default_rng(3)
-    cells = rng.integers(len(body.cells), size=200)
-    points = np.einsum("kv,kvd->kd", rng.dirichlet(np.ones(4), 200), body.points[body.cells[cells]])
-    slope = np.array([2.0, -1.0, 0.5])
-    assert_allclose(body.interpolation_to(points) @ (7.0 + body.points @ slope), 7.0 + points @ slope, rtol=1e-12)
-
-
 def test_round_pipe_mesh():
     """All edges of the electrodes are mesh lines on the wall; they have the area of their chords times their length."""
     along = np.array([[0.03, 0.07], [0.13, 0.17]])

@@ -6,13 +6,10 @@ What holds for the compiled substitution holds for the tests' own reference too.
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from eitbench.numerics.mesh import rectangle_mesh
 from eitbench.numerics.sparse_lu import SparseLU
-from eitbench.physics.flow import PlaneChannelFlow
-from eitbench.physics.transport import ConvectionDiffusion
 from numpy.testing import assert_allclose, assert_array_equal
 
-from references import SuperLUSolver, reference_flow
+from references import SuperLUSolver
 
 both = pytest.mark.parametrize("kind", [SparseLU, SuperLUSolver])
 WIDTHS = (1, 7, 8, 9, 20)
@@ -91,63 +88,3 @@ def test_results_are_not_shared():
         solver.solve(-b)
     for solution, before in zip(first, kept, strict=True):
         assert_array_equal(solution, before)
-
-
-# -- in convection–diffusion ----------------------------------------------------------------------
-
-
-def channel(model=ConvectionDiffusion):
-    """A short channel of 425 nodes, 17 of them on the inlet."""
-    mesh = rectangle_mesh(np.linspace(0.0, 1.0, 25), np.linspace(-0.25, 0.25, 17))
-    return model(mesh, PlaneChannelFlow(1.0, 0.25), 4e-3, 0.1, substeps=4)
-
-
-def states(k):
-    """Random concentrations and inflows before and after, (n, k) and twice (n_inlet, k)."""
-    rng = np.random.default_rng(6)
-    return [rng.uniform(10.0, 50.0, (20, size)).T[:, :k] for size in (425, 17, 17)]
-
-
-@pytest.mark.parametrize("model", [ConvectionDiffusion, reference_flow])
-@pytest.mark.parametrize("k", WIDTHS)
-def test_step_of_a_batch_is_the_step_of_each_to_the_bit(model, k):
-    """Eight flows carried on together are what each would be alone, as (n,) or as (n, 1)."""
-    cd = channel(model)
-    c, before, after = states(k)
-    together = cd.step(c, before, after)
-    assert together.shape == (425, k)
-    for j in range(k):
-        assert_array_equal(cd.step(c[:, j], before[:, j], after[:, j]), together[:, j])
-        one = slice(j, j + 1)
-        assert_array_equal(cd.step(c[:, one], before[:, one], after[:, one]), together[:, one])
-
-
-@pytest.mark.parametrize("k", WIDTHS)
-def test_scipy_agrees_on_a_step(k):
-    """To rounding, over ten steps."""
-    results = []
-    for model in (ConvectionDiffusion, reference_flow):
-        cd = channel(model)
-        c, before, after = states(k)
-        for _ in range(10):
-            c = cd.step(c, before, after)
-        results.append(c)
-    assert np.ptp(results[0]) > 10.0
-    assert_allclose(*results, rtol=1e-12)
-
-
-def test_scipy_agrees_on_the_evolution_model():
-    """F, Y and H to rounding."""
-    ours = channel().evolution_model()
-    scipy = channel(reference_flow).evolution_model()
-    for one, other in zip(ours, scipy, strict=True):
-        assert_allclose(one, other, rtol=0, atol=1e-12 * np.abs(other).max())
-        assert np.abs(other).max() > 0.1
-
-
-@pytest.mark.parametrize("model", [ConvectionDiffusion, reference_flow])
-def test_closed_vessel_has_an_evolution_model(model):
-    """Without an inlet Y has no columns, F and H are as ever."""
-    mesh = rectangle_mesh(np.linspace(0, 1, 5), np.linspace(0, 1, 5))
-    cd = model(mesh, np.zeros_like, 0.05, 1.0, inlet=np.array([], int))
-    assert [matrix.shape for matrix in cd.evolution_model()] == [(25, 25), (25, 0), (25, 25)]

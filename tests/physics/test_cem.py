@@ -190,32 +190,20 @@ def test_disc_reference_is_converged():
     assert np.linalg.norm(disc_reference(homogeneous=True) - reference) > 0.05 * np.linalg.norm(reference)
 
 
-def test_disc_modes_of_a_sharp_inclusion():
-    """A steep rim at ρ tends to Λ_n = R(1 − μq)/(nσ(1 + μq)), q = (ρ/R)^2n, μ = (σ₁ − σ)/(σ₁ + σ)."""
-    n, rho = np.arange(1, 11), 0.06
-
-    def steep(r: np.ndarray) -> np.ndarray:
-        return 0.3 * 5.0**(0.5 - 0.5 * np.tanh((r - rho) / 2e-5))
-
-    q = 2.0 / 3.0 * (rho / RADIUS)**(2 * n)
-    assert_allclose(disc_modes(steep, RADIUS, 10), RADIUS * (1 - q) / (0.3 * n * (1 + q)), rtol=1e-3)
-
-
-@pytest.mark.parametrize(("order", "cells", "final"), [(1, (12, 24, 48), 6e-4), (2, (8, 16, 32), 1.5e-4)])
-def test_disc(order, cells, final):
+def test_disc():
     """𝓡 of five unequal electrodes on a disc, homogeneous and with an inclusion, is approached like h²."""
     errors, results = [], []
     references = np.stack([disc_reference(True), disc_reference(False)])
     size = np.linalg.norm(references, axis=(1, 2))
-    for n in cells:
+    for n in (8, 16, 32):
         mesh, electrodes = disc_mesh(RADIUS, SPANS, n, grading=2.5)
-        cem = CompleteElectrodeModel(mesh, electrodes, CONTACTS, order)
+        cem = CompleteElectrodeModel(mesh, electrodes, CONTACTS)
         r = np.hypot(*mesh.points.T)
         results.append(cem.transfer_resistance(np.stack([np.full_like(r, SALINE), inclusion(r)])))
         errors.append(np.linalg.norm(results[-1] - references, axis=(1, 2)) / size)
     rate = np.log2(errors[1] / errors[2])
     assert (rate > 1.8).all() and (rate < 2.2).all(), errors
-    assert (errors[2] < final).all(), errors
+    assert (errors[2] < 1.5e-4).all(), errors
     # Taking out the h² term leaves a limit that is the disc's, not merely one close by.
     limit = (4 * results[2] - results[1]) / 3
     assert (np.linalg.norm(limit - references, axis=(1, 2)) < 2e-5 * size).all()
@@ -237,24 +225,6 @@ def test_reciprocity(dim, order):
     assert_allclose(raw, raw.T, rtol=1e-10)
 
 
-@every_element
-def test_spectrum_of_the_transfer_resistance(dim, order):
-    """𝓡 is positive semi-definite and only the constants are in its kernel: rank L − 1."""
-    R = small_cem(dim, order).transfer_resistance(small(dim)[2])
-    values = np.linalg.eigvalsh(R)
-    assert_allclose(R.sum(axis=0), 0.0, atol=1e-13 * values[-1])
-    assert abs(values[0]) < 1e-13 * values[-1] and values[1] > 1e-2 * values[-1]
-
-
-@every_element
-def test_scaling(dim, order):
-    """Conductivity α times higher and contacts α times better: voltages α times lower."""
-    mesh, electrodes, sigma = small(dim)
-    scaled = CompleteElectrodeModel(mesh, electrodes, IMPEDANCE / 7.3, order).transfer_resistance(7.3 * sigma)
-    reference = small_cem(dim, order).transfer_resistance(sigma)
-    assert_allclose(7.3 * scaled, reference, atol=1e-10 * np.abs(reference).max())
-
-
 def test_batch():
     """Any leading axes give the matrices of the single conductivities, and the voltages are currents @ 𝓡."""
     cem, sigma = small_cem(2, 2), small(2)[2]
@@ -265,13 +235,6 @@ def test_batch():
         assert_allclose(R[i, j], cem.transfer_resistance(batch[i, j]), rtol=1e-13)
     currents = patterns(4)
     assert_allclose(cem.voltages(batch[1, 1], currents), currents @ R[1, 1], rtol=1e-12, atol=1e-14)
-
-
-def test_scalar_contact_impedance_serves_all_electrodes():
-    """One number is the same as that number for each electrode."""
-    mesh, electrodes, sigma = small(2)
-    one, each = (CompleteElectrodeModel(mesh, electrodes, z).transfer_resistance(sigma) for z in (0.2, np.full(4, 0.2)))
-    assert_allclose(one, each, rtol=1e-14)
 
 
 @every_element

@@ -48,11 +48,6 @@ def test_derivative_of_the_law(law):
     assert_allclose(law.derivative(c), (law(c + step) - law(c - step)) / (2 * step), rtol=1e-8)
 
 
-def test_linear_law():
-    """σ = Λc."""
-    assert_allclose(LinearConductivity(0.011)(np.array([0.0, 10.0, 30.0])), [0.0, 0.11, 0.33])
-
-
 @pytest.mark.parametrize(("make", "match"), [
     (lambda: LinearConductivity(0.0), "molar_conductivity"),
     (lambda: LinearConductivity(np.nan), "molar_conductivity"),
@@ -76,14 +71,6 @@ def test_noise_formula():
     assert_allclose(VoltageNoise(floor=0.02).std(voltages), np.sqrt(expected**2 + 0.02**2), rtol=1e-14)
     assert_allclose(VoltageNoise(0.0, 0.0, 0.02).std(voltages), 0.02)
     assert_allclose(VoltageNoise().std(voltages[0]), expected[0])
-
-
-def test_noise_scales_with_the_current_unless_it_has_a_floor():
-    """Without a floor ten times the current gives ten times the noise: the amplitude buys nothing."""
-    voltages = np.random.default_rng(1).standard_normal((4, 3, 8))
-    assert_allclose(VoltageNoise().std(-10.0 * voltages), 10.0 * VoltageNoise().std(voltages))
-    floored = VoltageNoise(floor=0.01)
-    assert (floored.std(10.0 * voltages) < 10.0 * floored.std(voltages)).all()
 
 
 # -- the observation model --------------------------------------------------------------------------------------------

@@ -9,7 +9,6 @@ import pytest
 from eitbench.bench.methods import load_method
 from eitbench.bench.playing import estimates
 from eitbench.bench.tracks import Environment
-from eitbench.worlds import entry
 from matplotlib import pyplot as plt
 
 from short import world
@@ -110,17 +109,3 @@ def test_methods_are_compared_best_first():
     for nothing in ([], ["error"]):
         with pytest.raises(ValueError, match="table must be a DataFrame or several"):
             eitbench.plot.compare(nothing)
-
-
-def test_what_notebooks_show():
-    """Tables of the numbers; strangers' words are text."""
-    task = task_of(PIPE)
-    shown = task._repr_html_()
-    assert f"{task.mesh.n_nodes} nodes in 2D" in shown and f"at measurement t of the state t − {task.lag}" in shown
-    estimate = eitbench.Estimate(np.array([1.0, 2.5]))._repr_html_()
-    assert "(2,), 1 to 2.5" in estimate and estimate.count("no claim") == 5
-    played = entry(PIPE).world
-    of_world = played._repr_html_()
-    assert "noise_relative = 0.01" in of_world and "PlanePipe: " in of_world and "Pipe2D" in of_world
-    odd = eitbench.World("<script>x", played.vessel, played.flow, played.target)
-    assert "<script" not in odd._repr_html_() and "&lt;script&gt;x" in odd._repr_html_()

@@ -10,9 +10,8 @@ from eitbench.physics.cem import CompleteElectrodeModel
 from eitbench.worlds import World, register
 from eitbench.worlds.bodies import Cylinders
 from eitbench.worlds.flows import NoFlow
-from eitbench.worlds.mesh_vessel import MeshVessel
 from eitbench.worlds.schedule import AroundTheTank, Schedule
-from eitbench.worlds.vessels import RoundTank
+from eitbench.worlds.vessels import MeshVessel, RoundTank
 
 from shapes import write_mesh
 from short import register_apart

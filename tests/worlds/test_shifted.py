@@ -103,7 +103,7 @@ def test_readings_have_twice_the_noise_that_is_told():
         assert np.std((read - clean) / told) == pytest.approx(2.0, rel=0.02)
     here, there = small(SHIFTS[2]), small(HOME)
     assert here.instrument.untold_noise == 2.0
-    entries = make_recording(there, 7, simulate(there, 7))
+    entries = make_recording(there, simulate(there, 7))
     task = make_task(here)
     steps = np.arange(len(entries))
     currents = task.currents[steps % len(task.currents)]

@@ -98,17 +98,6 @@ def test_seed_decides_the_episode(world):
     assert one.velocity.shape == (4, 0)
 
 
-def test_disc_indicator_holds_the_area_of_the_disc():
-    """∫ indicator = πa², but for the edge's (π²/12)·(edge/2a)² of it, and its rim lies at one half."""
-    truth, _ = both(SHORT)
-    mesh, centre, a = truth.transport.mesh, np.array([0.03, -0.05]), 0.03
-    area = mass_matrix(mesh).sum(axis=0) @ disc_indicator(mesh.points, centre, a, 0.003)
-    assert area == pytest.approx(np.pi * a**2 * (1.0 + np.pi**2 / 12.0 * (0.0015 / a)**2), rel=2e-3)
-    rim = centre + a * np.array([[1.0, 0.0], [0.6, 0.8], [0.0, -1.0]])
-    np.testing.assert_allclose(disc_indicator(rim, centre, a, 0.003), 0.5, atol=1e-12)
-    assert disc_indicator(centre[None], centre, a, 0.003) > 1.0 - 1e-9
-
-
 def test_flow_rests_on_the_wall():
     """No slip at the nodes of the wall and amid its facets, where the fastest fluid does half a metre a second."""
     flow = stirred(24)
@@ -118,28 +107,7 @@ def test_flow_rests_on_the_wall():
     assert 0.5 < np.linalg.norm(flow(flow.mesh.points), axis=1).max() < 1.0
 
 
-def test_flow_has_nearly_no_divergence():
-    """∇·v is below 2 % of the vorticity (r.m.s., by differences), and less than a quarter of that with half the rings.
-
-    Between the circles of two rings no fluid is lost: the flux through any circle about the middle vanishes.
-    """
-    points = np.random.default_rng(0).uniform(-0.12, 0.12, (4000, 2))
-    points = points[np.hypot(*points.T) < 0.12]
-
-    def rates(flow, h=1e-3):
-        slope = [(flow(points + step) - flow(points - step)) / (2.0 * h) for step in h * np.eye(2)]
-        divergence, curl = slope[0][:, 0] + slope[1][:, 1], slope[0][:, 1] - slope[1][:, 0]
-        return np.sqrt((divergence**2).mean() / (curl**2).mean())
-
-    fine = rates(stirred(24))
-    assert fine < 0.02 and fine < 0.25 * rates(stirred(12))
-    angle = 2.0 * np.pi * np.arange(1000) / 1000
-    outwards = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    for radius in (0.03, 0.06, 0.1, 0.13):
-        assert abs((stirred(24)(radius * outwards) * outwards).sum(axis=1).mean()) < 1e-3
-
-
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, 2])
 def test_ball_goes_round_on_an_orbit_of_the_flow(seed):
     """Its centre moves with the mean velocity over the disc: an integral over 192 points, solved to high accuracy.
 
@@ -253,34 +221,3 @@ def test_frame_of_the_tank_at_rest_measures_sixteen_things():
     np.testing.assert_array_equal(currents[:8], -np.roll(currents[:8], 8, axis=1))
     pairs = {frozenset(np.flatnonzero(row).tolist()) for row in currents}
     assert len(pairs) == 16                                              # none is another's reverse
-
-
-@pytest.mark.parametrize(("world", "part", "change", "message"), [
-    (ROTATING, "vessel", {"radius": 0.0}, "radius must be"),
-    (ROTATING, "vessel", {"electrode_cover": 1.0}, "electrode_cover"),
-    (ROTATING, "flow", {"viscosity": -1.0}, "viscosity"),
-    (ROTATING, "flow", {"stirrer_position": (np.nan, 0.0)}, "stirrer_position must be"),
-    (ROTATING, "target", {"start_radius": (0.5, 0.9)}, "start_radius must be a range .* keeps the ball inside"),
-    (STATIONARY, "vessel", {"n_electrodes": 7}, "n_electrodes must be an integer of at least 8"),
-    (STATIONARY, "target", {"gap": 0.12}, "gap must leave room"),
-    (STATIONARY, "target", {"metal": 0.0}, "metal must be"),
-    (STATIONARY, "target", {"small_radius": (0.018, 0.035)}, "small_radius must not reach beyond large_radius"),
-    (STATIONARY, "target", {"small_radius": 0.02}, r"small_radius must have shape \(2,\)"),
-], ids=str)
-def test_wrong_numbers_are_named(world, part, change, message):
-    """The part, the number, what came, and what was expected."""
-    with pytest.raises(ValueError, match=f"^world.*{part}.*{message}"):
-        world.changed({part: change})
-
-
-@pytest.mark.parametrize("radius", [0.01, 0.02, 0.04])
-def test_cylinders_never_reach_through_the_wall(radius):
-    """As far out as they may stand, each is inside; a millionth further is refused."""
-    most = 1.0 - radius / STATIONARY.vessel.radius
-    sizes = {"large_radius": (radius, radius), "small_radius": (radius, radius), "gap": 0.02}
-    world = STATIONARY.changed({"target": sizes | {"furthest": most}})
-    for seed in range(20):
-        for centre, size in world.target.draw(world, flow_stream(seed)):
-            assert size == radius and np.hypot(*centre) + size <= world.vessel.radius
-    with pytest.raises(ValueError, match="furthest must be"):
-        STATIONARY.changed({"target": sizes | {"furthest": most + 1e-6}})

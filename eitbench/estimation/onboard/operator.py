@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
-from eitbench.data.recordings import step_error
-from eitbench.data.regions import score_mass
+from eitbench.data.recordings import score_mass, step_error
 from eitbench.estimation.filter import Filter
 from eitbench.estimation.gaussian import Observation
 from eitbench.estimation.nodal import nodal_states
@@ -115,7 +114,7 @@ class Operator(Protocol):
 
     @staticmethod
     def project(world: World, moment: np.ndarray) -> np.ndarray:
-        """Moments over what counts (T, n), see `eitbench.data.regions.integrals`, as `errors` wants
+        """Moments over what counts (T, n), `eitbench.data.recordings.Integrals`, as `errors` wants
         them."""
 
 

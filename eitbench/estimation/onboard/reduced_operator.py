@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from eitbench._notice import say
 from eitbench.data.cache import Key, cached, described, model_key
-from eitbench.data.regions import outline, score_mass
+from eitbench.data.recordings import outline, score_mass
 from eitbench.estimation.forward import LinearisedObservations
 from eitbench.estimation.gaussian import Observation
 from eitbench.estimation.nodal import starting_filter

@@ -1,0 +1,118 @@
+"""A world: its numbers can be changed, its parts are what their protocols ask for, its streams go on from a state."""
+
+import dataclasses
+import json
+import pickle
+
+import numpy as np
+import pytest
+from eitbench.worlds import entries
+from eitbench.worlds.catalogue import PIPE_2D, PIPE_3D, ROTATING_TANK_2D, STATIONARY_TANK_2D
+from eitbench.worlds.catalogue import PIPE_2D_TIME_VARYING as DRAWN
+from eitbench.worlds.streams import in_state, randomness
+
+
+def test_only_what_is_named_changes():
+    """Everything else is the same object; lists become tuples, and a part's part can be changed."""
+    world = PIPE_2D.changed({"target": {"strength": [0.1, 0.2], "arrivals": {"interval": 0.03}},
+                             "instrument": {"noise_relative": 0.02}})
+    assert world.target.strength == (0.1, 0.2)
+    assert world.target.arrivals.interval == 0.03
+    assert world.target.duration == PIPE_2D.target.duration
+    assert world.instrument.noise_relative == 0.02
+    assert world.vessel is PIPE_2D.vessel
+    assert world.schedule is PIPE_2D.schedule
+    assert world.name == PIPE_2D.name
+    assert PIPE_2D.target.strength == (0.22, 0.40)
+    assert PIPE_2D.changed(None) is PIPE_2D
+    assert PIPE_2D.changed({}) == PIPE_2D
+    back = world.changed({"target": {"strength": [0.22, 0.40], "arrivals": {"interval": 0.02}},
+                          "instrument": {"noise_relative": 0.01}})
+    assert back == PIPE_2D
+    assert hash(back) == hash(PIPE_2D)
+
+
+@pytest.mark.parametrize("id", entries())
+def test_every_number_can_be_named(id):
+    """A change of each to what it is changes nothing; and a copy from another process is equal."""
+    world = entries()[id].world
+
+    def numbers(part) -> dict:
+        found = {}
+        for each in dataclasses.fields(part):
+            value = getattr(part, each.name)
+            found[each.name] = numbers(value) if dataclasses.is_dataclass(value) else value
+        return found
+
+    changes = numbers(world)
+    del changes["name"]
+    again = world.changed(changes)
+    assert again == world
+    assert hash(again) == hash(world)
+    assert pickle.loads(pickle.dumps(world)) == world
+
+
+@pytest.mark.parametrize(("world", "changes", "message"), [
+    (PIPE_2D, {"colour": 1}, "^world has no 'colour'; there are vessel, flow, target, instrument, "
+                             "schedule, prior, region$"),
+    (PIPE_2D, {"name": "Mine"}, "^world must not change its name"),
+    (PIPE_2D, [1], r"^world must be a dict of parts and their numbers, got \[1\]"),
+    (PIPE_2D, {"vessel": {"radius": 1.0}}, "^world.vessel has no 'radius'; there are length, half_width"),
+    (PIPE_2D, {"vessel": {"length": "far"}}, "^world.vessel: length must be a number in m, got 'far'"),
+    (PIPE_2D, {"vessel": {"electrodes_per_wall": 2.5}}, "^world.vessel: electrodes_per_wall must be an int"),
+    (PIPE_2D, {"flow": {"mean_velocity": 0.0}}, "^world.flow: mean_velocity must be a finite number"),
+    (PIPE_2D, {"target": {"width": [0.02, 0.01]}}, "^world.target: width must be a range"),
+    (PIPE_2D, {"target": {"arrivals": {"interval": 0.0}}}, "^world.target.arrivals: interval must be"),
+    (PIPE_2D, {"target": {"reach": [0.5, 1.1]}}, "^world.target: reach must end above 0 and at most at 1"),
+    (PIPE_2D, {"instrument": {"untold_noise": -1.0}}, "^world.instrument: untold_noise must be a finite number in"),
+    (PIPE_2D, {"instrument": {"dead": [8, 8], "failing": [7, 7]}}, "must leave two electrodes sound"),
+    (PIPE_2D, {"schedule": {"time_step": float("nan")}}, "^world.schedule: time_step must be"),
+    (PIPE_2D, {"region": [0.0, 0.5]}, "region must be a range 0 ≤ begin < end ≤ 0.4 m"),
+    (DRAWN, {"flow": {"velocity_range": (5.0, 4.0)}}, "^world.flow: velocity_range must be a range low ≤ high"),
+    (DRAWN, {"flow": {"velocity_range": 4.5}}, r"velocity_range must have shape \(2,\)"),
+    (DRAWN, {"flow": {"swing_range": (0.5, 1.0)}}, "^world.flow: swing_range must lie below 1"),
+    (DRAWN, {"flow": {"period_range": (0.0, 0.4)}}, "^world.flow: period_range must be"),
+    (DRAWN, {"flow": {"skewness_range": (0.6, 5.5)}}, "skewness_range below 5"),
+    (DRAWN, {"flow": {"velocity_std": -1.0}}, "^world.flow: velocity_std must be"),
+    (PIPE_3D, {"vessel": {"electrode_rings": 0}}, "^world.vessel: electrode_rings must"),
+    (PIPE_3D, {"vessel": {"electrode_length": 0.2}}, "^world.vessel: electrode_length must leave gaps"),
+    (PIPE_3D, {"vessel": {"potential_order": 3}}, "^world.vessel: potential_order must"),
+    (ROTATING_TANK_2D, {"vessel": {"radius": 0.0}}, "^world.vessel: radius must be"),
+    (ROTATING_TANK_2D, {"vessel": {"electrode_cover": 1.0}}, "electrode_cover"),
+    (ROTATING_TANK_2D, {"flow": {"stirrer_position": (np.nan, 0.0)}}, "stirrer_position must be"),
+    (ROTATING_TANK_2D, {"target": {"start_radius": (0.5, 0.9)}}, "start_radius must be a range .* keeps the ball"),
+    (STATIONARY_TANK_2D, {"vessel": {"n_electrodes": 7}}, "n_electrodes must be an integer of at least 8"),
+    (STATIONARY_TANK_2D, {"target": {"gap": 0.12}}, "gap must leave room"),
+    (STATIONARY_TANK_2D, {"target": {"furthest": 0.8}}, "furthest must be"),
+    (STATIONARY_TANK_2D, {"target": {"metal": 0.0}}, "^world.target: metal must be"),
+    (STATIONARY_TANK_2D, {"target": {"small_radius": (0.018, 0.035)}}, "small_radius must not reach beyond large"),
+    (STATIONARY_TANK_2D, {"target": {"small_radius": 0.02}}, r"small_radius must have shape \(2,\)"),
+], ids=str)
+def test_what_is_wrong_is_named(world, changes, message):
+    """By the place of the part, the name of the number, what came and what is allowed."""
+    with pytest.raises(ValueError, match=message):
+        world.changed(changes)
+
+
+@pytest.mark.parametrize(("name", "part", "message"), [
+    ("vessel", PIPE_2D.flow, "vessel must be a Vessel, with .*; got LaminarFlow without .*electrode_model"),
+    ("flow", None, "flow must be a Flow, with .*; got NoneType without .*nominal"),
+    ("target", PIPE_2D.vessel, "target must be a Target, with .*; got PlanePipe without .*evolve")])
+def test_a_part_without_what_its_protocol_asks_for_is_refused(name, part, message):
+    """The message names the part, what came and what is missing."""
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(PIPE_2D, **{name: part})
+
+
+def test_a_generator_goes_on_from_a_state():
+    """It draws what the other would, also from a state that went through JSON; what it spawns differs by episode."""
+    spawned = []
+    for seed in range(3):
+        policy = randomness(seed).policy
+        state = policy.bit_generator.state
+        for given in (state, json.loads(json.dumps(state))):
+            copy = in_state(given)
+            assert copy.bit_generator.state == state
+            spawned.append(copy.spawn(1)[0].integers(2**63))
+        np.testing.assert_array_equal(copy.standard_normal(5), policy.standard_normal(5))
+    assert spawned[::2] == spawned[1::2] and len(set(spawned)) == 3
