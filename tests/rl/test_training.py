@@ -27,7 +27,8 @@ SHORT = {"world": {"flow": {"mean_velocity": 16.0}, "schedule": {"scored_steps":
 TINY = Config(total_steps=32, n_envs=2, interval=16, evaluation_episodes=2, episodes=3, hidden=(8,),
               algorithm={"n_steps": 8, "batch_size": 8})
 RUNS = {"ppo": (NAME, {"n_steps": 8, "batch_size": 8}), "maskable_ppo": (BUDGET, {"n_steps": 8, "batch_size": 8}),
-        "recurrent_ppo": (NAME, {"n_steps": 8, "batch_size": 8}), "dqn": (NAME, {"learning_starts": 4, "train_freq": 4}),
+        "recurrent_ppo": (NAME, {"n_steps": 8, "batch_size": 8}),
+        "dqn": (NAME, {"learning_starts": 4, "train_freq": 4}),
         "sac": (CURRENTS, {"learning_starts": 4, "batch_size": 4})}
 
 
