@@ -142,8 +142,10 @@ def test_truth_is_not_within_reach_of_observation_or_info(name):
     assert len(seen) > 50                      # the walk did go into the task
 
 
+@pytest.mark.parametrize("name", [
+    PIPE, "eitbench/Pipe2DFixedLag-v0", "eitbench/Pipe3D-v0", "eitbench/RotatingTank2D-v0"], scope="module")
 def test_frames_show_truth_estimate_and_spread(name):
-    """The picture changes with the estimate, with the spread and with the time."""
+    """The picture changes with the estimate, with the spread and with the time; by kind of vessel and with a lag."""
     env = make(name, render_mode="rgb_array")
     base = env.unwrapped
     env.reset(seed=1)

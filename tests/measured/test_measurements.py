@@ -91,7 +91,7 @@ def test_frames_follow_each_other():
 def test_a_large_record_stays_on_the_disk(tmp_path):
     """To read it, calibrate and play a little of it takes more memory than a short one does by less than half of its
     readings, and nothing of it is another number."""
-    sound = moving(frames=8, records=1)
+    sound = moving(frames=8)
     times = 18_000
     large = Measurements(sound.currents, np.tile(sound.injections, times), sound.matrix,
                          np.tile(sound.readings, (times, 1)), 0.01 * np.arange(64 * times), sound.reference)
