@@ -65,19 +65,6 @@ def test_world_is_that_of_the_id_but_for_the_changes(name):
     assert make(name, lag=1).unwrapped.lag == make(name, lag=1).unwrapped.task.lag == 1
 
 
-def test_two_environments_agree_to_the_bit(name):
-    """Same seed and actions, same observations and rewards."""
-    assert_same_play(make(name), make(name))
-
-
-def assert_same_play(one: gym.Env, other: gym.Env) -> None:
-    actions = noise_actions(one)
-    for a, b in zip(play(one, 1, actions), play(other, 1, actions), strict=True):
-        for key in ("voltages", "currents"):
-            np.testing.assert_array_equal(a[0][key], b[0][key])
-        assert a[1:] == b[1:]
-
-
 @pytest.mark.parametrize("id", [PIPE, "eitbench/Pipe2DTimeVaryingVelocity-v0", "eitbench/RotatingTank2D-v0"])
 def test_same_observation_in_another_process(id, tmp_path):
     """The seed decides, not the process: another one, which finds nothing in its cache, simulates the same bits."""
