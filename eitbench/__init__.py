@@ -1,7 +1,7 @@
-"""eitbench: process tomography as Gymnasium environments, with honest baselines and scores.
+"""eitbench: process tomography as Gymnasium environments, with baselines and scores.
 
-Importing it registers the environments ``eitbench/…-v0`` and those of installed packages; nothing
-heavy is loaded before something is used.
+Importing it registers the environments ``eitbench/…-v0`` and those of installed packages; heavy
+modules are loaded on first use.
 """
 
 from importlib import import_module
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as _gym
 
 from eitbench._extras import needed_by as _needed_by
-from eitbench.worlds import catalogue as _catalogue  # noqa: F401 (registers our ids)
+from eitbench.worlds import catalogue as _catalogue  # noqa: F401 (registers the ids)
 from eitbench.worlds.registry import register, register_installed
 
 if TYPE_CHECKING:
@@ -28,27 +28,25 @@ __version__ = "0.1.0"
 __all__ = ["Episode", "Estimate", "Rules", "Task", "World",
            "dataset", "evaluate", "make_task", "page", "plot", "register", "simulate"]
 
-_LATER = {"Estimate": "worlds.task", "Task": "worlds.task", "make_task": "worlds.task",
-          "World": "worlds.world", "Episode": "data.episodes", "simulate": "data.episodes",
-          "dataset": "data.dataset",
-          "Rules": "estimation.onboard.rules", "page": "envs.pages",
-          "evaluate": "bench.evaluation"}
-"""Where the public names lie that are loaded on first use."""
-_MODULES = {"leaderboard": "bench", "plot": "report.plot"}
-"""And where the modules lie."""
+_LAZY_NAMES = {"Estimate": "worlds.task", "Task": "worlds.task", "make_task": "worlds.task",
+               "World": "worlds.world", "Episode": "data.episodes", "simulate": "data.episodes",
+               "dataset": "data.dataset", "Rules": "estimation.onboard.rules",
+               "page": "envs.pages", "evaluate": "bench.evaluation"}
+"""Public name -> the module that is imported on its first use."""
+_LAZY_MODULES = {"leaderboard": "bench", "plot": "report.plot"}
 
 
 def __getattr__(name: str) -> Any:
-    """Load the public nouns, their makers, leaderboards and pictures on first use."""
+    """Import public names on first use (PEP 562)."""
     with _needed_by(f"eitbench.{name}"):
-        if name in _LATER:
-            return getattr(import_module(f"eitbench.{_LATER[name]}"), name)
-        if name in _MODULES:
-            return import_module(f"eitbench.{_MODULES[name]}")
+        if name in _LAZY_NAMES:
+            return getattr(import_module(f"eitbench.{_LAZY_NAMES[name]}"), name)
+        if name in _LAZY_MODULES:
+            return import_module(f"eitbench.{_LAZY_MODULES[name]}")
     raise AttributeError(f"module 'eitbench' has no attribute {name!r}")
 
 
-# measurements of a user, and public ones: without a world
+# measurement files of users, and public ones; they have no world
 _gym.register("eitbench/Measured-v0", entry_point="eitbench.envs.measured:MeasuredEnv")
 for _case in sorted((_Path(__file__).parent / "measured" / "cases").glob("*.yml")):
     _gym.register(f"eitbench/Measured-{_case.stem}-v0",

@@ -1,4 +1,4 @@
-"""Argument checks that name the argument, what came and what was expected."""
+"""Argument checks whose errors name the argument, the accepted values and the given one."""
 
 from __future__ import annotations
 
@@ -11,13 +11,15 @@ from typing import Any
 import numpy as np
 
 NUMBERS = "biufO"
-"""Kinds of arrays that may stand for real numbers; not complex ones, dates or text."""
+"""Kinds of arrays that can hold real numbers; not complex ones, dates or text."""
+DEEPEST = 20
+"""Default of the depth to which lists and dicts may be nested."""
 
 
 def number(name: str, value: object, *, low: float = -math.inf, high: float = math.inf,
            open_low: bool = False, units: str = "") -> float:
-    """``value`` as a finite float within [low, high] (``open_low``: within (low, high]); else a
-    ``ValueError``, as for booleans and what `array` refuses."""
+    """Return ``value`` as a finite float within [low, high] (``open_low``: within (low, high]);
+    ``ValueError`` for others, for booleans, and for what `array` rejects."""
     try:
         kind = np.asarray(value).dtype.kind
         if kind == "b" or kind not in NUMBERS:
@@ -33,8 +35,8 @@ def number(name: str, value: object, *, low: float = -math.inf, high: float = ma
 
 
 def integer(name: str, value: object, *, low: int, high: int | None = None) -> int:
-    """``value`` as an int within [low, high]; else a ``ValueError``."""
-    # as stable-baselines3 gives a single action
+    """Return ``value`` as an int within [low, high]; ``ValueError`` for others."""
+    # stable-baselines3 returns a single action as an array without axes
     if isinstance(value, np.ndarray) and value.ndim == 0 and value.dtype.kind in "iu":
         value = value.item()
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < low or (
@@ -45,16 +47,15 @@ def integer(name: str, value: object, *, low: int, high: int | None = None) -> i
 
 
 def array(name: str, value: object, shape: Iterable[int | None], *, units: str = "",
-          positive: bool = False) -> np.ndarray:
-    """``value`` as a finite float64 array whose trailing axes match ``shape`` (``None``: any
-    length).
+          positive: bool = False, allow_nan: bool = False) -> np.ndarray:
+    """Return ``value`` as a finite float64 array of this ``shape`` (``None``: any length).
 
-    A leading ``-1`` in ``shape`` stands for any number of batch axes. ``ValueError`` for other
-    shapes, and for what holds no real numbers: complex ones, text, dates, masked arrays, and
-    objects that are no numbers or too large for a float.
+    A leading ``-1`` in ``shape`` stands for any number of batch axes. With ``allow_nan``, entries
+    may be NaN. ``ValueError`` for other shapes, and for arrays without real numbers: complex ones,
+    text, dates, masked arrays, and objects that are not numbers or too large for a float.
     """
     wanted = list(shape)
-    batched = bool(wanted) and wanted[0] == -1
+    batched = wanted[:1] == [-1]
     core = wanted[1:] if batched else wanted
     came = type(value).__name__
     try:
@@ -67,18 +68,17 @@ def array(name: str, value: object, shape: Iterable[int | None], *, units: str =
         result = given.astype(np.float64, copy=False)
     except (TypeError, ValueError, OverflowError):
         raise ValueError(f"{name} must be an array of numbers{_in(units)}, got {came}") from None
-    trailing = result.shape[result.ndim - len(core):] if result.ndim >= len(core) else ()
-    fits = (result.ndim >= len(core) if batched else result.ndim == len(core)) and all(
-        want is None or want == have for want, have in zip(core, trailing, strict=True))
-    if not fits:
-        lengths = ["any" if want is None else str(want) for want in core]
-        text = ", ".join(["..."] * batched + lengths)
-        text += "," if len(wanted) == 1 else ""
+    sizes = result.shape[max(result.ndim - len(core), 0):]
+    if (len(sizes) != len(core) or (result.ndim > len(core) and not batched)
+            or any(want not in (None, size) for want, size in zip(core, sizes, strict=True))):
+        lengths = ["..."] * batched + ["any" if want is None else str(want) for want in core]
+        text = ", ".join(lengths) + "," * (len(wanted) == 1)
         raise ValueError(f"{name} must have shape ({text}), got {result.shape}")
-    if not np.isfinite(result).all():
-        wrong = ~np.isfinite(result)
-        raise ValueError(f"{name} must be finite{_in(units)}, got {np.count_nonzero(wrong)} "
-                         f"entries that are not, the first at index {_first(wrong)}")
+    wrong = np.isinf(result) if allow_nan else ~np.isfinite(result)
+    if wrong.any():
+        raise ValueError(f"{name} must be finite{' or NaN' * allow_nan}{_in(units)}, got "
+                         f"{np.count_nonzero(wrong)} entries that are not, the first at index "
+                         f"{_first(wrong)}")
     if positive and not (result > 0).all():
         raise ValueError(f"{name} must be positive{_in(units)}, got {result.min():g} at index "
                          f"{_first(result <= 0)}")
@@ -86,19 +86,15 @@ def array(name: str, value: object, shape: Iterable[int | None], *, units: str =
 
 
 def nearest(given: object, known: Iterable[str]) -> str:
-    """`` Did you mean …?``, to end a message that names what is ``known``; empty if nothing is
-    near."""
+    """Return ``. Did you mean …?`` to append to a message that lists ``known``; empty if no name
+    is similar."""
     names = {name.casefold(): name for name in known}
     found = difflib.get_close_matches(str(given).casefold(), names, n=1)
     return f". Did you mean {names[found[0]]}?" if found else ""
 
 
-DEEPEST = 20
-"""How deep lists and dicts from elsewhere may be nested."""
-
-
 def nesting(name: str, value: Any, deepest: int = DEEPEST) -> None:
-    """``ValueError`` if lists and dicts are nested too deep for what goes through them."""
+    """``ValueError`` if lists and dicts are nested deeper."""
     level = [value]
     for _ in range(deepest):
         level = [inner for each in level if isinstance(each, (list, tuple, dict))
@@ -109,8 +105,8 @@ def nesting(name: str, value: Any, deepest: int = DEEPEST) -> None:
 
 
 def document(name: str, value: object, size: int) -> None:
-    """``ValueError`` unless ``value`` is a dict that JSON can hold in so many bytes, its numbers
-    finite, also as floats, and not nested too deep."""
+    """``ValueError`` unless ``value`` is a dict that JSON holds in ``size`` bytes, with finite
+    numbers, also as floats, and no deeper than `nesting` accepts."""
     try:
         if not isinstance(value, dict):
             raise TypeError(f"got {type(value).__name__}")

@@ -1,4 +1,4 @@
-"""What is installed with which extra, and what is said where one is missing."""
+"""Optional dependencies: the extra that installs a missing module."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ EXTRAS = {
     "minari": ("minari",),
     "rl": ("torch", "stable_baselines3", "sb3_contrib"),
 }
-"""Extra -> modules that playing from Python does not need."""
+"""Extra -> modules that environments do not need."""
 
 
 def explained(what: str, error: ModuleNotFoundError) -> str | None:
-    """Which extra brings what is missing, and how; None for a module of none."""
+    """Return a sentence with the extra that installs the missing module; None if none does."""
     missing = (error.name or "").partition(".")[0]
     for extra, modules in EXTRAS.items():
         if missing in modules:
@@ -28,7 +28,7 @@ def explained(what: str, error: ModuleNotFoundError) -> str | None:
 
 @contextmanager
 def needed_by(what: str) -> Iterator[None]:
-    """A `ModuleNotFoundError` from within says which extra to install for ``what``."""
+    """Add the extra that ``what`` needs to a `ModuleNotFoundError`."""
     try:
         yield
     except ModuleNotFoundError as error:

@@ -1,34 +1,27 @@
-"""Files that are whole or not there."""
+"""Atomic writes, and the folders that come with the package."""
 
 from __future__ import annotations
 
-import glob
 import os
-import shutil
 import uuid
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
-
-def write_atomically(path: Path, data: bytes) -> None:
-    """Put ``data`` into ``path`` so that nobody ever sees half of it; parent folders are made."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    # unlike mkstemp: as the umask allows
-    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
-    try:
-        temporary.write_bytes(data)
-        os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+PACKAGE = Path(__file__).parent
+"""Folder of this package."""
+SHIPPED = ("baselines", "leaderboards")
+"""Folders that come with the package. Models of agents, learned networks, animations and the
+rendered site are in a checkout only: with them an installed package would be four times as
+large."""
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A path beside ``path`` for what is too large to be made in memory; what was written there
-    takes its place when all went well."""
+    """Yield a temporary path that replaces ``path`` if no error occurs; create parent folders."""
     path.parent.mkdir(parents=True, exist_ok=True)
+    # unlike a file of mkstemp, with the permissions of the umask
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
     try:
         yield temporary
@@ -37,49 +30,40 @@ def replacing(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+def write_atomically(path: Path, data: bytes) -> None:
+    """Write a file as a whole or not at all; create parent folders."""
+    with replacing(path) as temporary:
+        temporary.write_bytes(data)
+
+
 def replace_folder(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Let the folder hold these files and no others: a new one is written beside it and takes its
-    place when it is whole, so that whoever is interrupted leaves what was there before; if they are
-    killed between the two renamings, the next call begins by putting it back."""
+    """Replace a folder by one with these files only, written in full before the old one moves."""
     folder = folder.resolve()
     folder.parent.mkdir(parents=True, exist_ok=True)
-    for left in folder.parent.glob(f".{glob.escape(folder.name)}.*.old"):
-        if not folder.exists():
-            os.rename(left, folder)
-    mark = uuid.uuid4().hex
-    new, old = (folder.with_name(f".{folder.name}.{mark}.{which}") for which in ("new", "old"))
-    try:
+    with TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as temporary:
+        new, old = (Path(temporary) / name for name in ("new", "old"))
         new.mkdir()
         for name, data in files.items():
-            path = new / name
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(data)
+            write_atomically(new / name, data)
         if folder.exists():
             os.rename(folder, old)
-        os.rename(new, folder)
-    finally:
-        if old.exists() and not folder.exists():
-            os.rename(old, folder)
-        for left in (new, old):
-            shutil.rmtree(left, ignore_errors=True)
-
-
-PACKAGE = Path(__file__).parent
-"""Where this package lies."""
-SHIPPED = ("baselines", "leaderboards")
-"""Folders that come with the package. Models of our agents, learned networks, animations and the
-rendered site are in a checkout only: an installed package would have four times its size."""
+        try:
+            os.rename(new, folder)
+        except BaseException:
+            if old.exists():
+                os.rename(old, folder)
+            raise
 
 
 def shipped(name: str) -> Path:
-    """A folder that comes with the package: within an installed one, beside it in a checkout."""
+    """Return a folder of `SHIPPED`: inside an installed package, beside it in a checkout."""
     return PACKAGE / name if (PACKAGE / name).is_dir() else PACKAGE.parent / name
 
 
 def readable(path: Path) -> Path:
-    """The file or folder to read: the path itself if it leads to one; if not, and it begins as one
-    of ours does, as ``leaderboards/results`` in an empty folder, the one that is shipped."""
+    """Return ``path`` if it exists; else, if it begins with one of `SHIPPED` and exists there, the
+    shipped file or folder."""
     if path.exists() or not path.parts or path.parts[0] not in SHIPPED:
         return path
-    ours = shipped(path.parts[0]).joinpath(*path.parts[1:])
-    return ours if ours.exists() else path
+    found = shipped(path.parts[0]).joinpath(*path.parts[1:])
+    return found if found.exists() else path

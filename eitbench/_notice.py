@@ -1,5 +1,4 @@
-"""What takes longer than two seconds says so: what is made, for how long, and how to have it made
-beforehand."""
+"""Notices about work that takes longer than two seconds."""
 
 from __future__ import annotations
 
@@ -10,14 +9,13 @@ import time
 from tqdm import tqdm
 
 PATIENCE = 2.0
-"""s that nobody has to be told of"""
+"""Seconds of work without a notice."""
 NAME = "eitbench"
-"""The logger where nobody looks at a terminal or a notebook."""
+"""Name of the logger, and prefix of notices."""
 
 
 def say(text: str) -> None:
-    """A line on the terminal or in the notebook; without either a message to the logger, level
-    INFO."""
+    """Print a line on a terminal or in a notebook; elsewhere log it with level INFO."""
     if sys.stderr is not None and (sys.stderr.isatty() or "ipykernel" in sys.modules):
         tqdm.write(f"{NAME}: {text}", file=sys.stderr)
     else:
@@ -25,33 +23,30 @@ def say(text: str) -> None:
 
 
 class Wait:
-    """Says, once it is clear that work takes longer than `PATIENCE`, what is made and for how long.
+    """Report once that work of ``total`` steps is going to take longer than `PATIENCE`.
 
     Parameters
     ----------
     what : str
-        What is being made.
+        Description of the work.
     total : int
-        Steps of the work.
     beforehand : str
-        How to have it made at another time.
+        How to have it done at another time.
     """
 
     def __init__(self, what: str, total: int, beforehand: str) -> None:
         self._what = what
-        self._beforehand = beforehand
         self._total = total
+        self._beforehand = beforehand
         self._done = 0
-        self._told = False
+        self._is_reported = False
         self._begin = time.monotonic()
 
     def tick(self, steps: int) -> None:
-        """So many more steps are done."""
+        """Count ``steps`` more steps as done."""
         self._done += steps
         passed = time.monotonic() - self._begin
-        if self._told or passed < 0.25 * PATIENCE:
-            return
         whole = passed * self._total / self._done
-        if whole > PATIENCE:
-            self._told = True
+        if not self._is_reported and passed >= 0.25 * PATIENCE and whole > PATIENCE:
+            self._is_reported = True
             say(f"{self._what}, {whole:.0f} s or less; {self._beforehand}")

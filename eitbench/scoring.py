@@ -1,4 +1,4 @@
-"""Scores: arrays in, numbers out (``docs/methods.md``, 4). Lower is better unless said; `E` is the
+"""Scores as functions of arrays (``docs/methods.md``, 4). Lower is better unless stated; `E` is the
 relative error (5.12)."""
 
 from __future__ import annotations
@@ -12,20 +12,10 @@ from scipy.special import ndtr, ndtri
 
 def step_errors(estimate: np.ndarray, truth: np.ndarray, mass: Any,
                 reference: float = 0.0) -> np.ndarray:
-    """∫(ĉ_t − c_t)² / ∫(c_t − reference)² for each t.
+    """(T,) ∫(ĉ_t − c_t)² / ∫(c_t − reference)² for nodal values (T, n) on the truth's mesh.
 
-    Parameters
-    ----------
-    estimate, truth : (T, n)
-        Nodal values on the truth's mesh.
-    mass : (n, n) matrix, may be sparse
-        Mass matrix of that mesh.
-    reference : float
-        0 gives the terms of (5.12); the homogeneous estimate gives the contrast form.
-
-    Returns
-    -------
-    (T,) array, no unit.
+    ``mass`` (n, n) is the mass matrix of that mesh, dense or sparse. The ``reference`` 0 gives the
+    terms of (5.12), the homogeneous estimate the contrast form.
     """
     estimate, truth = _pair(estimate, truth)
     return _squares(estimate - truth, mass) / _squares(truth - reference, mass)
@@ -70,8 +60,8 @@ def crps(mean: np.ndarray, std: np.ndarray, truth: np.ndarray, weights: np.ndarr
 
 def coverage(mean: np.ndarray, std: np.ndarray, truth: np.ndarray, weights: np.ndarray,
              level: float) -> float:
-    """Part of space and time where the truth lies in the central ``level`` interval of the Gaussian
-    marginal."""
+    """Fraction of space and time in which the truth is in the central ``level`` interval of the
+    Gaussian marginal; arguments as in `crps`."""
     mean, truth = _pair(mean, truth)
     return float(np.average((np.abs(truth - mean) <= ndtri(0.5 + level / 2) * std).mean(axis=0),
                             weights=weights))
@@ -79,11 +69,11 @@ def coverage(mean: np.ndarray, std: np.ndarray, truth: np.ndarray, weights: np.n
 
 def spread_ratio(mean: np.ndarray, std: np.ndarray, truth: np.ndarray,
                  weights: np.ndarray) -> float:
-    """Mean variance over mean squared error; 1 when the claimed uncertainty is honest, above when
-    too modest."""
+    """Mean variance divided by the mean squared error; 1 for calibrated uncertainty, more if it is
+    overestimated."""
     mean, truth = _pair(mean, truth)
-    claimed = np.average((std**2).mean(axis=0), weights=weights)
-    return float(claimed / np.average(((mean - truth)**2).mean(axis=0), weights=weights))
+    variance = np.average((std**2).mean(axis=0), weights=weights)
+    return float(variance / np.average(((mean - truth)**2).mean(axis=0), weights=weights))
 
 
 def skill(error: float, homogeneous: float, reference: float) -> float:
@@ -93,20 +83,14 @@ def skill(error: float, homogeneous: float, reference: float) -> float:
 
 
 def deficit_centre(values: np.ndarray, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Where a field lies lowest: (d,) centroid in m of the deficit median − value, where above half
-    its maximum.
+    """(d,) centroid in m of the deficit median − value, where it exceeds half its maximum.
 
-    Parameters
-    ----------
-    values : (n,)
-        Nodal values; those above the median do not count.
-    points : (n, d) m
-    weights : (n,)
-        Area of each node: row sums of the mass matrix.
+    Takes nodal ``values`` (n,), ``points`` (n, d) in m, and ``weights`` (n,), the nodes' areas:
+    row sums of the mass matrix.
     """
     deficit = np.median(values) - values
     counted = weights * np.where(deficit > 0.5 * deficit.max(), deficit, 0.0)
-    if not counted.any():  # the same everywhere: no place is lower than another
+    if not counted.any():                                # a constant field has no minimum
         counted = weights
     centre: np.ndarray = counted @ points / counted.sum()
     return centre

@@ -1,8 +1,9 @@
-"""What comes with the package is found from any folder."""
+"""Shipped files are found from any folder; folders are replaced as a whole or not at all."""
 
 from pathlib import Path
 
-from eitbench._files import readable, shipped
+import pytest
+from eitbench._files import readable, replace_folder, shipped
 
 RECORDS = Path("leaderboards/results")
 
@@ -17,3 +18,14 @@ def test_ours_are_read_where_there_are_none(tmp_path, monkeypatch):
         assert found == (shipped("baselines") if path == "baselines" else Path(path))
     RECORDS.mkdir(parents=True)
     assert readable(RECORDS) == RECORDS
+
+
+def test_a_folder_is_replaced_as_a_whole(tmp_path):
+    """Nothing else is left; if a file cannot be written, the folder stays as it was."""
+    folder = tmp_path / "site"
+    for files in ({"a": b"1", "b/c": b"2"}, {"b/d": b"3"}):
+        replace_folder(folder, files)
+        assert {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()} == set(files)
+    with pytest.raises(OSError, match="b"):
+        replace_folder(folder, {"b": b"4", "b/d": b"5"})
+    assert (folder / "b" / "d").read_bytes() == b"3" and list(tmp_path.iterdir()) == [folder]

@@ -9,11 +9,11 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "eitbench"
-BUDGETS = {"numerics": 1580, "scoring": 130, "physics": 1420, "worlds": 2510, "data": 1500, "estimation": 5500,
-           "measured": 1870, "envs": 1700, "bench": 5300, "report": 3084, "rl": 800, "cli": 970}
+BUDGETS = {"numerics": 1580, "scoring": 110, "physics": 1420, "worlds": 2510, "data": 1500, "estimation": 5500,
+           "measured": 1770, "envs": 1630, "bench": 5300, "report": 3084, "rl": 730, "cli": 970}
 """Package (or module) -> lines of Python allowed, blank lines and docstrings included. Each imports only from those
 before it."""
-TOP = 600
+TOP = 430
 """Lines allowed in the other modules at the top: public names, argument checks, files, messages."""
 BASELINES = 2000
 TESTS = 20_400

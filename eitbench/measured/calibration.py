@@ -108,7 +108,19 @@ def calibrate(electrodes: CompleteElectrodeModel, currents: np.ndarray, matrix: 
     mean = np.where(known, readings, 0.0).sum(axis=0) / count
     if not mean.any():
         raise ValueError("readings must differ from each other, got 0 V everywhere")
-    model = _HomogeneousModel(electrodes, currents / depth, matrix)
+    driven = currents / depth
+
+    def model(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return readings (K, M) in V for σ = 1/ρ and contacts ζ = z σ, with x = (ln ρ, mean of
+        ln ζ, deviations from it), and their derivatives by x (2 + L, K, M)."""
+        contacts = np.exp(x[1] + x[2:])
+        vessel = electrodes.with_contacts(contacts)
+        R, by_contact = vessel.contact_derivatives(np.ones(vessel.mesh.n_nodes))
+        by_contact *= contacts[:, None, None]
+        by_x = np.exp(x[0]) * np.concatenate([R[None], by_contact.sum(axis=0)[None], by_contact])
+        slopes = driven @ by_x @ matrix.T
+        return slopes[0], slopes
+
     level = float(np.log(CONTACT_PRIOR_MEAN * electrode_sizes(electrodes).mean()))
     expected = np.array([0.0, level, *[0.0] * L])
     start, _ = model(expected)
@@ -119,12 +131,20 @@ def calibrate(electrodes: CompleteElectrodeModel, currents: np.ndarray, matrix: 
                          "sign of the currents or of the measurement matrix, or the order in which "
                          "readings count electrodes")
     expected[0] = np.log(scale)
+    prior = np.diag([0.0, 1.0 / CONTACT_PRIOR_LOG_STD, *[1.0 / CONTACT_BETWEEN_LOG_STD] * L])
+
+    def residuals(x: np.ndarray) -> np.ndarray:
+        return np.concatenate([(weight * (model(x)[0] - mean))[used], prior @ (x - expected)])
+
+    def jacobian(x: np.ndarray) -> np.ndarray:
+        return np.vstack([(weight * model(x)[1])[:, used].T, prior])
+
     x = expected
     for _ in range(2):                       # the second fit has the weights of the first misfit
-        x, jacobian = _fit(model, x, expected, mean, weight, used)
+        x = least_squares(residuals, x, jacobian, loss="soft_l1", xtol=1e-8, ftol=1e-8).x
+        slopes = jacobian(x)
         computed, _ = model(x)
-        squares = (mean - computed)[used]**2
-        misfit = _fit_noise(squares, np.abs(mean[used]))
+        misfit = _fit_noise((mean - computed)[used]**2, np.abs(mean[used]))
         weight = used / misfit.std(mean)
     repeated = bool(count.max() > 1)
     from_repeats = noise is not None or repeated
@@ -132,49 +152,12 @@ def calibrate(electrodes: CompleteElectrodeModel, currents: np.ndarray, matrix: 
         noise = _repeat_noise(readings, mean, used, count) if repeated else misfit
     fitted = float(np.exp(-x[0]))                                   # σ if the gain is 1
     sigma, gain = (fitted, 1.0) if conductivity is None else (conductivity, conductivity / fitted)
-    covariance = np.linalg.inv(jacobian.T @ jacobian)
+    covariance = np.linalg.inv(slopes.T @ slopes)
     of_contacts = np.hstack([np.ones((L, 2)), np.eye(L)])           # ln z = ln ρ + mean + δ
     contact_std = np.sqrt(np.einsum("lp,pq,lq->l", of_contacts, covariance, of_contacts))
     return Calibration(sigma, float(np.sqrt(covariance[0, 0])), np.exp(x[1] + x[2:]) / sigma,
                        contact_std, gain, noise, from_repeats, np.where(used, mean, np.nan),
                        computed, correction)
-
-
-class _HomogeneousModel:
-    """Readings for σ = 1/ρ and contacts ζ = z σ, with x = (ln ρ, mean of ln ζ, deviations from
-    it), (2 + L,)."""
-
-    def __init__(self, electrodes: CompleteElectrodeModel, driven: np.ndarray,
-                 matrix: np.ndarray) -> None:
-        self.electrodes = electrodes
-        self.driven = driven
-        self.matrix = matrix
-
-    def __call__(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return (K, M) in V, and the derivatives by x (2 + L, K, M)."""
-        contacts = np.exp(x[1] + x[2:])
-        model = self.electrodes.with_contacts(contacts)
-        R, by_contact = model.contact_derivatives(np.ones(model.mesh.n_nodes))
-        by_contact *= contacts[:, None, None]
-        by_x = np.exp(x[0]) * np.concatenate([R[None], by_contact.sum(axis=0)[None], by_contact])
-        slopes = self.driven @ by_x @ self.matrix.T
-        return slopes[0], slopes
-
-
-def _fit(model: _HomogeneousModel, start: np.ndarray, expected: np.ndarray, mean: np.ndarray,
-         weight: np.ndarray, used: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the best x and the derivatives of the weighted residuals there."""
-    prior = np.diag([0.0, 1.0 / CONTACT_PRIOR_LOG_STD,
-                     *[1.0 / CONTACT_BETWEEN_LOG_STD] * (len(start) - 2)])
-
-    def residuals(x: np.ndarray) -> np.ndarray:
-        return np.concatenate([(weight * (model(x)[0] - mean))[used], prior @ (x - expected)])
-
-    def slopes(x: np.ndarray) -> np.ndarray:
-        return np.vstack([(weight * model(x)[1])[:, used].T, prior])
-
-    x = least_squares(residuals, start, slopes, loss="soft_l1", xtol=1e-8, ftol=1e-8).x
-    return x, slopes(x)
 
 
 def electrode_misfits(calibration: Calibration, matrix: np.ndarray) -> np.ndarray:
@@ -193,11 +176,8 @@ def electrode_sizes(electrodes: CompleteElectrodeModel) -> np.ndarray:
     for facets in electrodes.electrodes:
         corners = electrodes.mesh.points[facets]
         edges = corners[:, 1:] - corners[:, :1]
-        if edges.shape[1] == 1:
-            sizes.append(np.linalg.norm(edges[:, 0], axis=1).sum())
-        else:
-            area = 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1).sum()
-            sizes.append(np.sqrt(area))
+        size = np.sqrt(np.linalg.det(edges @ edges.transpose(0, 2, 1))).sum()  # lengths, or areas·2
+        sizes.append(size if edges.shape[1] == 1 else np.sqrt(0.5 * size))
     return np.array(sizes)
 
 

@@ -26,7 +26,6 @@ from eitbench.measured.segmentation import read_truth
 CASES = Path(__file__).with_name("cases")
 WITHHELD_FRACTION = 0.1
 FOLDER_VARIABLE = "EITBENCH_MEASURED"
-CHUNK_BYTES = 1 << 20
 _TEXTS = ("title", "file", "sha256", "licence", "source")
 _OPTIONAL = ("beside", "truth")
 _SETTINGS = ("format", "span", "correction", "homogeneous_frames", "moves", "model_error")
@@ -62,21 +61,24 @@ class MeasuredCase:
             value = getattr(self, name)
             if not isinstance(value, str) or not value.strip():
                 raise ValueError(f"case.{name} must be a text, got {value!r}")
-        for name in ("vessel", "beside"):
-            if not isinstance(getattr(self, name), Mapping):
-                raise ValueError(f"case.{name} must be entries like 'name: value', got "
-                                 f"{getattr(self, name)!r}")
+        for name, entries in {"vessel": self.vessel, "beside": self.beside,
+                              "truth": self.truth or {}}.items():
+            if not isinstance(entries, Mapping):
+                raise ValueError(f"case.{name} must be entries like 'name: value', got {entries!r}")
         if self.truth is not None and set(self.truth) != {"file", "sha256"}:
             raise ValueError(f"case.truth must have file and sha256, got {self.truth!r}")
-        truth = {"truth.sha256": self.truth["sha256"]} if self.truth else {}
-        for name, digest in {"sha256": self.sha256, **self.beside, **truth}.items():
+        digests = {"sha256": self.sha256, **self.beside}
+        if self.truth:
+            digests["truth.sha256"] = self.truth["sha256"]
+        for name, digest in digests.items():
             if not isinstance(digest, str) or not re.fullmatch("[0-9a-f]{64}", digest):
                 raise ValueError(f"case.{name} must be 64 hexadecimal digits, got {digest!r}")
-        span = self.settings.get("span", [0, 1])
-        if (not isinstance(span, list) or len(span) != 2
-                or not all(isinstance(end, int) for end in span) or not 0 <= span[0] < span[1]):
-            raise ValueError("case.span must be two increasing numbers such as [0, 800], got "
-                             f"{span!r}")
+        match self.settings.get("span", [0, 1]):
+            case [int(first), int(end)] if 0 <= first < end:
+                pass
+            case span:
+                raise ValueError("case.span must be two increasing numbers such as [0, 800], got "
+                                 f"{span!r}")
         if unknown := sorted(set(self.settings) - set(_SETTINGS)):
             known = (*_TEXTS, "vessel", *_OPTIONAL, *_SETTINGS)
             raise ValueError(f"case has no {', '.join(unknown)}; there are {', '.join(known)}")
@@ -166,6 +168,5 @@ def file_sha256(path: Path) -> str:
     digest = hashlib.sha256()
     for each in filter(Path.is_file, files):
         with each.open("rb") as stream:
-            while chunk := stream.read(CHUNK_BYTES):
-                digest.update(chunk)
+            hashlib.file_digest(stream, lambda: digest)
     return digest.hexdigest()

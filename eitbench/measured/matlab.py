@@ -51,25 +51,23 @@ def provenance(path: Path, **more: Any) -> dict[str, Any]:
     return {"file": path.name, "sha256": hashlib.sha256(path.read_bytes()).hexdigest(), **more}
 
 
-def read_ktc(path: Path | str) -> Measurements:
+def read_ktc(path: Path) -> Measurements:
     """Read KTC's ``data*.mat`` or KIT4's ``datamat_*.mat``, with the file of the empty tank if it
     is in the same folder.
 
     The files state no units: currents are taken as mA (KTC: about 1.5 mA at 77 kHz) and readings
     as V, with which a tank of tap water has 0.01 S/m, and a second passes between injections.
-    Removed readings are NaN. ``ValueError`` names the file and the fault.
+    Removed readings are NaN.
     """
-    path = Path(path)
     currents, matrix, readings = _ktc_arrays(path)
-    candidates = [path.with_name(name) for name in KTC_REFERENCES]
-    reference = next((each for each in candidates if each.is_file() and each != path), None)
     empty = None
-    if reference is not None:
-        currents_0, matrix_0, readings_0 = _ktc_arrays(reference)
-        if (currents_0.shape != currents.shape or not np.allclose(currents_0, currents)
-                or not np.array_equal(matrix_0, matrix)):
-            raise ValueError(f"{reference} must have the injections and patterns of {path}")
-        empty = readings_0[None]
+    for reference in (path.with_name(name) for name in KTC_REFERENCES if name != path.name):
+        if empty is None and reference.is_file():
+            *patterns, values = _ktc_arrays(reference)
+            if any(one.shape != other.shape or not np.allclose(one, other)
+                   for one, other in zip(patterns, (currents, matrix), strict=True)):
+                raise ValueError(f"{reference} must have the injections and patterns of {path}")
+            empty = values[None]
     return Measurements.from_sequence(
         MILLIAMPERE * currents, matrix, readings, np.arange(float(len(readings))), empty,
         provenance(path, assumed="currents in mA, readings in V, a second between injections"))
@@ -91,18 +89,17 @@ def _ktc_arrays(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return currents, matrix, readings.reshape(T, M)
 
 
-def read_eidors(path: Path | str, name: str | None = None) -> Measurements:
+def read_eidors(path: Path, name: str | None = None) -> Measurements:
     """Read the frames (256, F) of the variable ``name``, by default the first known one, such as
     ``v_rotate`` of iirc_data_2006.mat or ``zc_demo3`` of montreal_data_1995.mat.
 
     Row 16·i + j of a frame is the voltage between electrodes j and j + 1 while 1 mA (assumed)
     enters at i and leaves at i + 1, in units of the instrument; complex readings lose their
     imaginary part. Files differ in their sign, so all readings get that of a resistive body.
-    Readings with an injecting electrode are NaN. ``ValueError`` names the file and the fault.
+    Readings with an injecting electrode are NaN.
     """
-    path = Path(path)
+    found = load_variables(path)
     if name is None:
-        found = load_variables(path)
         name = next((each for each in EIDORS_REFERENCES if each in found), "v_rotate")
     reference = EIDORS_REFERENCES.get(name)
     found = load_variables(path, name, *filter(None, [reference]))

@@ -28,8 +28,8 @@ CURRENT_BALANCE_RTOL = 1e-6
 class Measurements:
     """T readings of M numbers each, during K different injections by L electrodes.
 
-    Writable arrays are copied; read-only ones, such as the readings of a large file, stay where
-    they are (`load`). Currents whose sum differs from zero by rounding are reduced by their mean.
+    Writable arrays are copied; read-only ones, such as the readings of a large file, are not
+    (`load`). Currents whose sum differs from zero by rounding are reduced by their mean.
     ``ValueError`` names a field of the wrong shape, without numbers, or in contradiction to
     another.
     """
@@ -62,12 +62,12 @@ class Measurements:
             raise ValueError(f"times must increase, got {before:g} s and then {after:g} s at "
                              f"reading {back[0] + 1}")
         arrays = {"currents": currents, "injections": _check_indices(self.injections, T, K),
-                  "matrix": matrix, "readings": readings, "times": times, "reference": None}
+                  "matrix": matrix, "readings": readings, "times": times}
         if self.reference is not None:
             arrays["reference"] = _check_readings("reference", self.reference, (None, K, M))
         json.dumps(dict(self.source), allow_nan=False)
         for name, value in arrays.items():
-            if value is not None and value.flags.writeable:
+            if value.flags.writeable:
                 value = value.copy()
                 value.setflags(write=False)
             object.__setattr__(self, name, value)
@@ -84,19 +84,14 @@ class Measurements:
         order = np.argsort(first)                              # order of first use
         injections = np.argsort(order)[inverse.reshape(-1)]
         if reference is not None:
-            reference = np.asarray(reference, dtype=float)
-            if reference.ndim != 3 or reference.shape[1] != len(currents):
-                raise ValueError(f"reference must have shape (F, {len(currents)}, M), got "
-                                 f"{reference.shape}")
+            reference = _check_readings("reference", reference, (None, len(currents), None))
             reference = _by_injection(reference, injections, len(distinct))
         return cls(distinct[order], injections, matrix, readings, times, reference, source or {})
 
     @cached_property
     def frame(self) -> int:
         """Number of readings until each injection has been active once."""
-        first = np.zeros(len(self.currents), dtype=int)
-        first[self.injections[::-1]] = np.arange(len(self.injections))[::-1]
-        return 1 + int(first.max())
+        return 1 + int(np.unique(self.injections, return_index=True)[1].max())
 
     @cached_property
     def largest(self) -> float:
@@ -108,19 +103,17 @@ class Measurements:
         """(F, K, M) V: the reference, or without one the first ``frames`` frames."""
         if self.reference is not None:
             return self.reference
-        steps = min(_check.integer("frames", frames, low=1) * self.frame, len(self.readings))
-        return _by_injection(self.readings[None, :steps], self.injections[:steps],
-                             len(self.currents))
+        return self._sorted(slice(_check.integer("frames", frames, low=1) * self.frame))
 
-    def frames(self, most: int | None = None) -> np.ndarray:
+    def frames(self, most: int) -> np.ndarray:
         """(F, K, M) V: the first ``most`` complete frames; NaN where nothing was measured."""
-        whole = len(self.readings) - len(self.readings) % self.frame
-        if most is not None:
-            whole = min(whole, most * self.frame)
-        return np.concatenate([
-            _by_injection(self.readings[None, t:t + self.frame], self.injections[t:t + self.frame],
-                          len(self.currents))
-            for t in range(0, max(whole, 1), self.frame)])
+        count = min(max(len(self.readings) // self.frame, 1), most)
+        return np.concatenate([self._sorted(slice(k * self.frame, (k + 1) * self.frame))
+                               for k in range(count)])
+
+    def _sorted(self, steps: slice) -> np.ndarray:
+        return _by_injection(self.readings[None, steps], self.injections[steps],
+                             len(self.currents))
 
     def select(self, steps: slice) -> Measurements:
         """Return consecutive readings with the injections that they use."""
@@ -162,14 +155,13 @@ class Measurements:
                                      f"{found[0]!r}, version {found[1]!r}")
                 if missing := [name for name in REQUIRED if name not in file]:
                     raise ValueError(f"{', '.join(missing)} must be data sets of the file")
-                content = {name: file[name][()] for name in ("currents", "matrix")}
+                content = {name: file[name][()] for name in ("currents", "matrix", "reference")
+                           if name in file}
                 content |= {name: _rows(path, file[name], steps)
                             for name in ("injections", "times", "readings")}
                 if not content["injections"].size:
                     raise ValueError("steps must hold some of its "
                                      f"{len(file['injections'])} readings, got {steps}")
-                if "reference" in file:
-                    content["reference"] = file["reference"][()]
                 source = json.loads(file.attrs["source"])
             return cls(**content, source=source)
         except (OSError, KeyError, ValueError, TypeError) as error:
@@ -187,19 +179,17 @@ def _rows(path: Path, dataset: Any, steps: slice) -> np.ndarray:
     return rows
 
 
-def _by_injection(records: np.ndarray, injections: np.ndarray, K: int) -> np.ndarray:
+def _by_injection(sequences: np.ndarray, injections: np.ndarray, K: int) -> np.ndarray:
     """Sort F sequences (F, T, M) by injection into (F·R, K, M), with R the largest number of
     repetitions of an injection and NaN where an injection has fewer."""
-    F, T, M = records.shape
+    F, T, M = sequences.shape
     turn = np.zeros(T, dtype=int)
-    count = np.zeros(K, dtype=int)
-    for t, k in enumerate(injections):
-        turn[t] = count[k]
-        count[k] += 1
-    most = int(count.max())
-    found = np.full((F, most, K, M), np.nan)
-    found[:, turn, injections] = records
-    return found.reshape(F * most, K, M)
+    for k in np.unique(injections):
+        turn[injections == k] = np.arange(np.count_nonzero(injections == k))
+    repetitions = 1 + int(turn.max())
+    found = np.full((F, repetitions, K, M), np.nan)
+    found[:, turn, injections] = sequences
+    return found.reshape(F * repetitions, K, M)
 
 
 def _balanced(currents: np.ndarray) -> np.ndarray:
@@ -232,19 +222,7 @@ def _check_indices(given: np.ndarray, T: int, K: int) -> np.ndarray:
 
 def _check_readings(name: str, given: np.ndarray, shape: tuple[int | None, ...]) -> np.ndarray:
     """Return an array of this shape whose entries are finite or NaN, not all of them NaN."""
-    value = np.asarray(given)
-    if np.iscomplexobj(value):
-        raise ValueError(f"{name} must be real, got complex numbers; choose a part")
-    try:
-        value = value.astype(float, copy=False)
-    except (TypeError, ValueError):
-        raise ValueError(f"{name} must hold numbers, got {value.dtype}") from None
-    if value.ndim != len(shape) or not value.size or any(
-            want not in (None, size) for want, size in zip(shape, value.shape, strict=True)):
-        wanted = ", ".join("any" if size is None else str(size) for size in shape)
-        raise ValueError(f"{name} must have shape ({wanted}), got {value.shape}")
-    if np.isinf(value).any():
-        raise ValueError(f"{name} must be finite or NaN, got infinite values")
+    value = _check.array(name, given, shape, units="V", allow_nan=True)
     if np.isnan(value).all():
         raise ValueError(f"{name} must hold numbers, got NaN only")
     return value

@@ -2,54 +2,44 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import KW_ONLY, dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from eitbench import _check
 from eitbench.measured.measurements import Measurements
-
-if TYPE_CHECKING:
-    from eitbench.physics.cem import CompleteElectrodeModel
-    from eitbench.physics.observation import ObservationModel
+from eitbench.physics.cem import CompleteElectrodeModel
+from eitbench.physics.observation import ObservationModel
 
 
+@dataclass(eq=False)
 class MeasurementModel:
     """Readings gain · D U(c) + offset of potentials U = 𝓡(c) I, where ``mask``; a `VoltageModel`.
 
     A reading outside the mask is 0 for any concentration. Its innovation and its derivative are
     0, so a Kalman filter or a least-squares fit gives exactly the result without that reading.
-
-    Parameters
-    ----------
-    observation : ObservationModel
-    currents : (K, L)
-        A, each injection once.
-    matrix : (M, L)
-        D, from potentials to readings.
-    depth : float
-        m of fluid for a plane model, whose currents are in A/m; 1 in 3D.
-    offset, gain : (K, M), optional
-        V and factor that correct the model on homogeneous fluid. Default: 0 and 1.
-    mask : (K, M) bool, optional
-        Default: all readings.
     """
 
-    def __init__(self, observation: ObservationModel, currents: np.ndarray, matrix: np.ndarray,
-                 depth: float = 1.0, *, offset: np.ndarray | None = None,
-                 gain: np.ndarray | None = None, mask: np.ndarray | None = None) -> None:
-        L = observation.cem.n_electrodes
-        self.observation = observation
-        self.currents = _check.array("currents", currents, (None, L), units="A")
-        self.matrix = _check.array("matrix", matrix, (None, L))
-        self.depth = _check.number("depth", depth, low=0.0, open_low=True, units="m")
+    observation: ObservationModel
+    currents: np.ndarray
+    """(K, L) A, each injection once"""
+    matrix: np.ndarray
+    """(M, L) D, from potentials to readings"""
+    depth: float = 1.0
+    """m of fluid for a plane model, whose currents are in A/m; 1 in 3D"""
+    _: KW_ONLY
+    offset: Any = 0.0
+    """(K, M) V, corrects the model on homogeneous fluid"""
+    gain: Any = 1.0
+    """(K, M) factor of the model"""
+    mask: Any = True
+    """(K, M) bool, readings that are predicted"""
+
+    def __post_init__(self) -> None:
         shape = len(self.currents), len(self.matrix)
-        self.offset = _check.array("offset", np.zeros(shape) if offset is None else offset, shape,
-                                   units="V")
-        self.gain = _check.array("gain", np.ones(shape) if gain is None else gain, shape)
-        self.mask = np.ones(shape, bool) if mask is None else np.asarray(mask, bool)
-        if self.mask.shape != shape:
-            raise ValueError(f"mask must have shape {shape}, got {self.mask.shape}")
+        self.offset = np.broadcast_to(self.offset, shape)
+        self.gain = np.broadcast_to(self.gain, shape)
+        self.mask = np.broadcast_to(self.mask, shape)
         self._index = {row.tobytes(): k for k, row in enumerate(self.currents)}
 
     @property
@@ -59,8 +49,7 @@ class MeasurementModel:
 
     def with_mask(self, mask: np.ndarray) -> MeasurementModel:
         """Return the same model with another mask (K, M)."""
-        return MeasurementModel(self.observation, self.currents, self.matrix, self.depth,
-                                offset=self.offset, gain=self.gain, mask=mask)
+        return replace(self, mask=mask)
 
     def voltages(self, concentration: np.ndarray, currents: np.ndarray) -> np.ndarray:
         """Predict readings (J, M) in V for ``concentration`` (n,) in mol/m³ and injections (J, L)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from itertools import combinations
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,9 +13,7 @@ from eitbench.measured.calibration import (
     electrode_sizes,
 )
 from eitbench.measured.measurements import Measurements
-
-if TYPE_CHECKING:
-    from eitbench.physics.cem import CompleteElectrodeModel
+from eitbench.physics.cem import CompleteElectrodeModel
 
 CONDUCTIVITY_RANGE = (1e-4, 10.0)
 """S/m of fluids in vessels; sea water has 5."""
@@ -46,23 +43,25 @@ def quality_warnings(measurements: Measurements, calibration: Calibration,
 
 def _unit_warnings(calibration: Calibration) -> list[str]:
     found = []
-    low, high = CONDUCTIVITY_RANGE
-    if not low <= calibration.conductivity <= high:
-        found.append(f"The conductivity would be {calibration.conductivity:.3g} S/m, outside the "
-                     f"usual {low:g} to {high:g}: currents, readings or lengths are in other "
-                     "units.")
-    low, high = GAIN_RANGE
-    if not low <= calibration.gain <= high:
-        found.append(f"Readings are {calibration.gain:.3g} times the values for this conductivity: "
-                     "they are not in volts, or currents not in amperes.")
+    (low, high), sigma, gain = CONDUCTIVITY_RANGE, calibration.conductivity, calibration.gain
+    if not low <= sigma <= high:
+        found.append(f"The conductivity would be {sigma:.3g} S/m, outside the usual {low:g} to "
+                     f"{high:g}: currents, readings or lengths are in other units.")
+    if not GAIN_RANGE[0] <= gain <= GAIN_RANGE[1]:
+        found.append(f"Readings are {gain:.3g} times the values for this conductivity: they are "
+                     "not in volts, or currents not in amperes.")
     return found
 
 
 def _reciprocity_warnings(measurements: Measurements, calibration: Calibration) -> list[str]:
-    reading = _readings_across_injections(measurements)
-    has = reading >= 0
-    injected = np.abs(measurements.currents).max(axis=1)
-    exchanged = calibration.measured[:, reading[has]][has] / injected[has][:, None]
+    currents = measurements.currents
+    rows = measurements.matrix - measurements.matrix.mean(axis=1, keepdims=True)
+    norms = np.outer(np.linalg.norm(currents, axis=1), np.linalg.norm(rows, axis=1))
+    cosine = currents @ rows.T / np.maximum(norms, 1e-300)
+    has = cosine.max(axis=1) > 1.0 - 1e-9      # a reading is across the injecting electrodes
+    across = cosine.argmax(axis=1)[has]
+    injected = np.abs(currents[has]).max(axis=1, keepdims=True)
+    exchanged = calibration.measured[has][:, across] / injected
     difference = exchanged - exchanged.T
     known = np.isfinite(difference)
     if not known.any() or calibration.correction == "gain":
@@ -74,14 +73,6 @@ def _reciprocity_warnings(measurements: Measurements, calibration: Calibration) 
     return [f"Exchanging injection and reading changes readings by {100 * change:.2g} %, which "
             "breaks reciprocity: the order of injections or of readings is wrong, or channels "
             "have different gains (then --correction gain helps)."]
-
-
-def _readings_across_injections(measurements: Measurements) -> np.ndarray:
-    """(K,) index of the reading across each injection's electrodes; -1 without one."""
-    rows = measurements.matrix - measurements.matrix.mean(axis=1, keepdims=True)
-    norms = np.outer(np.linalg.norm(measurements.currents, axis=1), np.linalg.norm(rows, axis=1))
-    cosine = measurements.currents @ rows.T / np.maximum(norms, 1e-300)
-    return np.where(cosine.max(axis=1) > 1.0 - 1e-9, cosine.argmax(axis=1), -1)
 
 
 def _order_warnings(measurements: Measurements, calibration: Calibration,

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-import itertools
 from collections.abc import Callable
+from dataclasses import replace
 from datetime import datetime
 from inspect import signature
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -72,48 +72,33 @@ def _detect_format(path: Path) -> str:
                      f"one of {', '.join(READERS)}")
 
 
-class _Frame(NamedTuple):
-    time: float
-    """s"""
-    frequency: float
-    """Hz"""
-    amplitude: float
-    """A"""
-    pairs: list[tuple[int, int]]
-    potentials: list[np.ndarray]
-    """(L,) V, real parts, for each pair"""
-
-
-def read_sciospec(path: Path | str) -> Measurements:
+def read_sciospec(path: Path) -> Measurements:
     """Read one ``.eit`` file, or all of a folder in the order of their names.
 
     Potentials refer to the instrument's ground; their real parts, relative to their mean, are
     used. The current enters at the first electrode of a pair with the header's amplitude in A.
-    The injections of a frame are spaced evenly until the next frame. ``ValueError`` names the file
-    and the fault.
+    The injections of a frame are spaced evenly until the next frame.
     """
-    path = Path(path)
     files = sorted(path.glob("*.eit")) if path.is_dir() else [path]
     if not files:
         raise ValueError(f"{path} must hold .eit files, there are none")
-    frames = [_read_frame(file) for file in files]
-    first = frames[0]
-    for file, frame in zip(files, frames, strict=True):
-        if frame.pairs != first.pairs or frame.amplitude != first.amplitude:
+    begins, settings, readings = zip(*map(_read_frame, files), strict=True)
+    for file, setting in zip(files, settings, strict=True):
+        if setting != settings[0]:
             raise ValueError(f"{file} must have the injections of {files[0]}")
-    readings = np.array([frame.potentials for frame in frames])
-    K, L = readings.shape[1:]
-    readings -= readings.mean(axis=2, keepdims=True)
-    begins = np.array([frame.time for frame in frames])
-    frame_time = float(np.median(np.diff(begins))) if len(frames) > 1 else 1.0
-    times = begins[:, None] - begins[0] + frame_time / K * np.arange(K)
+    frequency, amplitude, pairs = settings[0]
+    potentials = np.array(readings)
+    _, K, L = potentials.shape
+    potentials -= potentials.mean(axis=2, keepdims=True)
+    frame_time = float(np.median(np.diff(begins))) if len(files) > 1 else 1.0
+    times = np.subtract(begins, begins[0])[:, None] + frame_time / K * np.arange(K)
     digest = hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
     # every folder of frames is called setup, so its parent's name tells them apart
     name = f"{path.resolve().parent.name}/{path.name}" if path.is_dir() else path.name
     return Measurements(
-        _pair_currents(np.array(first.pairs), first.amplitude, L),
-        np.tile(np.arange(K), len(times)), np.eye(L), readings.reshape(-1, L), times.ravel(),
-        source={"file": name, "sha256": digest, "frames": len(times), "frequency": first.frequency,
+        _pair_currents(np.array(pairs), amplitude, L), np.tile(np.arange(K), len(files)),
+        np.eye(L), potentials.reshape(-1, L), times.ravel(),
+        source={"file": name, "sha256": digest, "frames": len(files), "frequency": frequency,
                 "assumed": "real parts, relative to the mean of all electrodes; amplitude in A"})
 
 
@@ -126,7 +111,8 @@ def _pair_currents(pairs: np.ndarray, current: float, L: int) -> np.ndarray:
     return currents
 
 
-def _read_frame(path: Path) -> _Frame:
+def _read_frame(path: Path) -> tuple[float, tuple[float, float, list[list[int]]], np.ndarray]:
+    """Time in s; frequency in Hz, amplitude in A and electrode pairs; real parts (K, L) in V."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
         header = int(lines[0])
@@ -136,30 +122,22 @@ def _read_frame(path: Path) -> _Frame:
         count = len(channels.removeprefix(CHANNELS).split(","))
     except (OSError, UnicodeDecodeError, ValueError, IndexError, StopIteration):
         raise ValueError(f"{path} must begin with the header of a .eit file") from None
-    body = lines[header:]
-    if not body or len(body) % 2:
-        raise ValueError(f"{path} must hold pairs of lines after its header, injection and "
-                         f"potentials, got {len(body)} lines")
-    frame = _Frame(time, frequency, amplitude, [], [])
-    for line, pair, row in zip(itertools.count(header + 1, 2), body[::2], body[1::2], strict=False):
-        try:
-            enters, leaves = (int(each) for each in pair.split())
-            parts = np.array(row.split(), dtype=float)
-        except ValueError:
-            raise ValueError(f"{path}: line {line} must be two electrodes, and the next one "
-                             "numbers with decimal points") from None
-        if len(parts) < 2 * count or len(parts) % 2:
-            raise ValueError(f"{path}: line {line + 1} must have {2 * count} numbers, "
-                             f"two for each of {count} channels, got {len(parts)}")
-        if not 1 <= min(enters, leaves) <= max(enters, leaves) <= count:
-            raise ValueError(f"{path}: line {line} must name electrodes from 1 to {count}, got "
-                             f"{pair!r}")
-        frame.pairs.append((enters, leaves))
-        frame.potentials.append(parts[:2 * count:2])
-    return frame
+    body = [line.split() for line in lines[header:]]
+    try:
+        pairs = np.array(body[::2], dtype=int)
+        parts = np.array(body[1::2], dtype=float)
+        sound = (pairs.shape == (len(parts), 2) and parts.shape[1] >= 2 * count
+                 and pairs.min() >= 1 and pairs.max() <= count)
+    except (ValueError, IndexError):                    # lines of different lengths, text, or none
+        sound = False
+    if not sound:
+        raise ValueError(f"{path} must hold pairs of lines after its header: two electrodes from 1 "
+                         f"to {count}, and {2 * count} numbers with decimal points, two for each "
+                         "channel")
+    return time, (frequency, amplitude, pairs.tolist()), parts[:, :2 * count:2]
 
 
-def read_table(path: Path | str, *, electrodes: int, current: float, time_step: float = 1.0,
+def read_table(path: Path, *, electrodes: int, current: float, time_step: float = 1.0,
                unit: float = 1.0, decimal: str = ".", separator: str | None = None,
                reference_rows: int = 0) -> Measurements:
     """Read a text table with one row per injection.
@@ -167,7 +145,7 @@ def read_table(path: Path | str, *, electrodes: int, current: float, time_step: 
     Columns are the electrode (from 1) at which ``current`` enters, the electrode at which it
     leaves, and one reading per electrode: its potential, or, if a column title has a ``-``, its
     difference from the next electrode. A first line that does not begin with a number holds the
-    titles. Empty fields are NaN. ``ValueError`` names the line and the fault.
+    titles. Empty fields are NaN.
 
     Parameters
     ----------
@@ -186,66 +164,63 @@ def read_table(path: Path | str, *, electrodes: int, current: float, time_step: 
     reference_rows : int
         The first rows, complete frames of homogeneous fluid, become the reference.
     """
-    path = Path(path)
     L = _check.integer("electrodes", electrodes, low=2)
     _check.number("current", current, low=0.0, open_low=True, units="A")
     _check.number("time_step", time_step, low=0.0, open_low=True, units="s")
-    if decimal not in (".", ","):
-        raise ValueError(f"decimal must be '.' or ',', got {decimal!r}")
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} must be a text file: {error}") from None
-    lines = [line for line in text.splitlines() if line.strip()]
-    if not lines:
-        raise ValueError(f"{path} must hold rows, it is empty")
-    if separator is None:
-        separator = next((each for each in "\t;" if each in lines[0]), ",")
-    if separator == decimal:
-        raise ValueError(f"separator must differ from the decimal point, got {separator!r} for "
-                         "both")
-    titles = lines[0] if not lines[0].split(separator)[0].strip().isdigit() else ""
-    rows = [_table_row(path, number, line.split(separator), L, decimal)
-            for number, line in enumerate(lines, 1) if number > bool(titles)]
-    if not rows:
-        raise ValueError(f"{path} must hold rows below its titles, there are none")
-    numbers = np.array(rows)
-    currents = _pair_currents(numbers[:, :2].astype(int), current, L)
+    R = _check.integer("reference_rows", reference_rows, low=0)
+    pairs, readings, are_differences = _read_rows(path, L, decimal, separator)
+    readings *= unit
     matrix = np.eye(L)
-    readings = unit * numbers[:, 2:]
-    if "-" in titles:
+    if are_differences:
         matrix -= np.roll(matrix, 1, axis=1)
     else:
         known = np.isfinite(readings)
         count = np.maximum(known.sum(axis=1, keepdims=True), 1)
         readings -= np.where(known, readings, 0.0).sum(axis=1, keepdims=True) / count
+    currents = _pair_currents(pairs, current, L)
     source = provenance(path, assumed=f"{current:g} A, readings in {unit:g} V")
-    R = reference_rows
-    times = time_step * np.arange(len(readings) - R)
-    found = Measurements.from_sequence(currents[R:], matrix, readings[R:], times, None, source)
+    found = Measurements.from_sequence(currents[R:], matrix, readings[R:],
+                                       time_step * np.arange(len(readings) - R), source=source)
     if not R:
         return found
     empty = Measurements.from_sequence(currents[:R], matrix, readings[:R], np.arange(float(R)))
     if not np.array_equal(empty.currents, found.currents):
         raise ValueError("reference_rows must be complete frames of the table's injections, got "
                          f"{R}")
-    return Measurements(found.currents, found.injections, matrix, found.readings, times,
-                        empty.homogeneous(R), source)
+    return replace(found, reference=empty.homogeneous(R))
 
 
-def _table_row(path: Path, number: int, fields: list[str], L: int, decimal: str) -> list[float]:
-    if len(fields) != L + 2:
-        raise ValueError(f"{path}: line {number} must have {L + 2} columns, two electrodes and {L} "
-                         f"readings, got {len(fields)}; check the separator and the decimal point")
+def _read_rows(path: Path, L: int, decimal: str,
+               separator: str | None) -> tuple[np.ndarray, np.ndarray, bool]:
+    """Electrode pairs (T, 2) from 1, readings (T, L), and whether titles name differences."""
+    if decimal not in (".", ","):
+        raise ValueError(f"decimal must be '.' or ',', got {decimal!r}")
     try:
-        values = [float(text.strip().replace(decimal, ".") or "nan") for text in fields]
-    except ValueError as error:
-        raise ValueError(f"{path}: line {number} must hold numbers with the decimal point "
-                         f"{decimal!r}: {error}") from None
-    if not all(each in range(1, L + 1) for each in values[:2]) or values[0] == values[1]:
-        raise ValueError(f"{path}: line {number} must begin with two electrodes from 1 to {L}, got "
-                         f"{fields[0].strip()} and {fields[1].strip()}")
-    return values
+        lines = list(filter(str.strip, path.read_text(encoding="utf-8-sig").splitlines()))
+        if separator is None:
+            separator = next((each for each in "\t;" if each in "".join(lines[:1])), ",")
+        if separator == decimal:
+            raise ValueError(f"separator must differ from the decimal point, got {separator!r} for "
+                             "both")
+        titles = "" if not lines or lines[0].split(separator)[0].strip().isdigit() else lines[0]
+        if len(lines) <= bool(titles):
+            raise ValueError("there are no rows")
+        numbers = np.loadtxt(
+            lines, delimiter=separator, comments=None, skiprows=int(bool(titles)), ndmin=2,
+            converters=lambda text: float(text.strip().replace(decimal, ".") or "nan"))
+        if numbers.shape[1] != L + 2:
+            raise ValueError(f"rows must have {L + 2} columns, two electrodes and {L} readings, "
+                             f"got {numbers.shape[1]}")
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{path} must be a text table of numbers with the decimal point "
+                         f"{decimal!r} and the separator {separator!r}: {error}") from None
+    ends = numbers[:, :2]
+    valid = np.isin(ends, range(1, L + 1)).all(axis=1) & (ends[:, 0] != ends[:, 1])
+    if not valid.all():
+        row = int(valid.argmin())
+        raise ValueError(f"{path}: row {row + 1} must begin with two electrodes from 1 to {L}, got "
+                         f"{ends[row, 0]:g} and {ends[row, 1]:g}")
+    return ends.astype(int), numbers[:, 2:], "-" in titles
 
 
 def _table_options(path: Path) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -18,8 +18,6 @@ from eitbench.physics.cem import CompleteElectrodeModel
 from eitbench.worlds.vessels import MeshVessel, PlanePipe, RoundPipe, RoundTank
 
 DIRECTIONS = ("counter-clockwise", "clockwise")
-MAX_COVERAGE = 0.95
-"""Fraction of a wall that electrodes may cover."""
 INITIAL_CONTACT_IMPEDANCE = 1e-4
 """Ω·m², before calibration."""
 ENTRIES = {
@@ -105,24 +103,20 @@ class VesselConfig:
     def _electrodes(self) -> CompleteElectrodeModel:
         # finer than estimates need, as calibration corrects its error for homogeneous fluid only
         model = self.shape.electrode_model(fine=self.shape.carrier(fine=False)[0].dim == 2)
-        if not self._is_turned:
+        mesh = self._turned(model.mesh)
+        if mesh is model.mesh:
             return model
-        return CompleteElectrodeModel(self._turned(model.mesh), model.electrodes,
-                                      model.contact_impedance, model.order)
-
-    @property
-    def _is_turned(self) -> bool:
-        return self.first != 0.0 or self.direction != DIRECTIONS[0]
+        return CompleteElectrodeModel(mesh, model.electrodes, model.contact_impedance, model.order)
 
     def _turned(self, mesh: Mesh) -> Mesh:
-        if not self._is_turned:
+        """Mirror a mesh at y = 0 if electrodes are counted clockwise, then rotate it."""
+        if self.first == 0.0 and self.direction == DIRECTIONS[0]:
             return mesh
-        points = mesh.points.copy()
-        x = mesh.points[:, 0]
-        y = mesh.points[:, 1] * (1.0 if self.direction == DIRECTIONS[0] else -1.0)
         angle = np.radians(self.first)
-        points[:, 0] = np.cos(angle) * x - np.sin(angle) * y
-        points[:, 1] = np.sin(angle) * x + np.cos(angle) * y
+        mirror = 1.0 if self.direction == DIRECTIONS[0] else -1.0
+        points = mesh.points.copy()
+        points[:, :2] = mesh.points[:, :2] @ [[np.cos(angle), np.sin(angle)],
+                                              [-mirror * np.sin(angle), mirror * np.cos(angle)]]
         return Mesh(points, mesh.cells)
 
 
@@ -168,16 +162,17 @@ def _vessel(entries: dict[str, Any], folder: Path) -> VesselConfig:
 def _shape(kind: str, entries: dict[str, Any], folder: Path) -> Any:
     count = _check.integer("vessel.electrodes", entries["electrodes"], low=2)
     if kind == "circle":
-        radius = _positive(entries, "radius")
-        cover = _cover(entries, "width", count, 2.0 * np.pi * radius)
-        return RoundTank(radius=radius, n_electrodes=count, electrode_cover=cover)
+        tank = RoundTank(radius=entries["radius"], n_electrodes=count)
+        wall = 2.0 * np.pi * tank.radius
+        return replace(tank, electrode_cover=_cover(entries, "width", count / wall))
     if kind == "rectangle":
         if count % 2:
             raise ValueError(f"vessel.electrodes must be even, half on each wall, got {count}")
-        length = _positive(entries, "length")
-        return PlanePipe(length=length, half_width=0.5 * _positive(entries, "width"),
-                         electrodes_per_wall=count // 2,
-                         electrode_cover=_cover(entries, "electrode_width", count // 2, length))
+        width = _check.number("vessel.width", entries["width"], low=0.0, open_low=True, units="m")
+        pipe = PlanePipe(length=entries["length"], half_width=0.5 * width,
+                         electrodes_per_wall=count // 2)
+        cover = _cover(entries, "electrode_width", count // 2 / pipe.length)
+        return replace(pipe, electrode_cover=cover)
     if kind == "cylinder":
         return RoundPipe(length=entries["length"], radius=entries["radius"],
                          electrode_rings=entries["rings"], electrodes_per_ring=count,
@@ -197,17 +192,12 @@ def _flow(entries: Any) -> FlowConfig:
     return FlowConfig(**entries)
 
 
-def _positive(entries: Mapping[str, Any], name: str) -> float:
-    return _check.number(f"vessel.{name}", entries[name], low=0.0, open_low=True, units="m")
-
-
-def _cover(entries: Mapping[str, Any], width: str, count: int, wall: float) -> float:
-    """Fraction of a wall (m) that electrodes cover."""
+def _cover(entries: Mapping[str, Any], width: str, density: float) -> float:
+    """Fraction of a wall that electrodes cover; ``density`` is their number per m."""
     if (width in entries) == ("cover" in entries):
         raise ValueError(f"vessel must have either {width} or cover, got "
                          f"{'both' if width in entries else 'neither'}")
     if "cover" in entries:
-        return _check.number("vessel.cover", entries["cover"], low=0.0, high=MAX_COVERAGE,
-                             open_low=True)
-    return count / wall * _check.number(f"vessel.{width}", entries[width], low=0.0, open_low=True,
-                                        high=MAX_COVERAGE * wall / count, units="m")
+        cover: float = entries["cover"]
+        return cover
+    return density * _check.number(f"vessel.{width}", entries[width], units="m")

@@ -156,7 +156,7 @@ def test_side_by_side_as_one_by_one(name, estimator, observation):
     seeds = [k % 4 for k in range(18)]
     steps = [[env.reset(seed=seeds)] for env in envs]
     chosen = np.random.default_rng(0)
-    for _ in range(30 if estimator == "none" else 12):                # whose episodes are shorter
+    for _ in range(24 if estimator == "none" else 7):                 # whose episodes are shorter
         actions = (chosen.uniform(-1.0, 1.0, (18, 16)).astype(np.float32) if name == CURRENTS else
                    chosen.integers(120, size=18))
         for env, seen in zip(envs, steps, strict=True):
@@ -173,7 +173,7 @@ def test_side_by_side_as_one_by_one(name, estimator, observation):
 
 
 @pytest.mark.parametrize("name", [FAULTS, INFLOW])
-def test_with_the_exact_filter_too_others_beside_change_nothing(name):
+def test_with_the_full_filter_too_others_beside_change_nothing(name):
     """An episode is the same to the bit whether it is played alone or beside another one."""
     alone, beside = (make_many(name, n, estimator="full") for n in (1, 2))
     shown = [(alone.reset(seed=[0])[0], beside.reset(seed=[0, 1])[0])]

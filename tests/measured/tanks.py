@@ -1,5 +1,7 @@
 """Measurements by a simulated instrument: in a round tank, on a mesh that no estimator has, and in an environment."""
 
+from functools import cache
+
 import numpy as np
 from eitbench.measured import Measurements
 from eitbench.worlds.vessels import RoundTank
@@ -20,38 +22,41 @@ def instrument(n_electrodes=8):
     return 1e-3 * pairs, pairs
 
 
-def tank(contacts=CONTACTS):
-    model = RoundTank(radius=0.1, n_electrodes=8, electrode_cover=0.4).electrode_model(True)
-    return model.with_contacts(contacts)
+TANK = RoundTank(radius=0.1, n_electrodes=8, electrode_cover=0.4).electrode_model(True).with_contacts(CONTACTS)
+
+
+@cache
+def exact():
+    """(K, M) V of homogeneous fluid without noise."""
+    currents, matrix = instrument()
+    return currents @ TANK.transfer_resistance(np.full(TANK.mesh.n_nodes, SIGMA)) @ matrix.T
 
 
 def homogeneous(noise=0.0, records=1, seed=0):
     """Readings (F, K, M) of homogeneous fluid."""
-    currents, matrix = instrument()
-    model = tank()
-    exact = currents @ model.transfer_resistance(np.full(model.mesh.n_nodes, SIGMA)) @ matrix.T
-    return exact * (1.0 + noise * np.random.default_rng(seed).normal(size=(records, 8, 8)))
+    return exact() * (1.0 + noise * np.random.default_rng(seed).normal(size=(records, 8, 8)))
 
 
-def moving(frames=6, noise=1e-3, seed=1, records=3, amplitude=2 / 3, contacts=CONTACTS):
-    """A body with a third of the conductivity, on its way half round the tank."""
+@cache
+def moving(frames=6, amplitude=2 / 3, bad_contact=1.0):
+    """A body with a third of the conductivity, on its way half round the tank; electrode 4 has a contact impedance
+    of so many times the usual one."""
     currents, matrix = instrument()
-    model = tank(contacts)
+    model = TANK.with_contacts(CONTACTS * np.where(np.arange(8) == 3, bad_contact, 1.0))
     T = 8 * frames
     readings = np.empty((T, 8))
     for t in range(T):
         R = model.transfer_resistance(conductivity(model.mesh.points, angle(t, T), amplitude))
         readings[t] = currents[t % 8] @ R @ matrix.T
-    readings *= 1.0 + noise * np.random.default_rng(seed).normal(size=readings.shape)
+    readings *= 1.0 + 1e-3 * np.random.default_rng(1).normal(size=readings.shape)
     return Measurements(currents, np.arange(T) % 8, matrix, readings, 0.01 * np.arange(T),
-                        homogeneous(noise, records), {"file": "moving"})
+                        homogeneous(1e-3, 3), {"file": "moving"})
 
 
 def still():
     """One frame of the body at (5 cm, 0)."""
     currents, matrix = instrument()
-    model = tank()
-    readings = currents @ model.transfer_resistance(conductivity(model.mesh.points, 0.0)) @ matrix.T
+    readings = currents @ TANK.transfer_resistance(conductivity(TANK.mesh.points, 0.0)) @ matrix.T
     readings *= 1.0 + 1e-3 * np.random.default_rng(5).normal(size=readings.shape)
     return Measurements(currents, np.arange(8), matrix, readings, 0.01 * np.arange(8), homogeneous(1e-3, 3),
                         {"file": "still"})

@@ -1,6 +1,7 @@
 """Measured cases: environment ids with records and a board, whose data are elsewhere."""
 
 import json
+import shutil
 
 import gymnasium as gym
 import numpy as np
@@ -34,13 +35,15 @@ def write_case(path, data, **changes):
     return path
 
 
-@pytest.fixture
-def folder(tmp_path, monkeypatch):
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
     """A folder of data with a file, and its registered case."""
-    monkeypatch.setenv("EITBENCH_MEASURED", str(tmp_path))
-    case = write_case(tmp_path / "moving.yml", moving(frames=3).save(tmp_path / "moving.h5"))
+    path = tmp_path_factory.mktemp("measured")
+    case = write_case(path / "moving.yml", moving(frames=3).save(path / "moving.h5"))
     gym.register(ID, entry_point=tracks.MEASURED, kwargs={"case": str(case)})
-    yield tmp_path
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("EITBENCH_MEASURED", str(path))
+        yield path
     gym.registry.pop(ID)
 
 
@@ -114,8 +117,8 @@ def test_run_shows_the_withheld_rmse(folder):
     assert "ẽ_c" not in head
 
 
-@pytest.fixture
-def results(folder):
+@pytest.fixture(scope="module")
+def submitted(folder):
     """Records of a naive baseline and of a third-party method."""
     mine = write_baseline(folder, "mine", update="return Estimate(1.1 * self.level)")
     for method in ("homogeneous", mine):
@@ -123,6 +126,12 @@ def results(folder):
                                 "--out", folder / "store", "--jobs", 1)
         assert code == 0, err
     return folder / "results"
+
+
+@pytest.fixture
+def results(submitted, tmp_path):
+    """A copy of the records, to be changed."""
+    return shutil.copytree(submitted, tmp_path / "results")
 
 
 def of(results, method):
@@ -135,7 +144,7 @@ def test_submit_writes_records_with_the_scores_of_a_run(results):
     written = read_record(of(results, "homogeneous"))
     assert written["seeds"] == [f"test:{k}" for k in range(5)]
     env = gym.make(ID).unwrapped
-    for k, episode in enumerate(written["episodes"]):
+    for k, episode in enumerate(written["episodes"][:2]):
         run = run_on_measurements(env, "homogeneous", k)
         assert episode["scores"]["prediction_error"] == pytest.approx(run.withheld_rmse, rel=1e-12)
         assert episode["scores"]["error"] == pytest.approx(run.withheld_rmse**2, rel=1e-12)
@@ -152,12 +161,13 @@ def test_submit_writes_records_with_the_scores_of_a_run(results):
     assert "prediction_error" in err
 
 
-def test_the_board_shows_records(results, folder):
+def test_the_board_shows_records(results):
     """On the site and as text; titles are escaped, and an invalid file is left out and named."""
     mine = read_record(of(results, "mine")) | {"title": "<b>mine</b>"}
     of(results, "mine").write_text(json.dumps(sealed(mine)), "utf-8")
     write_record(results, record("homogeneous", [0.2, 0.3], role="floor"))
     assert eitbench("leaderboard", "--records", results)[0] == 0
+    folder = results.parent
     page = (folder / "site" / "measured.html").read_text("utf-8")
     assert 'href="measured.html"' in (folder / "site" / "index.html").read_text("utf-8")
     assert "&lt;b&gt;mine&lt;/b&gt;" in page

@@ -82,7 +82,7 @@ def test_truncated_frame_is_named(tmp_path):
     with pytest.raises(ValueError, match=r"setup_00001\.eit must hold pairs of lines"):
         read(path)
     path.write_text("\n".join([*lines[:-1], lines[-1][:40]]), encoding="utf-8")
-    with pytest.raises(ValueError, match=r"line 34 must (have 16 numbers|be two electrodes)"):
+    with pytest.raises(ValueError, match=r"must hold pairs of lines"):
         read(path)
     path.write_text("", encoding="utf-8")
     with pytest.raises(ValueError, match="must begin with the header"):
@@ -112,8 +112,8 @@ def test_table(tmp_path):
 
 @pytest.mark.parametrize(("how", "said"), [
     ({}, r"described by a YAML file.*comma\.yml"),
-    ({"electrodes": 8, "current": 1e-3}, "line 1 must hold numbers with the decimal point '.'"),
-    ({"electrodes": 9, "current": 1e-3, "decimal": ","}, "line 1 must have 11 columns"),
+    ({"electrodes": 8, "current": 1e-3}, "numbers with the decimal point '.'"),
+    ({"electrodes": 9, "current": 1e-3, "decimal": ","}, "rows must have 11 columns"),
     ({"electrodes": 8, "current": -1.0, "decimal": ","}, "current must be"),
 ])
 def test_tables_that_cannot_be_read(tmp_path, how, said):

@@ -10,7 +10,7 @@ from eitbench.envs.measured import MeasuredEnv
 from eitbench.measured import Measurements
 from eitbench.measured.vessel import read_vessel
 from scipy.io import savemat
-from tanks import BELIEVED, CONTACTS, CYLINDER, PIPE, VESSEL, angle, centroid, instrument, measurements_of, moving
+from tanks import BELIEVED, CYLINDER, PIPE, VESSEL, angle, centroid, instrument, measurements_of, moving
 
 from commands import eitbench
 
@@ -41,7 +41,7 @@ def test_the_body_is_found(env, runs):
 def test_a_failing_contact_is_visible(name):
     """Electrode 4 has thirty times the contact impedance from the middle of the record on."""
     sound = moving(frames=10, amplitude=0.0)
-    broken = moving(frames=10, amplitude=0.0, contacts=CONTACTS * np.where(np.arange(8) == 3, 30.0, 1.0))
+    broken = moving(frames=10, amplitude=0.0, bad_contact=30.0)
     readings = np.where(np.arange(80)[:, None] < 40, sound.readings, broken.readings)
     record = Measurements(sound.currents, sound.injections, sound.matrix, readings, sound.times, sound.reference)
     run = run_on_measurements(MeasuredEnv(record, VESSEL, **BELIEVED), name)

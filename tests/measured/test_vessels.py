@@ -19,7 +19,7 @@ def test_a_yaml_file_is_a_mapping(tmp_path):
 
 
 @pytest.mark.parametrize(("given", "message"), [
-    (VESSEL | {"kind": "ball"}, "vessel.kind must be one of"), (VESSEL | {"radius": -1.0}, "vessel.radius"),
+    (VESSEL | {"kind": "ball"}, "vessel.kind must be one of"), (VESSEL | {"radius": -1.0}, "radius must be"),
     (VESSEL | {"wdth": 1}, "has no wdth"), (VESSEL | {"width": 0.01}, "either width or cover, got both"),
     (VESSEL | {"direction": "left"}, "direction must be one of"), (VESSEL | {"electrodes": 0}, "vessel.electrodes"),
     ({"kind": "circle", "radius": 0.1}, "must have electrodes"),
