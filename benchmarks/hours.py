@@ -103,7 +103,7 @@ HOURS: dict[str, list[Step]] = {
     ],
     "Who reads the boards": [
         ("`eitbench.leaderboard.load()`", ["-c", LOAD]),
-        command("compare", "kalman_filter", "extended_kalman_filter", "--html", "two.html"),
+        command("compare", "kalman_filter", "extended_kalman_filter"),
         command("verify", OURS.format("kalman_filter"), "--episodes", "1"),
         command("render", "--baseline", "kalman_filter", "--seed", "dev:0", "--every", "4"),
     ],

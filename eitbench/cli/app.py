@@ -159,16 +159,14 @@ def leaderboard(
     from eitbench._files import write_atomically
     from eitbench.bench.records import write_episode_table_of
     from eitbench.report.boards import read_for_boards
-    from eitbench.report.site import Beside, Measured, collect, render, render_site, write_site
+    from eitbench.report.site import collect, render, render_site, write_site
     with options.clear_errors():
         found, complaints = read_for_boards(records)
-        measured = Measured.of(records.parent)
-        complaints += measured.complaints
-        site = collect(found)
         out = records.parent
-        pages = render_site(site, Beside.of(records.parent, out / "site"), measured)
-        texts = render(site, measured)
-        write_site(out / "site", pages)
+        site = collect(found, out)
+        complaints += site.measured.complaints
+        texts = render(site)
+        write_site(out / "site", render_site(site))
     for name, text in texts.items():
         write_atomically(out / name, text.encode())
         options.say(f"wrote {out / name}")
@@ -186,21 +184,16 @@ def compare(
     b: Annotated[str, typer.Argument(help="The same of the other.")],
     records: options.Records = options.RECORDS,
     score: Annotated[str, typer.Option(help="By which score.")] = "error",
-    html: Annotated[Path | None, typer.Option(help="Write a page too.")] = None,
 ) -> None:
     """Compare two methods seed by seed: differences with intervals, and how often the first is
     better; over several environments by gains, as on the boards."""
-    from eitbench._files import write_atomically
     from eitbench.report import compare as comparison
-    from eitbench.report.terminal import width
+    from eitbench.report.tables import terminal_width
     with options.clear_errors():
         ours, theirs = (comparison.find(name, records) for name in (a, b))
         table = comparison.compare(ours, theirs, score, comparison.floors(records))
     names = comparison.names(ours[0], theirs[0])
-    options.say(comparison.in_terminal(table, *names, score, width()))
-    if html is not None:
-        write_atomically(html, comparison.html(table, *names, score).encode())
-        options.say(f"\nwrote {html}")
+    options.say(comparison.in_terminal(table, *names, score, terminal_width()))
 
 
 @app.command()

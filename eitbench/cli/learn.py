@@ -110,7 +110,7 @@ def train(
     """Train an agent to choose injections.
 
     The same command again goes on from the last checkpoint. The folder receives model.zip,
-    config.json, monitor.csv, evaluations.npz (scores on dev episodes) and logs for TensorBoard.
+    config.json, evaluations.npz (scores on dev episodes) and logs for TensorBoard.
     """
     from dataclasses import replace
     with options.clear_errors():

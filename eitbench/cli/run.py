@@ -53,7 +53,7 @@ def run(
     """Run estimators or injection policies, print the table and write the page.
 
     Each episode is stored when it is finished; the same command again resumes. The table shows
-    this run, the page all results in OUT. For policies the table includes the adaptivity gap.
+    this run, the page all results in OUT. Below tables of policies stands the adaptivity gap.
 
     Exit status 1 if all episodes of a method failed.
     """
@@ -72,10 +72,7 @@ def run(
         store = EpisodeStore(out)
         left = unplayed(todo, before) if before else todo
         run_jobs(left, store, n_jobs=jobs, backend=backend, command=typed())
-        if track == "estimation":
-            report(out, todo, worlds)
-        else:
-            _report_policies(store, todo, left, before)
+        report(out, todo, worlds, before)
         _end_if_lost(todo, store, before)
 
 
@@ -95,43 +92,36 @@ def _track_of(env: list[str], baseline: list[str] | None, policy: list[str] | No
     return tracks.pop() if tracks else "estimation"
 
 
-def _report_policies(store: EpisodeStore, todo: list[Job], left: list[Job],
-                     before: list[dict[str, Any]]) -> None:
-    """Print a table for each injection environment."""
-    from eitbench.report.policies import policy_rows, policy_table
-    from eitbench.report.terminal import asked_of, width
-    names = dict.fromkeys(job.environment.name for job in todo)
-    for name in names:
-        jobs = [job for job in todo if job.environment.name == name]
-        privileged = {job.load().name for job in jobs if job.load().privileged}
-        rows = policy_rows(jobs, [*before, *store.results()])
-        title = f"{name}\n\n" if len(names) > 1 else ""
-        options.say(title + policy_table(rows, sorted(privileged), width()))
-    _say_failures(store, asked_of(store.write_records(), left), left)
-
-
-def report(out: Path, asked: Sequence[Job] = (), worlds: Sequence[dict[str, Any]] = ({},)) -> None:
+def report(out: Path, asked: Sequence[Job] = (), worlds: Sequence[dict[str, Any]] = ({},),
+           before: Sequence[dict[str, Any]] = ()) -> None:
     """Print the table of what was ``asked`` for (default: of all that the folder holds) and write
-    Markdown and page of all; of several ``worlds`` that differ in a number, how errors follow
-    it."""
+    Markdown and page of all; of several ``worlds`` that differ in a number, how errors follow it.
+    ``before`` are results of records that the table shows too."""
     from eitbench._files import write_atomically
     from eitbench.bench.store import EpisodeStore
     from eitbench.report.boards import anchors, run_boards, shipped_anchors
+    from eitbench.report.failures import asked_of
     from eitbench.report.page import write_page
-    from eitbench.report.sweep import sweep_text, sweeps, swept
-    from eitbench.report.terminal import asked_of, markdown, terminal_tables, width
+    from eitbench.report.policies import gap_text, policy_rows
+    from eitbench.report.sweep import sweeps, swept
+    from eitbench.report.tables import markdown, terminal_tables, terminal_width
     store = EpisodeStore(out)
     records = store.write_records()
-    if not records:
+    if not records and not before:
         raise typer.BadParameter(f"no results in {out}; make some with `eitbench run`")
     known = {**shipped_anchors(records), **anchors(records)}
     boards = run_boards(records, known)
     write_atomically(out / "leaderboard.md", markdown(boards).encode())
-    told = asked_of(records, asked) if asked else records
+    told = asked_of(store.records(before), asked) if asked else records
     number = swept(worlds)
     found = sweeps(told, number) if number else []
-    options.say("\n\n".join(sweep_text(each, width()) for each in found) if found
-                else terminal_tables(run_boards(told, known), width()))
+    width = terminal_width()
+    options.say("\n\n".join(each.text(width) for each in found) if found
+                else terminal_tables(run_boards(told, known), width))
+    for name in dict.fromkeys(job.environment.name for job in asked):
+        jobs = [job for job in asked if job.environment.name == name]
+        if gap := gap_text(policy_rows(jobs, [*before, *store.results()])):
+            options.say(f"\n{name}: {gap}")
     _say_failures(store, told, asked)
     write_page(store, boards, found)
     options.say(f"\nwrote {out / 'index.html'}")

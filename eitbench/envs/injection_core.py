@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium import spaces
 
-from eitbench.data.beginnings import Script, script, script_so_far
+from eitbench.data.beginnings import Script
 from eitbench.data.recordings import faults_of, outline
 from eitbench.data.regions import score_mass
+from eitbench.envs.episodes import EpisodeCore, Observation
 from eitbench.estimation.onboard.choice import operator_type
 from eitbench.estimation.onboard.console import Console
 from eitbench.estimation.onboard.operator import Innovation
@@ -18,22 +19,22 @@ from eitbench.estimation.onboard.rules import Rules
 from eitbench.worlds.instrument import Faults
 
 if TYPE_CHECKING:
-    from eitbench.envs.estimation import Observation
     from eitbench.worlds.world import World
 
-FURTHEST = 5.0
+OBSERVATIONS = ("scaled", "raw")
+MAX_SCALED = 5.0
 """Largest entry of a scaled observation."""
 RECENT = 4
-"""Injections that an observation remembers."""
+"""Injections in an observation."""
 
 
 def scaled(rules: Rules, observation: Observation) -> np.ndarray:
-    """An observation as one array (..., d), float32, each entry about between −1 and 1 and never
-    beyond ±5.
+    """Flatten a raw observation into one array (..., d), float32, each entry about between −1 and 1
+    and never beyond ±5.
 
     In this order: voltages, recent currents, innovations, mean and std on the grid, doubt, what is
-    left, and where the flow is estimated its velocity and that one's std; all as in the raw
-    observation but for the scale, the first frame left out.
+    left, and where the flow is estimated its velocity and standard deviation; without the first
+    frame.
     """
     world = rules.world
     level = world.expected_concentration
@@ -49,54 +50,64 @@ def scaled(rules: Rules, observation: Observation) -> np.ndarray:
                   observation["velocity_std"] / flow.initial_std]
     batch = observation["voltages"].shape[:-1]
     flat = np.concatenate([part.reshape(*batch, -1) for part in parts], axis=-1)
-    return np.clip(flat, -FURTHEST, FURTHEST).astype(np.float32)
+    return np.clip(flat, -MAX_SCALED, MAX_SCALED).astype(np.float32)
 
 
-class InjectionCore:
-    """B episodes: actions in, noisy voltages out, and by how much the estimator's error lies below
-    the homogeneous one.
+class InjectionCore(EpisodeCore):
+    """B episodes: injections in, noisy voltages out; the reward is the decrease of the error from
+    the homogeneous estimate to that of a filter.
 
     Parameters
     ----------
     rules : Rules
     estimator : str
         One of `eitbench.estimation.onboard.choice.ESTIMATORS`.
+    observation : str
+        One of `OBSERVATIONS`; without an estimator observations are raw.
     """
 
-    def __init__(self, rules: Rules, estimator: str) -> None:
+    def __init__(self, rules: Rules, estimator: str, observation: str = "raw") -> None:
+        super().__init__(rules.world)
+        if observation not in OBSERVATIONS:
+            raise ValueError(f"observation must be one of {', '.join(OBSERVATIONS)}, "
+                             f"got {observation!r}")
         self.rules = rules
-        self.world = rules.world
         self._operator_type = operator_type(rules, estimator)
+        self._is_scaled = observation == "scaled" and self._operator_type is not None
         self._table = rules.table if rules.limit is None else None
-        self.first = len(self.world.currents) if self._operator_type else 0
-        """Injections of the world's cycle before the agent's first."""
+        if self._operator_type:
+            self.first = len(self.world.currents)
         self.length = self.world.n_steps - self.first
+        self.action_space = rules.action_space
+
+    @property
+    def observation_space(self) -> spaces.Space:  # type: ignore[override]
+        """Space of one observation, scaled or raw."""
+        raw = self.space()
+        if not self._is_scaled:
+            return raw
+        zeros: Observation = {name: np.zeros(space.shape or ()) for name, space in raw.items()}
+        return spaces.Box(-MAX_SCALED, MAX_SCALED, scaled(self.rules, zeros).shape, np.float32)
 
     def space(self) -> spaces.Dict:
-        """What one environment shows, in SI units."""
+        """Space of one raw observation, in SI units."""
         world = self.world
         rules = self.rules
         L = world.currents.shape[1]
-        level = world.expected_concentration
         largest = 1e3 * outline(world).largest_voltage
         current = 1.5 * rules.amplitude                                    # "L2" goes up to √2
-        shown: dict[str, spaces.Space] = {
-            "voltages": spaces.Box(-largest, largest, (L,), np.float64),
-            "currents": spaces.Box(-current, current, (L,), np.float64)}
+        shown = {"voltages": _box(largest, L), "currents": _box(current, L)}
         if self._operator_type:
             columns, rows = world.vessel.patches
-            patches = (columns * rows,)
-            shown |= {"recent": spaces.Box(-current, current, (RECENT, L), np.float64),
-                      "frame": spaces.Box(-largest, largest, (self.first, L), np.float64),
-                      "innovations": spaces.Box(-1e6, 1e6, (L,), np.float64),
-                      "mean": spaces.Box(-1e3 * level, 1e3 * level, patches, np.float64),
-                      "std": spaces.Box(0.0, 1e3 * level, patches, np.float64),
-                      "doubt": spaces.Box(0.0, 1.0, (2, L), np.float64)}
+            mean = 1e3 * world.expected_concentration
+            shown |= {"recent": _box(current, RECENT, L), "frame": _box(largest, self.first, L),
+                      "innovations": _box(1e6, L), "mean": _box(mean, columns * rows),
+                      "std": _box(mean, columns * rows, low=0.0), "doubt": _box(1.0, 2, L, low=0.0)}
             flow = world.velocity_model
             if flow is not None:
                 fastest = 100.0 * max(flow.nominal)
-                shown |= {"velocity": spaces.Box(-fastest, fastest, (flow.size,), np.float64),
-                          "velocity_std": spaces.Box(0.0, fastest, (flow.size,), np.float64)}
+                shown |= {"velocity": _box(fastest, flow.size),
+                          "velocity_std": _box(fastest, flow.size, low=0.0)}
         left = [world.n_steps] if rules.budget is None else [world.n_steps, rules.budget]
         shown["left"] = spaces.Box(np.zeros(len(left)), np.array(left, dtype=float),
                                    dtype=np.float64)
@@ -104,30 +115,26 @@ class InjectionCore:
 
     def begin(self, seeds: Sequence[int],
               provide: Callable[[World, int], None] | None = None) -> None:
-        """Play these episodes up to the agent's first injection.
-
-        With ``provide`` of those that are not recorded the first steps alone are simulated; for the
-        rest it is called with the world and each seed, when the rest is needed.
-        """
+        """Begin these episodes, up to the agent's first injection; see `EpisodeCore.begin`."""
         world = self.world
         B = len(seeds)
         L = world.currents.shape[1]
         T = world.n_steps
-        self.seeds = tuple(seeds)
-        self._provide = provide
-        self._t = self.first
-        self._spent = np.zeros(B, dtype=int)
+        self.t = self.first
+        """injections so far, including those of the first frame"""
+        self.spent = np.zeros(B, dtype=int)
+        """(B,) injections that the agents have made of a budget"""
         self._resistance = np.empty((T, B, L, L))
         self._draws = np.empty((T, B, L))
         self._deviations, self._squares, self._totals = np.empty((3, B, T))
-        self._voltages, self._currents = np.zeros((2, B, L))
+        self._voltages, self.currents = np.zeros((2, B, L))
+        """V and A (A/m in 2D), (B, L) each, of the last injections"""
         self._recent = np.zeros((B, RECENT, L))
+        self._homogeneous: np.ndarray | None = None
         faults = [faults_of(world, seed) for seed in seeds]
-        self._faults = Faults(*(np.array(part) for part in zip(*faults, strict=True)))
-        if provide is None:
-            self._read([script(world, seed) for seed in seeds])
-        else:
-            self._read([script_so_far(world, seed, self.first + 1) for seed in seeds])
+        self.faults = Faults(*(np.array(part) for part in zip(*faults, strict=True)))
+        """faults of the instrument in these episodes, (B, L) each"""
+        super().begin(seeds, provide)
         if not self._operator_type:
             return
         self._frames = np.stack([self._measure(k, np.repeat(cycle[None], B, axis=0))
@@ -135,18 +142,13 @@ class InjectionCore:
         self._console = Console(self._operator_type, self.rules, self._frames)
         self._operator = self._console.operator
         self._voltages = self._frames[:, -1].copy()
-        self._currents = np.repeat(world.currents[-1:], B, axis=0)
+        self.currents = np.repeat(world.currents[-1:], B, axis=0)
         for k in range(RECENT):
             self._recent[:, k] = world.currents[(self.first - 1 - k) % self.first]
-        self._weigh()
 
     def _read(self, scripts: Sequence[Script]) -> None:
-        """Take in what is known of the episodes."""
         moments = []
-        self._known = min(len(entries) for entries, _ in scripts)
-        """Injections that can be made before more has to be read."""
         k = slice(self._known)
-        # all is copied: a mapped file is open, and there may be more than may be
         for b, (entries, integrals) in enumerate(scripts):
             self._resistance[k, b] = entries["transfer_resistance"][k]
             self._draws[k, b] = entries["noise"][k]
@@ -154,125 +156,100 @@ class InjectionCore:
             self._squares[b, k] = integrals.square[k]
             self._totals[b, k] = integrals.moment[k].sum(axis=1, dtype=float)
             if self._operator_type:
-                # All rows, so that the bits of a product of matrices do not depend on their number.
+                # all rows, so that the bits of a product of matrices do not depend on their number
                 moment = np.zeros((self.world.n_steps, integrals.moment.shape[1]), np.float32)
                 moment[k] = integrals.moment[k]
                 moments.append(self._operator_type.project(self.world, moment))
         self._moments = np.array(moments)
+        self._homogeneous = None
 
-    def _read_until(self, steps: int) -> None:
-        """Have so many steps of each episode."""
-        if steps <= self._known:
-            return
-        assert self._provide is not None
-        for seed in self.seeds:
-            self._provide(self.world, seed)
-        self._read([script(self.world, seed) for seed in self.seeds])
-        if self._operator_type:
-            self._weigh()
-
-    def _weigh(self) -> None:
-        """Of the homogeneous estimates the errors, (B, known)."""
-        level = self._operator.concentration[:, None] - self.world.background
-        area = score_mass(self.world).sum()
-        k = slice(self._known)
-        error = area * level**2 - 2.0 * level * self._totals[:, k] + self._deviations[:, k]
-        self._homogeneous = error / self._squares[:, k]
+    def homogeneous_errors(self) -> np.ndarray:
+        """(B, loaded steps) relative errors of the homogeneous estimates."""
+        if self._homogeneous is None:
+            level = self._operator.concentration[:, None] - self.world.background
+            area = score_mass(self.world).sum()
+            k = slice(self._known)
+            error = area * level**2 - 2.0 * level * self._totals[:, k] + self._deviations[:, k]
+            self._homogeneous = error / self._squares[:, k]
+        return self._homogeneous
 
     def _measure(self, k: int, currents: np.ndarray) -> np.ndarray:
         """(B, L) voltages of injection t = k + 1."""
-        return self.rules.instrument.measure(self._faults, k + 1, self._resistance[k], currents,
+        return self.rules.instrument.measure(self.faults, k + 1, self._resistance[k], currents,
                                              self._draws[k])
 
     def act(self, actions: np.ndarray) -> np.ndarray:
-        """Inject what actions (B,) or (B, L) ask for and return the rewards (B,)."""
+        """Inject the currents of actions (B,) or (B, L), and return the rewards (B,)."""
         currents = self.rules.currents(actions) if self._table is None else self._table[actions]
         if self.rules.budget is not None:
-            currents = currents * (self._spent < self.rules.budget)[:, None]
-            self._spent += currents.any(axis=1)
-        self._currents = currents
-        self._read_until(self._t + 1)
-        self._voltages = self._measure(self._t, currents)
+            currents = currents * (self.spent < self.rules.budget)[:, None]
+            self.spent += currents.any(axis=1)
+        self.currents = currents
+        self.load_until(self.t + 1)
+        self._voltages = self._measure(self.t, currents)
         self._recent = np.concatenate([currents[:, None], self._recent[:, :-1]], axis=1)
-        self._t += 1
+        self.t += 1
         if not self._operator_type:
             return np.zeros(len(currents))
         self._console.take_in(self._voltages, currents)
-        if self._t <= self.world.warm_up:
+        if self.t <= self.world.warm_up:
             return np.zeros(len(currents))
-        rewards = self._homogeneous[:, self._t - 1] - self.errors()
+        rewards = self.homogeneous_errors()[:, self.t - 1] - self.errors()
         if not np.isfinite(rewards).all():
             broken = [seed for seed, reward in zip(self.seeds, rewards, strict=True)
                       if not np.isfinite(reward)]
-            raise FloatingPointError(f"the estimate of state {self._t} is not finite in the "
+            raise FloatingPointError(f"the estimate of state {self.t} is not finite in the "
                                      f"episodes {broken}")
         return np.asarray(rewards)
 
     def errors(self) -> np.ndarray:
-        """(B,) relative errors (5.12) of the present estimates, not a number where the state is not
-        scored, or nothing estimates."""
-        if self._t <= self.world.warm_up or not self._operator_type:
-            return np.full(len(self._spent), np.nan)
-        k = self._t - 1
+        """(B,) relative errors (5.12) of the present estimates, NaN where the state is not scored
+        or there is no estimator."""
+        if self.t <= self.world.warm_up or not self._operator_type:
+            return np.full(len(self.spent), np.nan)
+        k = self.t - 1
         return self._operator.errors(self._moments[:, k], self._deviations[:, k],
                                      self._squares[:, k])
 
     def estimate(self) -> tuple[np.ndarray, np.ndarray]:
         """Present means and standard deviations (B, n) in mol/m³; without an estimator the expected
-        level and zero."""
+        concentration and zero."""
         if not self._operator_type:
-            shape = (len(self._spent), outline(self.world).mass.shape[0])
+            shape = (len(self.spent), outline(self.world).mass.shape[0])
             return np.full(shape, self.world.expected_concentration), np.zeros(shape)
         return self._operator.means(), self._operator.spreads()
 
     def innovations(self) -> list[Innovation | None]:
-        """Of each episode how the readings that the estimator used last differ from its
-        predictions.
-
-        None where nothing was injected, every reading was left out, or nothing estimates. The
-        update computed them anyway; for scores, never for agents.
-        """
-        return self._operator.innovations() if self._operator_type else [None] * len(self._spent)
-
-    @property
-    def t(self) -> int:
-        """Injections so far, those of the first frame among them."""
-        return self._t
-
-    @property
-    def spent(self) -> np.ndarray:
-        """(B,) injections that the agents have made of a budget."""
-        return self._spent.copy()
-
-    @property
-    def faults(self) -> Faults:
-        """What is wrong in these episodes, (B, L) each."""
-        return self._faults
-
-    @property
-    def last_currents(self) -> np.ndarray:
-        """(B, L) A (A/m in 2D) that were asked for last."""
-        return self._currents
+        """Innovations of the measurements that the filters accepted last, by episode; for scores,
+        never for agents. None without an injection, an accepted measurement or an estimator."""
+        return self._operator.innovations() if self._operator_type else [None] * len(self.spent)
 
     def action_masks(self) -> np.ndarray:
-        """(B, actions) which numbered actions do something: with the budget spent only the last, no
-        injection."""
+        """(B, actions) bool: numbered actions that have an effect; with the budget spent only the
+        last one, no injection."""
         if self._table is None:
             raise ValueError("action_masks is for environments whose actions are numbers; here "
                              "they are currents")
-        masks = np.ones((len(self._spent), len(self._table)), dtype=bool)
+        masks = np.ones((len(self.spent), len(self._table)), dtype=bool)
         if self.rules.budget is not None:
-            masks[self._spent >= self.rules.budget, :-1] = False
+            masks[self.spent >= self.rules.budget, :-1] = False
         return masks
 
     def observe(self) -> Observation:
-        """The last measurement and, if there is an estimator, what an operator makes of it; arrays
-        (B, …)."""
-        shown = {"voltages": self._voltages.copy(), "currents": self._currents.copy()}
+        """Return the last measurement and, with an estimator, its state on a grid; (B, …)."""
+        shown = {"voltages": self._voltages.copy(), "currents": self.currents.copy()}
         if self._operator_type:
             shown |= {"recent": self._recent.copy(), "frame": self._frames.copy()}
             shown |= self._console.shown()
-        left = [np.full(len(self._spent), float(self.world.n_steps - self._t))]
+        left = [np.full(len(self.spent), float(self.world.n_steps - self.t))]
         if self.rules.budget is not None:
-            left.append(self.rules.budget - self._spent.astype(float))
+            left.append(self.rules.budget - self.spent.astype(float))
         return shown | {"left": np.stack(left, axis=1)}
+
+    def format(self) -> Any:
+        shown = self.observe()
+        return scaled(self.rules, shown) if self._is_scaled else shown
+
+
+def _box(high: float, *shape: int, low: float | None = None) -> spaces.Space:
+    return spaces.Box(-high if low is None else low, high, shape, np.float64)

@@ -11,8 +11,9 @@ import numpy as np
 from gymnasium import spaces
 
 from eitbench import _check
-from eitbench.envs.estimation import RESET_NEEDED, Observation, checked_actions
-from eitbench.envs.spec import KnowsItsLength
+from eitbench._extras import needed_by
+from eitbench.envs.episodes import RENDER_MODES, RESET_NEEDED, FixedLengthEnv, Observation
+from eitbench.envs.estimation import checked_actions
 from eitbench.measured import Measurements, quality, read
 from eitbench.measured.calibration import calibrate, noise_of_frames
 from eitbench.measured.cases import MeasuredCase, read_case
@@ -33,7 +34,7 @@ WITHHOLDING_SEEDS = 100_000
 """Size of a split of seeds: ``test:3``, ``dev:3`` and ``train:3`` withhold the same readings."""
 
 
-class MeasuredEnv(KnowsItsLength, gym.Env[Observation, np.ndarray]):  # type: ignore[misc]
+class MeasuredEnv(FixedLengthEnv):
     """Estimate the concentration in a real vessel from measurements, without ground truth.
 
     ## Action Space
@@ -71,18 +72,21 @@ class MeasuredEnv(KnowsItsLength, gym.Env[Observation, np.ndarray]):  # type: ig
     | `moves` | None | whether the target moves; None: with two complete frames or more, or a flow |
     | `correction` | "offset" | of the misfit on homogeneous fluid; or "gain", see `calibrate` |
     | `homogeneous_frames` | 1 | number of first frames that replace a missing reference |
+    | `render_mode` | None | "rgb_array": last estimate, standard deviation, active electrodes |
 
     and those of `task_from_measurements`. A case, such as `eitbench/Measured-iirc-v0`, fixes all
-    but `file`.
+    but `file` and `render_mode`.
     """
 
-    metadata = {"render_modes": []}  # noqa: RUF012 (gymnasium's form)
+    metadata = {"render_modes": RENDER_MODES, "render_fps": 8}  # noqa: RUF012 (gymnasium's form)
     lag = 0
 
     def __init__(self, file: Path | str | Measurements,
                  vessel: Path | str | Mapping[str, Any] | VesselConfig, *, withheld: float = 0.1,
                  moves: bool | None = None, correction: str = "offset",
-                 homogeneous_frames: int = 1, **options: Any) -> None:
+                 homogeneous_frames: int = 1, render_mode: str | None = None,
+                 **options: Any) -> None:
+        self.check_render(render_mode)
         self.measurements = file if isinstance(file, Measurements) else read(file)
         self.vessel = vessel if isinstance(vessel, VesselConfig) else read_vessel(vessel)
         self.case: MeasuredCase | None = None
@@ -107,6 +111,7 @@ class MeasuredEnv(KnowsItsLength, gym.Env[Observation, np.ndarray]):  # type: ig
         self.episode_steps = T
         self.spread: np.ndarray | None = None
         """(n,) standard deviation of the last estimate in mol/m³, if the caller has one"""
+        self._last: np.ndarray | None = None
         self._seed = -1
         self._step = 0
         self._withhold(0)
@@ -149,7 +154,7 @@ class MeasuredEnv(KnowsItsLength, gym.Env[Observation, np.ndarray]):  # type: ig
             seed = int(self.np_random.integers(WITHHOLDING_SEEDS))
         self._withhold(seed % WITHHOLDING_SEEDS)
         self._step = 1
-        self.spread = None
+        self.spread = self._last = None
         return self._observe(), {"step": 1}
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -158,7 +163,7 @@ class MeasuredEnv(KnowsItsLength, gym.Env[Observation, np.ndarray]):  # type: ig
         if not 1 <= self._step <= self.episode_steps:
             raise gym.error.ResetNeeded(RESET_NEEDED)
         n = self.task.mesh.n_nodes
-        estimate = checked_actions(action, self.action_space, n)[:n]
+        self._last = estimate = checked_actions(action, self.action_space, n)[:n].copy()
         reward = 0.0
         if steps := self.scoring_steps(self._step):
             residuals = np.concatenate([self.withheld_residuals(t, estimate) for t in steps])
@@ -166,6 +171,23 @@ class MeasuredEnv(KnowsItsLength, gym.Env[Observation, np.ndarray]):  # type: ig
         self._step += 1
         return (self._observe(), reward, self._step > self.episode_steps, False,
                 {"step": self._step})
+
+    def render(self) -> np.ndarray | None:  # type: ignore[override]
+        """(height, width, 3) uint8: last estimate, its standard deviation if known, electrodes;
+        None without a mode."""
+        if not self.can_render():
+            return None
+        if self._step == 0:
+            raise gym.error.ResetNeeded("call reset() before render()")
+        with needed_by("render()"):
+            from eitbench.envs.rendering import draw_comparison
+        t = max(self._step - 2, 0)
+        estimate = self._last
+        if estimate is None:
+            estimate = np.full(self.task.mesh.n_nodes, self.task.expected_concentration)
+        currents = self.measurements.currents[self.measurements.injections[t]]
+        return draw_comparison(self.task, [("estimate", self.task.mesh, estimate)], currents,
+                               float(self.measurements.times[t]))
 
     def quality_warnings(self) -> list[str]:
         """Return data-quality warnings; see `eitbench.measured.quality`."""
@@ -200,9 +222,11 @@ class MeasuredEnv(KnowsItsLength, gym.Env[Observation, np.ndarray]):  # type: ig
         return {"voltages": voltages, "currents": currents.copy()}
 
 
-def case_env(case: Path | str, file: Path | str | None = None) -> MeasuredEnv:
+def case_env(case: Path | str, file: Path | str | None = None,
+             render_mode: str | None = None) -> MeasuredEnv:
     """Build the environment of a case; ``ValueError`` says which ``file`` is missing."""
     found = read_case(case)
-    env = MeasuredEnv(found.measurements(file), dict(found.vessel), **found.options)
+    env = MeasuredEnv(found.measurements(file), dict(found.vessel), render_mode=render_mode,
+                      **found.options)
     env.case = found
     return env

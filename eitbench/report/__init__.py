@@ -1,1 +1,1 @@
-"""Floor 7: tables, charts and pages made from records."""
+"""Tables, charts and pages made from records."""

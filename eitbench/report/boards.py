@@ -1,13 +1,17 @@
-"""Leaderboards from records: scores, intervals, gains, skills and ranks, board by board."""
+"""Leaderboards from records: columns, scores, intervals, gains, skills and ranks.
+
+A board is a list of rows, and the cells of all rows are one tidy table (`board_table`).
+"""
 
 from __future__ import annotations
 
 import math
-from array import array
-from collections.abc import Callable, Iterable, Mapping
+import re
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import Any, NamedTuple
+from urllib.parse import quote
 
 import numpy as np
 import pandas as pd
@@ -30,34 +34,149 @@ from eitbench.bench.statistics import (
     stratified_bootstrap,
 )
 from eitbench.bench.text import scores_by_seed, seed_ranges
-from eitbench.bench.tracks import CLASSES, home_of, ids, named
-from eitbench.report.model import (
-    ALL,
-    IDENTITY,
-    Board,
-    Row,
-    class_of,
-    fields,
-    floor_of,
-    is_floor,
-    kind_of,
-    place_of_world,
-    title_of,
-    world,
-)
+from eitbench.bench.tracks import CLASSES, FLOORS, home_of, ids, named, track_of_board
+from eitbench.bench.tracks import class_of as class_of_board
+from eitbench.bench.variants import as_typed, flat
 from eitbench.scoring import skill
 
+ALL = "all"
+"""Name of the environment in the rows of an aggregate."""
+IDENTITY = ("class", "environment", "method", "version", "title", "rank", "note", "official",
+            "seeds")
+INTERVALS = ("error", "gain")
+"""Numbers with an interval."""
 ANCHORS = ("homogeneous", "true_model_smoother")
 """Methods with skills 0 and 1."""
 Anchors = Mapping[tuple[str, str, str], Mapping[str, float]]
 """Method, world, split -> seed -> ẽ_c."""
 SPLITS = ("test", "dev", "train", "own")
 """Order of the boards of splits."""
+_NOT_THE_WORLD = ("lag", "assume", "gate", "inflow", "episodes", "render_mode", "observation",
+                  "estimator")
+"""Arguments of an environment that leave its true episodes unchanged."""
+_GAIN = ("gain", "1 − ẽ_c / ẽ_c of the floor (homogeneous; random_pair) in the same episode: 0 as "
+         "the floor, 1 perfect. Interquartile mean with its 95 % bootstrap interval")
+_SKILL = ("skill", "(E_h − E) / (E_h − E_s): 0 for the homogeneous estimate, 1 for the "
+          "fixed-interval smoother with the true flow, both from the whole record where the "
+          "environment has such a board, so that filters may fall below 0. With †, where these two "
+          "have no record of the same episodes: 1 − contrast")
+COSTS = {
+    "matmuls_per_step": (
+        "products/step", "time per step in units of a 1000 × 1000 × 1000 matrix product on one "
+        "thread of that processor, the median of all that were timed on it"),
+    "peak_memory": ("MB", "peak memory of the method's process"),
+}
+_RANK = ("1 + the number of methods that are significantly better; shared where the difference is "
+         "not significant. Floors, references, privileged methods and those that have not finished "
+         "every episode have none")
 
 
-def boards(records: list[dict[str, Any]]) -> pd.DataFrame:
-    """Return the `leaderboards` of records as one table of `fields`."""
-    return board_table(leaderboards(records))
+class Row(NamedTuple):
+    """One method on a board."""
+
+    cells: dict[str, Any]
+    """Values of `fields`; None where there is no value."""
+    record: dict[str, Any] | None = None
+    """Restricted to the board's episodes; None in an aggregate."""
+    gains: dict[str, float] = {}  # noqa: RUF012 (never changed)
+    """Seed -> gain over the floor; empty without a floor."""
+    colour: int = 0
+
+    @property
+    def label(self) -> str:
+        """Name and version."""
+        return f"{self.cells['method']}@{self.cells['version']}"
+
+    @property
+    def competes(self) -> bool:
+        """Whether it has a rank."""
+        return self.cells["rank"] is not None
+
+    @property
+    def badges(self) -> tuple[str, ...]:
+        """Reasons for having no rank."""
+        return tuple(filter(None, self.cells["note"].split(", ")))
+
+    @property
+    def unranked(self) -> bool:
+        """Whether it is a floor, a reference or privileged, finished or not."""
+        return not {"floor", "reference", "privileged"}.isdisjoint(self.badges)
+
+    @property
+    def complete(self) -> bool:
+        """Whether it has finished every episode."""
+        return not re.search("failed|missing", self.cells["note"])
+
+    def three(self, name: str) -> tuple[float, float, float]:
+        """Return a score and the ends of its interval; NaN and infinite where unknown."""
+        unknown = {name: math.nan, f"{name}_low": -math.inf, f"{name}_high": math.inf}
+        value, low, high = (default if self.cells[key] is None else self.cells[key]
+                            for key, default in unknown.items())
+        return value, low, high
+
+
+class Board(NamedTuple):
+    """One environment, or the aggregate of a class."""
+
+    of_class: str
+    environment: str
+    title: str
+    rows: list[Row]
+    """Best first."""
+
+    @property
+    def is_aggregate(self) -> bool:
+        return self.environment == ALL
+
+    @property
+    def records(self) -> list[dict[str, Any]]:
+        return [row.record for row in self.rows if row.record]
+
+    @property
+    def seeds(self) -> str:
+        """Seeds of all rows together."""
+        seeds = {seed for record in self.records for seed in record["seeds"]}
+        return seed_ranges(sorted(seeds)) if seeds else ""
+
+    @property
+    def address(self) -> str:
+        """Address of its page within the site."""
+        return f"environments/{quote(self.environment)}.html"
+
+    @property
+    def anchor(self) -> str:
+        """Identifier of its table in the index."""
+        return f"board-{self.of_class}-{self.environment}"
+
+
+# -- columns ---------------------------------------------------------------------------------------
+
+
+def columns(*, measured: bool = True) -> dict[str, tuple[str, str]]:
+    """Return name -> heading and explanation of each number: registered scores, gain, skill and
+    costs; with ``measured`` also the scores of measurements."""
+    known = scores() | (scores("measured") if measured else {})
+    each = {name: (score.heading, score.explanation) for name, score in known.items()}
+    heading, text = each.pop("error")
+    text += "; mean over the episodes with its 95 % interval; lower is better"
+    return {"error": (heading, text), "gain": _GAIN, "skill": _SKILL} | each | COSTS
+
+
+def headings(*, measured: bool = False) -> dict[str, str]:
+    """Return column -> heading of all numbers without an interval."""
+    return {name: heading for name, (heading, _) in columns(measured=measured).items()
+            if name not in INTERVALS}
+
+
+def meanings(*, measured: bool = False) -> dict[str, str]:
+    """Return heading -> explanation."""
+    return {"rank": _RANK} | dict(columns(measured=measured).values())
+
+
+def fields() -> list[str]:
+    """Return the columns of leaderboard.csv."""
+    ends = [f"{name}{end}" for name in INTERVALS for end in ("", "_low", "_high")]
+    return [*IDENTITY, *ends, *headings()]
 
 
 def board_table(found: Iterable[Board]) -> pd.DataFrame:
@@ -65,6 +184,52 @@ def board_table(found: Iterable[Board]) -> pd.DataFrame:
     rows = [row.cells for board in found for row in board.rows]
     types: dict[str, Any] = dict.fromkeys(fields()[len(IDENTITY):], float)
     return pd.DataFrame(rows, columns=fields()).astype(types | {"rank": "Int64"})
+
+
+def boards(records: list[dict[str, Any]]) -> pd.DataFrame:
+    """Return the `leaderboards` of records as one table of `fields`."""
+    return board_table(leaderboards(records))
+
+
+# -- environments ----------------------------------------------------------------------------------
+
+
+def class_of(record: dict[str, Any]) -> str:
+    """Return the class in `CLASSES` of a record."""
+    return class_of_board(record["environment"]["id"], record["board"])
+
+
+def kind_of(id: str) -> str:
+    """``eitbench/Pipe2DSmoothing-v0`` -> ``Pipe2D``."""
+    name = re.sub(r"(FixedLag|Smoothing)(?=(-v\d+)?$)", "", id)
+    return name.removeprefix("eitbench/").removesuffix("-v0")
+
+
+def world(record: dict[str, Any]) -> str:
+    """Return the name of what environments with the same true episodes share: ``Pipe2D
+    (scored_steps=3)``."""
+    environment = record["environment"]
+    changed = {key: value for key, value in environment["kwargs"].items()
+               if key not in _NOT_THE_WORLD}
+    return kind_of(environment["id"]) + _arguments(changed)
+
+
+def title_of(record: dict[str, Any]) -> str:
+    """Return the environment's id without its prefix, and its arguments."""
+    environment = record["environment"]
+    given = {} if environment["name"] == named(environment["id"], {}) else environment["kwargs"]
+    return environment["id"].removeprefix("eitbench/") + _arguments(given)
+
+
+def _arguments(kwargs: dict[str, Any]) -> str:
+    """`` (flow.mean_velocity=45.0, lag=3)``, or nothing."""
+    given = {key: value for key, value in kwargs.items() if value is not None}
+    flattened = flat(given | given.pop("world", {}))
+    texts = [f"{key}={as_typed(value)}" for key, value in sorted(flattened.items())]
+    return f" ({', '.join(texts)})" if texts else ""
+
+
+# -- boards ----------------------------------------------------------------------------------------
 
 
 def leaderboards(records: list[dict[str, Any]]) -> list[Board]:
@@ -87,13 +252,11 @@ def leaderboards(records: list[dict[str, Any]]) -> list[Board]:
                              f"{file_name(record)} has {record['split']} seeds")
     current, _ = newest(records)
     known = anchors(current)
-    products = _matrix_products(current)
     found: list[Board] = []
     for name in CLASSES:
         members = [record for record in current if class_of(record) == name]
-        made = [_board(group, known, products, ranked=True) for group in _by_environment(members)]
-        found += made
-        found += _aggregate(name, _counted(made))
+        made = _boards(members, current, known, ranked=True)
+        found += [*made, *_aggregate(name, _counted(made))]
     return found
 
 
@@ -108,22 +271,25 @@ def run_boards(records: list[dict[str, Any]], known: Anchors | None = None) -> l
         Between which skills are measured; default: those among the records.
     """
     known = anchors(records) if known is None else known
-    products = _matrix_products(records)
-    return [_board(group, known, products, ranked=False)
-            for group in _by_environment(sorted(records, key=_split_order))]
+    return _boards(sorted(records, key=_split_order), records, known, ranked=False)
 
 
-def _by_environment(records: Iterable[dict[str, Any]]) -> list[list[dict[str, Any]]]:
-    """Group records by split and environment, environments in the order of their worlds."""
-    groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
+def _boards(records: Iterable[dict[str, Any]], timed: list[dict[str, Any]], known: Anchors, *,
+            ranked: bool) -> list[Board]:
+    """Return a board for each split and environment, in the order of registration; ``timed`` are
+    the records whose machines are compared."""
+    products = _matrix_products(timed)
+    kinds = [kind_of(id) for id in ids()]
+    groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
     for record in records:
-        groups.setdefault((record["split"], record["environment"]["name"]), []).append(record)
-    return [groups[key] for key in sorted(groups, key=lambda key: (
-        _split_order(groups[key][0]), place_of_world(world(groups[key][0])), key[1]))]
+        kind = kind_of(record["environment"]["id"])
+        place = kinds.index(kind) if kind in kinds else len(kinds)
+        groups.setdefault((_split_order(record), place, world(record),
+                           record["environment"]["name"]), []).append(record)
+    return [_board(groups[key], known, products, ranked=ranked) for key in sorted(groups)]
 
 
 def _split_order(record: dict[str, Any]) -> int:
-    """Return the place of a record's split."""
     return SPLITS.index(record["split"])
 
 
@@ -140,9 +306,12 @@ def _board(records: list[dict[str, Any]], known: Anchors, products: dict[str, fl
     competing = {row.label: {environment: errors_of(row.record)} for row in rows
                  if not row.cells["note"]}
     ranks = shared_ranks(competing) if competing and ranked else {}
-    return Board(class_of(records[0]), environment, title_of(records[0]), [
-        row._replace(cells=row.cells | {"rank": ranks.get(row.label)}, colour=i)
-        for i, row in enumerate(rows)])
+    return Board(class_of(records[0]), environment, title_of(records[0]), _numbered(rows, ranks))
+
+
+def _numbered(rows: list[Row], ranks: Mapping[str, int | None]) -> list[Row]:
+    return [row._replace(cells=row.cells | {"rank": ranks.get(row.label)}, colour=i)
+            for i, row in enumerate(rows)]
 
 
 def _row(whole: dict[str, Any], seeds: set[str], zero: dict[str, float], known: Anchors,
@@ -151,16 +320,19 @@ def _row(whole: dict[str, Any], seeds: set[str], zero: dict[str, float], known: 
     record = whole | {
         "episodes": [episode for episode in whole["episodes"] if episode["seed"] in seeds],
         "seeds": [seed for seed in whole["seeds"] if seed in seeds]}
-    environment = record["environment"]["name"]
     errors = errors_of(record)
     counts = {"failed": sum(episode["status"] != "ok" for episode in whole["episodes"]),
               "missing": len(seeds - set(record["seeds"]))}
     note = [*filter(None, [record["role"]]), *["privileged"] * record["privileged"],
             *(f"{count} {what}" for what, count in counts.items() if count)]
-    cells = _identity(record, environment, ", ".join(note))
+    cells = _identity(record, record["environment"]["name"], ", ".join(note))
     cells |= errors_and_gains(errors, zero)
-    cells |= {"seeds": seed_ranges(record["seeds"]), **_means(record, known),
-              "matmuls_per_step": _in_products(record, products), "peak_memory": _peak(record)}
+    cells |= {"seeds": seed_ranges(record["seeds"]), "skill": _skill(record, known)}
+    for name in (scores() | scores("measured")).keys() - {"error"}:
+        values = list(scores_by_seed(record, name).values())
+        reduce: Any = min if name == "seconds_per_step" else np.mean
+        cells[name] = float(reduce(values)) if values else None
+    cells |= _costs(record, products)
     return Row(cells, record, gains_over(zero, errors))
 
 
@@ -170,20 +342,20 @@ def _identity(record: dict[str, Any], environment: str, note: str) -> dict[str, 
 
 
 def _place(row: Row) -> tuple[bool, float, str]:
-    errors = list(errors_of(row.record).values())
-    mean = mean_over_environments(errors) if errors else math.inf
-    return not row.complete, mean, row.label
+    error = row.cells["error"]
+    return not row.complete, math.inf if error is None else error, row.label
 
 
-def _means(record: dict[str, Any], known: Anchors) -> dict[str, float | None]:
-    """Return the mean of each score but the error, the least time per step, and the skill."""
-    found: dict[str, float | None] = {"skill": _skill(record, known)}
-    for name in scores() | scores("measured"):
-        values = list(scores_by_seed(record, name).values())
-        reduce: Callable[..., Any] = min if name == "seconds_per_step" else np.mean
-        if name != "error":
-            found[name] = float(reduce(values)) if values else None
-    return found
+def floor_of(records: Iterable[dict[str, Any]]) -> dict[str, Any] | None:
+    """Return the record from which gains are counted, of those of one environment, if any."""
+    return max(filter(is_floor, records), default=None,
+               key=lambda record: (record["official"], finished(record)))
+
+
+def is_floor(record: dict[str, Any]) -> bool:
+    """Return whether it is a record of the built-in floor: third-party versions are no numbers."""
+    return (record["method"] == FLOORS[track_of_board(record["board"])]
+            and version_number(record["version"]) is not None)
 
 
 def errors_of(record: dict[str, Any] | None) -> dict[str, float]:
@@ -214,7 +386,7 @@ def _with_ends(name: str, values: dict[str, dict[str, float]],
     return dict(zip(keys, (each if math.isfinite(each) else None for each in three), strict=True))
 
 
-# -- aggregates --------------------------------------------------------------------------------
+# -- aggregates ------------------------------------------------------------------------------------
 
 
 def counted() -> set[str]:
@@ -229,9 +401,8 @@ def _counted(made: list[Board]) -> list[Board]:
     names = counted()
     own = [board for board in made if board.environment in names
            and any(row.gains for row in board.rows)]
-    official = [board for board in own if any(
-        row.record and is_floor(row.record) and row.cells["official"] for row in board.rows)]
-    return official or own
+    return [board for board in own if any(
+        is_floor(record) and record["official"] for record in board.records)] or own
 
 
 def _aggregate(of_class: str, made: list[Board]) -> list[Board]:
@@ -241,30 +412,25 @@ def _aggregate(of_class: str, made: list[Board]) -> list[Board]:
         return []
     found = [{row.label: row for row in board.rows if row.complete and row.gains}
              for board in made]
-    cells: dict[str, dict[str, Any]] = {}
+    rows = []
     competing = {}
-    for label, first in found[0].items():
-        if not all(label in rows for rows in found):
-            continue
-        own = [rows[label] for rows in found]
+    for label in set.intersection(*map(set, found)):
+        own = [each[label] for each in found]
         gains = {board.environment: row.gains for board, row in zip(made, own, strict=True)}
         note = ", ".join(dict.fromkeys(word for row in own for word in row.badges))
-        assert first.record is not None
-        cells[label] = dict.fromkeys(fields()) | _identity(first.record, ALL, note)
-        cells[label] |= _with_ends("gain", gains, interquartile_mean)
-        cells[label]["official"] = all(row.cells["official"] for row in own)
+        assert own[0].record is not None
+        rows.append(Row(dict.fromkeys(fields()) | _identity(own[0].record, ALL, note)
+                        | _with_ends("gain", gains, interquartile_mean)
+                        | {"official": all(row.cells["official"] for row in own)}))
         if not note:
             competing[label] = gains
     ranks = shared_ranks(competing, statistic=interquartile_mean,
                          higher_is_better=True) if competing else {}
-    order = sorted(cells, key=lambda label: (-cells[label]["gain"], cells[label]["method"],
-                                             cells[label]["version"]))
-    rows = [Row(cells[label] | {"rank": ranks.get(label)}, colour=i)
-            for i, label in enumerate(order)]
-    return [Board(of_class, ALL, "All environments", rows)] if rows else []
+    rows.sort(key=lambda row: (-row.cells["gain"], row.cells["method"], row.cells["version"]))
+    return [Board(of_class, ALL, "All environments", _numbered(rows, ranks))] if rows else []
 
 
-# -- records -----------------------------------------------------------------------------------
+# -- records ---------------------------------------------------------------------------------------
 
 
 def read_for_boards(folder: Path) -> tuple[list[dict[str, Any]], list[str]]:
@@ -278,27 +444,19 @@ def read_for_boards(folder: Path) -> tuple[list[dict[str, Any]], list[str]]:
     """
     if not folder.is_dir():
         raise ValueError(f"records must be a folder that exists, got {folder}")
-    read, complaints = read_sound_records(folder, keep=_packed)
-    found = [record for record in read if record["split"] == "test"]
+    read, complaints = read_sound_records(folder)
     complaints += [f"record {folder / file_name(record)} has {record['split']} seeds, and "
                    "leaderboards are made of test seeds"
                    for record in read if record["split"] != "test"]
+    found = [record for record in read if record["split"] == "test"]
     if not found:
-        listed = "".join(f"; {complaint}" for complaint in complaints)
-        raise ValueError(f"records must be a folder with records of test seeds, got {folder}, "
-                         f"where there are none that can be shown{listed}")
+        raise ValueError("; ".join([f"records must be a folder with records of test seeds, got "
+                                    f"{folder}, where there are none that can be shown",
+                                    *complaints]))
     return found, complaints
 
 
-def _packed(record: dict[str, Any]) -> dict[str, Any]:
-    """Store the error of each step, most of a record, in a quarter of the memory."""
-    for episode in record["episodes"]:
-        if "step_errors" in episode:
-            episode["step_errors"] = array("d", episode["step_errors"])
-    return record
-
-
-# -- skill and cost ----------------------------------------------------------------------------
+# -- skill and cost --------------------------------------------------------------------------------
 
 
 def anchors(records: Iterable[dict[str, Any]]) -> Anchors:
@@ -337,25 +495,23 @@ def _skill(record: dict[str, Any], known: Anchors) -> float | None:
     return skill(e, high, low) if high != low else None
 
 
-def _matrix_products(records: list[dict[str, Any]]) -> dict[str, float]:
+def _matrix_products(records: Iterable[dict[str, Any]]) -> dict[str, float]:
     """Return processor -> time of a matrix product in s: the median of the runs, official ones
     where there are any, since a single one depends on the load."""
     timed: dict[str, dict[bool, list[float]]] = {}
     for record in records:
         for run in record["runs"]:
-            machine = run["machine"]
-            by = timed.setdefault(machine["processor"], {True: [], False: []})
-            by[record["official"]].append(machine["matmul_seconds"])
+            by = timed.setdefault(run["machine"]["processor"], {True: [], False: []})
+            by[record["official"]].append(run["machine"]["matmul_seconds"])
     return {processor: median(by[True] or by[False]) for processor, by in timed.items()}
 
 
-def _in_products(record: dict[str, Any], products: dict[str, float]) -> float | None:
-    """Return the time per step of the fastest episode in matrix products of its processor."""
-    return min((episode["scores"]["seconds_per_step"]
-                / products[record["runs"][episode["run"]]["machine"]["processor"]]
-                for episode in record["episodes"] if episode["status"] == "ok"), default=None)
-
-
-def _peak(record: dict[str, Any]) -> float | None:
-    return max((1e-6 * episode["peak_memory"] for episode in record["episodes"]
-                if episode["peak_memory"]), default=None)
+def _costs(record: dict[str, Any], products: dict[str, float]) -> dict[str, float | None]:
+    """Return the time per step of the fastest episode in matrix products of its processor, and the
+    peak memory in 10⁶ bytes."""
+    times = [episode["scores"]["seconds_per_step"]
+             / products[record["runs"][episode["run"]]["machine"]["processor"]]
+             for episode in record["episodes"] if episode["status"] == "ok"]
+    peaks = [1e-6 * episode["peak_memory"] for episode in record["episodes"]
+             if episode["peak_memory"]]
+    return {"matmuls_per_step": min(times, default=None), "peak_memory": max(peaks, default=None)}

@@ -13,6 +13,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+from markupsafe import Markup
 
 from eitbench._foreign import cleaned
 
@@ -23,18 +24,18 @@ CELL = 96
 """Width of a drawing in a table's cell, px."""
 LETTER = 7.0
 """Approximate width of a character, px."""
-LONGEST, LONGEST_BESIDE = 36, 60
-"""Characters of a name in a chart and beside one; titles, legends and tables have whole names."""
+MAX_NAME_CHARS = 36
+"""Characters of a name in a chart; titles, legends and tables have whole names."""
 
 
 class Series(NamedTuple):
-    """One line, or one row of intervals."""
+    """One line."""
 
     name: str
     colour: int
     """Index of the page's colour, --c0, --c1, …"""
     values: np.ndarray
-    """(n,) of a line; (value, low, high) of an interval, whose ends may be infinite."""
+    """(n,)"""
     faint: bool = False
 
 
@@ -47,6 +48,16 @@ class Point(NamedTuple):
     y: float
     competes: bool = True
     """Whether it may be on the front."""
+
+
+class Chart(NamedTuple):
+    """A drawing with its legend."""
+
+    svg: Markup
+    legend: list[tuple[int, bool, str]]
+    """Colour, whether dashed, name."""
+    note: str = ""
+    """End of the caption."""
 
 
 class Axis:
@@ -80,20 +91,22 @@ class Axis:
         return [round(i * step, 12) for i in range(first, last + 1)]
 
 
-def lines(x: np.ndarray, series: list[Series], x_label: str, y_label: str) -> str:
-    """Draw curves over a linear x axis and a logarithmic y axis; a series may end before ``x``."""
+def lines(x: np.ndarray, series: Sequence[Series], x_label: str, y_label: str, *,
+          log: bool = False) -> Markup:
+    """Draw curves over a linear or logarithmic x axis and a logarithmic y axis; a series may end
+    before ``x``, and NaN are left out."""
     values = np.concatenate([s.values for s in series])
     least = values[values > 0].min(initial=1.0) / 1.15  # where a perfect estimate's zero is drawn
-    px = Axis(x[0], max(x[-1], x[0] + 1), LEFT, WIDTH - RIGHT, log=False)
-    py = Axis(least, max(values.max(), least) * 1.15, HEIGHT - BOTTOM, TOP, log=True)
+    px = Axis(x[0], x[-1], LEFT, WIDTH - RIGHT, log=log)
+    py = Axis(least, max(np.nanmax(values), least) * 1.15, HEIGHT - BOTTOM, TOP, log=True)
     parts = _frame(px, py, x_label, y_label)
     for s in sorted(series, key=lambda s: not s.faint):
-        points = ((px(a), py(b)) for a, b in zip(x, s.values, strict=False))
-        parts.append(_polyline(f"series{' faint' * s.faint}", points, s.colour, s.name))
-    return "".join([*parts, "</svg>"])
+        places = [(px(a), py(b)) for a, b in zip(x, s.values, strict=False) if b == b]
+        parts.append(_polyline(f"series{' faint' * s.faint}", places, s.colour, s.name))
+    return Markup("".join([*parts, "</svg>"]))
 
 
-def front(points: list[Point], x_label: str, y_label: str) -> str:
+def front(points: Sequence[Point], x_label: str, y_label: str) -> Markup:
     """Draw marks over two logarithmic axes, where small is good; `optimal` ones are filled and
     joined. Names stand beside their marks where there is room."""
     def axis(values: list[float], begin: float, end: float) -> Axis:
@@ -104,7 +117,7 @@ def front(points: list[Point], x_label: str, y_label: str) -> str:
     py = axis([p.y for p in points], HEIGHT - BOTTOM, TOP)
     best = optimal(points)
     parts = [*_frame(px, py, x_label, y_label),
-             _polyline("front", ((px(p.x), py(p.y)) for p in best))]
+             _polyline("front", [(px(p.x), py(p.y)) for p in best])]
     taken = [(px(p.x) - 6, py(p.y) - 6, px(p.x) + 6, py(p.y) + 6) for p in points]
     for a, b in pairwise(best):  # names keep off the line too
         along = (np.linspace(px(a.x), px(b.x), 40), np.linspace(py(a.y), py(b.y), 40))
@@ -112,15 +125,16 @@ def front(points: list[Point], x_label: str, y_label: str) -> str:
     for p in [*best, *(p for p in points if p not in best)]:  # the best choose their places first
         colour = _colour(p.colour)
         fill = colour if p in best else "var(--card)"
-        parts.append(_dot(f"fill:{fill};stroke:{colour};stroke-width:2", px(p.x), py(p.y),
-                          f"{p.name}: {p.x:.3g}, {p.y:.3g}"))
-        name = shortened(p.name, LONGEST)
+        parts.append(f'<circle style="fill:{fill};stroke:{colour};stroke-width:2" '
+                     f'cx="{px(p.x):.1f}" cy="{py(p.y):.1f}" r="5">'
+                     f'{_title(f"{p.name}: {p.x:.3g}, {p.y:.3g}")}</circle>')
+        name = shortened(p.name, MAX_NAME_CHARS)
         if place := _room(px(p.x), py(p.y), LETTER * len(name), taken):
             parts.append(_text(*place, name, "name"))
-    return "".join([*parts, "</svg>"])
+    return Markup("".join([*parts, "</svg>"]))
 
 
-def optimal(points: list[Point]) -> list[Point]:
+def optimal(points: Iterable[Point]) -> list[Point]:
     """Return the competing points that no other beats in both coordinates, by x."""
     best: list[Point] = []
     for p in sorted((p for p in points if p.competes), key=lambda p: (p.x, p.y)):
@@ -129,60 +143,33 @@ def optimal(points: list[Point]) -> list[Point]:
     return best
 
 
-def intervals(rows: list[Series], x_label: str, *, log: bool = True,
-              mark: float | None = None) -> str:
-    """Draw a dot and its interval a row, over a logarithmic or linear axis, with a line at
-    ``mark``."""
-    names = [shortened(s.name, LONGEST_BESIDE) for s in rows]
-    label = 24 + LETTER * max(8, *map(len, names))
-    bottom = TOP + 28 * len(rows)
-    known = [float(value) for s in rows for value in s.values if math.isfinite(value)]
-    known += [] if mark is None else [mark]
-    margin = 0.05 * (max(known) - min(known)) or 1.0
-    low, high = min(known) - margin, max(known) + margin
-    if log:
-        least = min((float(s.values[0]) for s in rows if s.values[0] > 0), default=1.0)
-        # an interval that reaches further down is cut
-        low, high = max(min(known), least / 2) / 1.15, max(*known, least) * 1.15
-    px = Axis(low, high, label, WIDTH - RIGHT, log=log)
-    parts = [_open(bottom + BOTTOM, x_label), *_x_ticks(px, TOP, bottom, bottom)]
-    if mark is not None:
-        parts.append(_polyline("front", [(px(mark), TOP), (px(mark), bottom)]))
-    for i, (s, name) in enumerate(zip(rows, names, strict=True)):
-        y = TOP + 28 * (i + 0.5)
-        value, a, b = (float(end) if math.isfinite(end) else float(s.values[0]) for end in s.values)
-        parts += [_text(label - 12, y + 4, "end", name),
-                  f'<line style="stroke:{_colour(s.colour)};stroke-width:3" x1="{px(a):.1f}" '
-                  f'x2="{px(b):.1f}" y1="{y}" y2="{y}"/>',
-                  _dot(f"fill:{_colour(s.colour)}", px(value), y, f"{value:.3g}")]
-    parts.append(_text((label + WIDTH - RIGHT) / 2, bottom + BOTTOM - 6, "middle", x_label))
-    return "".join([*parts, "</svg>"])
+def legend(series: Iterable[Series | Point]) -> list[tuple[int, bool, str]]:
+    """Return the legend of series or points."""
+    return [(s.colour % COLOURS, s.colour >= COLOURS, s.name) for s in series]
 
 
-def cell(three: tuple[float, float, float], low: float, high: float, *, log: bool = False,
-         mark: float | None = None, each: Sequence[float] = ()) -> str:
-    """Draw a dot and its interval for a table's cell, on the scale of its column from ``low`` to
-    ``high``, with a line at ``mark`` and a stroke for ``each`` value of a mean. Hidden from screen
-    readers: the number beside it says the same."""
-    px = Axis(low, high, 4, CELL - 4, log=log)
+def cell(three: tuple[float, float, float], px: Axis, *, mark: float | None = None,
+         each: Iterable[float] = ()) -> Markup:
+    """Draw a dot and its interval for a table's cell, on the axis of its column, with a line at
+    ``mark`` and a stroke for ``each`` value of a mean. Hidden from screen readers: the number
+    beside it says the same."""
     value, a, b = (min(end if math.isfinite(end) else three[0], px.high) for end in three)
     strokes = "".join(f"M{px(min(one, px.high)):.1f} 2V12" for one in each)
-    return (f'<svg class="cell" viewBox="0 0 {CELL} 14" aria-hidden="true">{_mark(px, mark)}'
-            f'<line x1="{px(a):.1f}" x2="{px(b):.1f}" y1="7" y2="7"/>'
-            + (f'<path class="each" d="{strokes}"/>' if strokes else "")
-            + f'<circle cx="{px(value):.1f}" cy="7" r="3"/></svg>')
+    return Markup(f'<svg class="cell" viewBox="0 0 {CELL} 14" aria-hidden="true">{_mark(px, mark)}'
+                  f'<line x1="{px(a):.1f}" x2="{px(b):.1f}" y1="7" y2="7"/>'
+                  + (f'<path class="each" d="{strokes}"/>' if strokes else "")
+                  + f'<circle cx="{px(value):.1f}" cy="7" r="3"/></svg>')
 
 
-def cell_axis(low: float, high: float, *, log: bool = False, mark: float | None = None) -> str:
+def cell_axis(px: Axis, *, mark: float | None = None) -> Markup:
     """Draw the axis of a column of `cell`s, with a number at its first and its last tick."""
-    px = Axis(low, high, 4, CELL - 4, log=log)
     ticks = px.ticks()
     strokes = "".join(f"M{px(tick):.1f} 0V4" for tick in ticks)
     far = len(ticks) > 1 and px(ticks[-1]) - px(ticks[0]) > 0.5 * CELL
     labels = "".join(_text(px(tick), 14, "middle", _tick(tick).replace("-", "−"))
                      for tick in (ticks[:1] if far else []) + ticks[-1:])
-    return (f'<svg class="cell axis" viewBox="0 0 {CELL} 16" aria-hidden="true">'
-            f'<path d="M{px.begin} 0H{px.end}{strokes}"/>{_mark(px, mark, 6)}{labels}</svg>')
+    return Markup(f'<svg class="cell axis" viewBox="0 0 {CELL} 16" aria-hidden="true"><path d="'
+                  f'M{px.begin} 0H{px.end}{strokes}"/>{_mark(px, mark, 6)}{labels}</svg>')
 
 
 def shortened(name: str, letters: int) -> str:
@@ -198,24 +185,19 @@ def _mark(px: Axis, mark: float | None, height: float = 14) -> str:
 
 
 def _frame(px: Axis, py: Axis, x_label: str, y_label: str) -> list[str]:
-    """Draw grid, ticks and labels."""
-    parts = [_open(HEIGHT, f"{y_label} over {x_label}")]
+    """Begin a drawing with grid, ticks and labels."""
+    bottom = HEIGHT - BOTTOM
+    label = escape(cleaned(f"{y_label} over {x_label}"))
+    parts = [f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{label}">']
     for tick in py.ticks():
         parts += [_polyline("grid", [(LEFT, py(tick)), (WIDTH - RIGHT, py(tick))]),
                   _text(LEFT - 8, py(tick) + 4, "end", _tick(tick))]
-    parts += _x_ticks(px, HEIGHT - BOTTOM, HEIGHT - BOTTOM + 5, HEIGHT - BOTTOM)
+    for tick in px.ticks():
+        parts += [_polyline("grid", [(px(tick), bottom), (px(tick), bottom + 5)]),
+                  _text(px(tick), bottom + 18, "middle", _tick(tick))]
     return [*parts, _text((LEFT + WIDTH - RIGHT) / 2, HEIGHT - 6, "middle", x_label),
-            '<text text-anchor="middle" transform="translate(14 '
-            f'{(HEIGHT - BOTTOM + TOP) / 2}) rotate(-90)">{escape(y_label)}</text>']
-
-
-def _x_ticks(px: Axis, top: float, bottom: float, axis: float) -> list[str]:
-    return [_polyline("grid", [(px(tick), top), (px(tick), bottom)])
-            + _text(px(tick), axis + 18, "middle", _tick(tick)) for tick in px.ticks()]
-
-
-def _open(height: float, label: str) -> str:
-    return f'<svg viewBox="0 0 {WIDTH} {height}" role="img" aria-label="{escape(label)}">'
+            f'<text text-anchor="middle" transform="translate(14 {(bottom + TOP) / 2}) '
+            f'rotate(-90)">{escape(y_label)}</text>']
 
 
 def _text(x: float, y: float, anchor: str, words: str, kind: str = "") -> str:
@@ -224,20 +206,19 @@ def _text(x: float, y: float, anchor: str, words: str, kind: str = "") -> str:
             f'{escape(cleaned(words))}</text>')
 
 
-def _dot(style: str, x: float, y: float, title: str) -> str:
-    return (f'<circle style="{style}" cx="{x:.1f}" cy="{y:.1f}" r="5">'
-            f'<title>{escape(cleaned(title))}</title></circle>')
+def _title(words: str) -> str:
+    return f"<title>{escape(cleaned(words))}</title>"
 
 
-def _polyline(kind: str, places: Iterable[tuple[float, float]], colour: int | None = None,
+def _polyline(kind: str, places: Sequence[tuple[float, float]], colour: int | None = None,
               title: str = "") -> str:
     """Draw a line of this class of the style sheet, in a colour of the page, with a title."""
     points = " ".join(f"{x:.1f},{y:.1f}" for x, y in places)
-    dashes = ";stroke-dasharray:6 3" if colour is not None and colour >= COLOURS else ""
-    style = "" if colour is None else f' style="stroke:{_colour(colour)}{dashes}"'
-    return (f'<polyline class="{kind}"{style} points="{points}">'
-            f'<title>{escape(cleaned(title))}</title></polyline>' if title
-            else f'<polyline class="{kind}"{style} points="{points}"/>')
+    if colour is None:
+        return f'<polyline class="{kind}" points="{points}"/>'
+    dashes = ";stroke-dasharray:6 3" if colour >= COLOURS else ""
+    return (f'<polyline class="{kind}" style="stroke:{_colour(colour)}{dashes}" points="{points}">'
+            f'{_title(title)}</polyline>')
 
 
 def _colour(number: int) -> str:

@@ -5,11 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import numpy as np
 import pandas as pd
-from markupsafe import Markup
 
 from eitbench import _check
 from eitbench._files import readable, shipped
@@ -25,10 +23,7 @@ from eitbench.bench.statistics import (
 from eitbench.bench.table import NOTHING, Cell, Table, number_cell
 from eitbench.bench.text import scores_by_seed, with_interval
 from eitbench.bench.tracks import CLASSES
-from eitbench.report import charts
-from eitbench.report.boards import gains_over
-from eitbench.report.model import class_of, is_floor
-from eitbench.report.templates import template
+from eitbench.report.boards import class_of, gains_over, is_floor
 
 FIELDS = ("environment", "score", "episodes", "a", "b", "difference", "low", "high",
           "better", "better_low", "better_high")
@@ -54,31 +49,26 @@ def find(name: str, folder: Path) -> list[dict[str, Any]]:
     if name.endswith(".json"):
         return [read_record(readable(Path(name)))]
     method, _, version = name.partition("@")
-    there = read_records(folder)
-    records = _named(method, version, there)
-    if not records and folder.resolve() != SHIPPED.resolve():
-        there += read_records(SHIPPED)
-        records = _named(method, version, there)
-    if not version:
-        records = [record for record in records if record["official"]] or records
-    if not records:
-        raise ValueError(f"there is no record of {name} in {folder}"
-                         + _check.nearest(method, {record["method"] for record in there}))
-    versions = sorted({record["version"] for record in records})
-    if len(versions) > 1:
-        found = ", ".join(f"{method}@{each}" for each in versions)
-        raise ValueError(f"{name} fits several versions: {found}")
-    return records
 
-
-def _named(method: str, version: str, there: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the records of a method: of this version, without one the newest."""
-    def is_version(own: str) -> bool:
+    def fits(own: str) -> bool:
         shortened = version_number(own) is None and len(version) >= MIN_VERSION_DIGITS
         return own == version or (shortened and own.startswith(version))
 
-    return [record for record in (there if version else newest(there)[0])
-            if record["method"] == method and (not version or is_version(record["version"]))]
+    known: set[str] = set()
+    for place in dict.fromkeys([folder.resolve(), SHIPPED.resolve()]):
+        there = read_records(place)
+        known |= {record["method"] for record in there}
+        own = [record for record in (there if version else newest(there)[0])
+               if record["method"] == method and (not version or fits(record["version"]))]
+        if not version:
+            own = [record for record in own if record["official"]] or own
+        versions = sorted({record["version"] for record in own})
+        if len(versions) > 1:
+            found = ", ".join(f"{method}@{each}" for each in versions)
+            raise ValueError(f"{name} fits several versions: {found}")
+        if own:
+            return own
+    raise ValueError(f"there is no record of {name} in {folder}" + _check.nearest(method, known))
 
 
 def comparable(name: str) -> Score:
@@ -98,23 +88,13 @@ def floors(folder: Path) -> list[dict[str, Any]]:
     return newest(there)[0]
 
 
-class _Pair(NamedTuple):
-    """Scores of two methods in one environment, seed -> score, of the seeds that both have."""
-
-    label: str
-    kind: str
-    place: tuple[str, str]
-    ours: dict[str, float]
-    theirs: dict[str, float]
-
-
 def compare(a: list[dict[str, Any]], b: list[dict[str, Any]], score: str = "error",
             zero: Iterable[dict[str, Any]] = ()) -> pd.DataFrame:
     """Compare a score of a and b on the episodes that both finished: a row for each environment,
     and rows for several of them together.
 
-    Of errors the latter are of gains: a row for each class with several environments that have a
-    floor among ``zero``, ``all filter`` and so on. Of other scores it is one row, ``all``.
+    For the error, the latter compare gains: a row for each class with several environments that
+    have a floor among ``zero``, ``all filter`` and so on. For other scores it is one row, ``all``.
 
     Returns
     -------
@@ -130,54 +110,48 @@ def compare(a: list[dict[str, Any]], b: list[dict[str, Any]], score: str = "erro
         If there is no such score, or no environment in which both have it in an episode.
     """
     higher = comparable(score).better == "higher"
-    pairs = _pairs(a, b, score)
-    if not pairs:
+    theirs = {_place(record): scores_by_seed(record, score) for record in b}
+    both: dict[str, tuple[dict[str, float], dict[str, float]]] = {}
+    gains: dict[str, dict[str, Any]] = {kind: {} for kind in CLASSES}
+    levels = {_place(record): scores_by_seed(record, "error") for record in
+              sorted(zero, key=lambda record: (record["official"], finished(record)))}
+    for record in sorted(a, key=_place):
+        place = name, split = _place(record)
+        pair = scores_by_seed(record, score), theirs.get(place, {})
+        shared = pair[0].keys() & pair[1].keys()
+        if shared:
+            label = name if split == "test" else f"{name} ({split} seeds)"
+            own, other = ({seed: each[seed] for seed in shared} for each in pair)
+            both[label] = own, other
+            level = levels.get(place, {})
+            if gained := gains_over(level, own):
+                gains[class_of(record)][label] = gained, gains_over(level, other)
+    if not both:
         also = f" and have {score}" if score != "error" else ""
         raise ValueError("there is no environment in which both have finished an episode of the "
                          f"same seed{also}")
-    rows = [_row(pair.label, score, [pair], mean_over_environments, higher) for pair in pairs]
+    rows = [_row(label, score, {label: pair}, mean_over_environments, higher=higher)
+            for label, pair in both.items()]
     if score == "error":
-        levels = {_place(record): scores_by_seed(record, "error") for record in
-                  sorted(zero, key=lambda record: (record["official"], finished(record)))}
-        gains = [pair._replace(ours=gains_over(levels[pair.place], pair.ours),
-                               theirs=gains_over(levels[pair.place], pair.theirs))
-                 for pair in pairs if pair.place in levels]
-        for kind in CLASSES:
-            together = [pair for pair in gains if pair.kind == kind and pair.ours]
-            if len(together) > 1:
-                rows.append(_row(f"all {kind}", GAIN, together, interquartile_mean, True))
-    elif len(pairs) > 1:
-        rows.append(_row("all", score, pairs, mean_over_environments, higher))
+        rows += [_row(f"all {kind}", GAIN, together, interquartile_mean, higher=True)
+                 for kind, together in gains.items() if len(together) > 1]
+    elif len(both) > 1:
+        rows.append(_row("all", score, both, mean_over_environments, higher=higher))
     return pd.DataFrame(rows, columns=list(FIELDS))
-
-
-def _pairs(a: list[dict[str, Any]], b: list[dict[str, Any]], score: str) -> list[_Pair]:
-    others = {_place(record): scores_by_seed(record, score) for record in b}
-    found = []
-    for record in sorted(a, key=_place):
-        own, theirs = scores_by_seed(record, score), others.get(_place(record), {})
-        if shared := own.keys() & theirs.keys():
-            name, split = _place(record)
-            label = name if split == "test" else f"{name} ({split} seeds)"
-            found.append(_Pair(label, class_of(record), (name, split),
-                               *({seed: side[seed] for seed in shared} for side in (own, theirs))))
-    return found
 
 
 def _place(record: dict[str, Any]) -> tuple[str, str]:
     return record["environment"]["name"], record["split"]
 
 
-def _row(label: str, score: str, pairs: list[_Pair], statistic: Statistic,
-         higher: bool) -> dict[str, Any]:
-    ours = {pair.label: pair.ours for pair in pairs}
-    theirs = {pair.label: pair.theirs for pair in pairs}
+def _row(label: str, score: str, pairs: dict[str, Any], statistic: Statistic, *,
+         higher: bool) -> tuple[Any, ...]:
+    ours, theirs = ({name: pair[side] for name, pair in pairs.items()} for side in (0, 1))
     means = [float(statistic(*[list(own.values()) for own in side.values()]))
              for side in (ours, theirs)]
-    better = paired_probability_of_improvement(ours, theirs, higher_is_better=higher)
-    difference = paired_difference(ours, theirs, statistic=statistic)
-    values = (label, score, sum(map(len, ours.values())), *means, *difference, *better)
-    return dict(zip(FIELDS, values, strict=True))
+    return (label, score, sum(map(len, ours.values())), *means,
+            *paired_difference(ours, theirs, statistic=statistic),
+            *paired_probability_of_improvement(ours, theirs, higher_is_better=higher))
 
 
 def names(a: dict[str, Any], b: dict[str, Any]) -> tuple[str, str]:
@@ -191,15 +165,11 @@ def shown(table: pd.DataFrame, a: str, b: str, score: str = "error") -> Table:
     """Return the comparison of methods named ``a`` and ``b``, with a verdict: the better one where
     the interval of the difference excludes zero."""
     asked = comparable(score)
-    ends = table[["low", "high", "difference"]].abs().replace(math.inf, math.nan)
-    widest = ends.max(axis=1).groupby(table["score"]).max().replace(0.0, 1.0)
     rows = []
-    for _, row in table.iterrows():
+    for row in table.to_dict("records"):
         is_gain = row["score"] == GAIN
         less, more = (b, a) if is_gain or asked.better == "higher" else (a, b)
-        wide = float(np.nan_to_num(widest[row["score"]], nan=1.0))
-        three = (row["difference"], row["low"], row["high"])
-        difference, _, interval = with_interval(*three).partition(" ")
+        three = with_interval(row["difference"], row["low"], row["high"])
         share = f"{100 * row['better']:.0f} %"
         if math.isfinite(row["low"]):
             share += f" ({100 * row['better_low']:.0f} to {100 * row['better_high']:.0f} %)"
@@ -209,28 +179,18 @@ def shown(table: pd.DataFrame, a: str, b: str, score: str = "error") -> Table:
             levels = {key: cell._replace(text=f"{GAIN} {cell.text}")
                       for key, cell in levels.items()}
         rows.append({
-            "environment": row["environment"],
+            "environment": row["environment"].removeprefix("eitbench-"),
             "verdict": less if row["high"] < 0 else more if row["low"] > 0 else NOTHING,
             "episodes": Cell(str(row["episodes"]), float(row["episodes"])), **levels,
-            "difference": Cell(difference, row["difference"], small=interval,
-                               picture=Markup(charts.cell(three, -wide, wide, mark=0.0))),
+            "difference": Cell(three, row["difference"]),
             f"{a} better": Cell(share, row["better"])})
     return Table.of(rows, label="Comparison", keep=list(rows[0]))
 
 
 def in_terminal(table: pd.DataFrame, a: str, b: str, score: str, width: int) -> str:
     """Return the comparison in lines of ``width`` characters, where the methods are A and B."""
-    short = table.assign(environment=table["environment"].str.removeprefix("eitbench-"))
-    whole = shown(short, "A", "B", score)
+    whole = shown(table, "A", "B", score)
     first = ("environment", "verdict", "difference", *whole.headings[3:5], "A better", "episodes")
     fitted = whole.fitted(width, first)
     return "\n\n".join([f"A: {a}\nB: {b}", fitted.markdown(),
                         *filter(None, [whole.left_out(fitted)])])
-
-
-def html(table: pd.DataFrame, a: str, b: str, score: str = "error") -> str:
-    """Return the comparison as a page that needs no other file."""
-    asked = comparable(score)
-    less, more = (b, a) if asked.better == "higher" else (a, b)
-    return template("compare.html.j2").render(
-        root="", a=a, b=b, score=asked, less=less, more=more, table=shown(table, a, b, score))

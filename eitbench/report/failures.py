@@ -1,4 +1,4 @@
-"""Episodes that a method did not finish, grouped by their error."""
+"""Records of a run: those that were asked for, and the episodes that a method did not finish."""
 
 from __future__ import annotations
 
@@ -35,6 +35,19 @@ class Failure(NamedTuple):
             "\n" + textwrap.indent(self.traceback.rstrip(), "  ") if self.traceback else "")
 
 
+def asked_of(records: Iterable[dict[str, Any]], jobs: Iterable[Job]) -> list[dict[str, Any]]:
+    """Return the records restricted to the episodes of these jobs."""
+    asked = {_key(job) for job in jobs}
+    found = []
+    for record in records:
+        place = record["environment"]["name"], record["method"]
+        episodes = [each for each in record["episodes"] if (*place, each["seed"]) in asked]
+        if episodes:
+            found.append(record | {"episodes": episodes,
+                                   "seeds": [each["seed"] for each in episodes]})
+    return found
+
+
 def failures(store: EpisodeStore, records: Iterable[dict[str, Any]]) -> list[Failure]:
     """Return the failures of records of a store, in their order."""
     found = []
@@ -55,13 +68,17 @@ def debug_command(failure: Failure, jobs: Iterable[Job]) -> str:
     first = failure.seeds[0]
     failed = (failure.record["environment"]["name"], failure.record["method"], first)
     for job in jobs:
-        if (job.environment.name, job.load().name, name_seed(job.seed)) == failed:
-            option = _OPTIONS[job.environment.track]
+        if _key(job) == failed:
             given = json.loads(job.environment.kwargs)
             changes = [f"--set={number}={as_typed(value)}"
                        for number, value in flat(given.get("world", {})).items()]
             estimator = ["--estimator", given["estimator"]] if "estimator" in given else []
-            return shlex.join(["eitbench", "run", "--env", job.environment.id, option, job.method,
-                               "--seeds", first, *changes, *estimator, "--isolate", "none",
-                               "--jobs", "1"])
+            return shlex.join(["eitbench", "run", "--env", job.environment.id,
+                               _OPTIONS[job.environment.track], job.method, "--seeds", first,
+                               *changes, *estimator, "--isolate", "none", "--jobs", "1"])
     return ""
+
+
+def _key(job: Job) -> tuple[str, str, str]:
+    """Environment, method and seed, as records name them."""
+    return job.environment.name, job.load().name, name_seed(job.seed)

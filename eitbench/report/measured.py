@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import io
 from collections.abc import Sequence
 from itertools import cycle
 from pathlib import Path
@@ -24,7 +22,7 @@ from eitbench.envs.rendering import draw_electrodes, draw_field
 from eitbench.measured.calibration import electrode_misfits
 from eitbench.measured.segmentation import ktc_score, require_round_tank, segment
 from eitbench.physics.rest import AtRest
-from eitbench.report.templates import template
+from eitbench.report.templates import data_uri, rendered
 
 if TYPE_CHECKING:
     from eitbench.bench.measured import MeasuredRun
@@ -49,8 +47,8 @@ def write_report(path: Path, env: MeasuredEnv, runs: Sequence[MeasuredRun],
     `eitbench.measured.segmentation`, the segmentations."""
     source = dict(env.measurements.source)
     calibration = env.calibration
-    page = template("measured.html.j2").render(
-        title=str(source.pop("file", "Measurements")), source=source,
+    page = rendered(
+        "measured.html.j2", root="", title=str(source.pop("file", "Measurements")), source=source,
         methods=[(run.method, run.withheld_rmse, run.mean_nis(env.task.warm_up)) for run in runs],
         warnings=env.quality_warnings(),
         facts=_facts(env), estimate=_estimate(env, runs[0]), first=runs[0].method,
@@ -59,7 +57,7 @@ def write_report(path: Path, env: MeasuredEnv, runs: Sequence[MeasuredRun],
         contacts=_figure(_contacts(env)), electrodes=_figure(_electrodes(runs[0])),
         at_rest=_is_at_rest(env),
         segmentation="" if truth is None else _figure(_segmentations(env, runs, truth)))
-    write_atomically(path, page.encode())
+    write_atomically(path, page)
 
 
 def _is_at_rest(env: MeasuredEnv) -> bool:
@@ -103,7 +101,7 @@ def _estimate(env: MeasuredEnv, run: MeasuredRun) -> str:
     after = np.flatnonzero(run.steps > min(env.task.warm_up, env.episode_steps - 1))
     rows = after[np.unique(np.linspace(0, len(after) - 1, N_PLOTTED_FRAMES).round().astype(int))]
     frames = [_image(_picture(env, run, int(row))) for row in rows]
-    return _data_uri(frames[0], "webp", save_all=True, append_images=frames[1:], loop=0,
+    return data_uri(frames[0], "webp", save_all=True, append_images=frames[1:], loop=0,
                      duration=125, quality=40, method=4)
 
 
@@ -259,16 +257,10 @@ def _panels(count: int, size: tuple[float, float]) -> tuple[Figure, Sequence[Axe
 
 def _figure(figure: Figure) -> str:
     """Draw a figure as a data URI."""
-    return _data_uri(_image(figure), "png")
+    return data_uri(_image(figure))
 
 
 def _image(figure: Figure) -> Image.Image:
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
-
-
-def _data_uri(image: Image.Image, kind: str, **options: Any) -> str:
-    content = io.BytesIO()
-    image.save(content, kind, **options)
-    return f"data:image/{kind};base64," + base64.b64encode(content.getvalue()).decode()

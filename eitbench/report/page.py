@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import io
 import json
 import warnings
 from collections.abc import Callable, Sequence
@@ -14,6 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from PIL import Image
 
 from eitbench._files import write_atomically
 from eitbench._foreign import cleaned
@@ -24,11 +23,11 @@ from eitbench.bench.tracks import Environment
 from eitbench.data.seeds import for_scores, parse_seeds
 from eitbench.envs.rendering import FIELD_MAP, colour_range, draw_field
 from eitbench.numerics.mesh import Mesh
-from eitbench.report import figures, tables
+from eitbench.report import tables
+from eitbench.report.boards import Board
 from eitbench.report.failures import failures
-from eitbench.report.model import Board, Row
-from eitbench.report.sweep import Sweep, sweep_figure, sweep_table
-from eitbench.report.templates import template
+from eitbench.report.sweep import Sweep
+from eitbench.report.templates import data_uri, rendered
 from eitbench.worlds.task import Task
 
 N_PICTURED, N_TIMES = 3, 4
@@ -37,42 +36,39 @@ N_PICTURED, N_TIMES = 3, 4
 
 def write_page(store: EpisodeStore, boards: Sequence[Board], sweeps: Sequence[Sweep] = ()) -> Path:
     """Write ``index.html``, which needs no other file and no network, and return its path."""
-    sections = [_section(store, board) for board in boards]
-    runs = [run for board in boards for row in board.rows if row.record
-            for run in row.record["runs"]]
-    html = template("page.html.j2").render(
-        root="", sections=sections, explanations=tables.explanations(s["table"] for s in sections),
-        sweeps=[sweep_table(sweep) for sweep in sweeps],
-        number=sweeps[0].number if sweeps else "",
-        sweep_chart=_data_uri(sweep_figure(sweeps)) if sweeps else "", colour_bar=_colour_bar(),
+    shown = [tables.run_table(board, drawn=True) for board in boards]
+    sections = [{
+        "title": board.title,
+        "about": tables.run_title(board).removeprefix(f"{board.title}, "),
+        "table": table, "axes": tables.Axes.of(board).drawn(),
+        "curves": tables.curve_chart(board), "snapshots": _snapshots(store, board),
+        "failures": [(failure.record["title"], seed_ranges(failure.seeds), failure.message,
+                      failure.traceback) for failure in failures(store, board.records)],
+    } for board, table in zip(boards, shown, strict=True)]
+    runs = [run for board in boards for record in board.records for run in record["runs"]]
+    html = rendered(
+        "page.html.j2", root="", sections=sections, explanations=tables.explanations(shown),
+        sweeps=[(sweep, sweep.chart()) for sweep in sweeps],
+        colour_bar=_bare(3.0, 0.12, lambda axes: axes.imshow(np.linspace(0, 1, 256)[None],
+                                                             cmap=FIELD_MAP, aspect="auto")),
         runs=[group[0] for group in alike(runs, "command")])
     path = store.folder / "index.html"
-    write_atomically(path, html.encode())
+    write_atomically(path, html)
     return path
 
 
-def _section(store: EpisodeStore, board: Board) -> dict[str, Any]:
-    """Return the contents of the section of one environment."""
-    records = [row.record for row in board.rows if row.record]
-    return {
-        "title": board.title, "about": tables.run_title(board).removeprefix(f"{board.title}, "),
-        "table": tables.run_table(board, drawn=True), "axes": tables.Axes.of(board).drawn(),
-        "intervals": figures.error_chart(board), "curves": figures.curve_chart(board),
-        "snapshots": _snapshots(store, board.rows),
-        "failures": [(failure.record["title"], seed_ranges(failure.seeds), failure.message,
-                      failure.traceback) for failure in failures(store, records)]}
-
-
-def _snapshots(store: EpisodeStore, rows: list[Row]) -> dict[str, Any] | None:
+def _snapshots(store: EpisodeStore, board: Board) -> dict[str, Any] | None:
     """Return truth and estimates of the best methods but floors in one episode, as PNG data; None
     if their estimates are missing or do not fit the states."""
-    chosen = [row for row in rows if row.episodes() and "floor" not in row.badges][:N_PICTURED]
-    seeds = [{episode["seed"] for episode in row.episodes()} for row in chosen]
-    shared = sorted(set.intersection(*seeds)) if seeds else []
+    chosen = [(row, {episode["seed"] for episode in row.record["episodes"]
+                     if episode["status"] == "ok"})
+              for row in board.rows if row.record and "floor" not in row.badges]
+    chosen = [(row, seeds) for row, seeds in chosen if seeds][:N_PICTURED]
+    shared = sorted(set.intersection(*(seeds for _, seeds in chosen))) if chosen else []
     if not shared:
         return None
     seed = shared[0]
-    records = [row.record for row in chosen if row.record]
+    records = [row.record for row, _ in chosen if row.record]
     try:
         fields = [store.fields(record | {"seed": seed})["mean"] for record in records]
     except FileNotFoundError:                                      # only the records were kept
@@ -91,14 +87,13 @@ def _snapshots(store: EpisodeStore, rows: list[Row]) -> dict[str, Any] | None:
         return None
     truth = env.truth()
     times = task.warm_up + np.linspace(0.12, 0.88, N_TIMES) * (task.n_steps - task.warm_up)
-    lines = []
-    for t in np.maximum(times.astype(int), task.warm_up + 1):
-        pictures = [_picture(task, env.truth_mesh(), truth[t - 1])]
-        pictures += [_picture(task, task.mesh, field[t - 1]) for field in fields]
-        lines.append((f"t = {1e3 * t * task.transport.time_step:.0f} ms", pictures))
+    rows = [(f"t = {1e3 * t * task.transport.time_step:.0f} ms",
+             [_picture(task, env.truth_mesh(), truth[t - 1]),
+              *(_picture(task, task.mesh, field[t - 1]) for field in fields)])
+            for t in np.unique(np.maximum(times.astype(int), task.warm_up + 1))]
     low, high = colour_range(task)
-    return {"seed": seed, "columns": ["Truth", *(row.cells["title"] for row in chosen)],
-            "rows": lines, "low": f"{low:g}", "high": f"{high:g}", "size": _size(task),
+    return {"seed": seed, "columns": ["Truth", *(row.cells["title"] for row, _ in chosen)],
+            "rows": rows, "low": f"{low:g}", "high": f"{high:g}", "size": _size(task),
             "tank": _is_tank(task)}
 
 
@@ -125,22 +120,12 @@ def _picture(task: Task, mesh: Mesh, values: np.ndarray) -> str:
                  lambda axes: draw_field(axes, mesh, values, *colour_range(task)))
 
 
-def _colour_bar() -> str:
-    bar = np.linspace(0, 1, 256)[None]
-    return _bare(3.0, 0.12, lambda axes: axes.imshow(bar, cmap=FIELD_MAP, aspect="auto"))
-
-
 def _bare(width: float, height: float, draw: Callable[[Axes], object]) -> str:
-    """Draw on axes of this size in inches without frame."""
-    figure = Figure(figsize=(width, height), dpi=90)
-    axes = figure.add_axes((0, 0, 1, 1))
+    """Draw on axes of this size in inches without frame and background."""
+    figure = Figure(figsize=(width, height), dpi=90, facecolor="none")
+    axes = figure.add_axes((0, 0, 1, 1), facecolor="none")
     draw(axes)
     axes.axis("off")
-    return _data_uri(figure, transparent=True)
-
-
-def _data_uri(figure: Figure, *, transparent: bool = False) -> str:
-    content = io.BytesIO()
-    FigureCanvasAgg(figure)
-    figure.savefig(content, format="png", transparent=transparent)
-    return "data:image/png;base64," + base64.b64encode(content.getvalue()).decode()
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return data_uri(Image.fromarray(np.asarray(canvas.buffer_rgba())))

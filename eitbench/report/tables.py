@@ -5,37 +5,46 @@ from __future__ import annotations
 
 import math
 import re
-from collections import Counter, defaultdict
+import shutil
+from collections import Counter
 from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
+from urllib.parse import quote
 
 import numpy as np
+import pandas as pd
 from markupsafe import Markup
 
+from eitbench._foreign import as_markdown
 from eitbench.bench.table import NOTHING, Cell, Table, mean_cell, number_cell
 from eitbench.bench.table import Row as TableRow
 from eitbench.bench.text import number, scores_by_seed, with_interval
 from eitbench.report import charts
-from eitbench.report.boards import errors_and_gains, errors_of
-from eitbench.report.model import (
+from eitbench.report.boards import (
     COSTS,
     Board,
     Row,
     columns,
+    errors_and_gains,
+    errors_of,
     floor_of,
     headings,
     meanings,
-    method_address,
 )
 
 COMPACT = ("seconds_per_step", "peak_memory")
 """Numbers beside ranks and intervals in the index; the page of an environment has all."""
 WORST_GAIN = -1.0
 """Lower end of the drawn axis of gains: a method twice as bad as the floor."""
-DRAWN = {"error": ("ẽ_c", True), "gain": ("gain", False)}
-"""Score with an interval -> heading, and whether its axis is logarithmic."""
-_SEED = re.compile(r"_seed\d+$")
-_OF_TITLE = re.compile(r" trained with seed \d+$")
+DRAWN = {"error": "ẽ_c", "gain": "gain"}
+"""Score with an interval -> heading."""
+COLUMN_PRIORITY = ("method", "ẽ_c", "withheld RMSE", "skill", "seeds", "NIS/m", "ms/step",
+                   "contrast", "ẽ_v")
+"""Where a line is too short the last of these are left out, and all other columns before them."""
+MAX_LABEL_CHARS = 30
+
+
+# -- trainings -------------------------------------------------------------------------------------
 
 
 class Line(NamedTuple):
@@ -48,7 +57,7 @@ class Line(NamedTuple):
 
 def agent(method: str) -> str:
     """Return the name of an agent without its training seed."""
-    return _SEED.sub("", method)
+    return re.sub(r"_seed\d+$", "", method)
 
 
 def lines(board: Board) -> list[Line]:
@@ -57,15 +66,18 @@ def lines(board: Board) -> list[Line]:
     The mean is over the ranked trainings, of which there must be two; its interval is over the
     episodes, in each of which the scores of the trainings are averaged.
     """
-    trainings: dict[tuple[str, bool], list[Row]] = defaultdict(list)
+    groups: dict[tuple[str, bool], list[Row]] = {}
     for row in board.rows:
-        if _SEED.search(row.cells["method"]) and not row.unranked:
-            trainings[agent(row.cells["method"]), row.cells["official"]].append(row)
-    groups = [Line(_mean(board, rows), rows) for rows in trainings.values()
-              if sum(row.competes for row in rows) > 1]
-    grouped = {row.label for group in groups for row in group.parts}
-    single = [Line(row, []) for row in board.rows if row.label not in grouped]
-    return sorted([*single, *groups], key=lambda line: _place(line.row)) if groups else single
+        method = row.cells["method"]
+        if agent(method) != method and not row.unranked:
+            groups.setdefault((agent(method), row.cells["official"]), []).append(row)
+    together = [Line(_mean(board, rows), rows) for rows in groups.values()
+                if sum(row.competes for row in rows) > 1]
+    if not together:
+        return [Line(row, []) for row in board.rows]
+    grouped = {row.label for line in together for row in line.parts}
+    together += [Line(row, []) for row in board.rows if row.label not in grouped]
+    return sorted(together, key=lambda line: _place(line.row))
 
 
 def _place(row: Row) -> tuple[bool, float]:
@@ -76,53 +88,39 @@ def _place(row: Row) -> tuple[bool, float]:
 def _mean(board: Board, rows: list[Row]) -> Row:
     """Return the line of an agent; ``last_rank`` is the worst of its trainings."""
     ranked = [row for row in rows if row.competes]
-    unfinished = len(rows) - len(ranked)
-    first = ranked[0]
-    ranks = [row.cells["rank"] for row in ranked]
-    versions = {row.cells["version"] for row in ranked}
-    means = {name: _average([row.cells[name] for row in ranked])
-             for name in ("error", "gain", *headings())}
-    ends = dict.fromkeys(("error_low", "error_high", "gain_low", "gain_high"))
-    return first._replace(record=None, cells=first.cells | means | ends | {
-        **_over_episodes(board, ranked),
+    first, unfinished = ranked[0], len(rows) - len(ranked)
+    frame = pd.DataFrame([row.cells for row in ranked])
+    means = frame[[*DRAWN, *headings()]].astype(float).mean()
+    cells = first.cells | means.astype(object).where(means.notna(), None).to_dict() | dict.fromkeys(
+        f"{name}_{end}" for name in DRAWN for end in ("low", "high"))
+    played = pd.DataFrame([errors_of(row.record) for row in ranked]).dropna(axis=1)
+    errors = {str(seed): float(mean) for seed, mean in played.mean().items()}
+    if errors:
+        cells |= errors_and_gains(errors, errors_of(floor_of(board.records)))
+    return first._replace(record=None, cells=cells | {
         "method": agent(first.cells["method"]),
         "note": f"{unfinished} of {len(rows)} unfinished" if unfinished else "",
-        "title": _OF_TITLE.sub("", first.cells["title"]),
-        "version": versions.pop() if len(versions) == 1 else "",
-        "rank": min(ranks), "last_rank": max(ranks)})
+        "title": re.sub(r" trained with seed \d+$", "", first.cells["title"]),
+        "version": first.cells["version"] if frame["version"].nunique() == 1 else "",
+        "rank": frame["rank"].min(), "last_rank": frame["rank"].max()})
 
 
-def _average(values: list[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return float(np.mean(known)) if known else None
-
-
-def _over_episodes(board: Board, rows: list[Row]) -> dict[str, Any]:
-    """Return error and gain with their intervals; nothing without shared episodes."""
-    played = [errors_of(row.record) for row in rows]
-    errors = {seed: float(np.mean([own[seed] for own in played]))
-              for seed in played[0] if all(seed in own for own in played)}
-    if not errors:
-        return {}
-    return errors_and_gains(errors, errors_of(floor_of(_records(board))))
-
-
-def _records(board: Board) -> list[dict[str, Any]]:
-    return [row.record for row in board.rows if row.record]
+# -- cells -----------------------------------------------------------------------------------------
 
 
 class Axes(NamedTuple):
-    """Drawn axes of a board's intervals: one for each column, with a line at the floor."""
+    """Drawn axes of intervals: one for each column, with a line at the floor."""
 
-    ends: dict[str, tuple[float, float]]
+    axes: dict[str, charts.Axis]
     marks: dict[str, float | None]
 
     @classmethod
     def of(cls, board: Board) -> Axes:
-        floor = floor_of(_records(board))
+        """Return the axes that the rows of a board share."""
+        floor = floor_of(board.records)
         zero = next((row.cells["error"] for row in board.rows
                      if floor and row.record is floor), None)
-        return cls({name: _ends(board, name) for name in DRAWN}, {"error": zero, "gain": 0.0})
+        return cls({name: _axis(board.rows, name) for name in DRAWN}, {"error": zero, "gain": 0.0})
 
     def cell(self, row: Row, name: str, parts: Sequence[Row] = ()) -> Cell:
         """Return a score with its interval, drawn and written, and the range of the trainings."""
@@ -134,38 +132,83 @@ class Axes(NamedTuple):
         if each:
             spread = with_interval(value, each[0], each[-1]).partition(" ")[2].strip("()")
             interval += f" each {spread or number(value)}"
-        drawn = charts.cell((value, low, high), *self.ends[name], log=DRAWN[name][1],
-                            mark=self.marks[name], each=each)
-        return Cell(text, value, Markup(drawn), small=interval.strip())
+        drawn = charts.cell((value, low, high), self.axes[name], mark=self.marks[name], each=each)
+        return Cell(text, value, drawn, small=interval.strip())
+
+    def cells(self, row: Row, parts: Sequence[Row] = ()) -> dict[str, Cell]:
+        """Return heading -> cell of each score with an interval."""
+        return {heading: self.cell(row, name, parts) for name, heading in DRAWN.items()}
 
     def drawn(self) -> dict[str, Markup]:
         """Return heading -> the axis of its column, as SVG."""
-        return {heading: Markup(charts.cell_axis(*self.ends[name], log=log, mark=self.marks[name]))
-                for name, (heading, log) in DRAWN.items()}
+        return {heading: charts.cell_axis(self.axes[name], mark=self.marks[name])
+                for name, heading in DRAWN.items()}
 
 
-def _ends(board: Board, name: str) -> tuple[float, float]:
-    """Return the ends of the axis that shows all intervals of the board."""
-    ends = [end for row in board.rows for end in row.three(name) if math.isfinite(end)]
+def _axis(rows: Iterable[Row], name: str) -> charts.Axis:
+    """Return the axis that holds all intervals of a column: of gains linear, cut at
+    `WORST_GAIN`, else logarithmic."""
+    ends = [end for row in rows for end in row.three(name) if math.isfinite(end)]
     if name == "gain":
-        return max(min(ends, default=0.0), WORST_GAIN), 1.0
-    positive = [end for end in ends if end > 0] or [1.0]
-    return min(positive), max(positive)
+        low, high = max(min([0.0, *ends]), WORST_GAIN), 1.0
+    else:
+        positive = [end for end in ends if end > 0] or [1.0]
+        low, high = min(positive), max(positive)
+    return charts.Axis(low, high, 4, charts.CELL - 4, log=name != "gain")
+
+
+def _numbers(row: Row, names: Iterable[str]) -> dict[str, Cell]:
+    known = columns()
+    return {known[name][0]: number_cell(row.cells[name]) for name in names}
+
+
+def _rank(row: Row, shared: Counter[int | None]) -> Cell:
+    rank = row.cells["rank"]
+    if rank is None:
+        return Cell(NOTHING)
+    last = row.cells.get("last_rank", rank)
+    if last > rank:
+        return Cell(f"{rank}–{last}", float(rank))
+    return Cell(f"{rank}", float(rank), small="shared" if shared[rank] > 1 else "")
+
+
+def method_cell(row: Row, root: str, parts: Sequence[Row] = (), more: Iterable[str] = ()) -> Cell:
+    """Return title, name and badges of a method, linked to its page or with its trainings; ``more``
+    are further badges."""
+    title = row.cells["title"]
+    badges = (*row.badges, *more)
+    if parts:
+        return Cell(title, title.casefold(), small=f"mean of {len(parts)} trainings", badges=badges)
+    return Cell(title, title.casefold(), small=row.label, badges=badges,
+                link=f"{root}methods/{quote(row.cells['method'])}.html")
+
+
+def by_author(row: Row) -> list[str]:
+    """Return the badge of a self-reported row."""
+    return [] if row.cells["official"] else ["self-reported"]
+
+
+def flags(row: Row) -> str:
+    """Return the words by which the filters of a page select."""
+    return " ".join([*by_author(row), *["unranked"] * row.unranked])
+
+
+# -- tables ----------------------------------------------------------------------------------------
 
 
 def page_table(board: Board, root: str, *, compact: bool = False) -> Table:
     """Return a board for a page; ``root`` leads from the page to the site's folder."""
     axes = Axes.of(board)
     together = lines(board)
-    beaten = _outperformed(together)
+    outperformed = _outperformed(together)
+
+    def cells(row: Row, parts: Sequence[Row], shared: Counter[int | None]) -> dict[str, Cell]:
+        more = [*outperformed.get(row.label, ()), *by_author(row)]
+        return {"rank": _rank(row, shared), "method": method_cell(row, root, parts, more),
+                **axes.cells(row, parts), **_numbers(row, COMPACT if compact else headings())}
+
     of_lines = Counter(line.row.cells["rank"] for line in together)
     of_rows = Counter(row.cells["rank"] for row in board.rows)
-
-    def cells(row: Row, parts: Sequence[Row], shared: Counter[Any]) -> dict[str, Cell]:
-        return {"rank": _rank(row, shared), "method": method_cell(row, root, parts, beaten),
-                **{heading: axes.cell(row, name, parts) for name, (heading, _) in DRAWN.items()},
-                **_numbers(row, COMPACT if compact else headings())}
-
     made = Table.of((cells(line.row, line.parts, of_lines) for line in together),
                     label=board.title, keep=["rank"], flags=[flags(line.row) for line in together])
 
@@ -177,14 +220,26 @@ def page_table(board: Board, root: str, *, compact: bool = False) -> Table:
                                for row, line in zip(made.rows, together, strict=True)])
 
 
+def _outperformed(together: list[Line]) -> dict[str, list[str]]:
+    """Return label of a reference -> a note that competing methods have a smaller error."""
+    found = {}
+    before: list[str] = []
+    for row, _ in together:
+        if row.competes:
+            before.append(row.cells["title"])
+        elif before and "reference" in row.badges:
+            better = before[0] if len(before) == 1 else f"{len(before)} others"
+            found[row.label] = [f"no bound: {better} better here"]
+    return found
+
+
 def markdown_table(board: Board) -> Table:
     """Return a board as text: one line for each record."""
     axes = Axes.of(board)
     shared = Counter(row.cells["rank"] for row in board.rows)
     return Table.of([{
-        "rank": _rank(row, shared), "method": method_cell(row, ""),
-        **{heading: axes.cell(row, name) for name, (heading, _) in DRAWN.items()},
-        "by": "official" if row.cells["official"] else "self-reported",
+        "rank": _rank(row, shared), "method": method_cell(row, ""), **axes.cells(row),
+        "by": "".join(by_author(row)) or "official",
         **_numbers(row, headings())} for row in board.rows], keep=["rank"])
 
 
@@ -193,9 +248,12 @@ def run_table(board: Board, *, title: str = "title", drawn: bool = False) -> Tab
 
     ``title`` is the field that names a method. Intervals are ``drawn``, or ± half the 95 % interval
     of the mean error is written. Measurements have the withheld RMSE in place of ẽ_c. Seeds have a
-    column if they differ.
+    column if they differ. Policies have the paired difference of their error to that of the best
+    one that is not privileged.
     """
     axes = Axes.of(board)
+    best = next((row for row in board.rows if row.complete and "privileged" not in row.badges),
+                None) if board.of_class == "injection" and len(board.rows) > 1 else None
     seeds = run_seeds(board)
     others = [name for name in headings(measured=True) if name not in COSTS]
     is_measured = board.of_class == "measured"
@@ -203,22 +261,29 @@ def run_table(board: Board, *, title: str = "title", drawn: bool = False) -> Tab
         others.remove("prediction_error")
     rows = []
     for row, played in zip(board.rows, seeds, strict=True):
-        cells: dict[str, Cell | str] = {"method": row.cells[title]}
+        privileged = tuple(word for word in row.badges if word == "privileged")
+        cells: dict[str, Cell | str] = {
+            "method": Cell(row.cells[title], row.cells[title], badges=privileged)}
         if len(set(seeds)) > 1:
             cells["seeds"] = played
         if is_measured:
             residuals = scores_by_seed(row.record, "prediction_error") if row.record else {}
-            cells[columns(measured=True)["prediction_error"][0]] = mean_cell(residuals.values())
+            cells[columns()["prediction_error"][0]] = mean_cell(residuals.values())
         elif drawn:
-            cells |= {heading: axes.cell(row, name) for name, (heading, _) in DRAWN.items()}
+            cells |= axes.cells(row)
         else:
             cells["ẽ_c"] = mean_cell(errors_of(row.record).values())
+        if best:
+            own, other = errors_of(row.record), errors_of(best.record)
+            cells[f"worse than {best.cells['method']} by"] = Cell(NOTHING) if row is best else (
+                mean_cell(own[seed] - other[seed] for seed in own.keys() & other.keys()))
         cells |= _numbers(row, others)
         if row.cells["skill"] is None and row.cells.get("contrast_error") is not None:
             without = 1.0 - row.cells["contrast_error"]
             cells["skill"] = Cell(f"{number(without)}†", without)
         rows.append(cells)
-    return Table.of(rows, label=board.title, keep=["ẽ_c", "skill"])
+    keep = ["ẽ_c"] if board.of_class == "injection" else ["ẽ_c", "skill"]
+    return Table.of(rows, label=board.title, keep=keep)
 
 
 def run_seeds(board: Board) -> list[str]:
@@ -233,59 +298,96 @@ def run_title(board: Board) -> str:
     return ", ".join([board.title, board.of_class, *(seeds if len(seeds) == 1 else ())])
 
 
-def _numbers(row: Row, names: Iterable[str]) -> dict[str, Cell]:
-    known = columns(measured=True)
-    return {known[name][0]: number_cell(row.cells[name]) for name in names}
-
-
-def _outperformed(together: list[Line]) -> dict[str, str]:
-    """Return label of a reference -> a note that competing methods have a smaller error."""
-    found = {}
-    before: list[str] = []
-    for row, _ in together:
-        if row.competes:
-            before.append(row.cells["title"])
-        elif before and "reference" in row.cells["note"]:
-            better = before[0] if len(before) == 1 else f"{len(before)} others"
-            found[row.label] = f"no bound: {better} better here"
-    return found
-
-
-def _rank(row: Row, shared: Counter[Any]) -> Cell:
-    rank = row.cells["rank"]
-    if rank is None:
-        return Cell(NOTHING)
-    last = row.cells.get("last_rank", rank)
-    if last > rank:
-        return Cell(f"{rank}–{last}", float(rank))
-    return Cell(f"{rank}", float(rank), small="shared" if shared[rank] > 1 else "")
-
-
-def method_cell(row: Row, root: str, parts: Sequence[Row] = (),
-                beaten: dict[str, str] | None = None) -> Cell:
-    """Return title, name and badges of a method, linked to its page or with its trainings.
-
-    ``beaten`` are further badges by label; with them self-reported rows are marked too.
-    """
-    title = row.cells["title"]
-    badges = list(row.badges)
-    if beaten is not None:
-        badges += [*filter(None, [beaten.get(row.label)]),
-                   *["self-reported"] * (not row.cells["official"])]
-    if parts:
-        return Cell(title, title.casefold(), small=f"mean of {len(parts)} trainings",
-                    badges=tuple(badges))
-    return Cell(title, title.casefold(), small=row.label, badges=tuple(badges),
-                link=root + method_address(row.cells["method"]))
-
-
-def flags(row: Row) -> str:
-    """Return the words by which the filters of a page select."""
-    holds = {"self-reported": not row.cells["official"], "unranked": row.unranked}
-    return " ".join(name for name, is_so in holds.items() if is_so)
-
-
 def explanations(tables: Iterable[Table]) -> dict[str, str]:
     """Return heading -> explanation of the headings of these tables."""
     shown = {heading for each in tables for heading in each.headings}
     return {heading: text for heading, text in meanings(measured=True).items() if heading in shown}
+
+
+# -- text ------------------------------------------------------------------------------------------
+
+
+def terminal_width() -> int:
+    """Return the columns of the terminal; 80 without one."""
+    return shutil.get_terminal_size().columns
+
+
+def terminal_tables(boards: Sequence[Board], characters: int) -> str:
+    """Return a table of each board, at most ``characters`` wide, and notes."""
+    parts = []
+    left_out: dict[str, None] = {}
+    for board in boards:
+        table = run_table(board, title="method")
+        table = table._replace(rows=[row._replace(cells=[
+            cell._replace(text=charts.shortened(cell.text, MAX_LABEL_CHARS)) for cell in row.cells])
+            for row in table.rows])
+        worse = [heading for heading in table.headings if heading.startswith("worse than ")]
+        order = [*COLUMN_PRIORITY[:2], *worse, *COLUMN_PRIORITY[2:]]
+        shown = table.fitted(characters, order)
+        left_out |= dict.fromkeys(heading for heading in table.headings
+                                  if heading not in shown.headings)
+        parts.append(f"{run_title(board)}\n\n{shown.markdown()}")
+    if any("†" in part for part in parts):
+        parts.append("† 1 − contrast, since the references have no record of these episodes: 0 is\n"
+                     "the homogeneous estimate of the whole record, 1 no error at all")
+    if left_out:
+        parts.append(f"no room for {', '.join(left_out)}")
+    return "\n\n".join(parts)
+
+
+def markdown(boards: Sequence[Board]) -> str:
+    """Return the tables of all boards as Markdown."""
+    return "\n\n".join(f"## {as_markdown(run_title(board))}\n\n{run_table(board).markdown()}"
+                       for board in boards) + "\n"
+
+
+# -- charts ----------------------------------------------------------------------------------------
+
+MAX_CURVES, N_STRONG = 7, 5
+"""Curves that can be told apart, and the number drawn strongly where there are more."""
+
+
+def cost_chart(board: Board) -> charts.Chart | None:
+    """Draw error against computing time per step; the note names the methods on the front. None
+    without data."""
+    points = [charts.Point(row.cells["title"], row.colour, row.cells["seconds_per_step"],
+                           row.cells["error"], row.competes)
+              for row, _ in lines(board)
+              if row.cells["error"] is not None and row.cells["seconds_per_step"]]
+    if not points:
+        return None
+    best = ", ".join(point.name for point in charts.optimal(points))
+    svg = charts.front(points, "time per step on one core, ms", "relative error ẽ_c")
+    return charts.Chart(svg, charts.legend(points), f": {best}" if best else "")
+
+
+def curve_chart(board: Board) -> charts.Chart | None:
+    """Draw the error of each scored step, the mean over the episodes. None without data."""
+    found = []
+    for row in board.rows:
+        errors = [episode["step_errors"] for episode in (row.record or {}).get("episodes", ())
+                  if episode["status"] == "ok"]
+        if errors and len(errors[0]) > 1:
+            found.append((row, np.mean(errors, axis=0)))
+    if not found:
+        return None
+    strong = _strong([row for row, _ in found])
+    series = [charts.Series(row.cells["title"], row.colour, errors, faint=row not in strong)
+              for row, errors in found]
+    steps = np.arange(1, max(len(each.values) for each in series) + 1)
+    svg = charts.lines(steps, series, "scored state", "relative error")
+    return charts.Chart(svg, charts.legend(each for each in series if not each.faint),
+                        " Thin: all other methods." if len(strong) < len(found) else "")
+
+
+def _strong(rows: list[Row]) -> list[Row]:
+    """Return the rows with strong curves: all, or of many two floors or references and the best
+    others, trainings of one agent once."""
+    if len(rows) <= MAX_CURVES:
+        return rows
+    chosen = [row for row in rows if row.unranked][:2]
+    kinds: dict[str, Row] = {}
+    for row in rows:
+        if not row.unranked:
+            kinds.setdefault(agent(row.cells["method"]), row)
+    return chosen + list(kinds.values())[:N_STRONG - len(chosen)]

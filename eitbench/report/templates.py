@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import base64
+import io
 import re
+from collections.abc import Mapping
 from functools import lru_cache
 from typing import Any
 from urllib.parse import quote
@@ -10,6 +13,7 @@ from urllib.parse import quote
 import jinja2
 from markdown_it import MarkdownIt
 from markupsafe import Markup, escape
+from PIL import Image
 
 from eitbench._foreign import cleaned
 
@@ -21,9 +25,9 @@ ICON = f"data:image/svg+xml,{quote(_DRAWING, safe='')}"
 """Icon of the browser's tab: a pipe with a slug."""
 
 
-def template(name: str) -> jinja2.Template:
-    """Return one of the templates in this folder."""
-    return _environment().get_template(name)
+def rendered(name: str, /, **contents: Any) -> bytes:
+    """Return the page that one of the templates in this folder makes of its contents."""
+    return _environment().get_template(name).render(**contents).encode()
 
 
 @lru_cache(maxsize=1)
@@ -60,3 +64,15 @@ def markdown(text: str) -> Markup:
     html = reader.renderer.render(tokens, reader.options, {})
     begin = '<div class="card" tabindex="0" role="region" aria-label="table"><table>'
     return Markup(html.replace("<table>", begin).replace("</table>", "</table></div>"))
+
+
+def markdown_list(texts: Mapping[str, str]) -> str:
+    """Return a list of terms and their explanations as Markdown."""
+    return "\n".join(f"- **{name}**: {text}" for name, text in texts.items())
+
+
+def data_uri(image: Image.Image, kind: str = "png", **options: Any) -> str:
+    """Return a picture as an address that holds it."""
+    content = io.BytesIO()
+    image.save(content, kind, **options)
+    return f"data:image/{kind};base64," + base64.b64encode(content.getvalue()).decode()

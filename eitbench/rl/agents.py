@@ -1,4 +1,4 @@
-"""Trained agents that play as policies do, from the folder that `eitbench train` leaves."""
+"""Trained agents as policies, from the folder that `eitbench train` writes."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from eitbench.estimation.onboard.rules import Rules
 
 
 class Agent:
-    """A policy that does what a model of stable-baselines3 thinks best; subclasses have the model.
+    """A policy with the deterministic actions of a stable-baselines3 model, which subclasses set.
 
-    Whatever filter is inside the environment, the agent is shown the one of reduced order with
-    which it was trained, and so injects the same.
+    The agent observes the reduced filter with which it was trained, whichever filter the
+    environment has, so its injections do not depend on that filter.
     """
 
     model: ClassVar[Any]
@@ -29,11 +29,10 @@ class Agent:
 
     @classmethod
     def suits(cls, rules: Rules) -> bool:
-        """Whether arrays have the shapes that the model was trained on, whatever they mean."""
-        spaces = InjectionCore(rules, "reduced").space().items()
-        seen = scaled(rules, {name: np.zeros(space.shape or ()) for name, space in spaces})
-        return bool(cls.model.action_space == rules.action_space
-                    and cls.model.observation_space.shape == seen.shape)
+        """Return whether spaces have the shapes with which the model was trained."""
+        core = InjectionCore(rules, "reduced", "scaled")
+        return bool(cls.model.action_space == core.action_space
+                    and cls.model.observation_space.shape == core.observation_space.shape)
 
     def __init__(self, rules: Rules, random: np.random.Generator) -> None:
         self.rules = rules
@@ -61,41 +60,36 @@ class Agent:
 
 
 def load_agent(path: Path, content: bytes) -> tuple[str, str, type[Agent], dict[str, Any]]:
-    """Name, title, policy and parameters of the model.zip at ``path`` with this ``content``.
+    """Return name, title, policy and parameters of the model.zip at ``path`` with this ``content``.
 
-    The name is ALGO_seedK for our own agents, and bears a mark of the configuration,
-    ALGO_MARK_seedK, for all others. A model is unpickled, so it is code: the folder must hold its
-    ``sha256``, and a file that differs is not opened. ``ValueError`` if it differs, or if
-    ``config.json`` or ``sha256`` is missing beside it.
+    The name is ALGO_seedK for built-in agents, and ALGO_HASH_seedK, with a hash of the
+    configuration, for all others. Loading a model executes code, so the folder must hold its
+    ``sha256``, and a file with another digest is not loaded. ``ValueError`` if it differs, or if
+    ``config.json`` or ``sha256`` is missing.
     """
     try:
         asked = json.loads((path.parent / "config.json").read_text())
         expected = (path.parent / "sha256").read_text().split()[0]
     except (OSError, ValueError, IndexError) as error:
-        raise ValueError(f"policy {path} must lie beside the config.json and sha256 that "
-                         f"`eitbench train` leaves: {error}") from None
+        raise ValueError(f"policy {path} must be in a folder with the config.json and sha256 that "
+                         f"`eitbench train` writes: {error}") from None
     found = hashlib.sha256(content).hexdigest()
     if found != expected:
-        raise ValueError(f"policy {path} must have the sha256 that lies beside it, {expected}; "
-                         f"it has {found}")
-    from eitbench.rl.training import algorithm_of
-    algo = asked["algo"]
-    seed = asked["seed"]
-    model = algorithm_of(algo).load(io.BytesIO(content), device="cpu")
+        raise ValueError(f"policy {path} must have the sha256 of its folder, {expected}, got "
+                         f"{found}")
+    from eitbench.rl.training import ALGORITHMS
+    algo, seed = asked["algo"], asked["seed"]
+    model = ALGORITHMS[algo].load(io.BytesIO(content), device="cpu")
     policy = type("Policy", (Agent,), {"model": model, "masked": algo.startswith("maskable")})
-    mark = "" if _is_shipped(asked, found) else f"_{_mark(asked)}"
+    built_in = (baseline_folder() / "checkpoints" / asked["env"].replace("/", "-") / algo
+                / f"seed{seed}" / "sha256")             # a copy elsewhere is built-in too
+    is_built_in = built_in.is_file() and built_in.read_text().split()[:1] == [found]
+    mark = "" if is_built_in else f"_{configuration_hash(asked)}"
     parameters = {"env": asked["env"], **asked["config"]}
     return f"{algo}{mark}_seed{seed}", f"{algo} trained with seed {seed}", policy, parameters
 
 
-def _is_shipped(asked: dict[str, Any], sha256: str) -> bool:
-    """Whether it is one of our own agents, wherever its copy lies: a guest is given one."""
-    ours = (baseline_folder() / "checkpoints" / asked["env"].replace("/", "-") / asked["algo"]
-            / f"seed{asked['seed']}" / "sha256")
-    return ours.is_file() and ours.read_text().split()[:1] == [sha256]
-
-
-def _mark(asked: dict[str, Any]) -> str:
-    """Six digits for what was asked of the training but its seed: configurations stay apart."""
+def configuration_hash(asked: dict[str, Any]) -> str:
+    """Return six digits that identify the arguments of a training but its seed."""
     rest = {name: value for name, value in asked.items() if name != "seed"}
     return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()[:6]

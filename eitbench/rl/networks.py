@@ -1,7 +1,7 @@
-"""Networks for choosing electrode pairs: an electrode's worth is shared by all its pairs.
+"""Policy networks over electrode pairs, whose logits share one term for each electrode.
 
-A plain network has to learn 120 times that an electrode is dead; here a pair's logit is the sum of
-what its two electrodes are worth as source and as sink, and of a part of its own.
+A plain network would have to learn for each of an electrode's 15 pairs that it is dead; here the
+logit of a pair is the sum of a term of its source, a term of its sink, and a term of the pair.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The vectorised injection environments as stable-baselines3 wants them (extra ``rl``)."""
+"""Injection environments as a `VecEnv` of stable-baselines3."""
 
 from __future__ import annotations
 
@@ -19,12 +19,11 @@ class InjectionVecEnv(VecEnv):
     ----------
     envs : InjectionVectorEnv
     reward_scale : float
-        Rewards are multiplied by it, which changes no optimum: they are of the order of 0.01 in
-        themselves.
+        Factor of the rewards, which are of the order of 0.01.
     reference : (episodes, steps), optional
-        What somebody else earned in each training episode: rewards are counted from that. It
-        changes no optimum either, since the agent has no hand in it, and most of what makes one
-        episode harder than another drops out.
+        Rewards of another policy in each training episode, which are subtracted. Like the factor,
+        they do not depend on the actions, and change no optimum; they reduce the variance between
+        episodes.
     """
 
     def __init__(self, envs: InjectionVectorEnv, *, reward_scale: float = 1.0,
@@ -35,20 +34,15 @@ class InjectionVecEnv(VecEnv):
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
 
     def reset(self) -> Any:
-        """Begin training episodes; after ``seed(s)`` they are drawn as s determines."""
-        first = self._seeds[0]
-        seeds = None
-        if first is not None:
-            many = self.envs.pool.size
-            seeds = np.random.default_rng(first).choice(
-                many, size=self.num_envs, replace=self.num_envs > many).tolist()
+        """Begin training episodes, drawn with the seed of ``seed(s)`` if it was called."""
+        seeds: Any = None
+        if self._seeds[0] is not None:
+            size = self.envs.pool.size
+            seeds = np.random.default_rng(self._seeds[0]).choice(
+                size, size=self.num_envs, replace=self.num_envs > size).tolist()
         self._reset_seeds()
-        return self._begin(seeds)
-
-    def _begin(self, seeds: list[int] | None) -> Any:
-        observation = self.envs.reset(seed=seeds)[0]  # type: ignore[arg-type]
         self._step = 0
-        return observation
+        return self.envs.reset(seed=seeds)[0]
 
     def step_async(self, actions: np.ndarray) -> None:
         self._actions = actions
@@ -62,7 +56,7 @@ class InjectionVecEnv(VecEnv):
         if ended.all():
             for info, last in zip(infos, observation, strict=True):
                 info |= {"terminal_observation": last, "TimeLimit.truncated": False}
-            observation = self._begin(None)
+            observation = self.reset()
         return observation, (self.reward_scale * rewards).astype(np.float32), ended, infos
 
     def close(self) -> None:
@@ -70,14 +64,13 @@ class InjectionVecEnv(VecEnv):
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None,
                    **kwargs: Any) -> list[Any]:
-        """`action_masks` of each environment."""
+        """Return an entry of `action_masks` for each environment."""
         every = getattr(self.envs, method_name)(*args, **kwargs)
         return [every[k] for k in self._get_indices(indices)]
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        # A space is asked for as each environment's own.
-        spaces = ("observation_space", "action_space")
-        value = getattr(self.envs, f"single_{attr_name}" if attr_name in spaces else attr_name)
+        prefix = "single_" if attr_name in ("observation_space", "action_space") else ""
+        value = getattr(self.envs, prefix + attr_name)
         return [value for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:

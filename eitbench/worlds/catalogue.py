@@ -180,6 +180,7 @@ The contact impedance of each electrode is drawn for each episode within 50 % of
 PIPE_2D_OTHER_INLET = shifted(
     "Pipe2DOtherInlet", target=Slugs(width=(6e-3, 9e-3), reach=(0.7, 0.95)), about="""
 Slugs are narrow and enter near the walls, where the fluid is slow: their centres lie 0.7 to 0.95 R
+from the axis, at home 0 to 0.7 R, and their standard deviation across is 6 to 9 mm, at home 10 to
 25 mm.
 """)
 
@@ -239,6 +240,7 @@ that injection alone. Two frames of 16 [ours]."""
 register(STATIONARY_TANK_2D, "eitbench/StationaryTank2D-v0", about="""
 Two metal cylinders stand in a flat round tank of saline; nothing moves. Sixteen electrodes on the
 wall, one injection after another: estimate the concentration (which stands for the conductivity)
+from the first injection on. A Kalman filter with F = I and a smoothness prior in Γ_{0|0} has found
 both cylinders after about five injections (Seppänen 2005, 7.2, Fig. 7.4). Both cylinders are drawn
 anew for each episode.
 """)

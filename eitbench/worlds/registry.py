@@ -19,7 +19,7 @@ GROUP = "eitbench.worlds"
 """Entry points of installed packages: modules that call `register` when they are imported."""
 CLASSES = {
     "estimation": ("eitbench.envs.estimation:EstimationEnv",
-                   "eitbench.envs.estimation_vector:EstimationVectorEnv"),
+                   "eitbench.envs.estimation:EstimationVectorEnv"),
     "injection": ("eitbench.envs.injection:InjectionEnv",
                   "eitbench.envs.injection:InjectionVectorEnv")}
 """Track -> its environment, one at a time and vectorised."""

@@ -19,13 +19,7 @@ from eitbench.bench.suites import jobs as jobs_of
 from eitbench.bench.text import mean_and_interval
 from eitbench.data.seeds import name_seed
 from eitbench.report.animate import animate
-from eitbench.report.policies import (
-    OPEN_LOOP,
-    errors_by_policy,
-    policy_rows,
-    policy_table,
-    ranking,
-)
+from eitbench.report.policies import OPEN_LOOP, errors_by_policy, gap_text, policy_rows
 
 from .common import ACCENT, INK, TRUE, bare, save
 
@@ -62,7 +56,9 @@ def injection(seeds: list[int] | None, jobs: int, out: Path) -> tuple[Path, str]
         privileged = sorted({job.load().name for job in todo if job.load().privileged})
         _scores(axes, rows, privileged)
         axes.set_title(title, fontsize=11)
-        said.append(f"{env}\n{policy_table(rows, privileged)}\n")
+        means = errors_by_policy(rows).agg(["mean", "std", "count"]).T
+        table = means.to_string(float_format="{:.3g}".format)
+        said.append(f"{env}\n{table}\n{gap_text(rows)}\n")
     for env, axes in zip(COMPETITIONS, panels[2], strict=True):
         _curves(axes, env)
         axes.set_title(WORLDS[env], fontsize=11)
@@ -84,7 +80,7 @@ def _scores(axes: Axes, rows: pd.DataFrame, privileged: list[str]) -> None:
     how hard they are; thick, that of the difference to the best one that is not privileged, episode
     by episode."""
     errors = errors_by_policy(rows)
-    order = ranking(errors)[::-1]
+    order = list(errors)[::-1]
     best = errors[[name for name in order if name not in privileged][-1]]
     axes.axvline(best.mean(), color=TRUE, linewidth=0.6, linestyle=":", zorder=0)
     for place, name in enumerate(order):

@@ -44,7 +44,6 @@ def test_an_agent_plays_as_it_did_when_it_was_kept(path):
     assert folder.parts[-3] == asked["env"].replace("/", "-") and asked["kwargs"] == {}
     kept = np.load(folder / "evaluations.npz")
     assert kept["steps"][0] == 0 and kept["steps"][-1] >= asked["config"]["total_steps"]
-    assert len((folder / "monitor.csv").read_text().splitlines()) > 100
     error = injected(asked["env"], {}, path, FIRST, "reduced").errors.mean()
     np.testing.assert_allclose(error, kept["errors"][-1][0], rtol=0.02)
 

@@ -14,7 +14,7 @@ from eitbench.data.seeds import parse_seeds
 from eitbench.envs.injection import InjectionEnv
 from eitbench.estimation.onboard.belief import Belief
 from eitbench.estimation.onboard.rules import Rules
-from eitbench.report.policies import adaptivity_gap, policy_rows, policy_table
+from eitbench.report.policies import adaptivity_gap, errors_by_policy, gap_text, policy_rows
 from eitbench.worlds.catalogue import PIPE_2D
 from scipy.stats import t as student
 
@@ -254,37 +254,19 @@ def test_a_mistake_is_the_result_of_its_policy(tmp_path):
     failed, floor = store.write_records()
     assert "action must be an integer" in failed["episodes"][0]["message"] and failed["role"] is None
     assert floor["episodes"][0]["status"] == "ok" and floor["role"] == "floor"
-    rows = policy_rows(jobs_of([bad], "dev:0", estimator="reduced"), store.results())
-    assert policy_table(rows, []) == "no episode was finished"
+    assert policy_rows(jobs_of([bad], "dev:0", estimator="reduced"), store.results()).empty
 
 
-def test_table_pairs_the_episodes():
-    """Mean errors in order, and differences to the best that is not privileged with the interval of paired episodes."""
-    errors = {"clairvoyant": [1.0, 2.0, 3.0], "best_pair": [2.0, 3.1, 4.0], "random_pair": [3.0, 4.1, 5.2]}
-    rows = pd.DataFrame([{"policy": name, "seed": f"dev:{k}", "error": error, "spent": 5, "seconds_per_step": 0.001}
-                         for name, each in errors.items() for k, error in enumerate(each)])
-    lines = policy_table(rows, ["clairvoyant"]).splitlines()
-    names = [line.split("|")[1].strip() for line in lines[2:5]]
-    assert names == ["clairvoyant (privileged)", "best_pair", "random_pair"]
-    # 1.0667 on average with a standard deviation of 0.1155: half the interval is 4.303·0.1155/√3
-    assert "1.1 ± 0.3" in lines[4] and "–" in lines[3] and "gap 0.49" in lines[-1]
-    # Agents of two trainings, 1.7 and 2.3 on average, are one policy.
-    agents = pd.DataFrame([{"policy": f"ppo_seed{k}", "seed": f"dev:{j}", "error": 1.7 + 0.6 * k + 0.1 * j, "spent": 5,
-                            "seconds_per_step": 0.001} for k in range(2) for j in range(3)])
-    lines = policy_table(pd.concat([rows, agents]), ["clairvoyant"]).splitlines()
-    assert lines[3].split()[1:4] == ["ppo", "|", "2.1"] and "ppo_seed" not in str(lines)
-    assert "gap 0.49" in lines[-1]
-
-
-def test_who_failed_comes_after_who_did_not():
-    """Two easy episodes do not make a best policy of one that failed in the hard one; the table says how many count."""
-    rows = pd.DataFrame([{"policy": name, "seed": f"dev:{k}", "error": error, "spent": 5, "seconds_per_step": 0.001}
-                         for name, each in {"bold": [1.0, 2.0], "sound": [1.1, 2.1, 9.0]}.items()
-                         for k, error in enumerate(each)])
-    lines = policy_table(rows, []).splitlines()
-    cells = [[cell.strip() for cell in line.split("|")] for line in lines]
-    assert cells[0][1:4] == ["policy", "ẽ_c", "worse than sound by"]
-    assert [cells[2][1], cells[3][1]] == ["sound", "bold (2 of 3 episodes)"]
+def test_errors_of_policies_are_ordered_and_pool_trainings():
+    """A policy that failed in an episode comes last; agents that differ in their training seed are averaged."""
+    errors = {"clairvoyant": [1.0, 2.0, 3.0], "best_pair": [2.0, 3.1, 4.0], "random_pair": [3.0, 4.1, 5.2],
+              "bold": [0.5, 1.0], "ppo_seed0": [1.7, 1.8, 1.9], "ppo_seed1": [2.3, 2.4, 2.5]}
+    rows = hand_made(**errors)
+    found = errors_by_policy(rows)
+    assert list(found) == ["clairvoyant", "ppo", "best_pair", "random_pair", "bold"]
+    assert found["ppo"].tolist() == pytest.approx([2.0, 2.1, 2.2])
+    assert gap_text(rows) == "adaptivity gap 0.49 (an interval takes 6 episodes) over 3 episodes"
+    assert gap_text(rows[rows["policy"] != "clairvoyant"]) == ""
 
 
 # -- mistakes ---------------------------------------------------------------------------------------------------------
@@ -367,5 +349,5 @@ def test_adaptivity_gap_s_interval_is_student_s():
 def test_a_table_with_gaps_is_refused(open_loop):
     """Every policy that counts has played every episode."""
     table = hand_made(clairvoyant=[1.0, 1.0], random_pair=[4.0, 6.0], c=[2.0])
-    with pytest.raises(ValueError, match="table must hold clairvoyant, random_pair and some open-loop policies"):
+    with pytest.raises(ValueError, match="rows must hold clairvoyant, random_pair and some open-loop policies"):
         adaptivity_gap(table, open_loop)

@@ -4,7 +4,6 @@ import json
 
 import eitbench
 import numpy as np
-import pandas as pd
 import pytest
 from eitbench import scoring
 from eitbench.bench import playing
@@ -14,7 +13,6 @@ from eitbench.bench.tracks import TRACKS, Environment
 from eitbench.bench.verify import differences_of
 from eitbench.data.regions import mass_between
 from eitbench.numerics.fem import mass_matrix
-from eitbench.report import policies
 from eitbench.report.boards import run_boards
 from eitbench.report.site import collect, render
 from eitbench.report.tables import run_table
@@ -141,17 +139,3 @@ def test_boards_show_it_where_it_is_known():
     assert rows_of(text, " opposite@")[0][place] == "–"
     shown = said(run_table(run_boards([*old, new])[0]))
     assert sorted(shown["CRPS"]) == ["0.44", "–", "–"]
-
-
-def test_the_table_of_policies_shows_it_where_it_is_known():
-    """Means over the episodes that have it; no column if nobody has."""
-    rows = pd.DataFrame([
-        {"policy": name, "seed": f"dev:{k}", "error": error + k, "spent": 5, "nis": nis,
-         "seconds_per_step": 0.001}
-        for name, error, claimed in (("old", 1.0, [None, None]), ("new", 2.0, [1.0, 2.0]))
-        for k, nis in enumerate(claimed)])
-    lines = policies.policy_table(rows, []).splitlines()
-    headings = [cell.strip() for cell in lines[0].strip("|").split("|")]
-    assert headings == ["policy", "ẽ_c", "worse than old by", "NIS/m", "injections", "ms/step"]
-    assert [line.split("|")[4].strip() for line in lines[2:]] == ["–", "1.5"]
-    assert "NIS/m" not in policies.policy_table(rows.drop(columns="nis"), [])

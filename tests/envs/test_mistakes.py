@@ -18,7 +18,7 @@ STIRRED, STILL = "eitbench/RotatingTank2D-v0", "eitbench/StationaryTank2D-v0"
     (PIPE, {"world": {"flow": {"speed": 1.0}}},
      "world.flow has no 'speed'; there are mean_velocity, diffusivity"),
     (PIPE, {"assume": {"mean_velocity": -1.0}}, "assume.mean_velocity must be a finite number"),
-    (PIPE, {"assume": 4.5}, "assume must be a dict of what is believed of the flow, got 4.5"),
+    (PIPE, {"assume": 4.5}, "assume must be a dict of assumptions on the flow, got 4.5"),
     (SOLID, {"assume": {"profile": "plug"}}, "assume has no 'profile'; there are mean_velocity"),
     (STIRRED, {"assume": {"flow": "real"}}, "this world has nothing to assume"),
     (OBSTACLE, {"assume": {"flow": "guessed"}}, "assume.flow must be one of parabolic, real"),

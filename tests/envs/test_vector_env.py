@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from eitbench.data.episodes import simulate
-from eitbench.envs import estimation, estimation_vector
+from eitbench.envs import estimation
 from eitbench.worlds import entry
 from eitbench.worlds.catalogue import PIPE_2D
 from eitbench.worlds.task import lag_steps
@@ -73,7 +73,7 @@ def test_same_as_so_many_scalar_environments(name, num_envs):
     """Over three whole episodes, of which two begin by themselves, it is gymnasium's SyncVectorEnv."""
     mine = make(name, num_envs)
     sync = make(name, num_envs, "sync")
-    assert isinstance(mine.unwrapped, estimation_vector.EstimationVectorEnv)
+    assert isinstance(mine.unwrapped, estimation.EstimationVectorEnv)
     assert mine.single_observation_space == sync.single_observation_space
     assert mine.single_action_space == sync.single_action_space
     assert mine.observation_space == sync.observation_space
@@ -254,7 +254,6 @@ def test_seeds_that_would_be_cast_are_refused(seed):
 def test_wrong_arguments_are_named_before_anything_is_computed(change, monkeypatch):
     """No mesh is built to find out that lag is wrong."""
     monkeypatch.setattr(estimation, "outline", None)
-    monkeypatch.setattr(estimation_vector, "outline", None)
     asked = {"num_envs": 2, "world": {"flow": {"mean_velocity": 44.0}}} | change
     with pytest.raises(ValueError, match=f"{next(iter(change))} must be"):
         gym.make_vec(PIPE, **asked)

@@ -12,7 +12,7 @@ from eitbench.bench.records import read_record, read_records, sealed, write_reco
 from eitbench.envs.measured import case_env
 from eitbench.measured.cases import CASES, case_id, file_sha256, read_case
 from eitbench.measured.segmentation import ktc_score
-from eitbench.report.site.measured import Measured, all_cases_table, case_table
+from eitbench.report.site.measured import Measured
 from scipy.io import savemat
 from tanks import VESSEL, moving, still
 
@@ -190,8 +190,9 @@ def test_a_case_with_a_truth_has_the_ktc_score(folder):
 def test_tables_are_those_by_hand():
     """Order by the mean withheld RMSE; relative to naive baselines by the geometric mean of a method's cases."""
     def said(method, values, role=None):
-        episodes = [{"status": "ok", "scores": {"prediction_error": value, "seconds_per_step": 0.01}}
-                    for value in values]
+        episodes = [{"seed": f"test:{k}", "status": "ok",
+                     "scores": {"prediction_error": value, "seconds_per_step": 0.01}}
+                    for k, value in enumerate(values)]
         return {"method": method, "version": "v1", "title": method, "role": role, "official": True,
                 "episodes": episodes}
 
@@ -199,9 +200,9 @@ def test_tables_are_those_by_hand():
     measured = Measured(cases, {
         "iirc": [said("good", [1.0, 2.0, 3.0]), said("naive", [8.0], "floor")],
         "montreal": [said("good", [1.0]), said("late", [3.0]), said("naive", [4.0], "floor")]}, [])
-    assert [[cell.plain for cell in row.cells] for row in case_table(measured, "iirc").rows] == [
+    assert [[cell.plain for cell in row.cells] for row in measured.case_table("iirc").rows] == [
         ["good good@v1", "2 1 to 3", "10"], ["naive naive@v1 (floor)", "8 8 to 8", "10"]]
-    rows = [[cell.plain for cell in row.cells] for row in all_cases_table(measured).rows]
+    rows = [[cell.plain for cell in row.cells] for row in measured.all_cases_table().rows]
     assert [row[0].split("@")[0] for row in rows] == ["good", "naive", "late"]
     assert [float(row[-1]) for row in rows] == [0.25, 1.0, 0.75]             # √(2/8 · 1/4)
     assert rows[2][1] == "–"

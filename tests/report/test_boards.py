@@ -13,8 +13,7 @@ from eitbench.bench import load
 from eitbench.bench.records import read_records, write_record
 from eitbench.bench.statistics import interquartile_mean, stratified_bootstrap
 from eitbench.bench.tracks import named
-from eitbench.report.boards import boards
-from eitbench.report.model import ALL, class_of
+from eitbench.report.boards import ALL, boards, class_of
 from eitbench.report.site import collect, render
 
 from tiny import BOARD_IDS, RUN, record, sha

@@ -5,16 +5,16 @@ import re
 
 import numpy as np
 import pytest
-from eitbench.bench.records import read_records, write_record
+from eitbench.bench.records import write_record
 from eitbench.bench.statistics import (
     interquartile_mean,
     paired_difference,
     paired_probability_of_improvement,
 )
 from eitbench.bench.text import scores_by_seed
+from eitbench.report import compare as comparison
 from eitbench.report.boards import boards
-from eitbench.report.compare import SHIPPED, compare, find, floors, html, in_terminal, names, shown
-from pages import Page, text_of
+from eitbench.report.compare import compare, find, floors, in_terminal, names, shown
 
 from tables import said
 from tiny import record, sha
@@ -106,8 +106,9 @@ def test_what_cannot_be_compared():
             compare(a, b)
 
 
-def test_records_are_found_by_name_version_and_file(tmp_path):
+def test_records_are_found_by_name_version_and_file(tmp_path, monkeypatch):
     """A name is enough where there is one version of it."""
+    monkeypatch.setattr(comparison, "SHIPPED", tmp_path)
     a, (b, _) = two_methods()
     paths = [write_record(tmp_path, each) for each in [*a, b]]
     assert find("a", tmp_path) == a and find(f"a@{sha('a1')[:4]}", tmp_path) == a
@@ -145,31 +146,15 @@ def test_words_follow_from_the_intervals():
     assert (few["verdict"][0], few["a better"][0], few["difference"][0]) == ("–", "100 %", "-0.3")
 
 
-def test_the_page_has_the_table():
-    """Offline, well-formed, with every number of the table; names are text that may break after underscores."""
-    a, b = two_methods()
-    table, evil = compare(a, b), "<script>my_name"
-    page = html(table, evil, "yours")
-    assert page.count("<script") == 1 and all(address.startswith("data:") for address in Page(page).attributes("href"))
-    assert ">ẽ_c of &lt;script&gt;my_<wbr/>name</th>" in page
-    rows = re.findall(r"<tr>(<td.*?)</tr>", page)
-    found = [[text_of(cell) for cell in re.findall(r"<td.*?</td>", row)] for row in rows]
-    assert found == said(shown(table, evil, "yours")).to_numpy().tolist()
-    circles = [float(x) for x in re.findall(r'<circle cx="([\d.]+)"', page)]
-    assert [x < 48 for x in circles] == [difference < 0 for difference in table["difference"]]
-    few = html(compare([record("a", [0.1])], [record("b", [0.4])]), "a", "b")
-    assert '<line x1="4.0" x2="4.0"' in few            # no interval, and the only difference
-
-
-def test_who_is_not_in_the_folder_comes_with_the_package(tmp_path):
+def test_who_is_not_in_the_folder_comes_with_the_package(tmp_path, monkeypatch):
     """After a first submission, in a folder of one's own: my method against ours, and our floors."""
-    write_record(tmp_path, record("mine", [0.1]))
-    assert find("mine", tmp_path) == read_records(tmp_path)
-    ours = find("kalman_filter", tmp_path)
-    assert ours == find("kalman_filter", SHIPPED) and all(each["method"] == "kalman_filter" for each in ours)
-    assert {each["environment"]["name"] for each in floors(tmp_path)} == {
-        each["environment"]["name"] for each in floors(SHIPPED)}
-    assert floors(tmp_path / "nowhere") == floors(SHIPPED)
+    shipped, own = tmp_path / "shipped", tmp_path / "own"
+    monkeypatch.setattr(comparison, "SHIPPED", shipped)
+    ours, floor = record("kalman_filter", [0.1], version="v1"), record("homogeneous", [0.2], role="floor")
+    for folder, each in ((own, mine := record("mine", [0.1])), (shipped, ours), (shipped, floor)):
+        write_record(folder, each)
+    assert find("mine", own) == [mine] and find("kalman_filter", own) == [ours]
+    assert floors(own) == floors(tmp_path / "nowhere") == [floor]
 
 
 def test_in_a_terminal_lines_are_not_wrapped():

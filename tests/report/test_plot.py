@@ -68,11 +68,11 @@ def test_an_episode_shows_truth_and_estimate():
     """The numbers drawn are those of the truth and of the estimate at the times that the titles say; ẽ_c is that of the
     score."""
     given = world(PIPE)["world"]
-    axes = eitbench.plot.episode("kalman_filter", PIPE, "dev:0", world=given, times=2)
+    axes = eitbench.plot.episode("homogeneous", PIPE, "dev:0", world=given, times=2)
     assert axes.shape == (2, 2)
     asked = Environment(PIPE).make(world=given)
-    said = dict(estimates(asked, load_method("kalman_filter", "estimation"), 100_000))
-    errors = eitbench.evaluate("kalman_filter", PIPE, "dev:0", world=given)["error"][0]
+    said = dict(estimates(asked, load_method("homogeneous", "estimation"), 100_000))
+    errors = eitbench.evaluate("homogeneous", PIPE, "dev:0", world=given)["error"][0]
     told = []
     for truth, estimate in axes:
         t = round(float(truth.get_title().split()[3]) / (1e3 * asked.world.time_step))

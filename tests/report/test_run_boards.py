@@ -6,10 +6,8 @@ import re
 import numpy as np
 import pytest
 from eitbench.bench.text import mean_and_interval, number, rounded, seed_ranges, with_interval
-from eitbench.report.boards import run_boards
-from eitbench.report.model import title_of, world
-from eitbench.report.tables import run_table
-from eitbench.report.terminal import markdown, terminal_tables
+from eitbench.report.boards import run_boards, title_of, world
+from eitbench.report.tables import markdown, run_table, terminal_tables
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats

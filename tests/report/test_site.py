@@ -14,10 +14,20 @@ from eitbench.bench.table import NOTHING
 from eitbench.bench.text import number, with_interval
 from eitbench.bench.tracks import ids
 from eitbench.report import charts
-from eitbench.report.site import Beside, Measured, collect, render, render_site, write_site
-from eitbench.report.site.collect import HEADLINE, LINKS, METHODS, ROBUSTNESS
-from eitbench.report.site.pages import documentation, headline, key_figures
-from eitbench.report.site.robustness import families, heading, robustness_table
+from eitbench.report.site import (
+    HEADLINE,
+    LINKS,
+    METHODS,
+    ROBUSTNESS,
+    collect,
+    documentation,
+    headline,
+    key_figures,
+    render,
+    render_site,
+    write_site,
+)
+from eitbench.report.site.robustness import families, heading
 from eitbench.report.tables import lines, markdown_table, page_table
 from eitbench.report.templates import markdown
 from pages import Page, text_of
@@ -27,12 +37,13 @@ from tiny import BOARD_IDS, RUN, record, several_boards
 
 ROOT = Path(__file__).parents[2]
 BUDGET = "eitbench/Pipe2DInjectionBudget-v0"
-PICTURES = Beside(media={"eitbench-Pipe2D-v0.webp": 340_000} | dict.fromkeys(HEADLINE, 1))
+PICTURES = {"eitbench-Pipe2D-v0.webp": 340_000} | dict.fromkeys(HEADLINE, 1)
 FLOOR = {"role": "floor", "official": True}
 
 
-def rendered(records, beside=PICTURES):
-    return {path: content.decode() for path, content in render_site(collect(records), beside).items()}
+def rendered(records):
+    site = collect(records)._replace(media=PICTURES)
+    return {path: content.decode() for path, content in render_site(site).items()}
 
 
 @pytest.fixture(scope="module")
@@ -52,11 +63,10 @@ def pages(site):
 def test_published_files_are_rendered_from_the_records():
     """`eitbench leaderboard --records leaderboards/results` changes nothing; the site is not too large either."""
     folder = ROOT / "leaderboards"
-    found, measured = collect(read_records(folder / "results")), Measured.of(folder)
-    assert not measured.complaints
-    texts = {name: text.encode() for name, text in render(found, measured).items()}
-    expected = {f"site/{path}": content for path, content in
-                render_site(found, Beside.of(folder, folder / "site"), measured).items()} | texts
+    found = collect(read_records(folder / "results"), folder)
+    assert not found.measured.complaints
+    texts = {name: text.encode() for name, text in render(found).items()}
+    expected = {f"site/{path}": content for path, content in render_site(found).items()} | texts
     published = {path.relative_to(folder).as_posix(): path.read_bytes()
                  for path in [*(folder / "site").rglob("*"), *map(folder.joinpath, texts)] if path.is_file()}
     differ = sorted(path for path in expected.keys() | published.keys() if expected.get(path) != published.get(path))
@@ -236,8 +246,8 @@ def shifted(*more):
 
 
 def robustness(records):
-    (family,) = families(collect(records))
-    shown = said(robustness_table(family))
+    (family,) = families(collect(records).boards)
+    shown = said(family.table)
     return shown.set_index(shown["method"].str.extract(r"(\w+)@")[0].rename("name")).drop(columns="method")
 
 
@@ -323,21 +333,20 @@ def test_every_link_resolves(site, pages):
 
 
 def test_links_beside_the_site(tmp_path):
-    """To what exists, also from a site one folder deeper."""
+    """Only to what exists."""
     folder = tmp_path / "leaderboards"
     for name in (LINKS["How to submit"], LINKS["Code"], f"{METHODS}/kalman_filter.py", *(
             f"media/{name}" for name in HEADLINE)):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text("")
-    found = Beside.of(folder, folder / "season-1" / "site")
-    assert found.root == "../../" and found.links("../") == {
-        "How to submit": "../../../README.md", "Code": "../../../../README.md"}
-    files = rendered([*headlined(ERRORS), record("kalman_filter", [0.1], version="v1", official=True)], found)
+    records = [*headlined(ERRORS), record("kalman_filter", [0.1], version="v1", official=True)]
+    files = render_site(collect(records, folder))
     for page in ("index.html", "methods/kalman_filter.html"):
-        for address in re.findall(r'(?:href|src|srcset)="(\.\./\.\./[^"]*)"', files[page]):
-            assert (folder / "season-1" / "site" / page).parent.joinpath(address).resolve().exists() or (
-                address.endswith("leaderboard.csv")), address
-    assert 'baselines/kalman_filter.py"' in files["methods/kalman_filter.html"]
+        html = files[page].decode()
+        assert "How to submit" in html and "Statistics" not in html
+        for address in re.findall(r'(?:href|src|srcset)="((?:\.\./)+(?:README|media|baselines|docs)[^"]*)"', html):
+            assert (folder / "site" / page).parent.joinpath(address).resolve().exists(), address
+    assert 'baselines/kalman_filter.py"' in html
 
 
 def test_markdown_is_text_and_tables():

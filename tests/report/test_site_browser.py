@@ -8,8 +8,7 @@ from eitbench.bench.records import sealed
 from eitbench.bench.store import EpisodeStore
 from eitbench.report.boards import run_boards
 from eitbench.report.page import write_page
-from eitbench.report.site import Beside, collect, render_site, write_site
-from eitbench.report.site.collect import HEADLINE
+from eitbench.report.site import HEADLINE, collect, render_site, write_site
 from PIL import Image
 
 from tiny import record, several_boards
@@ -55,7 +54,7 @@ def tab(tmp_path_factory):
 def index(tab, folder):
     """The index, wide and light, without memories."""
     tab.size(1200)
-    tab.prefer(prefers_color_scheme="light")
+    tab.prefer(prefers_color_scheme="light", prefers_reduced_motion="reduce")    # a smooth scroll moves what is clicked
     tab.open((folder / "index.html").as_uri())
     tab.js("localStorage.clear()")
     tab.open((folder / "index.html").as_uri())
@@ -205,7 +204,7 @@ def test_the_picture_can_be_stopped(tab, tmp_path):
     for name in HEADLINE:
         (tmp_path / "media").mkdir(exist_ok=True)
         Image.new("RGB", (72, 60), "teal").save(tmp_path / "media" / name)
-    write_site(tmp_path / "site", render_site(collect(records), Beside.of(tmp_path, tmp_path / "site")))
+    write_site(tmp_path / "site", render_site(collect(records, tmp_path)))
     for wish, first in (("no-preference", 0), ("reduce", 1)):
         tab.prefer(prefers_reduced_motion=wish)
         tab.open((tmp_path / "site" / "index.html").as_uri())

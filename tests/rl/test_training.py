@@ -1,4 +1,4 @@
-"""Training with stable-baselines3: what is learnt from is what the environments show, and nothing is lost."""
+"""Training with stable-baselines3: agents learn from what the environments show, and no result is lost."""
 
 import json
 from dataclasses import asdict, replace
@@ -11,8 +11,8 @@ from eitbench.bench.methods import load_method
 from eitbench.envs.injection import InjectionVectorEnv
 from eitbench.estimation.onboard.rules import Rules
 from eitbench.rl import training
-from eitbench.rl.agents import _mark, load_agent
-from eitbench.rl.training import Config, read_config, train
+from eitbench.rl.agents import configuration_hash, load_agent
+from eitbench.rl.training import ALGORITHMS, Config, read_config, train
 from eitbench.rl.vec_env import InjectionVecEnv
 from eitbench.worlds.catalogue import PIPE_2D
 from threadpoolctl import threadpool_limits
@@ -26,24 +26,42 @@ SHORT = {"world": {"flow": {"mean_velocity": 16.0}, "schedule": {"scored_steps":
 """Four steps of the agent an episode."""
 TINY = Config(total_steps=32, n_envs=2, interval=16, evaluation_episodes=2, episodes=3, hidden=(8,),
               algorithm={"n_steps": 8, "batch_size": 8})
+RUNS = {"ppo": (NAME, {"n_steps": 8, "batch_size": 8}), "maskable_ppo": (BUDGET, {"n_steps": 8, "batch_size": 8}),
+        "recurrent_ppo": (NAME, {"n_steps": 8, "batch_size": 8}),
+        "dqn": (NAME, {"learning_starts": 4, "train_freq": 4}),
+        "sac": (CURRENTS, {"learning_starts": 4, "batch_size": 4})}
+
+
+@pytest.fixture(scope="module", params=ALGORITHMS)
+def run(request, tmp_path_factory):
+    """A finished training of each algorithm: environment, arguments, algorithm, configuration, and model."""
+    algo = request.param
+    env, options = RUNS[algo]
+    kwargs = merged(SHORT, {"world": {"schedule": {"budget": 2}}}) if env == BUDGET else SHORT
+    config = replace(TINY, algorithm=options)
+    return env, kwargs, algo, config, train(env, algo, config, 1, tmp_path_factory.mktemp(algo), kwargs)
+
+
+def vector(episodes=3):
+    return gym.make_vec(NAME, num_envs=3, vectorization_mode="vector_entry_point", episodes=episodes, **SHORT)
 
 
 def test_sb3_sees_what_the_environments_show():
     """Step by step the observations and rewards of single environments, over an episode's end; rewards scaled."""
-    envs = gym.make_vec(NAME, num_envs=3, vectorization_mode="vector_entry_point", episodes=3, **SHORT)
+    envs = vector()
     ours = InjectionVecEnv(envs, reward_scale=10.0)
     ours.seed(5)
     shown = ours.reset()
-    played = list(envs.seeds)
-    assert len(set(played)) == 3                       # environments of one seed would be twins from then on
+    started = list(envs.seeds)
+    assert len(set(started)) == 3                       # environments of one seed would be twins from then on
     single = [gym.make(NAME, episodes=3, **SHORT) for _ in range(3)]
-    expected = [env.reset(seed=k)[0] for env, k in zip(single, played, strict=True)]
+    expected = [env.reset(seed=k)[0] for env, k in zip(single, started, strict=True)]
     np.testing.assert_array_equal(shown, expected)
+    assert ours.get_attr("action_space") == [env.action_space for env in single]
+    assert ours.get_attr("observation_space", [1]) == [single[1].observation_space]
     rng = np.random.default_rng(0)
     for step in range(1, 6):
         actions = rng.integers(120, size=3)
-        assert ours.get_attr("action_space") == [env.action_space for env in single]
-        assert ours.get_attr("observation_space", [1]) == [single[1].observation_space]
         shown, rewards, ended, infos = ours.step(actions)
         outcome = [env.step(int(action)) for env, action in zip(single, actions, strict=True)]
         np.testing.assert_allclose(rewards, [10.0 * each[1] for each in outcome], rtol=1e-6)
@@ -55,31 +73,58 @@ def test_sb3_sees_what_the_environments_show():
             np.testing.assert_array_equal(shown, [each[0] for each in outcome])
 
 
-@pytest.mark.parametrize(("env", "algo", "options"), [
-    (NAME, "ppo", {"n_steps": 8, "batch_size": 8}), (BUDGET, "maskable_ppo", {"n_steps": 8, "batch_size": 8}),
-    (NAME, "recurrent_ppo", {"n_steps": 8, "batch_size": 8}), (NAME, "dqn", {"learning_starts": 4, "train_freq": 4}),
-    (CURRENTS, "sac", {"learning_starts": 4, "batch_size": 4}),
-])
-def test_every_algorithm_leaves_a_whole_run(env, algo, options, tmp_path):
-    """Model, configuration, monitor, evaluations that are the model's own, and a checksum."""
-    path = train(env, algo, replace(TINY, algorithm=options), 1, tmp_path, SHORT)
-    model = training.algorithm_of(algo).load(path)
+def test_every_algorithm_leaves_a_whole_run(run):
+    """Model, configuration, evaluations that are the model's own, and a checksum; the same command changes nothing."""
+    env, kwargs, algo, config, path = run
+    folder = path.parent
+    model = ALGORITHMS[algo].load(path)
     assert 32 <= model.num_timesteps < 48
-    kept = np.load(tmp_path / "evaluations.npz")
+    kept = np.load(folder / "evaluations.npz")
     assert kept["steps"][0] == 0 and (np.diff(kept["steps"]) > 0).all() and kept["steps"][-1] == model.num_timesteps
-    np.testing.assert_allclose(kept["errors"][-1], training.evaluation(env, SHORT, TINY)(model), rtol=1e-6)
-    rows = (tmp_path / "monitor.csv").read_text().splitlines()
-    assert rows[0] == "steps,return,length,seconds" and len(rows) - 1 == model.num_timesteps // 4
-    assert json.loads((tmp_path / "config.json").read_text())["algo"] == algo
+    np.testing.assert_allclose(kept["errors"][-1], training.evaluation(env, kwargs, config)(model), rtol=1e-6)
+    assert json.loads((folder / "config.json").read_text())["algo"] == algo
     assert not (getattr(model.policy, "actor", None) or model.policy).optimizer.state
-    assert len((tmp_path / "sha256").read_text()) == 64 and not (tmp_path / "latest.zip").exists()
-    with ZipFile(path) as model_zip:                                                        # fifteen lie in git
+    assert len((folder / "sha256").read_text()) == 64 and not (folder / "latest.zip").exists()
+    with ZipFile(path) as model_zip:                                                     # fifteen are kept in git
         assert {file.compress_type for file in model_zip.infolist()} == {ZIP_DEFLATED}
+    before = {each: each.stat().st_mtime_ns for each in folder.iterdir()}
+    assert train(env, algo, config, 1, folder, kwargs) == path
+    assert before == {each: each.stat().st_mtime_ns for each in folder.iterdir()}
+
+
+def test_an_agent_acts_as_it_was_evaluated(run):
+    """As a policy its errors are those of the last evaluation, whichever filter the environment has."""
+    env, kwargs, algo, config, path = run
+    expected = np.load(path.parent / "evaluations.npz")["errors"][-1]
+    errors = [injected(env, kwargs, str(path), seed, "reduced").errors.mean() for seed in (100_000, 100_001)]
+    np.testing.assert_allclose(errors, expected, rtol=1e-5)
+    agent = load_method(str(path), "injection")
+    asked = json.loads((path.parent / "config.json").read_text())
+    mark = configuration_hash(asked)
+    assert asked["config"] == json.loads(json.dumps(asdict(config)))
+    assert agent.name == f"{algo}_{mark}_seed1" and mark == configuration_hash(asked | {"seed": 2})
+    assert mark != configuration_hash(asked | {"kwargs": {}})
+    assert not agent.privileged and agent.parameters["env"] == env
+    other = {"instrument": {"limit": None if env == CURRENTS else "L1"}}
+    assert not agent.suits(Rules(PIPE_2D.changed(other)))
+    if algo == "ppo":
+        chosen = [injected_currents(agent, env, kwargs, estimator) for estimator in ("reduced", "full")]
+        np.testing.assert_array_equal(*chosen)
+
+
+def injected_currents(agent, env, kwargs, estimator):
+    world = gym.make(env, estimator=estimator, observation="raw", **kwargs).unwrapped
+    policy, ended, currents = agent.make(world.rules, np.random.default_rng(0)), False, []
+    observation, _ = world.reset(seed=7)
+    while not ended:
+        observation, _, ended, _, _ = world.step(policy.act(observation))
+        currents.append(observation["currents"])
+    return currents
 
 
 def test_a_killed_run_loses_no_more_than_an_interval(tmp_path, monkeypatch):
-    """It goes on from its last checkpoint to the full number of steps, and its records go on too."""
-    keep, calls = training._Checkpoints._keep, []
+    """It resumes from its last checkpoint to the full number of steps; a changed model is not loaded."""
+    keep, calls = training._Checkpoints._on_training_end, []
 
     def kill(self):
         keep(self)
@@ -87,27 +132,23 @@ def test_a_killed_run_loses_no_more_than_an_interval(tmp_path, monkeypatch):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(training._Checkpoints, "_keep", kill)
+        patch.setattr(training._Checkpoints, "_on_training_end", kill)
         with pytest.raises(KeyboardInterrupt):
             train(NAME, "ppo", TINY, 1, tmp_path, SHORT)
     assert calls == [16]
-    with (tmp_path / "monitor.csv").open("a") as file:
-        file.write("1")                                         # cut short
-    model = training.algorithm_of("ppo").load(train(NAME, "ppo", TINY, 1, tmp_path, SHORT))
-    assert model.num_timesteps == 32
+    path = train(NAME, "ppo", TINY, 1, tmp_path, SHORT)
+    assert ALGORITHMS["ppo"].load(path).num_timesteps == 32
     assert np.load(tmp_path / "evaluations.npz")["steps"].tolist() == [0, 16, 32]
-    rows = (tmp_path / "monitor.csv").read_text().splitlines()
-    assert [row.split(",")[0] for row in rows] == ["steps", *(str(8 * (1 + k // 2)) for k in range(8))]
     with pytest.raises(ValueError, match="out must be an empty folder or one of the same run"):
         train(NAME, "ppo", TINY, 2, tmp_path, SHORT)
-
-
-def test_a_finished_run_stays_as_it_is(tmp_path):
-    """The same command again gives the same model, and touches nothing."""
-    path = train(NAME, "ppo", TINY, 1, tmp_path, SHORT)
-    before = {each: each.stat().st_mtime_ns for each in tmp_path.iterdir()}
-    assert train(NAME, "ppo", TINY, 1, tmp_path, SHORT) == path
-    assert before == {each: each.stat().st_mtime_ns for each in tmp_path.iterdir()}
+    content = path.read_bytes()
+    path.write_bytes(content + b"x")
+    assert load_agent(path, content)[0].startswith("ppo_")       # what was checked is what is loaded
+    with pytest.raises(ValueError, match="must have the sha256 of its folder"):
+        load_method(str(path), "injection")
+    (tmp_path / "sha256").unlink()
+    with pytest.raises(ValueError, match="must be in a folder with the config"):
+        load_method(str(path), "injection")
 
 
 def test_the_same_seed_learns_the_same(tmp_path):
@@ -116,7 +157,7 @@ def test_the_same_seed_learns_the_same(tmp_path):
 
     def networks(seed, name, threads):
         with threadpool_limits(threads):
-            model = training.algorithm_of("ppo").load(train(NAME, "ppo", config, seed, tmp_path / name, SHORT))
+            model = ALGORITHMS["ppo"].load(train(NAME, "ppo", config, seed, tmp_path / name, SHORT))
         return np.concatenate([p.detach().numpy().ravel() for p in model.policy.parameters()])
     first, again, other = networks(1, "a", 1), networks(1, "b", 2), networks(2, "c", 1)
     assert (first == again).all() and (first != other).any()
@@ -125,26 +166,25 @@ def test_the_same_seed_learns_the_same(tmp_path):
 def test_an_estimate_that_is_not_finite_shows(monkeypatch):
     """States that are not scored are left out of an evaluation, a scored one that is not a number is not."""
     class Still:
-        def predict(self, observation, **_):
+        def predict(self, *_, **__):
             return np.zeros(2, dtype=int), None
 
     errors, factors = InjectionVectorEnv.errors, iter([[1, 1], [1, 1], [1, 1], [1, np.nan]])
-    assert np.isfinite(training.evaluation(NAME, SHORT, TINY)(Still())).all()
     monkeypatch.setattr(InjectionVectorEnv, "errors", lambda self: errors(self) * next(factors))
     assert list(np.isnan(training.evaluation(NAME, SHORT, TINY)(Still()))) == [False, True]
 
 
-def test_a_pupil_learns_what_its_teacher_says(tmp_path):
+def test_a_pupil_learns_what_its_teacher_does(tmp_path):
     """After imitation alone the agent does what the teacher does: here always the same pair."""
     config = replace(TINY, total_steps=0, imitate={"teacher": "best_pair", "rounds": 2, "episodes": 3, "epochs": 60})
-    model = training.algorithm_of("ppo").load(train(NAME, "ppo", config, 0, tmp_path, SHORT))
+    model = ALGORITHMS["ppo"].load(train(NAME, "ppo", config, 0, tmp_path, SHORT))
     observation, _ = gym.make(NAME, **SHORT).reset(seed=2)
     assert int(model.predict(observation, deterministic=True)[0]) == 7
 
 
 @pytest.mark.parametrize(("text", "message"), [
     ("- a\n", "must hold entries of"), ("steps: 3\n", "must hold entries of"), ("a: [", "config must be a YAML file"),
-    ("n_envs: 2\n", "config .*config.yml' must hold what `Config` asks for: .*'total_steps'"),
+    ("n_envs: 2\n", "config .*config.yml' must hold total_steps"),
     ("total_steps: 1\nanneal: true\nalgorithm: fast\n", "algorithm must be a dict of names and values, got 'fast'"),
     ("total_steps: 1\nhidden: [8, x]\n", "each entry of hidden must be an integer of at least 1, got 'x'"),
     ("total_steps: 1\nanneal: 'no'\n", "anneal must be true or false, got 'no'"),
@@ -158,15 +198,9 @@ def test_wrong_configurations_are_named(text, message, tmp_path):
         read_config(path)
 
 
-def test_wrong_arguments_are_named(tmp_path):
-    """Environments without injections, and algorithms there are none of."""
-    with pytest.raises(ValueError, match="env must be one of eitbench/Pipe2DInjection-v0"):
-        train("eitbench/Pipe2D-v0", "ppo", TINY, 0, tmp_path)
-    with pytest.raises(ValueError, match="algo must be one of ppo"):
-        train(NAME, "reinforce", TINY, 0, tmp_path)
-
-
 @pytest.mark.parametrize(("env", "algo", "change", "kwargs", "message"), [
+    ("eitbench/Pipe2D-v0", "ppo", {}, {}, "env must be one of eitbench/Pipe2DInjection-v0"),
+    (NAME, "reinforce", {}, {}, "algo must be one of ppo"),
     (NAME, "ppo", {"imitate": {"teacher": "event_triggered"}}, {},
      "imitate.teacher must be a policy that suits env, got 'event_triggered'"),
     (NAME, "ppo", {"imitate": {"teacher": "best_pair", "learning_rate": 0}}, {}, "imitate.learning_rate must be"),
@@ -175,70 +209,31 @@ def test_wrong_arguments_are_named(tmp_path):
     (NAME, "sac", {}, {}, "sac is for actions that are currents, and env takes numbers"),
     (CURRENTS, "ppo", {"imitate": {"teacher": "best_pair"}}, {}, "imitate is for actions that are numbers"),
     (NAME, "ppo", {}, {"episodes": 3, "estimator": "full"}, "kwargs must not hold.*; got episodes, estimator"),
-    (NAME, "ppo", {"algorithm": {"n_steps": 0}}, {}, "algorithm must hold what ppo takes: "),
+    (NAME, "ppo", {"algorithm": {"n_steps": 0}}, {}, "algorithm must hold valid arguments of ppo: "),
 ])
-def test_what_does_not_go_together_is_named_before_the_folder_is_taken(env, algo, change, kwargs, message, tmp_path):
-    """So that the same folder serves once the mistake is mended."""
+def test_wrong_arguments_are_named_before_the_folder_is_taken(env, algo, change, kwargs, message, tmp_path):
+    """So that the same folder can be used once the mistake is fixed."""
     with pytest.raises(ValueError, match=message):
         train(env, algo, replace(TINY, **({"algorithm": {}} | change)), 0, tmp_path, SHORT | kwargs)
     assert not list(tmp_path.iterdir())
 
 
-def test_rewards_may_be_counted_from_others(tmp_path):
-    """What a policy earns in the same episodes is taken away, step by step, in this episode and the next."""
+def test_rewards_of_a_reference_are_subtracted(tmp_path):
+    """Rewards of a policy in the same episodes, step by step, in this episode and the next."""
     world = gym.make(NAME, episodes=5, observation="raw", **SHORT).unwrapped
     reference = training.rewards_of("best_pair", world, tmp_path / "reference.npy")
-    envs, plain = (gym.make_vec(NAME, num_envs=3, vectorization_mode="vector_entry_point", episodes=5, **SHORT)
-                   for _ in range(2))
+    envs, plain = vector(5), vector(5)
     ours = InjectionVecEnv(envs, reward_scale=10.0, reference=reference)
     ours.seed(5)
     ours.reset()
     rng, best = np.random.default_rng(0), world.rules.pairs.tolist().index([0, 8])
     for _ in range(2):
-        playing, actions = list(envs.seeds), rng.integers(120, size=(4, 3))
+        started, actions = list(envs.seeds), rng.integers(120, size=(4, 3))
         earned = []
         for chosen in (actions, np.full((4, 3), best)):
-            plain.reset(seed=playing)
+            plain.reset(seed=started)
             earned.append([plain.step(action)[1] for action in chosen])
         expected = 10.0 * np.subtract(*earned)
         assert np.abs(expected).max() > 1e-3
         np.testing.assert_allclose([ours.step(action)[1] for action in actions], expected, atol=1e-6)
     np.testing.assert_array_equal(training.rewards_of("random_pair", world, tmp_path / "reference.npy"), reference)
-
-
-@pytest.mark.parametrize(("env", "algo"), [(NAME, "ppo"), (BUDGET, "maskable_ppo"), (CURRENTS, "sac"),
-                                           (NAME, "recurrent_ppo")])
-def test_an_agent_plays_as_it_was_evaluated(env, algo, tmp_path):
-    """As a policy its errors are those of the last evaluation; a file that was changed is not opened."""
-    options = {"learning_starts": 4, "batch_size": 4} if algo == "sac" else {"n_steps": 8, "batch_size": 8}
-    kwargs = merged(SHORT, {"world": {"schedule": {"budget": 2}}}) if env == BUDGET else SHORT
-    config = replace(TINY, algorithm=options)
-    path = train(env, algo, config, 1, tmp_path, kwargs)
-    expected = np.load(tmp_path / "evaluations.npz")["errors"][-1]
-    errors = [injected(env, kwargs, str(path), seed, "reduced").errors.mean() for seed in (100_000, 100_001)]
-    np.testing.assert_allclose(errors, expected, rtol=1e-5)
-    agent = load_method(str(path), "injection")
-    chosen = []
-    for estimator in ("reduced", "full"):
-        world = gym.make(env, estimator=estimator, observation="raw", **kwargs).unwrapped
-        player, ended = agent.make(world.rules, np.random.default_rng(0)), False
-        observation, _ = world.reset(seed=7)
-        chosen.append([])
-        while not ended:
-            observation, _, ended, _, _ = world.step(player.act(observation))
-            chosen[-1].append(observation["currents"])
-    np.testing.assert_array_equal(*chosen)                # whichever filter is inside
-    asked = json.loads((tmp_path / "config.json").read_text())
-    assert asked["config"] == json.loads(json.dumps(asdict(config)))
-    assert agent.name == f"{algo}_{_mark(asked)}_seed1" and _mark(asked) == _mark(asked | {"seed": 2})
-    assert _mark(asked) != _mark(asked | {"kwargs": {}}) and not agent.privileged and agent.parameters["env"] == env
-    other = {"instrument": {"limit": None if env == CURRENTS else "L1"}}
-    assert not agent.suits(Rules(PIPE_2D.changed(other)))
-    content = path.read_bytes()
-    path.write_bytes(content + b"x")
-    assert load_agent(path, content)[0] == agent.name            # what was checked is what is opened
-    with pytest.raises(ValueError, match="must have the sha256 that lies beside it"):
-        load_method(str(path), "injection")
-    (tmp_path / "sha256").unlink()
-    with pytest.raises(ValueError, match="must lie beside the config"):
-        load_method(str(path), "injection")

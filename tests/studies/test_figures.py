@@ -165,7 +165,7 @@ def test_injection_is_drawn(monkeypatch, run_cache, tmp_path):
     picture = imread(path)
     assert min(picture.shape[:2]) > 250 and picture[..., :3].std() > 0.05
     assert list(played.items()) == [((env, "{}"), entry(env).seeds) for env in injection.WORLDS]
-    assert remark.count("| best_pair ") == 6
+    assert remark.count("best_pair ") == 6
     with Image.open(tmp_path / "new" / "injection.gif") as moving:
         assert moving.n_frames == 4                        # the first frame of 16, then four steps
 

@@ -1,58 +1,140 @@
 """Leaderboards as a static site, as Markdown, and as CSV.
 
 Rendered from the records and from what the repository holds: docstrings of environments and
-methods, files and checkpoints of built-in methods. The same records and the same checkout give the
-same bytes.
+methods, files and checkpoints of built-in methods, animations. The same records and the same
+checkout give the same bytes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import ast
+import json
+import math
+import re
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any, NamedTuple
 
-from eitbench._files import replace_folder
+from markupsafe import Markup
+
+from eitbench._files import PACKAGE, replace_folder, shipped
 from eitbench._foreign import as_cell, as_markdown
-from eitbench.bench.records import file_name
-from eitbench.report.boards import board_table
-from eitbench.report.model import meanings
-from eitbench.report.site.collect import Beside, Site, collect
-from eitbench.report.site.measured import NOBODY, Measured, measured_pages, measured_text
-from eitbench.report.site.pages import environment_page, index_page, method_page
-from eitbench.report.site.robustness import robustness_pages, robustness_text
-from eitbench.report.tables import markdown_table
+from eitbench.bench.methods import baseline_folder, own_files, own_sha256, version_of
+from eitbench.bench.records import alike, file_name, finished, newest
+from eitbench.bench.table import NOTHING, Cell, Table, number_cell
+from eitbench.bench.text import scores_by_seed
+from eitbench.bench.tracks import home_of, named
+from eitbench.envs.pages import page
+from eitbench.report import tables
+from eitbench.report.boards import (
+    ALL,
+    Board,
+    board_table,
+    counted,
+    headings,
+    leaderboards,
+    meanings,
+    title_of,
+)
+from eitbench.report.site import measured, robustness
+from eitbench.report.templates import markdown, markdown_list, rendered
 
-__all__ = ["Beside", "Measured", "collect", "render", "render_site", "write_site"]
-
+ABOUT = {
+    "filter": "Estimates of each moment from the measurements until then.",
+    "fixed-lag": "Estimates of each moment from the measurements until a few later.",
+    "smoothing": "Estimates of each moment from the whole record.",
+    "stationary": "Targets that stand still.",
+    "injection": "The next current is chosen; a Kalman filter inside makes the estimate.",
+}
+"""Class -> task."""
+PIPE, AGENTS = "eitbench-Pipe2D-v0", "eitbench-Pipe2DInjectionBudget-v0"
+COMPARED = ("homogeneous", "gauss_newton", "extended_kalman_filter")
+MULTIPLES = ("two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven",
+             "twelve")
+ROBUSTNESS, MEASURED = "robustness.html", "measured.html"
+HEADLINE = "headline.webp", "headline.png"
+"""Animation of the first page, and its still picture. Others are named like an environment, as in
+eitbench-Pipe2D-v0.webp."""
+LINKS = {"How to submit": "README.md", "Statistics": "../docs/statistics.md",
+         "Code": "../README.md"}
+"""Link of every page -> file, from the leaderboards' folder."""
+METHODS = "../baselines"
+"""Folder of the built-in methods, from the leaderboards' folder."""
 PUBLIC_EPISODES = "The test episodes are public: anybody can simulate them."
 MARK = b"<strong>eitbench</strong> leaderboards"
 """Text by which the index.html of a site is recognised."""
-HERE = Path(__file__).parent.parent
 
 
-def render_site(site: Site, beside: Beside = Beside(),  # noqa: B008 (it is never changed)
-                measured: Measured = NOBODY) -> dict[str, bytes]:
-    """Return all files of the site, by their path within it.
+class Site(NamedTuple):
+    """Contents of all pages."""
 
-    Parameters
-    ----------
-    site : Site
-        As `collect` makes it of records.
-    beside : Beside
-        Files beside the site's folder: animations, and link targets. Default: none.
-    measured : Measured
-        Records of measurement files. Default: none.
-    """
-    files = {"index.html": index_page(site, beside, measured)}
+    boards: list[Board]
+    """Class by class, each followed by its aggregate."""
+    records: list[dict[str, Any]]
+    """Sorted; superseded ones included."""
+    measured: measured.Measured = measured.NOBODY
+    media: Mapping[str, int] = {}
+    """Name of each picture in the folder ``media`` beside the site -> bytes."""
+    beside: frozenset[str] = frozenset()
+    """Those of `LINKS` and `METHODS` that exist."""
+
+    @property
+    def classes(self) -> dict[str, list[Board]]:
+        """Class -> its boards, the aggregate first."""
+        found: dict[str, list[Board]] = {board.of_class: [] for board in self.boards}
+        for board in sorted(self.boards, key=lambda board: not board.is_aggregate):
+            found[board.of_class].append(board)
+        return found
+
+    def board(self, of_class: str, environment: str) -> Board | None:
+        """Return one of the boards, if there is one."""
+        return next((board for board in self.boards
+                     if (board.of_class, board.environment) == (of_class, environment)), None)
+
+    def page(self, kind: str, root: str = "", /, **contents: Any) -> bytes:
+        """Render a template of the site for a page from which ``root`` leads to the site."""
+        links = {words: f"{root}../{name}" for words, name in LINKS.items() if name in self.beside}
+        return rendered(f"site/{kind}.html.j2", root=root, links=links, **contents)
+
+    def picture(self, name: str, root: str) -> str:
+        """Return the address of a picture; empty if there is none."""
+        return f"{root}../media/{name}" if name in self.media else ""
+
+
+def collect(records: Iterable[dict[str, Any]], folder: Path | None = None) -> Site:
+    """Return the site of the records, and of the measured records, pictures and files that it finds
+    in a ``folder`` of leaderboards and in the checkout around it."""
+    ordered = sorted(records, key=lambda record: (
+        record["environment"]["name"], record["method"], record["version"]))
+    site = Site(leaderboards(ordered), ordered)
+    if folder is None:
+        return site
+    media = {path.name: path.stat().st_size for path in sorted((folder / "media").glob("*.*"))
+             if path.suffix in (".webp", ".png")}
+    beside = frozenset(name for name in (*LINKS.values(), METHODS) if (folder / name).exists())
+    return site._replace(measured=measured.Measured.of(folder), media=media, beside=beside)
+
+
+def render_site(site: Site) -> dict[str, bytes]:
+    """Return all files of the site, by their path within it."""
+    families = robustness.families(site.boards)
+    files = {"index.html": index_page(site)}
     for board in site.boards:
         if not board.is_aggregate:
-            files[f"environments/{board.environment}.html"] = environment_page(site, board, beside)
+            files[f"environments/{board.environment}.html"] = environment_page(site, board)
     for name in dict.fromkeys(record["method"] for record in site.records):
-        files[f"methods/{name}.html"] = method_page(site, name, beside)
-    files |= robustness_pages(site, beside) | measured_pages(measured, beside)
-    return files | {name: (HERE / name).read_bytes() for name in ("style.css", "script.js")}
+        files[f"methods/{name}.html"] = method_page(site, name)
+    if families:
+        files[ROBUSTNESS] = site.page("robustness", families=families,
+                                      explanations=robustness.MEANINGS)
+    if site.measured.records:
+        files[MEASURED] = site.page("measured", measured=site.measured,
+                                    explanations=measured.MEANINGS)
+    return files | {name: (PACKAGE / "report" / name).read_bytes()
+                    for name in ("style.css", "script.js")}
 
 
-def render(site: Site, measured: Measured = NOBODY) -> dict[str, str]:
+def render(site: Site) -> dict[str, str]:
     """Return the content of ``leaderboard.csv`` and ``leaderboard.md``, by file name; records of
     measurement files are in the second only."""
     parts = ["# Leaderboards", "*Rendered from the records by `eitbench leaderboard --records "
@@ -62,15 +144,14 @@ def render(site: Site, measured: Measured = NOBODY) -> dict[str, str]:
         parts.append(f"## {name}")
         for board in boards:
             seeds = f", {board.seeds}" if board.seeds else ""
-            parts += [f"### {as_markdown(board.title)}{seeds}", markdown_table(board).markdown()]
-    parts += robustness_text(site)
-    parts += measured_text(measured)
+            parts += [f"### {as_markdown(board.title)}{seeds}",
+                      tables.markdown_table(board).markdown()]
+    parts += [*robustness.text(site.boards), *measured.text(site.measured)]
     if site.boards:
-        listed = [f"- **{heading}**: {text}" for heading, text in meanings().items()]
-        parts += ["## Column descriptions", "\n".join(listed)]
-    if site.outdated:
+        parts += ["## Column descriptions", markdown_list(meanings())]
+    if outdated := newest(site.records)[1]:
         parts += ["## Superseded records", "Made by an earlier version of the method.\n\n"
-                  + "\n".join(f"- {as_markdown(file_name(record))}" for record in site.outdated)]
+                  + "\n".join(f"- {as_markdown(file_name(record))}" for record in outdated)]
     table = board_table(site.boards)
     texts = {name: table[name].map(as_cell) for name in ("environment", "method", "title")}
     plain = table.assign(**texts).to_csv(index=False, float_format="%.6g", lineterminator="\n")
@@ -92,3 +173,214 @@ def write_site(folder: Path, files: Mapping[str, bytes]) -> None:
         raise ValueError("folder must be empty or hold a site of the leaderboards, since other "
                          f"files in it are deleted; {folder} holds something else")
     replace_folder(folder, files)
+
+
+# -- index -----------------------------------------------------------------------------------------
+
+
+class KeyFigure(NamedTuple):
+    """One of the numbers below the headline."""
+
+    value: str
+    about: str
+    board: Board
+
+
+class Headline(NamedTuple):
+    """The comparison of an image with and without a flow model."""
+
+    text: str
+    measured: str
+    figure: KeyFigure
+
+
+def index_page(site: Site) -> bytes:
+    """Return the HTML of ``index.html``."""
+    shown = {name: [(board, tables.page_table(board, "", compact=True),
+                     tables.Axes.of(board).drawn()) for board in boards]
+             for name, boards in site.classes.items()}
+    top = headline(site)
+    return site.page(
+        "index", headline=top, figures=[*([top.figure] if top else []), *key_figures(site)],
+        moving=site.picture(HEADLINE[0], ""), still=site.picture(HEADLINE[1], ""),
+        n_environments=sum(not board.is_aggregate for board in site.boards),
+        n_records=len(site.records),
+        n_methods=len({record["method"] for record in site.records}), classes=shown, about=ABOUT,
+        robustness=ROBUSTNESS if robustness.families(site.boards) else "",
+        measured=MEASURED if site.measured.records else "",
+        last=max(map(finished, site.records), default="")[:10],
+        explanations=tables.explanations(table for boards in shown.values()
+                                         for _, table, _ in boards))
+
+
+def headline(site: Site) -> Headline | None:
+    """Return how many times a flow model reduces the error; None without official records."""
+    board = site.board("filter", PIPE)
+    errors = {row.cells["method"]: row.cells["error"] for row in (board.rows if board else ())
+              if row.cells["official"] and row.complete}
+    if board is None or not set(COMPARED) <= errors.keys():
+        return None
+    flat, stationary, filtered = (errors[name] for name in COMPARED)
+    times = stationary / filtered
+    if not 2 <= times < len(MULTIPLES) + 2:
+        return None
+    return Headline(
+        f"A flow model cuts the error {MULTIPLES[int(times) - 2]}fold",
+        f"Images of a target that is assumed to stand still (Gauss–Newton) have an error of "
+        f"{stationary:#.2g}, those of an extended Kalman filter with a model of the flow "
+        f"{filtered:#.2g}: {times:.1f} times less, or {math.sqrt(times):.1f} times by its root. "
+        f"The error is the squared distance from the truth over the square of the truth, the mean "
+        f"over {board.seeds} of {board.title}. The best homogeneous image has {flat:#.2g}.",
+        KeyFigure(f"{flat / filtered:.1f} ×", "less error than the best homogeneous image: the "
+                  f"extended Kalman filter on {board.title}", board))
+
+
+def key_figures(site: Site) -> list[KeyFigure]:
+    """Return up to two: gains of the best filter and of the best trained agent."""
+    def best(board: Board | None, *, trained: bool | None = None) -> tables.Line | None:
+        return next((line for line in (tables.lines(board) if board else ()) if line.row.competes
+                     and trained in (None, bool(line.parts))), None)
+
+    def percent(line: tables.Line) -> str:
+        return f"{100 * line.row.cells['gain']:.0f} %"
+
+    found = []
+    board = site.board("filter", ALL)
+    if board and (first := best(board)):
+        count = sum(each.of_class == "filter" and each.environment in counted()
+                    for each in site.boards)
+        found.append(KeyFigure(percent(first), "less error than the floor with the best filter "
+                               f"({first.row.cells['title']}), over {count} environments", board))
+    board = site.board("injection", AGENTS)
+    agent, rule = best(board, trained=True), best(board, trained=False)
+    if board and agent and rule:
+        found.append(KeyFigure(
+            percent(agent), "less error than random pairs with an agent trained to choose when "
+            f"and where to inject ({agent.row.cells['title']}, mean of {len(agent.parts)} "
+            f"trainings, on {board.title}); {percent(rule)} with the best written rule", board))
+    return found
+
+
+# -- environments ----------------------------------------------------------------------------------
+
+
+def environment_page(site: Site, board: Board) -> bytes:
+    """Return the HTML of the page of an environment."""
+    id = board.records[0]["environment"]["id"]
+    table = tables.page_table(board, "../")
+    description, details = documentation(id)
+    animation = f"{board.environment}.webp"
+    return site.page(
+        "environment", "../", board=board, id=id, description=description, details=details,
+        table=table, axes=tables.Axes.of(board).drawn(),
+        explanations=tables.explanations([table]),
+        front=tables.cost_chart(board), curves=tables.curve_chart(board),
+        moving=site.picture(animation, "../"),
+        media_mb=f"{1e-6 * site.media.get(animation, 0):.1f} MB",
+        robustness=ROBUSTNESS if home_of(id) and named(id, {}) == board.environment else "",
+        siblings=[other for other in site.classes[board.of_class]
+                  if other is not board and not other.is_aggregate])
+
+
+def documentation(id: str) -> tuple[Markup, Markup]:
+    """Return the description of an id and the remaining sections of its page, as HTML."""
+    text = re.sub(r"\A\s*## Description\s*", "", page(id))
+    first, rest = re.split(r"^(?=## |\|)", text, maxsplit=1, flags=re.MULTILINE)
+    return markdown(first), markdown(rest)
+
+
+# -- methods ---------------------------------------------------------------------------------------
+
+
+def method_page(site: Site, name: str) -> bytes:
+    """Return the HTML of the page of all versions of a method."""
+    records = sorted((record for record in site.records if record["method"] == name),
+                     key=lambda record: (record["official"], finished(record)), reverse=True)
+    placements = [(board, row) for boards in site.classes.values() for board in boards
+                  for row in board.rows if row.cells["method"] == name]
+    addresses = {(row.cells["environment"], row.cells["version"]): board.address
+                 for board, row in placements}
+    versions: dict[str, list[dict[str, Any]]] = {}
+    for record in records:
+        versions.setdefault(record["version"], []).append(record)
+    table, axes = _placements(placements)
+    return site.page(
+        "method", "../", name=name, title=records[0]["title"], placements=table, axes=axes,
+        checkout="../../../" if METHODS in site.beside else "",
+        versions=[_version(own, addresses) for own in versions.values()])
+
+
+def _placements(placements: list[tuple[Board, tables.Row]]) -> tuple[Table, dict[str, Markup]]:
+    """Return one row for each board, and the axes of gains, which all rows share."""
+    gains = tables.Axes.of(Board("", ALL, "", [row for _, row in placements]))
+    rows = []
+    for board, row in placements:
+        rank = row.cells["rank"]
+        link = f"../index.html#{board.anchor}" if board.is_aggregate else f"../{board.address}"
+        rows.append({
+            "board": Cell(board.title, board.title.casefold(), link=link,
+                          small=f"{board.of_class} · {row.cells['version']}", badges=row.badges),
+            "rank": Cell(NOTHING) if rank is None else Cell(
+                str(rank), float(rank), small=f"of {sum(each.competes for each in board.rows)}"),
+            "ẽ_c": tables.Axes.of(board).cell(row, "error"), "gain": gains.cell(row, "gain"),
+            "ms/step": number_cell(row.cells["seconds_per_step"])})
+    table = Table.of(rows, label="Boards", keep=list(rows[0]) if rows else ())
+    return table, {"gain": gains.drawn()["gain"]}
+
+
+def _version(records: list[dict[str, Any]], addresses: dict[tuple[str, str], str],
+             ) -> dict[str, Any]:
+    """Return the properties of one version, and its records."""
+    record = records[0]
+    file = source_file(record)
+    shown = []
+    for each in sorted(records, key=lambda record: record["environment"]["name"]):
+        runs = [group[0] | {"products": sorted(1000 * run["machine"]["matmul_seconds"]
+                                               for run in group)} for group in alike(each["runs"])]
+        shown.append({
+            "title": title_of(each), "official": each["official"], "runs": runs,
+            "file": file_name(each), "episodes": _episodes(each),
+            "address": addresses.get((each["environment"]["name"], each["version"])),
+            "commands": sorted({run["command"] for run in each["runs"]}),
+            "failures": [episode for episode in each["episodes"] if episode["status"] != "ok"]})
+    return {"name": record["version"], "sha256": record["method_sha256"],
+            "checkpoint": record["checkpoint_sha256"], "file": file,
+            "docstring": docstring(record, file), "records": shown,
+            "parameters": {key: json.dumps(value, ensure_ascii=False)
+                           for key, value in sorted(record["parameters"].items())}}
+
+
+def _episodes(record: dict[str, Any]) -> Table:
+    """Return one row for each episode, with the scores that any of them has."""
+    values = {heading: scores_by_seed(record, name)
+              for name, heading in ({"error": "ẽ_c"} | headings()).items()}
+    return Table.of([{
+        "seed": Cell(episode["seed"], float(i)), "status": episode["status"],
+        **{heading: number_cell(own.get(episode["seed"])) for heading, own in values.items()},
+        "date": Cell(episode["finished"][:10], episode["finished"]),
+    } for i, episode in enumerate(record["episodes"])], label=f"Episodes of {title_of(record)}")
+
+
+def source_file(record: dict[str, Any]) -> str:
+    """Return the path of a built-in method's file in this repository; empty if it is not there.
+
+    Agents must be the very version, since others may use their names.
+    """
+    path = own_files(record["environment"]["id"]).get(record["method"])
+    if path is None or not (path.suffix == ".py" or _is_version(record, path)):
+        return ""
+    return f"baselines/{path.relative_to(baseline_folder()).as_posix()}"
+
+
+def docstring(record: dict[str, Any], file: str) -> Markup:
+    """Return the docstring of the method's file, if this repository holds the recorded version."""
+    path = shipped("baselines").parent / file
+    if path.suffix != ".py" or not _is_version(record, path):
+        return Markup()
+    return markdown(ast.get_docstring(ast.parse(path.read_bytes())) or "")
+
+
+def _is_version(record: dict[str, Any], path: Path) -> bool:
+    """Return whether a file is the recorded version: by number, of third parties by content."""
+    sha256 = own_sha256(path)
+    return record["version"] == version_of(path, sha256) or sha256 == record["method_sha256"]

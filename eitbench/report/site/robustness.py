@@ -9,18 +9,18 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterable
 from statistics import fmean
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from markupsafe import Markup
 
 from eitbench.bench.table import NOTHING, Cell, Table, number_cell
 from eitbench.bench.text import number
 from eitbench.bench.tracks import home_of, ids, named
-from eitbench.report.model import Board, Row, kind_of
-from eitbench.report.site.collect import ROBUSTNESS, Beside, Site
-from eitbench.report.tables import flags, method_cell
-from eitbench.report.templates import markdown
+from eitbench.report.boards import Board, Row, kind_of
+from eitbench.report.tables import by_author, flags, method_cell
+from eitbench.report.templates import markdown, markdown_list
 from eitbench.worlds.registry import entry
 
 BELOW = "below the floor"
@@ -50,16 +50,51 @@ class Family(NamedTuple):
     shifts: dict[str, Board]
     """Heading -> board, of those with records, in the order of registration."""
 
+    @property
+    def definitions(self) -> dict[str, Markup]:
+        """Heading -> the first paragraph of the description of a shift."""
+        texts = {name: entry(board.records[0]["environment"]["id"]).about
+                 for name, board in self.shifts.items()}
+        return {name: markdown(text.strip().split("\n\n")[0]) for name, text in texts.items()}
 
-def families(site: Site) -> list[Family]:
-    """Return the registered ids with a nominal id that have records, grouped by it."""
-    boards = {board.environment: board for board in site.boards if not board.is_aggregate}
+    @property
+    def table(self) -> Table:
+        """The largest least gain first, unfinished methods last."""
+        nominal = {row.label: row for row in self.nominal.rows} if self.nominal else {}
+        shifted = {name: {row.label: row for row in board.rows}
+                   for name, board in self.shifts.items()}
+        floors = {name: _best_floor(board) for name, board in self.shifts.items()}
+        lines: list[tuple[float, dict[str, Cell | str], str]] = []
+        for label in dict.fromkeys(label for rows in shifted.values() for label in rows):
+            home = nominal.get(label)
+            own = {name: rows[label] for name, rows in shifted.items() if label in rows}
+            gains = {name: row.cells["gain"] for name, row in own.items()
+                     if row.complete and row.cells["gain"] is not None}
+            row = home or next(iter(own.values()))
+            cells: dict[str, Cell | str] = {"method": method_cell(row, "", more=by_author(row)),
+                                            "nominal": _error(home)}
+            cells |= {name: _error(own.get(name), home, floors[name]) for name in self.shifts}
+            least = min(gains, key=gains.__getitem__) if gains.keys() == shifted.keys() else ""
+            cells["mean gain"] = number_cell(fmean(gains.values()) if least else None)
+            cells["least gain"] = Cell(number(gains[least]), gains[least],
+                                       small=least) if least else Cell(NOTHING)
+            lines.append((-gains[least] if least else math.inf, cells, flags(row)))
+        lines.sort(key=lambda line: line[0])
+        return Table.of([cells for _, cells, _ in lines], keep=["nominal"],
+                        label=f"{kind_of(self.home)} and its shifts",
+                        flags=[flag for *_, flag in lines])
+
+
+def families(boards: Iterable[Board]) -> list[Family]:
+    """Return the registered ids with a nominal id that have boards, grouped by it."""
+    of_environment = {board.environment: board for board in boards if not board.is_aggregate}
     found: dict[str, Family] = {}
     for id in ids():
         home = home_of(id)
-        board = boards.get(named(id, {}))
+        board = of_environment.get(named(id, {}))
         if home and board:
-            family = found.setdefault(home, Family(home, boards.get(named(home, {})), {}))
+            nominal = of_environment.get(named(home, {}))
+            family = found.setdefault(home, Family(home, nominal, {}))
             family.shifts[heading(id, home)] = board
     return list(found.values())
 
@@ -68,33 +103,6 @@ def heading(id: str, home: str) -> str:
     """``eitbench/Pipe2DShortSlugs-v0`` -> ``short slugs``."""
     words = kind_of(id).removeprefix(kind_of(home)) or kind_of(id)
     return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", words).lower()
-
-
-def robustness_table(family: Family) -> Table:
-    """Return the board of a family, the largest least gain first, unfinished methods last."""
-    nominal = {row.label: row for row in family.nominal.rows} if family.nominal else {}
-    shifted = {name: {row.label: row for row in board.rows}
-               for name, board in family.shifts.items()}
-    floors = {name: _best_floor(board) for name, board in family.shifts.items()}
-    lines: list[tuple[float, dict[str, Cell | str], str]] = []
-    for label in dict.fromkeys(label for rows in shifted.values() for label in rows):
-        home = nominal.get(label)
-        own = {name: rows[label] for name, rows in shifted.items() if label in rows}
-        gains = {name: row.cells["gain"] for name, row in own.items()
-                 if row.complete and row.cells["gain"] is not None}
-        row = home or next(iter(own.values()))
-        cells: dict[str, Cell | str] = {"method": method_cell(row, "", beaten={}),
-                                        "nominal": _error(home)}
-        cells |= {name: _error(own.get(name), home, floors[name]) for name in family.shifts}
-        least = min(gains, key=gains.__getitem__) if gains.keys() == shifted.keys() else ""
-        cells["mean gain"] = number_cell(fmean(gains.values()) if least else None)
-        cells["least gain"] = Cell(number(gains[least]), gains[least],
-                                   small=least) if least else Cell(NOTHING)
-        lines.append((-gains[least] if least else math.inf, cells, flags(row)))
-    lines.sort(key=lambda line: line[0])
-    return Table.of([cells for _, cells, _ in lines], keep=["nominal"],
-                    label=f"{kind_of(family.home)} and its shifts",
-                    flags=[flag for _, _, flag in lines])
 
 
 def _best_floor(board: Board) -> float:
@@ -119,32 +127,13 @@ def _error(row: Row | None, home: Row | None = None, floor: float = math.inf) ->
     return Cell(number(error), error, small=ratio, badges=(*below, *lacks))
 
 
-def robustness_pages(site: Site, beside: Beside) -> dict[str, bytes]:
-    """Return the HTML of the page; nothing without a record of a shift."""
-    found = families(site)
-    if not found:
-        return {}
-    shown: list[dict[str, Any]] = [{
-        "home": family.home, "board": family.nominal, "table": robustness_table(family),
-        "shifts": {name: (board, definition(board)) for name, board in family.shifts.items()},
-    } for family in found]
-    return {ROBUSTNESS: beside.page("robustness", families=shown, explanations=MEANINGS)}
-
-
-def definition(board: Board) -> Markup:
-    """Return the first paragraph of the description of a shift, as HTML."""
-    id = next(row.record["environment"]["id"] for row in board.rows if row.record)
-    return markdown(entry(id).about.strip().split("\n\n")[0])
-
-
-def robustness_text(site: Site) -> list[str]:
+def text(boards: Iterable[Board]) -> list[str]:
     """Return the Markdown section in parts; nothing without a record of a shift."""
-    found = families(site)
+    found = families(boards)
     if not found:
         return []
     parts = ["## robustness", "Scores where the truth differs from the model, beside nominal ones; "
              "ordered by the least gain over the floor in the same world."]
     for family in found:
-        parts += [f"### {kind_of(family.home)} and its shifts",
-                  robustness_table(family).markdown()]
-    return [*parts, "\n".join(f"- **{name}**: {text}" for name, text in MEANINGS.items())]
+        parts += [f"### {family.table.label}", family.table.markdown()]
+    return [*parts, markdown_list(MEANINGS)]

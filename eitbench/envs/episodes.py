@@ -1,0 +1,350 @@
+"""Episodes of a simulated world: a core with a batch axis, and a scalar and a vector environment
+around it."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+
+from eitbench import _check
+from eitbench._extras import needed_by
+from eitbench.data.beginnings import Script, concentration_at, script, script_so_far
+from eitbench.data.pool import Pool
+from eitbench.data.seeds import warn_of_reserved
+from eitbench.worlds.task import Task, make_task
+
+if TYPE_CHECKING:
+    from eitbench.numerics.mesh import Mesh
+    from eitbench.worlds.world import World
+
+Observation = dict[str, np.ndarray]
+RESET_NEEDED = "call reset() before step(), and again when an episode has ended"
+RENDER_MODES = ["rgb_array"]
+MAX_CORE_EPISODES = 16
+"""Episodes of a core in a vector environment: the arrays of more do not fit a CPU core's cache."""
+
+
+class EpisodeCore(ABC):
+    """B episodes of a world at the same step: actions in, rewards and observations out.
+
+    Of an episode that is not recorded, only the first steps are simulated until more are needed.
+    """
+
+    first = 0
+    """measurements before the first action"""
+    length: int
+    """steps of an episode"""
+    observation_space: spaces.Space
+    """of one episode"""
+    action_space: spaces.Space
+    """of one episode"""
+
+    def __init__(self, world: World) -> None:
+        self.world = world
+        self.seeds: tuple[int, ...] = ()
+        """episodes in progress"""
+
+    def begin(self, seeds: Sequence[int],
+              provide: Callable[[World, int], None] | None = None) -> None:
+        """Begin these episodes.
+
+        With ``provide``, only the first steps of episodes that are not recorded are simulated; it
+        is called with the world and each seed when later steps are needed.
+        """
+        self.seeds = tuple(seeds)
+        self._provide = provide
+        if provide is None:
+            self._load([script(self.world, seed) for seed in seeds])
+        else:
+            self._load([script_so_far(self.world, seed, self.first + 1) for seed in seeds])
+
+    def _load(self, scripts: Sequence[Script]) -> None:
+        self._known = min(len(entries) for entries, _ in scripts)
+        """steps that are loaded"""
+        self._read(scripts)
+
+    def load_until(self, t: int) -> None:
+        """Load at least the steps 1 … t of each episode."""
+        if self._known < min(t, self.world.n_steps):
+            assert self._provide is not None
+            for seed in self.seeds:
+                self._provide(self.world, seed)
+            self._load([script(self.world, seed) for seed in self.seeds])
+
+    @abstractmethod
+    def _read(self, scripts: Sequence[Script]) -> None:
+        """Copy the arrays of the episodes; a script may be mapped from a file, which stays open."""
+
+    @abstractmethod
+    def act(self, actions: np.ndarray) -> np.ndarray:
+        """Take valid actions (B, …) and return the rewards (B,)."""
+
+    @abstractmethod
+    def observe(self) -> Observation:
+        """Return observations in SI units, new arrays (B, …)."""
+
+    def format(self) -> Any:
+        """Return observations in `observation_space`, with a leading axis B."""
+        return self.observe()
+
+
+class FixedLengthEnv(gym.Env[Any, Any]):  # type: ignore[misc]
+    """An environment whose ``spec`` states the steps of its episodes as ``max_episode_steps``.
+
+    The last step is ``terminated``, and ids are registered without that number, so
+    `gymnasium.make` adds no `gymnasium.wrappers.TimeLimit`. An environment made from this spec has
+    one, whose last step is ``truncated`` too (``gymnasium.make(spec, max_episode_steps=-1)`` leaves
+    it out).
+    """
+
+    episode_steps: int
+    _spec: EnvSpec | None = None
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """Specification that the environment was made from."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, made_from: EnvSpec | None) -> None:
+        self._spec = made_from and replace(made_from, max_episode_steps=self.episode_steps)
+
+    def check_render(self, render_mode: str | None) -> None:
+        """Set the render mode; ``ValueError`` if there is no such mode."""
+        if render_mode not in (None, *RENDER_MODES):
+            raise ValueError(f"render_mode must be None or one of {RENDER_MODES}, "
+                             f"got {render_mode!r}")
+        self.render_mode = render_mode
+
+    def can_render(self) -> bool:
+        """Return whether a picture can be drawn; warn without a mode."""
+        if self.render_mode is None:
+            gym.logger.warn("render() needs gym.make(..., render_mode='rgb_array')")
+        return self.render_mode is not None
+
+
+class EpisodeEnv(FixedLengthEnv):
+    """One episode of a core at a time."""
+
+    metadata = {"render_modes": RENDER_MODES, "render_fps": 8}  # noqa: RUF012 (gymnasium's form)
+    core: EpisodeCore
+    _task_options: dict[str, Any] = {}  # noqa: RUF012 (replaced, not changed)
+
+    def __init__(self, core: EpisodeCore, episodes: int | None, render_mode: str | None) -> None:
+        self.check_render(render_mode)
+        self.pool = Pool(episodes)
+        """training episodes of unseeded resets"""
+        self.core = core
+        """simulates the episode; its results include the ground truth"""
+        self.world = core.world
+        """configuration of the simulated truth; estimators are given `task` instead"""
+        self.episode_steps = core.length
+        self.observation_space = core.observation_space
+        self.action_space = core.action_space
+        self._step = 0
+
+    @cached_property
+    def task(self) -> Task:
+        """Information for an estimator; built on first use, since steps need none of its models."""
+        return make_task(self.world, **self._task_options)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state of the episode, so that a copy continues it, also in another process;
+        the models of the task are built again."""
+        return {name: value for name, value in vars(self).items() if name != "task"}
+
+    def reset(self, *, seed: int | None = None,
+              options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begin the episode with this seed (`eitbench.data.seeds`), or a random training one."""
+        super().reset(seed=seed)
+        if seed is not None:
+            self.pool.restart()
+        number = self.pool.draw(self.np_random) if seed is None else seed
+        warn_of_reserved([number])
+        self.core.begin([number], self.pool.provide)
+        self._step = 1
+        return self._observe(), {"step": 1}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Take an action; ``ValueError`` if it is not in the action space."""
+        if not 1 <= self._step <= self.episode_steps:
+            raise gym.error.ResetNeeded(RESET_NEEDED)
+        reward = float(self.core.act(self._checked(action))[0])
+        self._step += 1
+        ended = self._step > self.episode_steps
+        return self._observe(), reward, ended, False, {"step": self._step}
+
+    def _observe(self) -> Any:
+        shown = self.core.format()
+        return {name: array[0] for name, array in shown.items()} if isinstance(shown, dict) \
+            else shown[0]
+
+    def _checked(self, action: Any) -> np.ndarray:
+        """Return a valid action with a batch axis of length 1."""
+        raise NotImplementedError
+
+    def render(self) -> np.ndarray | None:  # type: ignore[override]
+        """(height, width, 3) uint8: truth, estimate, its standard deviation, electrodes; None
+        without a mode."""
+        if not self.can_render():
+            return None
+        self.require_reset("render()")
+        with needed_by("render()"):
+            from eitbench.envs.rendering import draw_frame
+        t, estimate, spread, currents = self._picture()
+        truth = concentration_at(self.world, self.core.seeds[0], t, self.core.first + 1)
+        return draw_frame(self.task, self.truth_mesh(), truth, estimate, spread, currents,
+                          t * self.world.time_step, self.world.region)
+
+    def _picture(self) -> tuple[int, np.ndarray, np.ndarray | None, np.ndarray]:
+        """Return t, the estimate of its state, the standard deviation, and the currents (L,)."""
+        raise NotImplementedError
+
+    def truth_mesh(self) -> Mesh:
+        """Return the mesh of the ground truth."""
+        from eitbench.data.episodes import truth_discretisation
+        return truth_discretisation(self.world).transport.mesh
+
+    def require_reset(self, caller: str) -> None:
+        """Raise ``ResetNeeded`` before the first episode."""
+        if self._step == 0:
+            raise gym.error.ResetNeeded(f"call reset() before {caller}")
+
+
+class EpisodeVectorEnv(gym.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
+    """Environments whose episodes have the same length, so that they begin and end together.
+
+    Observations equal those of ``SyncVectorEnv`` over the scalar environment, bit for bit:
+    ``reset(seed=s)`` begins episode s + k in environment k, and the step after an episode's end
+    begins the next one (``NEXT_STEP``). A growing pool of training episodes (``episodes`` None)
+    counts the resets of all environments here, and those of each there.
+    """
+
+    metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
+
+    def __init__(self, make_core: Callable[[], EpisodeCore], num_envs: int, episodes: int | None,
+                 max_episode_steps: int | None, *, threads: int = 1,
+                 core_episodes: int = MAX_CORE_EPISODES) -> None:
+        self.num_envs = _check.integer("num_envs", num_envs, low=1)
+        self.pool = Pool(episodes)
+        """training episodes of unseeded resets"""
+        self._threads = _check.integer("threads", threads, low=1)
+        size = min(core_episodes, -(-num_envs // threads))
+        self._parts = [slice(first, first + size) for first in range(0, num_envs, size)]
+        self.cores: list[Any] = [make_core() for _ in self._parts]
+        first_core = self.cores[0]
+        self.world: World = first_core.world
+        self._length: int = first_core.length
+        if max_episode_steps not in (None, self._length):      # gymnasium passes that of a spec
+            raise ValueError("max_episode_steps must be None or the steps of an episode, "
+                             f"{self._length}, got {max_episode_steps!r}")
+        self.single_observation_space = first_core.observation_space
+        self.single_action_space = first_core.action_space
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._randoms: list[np.random.Generator | None] = [None] * num_envs
+        self._step = 0
+        self._ended = False
+        self._start_threads()
+
+    def _start_threads(self) -> None:
+        self._executor = ThreadPoolExecutor(self._threads) if self._threads > 1 else None
+        self._map = self._executor.map if self._executor else map
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return everything but the threads: a copy has separate ones."""
+        return {name: value for name, value in vars(self).items()
+                if name not in ("_executor", "_map")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._start_threads()
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Stop the threads."""
+        if self._executor:
+            self._executor.shutdown()
+
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        """Episodes in progress."""
+        return tuple(seed for core in self.cores for seed in core.seeds)
+
+    def reset(self, *, seed: int | list[int | None] | None = None,
+              options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begin the episodes seed, seed + 1, …, or those of a list; or random training episodes."""
+        if options and "reset_mask" in options:
+            raise ValueError("options must not hold 'reset_mask': all environments begin and end "
+                             "together")
+        seeds = self._seeds(seed)
+        if any(one is not None for one in seeds):
+            self.pool.restart()
+        chosen = []
+        for k, one in enumerate(seeds):
+            random = self._randoms[k]
+            if one is not None or random is None:
+                self._randoms[k] = random = seeding.np_random(one)[0]
+            chosen.append(self.pool.draw(random) if one is None else one)
+        warn_of_reserved(chosen)
+        for number in chosen:
+            self.pool.provide(self.world, number)
+        for core, part in zip(self.cores, self._parts, strict=True):
+            core.begin(chosen[part])
+        self._step = 1
+        self._ended = False
+        return self._observe(), self._info()
+
+    def _seeds(self, seed: int | list[int | None] | None) -> list[int | None]:
+        if seed is None:
+            return [None] * self.num_envs
+        if not isinstance(seed, (list, tuple, np.ndarray)):
+            first = _check.integer("seed", seed, low=0)
+            return [first + k for k in range(self.num_envs)]
+        if len(seed) != self.num_envs:
+            raise ValueError(f"seed must be an integer or a list of {self.num_envs}, "
+                             f"got {len(seed)} entries")
+        return [None if one is None else _check.integer("seed", one, low=0) for one in seed]
+
+    def step(self, actions: np.ndarray,
+             ) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Step each environment; after an episode's end begin a new one, for any actions."""
+        if self._step == 0:
+            raise gym.error.ResetNeeded("call reset() before step()")
+        none_ended = np.zeros(self.num_envs, dtype=bool)
+        if self._ended:
+            observation, info = self.reset()
+            return observation, np.zeros(self.num_envs), none_ended, none_ended.copy(), info
+        checked = self._checked(actions)
+        by_core = [checked[part] for part in self._parts]
+        rewards = np.concatenate(list(self._map(type(self.cores[0]).act, self.cores, by_core)))
+        self._step += 1
+        self._ended = self._step > self._length
+        ended = np.full(self.num_envs, self._ended)
+        return self._observe(), rewards, ended, none_ended, self._info()
+
+    def _checked(self, actions: np.ndarray) -> np.ndarray:
+        """Return valid actions (num_envs, …)."""
+        raise NotImplementedError
+
+    def _observe(self) -> Any:
+        shown = list(self._map(type(self.cores[0]).format, self.cores))
+        if not isinstance(shown[0], dict):
+            return np.concatenate(shown)
+        return {name: np.concatenate([part[name] for part in shown]) for name in shown[0]}
+
+    def _info(self) -> dict[str, Any]:
+        return {"step": np.full(self.num_envs, self._step),
+                "_step": np.ones(self.num_envs, dtype=bool)}
+
