@@ -190,7 +190,7 @@ def _is_numeric(value: Any) -> bool:
 def world_golden(id: str, *, is_quick: bool = False) -> dict[str, Any]:
     """Compute the golden numbers of a registered id: its world's, and its first observations."""
     return {"id": id, **world_numbers(entry(id).world, QUICK if is_quick else (*WORLD_EPISODES,)),
-            "observations": {name: _observations(id, name)
+            "observations": {name: first_observations(id, name)
                              for name in (QUICK if is_quick else OBSERVATION_SEEDS)}}
 
 
@@ -305,7 +305,7 @@ def _episode_numbers(world: World, name: str) -> dict[str, Any]:
     return numbers
 
 
-def _observations(id: str, name: str) -> dict[str, Any]:
+def first_observations(id: str, name: str) -> dict[str, Any]:
     """Return some entries of the first observations of an environment, and the rewards."""
     env = gym.make(id)
     observation, _ = env.reset(seed=parse_seeds(name)[0])

@@ -379,13 +379,6 @@ def test_mistakes_are_explained(arguments, message):
     assert code == 1 and "record record.json cannot be read" in complaint
 
 
-@pytest.mark.parametrize("command", ["check", "season", "held-out"])
-def test_removed_commands_name_their_replacement(command):
-    code, said, complaint = eitbench(command, "somewhere", "--out", "x", "--help")
-    assert code == 2 and said == ""
-    assert re.search(f"`eitbench {command}` was removed: .*(verify|docs/trust.md)", complaint)
-
-
 def test_the_workflow_calls_an_existing_command():
     """Its options are those of `verify`."""
     text = (Path(held_out.__file__).parents[2] / ".github/workflows/submission.yml").read_text()
