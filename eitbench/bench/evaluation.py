@@ -30,22 +30,11 @@ def evaluate(method: Any, env: str | gym.Env, seeds: str | Iterable[int], *,
     By default the method's code runs in this process, with all its rights: it can read the truth,
     files and the network. Use ``isolate`` for a third-party file.
 
-    Parameters
-    ----------
-    method : class, name or path
-        A class ``Estimator`` or ``Policy`` as in a method's file, under any name; or the name of a
-        built-in method; or the path of a file.
-    env : str or Env
-        A registered id, or an environment made by `gymnasium.make`, whose arguments are used.
-    seeds : str or iterable of int
-        As in ``"dev:0-9"``, or the seeds themselves.
-    world : dict
-        Changes of the world's parts, as `gymnasium.make` takes them.
-    n_jobs : int
-        Processes. With one, the method's output is shown, and a debugger stops in it.
-    isolate : str
-        As the option ``--isolate`` of ``eitbench run``, for a method by name or path: the method
-        runs in a separate process. Default: in this process, or those of ``n_jobs``.
+    ``method`` is a class ``Estimator`` or ``Policy`` as in a method's file, the name of a built-in
+    method, or the path of a file; ``env`` a registered id, or an environment made by
+    `gymnasium.make`, whose arguments are used; ``seeds`` such as ``"dev:0-9"``, or numbers;
+    ``world`` changes of the world as `gymnasium.make` takes them. ``isolate`` is the option of
+    ``eitbench run``, for a method by name or path.
 
     Returns
     -------
@@ -53,12 +42,8 @@ def evaluate(method: Any, env: str | gym.Env, seeds: str | Iterable[int], *,
         A row for each seed: environment, method, seed (as ``dev:3``), and each score by its name,
         in SI units as in ``leaderboards/schema.json``; None where the method gives no value.
 
-    Raises
-    ------
-    ValueError
-        If an argument is wrong, or the method does not suit the environment.
-    Exception
-        The exception that the method raises, with a note that names the episode.
+    ``ValueError`` if an argument is wrong, or the method does not suit the environment. Exceptions
+    of the method pass, with a note that names the episode.
     """
     asked = environment_of(env, world)
     if isolate is None:

@@ -2,15 +2,15 @@
 
 A golden file decides whether numbers have changed; the text of the code does not. Each world's file
 holds numbers of its model, of two simulated episodes (one of them unshortened), and the first
-observations of its environment; each method's file holds scores and estimates in short episodes and
-in one unshortened episode. Tolerances allow for other processors and BLAS kernels.
+observations of its environment; each method's file holds scores and estimates in two short episodes
+and in one unshortened episode. Tolerances allow for other processors and BLAS kernels.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -48,11 +48,14 @@ from eitbench.worlds.task import make_task
 from eitbench.worlds.world import World
 
 WORLD_FOLDER = PACKAGE / "worlds" / "golden"
+METHOD_FOLDER = baseline_folder() / "golden"
 FIRST_STEPS = 24
 """Simulated steps of a shortened episode; they include the first scored ones."""
 WORLD_EPISODES = {"train:0": FIRST_STEPS, "dev:0": None}
 """Seed -> number of simulated steps of a world's golden episode; None: the whole episode."""
 OBSERVATION_SEEDS = ("train:0", "dev:0", "dev:1")
+QUICK = ("train:0",)
+"""The shortened episode of worlds, which a quick check computes alone."""
 N_OBSERVATIONS = 3
 """Observations of each of these seeds: that of `reset` and those of two steps."""
 N_ENTRIES = 5
@@ -62,46 +65,96 @@ SINGLE = 1e-4
 """Relative tolerances. The reduced filter and stored moments are in single precision."""
 
 
-# -- worlds ----------------------------------------------------------------------------------------
+# -- files ----------------------------------------------------------------------------------------
 
 
-def world_golden(id: str) -> dict[str, Any]:
-    """Compute the golden numbers of a registered id: its world's, and its first observations."""
-    return {"id": id, **world_numbers(entry(id).world),
-            "observations": {name: _observations(id, name) for name in OBSERVATION_SEEDS}}
+def official_methods() -> dict[str, str]:
+    """Map the name of each method's golden file to the method: a name, or an agent's path."""
+    agents = {card_name(Path(path)): path
+              for id in tracks.ids("injection") for path in reversed(own_agents(id))}
+    return {name: name for track in tracks.TRACKS for name in own_methods(track)} | agents
 
 
-@lru_cache(maxsize=2)
-def world_numbers(world: World) -> dict[str, Any]:
-    """Compute numbers of a world's model and of its golden episodes.
+def golden_path(name: str) -> Path:
+    """Return the path of the golden file of a built-in id or method."""
+    folder = WORLD_FOLDER if name in tracks.own_ids() else METHOD_FOLDER
+    return folder / f"{name.replace('/', '-')}.json"
 
-    Returns
-    -------
-    dict
-        JSON-ready: ``model`` (computed voltages in V, a transport step in mol/m³), and for each of
-        ``episodes`` some entries of 𝓡 in Ω, noise draws, voltages in V, moments b_t,
-        ∫(c − background)², ∫c², moments of the flow, faults, ĉ_bh in mol/m³, and the mean relative
-        error of that estimate.
+
+def read_golden(name: str) -> dict[str, Any] | None:
+    """Read a golden file; None if it is missing, ``ValueError`` if it is damaged."""
+    path = golden_path(name)
+    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
+
+
+def check(name: str, episodes: tuple[int, ...] | None = None) -> list[str]:
+    """Compare a built-in id or method with its golden file: one sentence for each number that
+    differs; a method's scores that the file does not have are ignored.
+
+    ``episodes`` chooses among those of a method (0, 1: short, 2: unshortened). For a world (0,)
+    chooses the model, the shortened episode and the observations of its seed. Default: all.
     """
-    return {"model": _model_numbers(world.fluid), "episodes": {
-        name: _episode_numbers(world, name) for name in WORLD_EPISODES}}
-
-
-def golden_path(id: str) -> Path:
-    """Return the path of the golden file of a built-in id."""
-    return WORLD_FOLDER / f"{id.replace('/', '-')}.json"
-
-
-def check_world(id: str) -> list[str]:
-    """Compare a world with its golden file: one sentence for each number that differs."""
     try:
-        expected = json.loads(golden_path(id).read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        return [f"{id} has no golden file: {golden_path(id)} is missing"]
+        expected = read_golden(name)
     except ValueError as error:                                 # invalid JSON or UTF-8
-        return [f"the golden file of {id} is damaged: {error}"]
-    computed = json.loads(world_text(world_golden(id)))
-    return [f"{id}: {sentence}" for sentence in differences(computed, expected)]
+        return [f"the golden file of {name} is damaged: {error}"]
+    if expected is None:
+        return [f"{name} has no golden file: {golden_path(name)} is missing"]
+    if name in tracks.own_ids():
+        return _world_differences(name, expected, is_quick=episodes == (0,))
+    chosen = [expected["episodes"][i] for i in episodes or range(len(expected["episodes"]))]
+    return _method_differences(expected | {"episodes": chosen}, _method_golden(
+        expected | {"episodes": chosen}, official_methods()[name]))
+
+
+def update(names: list[str], *, new_version: bool = False) -> Iterator[tuple[str, str, list[str]]]:
+    """Compare built-in ids and methods (default: all) with their golden files, and write missing
+    files.
+
+    With ``new_version`` a method's file whose numbers moved is written with the next version
+    number; otherwise it stays as it is, as a world's file always does.
+
+    Yields
+    ------
+    name, status, differences
+        ``status`` is ``new``, ``same``, ``moved``, or the new version.
+
+    ``ValueError`` if a name is neither an id nor a built-in method's.
+    """
+    ids, methods = tracks.own_ids(), official_methods()
+    if unknown := [name for name in names if name not in ids and name not in methods]:
+        raise ValueError(f"names must be ids, or methods of {', '.join(methods)}; got "
+                         f"{', '.join(unknown)}")
+    for name in names or [*ids, *methods]:
+        if name in methods:
+            yield (name, *_update_method(name, methods[name], new_version))
+        elif golden_path(name).is_file():
+            moved = check(name)
+            yield name, "moved" if moved else "same", moved
+        else:
+            write_atomically(golden_path(name), world_text(world_golden(name)).encode())
+            yield name, "new", []
+
+
+def _update_method(name: str, method: str, new_version: bool) -> tuple[str, list[str]]:
+    expected = read_golden(name)
+    computed = _method_golden(expected or _new_golden(name, method), method)
+    moved = _method_differences(expected, computed) if expected else []
+    if moved and not new_version:
+        return "moved", moved
+    if expected and not moved:
+        # Scores introduced after the file was written are added; the others stay bit for bit.
+        computed = expected | {"episodes": [
+            old | {"scores": new["scores"] | old["scores"]}
+            for old, new in zip(expected["episodes"], computed["episodes"], strict=True)]}
+        status = "same"
+    else:
+        computed["version"] = expected["version"] + 1 if expected else 1
+        status = f"v{computed['version']}" if expected else "new"
+    if computed != expected:
+        write_atomically(golden_path(name), _method_text(computed).encode())
+        card_version.cache_clear()
+    return status, moved
 
 
 def differences(computed: Any, expected: Any, tolerance: float = DOUBLE,
@@ -137,12 +190,30 @@ def _is_numeric(value: Any) -> bool:
     return all(isinstance(each, int | float) for each in values)
 
 
-def _update_world(id: str) -> tuple[str, list[str]]:
-    if golden_path(id).is_file():
-        moved = check_world(id)
-        return "moved" if moved else "same", moved
-    write_atomically(golden_path(id), world_text(world_golden(id)).encode())
-    return "new", []
+# -- worlds ----------------------------------------------------------------------------------------
+
+
+def world_golden(id: str, *, is_quick: bool = False) -> dict[str, Any]:
+    """Compute the golden numbers of a registered id: its world's, and its first observations."""
+    return {"id": id, **world_numbers(entry(id).world, QUICK if is_quick else (*WORLD_EPISODES,)),
+            "observations": {name: first_observations(id, name)
+                             for name in (QUICK if is_quick else OBSERVATION_SEEDS)}}
+
+
+@lru_cache(maxsize=2)
+def world_numbers(world: World, episodes: tuple[str, ...]) -> dict[str, Any]:
+    """Compute numbers of a world's model and of its golden episodes.
+
+    Returns
+    -------
+    dict
+        JSON-ready: ``model`` (computed voltages in V, a transport step in mol/m³), and for each of
+        ``episodes`` some entries of 𝓡 in Ω, noise draws, voltages in V, moments b_t,
+        ∫(c − background)², ∫c², moments of the flow, faults, ĉ_bh in mol/m³, and the mean relative
+        error of that estimate.
+    """
+    return {"model": _model_numbers(world.fluid),
+            "episodes": {name: _episode_numbers(world, name) for name in episodes}}
 
 
 def world_text(numbers: dict[str, Any]) -> str:
@@ -156,6 +227,14 @@ def _rounded(value: Any) -> Any:
     if isinstance(value, str):
         return value
     return [float(f"{number:.10g}") for number in np.ravel(value)]
+
+
+def _world_differences(id: str, expected: dict[str, Any], *, is_quick: bool) -> list[str]:
+    computed = json.loads(world_text(world_golden(id, is_quick=is_quick)))
+    if is_quick:
+        expected = expected | {part: {name: expected[part][name] for name in QUICK}
+                               for part in ("episodes", "observations")}
+    return [f"{id}: {sentence}" for sentence in differences(computed, expected)]
 
 
 def _sample(values: np.ndarray) -> np.ndarray:
@@ -182,7 +261,7 @@ def _shown_steps(n_steps: int) -> list[int]:
     return first + [n_steps // 2, n_steps - 1] * (n_steps > FIRST_STEPS)
 
 
-@lru_cache(maxsize=2 * len(WORLD_EPISODES))
+@lru_cache(maxsize=4)
 def _episode(world: World, name: str) -> Episode:
     """Simulate a golden episode; 𝓡 is NaN at steps that the golden file does not use."""
     truth = truth_discretisation(world)
@@ -231,7 +310,7 @@ def _episode_numbers(world: World, name: str) -> dict[str, Any]:
     return numbers
 
 
-def _observations(id: str, name: str) -> dict[str, Any]:
+def first_observations(id: str, name: str) -> dict[str, Any]:
     """Return some entries of the first observations of an environment, and the rewards."""
     env = gym.make(id)
     observation, _ = env.reset(seed=parse_seeds(name)[0])
@@ -264,25 +343,7 @@ def _fixed_action(env: gym.Env, k: int) -> Any:
 # -- methods ---------------------------------------------------------------------------------------
 
 
-def method_golden(name: str) -> Path:
-    """Return the path of a built-in method's golden file."""
-    return baseline_folder() / "golden" / f"{name}.json"
-
-
-def official_methods() -> dict[str, str]:
-    """Map the name of each golden file to its method: a name, or the path of an agent's model."""
-    agents = {card_name(Path(path)): path
-              for id in tracks.ids("injection") for path in reversed(own_agents(id))}
-    return {name: name for track in tracks.TRACKS for name in own_methods(track)} | agents
-
-
-def read_golden(name: str) -> dict[str, Any] | None:
-    """Read a method's golden file; None if it is missing."""
-    path = method_golden(name)
-    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
-
-
-def new_golden(name: str, method: str) -> dict[str, Any]:
+def _new_golden(name: str, method: str) -> dict[str, Any]:
     """Choose the episodes of a method's first golden file: those of the first golden file all of
     whose environments the method plays. ``ValueError`` if there is none."""
     for known in filter(None, map(read_golden, official_methods())):
@@ -294,15 +355,22 @@ def new_golden(name: str, method: str) -> dict[str, Any]:
     raise ValueError(f"method {name} plays the episodes of no golden file")
 
 
-def run_golden(golden: dict[str, Any], method: str, which: Iterable[int] = range(3),
-               ) -> dict[str, Any]:
-    """Run the episodes of a method's golden file again, and return the file with today's numbers.
+def _can_play(method: str, id: str, kwargs: dict[str, Any]) -> bool:
+    asked = tracks.Environment(id, json.dumps(kwargs))
+    if is_path(method):
+        return Path(method).parents[2].name == id.replace("/", "-")
+    return method in own_methods(asked.track) and playing.can_play(
+        load_method(method, asked.track), playing.environment(asked))
+
+
+def _method_golden(golden: dict[str, Any], method: str) -> dict[str, Any]:
+    """Run the episodes of a method's golden file again, and return it with today's numbers.
 
     ``scores`` are the finite ones that do not measure time. An estimator has ``mean`` and ``last``:
     entries of its mean and last estimate in mol/m³; a policy has ``injections``: source and sink
-    electrode of each step. ``which`` chooses episodes. ``ValueError`` if the method does not suit.
+    electrode of each step. ``ValueError`` if the method does not suit.
     """
-    return golden | {"episodes": [_run_episode(golden["episodes"][i], method) for i in which]}
+    return golden | {"episodes": [_run_episode(episode, method) for episode in golden["episodes"]]}
 
 
 def _run_episode(episode: dict[str, Any], method: str) -> dict[str, Any]:
@@ -327,68 +395,13 @@ def _answer(played: playing.Episode) -> dict[str, Any]:
     return {"mean": states[:, nodes].mean(axis=0).tolist(), "last": states[-1, nodes].tolist()}
 
 
-def method_differences(expected: dict[str, Any], computed: dict[str, Any]) -> list[str]:
-    """Describe each number of a method's golden file that differs; new scores are ignored."""
+def _method_differences(expected: dict[str, Any], computed: dict[str, Any]) -> list[str]:
     found = []
     for old, new in zip(expected["episodes"], computed["episodes"], strict=True):
         known = new | {"scores": {name: new["scores"].get(name) for name in old["scores"]}}
         found += differences(known, old, expected["tolerance"],
                              f"{old['environment']} {old['seed']}")
     return found
-
-
-def update(names: list[str], *, new_version: bool = False) -> Iterator[tuple[str, str, list[str]]]:
-    """Compare built-in ids and methods (default: all) with their golden files, and write missing
-    files.
-
-    With ``new_version`` a method's file whose numbers moved is written with the next version
-    number; otherwise it stays as it is, as a world's file always does.
-
-    Yields
-    ------
-    name, status, differences
-        ``status`` is ``new``, ``same``, ``moved``, or the new version.
-
-    ``ValueError`` if a name is neither an id nor a built-in method's.
-    """
-    ids, methods = tracks.own_ids(), official_methods()
-    if unknown := [name for name in names if name not in ids and name not in methods]:
-        raise ValueError(f"names must be ids, or methods of {', '.join(methods)}; got "
-                         f"{', '.join(unknown)}")
-    for name in names or [*ids, *methods]:
-        updated = (_update_world(name) if name in ids
-                   else _update_method(name, methods[name], new_version))
-        yield (name, *updated)
-
-
-def _update_method(name: str, method: str, new_version: bool) -> tuple[str, list[str]]:
-    expected = read_golden(name)
-    computed = run_golden(expected or new_golden(name, method), method)
-    moved = method_differences(expected, computed) if expected else []
-    if moved and not new_version:
-        return "moved", moved
-    if expected and not moved:
-        # Scores introduced after the file was written are added; the others stay bit for bit.
-        computed = expected | {"episodes": [
-            old | {"scores": new["scores"] | old["scores"]}
-            for old, new in zip(expected["episodes"], computed["episodes"], strict=True)]}
-        status = "same"
-    else:
-        computed["version"] = expected["version"] + 1 if expected else 1
-        status = f"v{computed['version']}" if expected else "new"
-    if computed != expected:
-        write_atomically(method_golden(name), _method_text(computed).encode())
-        card_version.cache_clear()
-    return status, moved
-
-
-def _can_play(method: str, id: str, kwargs: dict[str, Any]) -> bool:
-    asked = tracks.Environment(id, json.dumps(kwargs))
-    if is_path(method):
-        return Path(method).parents[2].name == id.replace("/", "-")
-    if method not in own_methods(asked.track):
-        return False
-    return playing.can_play(load_method(method, asked.track), playing.environment(asked))
 
 
 def _method_text(golden: dict[str, Any]) -> str:

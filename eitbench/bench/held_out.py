@@ -67,25 +67,10 @@ def verify_held_out(record: dict[str, Any], job: Job, secret: bytes,
     The errors of both are relative to those of the naive baseline on the same episodes, which is
     run here too.
 
-    Parameters
-    ----------
-    record, job
-        As read, and as `verify.job_of` returns.
-    secret : bytes
-    episodes : int
-        How many held-out episodes.
-
-    Returns
-    -------
-    row, problems
-        Geometric mean of the relative errors, public and held-out, and p; a sentence for each
-        problem.
-
-    Raises
-    ------
-    ValueError
-        If the episodes are too few for the test, or the method is third-party and not confined by
-        bubblewrap: it could read the seeds.
+    ``job`` is as of `verify.job_of`. Returns a row with the geometric mean of the relative errors,
+    public and held-out, and p; and a sentence for each problem. ``ValueError`` if the episodes are
+    too few for the test, or the method is third-party and not confined by bubblewrap: it could
+    read the seeds.
     """
     if not is_ours(job.method) and job.isolation != "bubblewrap":
         raise ValueError(f"{job.method} must run under bubblewrap on held-out episodes, got "

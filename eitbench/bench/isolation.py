@@ -55,7 +55,7 @@ from eitbench.bench.methods import (
 from eitbench.bench.tracks import BOARDS, Environment, is_measured
 from eitbench.data.cache import CACHE_VARIABLE, cache_folder, model_key
 from eitbench.worlds import streams
-from eitbench.worlds.registry import entry, registered_by_hand, take_over
+from eitbench.worlds.registry import registered_by_hand, take_over
 
 ISOLATE = ("auto", "none", "process", "bubblewrap")
 """Values of the option ``isolate``."""
@@ -112,23 +112,23 @@ def choose_isolation(environment: Environment, method: str, isolate: str = "auto
     """
     if isolate not in ISOLATE:
         raise ValueError(f"isolate must be one of {', '.join(ISOLATE)}, got {isolate!r}")
-    if is_ours(method):
-        is_plain = isolate in ("auto", "none") or load_method(method, environment.track).privileged
-        kind = "none" if is_plain else isolate
-    elif isolate == "auto":
-        kind = "bubblewrap" if strict else "process"
-    else:
-        kind = isolate
+    third_party = not is_ours(method)
     if is_measured(environment.id):
-        if strict and isolate != "none" and not is_ours(method):
+        if strict and third_party and isolate != "none":
             raise ValueError(f"{method} would run on measurements in this process, which only "
                              "--isolate none permits")
         return "none"
-    if strict and kind == "none" and not is_ours(method):
+    kind = isolate
+    if third_party and isolate == "auto":
+        kind = "bubblewrap" if strict else "process"
+    elif not third_party and (isolate == "auto"
+                              or load_method(method, environment.track).privileged):
+        kind = "none"
+    if strict and third_party and kind == "none":
         raise ValueError(f"isolate must be bubblewrap or process for the third-party file {method}")
     if kind == "bubblewrap" and (reason := bubblewrap_problem()):
         raise ValueError(f"{method} must run under bubblewrap, but {reason}; {INSTALL}")
-    if kind == "process" and not is_ours(method):
+    if kind == "process" and third_party:
         _notify_of_process(method)
     return kind
 
@@ -236,7 +236,13 @@ def _numeric(dtype: Any) -> str:
     return dtype
 
 
-# -- the process that asks ----------------------------------------------------------------------
+# -- the parent process -------------------------------------------------------------------------
+
+
+_Key = tuple[str, str, str, str, str, str]
+"""Track, id, kwargs as JSON, method, sha256 of its file, and isolation of a worker."""
+_current: dict[_Key, Worker] = {}
+"""The worker of this process, which serves one method in one environment; empty or one entry."""
 
 
 def load_isolated(track: str, id: str, kwargs: str, method: str, isolation: str) -> Method:
@@ -251,46 +257,57 @@ def load_isolated(track: str, id: str, kwargs: str, method: str, isolation: str)
         loaded = load_method(method, track)
         if loaded.privileged:
             raise ValueError(f"{path} is privileged: it needs the ground truth")
-        start = partial(_start, track, id, kwargs, method, loaded.sha256, isolation)
-        return loaded._replace(make=_RemoteClass(start, loaded.suits))
+        key = (track, id, kwargs, method, loaded.sha256, isolation)
+        return loaded._replace(make=_RemoteClass(key, loaded.suits))
     sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
-    return _load(track, id, kwargs, method, path, sha256, isolation)
+    return _load((track, id, kwargs, method, sha256, isolation), path)
 
 
 def peak_memory() -> int | None:
     """Return the most bytes that a process of the current worker has held; None if unknown."""
-    return _current[0][1].peak_memory if _current else None
+    return next((worker.peak_memory for worker in _current.values()), None)
 
 
 def close() -> None:
     """End the current worker."""
     while _current:
-        _current.pop()[1].close()
+        _current.popitem()[1].close()
 
 
-_current: list[tuple[tuple[str, ...], Worker]] = []
-"""The worker of this process, which serves one method in one environment, and its key."""
+atexit.register(close)
 
 
 class _RemoteClass:
     """Stands for a method's class: an instance is the worker, at the beginning of an episode."""
 
-    def __init__(self, start: Callable[[], Worker], suits: Callable[[Any], bool]) -> None:
-        self._start = start
+    def __init__(self, key: _Key, suits: Callable[[Any], bool]) -> None:
+        self._key = key
         self.suits = suits
 
     def __call__(self, task: Any, random: np.random.Generator | None = None) -> Worker:
-        worker = self._start()
+        worker = _worker(self._key)
         worker.begin(random)
         return worker
 
 
+def _worker(key: _Key) -> Worker:
+    """Return the current worker if it serves this method, else a new one in its place."""
+    worker = _current.get(key)
+    if worker is None or not worker.is_alive:
+        close()
+        track, id, kwargs, method, _, isolation = key
+        worker = _current[key] = Worker(track, id, json.loads(kwargs), method, isolation)
+    if worker.sha256 not in ("", key[4]):
+        close()
+        raise WorkerError(f"ValueError: {key[3]} was changed during the run")
+    return worker
+
+
 @cache
-def _load(track: str, id: str, kwargs: str, method: str, path: Path, sha256: str,
-          isolation: str) -> Method:
-    start = partial(_start, track, id, kwargs, method, sha256, isolation)
+def _load(key: _Key, path: Path) -> Method:
+    track, id, _, _, sha256, _ = key
     try:
-        about = start().about
+        about = _worker(key).about
     except WorkerError as error:
         raise ValueError(f"{path} cannot be loaded: {error}") from None
     if about.get("privileged"):
@@ -302,9 +319,9 @@ def _load(track: str, id: str, kwargs: str, method: str, path: Path, sha256: str
     if built_in is not None and own_sha256(built_in) != sha256:
         raise ValueError(f"{path} has the name of a built-in method, {about['name']}, under which "
                          "results are stored; rename it")
-    remote = _RemoteClass(start, lambda _: bool(about.get("suits")))
     return Method(track, about["name"], about["title"], path, sha256, tuple(about["boards"]),
-                  about["parameters"], remote, about["role"])
+                  about["parameters"], _RemoteClass(key, lambda _: bool(about.get("suits"))),
+                  about["role"])
 
 
 def _check_about(path: Path, about: dict[str, Any], track: str) -> None:
@@ -321,42 +338,13 @@ def _check_about(path: Path, about: dict[str, Any], track: str) -> None:
     _check.document(f"{path}: parameters", about.get("parameters"), PARAMETERS)
 
 
-def _start(track: str, id: str, kwargs: str, method: str, sha256: str, isolation: str) -> Worker:
-    """Return the current worker if it serves this method, else a new one in its place."""
-    key = (track, id, kwargs, method, sha256, isolation)
-    if not _current or _current[0][0] != key or not _current[0][1].is_alive:
-        close()
-        atexit.register(close)
-        worker = Worker(track, id, json.loads(kwargs), method, isolation)
-        _current.append((key, worker))
-    worker = _current[0][1]
-    if worker.sha256 not in ("", sha256):
-        close()
-        raise WorkerError(f"ValueError: {method} was changed during the run")
-    return worker
-
-
 class Worker:
     """A process that runs one estimator or policy in one environment, episode after episode.
 
-    Parameters
-    ----------
-    track : "estimation" or "injection"
-    id, kwargs
-        The environment. The worker makes its own, without an episode.
-    method : str
-        Name of a built-in method, or the path of a file, whose content is sent to the worker.
-    isolation : "process" or "bubblewrap"
-    limits : Limits
-    reply_timeout : float
-        s
-
-    Raises
-    ------
-    WorkerError
-        If the method cannot be loaded.
-    ValueError
-        If the cache folder lies where a worker under bubblewrap can read.
+    ``method`` is the name of a built-in method, or the path of a file, whose content is sent to the
+    worker, which makes its own environment. A reply may take ``reply_timeout`` seconds.
+    `WorkerError` if the method cannot be loaded; ``ValueError`` if the cache folder lies where a
+    worker under bubblewrap can read.
     """
 
     def __init__(self, track: str, id: str, kwargs: dict[str, Any], method: str,
@@ -367,15 +355,16 @@ class Worker:
         """of the file that runs; empty for a built-in method"""
         self._name = cleaned(Path(method).stem)
         self._limits = limits or Limits()
-        self._left_s = EPISODE_TIMEOUT_S
-        self._left_chars = MAX_OUTPUT_CHARS
+        self._left_s, self._left_chars = EPISODE_TIMEOUT_S, MAX_OUTPUT_CHARS
         self._next_check = 0.0
         self._is_confined = isolation == "bubblewrap"
         self._home = Path("/tmp" if self._is_confined else tempfile.mkdtemp(prefix="eitbench-"))
         command = [sys.executable, "-P", "-c", _START, json.dumps(self._limits)]
         if self._is_confined:
             check_out_of_reach(cache_folder(), "the cache folder")
-            command = [*bubblewrap(self._limits, {"/tmp/cache/models": _models_folder()}), *command]
+            models = cache_folder() / model_key("", None, 0).folder         # holds no episode
+            files = {"/tmp/cache/models": str(models.absolute())}
+            command = [*bubblewrap(self._limits, files), *command]
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
             start_new_session=True, env=self._environment(), cwd="/")
@@ -393,8 +382,7 @@ class Worker:
     def begin(self, random: np.random.Generator | None = None) -> None:
         """Begin an episode with a new instance of the method; a policy draws from a generator in
         the state of ``random``."""
-        self._left_s = EPISODE_TIMEOUT_S
-        self._left_chars = MAX_OUTPUT_CHARS
+        self._left_s, self._left_chars = EPISODE_TIMEOUT_S, MAX_OUTPUT_CHARS
         self._ask("begin", random=None if random is None else random.bit_generator.state)
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Any:
@@ -434,19 +422,21 @@ class Worker:
 
     def _environment(self) -> dict[str, str]:
         """Return the worker's environment variables, which tell nothing about this process."""
-        variables = {name: value for name, value in os.environ.items()
-                     if name.startswith(NUMERIC_ENV)}
+        numeric = {name: value for name, value in os.environ.items()
+                   if name.startswith(NUMERIC_ENV)}
         threads = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-        paths = {"PATH": os.environ.get("PATH", ""), "PYTHONPATH": str(PACKAGE.parent),
-                 "HOME": str(self._home), "TMPDIR": str(self._home),
-                 CACHE_VARIABLE: "/tmp/cache" if self._is_confined else str(cache_folder())}
-        kernels = {"NUMBA_CACHE_DIR": "/tmp/kernels"} if self._is_confined else {}
-        return variables | threads | paths | kernels | {"PYTHONDONTWRITEBYTECODE": "1"}
+        inside = {CACHE_VARIABLE: "/tmp/cache", "NUMBA_CACHE_DIR": "/tmp/kernels"}
+        return numeric | threads | {
+            "PATH": os.environ.get("PATH", ""), "PYTHONPATH": str(PACKAGE.parent),
+            "HOME": str(self._home), "TMPDIR": str(self._home), "PYTHONDONTWRITEBYTECODE": "1",
+            CACHE_VARIABLE: str(cache_folder())} | (inside if self._is_confined else {})
 
     def _files(self, id: str, method: str) -> dict[str, np.ndarray]:
         """Return the name of the method, the contents of its files, and an entry that only a
         script has registered, as bytes."""
-        contents = {"method": str(method).encode(), "entry": _pickled_entry(id)}
+        by_hand = [each for each in registered_by_hand() if each.id == id]
+        contents = {"method": str(method).encode(),
+                    "entry": b"".join(map(cloudpickle.dumps, by_hand))}
         if is_path(method) and is_ours(method):
             contents["method"] = str(Path(method).resolve()).encode()
         elif is_path(method):
@@ -571,18 +561,6 @@ def _status(pid: int, field: str) -> int:
     return int(found[1]) * (1024 if found[2] else 1) if found else 0
 
 
-def _models_folder() -> str:
-    """Return the part of the cache that holds no episode."""
-    return str((cache_folder() / model_key("", None, 0).folder).absolute())
-
-
-def _pickled_entry(id: str) -> bytes:
-    """Return an entry that a script has registered, which the worker does not know; else
-    nothing."""
-    is_known = id not in [each.id for each in registered_by_hand()]
-    return b"" if is_known else bytes(cloudpickle.dumps(entry(id)))
-
-
 def _text(value: Any, length: int = 2000) -> str:
     return str(value)[:length]
 
@@ -607,9 +585,10 @@ def main() -> None:
             return
         try:
             reply, result = getattr(server, header["do"])(header, arrays)
-            message = encode_message(reply | _printed(printed), result)
+            message = encode_message(reply | {"printed": _sendable(printed.getvalue())}, result)
         except (Exception, SystemExit) as error:
-            message = encode_message(server.describe(error) | _printed(printed))
+            message = encode_message(server.describe(error)
+                                     | {"printed": _sendable(printed.getvalue())})
         outgoing.write(message)
         outgoing.flush()
 
@@ -619,11 +598,6 @@ def _read_exactly(stream: Any, n: int) -> bytes:
     if len(content) < n:
         raise EOFError
     return content
-
-
-def _printed(stream: io.StringIO) -> dict[str, str]:
-    text = stream.getvalue()[:MAX_OUTPUT_CHARS].encode(errors="replace").decode()
-    return {"printed": text} if text else {}
 
 
 def _set_limits(limits: Limits) -> None:
@@ -705,5 +679,9 @@ class _MethodServer:
         message = f"{type(error).__name__}: {error}".replace(f"{self._file.parent}/", "")
         found = {"error": message, "where": where_of(error, self._file),
                  "traceback": traceback_of(error, self._file)}
-        return {key: _text(value).encode(errors="replace").decode()
-                for key, value in found.items()}
+        return {key: _sendable(value, 2000) for key, value in found.items()}
+
+
+def _sendable(text: str, length: int = MAX_OUTPUT_CHARS) -> str:
+    """Cut a text, and replace lone surrogates, which UTF-8 does not have."""
+    return text[:length].encode(errors="replace").decode()

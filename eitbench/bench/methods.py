@@ -27,7 +27,7 @@ LOADERS = "eitbench.loaders"
 """Entry points that load a policy from another kind of file: named by its suffix, called with path
 and content."""
 ROLES = (None, "floor", "reference")
-"""What a method is on a board: ranked, or a mark from which the others are judged."""
+"""Role of a method on a board: ranked, naive baseline, or oracle."""
 
 MOST_BYTES = 1 << 28
 """of a method's file, which is read whole"""
@@ -40,18 +40,14 @@ ELSEWHERE = ("models of our trained agents are in a checkout only, not in an ins
 
 
 class Form(NamedTuple):
-    """How the methods of a track are written."""
+    """Form of the methods of a track: their kind in messages, the class that a file defines, its
+    method, the accepted files, and the folder of built-in ones below `baseline_folder`."""
 
     kind: str
-    """As commands and messages call them."""
     type: str
-    """Name of the class that a file defines."""
     answers: str
-    """Its method, and what that takes."""
     files: str
-    """What a path may lead to."""
     folder: str
-    """Where ours lie, below `baseline_folder`."""
 
 
 FORMS = {
@@ -59,7 +55,6 @@ FORMS = {
     "injection": Form("policy", "Policy", "act(observation)",
                       "a .py file or of an agent's model.zip", "injection"),
 }
-"""Of each track."""
 
 
 class Method(NamedTuple):
@@ -74,7 +69,7 @@ class Method(NamedTuple):
     path: Path
     sha256: str
     boards: tuple[str, ...]
-    """Those of its track that it can play."""
+    """Boards of its track that it can run on."""
     parameters: dict[str, Any]
     make: Callable[..., Any]
     """Estimator(task), with update(voltages, currents) -> Estimate or None; or
@@ -82,8 +77,8 @@ class Method(NamedTuple):
     role: str | None = None
     """One of `ROLES`."""
     privileged: bool = False
-    """Shown the truth: Estimator(task, revealed), with the episode's flow and whole record;
-    Policy(rules, random, core). A mark for the others, not one of them."""
+    """Whether it gets the ground truth: Estimator(task, revealed), with the episode's flow and
+    whole record; Policy(rules, random, core)."""
 
     @property
     def version(self) -> str:
@@ -91,36 +86,37 @@ class Method(NamedTuple):
         return version_of(self.path, self.sha256)
 
     def suits(self, world: Any) -> bool:
-        """Whether it can play a `Task` of its boards, or under these `Rules`; a method without a
-        word on that suits all."""
-        judge = getattr(self.make, "suits", None)
-        return judge is None or bool(judge(world))
+        """Return whether it can run on a `Task` of its boards, or under these `Rules`; without a
+        function ``suits`` a method suits all."""
+        suits = getattr(self.make, "suits", None)
+        return suits is None or bool(suits(world))
 
 
 def baseline_folder() -> Path:
-    """Where our own methods lie."""
+    """Return the folder of the built-in methods."""
     return shipped("baselines")
 
 
 def own_methods(track: str) -> list[str]:
-    """Names of our own methods of a track, without agents."""
+    """Return the names of the built-in methods of a track, without agents."""
     return sorted(path.stem for path in (baseline_folder() / FORMS[track].folder).glob("*.py"))
 
 
 def own_agents(id: str) -> list[str]:
-    """Paths of our own trained agents for an environment; none without the extra ``rl``, and none
-    where their models are not, which is said."""
+    """Return the paths of the built-in agents of an environment; none without the extra ``rl``, and
+    none, with a notice, where their models are missing."""
     if not importlib.util.find_spec("stable_baselines3"):
         return []
-    there = [str(path) for path in _agents(id) if path.is_file()]
-    if not there and _agents(id):
+    agents = _agents(id)
+    found = [str(path) for path in agents if path.is_file()]
+    if agents and not found:
         say(f"our agents for {id} are left out: {ELSEWHERE}")
-    return there
+    return found
 
 
 def own_files(id: str) -> dict[str, Path]:
-    """Name under which results are kept in an environment -> file, of each of our own methods and
-    of its agents, whose models may be elsewhere."""
+    """Map the name under which results are stored to the file, of each built-in method and of the
+    agents of an environment, whose models may be missing."""
     folders = [baseline_folder() / form.folder for form in FORMS.values()]
     return ({path.stem: path for folder in folders for path in sorted(folder.glob("*.py"))}
             | {f"{path.parents[1].name}_{path.parent.name}": path for path in _agents(id)})
@@ -133,31 +129,28 @@ def _agents(id: str) -> list[Path]:
 
 
 def own_sha256(path: Path) -> str:
-    """Of the file of one of our own methods; of an agent what its training left beside it."""
+    """Return the sha256 of a built-in method's file; an agent's was written by its training."""
     if path.suffix == ".py":
         return hashlib.sha256(path.read_bytes()).hexdigest()
     return path.with_name("sha256").read_text(encoding="ascii").strip()
 
 
 def is_ours(name: str) -> bool:
-    """Whether a method, by name or by path, is one of ours: it lies in our folder."""
+    """Return whether a method, by name or by path, is built in: it lies in our folder."""
     if is_path(name):
         return Path(name).resolve().is_relative_to(baseline_folder().resolve())
     return any(name in own_methods(track) for track in TRACKS)
 
 
 def is_path(name: str) -> bool:
-    """Whether a method is named by the path of its file, by its suffix."""
+    """Return whether a method is given by the path of its file, as its suffix shows."""
     return Path(name).suffix in {".py", *_loaders()}
 
 
 @lru_cache(maxsize=1)
 def installed_methods() -> dict[str, Path]:
-    """Name -> file of each method that an installed package offers (entry points `METHODS`).
-
-    A package that takes a name of ours, or whose file is not to be found, is left out with a
-    warning.
-    """
+    """Map name to file of each method of installed packages (entry points `METHODS`); one that has
+    a built-in name, or no file, is left out with a warning."""
     found = {}
     for point in entry_points(group=METHODS):
         try:
@@ -175,7 +168,7 @@ def installed_methods() -> dict[str, Path]:
 
 @lru_cache(maxsize=1)
 def _loaders() -> dict[str, EntryPoint]:
-    """Suffix -> what loads such files."""
+    """Map suffixes to loaders."""
     return {f".{point.name}": point for point in entry_points(group=LOADERS)}
 
 
@@ -186,21 +179,21 @@ def loader_of(path: Path) -> str:
 
 
 def version_of(path: Path, sha256: str) -> str:
-    """What a method's records say of its version: of ours that of its card, v1 where there is none;
-    of all others eight digits of their file's sha256."""
+    """Return the version that records name: of a built-in method that of its golden file, of others
+    eight digits of their file's sha256."""
     return f"v{card_version(card_name(path))}" if is_ours(str(path)) else sha256[:8]
 
 
 def card_name(path: Path) -> str:
-    """Of the card of one of our methods: that of its file; agents of one environment and algorithm
-    share one."""
+    """Return the name of a built-in method's golden file: that of its file; agents of one
+    environment and algorithm share one."""
     folders = path.resolve().parents
     return path.stem if path.suffix == ".py" else f"{folders[2].name}--{folders[1].name}"
 
 
 @lru_cache(maxsize=256)
 def card_version(name: str) -> int:
-    """The number of the version that a card describes; 1 where there is no card."""
+    """Return the version of a golden file; 1 if it is missing."""
     path = baseline_folder() / "golden" / f"{name}.json"
     if not path.is_file():
         return 1
@@ -208,13 +201,8 @@ def card_version(name: str) -> int:
 
 
 def find_method(name: str, track: str) -> Path:
-    """The file of one of our methods by name, of an installed package's, or anybody's by its path.
-
-    Raises
-    ------
-    ValueError
-        If there is none, or it has the name of another.
-    """
+    """Return the file of a method by its name, if it is built in or installed, or by its path.
+    ``ValueError`` if there is none, or it has the name of another."""
     form = FORMS[track]
     folder = baseline_folder() / form.folder
     own = own_methods(track)
@@ -238,22 +226,16 @@ def find_method(name: str, track: str) -> Path:
 
 
 def load_method(name: str, track: str) -> Method:
-    """Load one of our methods by name, of an installed package's, or anybody's by the path of its
-    file; a trained agent by that of its model.zip.
-
-    Raises
-    ------
-    ValueError
-        If there is no such method, its file has no class as its track asks for, or an agent's file
-        is not the one that training left.
-    """
+    """Load a method as `find_method`; a trained agent by the path of its model.zip.
+    ``ValueError`` if there is none, its file has no class as its track requires, or an agent's file
+    is not the one that its training wrote."""
     path = find_method(name, track)
     return _load(path, path.read_bytes(), track)
 
 
 @lru_cache(maxsize=64)
 def _load(path: Path, source: bytes, track: str) -> Method:
-    """The file with this content, executed once a process."""
+    """Load the file with this content, which is executed once a process."""
     sha256 = hashlib.sha256(source).hexdigest()
     form = FORMS[track]
     if track == "injection" and path.suffix in _loaders():
@@ -262,7 +244,7 @@ def _load(path: Path, source: bytes, track: str) -> Method:
         return Method(track, name, title, path, sha256, BOARDS[track], parameters, agent)
     module = load_module(form.kind, path, source)
     method = getattr(module, form.type, None)
-    if not isinstance(method, type) or not _answers(method, form):
+    if not isinstance(method, type):
         raise ValueError(f"{form.kind} {path} must define a class {form.type} with a method "
                          f"{form.answers}")
     return method_of(method, track, path.stem, str(path))._replace(
@@ -270,11 +252,11 @@ def _load(path: Path, source: bytes, track: str) -> Method:
 
 
 def method_of(method: type[Any], track: str, name: str, where: str = "") -> Method:
-    """A class as a method of a track, without a file. ``ValueError``, saying ``where`` it is
-    (default: its name), if it is not as that asks for."""
+    """Return a class as a method of a track, without a file. ``ValueError``, naming ``where`` it is
+    (default: its name), if it is not as the track requires."""
     form = FORMS[track]
     who = f"{form.kind} {where or name}: {method.__name__}"
-    if not _answers(method, form):
+    if not callable(getattr(method, form.answers.partition("(")[0], None)):
         raise ValueError(f"{who} must have a method {form.answers}")
     boards = tuple(getattr(method, "boards", BOARDS[track][:1]))
     if not boards or not set(boards) <= set(BOARDS[track]):
@@ -285,17 +267,15 @@ def method_of(method: type[Any], track: str, name: str, where: str = "") -> Meth
     privileged = getattr(method, "privileged", False)
     if not isinstance(privileged, bool):
         raise ValueError(f"{who}.privileged must be True or False, got {privileged!r}")
-    return Method(track, name, name, Path(), "", boards, _parameters(who, method), method, role,
-                  privileged)
-
-
-def _answers(method: type[Any], form: Form) -> bool:
-    return callable(getattr(method, form.answers.partition("(")[0], None))
+    given = getattr(method, "parameters", {})
+    parameters = dict(given) if isinstance(given, Mapping) else given
+    _check.document(f"{who}.parameters", parameters, PARAMETERS)
+    return Method(track, name, name, Path(), "", boards, parameters, method, role, privileged)
 
 
 def load_module(kind: str, path: Path, source: bytes) -> ModuleType:
-    """The module that a file's content makes; ``ValueError``, naming ``kind`` and path, if it
-    cannot be executed."""
+    """Execute a file's content as a module; ``ValueError``, naming ``kind`` and path, if that
+    fails."""
     name = f"eitbench_{kind}_{path.stem}"
     specification = importlib.util.spec_from_file_location(name, path)
     assert specification is not None
@@ -312,16 +292,7 @@ def load_module(kind: str, path: Path, source: bytes) -> ModuleType:
 
 
 def title_of(module: ModuleType, path: Path) -> str:
-    """First line of the docstring, up to a colon, bracket or full stop, 120 letters at most;
-    without one, the file's name."""
+    """Return the first line of the docstring, up to a colon, bracket or full stop, `TITLE` letters
+    at most; without one, the file's name."""
     line = f"{(module.__doc__ or '').strip()}\n".splitlines()[0]
     return re.split(r"[:(.]", line)[0].strip()[:TITLE].strip() or path.stem
-
-
-def _parameters(who: str, method: type[Any]) -> dict[str, Any]:
-    """The class attribute ``parameters``; ``ValueError``, naming ``who``, if a record cannot hold
-    them."""
-    given = getattr(method, "parameters", {})
-    parameters = dict(given) if isinstance(given, Mapping) else given
-    _check.document(f"{who}.parameters", parameters, PARAMETERS)
-    return parameters

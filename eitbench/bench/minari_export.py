@@ -37,26 +37,11 @@ def export_minari(name: str, env: str, policy: str, seeds: str | Sequence[int], 
     All are written at the end: an interrupted export leaves nothing but simulated episodes in the
     cache, and starts again.
 
-    Parameters
-    ----------
-    name : str
-        Of the data set, as in ``eitbench/pipe2d/random-pair-v0``.
-    env : str
-        Id of an injection environment, which is made by ``gym.make(env)``.
-    policy : str
-        Name of a built-in policy, or the path of a file, which runs in this process.
-    seeds : str or sequence of int
-        As of `eitbench.dataset`.
-    n_jobs, backend
-        Of the simulation; see `eitbench.data.bank.fill`.
-
-    Raises
-    ------
-    ValueError
-        For an unknown environment, policy or seed, a policy that does not suit the environment, or
-        a name that is malformed or taken.
-    ModuleNotFoundError
-        If Minari is not installed.
+    ``name`` is that of the data set, as in ``eitbench/pipe2d/random-pair-v0``; ``env`` the id of an
+    injection environment; ``policy`` a built-in name, or the path of a file, which runs in this
+    process; ``seeds`` as of `eitbench.dataset`, ``n_jobs`` and ``backend`` of
+    `eitbench.data.bank.fill`. ``ValueError`` for an unknown environment, policy or seed, a policy
+    that does not suit the environment, or a name that is malformed or taken.
     """
     with needed_by("format minari"):
         from minari import create_dataset_from_buffers

@@ -1,5 +1,4 @@
-"""From what an estimator said of an episode to what can be scored, on the truth's mesh
-(``docs/methods.md``, 4)."""
+"""Outcomes of episodes, to be scored on the truth's mesh (``docs/methods.md``, 4)."""
 
 from __future__ import annotations
 
@@ -22,12 +21,12 @@ from eitbench.worlds.world import World
 
 @dataclass
 class Said:
-    """What an estimator said in one episode, and what it saw."""
+    """Outputs and inputs of an estimator in one episode."""
 
     means: np.ndarray
     """(T, n) mol/m³ for t = 1 … T"""
     variances: np.ndarray | None
-    """(T, n) or None; rows of states without a claim are NaN"""
+    """(T, n) or None; NaN in states without a variance"""
     voltages: np.ndarray
     """(T, L) measured, V"""
     currents: np.ndarray
@@ -35,16 +34,16 @@ class Said:
     innovations: dict[int, tuple[np.ndarray, np.ndarray]]
     """measurement i -> (ν, S)"""
     seconds: np.ndarray
-    """what each update took; the first also what the constructor took"""
+    """of each update; the first includes the constructor"""
     velocities: np.ndarray
-    """(T, k) parameters of the flow in m/s; k = 0 where it is not asked for"""
+    """(T, k) parameters of the flow in m/s; k = 0 where it is known"""
 
     @classmethod
     def collect(
         cls, task: Task,
         played: Iterable[tuple[int, Estimate | None, dict[str, np.ndarray], float]],
     ) -> Said:
-        """Take in (t, estimate, measurement, seconds) step by step."""
+        """Collect (t, estimate, measurement, seconds) step by step."""
         means = np.full((task.n_steps, task.mesh.n_nodes), np.nan)
         variances = means.copy()
         velocities = np.tile(task.velocity.nominal if task.velocity else (), (task.n_steps, 1))
@@ -74,7 +73,7 @@ class Said:
                    np.array(seconds), velocities)
 
     def fields(self) -> dict[str, np.ndarray]:
-        """Means and standard deviations as float32, for pictures."""
+        """Return means and standard deviations as float32, for pictures."""
         fields = {"mean": self.means.astype(np.float32)}
         if self.variances is not None:
             fields["std"] = np.sqrt(self.variances).astype(np.float32)
@@ -84,7 +83,7 @@ class Said:
 
 
 def outcome_of(env: EstimationEnv, said: Said) -> Outcome:
-    """What can be scored of the episode that ``env`` has just played."""
+    """Return the outcome of the episode that has just ended in ``env``."""
     task = env.task
     interpolation, mass = region_operators(env.world)
     states = slice(task.warm_up, None)
@@ -117,7 +116,7 @@ def outcome_of(env: EstimationEnv, said: Said) -> Outcome:
 
 
 class Claim(NamedTuple):
-    """What the filter inside an environment says of a scored state."""
+    """Estimate of a scored state by the filter inside an environment."""
 
     t: int
     error: float
@@ -127,12 +126,12 @@ class Claim(NamedTuple):
     std: np.ndarray
     """(n,) mol/m³"""
     innovation: Innovation | None
-    """Of the readings that were used for it; None where there were none."""
+    """of the accepted readings; None if there are none"""
 
 
 def outcome_of_claims(world: World, seed: int, claims: list[Claim], seconds_per_step: float,
                       spent: int) -> Outcome:
-    """What can be scored of an episode in which a policy made so many injections."""
+    """Return the outcome of an episode in which a policy made ``spent`` injections."""
     states, errors, means, stds, innovations = zip(*claims, strict=True)
     interpolation, mass = region_operators(world)
     truth = simulate(world, seed, progress=False).concentration[list(states)].astype(float)

@@ -1,4 +1,4 @@
-"""Play methods on episodes, step by step or whole, and hand over what can be scored."""
+"""Run methods on episodes, step by step or whole."""
 
 from __future__ import annotations
 
@@ -33,21 +33,21 @@ if TYPE_CHECKING:
 
 
 class Episode(NamedTuple):
-    """An episode that a method has played."""
+    """A finished episode."""
 
     outcome: Outcome
     currents: np.ndarray
     """(steps, L) A (A/m in 2D), injected in each step"""
     fields: dict[str, np.ndarray]
-    """Means and standard deviations of an estimator's estimates as float32, for pictures; none of a
-    policy, or on measurements."""
+    """Means and standard deviations of an estimator's estimates as float32, for pictures; empty for
+    policies and on measurements."""
     actions: list[Any] | None = None
     """of a policy, JSON-ready"""
 
 
 def environment(asked: Environment) -> Any:
-    """Made once a process, so that its models, and what methods derive from them, are shared by all
-    its episodes; errors as `Environment.make`."""
+    """Make an environment once a process, so that all its episodes share its models, and what
+    methods derive from them; errors as `Environment.make`."""
     if is_measured(asked.id):
         return _made(asked, None, "")
     registered = entry(asked.id)
@@ -56,25 +56,19 @@ def environment(asked: Environment) -> Any:
 
 @lru_cache(maxsize=4)
 def _made(asked: Environment, world: World | None, settings: str) -> Any:
-    """Make it with the ``world`` and the ``settings`` of the id, which may be registered anew."""
+    """Make it; ``world`` and ``settings`` of the id may be registered again."""
     return asked.make()
 
 
 def can_play(method: Method, env: Any) -> bool:
-    """Whether an environment is of one of a method's boards, and such as suits it."""
+    """Return whether an environment belongs to one of a method's boards and suits it."""
     known = env.rules if isinstance(env, InjectionEnv) else env.task
     return board_of(env) in method.boards and method.suits(known)
 
 
 def play(asked: Environment, method: Method, seed: int) -> Episode:
-    """Play one whole episode.
-
-    Raises
-    ------
-    ValueError
-        If there is no such environment, it is of another track than the method, or the method does
-        not suit it or answers wrongly.
-    """
+    """Run one whole episode. ``ValueError`` if there is no such environment, it is of another track
+    than the method, or the method does not suit it or returns an invalid answer."""
     check_track(asked.id, method.track)
     env = environment(asked)
     if isinstance(env, InjectionEnv):
@@ -91,7 +85,7 @@ def run_on_measurements(env: MeasuredEnv, method: str | Method, seed: int = 0, *
     """Run a built-in estimator, or the one of a path, on measurements.
 
     ``seed`` draws the withheld readings; estimates are kept at the steps ``kept``, by default all.
-    ``ValueError`` if the method does not suit the task or answers wrongly.
+    ``ValueError`` if the method does not suit the task or returns an invalid estimate.
     """
     if isinstance(method, str):
         method = load_method(method, "estimation")
@@ -116,7 +110,7 @@ def _motion(task: Task) -> str:
 
 
 def estimated(env: EstimationEnv, estimator: Method, seed: int) -> Episode:
-    """What an estimator makes of one whole episode."""
+    """Run an estimator on one whole episode."""
     said = Said.collect(env.task, _estimates(env, estimator, seed))
     return Episode(outcome_of(env, said), said.currents, said.fields())
 
@@ -140,9 +134,9 @@ def _injected(env: InjectionEnv, policy: Method, seed: int) -> Episode:
 
 def injections(env: InjectionEnv, policy: Method, seed: int, actions: list[Any] | None = None,
                ) -> Iterator[tuple[int, dict[str, np.ndarray], float]]:
-    """(t of the state now seen, observation, seconds the policy took) after each of its injections
-    in one episode, the first with what it took to prepare; errors as `play`. ``actions`` receives
-    what the policy returned."""
+    """Yield (t of the observed state, observation, seconds the policy took) after each injection of
+    one episode, the first including its preparation; errors as `play`. ``actions`` receives the
+    actions."""
     if not policy.suits(env.rules):
         raise ValueError(f"policy {policy.name} does not suit {env.spec.id if env.spec else env}")
     with for_scores():
@@ -164,16 +158,16 @@ def injections(env: InjectionEnv, policy: Method, seed: int, actions: list[Any] 
 
 
 def policys_random(seed: int) -> np.random.Generator:
-    """What a policy draws from in the episode of this seed."""
-    # A generator knows what it was seeded with, so the policy's is given its state only.
+    """Return the generator that a policy draws from in the episode of this seed."""
+    # A generator reveals its seed, so the policy's gets a state only.
     drawn = np.random.default_rng(int(randomness(seed).policy.integers(2**63)))
     return in_state(drawn.bit_generator.state)
 
 
 def estimates(env: EstimationEnv, estimator: Method,
               seed: int) -> Iterator[tuple[int, Estimate]]:
-    """(t, estimate of the state t ≥ 1) in one episode. The estimator sees the task and the
-    measurements; rewards and the environment itself stay here."""
+    """Yield (t, estimate of the state t ≥ 1) in one episode. The estimator gets the task and the
+    measurements, neither rewards nor the environment."""
     for t, estimate, _, _ in _estimates(env, estimator, seed):
         if estimate is not None and t >= 1:
             yield t, estimate
@@ -181,11 +175,11 @@ def estimates(env: EstimationEnv, estimator: Method,
 
 def _estimates(env: EstimationEnv | MeasuredEnv, estimator: Method, seed: int,
                ) -> Iterator[tuple[int, Estimate | None, dict[str, np.ndarray], float]]:
-    """(t = i − lag, estimate, measurement i, seconds the estimator took) at each step i."""
+    """Yield (t = i − lag, estimate, measurement i, seconds the estimator took) at each step i."""
     with for_scores():
         observation, _ = env.reset(seed=seed)
     if estimator.privileged and not isinstance(env, EstimationEnv):
-        raise ValueError(f"{estimator.name} is told the truth, which nobody knows of a record")
+        raise ValueError(f"{estimator.name} needs the ground truth, which measurements do not have")
     shown = (env.task, env.reveal()) if isinstance(env, EstimationEnv) and estimator.privileged \
         else (env.task,)
     begin = time.perf_counter()
@@ -213,13 +207,12 @@ def _estimates(env: EstimationEnv | MeasuredEnv, estimator: Method, seed: int,
 
 
 def _action(task: Task, estimate: Estimate | None, silence: np.ndarray) -> np.ndarray:
-    """What the environment is told; the flow believed at first where an estimator says nothing of
-    it."""
+    """Return the environment's action, with the nominal flow where an estimator gives none."""
     mean = silence if estimate is None else estimate.mean
     if task.velocity is None:
         return mean
-    said = None if estimate is None else estimate.velocity
-    return np.concatenate([mean, task.velocity.nominal if said is None else said])
+    velocity = None if estimate is None else estimate.velocity
+    return np.concatenate([mean, task.velocity.nominal if velocity is None else velocity])
 
 
 def _check_estimate(estimate: Any, task: Task, readings: int) -> None:

@@ -1,5 +1,4 @@
-"""Run baselines and policies on environments over seeds; each episode's result is stored the moment
-it is done."""
+"""Run methods on environments over seeds; each episode's result is stored when it is finished."""
 
 from __future__ import annotations
 
@@ -35,7 +34,7 @@ from eitbench.measured.cases import read_case
 from eitbench.worlds.registry import entry
 
 _LASTING = ("environment", "method", *SHARED)
-"""What a method may not change while it is played: its results are kept by it."""
+"""Fields of a result that a method may not change during a run."""
 
 
 class Job(NamedTuple):
@@ -50,7 +49,7 @@ class Job(NamedTuple):
     ``bubblewrap``."""
 
     def load(self) -> Method:
-        """The method's file."""
+        """Load the method."""
         track = self.environment.track
         if self.isolation != "none":
             return load_isolated(track, self.environment.id, self.environment.kwargs, self.method,
@@ -84,16 +83,11 @@ def _content_digest(id: str, changes: dict[str, Any] | None) -> str:
 
 
 def run_episode(job: Job) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Play and score one episode.
+    """Run and score one episode.
 
-    Returns
-    -------
-    result : dict
-        JSON-ready: status "ok" with scores and the error of every scored step, or "failed" with a
-        message, file and line, and the traceback of the method's own code.
-    fields : dict of arrays
-        The estimates' means and standard deviations (float32); empty for policies and after a
-        failure.
+    Returns its result, JSON-ready (status "ok" with scores and the error of every scored step, or
+    "failed" with a message, file and line, and the traceback of the method's own code), and the
+    estimates' means and standard deviations (float32; empty for policies and after a failure).
     """
     method = job.load()
     result = _beginning(job, method)
@@ -103,47 +97,40 @@ def run_episode(job: Job) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         with threadpool_limits(1), redirect_stdout(sys.stderr):  # standard output is for tables
             played = play(job.environment, method, job.seed)
             numbers = scored(method.track, played.outcome)
-        said = {"scores": numbers, "step_errors": played.outcome.errors.tolist()}
+        scores = {"scores": numbers, "step_errors": played.outcome.errors.tolist()}
         if played.actions is not None:
-            said["actions"] = played.actions
-        json.dumps(said, allow_nan=False)  # what cannot be kept is the method's failure too
-        result |= {"status": "ok"} | said
+            scores["actions"] = played.actions
+        json.dumps(scores, allow_nan=False)  # what cannot be stored is a failure of the method
+        result |= {"status": "ok"} | scores
         fields = played.fields
-    # whatever a method does wrong is its result, not our crash
+    # an error of a method is its result
     except (Exception, SystemExit) as error:
         result |= _failure(error, method.path)
     if job.isolation != "none":
         result["peak_memory"] = isolation.peak_memory()
-    result["finished"] = datetime.now(UTC).isoformat(timespec="microseconds")
-    result["seconds"] = time.perf_counter() - begin
+    result |= {"finished": _now(), "seconds": time.perf_counter() - begin}
     return result, fields
 
 
 def _beginning(job: Job, method: Method) -> dict[str, Any]:
-    """What is known of a result before anything is played."""
-    env = environment(job.environment)
+    """Return the fields of a result that are known before the episode runs."""
+    asked = job.environment
+    own = ("title", "parameters", "role", "privileged", "version")
     return {
-        "identity": job.identity(),
-        "seed": name_seed(job.seed),
-        "method": method.name,
-        "title": method.title,
-        "parameters": method.parameters,
-        "role": method.role,
-        "privileged": method.privileged,
-        "version": method.version,
-        "method_sha256": method.sha256,
+        "identity": job.identity(), "seed": name_seed(job.seed), "method": method.name,
+        **{name: getattr(method, name) for name in own}, "method_sha256": method.sha256,
         "checkpoint_sha256": method.sha256 if method.path.suffix == ".zip" else None,
-        "board": board_of(env),
-        "environment": {"id": job.environment.id, "name": job.environment.name,
-                        "kwargs": job.environment.given},
-        "finished": datetime.now(UTC).isoformat(timespec="microseconds"),
-        "peak_memory": None,
-        "seconds": 0.0,
-    }
+        "board": board_of(environment(asked)),
+        "environment": {"id": asked.id, "name": asked.name, "kwargs": asked.given},
+        "finished": _now(), "peak_memory": None, "seconds": 0.0}
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="microseconds")
 
 
 def _failure(error: BaseException, own: Path) -> dict[str, Any]:
-    """What a result says of it; ``own`` is the method's file."""
+    """Return the fields of a failed result; ``own`` is the method's file."""
     if isinstance(error, WorkerError):
         return {"status": "failed", "message": str(error), "where": error.where,
                 "traceback": error.traceback}
@@ -152,14 +139,12 @@ def _failure(error: BaseException, own: Path) -> dict[str, Any]:
 
 
 def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1, backend: str = "loky",
-             command: str = "") -> None:
+             command: str = "", keep_estimates: bool = True) -> None:
     """Run all jobs that ``store`` does not hold yet, in ``n_jobs`` processes with one BLAS thread
-    each.
+    each, and store each episode when it is finished.
 
-    Each process stores an episode the moment it is done. ``backend`` is one of
-    `eitbench.data.parallel.BACKENDS`, of which those of a cluster need the folders of ``store`` and
-    cache on all its machines; the results name ``command``, without folders, as the command that
-    made them. Errors as `eitbench.data.parallel.in_parallel`.
+    Clusters (``backend``, see `eitbench.data.parallel.in_parallel`) need the folders of ``store``
+    and cache on all machines. Results name ``command``, without folders.
     """
     todo = [job for job in jobs
             if not store.holds(job.environment.name, job.load().name, job.seed, job.identity())]
@@ -167,7 +152,7 @@ def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1, backend: 
         tqdm.write(f"{len(jobs) - len(todo)} of {len(jobs)} episodes are already there")
     if not todo:
         return
-    truths: dict[Any, Job] = {}  # each once, before several methods want it at once
+    truths: dict[Any, Job] = {}  # each is simulated once, before several methods need it
     for job in (job for job in todo if not is_measured(job.environment.id)):
         truths.setdefault((environment(job.environment).world, job.seed), job)
     run = {"command": portable_command(command), **provenance(), "machine": machine()}
@@ -176,7 +161,8 @@ def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1, backend: 
     try:
         for function, work, label in (
             (_simulate_job, [(job,) for job in truths.values()], "simulating truths"),
-            (_run_job, [(job, store, run, home, _beginning(job, job.load())) for job in todo],
+            (_run_job, [(job, store, run, home, _beginning(job, job.load()), keep_estimates)
+                        for job in todo],
              "running methods"),
         ):
             done = in_parallel(function, work, n_jobs, backend)
@@ -186,28 +172,23 @@ def run_jobs(jobs: list[Job], store: EpisodeStore, *, n_jobs: int = 1, backend: 
         isolation.close()
 
 
-def successful(
-    jobs: Iterable[Job], results: Iterable[dict[str, Any]],
-) -> dict[Job, dict[str, Any]]:
-    """The successful results of the jobs that have one, the first of each: of the same environment,
-    method, version and seed, whatever code it was that played."""
-    fine: dict[tuple[str, ...], dict[str, Any]] = {}
+def successful(jobs: Iterable[Job],
+               results: Iterable[dict[str, Any]]) -> dict[Job, dict[str, Any]]:
+    """Map the jobs that have one to their first successful result: of the same environment, method,
+    version and seed, by any code."""
+    first: dict[tuple[str, ...], dict[str, Any]] = {}
     for result in results:
         if result["status"] == "ok":
-            what = (result["environment"]["name"], result["method"], result["version"],
-                    result["seed"])
-            fine.setdefault(what, result)
-    found = {}
-    for job in jobs:
-        method = job.load()
-        what = (job.environment.name, method.name, method.version, name_seed(job.seed))
-        if what in fine:
-            found[job] = fine[what]
-    return found
+            key = (result["environment"]["name"], result["method"], result["version"],
+                   result["seed"])
+            first.setdefault(key, result)
+    keys = {job: (job.environment.name, job.load().name, job.load().version, name_seed(job.seed))
+            for job in jobs}
+    return {job: first[key] for job, key in keys.items() if key in first}
 
 
 def unplayed(jobs: Sequence[Job], results: Iterable[dict[str, Any]]) -> list[Job]:
-    """The jobs of which none of the results is a successful one."""
+    """Return the jobs without a successful result."""
     done = successful(jobs, results)
     return [job for job in jobs if job not in done]
 
@@ -217,17 +198,17 @@ def _simulate_job(job: Job) -> None:
 
 
 def _run_job(job: Job, store: EpisodeStore, run: dict[str, Any], home: str,
-             beginning: dict[str, Any]) -> None:
+             beginning: dict[str, Any], keep_estimates: bool) -> None:
     try:
         result, fields = run_episode(job)
         if any(result[name] != beginning[name] for name in _LASTING):
-            raise ValueError(f"{job.method} says other things of itself than before")
-        # a world of a script is told apart by the script's file, which this process has not
+            raise ValueError(f"{job.method}: metadata changed between episodes")
+        # a world of a script is identified by the script's file, which this process lacks
         result["identity"] = beginning["identity"]
-    # what could be loaded in the beginning and cannot any more: that, too, is only its own result
     except Exception as error:
         result, fields = beginning | _failure(error, Path(job.method)), {}
-    # whose times these are, not who asked
+    if not keep_estimates:
+        fields = {}
     elsewhere = {} if platform.node() == home else {"machine": machine()}
     result["run"] = run | elsewhere | {"isolation": job.isolation}
     try:

@@ -1,7 +1,4 @@
-"""Scores: what each is called, its unit, which way is better, what it needs, and how it follows
-from an episode. A new one is one `Score`, registered; records, tables, CSV, pages and `compare`
-have it then.
-"""
+"""Scores of an episode; a registered one appears in records, tables, CSV, pages and `compare`."""
 
 from __future__ import annotations
 
@@ -76,47 +73,27 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Score:
-    """A number that an episode is judged by.
-
-    Parameters
-    ----------
-    name : str
-        As records and CSV have it: lower-case letters, digits, underscores.
-    heading : str
-        Of its column.
-    explanation : str
-        What it says, its unit among it, for readers of a table.
-    of : callable
-        Outcome -> number, or None where it means nothing.
-    better : str
-        One of `BETTER`.
-    needs : sequence of str
-        Fields of `Outcome` without which the score is None.
-    tracks : sequence of str
-        Among `KINDS`.
-    factor : float
-        What it is multiplied by where it is shown: 1e3 for seconds in ms.
-    everywhere : bool
-        Whether tables show its column if nobody has it.
-    repeats : bool
-        Whether the same episode gives the same number: times do not.
-
-    Raises
-    ------
-    ValueError
-        If one of these is not as it must be.
-    """
+    """A number by which an episode is scored; ``ValueError`` if a field is invalid."""
 
     name: str
+    """in records and CSV: lower-case letters, digits, underscores"""
     heading: str
     explanation: str
+    """for readers of a table, with the unit"""
     of: Callable[[Any], float | None]
+    """Outcome -> number, or None where it has no meaning"""
     better: str = "lower"
+    """One of `BETTER`."""
     needs: Sequence[str] = ()
+    """Fields of `Outcome` without which the score is None."""
     tracks: Sequence[str] = ("estimation",)
+    """Among `KINDS`."""
     factor: float = 1.0
+    """Factor of displayed values: 1e3 for seconds in ms."""
     everywhere: bool = False
+    """Whether tables show its column even if it is empty."""
     repeats: bool = True
+    """Whether the same episode gives the same number, unlike times."""
 
     def __post_init__(self) -> None:
         if not self.name.isidentifier() or self.name != self.name.lower() or self.name[0] == "_":
@@ -132,13 +109,8 @@ class Score:
         _check.number("factor", self.factor, low=0.0, open_low=True)
 
     def __call__(self, outcome: Outcome) -> float | None:
-        """The score of an episode, None where it lacks what the score needs, or that means nothing.
-
-        Raises
-        ------
-        ValueError
-            If what comes out is no finite number.
-        """
+        """Compute the score of an episode; None if a field is missing or the score has no meaning.
+        ``ValueError`` if it is not a finite number."""
         if any(getattr(outcome, need) is None for need in self.needs):
             return None
         value = self.of(outcome)
@@ -152,13 +124,8 @@ _scores: dict[str, Score] = {}
 
 
 def register_score(score: Score) -> Score:
-    """Let a score be among those of every episode that is played from now on.
-
-    Raises
-    ------
-    ValueError
-        If another has its name or heading.
-    """
+    """Add a score to those of all episodes that run from now on. ``ValueError`` if another has its
+    name or heading."""
     for other in _scores.values():
         if other.name == score.name or other.heading == score.heading:
             raise ValueError(f"score {score.name} ({score.heading}) has the name or heading of "
@@ -168,8 +135,8 @@ def register_score(score: Score) -> Score:
 
 
 def scores(track: str | None = None) -> dict[str, Score]:
-    """All of one of `KINDS`, or of all tracks, by name, in the order of tables: ours, then those of
-    installed packages and those registered by hand."""
+    """Map names to the scores of one of `KINDS`, or of all tracks, in the order of tables: built-in
+    ones, then those of installed packages and those registered by hand."""
     _load_installed()
     kinds = set(TRACKS) if track is None else {track}
     return {name: each for name, each in _scores.items() if kinds & set(each.tracks)}
@@ -180,13 +147,13 @@ def _load_installed() -> None:
     for point in entry_points(group=GROUP):
         try:
             point.load()
-        except Exception as error:          # somebody else's package must not break ours
+        except Exception as error:          # a third-party package must not break this one
             warnings.warn(f"scores of {point.value} are left out: {type(error).__name__}: {error}",
                           stacklevel=2)
 
 
 def scored(track: str, outcome: Outcome) -> dict[str, float | None]:
-    """Name -> what each score of a track says of an episode; of measurements, their own scores."""
+    """Compute all scores of an episode of a track, or of measurements."""
     kind = "measured" if outcome.world is None else track
     return {name: each(outcome) for name, each in scores(kind).items()}
 
@@ -214,7 +181,7 @@ def _nis(outcome: Any) -> float | None:
 
 
 def _claimed(outcome: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """What `scoring` asks for of a claimed uncertainty."""
+    """Return the arguments of `scoring` for a reported uncertainty."""
     return outcome.mean, outcome.std, outcome.truth, outcome.weights
 
 

@@ -72,10 +72,14 @@ class EpisodeStore:
     def holds(self, environment: str, method: str, seed: int, identity: str) -> bool:
         """Return whether a successful result of exactly this identity is there."""
         try:
-            result = _read(self._path(environment, method, name_seed(seed)))
+            result = self.result(environment, method, seed)
         except ValueError:
             return False
         return result["identity"] == identity and result["status"] == "ok"
+
+    def result(self, environment: str, method: str, seed: int) -> dict[str, Any]:
+        """Return a stored result; ``ValueError`` if there is none, or it is damaged."""
+        return _read(self._path(environment, method, name_seed(seed)))
 
     def results(self) -> Iterator[dict[str, Any]]:
         """Yield all stored results; a damaged file is left out with a warning that names it."""

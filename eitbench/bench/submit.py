@@ -26,13 +26,9 @@ def submit(method: str | None, environments: list[str], seeds: list[int] | None,
     this version of the method. Without a ``method`` all built-in ones are run, by default in all
     environments. ``official`` records are a maintainer's, from a commit without changes.
 
-    Raises
-    ------
-    ValueError
-        By the call, if a seed is not of the test split, the method does not run in one of the
-        environments, an official record is asked for from a checkout with changes, or a record
-        would lose its being official; by the iterator, if a record is not valid or would lose
-        episodes.
+    ``ValueError`` by the call, if a seed is not of the test split, the method does not run in one
+    of the environments, an official record is asked for from a checkout with changes, or would be
+    replaced by another; by the iterator, if a record is not valid or would lose episodes.
     """
     code = provenance()
     if official and (code["commit"] is None or code["dirty"]):

@@ -1,4 +1,4 @@
-"""What is played when nobody says it in detail."""
+"""Jobs of a run: methods, environments and seeds, with their defaults."""
 
 from __future__ import annotations
 
@@ -31,36 +31,20 @@ from eitbench.bench.tracks import (
 )
 
 TOO_SLOW_FOR_QUICK = {("filter", "gauss_newton")}
-"""An image at every step takes minutes an episode."""
+"""A reconstruction at every step takes minutes an episode."""
 
 
 def jobs(track: str, environments: list[str], methods: list[str], seeds: list[int] | None = None, *,
          suite: str = "full", estimator: str = "full", isolate: str = "auto", strict: bool = False,
          worlds: Sequence[dict[str, Any]] = ({},)) -> list[Job]:
-    """Every named method of a track in every named environment that it suits, and in each variant
-    of that, ordered by environment, method and seed.
+    """Return the jobs of each named method (default: all built-in ones, with trained agents) in
+    each environment that it suits, ordered by environment, method and seed.
 
-    Parameters
-    ----------
-    track : str
-        One of `tracks.TRACKS`.
-    environments, methods : list of str
-        Default: the suite's; all of ours, trained agents among them.
-    seeds : list of int
-        Default: the suite's, those of the boards.
-    suite : "quick" or "full"
-    estimator : str
-        What stands inside environments that ask for injections: one of `tracks.ESTIMATORS`.
-    isolate, strict
-        As of `isolation.choose_isolation`.
-    worlds : sequence of dict
-        Variants of each environment: what `gymnasium.make` takes as ``world``.
-
-    Raises
-    ------
-    ValueError
-        If there is no such environment or method, a named method plays none of the environments, or
-        two have one name.
+    Environments and seeds are by default those of the ``suite``, quick or full. Each environment
+    has a variant for each of ``worlds`` (the argument ``world`` of `gymnasium.make`), and injection
+    environments the filter ``estimator``. ``isolate`` and ``strict`` are as of
+    `isolation.choose_isolation`. ``ValueError`` if there is no such environment or method, a named
+    method suits none of the environments, or two have one name.
     """
     if estimator not in ESTIMATORS:
         raise ValueError(f"estimator must be one of {', '.join(ESTIMATORS)}, got {estimator!r}")
@@ -104,7 +88,7 @@ def isolated_job(environment: Environment, method: str, isolate: str,
 
 
 def _to_look_at(asked: Environment) -> Any:
-    """The environment, with whatever filter is made fastest: for what it asks, not to be played."""
+    """Make the environment with the filter that is made fastest, for its board and rules only."""
     if asked.track == "injection":
         kwargs = json.loads(asked.kwargs) | {"estimator": "reduced"}
         asked = asked._replace(kwargs=json.dumps(kwargs))
@@ -112,7 +96,7 @@ def _to_look_at(asked: Environment) -> Any:
 
 
 def _distinct(names: dict[str, str]) -> None:
-    """``ValueError`` if two of the methods, by the name of their file, would be kept under one."""
+    """Raise ``ValueError`` if results of two methods would be stored under one name."""
     first: dict[str, str] = {}
     for file, name in names.items():
         if first.setdefault(name, file) != file:
@@ -121,6 +105,6 @@ def _distinct(names: dict[str, str]) -> None:
 
 
 def _absolute(method: str) -> str:
-    """A path that workers find too, also of an installed method; a name of ours as it is."""
+    """Return an absolute path, also of an installed method; a built-in name as it is."""
     path = installed_methods().get(method, Path(method))
     return str(path.absolute()) if is_path(str(path)) else method

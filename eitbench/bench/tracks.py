@@ -1,8 +1,4 @@
-"""What is asked, and where: the registered environments, their track, their boards, and the seeds
-that are played.
-
-All that the benchmark knows of ids is in this file.
-"""
+"""Registered environments: their tracks, boards and default seeds, all derived from their ids."""
 
 from __future__ import annotations
 
@@ -22,22 +18,21 @@ if TYPE_CHECKING:
     from eitbench.envs.injection import InjectionEnv
 
 TRACKS = ("estimation", "injection")
-"""What may be asked for: an estimate of every state, or the next current."""
+"""Tasks: an estimate of every state, or the next injection."""
 BOARDS = {"estimation": ("filter", "fixed-lag", "smoothing"), "injection": ("injection",)}
-"""Of each track: in estimation, by how late the estimate of a state is asked for."""
+"""Boards of each track; in estimation they differ in the lag of an estimate."""
 ALL_BOARDS = tuple(board for boards in BOARDS.values() for board in boards)
 CLASSES = ("filter", "fixed-lag", "smoothing", "stationary", "injection")
-"""What is ranked together: the boards, and targets that stand still apart."""
+"""Groups of environments that are ranked together: the boards, and stationary targets apart."""
 FLOORS = {"estimation": "homogeneous", "injection": "random_pair"}
-"""Whose episodes are the board's, and from whose error the gain is counted."""
+"""Naive baselines: their episodes are those of the board, and the gain is relative to them."""
 ARGUMENTS = {
     "estimation": ("world", "lag", "assume", "episodes", "render_mode"),
     "injection": ("world", "estimator", "observation", "gate", "inflow", "episodes",
                   "render_mode")}
-"""What may be given to an environment of each track, beside its name."""
+"""Arguments of the environments of each track."""
 ESTIMATORS = ("full", "reduced")
-"""What may stand inside an injection environment: the exact filter, for scores, or that of
-training."""
+"""Filters inside an injection environment: the exact one, for scores, or that of training."""
 
 MEASURED = "eitbench.envs.measured:case_env"
 """Entry point of the ids of measured cases."""
@@ -46,17 +41,17 @@ MEASURED_FILES = "eitbench-Measured-"
 MEASURED_SEEDS = "test:0-4"
 """Each withholds other readings of the same measurements."""
 QUICK = ("eitbench/Pipe2D-v0", "eitbench/Pipe2DFixedLag-v0", "eitbench/Pipe2DSmoothing-v0")
-"""What the quick suite runs; the full one runs all that ask for estimates."""
+"""Environments of the quick suite; the full one has all of the track estimation."""
 QUICK_SEEDS = "test:0-3"
 
 
 SCORED = {"estimation": {}, "injection": {"estimator": "full", "observation": "raw"}}
-"""Arguments of each track's environments in runs, unless others are given: with the exact filter,
-and what policies are shown as it is. In training, registered ids have other defaults."""
+"""Default arguments of each track's environments in runs: with the exact filter and unscaled
+observations. In training, registered ids have other defaults."""
 
 
 class Environment(NamedTuple):
-    """A registered id with keyword arguments: what is made, and what a record names."""
+    """A registered id with keyword arguments."""
 
     id: str
     kwargs: str = "{}"
@@ -64,35 +59,30 @@ class Environment(NamedTuple):
 
     @property
     def given(self) -> dict[str, Any]:
-        """The arguments that differ from what is registered."""
+        """Return the arguments that differ from the registered ones."""
         return changed(self.id, json.loads(self.kwargs))
 
     @property
     def name(self) -> str:
-        """Fit for a folder; other arguments, other name."""
+        """Return a name for folders, which differs where arguments differ."""
         return named(self.id, self.given)
 
     @property
     def track(self) -> str:
-        """One of `TRACKS`; ``ValueError`` if there is no such environment."""
+        """As `track_of`."""
         return track_of(self.id)
 
     @property
     def arguments(self) -> dict[str, Any]:
-        """All arguments with which it is made, defaults included."""
+        """Return all arguments with which it is made, defaults included."""
         creator = load_env_creator(str(gym.spec(self.id).entry_point))
         defaults = {name: each.default for name, each in signature(creator).parameters.items()
                     if each.default is not Parameter.empty}
         return defaults | registered(self.id) | SCORED[self.track] | json.loads(self.kwargs)
 
     def make(self, **extra: Any) -> EstimationEnv | InjectionEnv:
-        """A fresh environment as it is played, without gymnasium's wrappers.
-
-        Raises
-        ------
-        ValueError
-            If there is none of this id, or its arguments are wrong.
-        """
+        """Make the environment without gymnasium's wrappers; ``ValueError`` if there is none of
+        this id, or its arguments are wrong."""
         arguments = SCORED[self.track] | json.loads(self.kwargs) | extra
         if arguments.get("estimator", "full") not in ESTIMATORS:
             raise ValueError(f"estimator must be one of {', '.join(ESTIMATORS)}, got "
@@ -102,37 +92,37 @@ class Environment(NamedTuple):
 
 
 def ids(track: str | None = None) -> list[str]:
-    """Registered environments of one track, or of all, as they were registered."""
+    """Return the registered environments of one track, or of all, in their order."""
     return [id for id, each in entries().items() if track in (None, each.track)]
 
 
 def measured_ids() -> list[str]:
-    """Ids of measured cases, which no default suite contains."""
+    """Return the ids of measured cases, which no default suite contains."""
     return [id for id in gym.registry if is_measured(id)]
 
 
 def is_measured(id: str) -> bool:
-    """Whether an id is a measured case: its data have no simulated truth."""
+    """Return whether an id is a measured case, without simulated truth."""
     return id in gym.registry and gym.registry[id].entry_point == MEASURED
 
 
 def own_ids() -> list[str]:
-    """Those of ours."""
+    """Return the built-in ids."""
     return [id for id in ids() if id.startswith("eitbench/")]
 
 
 def track_of(id: str) -> str:
-    """One of `TRACKS`; ``ValueError`` if there is no environment of this id."""
+    """Return the track of an id; ``ValueError`` if there is no such environment."""
     return "estimation" if is_measured(id) else entry(id).track
 
 
 def home_of(id: str) -> str:
-    """The id whose task estimators get in this one too, though the truth is another; else empty."""
+    """Return the id of which this one is a shifted variant, with the same task; else empty."""
     return "" if is_measured(id) else entry(id).home
 
 
 def check_track(id: str, track: str) -> None:
-    """``ValueError`` if an environment is of another track, or there is none."""
+    """Raise ``ValueError`` if an environment is of another track, or there is none."""
     if track_of(id) != track:
         asked = {"estimation": "estimates", "injection": "injections"}[track]
         raise ValueError(f"environment {id} does not ask for {asked}; env must be one of "
@@ -140,7 +130,7 @@ def check_track(id: str, track: str) -> None:
 
 
 def registered(id: str) -> dict[str, Any]:
-    """Arguments that an id was registered with; none for one that is not registered."""
+    """Return the arguments that an id was registered with; none if it is not registered."""
     each = entries().get(id)
     if each is None:
         return dict(gym.registry[id].kwargs) if is_measured(id) else {}
@@ -148,28 +138,28 @@ def registered(id: str) -> dict[str, Any]:
 
 
 def changed(id: str, kwargs: dict[str, Any]) -> dict[str, Any]:
-    """The arguments that make another world than the registered one, or other beliefs about it."""
+    """Select the arguments that differ from the registered ones."""
     usual = {"world": {}} | registered(id)
     return {key: value for key, value in kwargs.items() if value is not None
             and (key not in usual or json.dumps(value) != json.dumps(usual[key]))}
 
 
 def named(id: str, given: dict[str, Any]) -> str:
-    """Name of an id with the arguments that differ from what is registered."""
+    """Return the name of an id with the arguments that differ from the registered ones."""
     text = json.dumps(given, sort_keys=True)
     digest = hashlib.sha256(text.encode()).hexdigest()[:8]
     return id.replace("/", "-") + (f"-{digest}" if given else "")
 
 
 def record_name(environment: str, method: str, version: str, split: str) -> str:
-    """Of a record's file: ``ENV--METHOD--VERSION.json``; of other seeds than test with their split
-    in it too."""
+    """Return the name of a record's file: ``ENV--METHOD--VERSION.json``, with the split if that is
+    not test."""
     parts = [environment, method, version, *[split] * (split != "test")]
     return "--".join(parts) + ".json"
 
 
 def board_of(env: EstimationEnv | InjectionEnv) -> str:
-    """Which of its track's `BOARDS` an environment belongs to."""
+    """Return the board of an environment, one of its track's `BOARDS`."""
     lag = getattr(env, "lag", None)
     if lag is None:
         return "injection"
@@ -179,13 +169,8 @@ def board_of(env: EstimationEnv | InjectionEnv) -> str:
 
 
 def boards_of(id: str, kwargs: dict[str, Any]) -> tuple[str, ...]:
-    """The boards that a registered id with these arguments may belong to, without making it: one,
-    or two where only a world of somebody's own would say which.
-
-    Raises
-    ------
-    ValueError
-        If the arguments are not such as it takes.
+    """Return the boards that a registered id with these arguments may belong to, without making it:
+    one, or two where that depends on a changed world. ``ValueError`` if it has no such arguments.
     """
     track = track_of(id)
     for name, value in kwargs.items():
@@ -212,12 +197,12 @@ def boards_of(id: str, kwargs: dict[str, Any]) -> tuple[str, ...]:
 
 
 def track_of_board(board: str) -> str:
-    """One of `TRACKS`."""
+    """Return the track of a board."""
     return next(track for track, boards in BOARDS.items() if board in boards)
 
 
 def class_of(id: str, board: str) -> str:
-    """Which of `CLASSES` a board of an environment belongs to; ``measured`` of a case."""
+    """Return the one of `CLASSES` of an environment's board; ``measured`` for a case."""
     if is_measured(id):
         return "measured"
     each = entries().get(id)

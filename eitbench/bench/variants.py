@@ -11,15 +11,8 @@ from typing import Any
 def variants(settings: Iterable[str]) -> list[dict[str, Any]]:
     """Return the argument ``world`` of `gymnasium.make` for each combination of the values.
 
-    Parameters
-    ----------
-    settings : iterable of str
-        ``part.number=value``, or several values separated by commas; values are JSON or words.
-
-    Raises
-    ------
-    ValueError
-        If one has another form, two set the same number, or a value is repeated.
+    Settings are ``part.number=value``, or several values separated by commas; values are JSON or
+    words. ``ValueError`` if one has another form, two set the same number, or a value is repeated.
     """
     chosen: dict[str, list[Any]] = {}
     for setting in settings:

@@ -14,8 +14,7 @@ import pandas as pd
 from tqdm import tqdm
 
 from eitbench import _check
-from eitbench._files import write_atomically
-from eitbench.bench.isolation import WorkerError, choose_isolation, close
+from eitbench.bench.isolation import WorkerError, choose_isolation
 from eitbench.bench.methods import (
     Method,
     find_method,
@@ -34,8 +33,9 @@ from eitbench.bench.records import (
     read_sound_files,
     version_number,
 )
-from eitbench.bench.run import Job, run_episode
+from eitbench.bench.run import Job, run_jobs
 from eitbench.bench.scores import scored, scores
+from eitbench.bench.store import EpisodeStore
 from eitbench.bench.table import Cell, Table
 from eitbench.bench.text import scores_by_seed
 from eitbench.bench.tracks import Environment
@@ -44,32 +44,20 @@ from eitbench.data.parallel import in_parallel
 from eitbench.data.seeds import parse_seeds
 
 BUILTIN_FIELDS = ("method", "board", "role", "privileged")
-"""What a rerun of a built-in method must repeat besides scores; its title may have changed."""
+"""Fields that a rerun of a built-in method must repeat; its title may have changed."""
 TOLERANCE = 1e-6
 """relative difference of scores within which they agree: processors sum in different orders"""
 MANY_ROWS = 30
 """From here on a table has a row for each environment instead of each episode."""
 
 
-class Rerun(NamedTuple):
-    """One episode of one record, to be rerun."""
+class Case(NamedTuple):
+    """One episode of one record, to be rerun, or replayed if there is no job."""
 
-    record: Path
-    episode: int
-    """its position in the record"""
-    outcome: Path
-    """file of the comparison's result"""
-    file: str | None
-    """Path of the method's file, as of `job_of`."""
-    isolate: str
-    """As of `isolation.choose_isolation`, strict."""
-    replay: bool
-    """Replay recorded actions instead of running the policy."""
-
-    def job(self, record: dict[str, Any]) -> Job:
-        """Return the job of the record that was read, with seed 0; errors as `job_of`."""
-        return job_of(record, self.file, self.isolate,
-                      self.record.absolute().parents[1] / "methods")
+    file: str
+    record: dict[str, Any]
+    episode: dict[str, Any]
+    job: Job | None
 
 
 def verify(paths: Sequence[Path], folder: Path, *, file: str | None = None, isolate: str = "auto",
@@ -77,53 +65,50 @@ def verify(paths: Sequence[Path], folder: Path, *, file: str | None = None, isol
            backend: str = "loky") -> pd.DataFrame:
     """Rerun ``episodes`` of each record, drawn with this ``seed``, and compare the scores.
 
-    ``file``, ``isolate`` and ``replay`` are as of `Rerun`. Episodes are simulated again.
-    Comparisons are stored in ``folder`` as soon as they are made; the
-    same call with the same code and records resumes.
+    ``file`` and ``isolate`` are as of `job_of`; ``replay`` applies recorded actions instead of
+    running the policy. Episodes are simulated again. Reruns are stored in ``folder``, where the
+    same call resumes.
 
     Returns
     -------
     DataFrame
-        A row for each episode, or for a record that cannot be read: record, environment, method,
-        episode, isolation (of the rerun, or ``replay``), score (that with the largest relative
-        difference), difference, recorded and rerun (ẽ_c), problem (a sentence where they cannot
-        agree), note.
+        A row for each episode, or for a record that cannot be read or rerun: record, environment,
+        method, episode, isolation (of the rerun, or ``replay``), score (that with the largest
+        relative difference), difference, recorded and rerun (ẽ_c), problem (a sentence where they
+        cannot agree), note.
     """
     _check.integer("episodes", episodes, low=1)
     rows = []
-    work: list[tuple[float, Rerun]] = []
+    cases: list[Case] = []
     for path in paths:
         try:
             record = read_record(path)
-        except ValueError as error:
+            job = None if replay else job_of(record, file, isolate, methods_beside(path))
+            if job is not None:
+                job.load()
+        except (ValueError, WorkerError) as error:
             rows.append(_row(path.name, problem=str(error)))
             continue
-        for number in drawn_of(record, episodes, seed):
-            name = f"{path.stem}--{record['seeds'][number].replace(':', '-')}.json"
-            work.append((record["episodes"][number]["seconds"],
-                         Rerun(path, number, folder / "outcomes" / name, file, isolate,
-                               replay)))
-    reruns = [rerun for _, rerun in sorted(work, key=lambda timed: timed[0])]
-    left = [(rerun,) for rerun in reruns if _stored(rerun) is None]
-    try:
-        with cache_in((folder / "cache").absolute()):
-            for _ in tqdm(in_parallel(_compare, left, n_jobs, backend), total=len(reruns),
-                          initial=len(reruns) - len(left), desc="verifying", unit="episode",
-                          disable=None):
-                pass
-    finally:
-        close()
-    rows += [stored for rerun in reruns if (stored := _stored(rerun)) is not None]
-    order = {path.name: place for place, path in enumerate(paths)}
-    rows.sort(key=lambda row: (order[row["record"]], len(row["episode"]), row["episode"]))
-    return pd.DataFrame(rows).drop(columns="identity")
+        for k in drawn_of(record, episodes, seed):
+            episode = record["episodes"][k]
+            numbered = job and job._replace(seed=parse_seeds(episode["seed"])[0])
+            cases.append(Case(path.name, record, episode, numbered))
+    with cache_in((folder / "cache").absolute()):
+        if replay:
+            bar = tqdm(in_parallel(_replayed_row, [(case,) for case in cases], n_jobs, backend),
+                       total=len(cases), desc="replaying", unit="episode", disable=None)
+            rows += sorted(
+                bar, key=lambda row: (row["record"], len(row["episode"]), row["episode"]))
+        else:
+            rows += _rerun_rows(cases, folder, n_jobs, backend)
+    return pd.DataFrame(rows)
 
 
 def select_records(folder: Path, environments: Sequence[str] = (), *, top: int = 0) -> list[Path]:
     """Return the paths of the current official records of a folder, of these environments or of
     all that are simulated.
 
-    With ``top``, of all current records the so many of each environment with the smallest mean
+    With ``top``, of all current records the ``top`` of each environment with the smallest mean
     error, without naive baselines, oracles and failures. ``ValueError`` if there are none, or
     naming all files that are not valid.
     """
@@ -163,6 +148,11 @@ def drawn_of(record: dict[str, Any], episodes: int, seed: int) -> list[int]:
 
 
 # -- the method of a record ---------------------------------------------------------------------
+
+
+def methods_beside(path: Path) -> Path:
+    """Return the folder of methods that belongs to the folder of a record."""
+    return path.absolute().parents[1] / "methods"
 
 
 def job_of(record: dict[str, Any], file: str | None = None, isolate: str = "auto",
@@ -219,49 +209,62 @@ def is_builtin_record(record: dict[str, Any], method: str) -> bool:
 # -- one episode --------------------------------------------------------------------------------
 
 
-def _compare(rerun: Rerun) -> None:
-    """Rerun one episode and store how it differs from the record."""
-    record = read_record(rerun.record)
-    recorded = record["episodes"][rerun.episode]
-    row = _row(rerun.record.name, environment=record["environment"]["id"],
-               method=record["method"], episode=recorded["seed"], identity=_identity(rerun),
-               recorded=recorded.get("scores", {}).get("error"))
-    try:
-        result, notes, problems, isolation = _result(record, recorded, rerun)
-    except (ValueError, WorkerError) as error:
-        row["problem"] = str(error)
-    else:
-        differences = differences_of(recorded, result)
-        worst = max(differences, key=lambda name: differences[name], default="")
-        if result["status"] != recorded["status"]:
-            problems.append(f"the rerun {result['status']}: {result.get('message', '')}")
-        row |= {"score": worst, "difference": differences.get(worst, 0.0), "note": notes,
-                "isolation": isolation, "problem": "; ".join(problems),
-                "rerun": result.get("scores", {}).get("error")}
-    write_atomically(rerun.outcome, json.dumps(row, indent=1).encode())
+def _rerun_rows(cases: list[Case], folder: Path, n_jobs: int, backend: str,
+                ) -> list[dict[str, Any]]:
+    """Run what the folder does not hold yet, and compare. Each version of a method has its store,
+    as third-party methods may share a name; so has each kind of isolation."""
+    jobs: dict[Path, list[Job]] = {}
+    for case in cases:
+        if case.job is not None:
+            jobs.setdefault(_store_folder(case, case.job, folder), []).append(case.job)
+    for store, asked in jobs.items():
+        run_jobs(asked, EpisodeStore(store), n_jobs=n_jobs, backend=backend, keep_estimates=False)
+    return [_rerun_row(case, case.job, EpisodeStore(_store_folder(case, case.job, folder)))
+            for case in cases if case.job is not None]
 
 
-def _result(record: dict[str, Any], recorded: dict[str, Any], rerun: Rerun,
-            ) -> tuple[dict[str, Any], str, list[str], str]:
-    """Return the rerun's result, a note, what it states differently, and its isolation."""
-    (seed,) = parse_seeds(recorded["seed"])
-    if rerun.replay:
-        return replayed(record, recorded, seed), "", [], "replay"
-    job = rerun.job(record)
-    result = json.loads(json.dumps(run_episode(job._replace(seed=seed))[0]))
+def _store_folder(case: Case, job: Job, folder: Path) -> Path:
+    return folder / job.isolation / case.record["version"]
+
+
+def _rerun_row(case: Case, job: Job, store: EpisodeStore) -> dict[str, Any]:
+    """Compare a stored rerun with the record."""
+    record = case.record
+    method = job.load()
+    result = store.result(job.environment.name, method.name, job.seed)
     fields = BUILTIN_FIELDS if is_builtin_record(record, job.method) else (*SHARED, "method")
     problems = [f"{name} is {result[name]!r}, but {record[name]!r} in the record"
                 for name in (*fields, "environment") if result[name] != record[name]]
-    now, then = version_number(job.load().version), version_number(record["version"])
+    now, then = version_number(method.version), version_number(record["version"])
     note = ""
     if now and then and then < now:
         note = f"the record is of {record['version']}, and {record['method']} is now v{now}"
     if now and then and then > now:
         problems.append(f"the record is of {record['version']}, but {record['method']} is v{now}")
-    return result, note, problems, job.isolation
+    return _compared(case, result, job.isolation, problems) | {"note": note}
 
 
-def replayed(record: dict[str, Any], recorded: dict[str, Any], seed: int) -> dict[str, Any]:
+def _replayed_row(case: Case) -> dict[str, Any]:
+    """Replay an episode and compare it with the record."""
+    try:
+        return _compared(case, replayed(case.record, case.episode), "replay", [])
+    except ValueError as error:
+        return _row(case.file, case, problem=str(error))
+
+
+def _compared(case: Case, result: dict[str, Any], isolation: str,
+              problems: list[str]) -> dict[str, Any]:
+    differences = differences_of(case.episode, result)
+    worst = max(differences, key=lambda name: differences[name], default="")
+    if result["status"] != case.episode["status"]:
+        problems.append(f"status is {result['status']} ({result.get('message', 'no error')}), but "
+                        f"{case.episode['status']} in the record")
+    return _row(case.file, case, score=worst, difference=differences.get(worst, 0.0),
+                isolation=isolation, problem="; ".join(problems),
+                rerun=result.get("scores", {}).get("error"))
+
+
+def replayed(record: dict[str, Any], recorded: dict[str, Any]) -> dict[str, Any]:
     """Return the result of an episode in which a record's actions are applied without its policy.
     ``ValueError`` if the record has no actions, or the environment rejects them."""
     actions = recorded.get("actions")
@@ -271,7 +274,7 @@ def replayed(record: dict[str, Any], recorded: dict[str, Any], seed: int) -> dic
                               json.dumps(record["environment"]["kwargs"]))
     replay = Method("injection", record["method"], record["title"], Path(), "",
                     (record["board"],), {}, lambda *_: _Replay(actions))
-    outcome = play(environment, replay, seed).outcome
+    outcome = play(environment, replay, parse_seeds(recorded["seed"])[0]).outcome
     return {"status": "ok", "scores": scored("injection", outcome),
             "step_errors": outcome.errors.tolist()}
 
@@ -313,31 +316,15 @@ def _relative(a: Sequence[float | None], b: Sequence[float | None]) -> float:
     return float(np.nanmax(relative, initial=0.0))
 
 
-def _row(record: str, **known: Any) -> dict[str, Any]:
-    return {"record": record, "environment": "", "method": "", "episode": "", "isolation": "",
-            "score": "", "difference": 0.0, "recorded": None, "rerun": None, "problem": "",
-            "note": "", "identity": ""} | known
-
-
-def _stored(rerun: Rerun) -> dict[str, Any] | None:
-    """Return the stored comparison, if it is of this code, record, method and world."""
-    try:
-        row: dict[str, Any] = json.loads(rerun.outcome.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    return row if row.get("identity") == _identity(rerun) else None
-
-
-def _identity(rerun: Rerun) -> str:
-    """Return the hash of all that a comparison depends on."""
-    record = read_record(rerun.record)
-    try:
-        job = rerun.job(record)._replace(seed=parse_seeds(record["seeds"][rerun.episode])[0])
-        depends = f"{job.identity()} {job.isolation}"
-    except ValueError as error:
-        depends = str(error)
-    content = f"{record['sha256']} {rerun[3:]} {depends}"
-    return hashlib.sha256(content.encode()).hexdigest()[:16]
+def _row(file: str, case: Case | None = None, **known: Any) -> dict[str, Any]:
+    row = {"record": file, "environment": "", "method": "", "episode": "", "isolation": "",
+           "score": "", "difference": 0.0, "recorded": None, "rerun": None, "problem": "",
+           "note": ""}
+    if case is not None:
+        row |= {"environment": case.record["environment"]["id"], "method": case.record["method"],
+                "episode": case.episode["seed"],
+                "recorded": case.episode.get("scores", {}).get("error")}
+    return row | known
 
 
 # -- reports ------------------------------------------------------------------------------------

@@ -223,32 +223,5 @@ def render(
         options.say(f"wrote {out}")
 
 
-REPLACED = {
-    "cards": "`eitbench golden`",
-    "submit-measured": "`eitbench submit --env eitbench/Measured-CASE-v0`",
-    "kits": "`eitbench.bench.package_data.write_package_data()`, for maintainers",
-    "fit-model": "`eitbench fit model`",
-    "fit-prior": "`eitbench fit prior`",
-    "policies": "`eitbench run --env ID --policy NAME` runs injection policies",
-    "reproduce": "`python studies/thesis NAME` in a checkout draws a figure of the thesis",
-    "check": "`eitbench verify RECORDS…` verifies the records of a submission",
-    "held-out": "docs/trust.md says how to draw the secret of held-out episodes",
-    "season": "`eitbench verify --top 3 --held-out 20 --secret FILE` verifies the first records; "
-              "there is one public test split",
-}
-"""Removed command -> what replaces it."""
-
-
-def _removed(name: str) -> None:
-    @app.command(name, hidden=True, add_help_option=False, context_settings={
-        "allow_extra_args": True, "ignore_unknown_options": True})
-    def removed() -> None:
-        options.say(f"`eitbench {name}` was removed: {REPLACED[name]}", err=True)
-        raise typer.Exit(2)
-
-
-for _name in REPLACED:
-    _removed(_name)
-
 if __name__ == "__main__":
     app()

@@ -106,7 +106,7 @@ def _held_out(paths: list[Path], folder: Path, method: str | None, isolate: str,
     from eitbench.bench.isolation import WorkerError, close
     from eitbench.bench.records import read_record
     from eitbench.bench.table import Table
-    from eitbench.bench.verify import job_of
+    from eitbench.bench.verify import job_of, methods_beside
     from eitbench.data.cache import cache_in
     rows: list[dict[str, Any]] = []
     problems: list[str] = []
@@ -114,7 +114,7 @@ def _held_out(paths: list[Path], folder: Path, method: str | None, isolate: str,
         for path in paths:
             try:
                 record = read_record(path)
-                job = job_of(record, method, isolate, path.absolute().parents[1] / "methods")
+                job = job_of(record, method, isolate, methods_beside(path))
                 row, found = verify_held_out(record, job, secret, episodes)
             except (ValueError, WorkerError) as error:
                 row, found = {}, [str(error)]

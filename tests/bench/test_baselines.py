@@ -24,7 +24,7 @@ def test_our_baselines_load():
 
 @pytest.mark.parametrize(("source", "message"), [
     ("x = 1", "must define a class Estimator with a method update"),
-    ("class Estimator: pass", "must define a class Estimator with a method update"),
+    ("class Estimator: pass", "Estimator must have a method update"),
     ("class Estimator:\n  boards = ('filer',)\n  def update(self, V, I): pass", "boards must be some of filter"),
     ("class Estimator:\n  boards = ()\n  def update(self, V, I): pass", "boards must be some of filter"),
     ("class Estimator:\n  boards = 'filter'\n  def update(self, V, I): pass", "boards must be some of filter"),

@@ -1,7 +1,8 @@
 """Golden files: numbers of every world and method agree with them, a constant off by 0.1 % shows, and a damaged file
 is reported.
 
-Worlds are simulated once each: ids that share a fluid follow each other.
+The default run computes one shortened episode of each world and method; `pytest -m slow` all of them. Worlds that
+share a fluid follow each other, and so do methods that run in one environment: what they share is computed once.
 """
 
 import json
@@ -10,48 +11,43 @@ import pytest
 from eitbench.bench import golden, methods
 from eitbench.bench.methods import baseline_folder
 from eitbench.bench.tracks import own_ids
-from eitbench.cli.app import app
 from eitbench.worlds import entry
-from typer.testing import CliRunner
+
+from commands import eitbench
 
 IDS = own_ids()
 FLUIDS = list(dict.fromkeys(entry(id).world.fluid for id in IDS))
 BY_FLUID = sorted(IDS, key=lambda id: FLUIDS.index(entry(id).world.fluid))
 METHODS = golden.official_methods()
-BY_WORLD = sorted(METHODS, key=lambda name: str((golden.read_golden(name) or {}).get("episodes")))
+BY_ENVIRONMENT = sorted(METHODS, key=lambda name: str((golden.read_golden(name) or {}).get("episodes")))
 SLOW = ("filter_bank", "eitbench-Pipe2DInjectionFlow-v0--ppo")
 """Methods whose short episodes take half a minute."""
 PLAIN = "eitbench/Pipe2D-v0"
 
 
-def read(id):
-    """The golden file of a world."""
-    return json.loads(golden.golden_path(id).read_text())
+def some(names, is_slow):
+    return [pytest.param(name, marks=pytest.mark.slow if is_slow(name) else ()) for name in names]
 
 
-@pytest.mark.parametrize("id", [
-    pytest.param(id, marks=pytest.mark.slow) if "3D" in id else id for id in BY_FLUID])
-def test_world_agrees_with_its_golden_file(id):
-    """Other numbers need a new version of the id. Three dimensions take minutes."""
-    assert not golden.check_world(id)
+@pytest.mark.parametrize("name", [*some(BY_FLUID, lambda id: "3D" in id),
+                                  *some(BY_ENVIRONMENT, lambda name: name in SLOW)])
+def test_shortened_episode_agrees_with_the_golden_file(name):
+    """Other numbers need a new version of the id or method. In three dimensions this takes minutes."""
+    assert not golden.check(name, (0,))
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if name in SLOW else ())
-                                  for name in BY_WORLD])
-def test_method_agrees_with_its_golden_file(name):
-    """Two short episodes; the unshortened one is the next test's."""
-    expected = golden.read_golden(name)
-    short = expected | {"episodes": expected["episodes"][:2]}
-    assert not golden.method_differences(short, golden.run_golden(expected, METHODS[name], range(2)))
+@pytest.mark.parametrize("id", [id for id in BY_FLUID if "3D" in id])
+def test_first_observations_agree_with_the_golden_file(id):
+    """The part of a world in three dimensions that takes seconds."""
+    computed = json.loads(golden.world_text(golden.first_observations(id, "train:0")))
+    assert not golden.differences(computed, golden.read_golden(id)["observations"]["train:0"])
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", BY_WORLD)
-def test_unshortened_episode_agrees_with_the_golden_file(name):
+@pytest.mark.parametrize("name", [*BY_FLUID, *BY_ENVIRONMENT])
+def test_all_episodes_agree_with_the_golden_file(name):
     """Errors that build up over an episode show here."""
-    expected = golden.read_golden(name)
-    whole = expected | {"episodes": expected["episodes"][2:]}
-    assert not golden.method_differences(whole, golden.run_golden(expected, METHODS[name], [2]))
+    assert not golden.check(name)
 
 
 def test_every_id_and_method_has_its_golden_file_and_nothing_else_has():
@@ -78,45 +74,49 @@ def test_versions_of_built_in_methods_are_those_of_their_golden_files(monkeypatc
 @pytest.mark.parametrize(("id", "part", "name", "shows", "stays"), [
     (PLAIN, "flow", "diffusivity", {"model.step", "episodes.train:0.resistance"}, "noise"),
     (PLAIN, "vessel", "contact_impedance", {"model.homogeneous", "episodes.train:0.resistance"}, "moment"),
-    (PLAIN, "instrument", "noise_relative", {"episodes.train:0.voltages", "episodes.dev:0.homogeneous"}, "model"),
-    ("eitbench/Pipe2DObstacle-v0", "flow", "viscosity",
-     {"episodes.train:0.moment", "episodes.train:0.resistance"}, "model")])
-def test_constant_off_by_a_thousandth_shows(id, part, name, shows, stays, monkeypatch):
+    (PLAIN, "instrument", "noise_relative", {"episodes.train:0.voltages", "episodes.train:0.homogeneous"}, "model"),
+    pytest.param("eitbench/Pipe2DObstacle-v0", "flow", "viscosity",
+                 {"episodes.train:0.moment", "episodes.train:0.resistance"}, "model", marks=pytest.mark.slow)])
+def test_constant_off_by_a_thousandth_shows(id, part, name, shows, stays):
     """In the numbers that depend on it, and in no other."""
-    monkeypatch.setattr(golden, "WORLD_EPISODES", {"train:0": 24, "dev:0": 24})
     value = getattr(getattr(entry(id).world, part), name)
     world = entry(id).world.changed({part: {name: 1.001 * value}})
-    computed = json.loads(golden.world_text(golden.world_numbers(world)))
-    expected = read(id)
-    same_length = computed | {"episodes": {"train:0": computed["episodes"]["train:0"],
-                                           "dev:0": expected["episodes"]["dev:0"] | {
-                                               "homogeneous": computed["episodes"]["dev:0"]["homogeneous"]}}}
-    found = {line.split(" ")[0] for line in golden.differences(
-        same_length, {key: expected[key] for key in ("model", "episodes")})}
+    computed = json.loads(golden.world_text(golden.world_numbers(world, ("train:0",))))
+    expected = golden.read_golden(id)
+    expected = {"model": expected["model"], "episodes": {"train:0": expected["episodes"]["train:0"]}}
+    found = {line.split(" ")[0] for line in golden.differences(computed, expected)}
     assert shows <= found and not any(stays in place for place in found)
 
 
 @pytest.fixture
 def copy(tmp_path, monkeypatch):
     """A golden file in a folder of this test, of a world that is not simulated again."""
-    content = read(PLAIN)
+    content = golden.read_golden(PLAIN)
     monkeypatch.setattr(golden, "WORLD_FOLDER", tmp_path)
-    monkeypatch.setattr(golden, "world_golden", lambda id: content)
+    monkeypatch.setattr(golden, "world_golden", lambda id, is_quick: content)
     golden.golden_path(PLAIN).write_text(golden.world_text(content))
     return golden.golden_path(PLAIN)
 
 
 def test_missing_and_damaged_files_are_reported(copy):
     """With the id and the path, without a traceback."""
-    assert golden.check_world(PLAIN) == []
+    assert golden.check(PLAIN) == []
     text = copy.read_text()
     for damaged in (text[:len(text) // 2], "", text.replace("[", "(", 1), "\ud800" + text):
         copy.write_bytes(damaged.encode("utf-8", "surrogatepass"))
-        (sentence,) = golden.check_world(PLAIN)
+        (sentence,) = golden.check(PLAIN)
         assert PLAIN in sentence and "damaged" in sentence
     copy.unlink()
-    (sentence,) = golden.check_world(PLAIN)
+    (sentence,) = golden.check(PLAIN)
     assert str(copy) in sentence and "missing" in sentence
+
+
+def moved(by):
+    """A change of one voltage relative to the largest."""
+    def change(content):
+        voltages = content["episodes"]["dev:0"]["voltages"]
+        voltages[2] += by * max(map(abs, voltages))
+    return change
 
 
 @pytest.mark.parametrize(("change", "message"), [
@@ -125,47 +125,26 @@ def test_missing_and_damaged_files_are_reported(copy):
     (lambda made: made.update(model=None), "model is"),
     (lambda made: made["model"].update(step=["fast"] * 5), "model.step is ["),
     (lambda made: made["model"].update(step=[None] * 5), "model.step"),
-    (lambda made: made["episodes"].update({"dev:0": []}), "episodes.dev:0 is")])
-def test_file_of_another_form_is_reported(change, message, copy):
-    """Whichever number, name or kind differs."""
-    content = read(PLAIN)
+    (lambda made: made["episodes"].update({"dev:0": []}), "episodes.dev:0 is"),
+    (moved(0.01), "episodes.dev:0.voltages differs by 0.01 of its largest"), (moved(0.5 * golden.DOUBLE), "")])
+def test_difference_is_reported(change, message, copy):
+    """The number, name or kind that differs; not a difference within the tolerance."""
+    content = golden.read_golden(PLAIN)
     change(content)
     copy.write_text(json.dumps(content))
-    assert any(f"{PLAIN}: " in said and message in said for said in golden.check_world(PLAIN))
-
-
-def test_number_that_moved_is_named(copy):
-    """With its place and both values; a difference within the tolerance is not reported."""
-    content = read(PLAIN)
-    voltages = content["episodes"]["dev:0"]["voltages"]
-    largest = max(map(abs, voltages))
-    before = voltages[2]
-    for change, sentences in ((0.5 * golden.DOUBLE, 0), (0.01, 1)):
-        voltages[2] = before + change * largest
-        copy.write_text(json.dumps(content))
-        assert len(found := golden.check_world(PLAIN)) == sentences
-    assert found[0].startswith(f"{PLAIN}: episodes.dev:0.voltages differs by 0.01 of its largest")
+    found = golden.check(PLAIN)
+    assert any(f"{PLAIN}: " in said and message in said for said in found) if message else not found
     assert golden.differences({"floor": [float("nan")]}, {"floor": [0.02]})
 
 
 @pytest.fixture
 def method_files(monkeypatch, tmp_path):
-    """Golden files of one estimator and one policy, reduced to their short episodes, in a folder of this test."""
-    contents = {}
-    for name in ("homogeneous", "best_pair"):
-        contents[name] = golden.read_golden(name)
-        contents[name]["episodes"][2] = contents[name]["episodes"][1]
-    monkeypatch.setattr(golden, "method_golden", lambda name: tmp_path / f"{name}.json")
+    """Golden files of one estimator and one policy, reduced to a short episode, in a folder of this test."""
+    contents = {name: golden.read_golden(name) for name in ("homogeneous", "best_pair")}
+    monkeypatch.setattr(golden, "METHOD_FOLDER", tmp_path)
     for name, content in contents.items():
-        (tmp_path / f"{name}.json").write_text(json.dumps(content))
+        (tmp_path / f"{name}.json").write_text(json.dumps(content | {"episodes": content["episodes"][1:2]}))
     return tmp_path
-
-
-def run_command(*arguments):
-    done = CliRunner().invoke(app, ["golden", *arguments])
-    if done.exception is not None and not isinstance(done.exception, SystemExit):
-        raise done.exception
-    return done.exit_code, done.stdout, done.stderr
 
 
 @pytest.mark.parametrize(("name", "change", "message"), [
@@ -173,20 +152,19 @@ def run_command(*arguments):
      "error differs by "),
     ("homogeneous", lambda episode: episode["scores"].update(beauty=1.0), "beauty is None, expected 1.0"),
     ("homogeneous", lambda episode: episode["last"].__setitem__(0, 1.01 * episode["last"][0]), "last differs by "),
-    ("best_pair", lambda episode: episode["injections"].__setitem__(0, [0, 1]), "injections is "),
-    ("best_pair", lambda episode: episode["injections"].pop(), "injections is ")])
+    ("best_pair", lambda episode: episode["injections"].__setitem__(0, [0, 1]), "injections is ")])
 def test_numbers_that_moved_are_written_only_as_a_new_version(name, change, message, method_files):
     """Exit status 1 with the method's name and the number; ``--new-version`` writes and counts on."""
     path = method_files / f"{name}.json"
     content = json.loads(path.read_text())
-    change(content["episodes"][1])
+    change(content["episodes"][0])
     path.write_text(json.dumps(content))
     before = path.read_bytes()
-    code, output, errors = run_command(name)
+    code, output, errors = eitbench("golden", name)
     assert code == 1 and f"{name}: moved" in output and message in errors and path.read_bytes() == before
-    code, output, _ = run_command(name, "--new-version")
+    code, output, _ = eitbench("golden", name, "--new-version")
     assert code == 0 and f"{name}: v2" in output and json.loads(path.read_text())["version"] == 2
-    assert run_command(name) == (0, f"{name}: same\n", "")
+    assert eitbench("golden", name)[:2] == (0, f"{name}: same\n")
 
 
 def test_numbers_within_tolerance_stay_to_the_last_bit(method_files):
@@ -197,18 +175,19 @@ def test_numbers_within_tolerance_stay_to_the_last_bit(method_files):
     scores["error"] *= 1 + 1e-9
     removed = scores.pop("contrast_error")
     path.write_text(json.dumps(content))
-    code, output, _ = run_command("homogeneous", "--new-version")
+    code, output, _ = eitbench("golden", "homogeneous", "--new-version")
     now = json.loads(path.read_text())
     assert code == 0 and output == "homogeneous: same\n" and now["version"] == 1
     assert now["episodes"][0]["scores"]["error"] == scores["error"]
     assert now["episodes"][0]["scores"]["contrast_error"] == pytest.approx(removed, rel=1e-6)
-    assert run_command("homogeneous", "worst_pair")[:2] == (2, "")
+    assert eitbench("golden", "homogeneous", "worst_pair")[:2] == (2, "")
 
 
 def test_a_new_method_gets_the_episodes_of_another(method_files):
     """Of the first file that it can play."""
     old = method_files / "homogeneous.json"
-    content = json.loads(old.read_text())
+    content = old.read_text()
     old.rename(method_files / "persistence.json")
-    assert run_command("homogeneous") == (0, "homogeneous: new\n", "")
-    assert not golden.method_differences(content, json.loads(old.read_text()))
+    assert eitbench("golden", "homogeneous")[:2] == (0, "homogeneous: new\n")
+    assert json.loads(old.read_text())["episodes"][0]["seed"] == json.loads(content)["episodes"][0]["seed"]
+    assert not golden.check("homogeneous")

@@ -390,8 +390,7 @@ def test_the_next_episode_begins_with_a_worker_that_answers(statement, tmp_path)
         here = run_episode(job._replace(isolation="none"))[0]
         assert lasting(result) == lasting(here) and result["where"].startswith("mine.py:")
     assert run_episode(job)[0]["status"] == "failed"
-    job.load().make(None)
-    assert isolation._current[0][1].is_alive
+    assert job.load().make(None).is_alive
 
 
 def test_a_changed_file_does_not_run(tmp_path):
@@ -413,7 +412,7 @@ os.write(4, encode_message(valid | {{{}}}))
 
 
 @pytest.mark.parametrize(("content", "message"), [
-    ("class Estimator: pass", "must define a class Estimator with a method update"),
+    ("class Estimator: pass", "Estimator must have a method update"),
     ("raise SystemExit(3)", "cannot be loaded: SystemExit: 3"),
     ("import os; os._exit(4)", "ended with status 4"),
     (ABOUT.format("'title': 'a' * 121"), "reports an invalid title"),
