@@ -223,5 +223,25 @@ def render(
         options.say(f"wrote {out}")
 
 
+REPLACED = {
+    "cards": "eitbench golden", "check": "eitbench verify RECORDS…",
+    "fit-model": "eitbench fit model", "fit-prior": "eitbench fit prior",
+    "policies": "eitbench run --env ID --policy NAME", "reproduce": "python studies/thesis NAME",
+    "season": "eitbench verify --top 3 --held-out 20 --secret FILE",
+    "submit-measured": "eitbench submit --env eitbench/Measured-CASE-v0"}
+"""Removed command -> what replaces it."""
+
+
+def removed(context: typer.Context) -> None:
+    """Print what replaces a removed command."""
+    name = str(context.info_name)
+    options.say(f"`eitbench {name}` was removed: use `{REPLACED[name]}`", err=True)
+    raise typer.Exit(2)
+
+
+for _name in REPLACED:
+    app.command(_name, hidden=True, add_help_option=False, context_settings={
+        "allow_extra_args": True, "ignore_unknown_options": True})(removed)
+
 if __name__ == "__main__":
     app()
