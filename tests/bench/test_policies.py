@@ -273,7 +273,7 @@ def test_errors_of_policies_are_ordered_and_pool_trainings():
 
 
 @pytest.mark.parametrize(("body", "message"), [
-    ("x = 1", r"mine\.py must define a class Policy with a method act\(observation\)"),
+    ("x = 1", r"mine\.py: Policy must have a method act\(observation\)"),
     ("privileged = 1\n    def act(self, observation): ...", "Policy.privileged must be True or False, got 1"),
     ("parameters = {'a': {1}}\n    def act(self, observation): ...", "Policy.parameters must be a dict fit for JSON"),
     ("role = 'best'\n    def act(self, observation): ...", "Policy.role must be None, .*, got 'best'"),
