@@ -14,7 +14,7 @@ from eitbench.data.episodes import simulate, truth_discretisation
 from eitbench.data.recordings import region_operators
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.estimation import best_homogeneous
-from eitbench.estimation.onboard.operator import Innovation
+from eitbench.estimation.onboard.innovation import Innovation
 from eitbench.worlds.task import Estimate, Task
 from eitbench.worlds.world import World
 

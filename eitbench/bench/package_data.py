@@ -10,9 +10,7 @@ import numpy as np
 from eitbench.bench.tracks import own_ids
 from eitbench.data.cache import PACKAGE_DATA, Arrays, File, load_shipped, ship
 from eitbench.data.recordings import beginning_file, csr_of, outline_file, region_file
-from eitbench.estimation.onboard import joint_operator, reduced_operator
-from eitbench.estimation.onboard.packing import unpacked
-from eitbench.estimation.onboard.reduced_operator import pack_model, stored_model_key
+from eitbench.estimation.onboard.models import packed_model, stored_model_key, unpacked
 from eitbench.worlds.registry import Entry, entries, entry
 
 TOLERANCE = 1e-5
@@ -35,10 +33,7 @@ def _files(registered: Entry) -> Iterator[File]:
     if needed <= world.warm_up:
         yield beginning_file(world, needed)
     if registered.track == "injection":
-        joint = world.velocity_model is not None
-        make = joint_operator.make_model if joint else reduced_operator.make_model
-        yield File(stored_model_key(world, "joint" if joint else "reduced"),
-                   lambda: pack_model(lambda: make(world.sound)))
+        yield File(stored_model_key(world), lambda: packed_model(world.sound))
 
 
 def _needed_steps(registered: Entry) -> int:

@@ -10,9 +10,8 @@ from gymnasium import spaces
 
 from eitbench.data.recordings import faults_of, integrals, outline, score_mass
 from eitbench.envs.episodes import EpisodeCore, Observation
-from eitbench.estimation.onboard.choice import operator_type
-from eitbench.estimation.onboard.console import Console
-from eitbench.estimation.onboard.operator import Innovation
+from eitbench.estimation.onboard.innovation import Innovation
+from eitbench.estimation.onboard.onboard_filter import OnboardFilter, filters_type
 from eitbench.estimation.onboard.rules import Rules
 from eitbench.worlds.instrument import Faults
 
@@ -59,7 +58,7 @@ class InjectionCore(EpisodeCore):
     ----------
     rules : Rules
     estimator : str
-        One of `eitbench.estimation.onboard.choice.ESTIMATORS`.
+        One of `eitbench.estimation.onboard.onboard_filter.ESTIMATORS`.
     observation : str
         One of `OBSERVATIONS`; without an estimator observations are raw.
     """
@@ -70,10 +69,10 @@ class InjectionCore(EpisodeCore):
             raise ValueError(f"observation must be one of {', '.join(OBSERVATIONS)}, "
                              f"got {observation!r}")
         self.rules = rules
-        self._operator_type = operator_type(rules, estimator)
-        self._is_scaled = observation == "scaled" and self._operator_type is not None
+        self._filters_type = filters_type(rules, estimator)
+        self._is_scaled = observation == "scaled" and self._filters_type is not None
         self._table = rules.table if rules.limit is None else None
-        if self._operator_type:
+        if self._filters_type:
             self.first = len(self.world.currents)
         self.length = self.world.n_steps - self.first
         self.action_space = rules.action_space
@@ -95,7 +94,7 @@ class InjectionCore(EpisodeCore):
         largest = 1e3 * outline(world).largest_voltage
         current = 1.5 * rules.amplitude                                    # "L2" goes up to √2
         shown = {"voltages": _box(largest, L), "currents": _box(current, L)}
-        if self._operator_type:
+        if self._filters_type:
             columns, rows = world.vessel.patches
             mean = 1e3 * world.expected_concentration
             shown |= {"recent": _box(current, RECENT, L), "frame": _box(largest, self.first, L),
@@ -133,12 +132,12 @@ class InjectionCore(EpisodeCore):
         self.faults = Faults(*(np.array(part) for part in zip(*faults, strict=True)))
         """faults of the instrument in these episodes, (B, L) each"""
         super().begin(seeds, provide)
-        if not self._operator_type:
+        if not self._filters_type:
             return
         self._frames = np.stack([self._measure(k, np.repeat(cycle[None], B, axis=0))
                                  for k, cycle in enumerate(world.currents)], axis=1)
-        self._console = Console(self._operator_type, self.rules, self._frames)
-        self._operator = self._console.operator
+        self._onboard = OnboardFilter(self._filters_type, self.rules, self._frames)
+        self._filters = self._onboard.filters
         self._voltages = self._frames[:, -1].copy()
         self.currents = np.repeat(world.currents[-1:], B, axis=0)
         for k in range(RECENT):
@@ -154,18 +153,18 @@ class InjectionCore(EpisodeCore):
             self._deviations[b, k] = counted.deviation[k]
             self._squares[b, k] = counted.square[k]
             self._totals[b, k] = counted.moment[k].sum(axis=1, dtype=float)
-            if self._operator_type:
+            if self._filters_type:
                 # all rows, so that the bits of a product of matrices do not depend on their number
                 moment = np.zeros((self.world.n_steps, counted.moment.shape[1]), np.float32)
                 moment[k] = counted.moment[k]
-                moments.append(self._operator_type.project(self.world, moment))
+                moments.append(self._filters_type.project(self.rules, moment))
         self._moments = np.array(moments)
         self._homogeneous = None
 
     def homogeneous_errors(self) -> np.ndarray:
         """(B, loaded steps) relative errors of the homogeneous estimates."""
         if self._homogeneous is None:
-            level = self._operator.concentration[:, None] - self.world.background
+            level = self._filters.concentration[:, None] - self.world.background
             area = score_mass(self.world).sum()
             k = slice(self._known)
             error = area * level**2 - 2.0 * level * self._totals[:, k] + self._deviations[:, k]
@@ -188,9 +187,9 @@ class InjectionCore(EpisodeCore):
         self._voltages = self._measure(self.t, currents)
         self._recent = np.concatenate([currents[:, None], self._recent[:, :-1]], axis=1)
         self.t += 1
-        if not self._operator_type:
+        if not self._filters_type:
             return np.zeros(len(currents))
-        self._console.take_in(self._voltages, currents)
+        self._onboard.assimilate(self._voltages, currents)
         if self.t <= self.world.warm_up:
             return np.zeros(len(currents))
         rewards = self.homogeneous_errors()[:, self.t - 1] - self.errors()
@@ -204,24 +203,24 @@ class InjectionCore(EpisodeCore):
     def errors(self) -> np.ndarray:
         """(B,) relative errors (5.12) of the present estimates, NaN where the state is not scored
         or there is no estimator."""
-        if self.t <= self.world.warm_up or not self._operator_type:
+        if self.t <= self.world.warm_up or not self._filters_type:
             return np.full(len(self.spent), np.nan)
         k = self.t - 1
-        return self._operator.errors(self._moments[:, k], self._deviations[:, k],
+        return self._filters.errors(self._moments[:, k], self._deviations[:, k],
                                      self._squares[:, k])
 
     def estimate(self) -> tuple[np.ndarray, np.ndarray]:
         """Present means and standard deviations (B, n) in mol/m³; without an estimator the expected
         concentration and zero."""
-        if not self._operator_type:
+        if not self._filters_type:
             shape = (len(self.spent), outline(self.world).mass.shape[0])
             return np.full(shape, self.world.expected_concentration), np.zeros(shape)
-        return self._operator.means(), self._operator.spreads()
+        return self._filters.means(), self._filters.spreads()
 
     def innovations(self) -> list[Innovation | None]:
         """Innovations of the measurements that the filters accepted last, by episode; for scores,
         never for agents. None without an injection, an accepted measurement or an estimator."""
-        return self._operator.innovations() if self._operator_type else [None] * len(self.spent)
+        return self._filters.innovations() if self._filters_type else [None] * len(self.spent)
 
     def action_masks(self) -> np.ndarray:
         """(B, actions) bool: numbered actions that have an effect; with the budget spent only the
@@ -237,9 +236,9 @@ class InjectionCore(EpisodeCore):
     def observe(self) -> Observation:
         """Return the last measurement and, with an estimator, its state on a grid; (B, …)."""
         shown = {"voltages": self._voltages.copy(), "currents": self.currents.copy()}
-        if self._operator_type:
+        if self._filters_type:
             shown |= {"recent": self._recent.copy(), "frame": self._frames.copy()}
-            shown |= self._console.shown()
+            shown |= self._onboard.shown()
         left = [np.full(len(self.spent), float(self.world.n_steps - self.t))]
         if self.rules.budget is not None:
             left.append(self.rules.budget - self.spent.astype(float))

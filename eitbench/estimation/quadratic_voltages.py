@@ -57,6 +57,8 @@ class QuadraticVoltages:
         self._curvature = 0.5 * (self._curvature + self._curvature.swapaxes(0, 1))
         L = self._resistance.shape[0]
         injections = CACHE_BYTES // (8 * L * (n + q * q))
+        self.tables = self._resistance, self._slope, self._to_modes, self._curvature
+        """𝓡_0 (L, L), D (n, L·L), the modes by u (q, n), and H (q, q, L·L)"""
         self._of_injection = lru_cache(maxsize=max(1, injections))(self._contracted)
 
     def _by_mode(self, model: Resistances, modes: np.ndarray, u: np.ndarray) -> np.ndarray:
@@ -121,18 +123,18 @@ class ScaledVoltages:
         self.smallest = model.smallest_concentration
         modes = _check.array("modes", modes, (None, None))
         with_level, _ = np.linalg.qr(np.column_stack([np.ones(len(modes)), modes]))
-        self._quadratic = QuadraticVoltages(_Scaled(model, level), level, with_level)
+        self.quadratic = QuadraticVoltages(_Scaled(model, level), level, with_level)
 
     def voltages(self, concentration: np.ndarray, currents: np.ndarray) -> np.ndarray:
         """(K, L) V for currents (K, L) in A (A/m in 2D) and a concentration (n,) in mol/m³."""
         c = np.maximum(concentration, self.smallest)
-        return self._quadratic.voltages(c, currents) / _scale(c, self.level)
+        return self.quadratic.voltages(c, currents) / _scale(c, self.level)
 
     def linearise(self, concentration: np.ndarray,
                   currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Voltages (K, L) in V and their derivatives by c, (K, L, n) in V·m³/mol."""
         c = np.maximum(concentration, self.smallest)
-        scaled, by_c = self._quadratic.linearise(c, currents)
+        scaled, by_c = self.quadratic.linearise(c, currents)
         scale = _scale(c, self.level)
         return scaled / scale, (by_c - scaled[..., None] / (len(c) * c)) / scale
 

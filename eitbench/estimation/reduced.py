@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from itertools import pairwise
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import scipy.linalg
@@ -93,31 +93,44 @@ def main_directions(learnt: np.ndarray, mass: np.ndarray, rank: int) -> np.ndarr
     return basis
 
 
-class ReducedFilter:
-    """The textbook's Kalman filter for B records side by side, each with its own injections.
+class ReducedStates(Protocol):
+    """State space of few coordinates for B episodes side by side, in the precision of its arrays.
 
-    A record's numbers do not depend on what is filtered beside it, to the bit.
-
-    Parameters
-    ----------
-    model : ReducedModel
-    mean, covariance : (B, r), (B, r, r)
-        Of the present states; the filter works in the precision that these and the model have.
-
-    Attributes
-    ----------
-    innovation_covariance : (B, m, m)
-        S of the last measurement, m = 0 before the first; rows and columns of readings left out are
-        those of 1.
+    The state has s entries, the concentration q coordinates in a basis. No episode's numbers depend
+    on what is filtered beside it, to the bit.
     """
 
-    def __init__(self, model: ReducedModel, mean: np.ndarray, covariance: np.ndarray) -> None:
+    basis: np.ndarray
+    """(n, q) of the concentration's deviation relative to its level"""
+
+    def initial(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return mean (s,) and covariance (s, s) at t = 0."""
+
+    def propagate(self, mean: np.ndarray,
+                  covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return mean (B, s) and covariance (B, s, s) one time step later."""
+
+    def step(self, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the derivative of a step at a mean (s,), the covariance of its noise, (s, s)
+        each, and the mean after it."""
+
+    def coordinates(self, mean: np.ndarray) -> np.ndarray:
+        """Return the coordinates (B, q) of the concentration."""
+
+    def jacobian(self, mean: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+        """Return derivatives (B, m, s) by the state from those by the coordinates, (B, m, q) or
+        (m, q)."""
+
+    def constrain(self, mean: np.ndarray) -> np.ndarray:
+        """Return the nearest mean (B, s) within bounds."""
+
+
+class SteadyStates:
+    """State space of a `ReducedModel`: the coordinates of the concentration. A `ReducedStates`."""
+
+    def __init__(self, model: ReducedModel) -> None:
         self.model = model
-        self.mean = mean
-        self.covariance = covariance.copy()
-        self.innovation_covariance = np.empty((len(mean), 0, 0))
-        self._half = np.empty_like(covariance)
-        self._next = np.empty_like(covariance)
+        self.basis = model.basis
         A = model.transition
         r = len(A)
         splits = [k for k in range(1, r) if A[k, k - 1] == 0.0]
@@ -125,47 +138,85 @@ class ReducedFilter:
                   for third in (r // 3, 2 * r // 3) if splits}
         self._edges = [0, *sorted(thirds), r]
 
-    def predict(self) -> None:
-        """One time step on."""
+    def initial(self) -> tuple[np.ndarray, np.ndarray]:
+        return np.zeros_like(self.model.initial[0]), self.model.initial
+
+    def propagate(self, mean: np.ndarray,
+                  covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         A = self.model.transition
-        P = self.covariance
-        AP = self._half
-        APA = self._next
-        self.mean = (A @ self.mean[..., None])[..., 0]
+        AP, APA = np.empty_like(covariance), np.empty_like(covariance)
         for begin, end in pairwise(self._edges):                     # below its blocks A is zero
-            np.matmul(A[begin:end, begin:], P[:, begin:], out=AP[:, begin:end])
+            np.matmul(A[begin:end, begin:], covariance[:, begin:], out=AP[:, begin:end])
         for begin, end in pairwise(self._edges):
             np.matmul(AP[:, :, begin:], A[begin:end, begin:].T, out=APA[:, :, begin:end])
         APA += self.model.noise
-        self.covariance = APA
-        self._next = P
+        return (A @ mean[..., None])[..., 0], APA
 
-    def update(self, matrix: np.ndarray, residual: np.ndarray, noise_variance: np.ndarray, *,
-               gate: float = math.inf) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Take in residual = matrix·a + v: (B, m, r), (B, m), (B, m).
+    def step(self, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return self.model.transition, self.model.noise, self.model.transition @ mean
 
-        Readings that are not accepted with this ``gate`` are left out. Returns of all of them
-        the innovations, their predicted variances and which were taken in, (B, m) each.
+    def coordinates(self, mean: np.ndarray) -> np.ndarray:
+        return mean
+
+    def jacobian(self, mean: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+        return matrix
+
+    def constrain(self, mean: np.ndarray) -> np.ndarray:
+        return mean
+
+
+class ReducedFilter:
+    """Kalman filter of B episodes side by side, each with its own injections.
+
+    Parameters
+    ----------
+    states : ReducedStates
+    episodes : int
+        B.
+
+    Attributes
+    ----------
+    mean, covariance : (B, s), (B, s, s)
+        Of the present states.
+    innovation_covariance : (B, m, m)
+        S of the last measurement; rows and columns of rejected readings are those of 1.
+    """
+
+    def __init__(self, states: ReducedStates, episodes: int) -> None:
+        self.states = states
+        mean, covariance = states.initial()
+        self.mean = np.repeat(mean[None], episodes, axis=0)
+        self.covariance = np.repeat(covariance[None], episodes, axis=0)
+        self.innovation_covariance = np.empty((episodes, 0, 0))
+
+    def predict(self) -> None:
+        """Advance one time step."""
+        self.mean, self.covariance = self.states.propagate(self.mean, self.covariance)
+
+    def update(self, matrix: np.ndarray, innovation: np.ndarray, noise_variance: np.ndarray, *,
+               gate: float = math.inf) -> tuple[np.ndarray, np.ndarray]:
+        """Condition on innovations (B, m) of readings with derivatives (B, m, s) and noise (B, m).
+
+        Readings beyond the ``gate`` are rejected. Returns the predicted variances of all, and which
+        were accepted, (B, m) each.
         """
         P = self.covariance
         m = matrix.shape[1]
         cross = matrix @ P                                                                  # H P
         S = cross @ np.swapaxes(matrix, -1, -2)
         S[:, np.arange(m), np.arange(m)] += noise_variance
-        innovation = residual - (matrix @ self.mean[..., None])[..., 0]
         variance = S.diagonal(axis1=1, axis2=2).copy()
-        kept = gate_mask(innovation, variance, gate)
-        taken = innovation
-        if not kept.all():  # a reading left out is one without a word on the state
-            cross = cross * kept[..., None]
-            taken = innovation * kept
-            S *= kept[:, :, None] & kept[:, None, :]
-            S[:, np.arange(m), np.arange(m)] += ~kept
+        accepted = gate_mask(innovation, variance, gate)
+        if not accepted.all():  # a rejected reading is one that does not depend on the state
+            cross = cross * accepted[..., None]
+            innovation = innovation * accepted
+            S *= accepted[:, :, None] & accepted[:, None, :]
+            S[:, np.arange(m), np.arange(m)] += ~accepted
         self.innovation_covariance = S
         inverse_root = np.linalg.inv(np.linalg.cholesky(S))
         W = inverse_root @ cross
         gained = np.swapaxes(W, -1, -2)
-        whitened = inverse_root @ taken[..., None]
-        self.mean = self.mean + (gained @ whitened)[..., 0]
+        whitened = inverse_root @ innovation[..., None]
+        self.mean = self.states.constrain(self.mean + (gained @ whitened)[..., 0])
         P -= gained @ W
-        return innovation, variance, kept
+        return variance, accepted

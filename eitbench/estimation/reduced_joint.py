@@ -12,8 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from eitbench.estimation.reduced import ReducedFilter
-
 
 class JointModel(NamedTuple):
     """a⁺ = A(θ) a + w, θ⁺ = θ + ω, for c − s = Φ a about a liquid that the flow leaves as it is."""
@@ -63,67 +61,74 @@ class JointTables:
         return ((c3 * d + c2) * d + c1) * d + c0, slope, ((n3 * d + n2) * d + n1) * d + n0
 
 
-class ReducedJointFilter(ReducedFilter):
-    """The extended Kalman filter of (a, θ), as `VelocityStates`, for B records side by side.
+class JointStates:
+    """State space of a `JointModel`: (a, θ), as in `VelocityStates`, θ in m/s. A `ReducedStates`.
 
-    The covariance moves with [[A, (dA/dθ) a], [0, 1]] at the present estimate. θ is kept within
-    ``bounds``. A record's numbers do not depend on what is filtered beside it, to the bit.
+    Deviations move with [[A, (dA/dθ) a], [0, 1]].
 
     Parameters
     ----------
-    tables : JointTables
-    mean, covariance : (B, r + 1), (B, r + 1, r + 1)
-        Of the present (a, θ), θ in m/s; the filter works in the precision that these and the tables
-        have.
-    walk_std : float
-        m/s, of the steps of θ.
+    model : JointModel
+    nominal, std, walk_std : float
+        m/s: mean and standard deviation of θ at t = 0, and standard deviation of its steps.
     bounds : (float, float)
         m/s, least and largest θ.
+    dtype : numpy float type
+        In which the filter works.
     """
 
-    def __init__(self, tables: JointTables, mean: np.ndarray, covariance: np.ndarray,
-                 walk_std: float, bounds: tuple[float, float]) -> None:
-        self.tables = tables
-        self.mean = mean
-        self.covariance = covariance.copy()
-        self.innovation_covariance = np.empty((len(mean), 0, 0))
+    def __init__(self, model: JointModel, nominal: float, std: float, walk_std: float,
+                 bounds: tuple[float, float], dtype: type = np.float64) -> None:
+        self.basis = model.basis.astype(dtype)
+        self.tables = JointTables(model, dtype)
+        r = len(model.initial)
+        self._mean = np.append(np.zeros(r), nominal).astype(dtype)
+        self._covariance = np.zeros((r + 1, r + 1), dtype)
+        self._covariance[:r, :r] = model.initial
+        self._covariance[r, r] = std**2
         self._walk_variance = walk_std**2
         self._bounds = bounds
 
-    def predict(self) -> None:
-        """One time step on."""
-        transition, noise = self.step_at(self.mean)
-        r = transition.shape[1] - 1
-        moved = (transition[:, :r, :r] @ self.mean[:, :r, None])[..., 0]
-        self.mean = np.concatenate([moved, self.mean[:, r:]], axis=1)
-        self.covariance = transition @ self.covariance @ np.swapaxes(transition, 1, 2) + noise
+    def initial(self) -> tuple[np.ndarray, np.ndarray]:
+        return self._mean, self._covariance
 
-    def step_at(self, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """How deviations from ``mean`` (B, r + 1) move, and their noise; (B, r + 1, r + 1) each."""
-        return joint_step(self.tables, mean, self._walk_variance)
+    def propagate(self, mean: np.ndarray,
+                  covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        transition, noise = self._step(mean)
+        covariance = transition @ covariance @ np.swapaxes(transition, 1, 2) + noise
+        return _moved(transition, mean), covariance
 
-    def update(self, matrix: np.ndarray, residual: np.ndarray, noise_variance: np.ndarray, *,
-               gate: float = np.inf) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Take in residual = matrix·a + v: (B, m, r), (B, m), (B, m); see `ReducedFilter`."""
-        blind = np.zeros((*matrix.shape[:2], 1), matrix.dtype)  # θ itself is not seen
-        seen = np.concatenate([matrix, blind], axis=2)
-        result = super().update(seen, residual, noise_variance, gate=gate)
-        np.clip(self.mean[:, -1], *self._bounds, out=self.mean[:, -1])  # the filter's own array
-        return result
+    def step(self, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        transition, noise = self._step(mean[None])
+        return transition[0], noise[0], _moved(transition, mean[None])[0]
+
+    def _step(self, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return [[A, (dA/dθ) a], [0, 1]] and the covariance of (w, ω), (B, r + 1, r + 1)."""
+        A, slope, W = self.tables.at(mean[:, -1])
+        B, r = mean[:, :-1].shape
+        transition, noise = np.zeros((2, B, r + 1, r + 1), A.dtype)
+        transition[:, :r, :r] = A
+        transition[:, r, r] = 1.0
+        transition[:, :r, r] = (slope @ mean[:, :r, None])[..., 0]
+        noise[:, :r, :r] = W
+        noise[:, r, r] = self._walk_variance
+        return transition, noise
+
+    def coordinates(self, mean: np.ndarray) -> np.ndarray:
+        return mean[:, :-1]
+
+    def jacobian(self, mean: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+        blind = np.zeros((*matrix.shape[:-1], 1), matrix.dtype)  # θ itself is not seen
+        return np.concatenate([matrix, blind], axis=-1)
+
+    def constrain(self, mean: np.ndarray) -> np.ndarray:
+        return np.concatenate([mean[:, :-1], np.clip(mean[:, -1:], *self._bounds)], axis=1)
 
 
-def joint_step(tables: JointTables, mean: np.ndarray,
-               walk_variance: float) -> tuple[np.ndarray, np.ndarray]:
-    """[[A, (dA/dθ) a], [0, 1]] and (w, ω)'s covariance, (B, r + 1, r + 1); ``mean`` (B, r + 1)."""
-    A, slope, W = tables.at(mean[:, -1])
-    B, r = mean[:, :-1].shape
-    transition, noise = np.zeros((2, B, r + 1, r + 1), A.dtype)
-    transition[:, :r, :r] = A
-    transition[:, r, r] = 1.0
-    transition[:, :r, r] = (slope @ mean[:, :r, None])[..., 0]
-    noise[:, :r, :r] = W
-    noise[:, r, r] = walk_variance
-    return transition, noise
+def _moved(transition: np.ndarray, mean: np.ndarray) -> np.ndarray:
+    """Return (A a, θ) of (a, θ), (B, r + 1)."""
+    a = (transition[:, :-1, :-1] @ mean[:, :-1, None])[..., 0]
+    return np.concatenate([a, mean[:, -1:]], axis=1)
 
 
 def joint_model(basis: np.ndarray, mass: np.ndarray, initial: np.ndarray, velocities: np.ndarray,

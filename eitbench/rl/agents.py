@@ -12,8 +12,8 @@ import numpy as np
 
 from eitbench.bench.methods import baseline_folder
 from eitbench.envs.injection_core import InjectionCore, scaled
-from eitbench.estimation.onboard.choice import operator_type
-from eitbench.estimation.onboard.console import Console
+from eitbench.estimation.onboard.onboard_filter import OnboardFilter
+from eitbench.estimation.onboard.reduced_filters import ReducedFilters
 from eitbench.estimation.onboard.rules import Rules
 
 
@@ -37,17 +37,15 @@ class Agent:
     def __init__(self, rules: Rules, random: np.random.Generator) -> None:
         self.rules = rules
         self.memory = None
-        self.console: Console | None = None
+        self.onboard: OnboardFilter | None = None
 
     def act(self, observation: dict[str, np.ndarray]) -> Any:
-        begins = self.console is None
-        if self.console is None:
-            kind = operator_type(self.rules, "reduced")
-            assert kind is not None
-            self.console = Console(kind, self.rules, observation["frame"][None])
+        begins = self.onboard is None
+        if self.onboard is None:
+            self.onboard = OnboardFilter(ReducedFilters, self.rules, observation["frame"][None])
         else:
-            self.console.take_in(observation["voltages"][None], observation["currents"][None])
-        observation = observation | {name: array[0] for name, array in self.console.shown().items()}
+            self.onboard.assimilate(observation["voltages"][None], observation["currents"][None])
+        observation = observation | {name: array[0] for name, array in self.onboard.shown().items()}
         masks = {}
         if self.masked:
             spent = self.rules.budget is not None and observation["left"][1] == 0.0

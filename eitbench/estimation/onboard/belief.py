@@ -3,17 +3,17 @@ reduced order."""
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from eitbench.estimation.design import pair_gains
-from eitbench.estimation.onboard.choice import operator_type
-from eitbench.estimation.onboard.operator import levels_of
-from eitbench.estimation.onboard.reduced_operator import ReducedOperator
+from eitbench.estimation.onboard.levels import levels_of
+from eitbench.estimation.onboard.reduced_filters import ReducedFilters
 
 if TYPE_CHECKING:
+    from eitbench.estimation.onboard.levels import Linearisation
     from eitbench.estimation.onboard.rules import Rules
 
 DOUBTFUL = 0.3
@@ -43,13 +43,9 @@ class Belief:
 
     def __init__(self, rules: Rules, observation: dict[str, np.ndarray]) -> None:
         self.rules = rules
-        kind = operator_type(rules, "reduced")
-        assert kind is not None
-        assert issubclass(kind, ReducedOperator)
-        self._operator = kind(rules.world, observation["frame"][None], gate=rules.gate,
-                              noise_floor=rules.instrument.noise_floor)
+        self._filters = ReducedFilters(rules, observation["frame"][None])
         self._along: np.ndarray | None = None
-        self._steps: list[tuple[np.ndarray, np.ndarray]] = []
+        self._forget()
         reading, self._driving = observation["doubt"]
         self.doubt = reading + self._driving
         """(L,) share of an electrode's recent readings, and of the recent injections it drove, not
@@ -79,9 +75,9 @@ class Belief:
         if left alone, forgiven: whichever then reads what was predicted is trusted again, and a
         broken one reads interference.
         """
-        self._operator.assimilate(observation["voltages"][None], observation["currents"][None])
+        self._filters.assimilate(observation["voltages"][None], observation["currents"][None])
         self._along = None
-        self._steps = []
+        self._forget()
         reading, driving = observation["doubt"]
         self._driving = np.where(observation["currents"] == 0.0, FORGIVEN * self._driving, driving)
         self.doubt = reading + self._driving
@@ -89,13 +85,19 @@ class Belief:
     def told(self, entries: np.ndarray) -> None:
         """Be shown the truth, by the rest of an episode's recording from the present t on: for
         bounds only."""
-        self._along = self._operator.truth(entries)
-        self._steps = []
+        self._along = self._filters.truth(entries)
+        self._forget()
+
+    def _forget(self) -> None:
+        """Drop what was computed for the last state."""
+        self._steps: list[tuple[np.ndarray, ...]] = []
+        vars(self).pop("linearised", None)
+        vars(self).pop("_weight", None)
 
     @property
     def mean(self) -> np.ndarray:
         """(n,) estimate in mol/m³ at the nodes of the task's mesh."""
-        return self._operator.means()[0]
+        return self._filters.means()[0]
 
     @property
     def sound(self) -> np.ndarray:
@@ -113,22 +115,23 @@ class Belief:
         ``ahead`` says how many steps from now that other one holds; it matters where the flow is
         estimated, since what an error of the velocity does depends on what flows.
         """
-        transition, noise = self._step(ahead)
-        now = self._operator.covariance[0].astype(float) if covariance is None else covariance
+        transition, noise, _ = self._step(ahead)
+        now = self._filters.covariance if covariance is None else covariance
         return transition @ now @ transition.T + noise
 
-    def _step(self, ahead: int) -> tuple[np.ndarray, np.ndarray]:
-        """How deviations move in the step that begins so many steps from now, and their noise."""
+    def _step(self, ahead: int) -> tuple[np.ndarray, ...]:
+        """How deviations move in the step that begins so many steps from now, their noise, and the
+        mean after it."""
         if ahead >= len(self._steps):
             count = max(ahead + 1, 2 * len(self._steps))
             if self._along is not None:
                 count = len(self._along)
-            self._steps = self._operator.steps(count, self._along)
+            self._steps = self._filters.steps(count, self._along)
         return self._steps[ahead]
 
     def expected_error(self, covariance: np.ndarray) -> float:
         """Expected squared error, integrated over what counts, in parts of the level's square."""
-        weight = self._operator.weight
+        weight = self._weight
         return float(covariance.trace() if weight is None else (weight * covariance).sum())
 
     def foresight(self, steps: int, ahead: int = 0) -> np.ndarray:
@@ -136,7 +139,7 @@ class Belief:
         all that they will do: the flow carries them, and the squared errors over what counts are
         summed over this and so many steps more.
         """
-        first = self._operator.weight
+        first = self._weight
         weight = total = np.eye(len(self._step(ahead)[0])) if first is None else first
         # The states of an episode are one more than the steps between them.
         last = len(self._along) - 1 if self._along is not None else ahead + steps + 1
@@ -161,7 +164,7 @@ class Belief:
         variance = self._noise_variance
         if sound is not None:
             variance = np.where(sound, variance, np.inf)
-        weight = self._operator.weight if weight is None else weight
+        weight = self._weight if weight is None else weight
         DPW = DP if weight is None else DP @ weight
         tables = ((DP @ D.T).reshape(L, L, L, L), (DPW @ DP.T).reshape(L, L, L, L))
         gains = pair_gains(*tables, self.rules.pairs, variance)
@@ -209,24 +212,28 @@ class Belief:
         assert first is not None
         return first
 
+    @cached_property
+    def linearised(self) -> Linearisation:
+        """Of 𝓡 by the state (L, L, s), as the filter linearises the next measurement: about the
+        level, or with a learned inflow about the prediction."""
+        return self._filters.linearised(self._step(0)[2])
+
     @property
     def derivative(self) -> np.ndarray:
-        """(L, L, s) of 𝓡 by the state, about which the filter linearises the next measurement:
-        the level, or where the inflow's prior is learned what it predicts."""
-        return self._with_flow(self._operator.linearised.derivative.astype(float))
+        """(L, L, s) derivatives of `linearised`."""
+        return self.linearised.derivative
 
     def relinearised(self) -> np.ndarray:
-        """(L, L, s) of 𝓡 by the state, about the present estimate; some 10 ms."""
-        return self._with_flow(self._operator.relinearised())
+        """(L, L, s) derivatives of 𝓡 by the state, about the present estimate; some 10 ms."""
+        return self._filters.relinearised()
 
-    def _with_flow(self, derivative: np.ndarray) -> np.ndarray:
-        """Derivatives by the whole state: a velocity itself is not seen."""
-        beyond = self._operator.covariance.shape[1] - derivative.shape[2]
-        return np.pad(derivative, ((0, 0), (0, 0), (0, beyond))) if beyond else derivative
+    @cached_property
+    def _weight(self) -> np.ndarray | None:
+        return self._filters.weight(self._step(0)[2])
 
     @property
     def _noise_variance(self) -> np.ndarray:
-        return _noise_variance(self.rules, self._operator.linearised.resistance.tobytes())
+        return _noise_variance(self.rules, self.linearised.resistance.tobytes())
 
 
 @lru_cache(maxsize=64)

@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 
 from eitbench import _check
-from eitbench.estimation.onboard.operator import electrode_pairs, pair_currents
+from eitbench.estimation.onboard.levels import electrode_pairs, pair_currents
 
 if TYPE_CHECKING:
     from eitbench.worlds.instrument import Instrument

@@ -1,0 +1,189 @@
+"""Reduced state space of a learned inflow: recent inflows, and what older ones leave in the pipe.
+
+The flow carries an inflow through the pipe (`steady_response`): c_t = c_bh (1 + Σ_k W_k u_{t−k}),
+with u = exp(E x) − 1 and x the Gaussian moments of the inflow's logarithm (`InflowPrior`). The last
+D values of x are part of the state, so that voltages are linearised about them anew at each step.
+What older inflows leave is a few coordinates a with a⁺ = A a + W_D u_{t−D}; A is fitted to the
+response. The exact filter (`InflowWindow`) keeps as many x as the pipe remembers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from scipy.linalg import toeplitz
+
+from eitbench._notice import say
+from eitbench.data.seeds import SPLITS
+from eitbench.estimation.inflow_prior import InflowPrior, learned_inflow_prior
+from eitbench.estimation.inflow_response import Response
+from eitbench.estimation.inflow_window import stationary
+
+if TYPE_CHECKING:
+    from eitbench.worlds.world import World
+
+RECENT = 8
+"""D; with fewer, more of the nonlinearity is linearised before anything is measured of it."""
+OLDER = 48
+"""Coordinates of what older inflows leave."""
+EPISODES = 200
+"""Training inflows from which the prior is learned, the first ones."""
+STEPS = 80
+"""Scored steps of these, whatever the world has: short records would not show how inflows last."""
+DIRECTIONS = 100
+"""Coordinates of the concentration, the first of which are those of what older inflows leave."""
+
+
+class InflowModel(NamedTuple):
+    """State (a, x_t, …, x_{t−D+1}) with s = h + D·r entries and the concentration that it means."""
+
+    basis: np.ndarray
+    """(n, q) orthonormal, of the concentration relative to the level, less 1"""
+    transition: np.ndarray
+    """(h, h) A"""
+    weights: np.ndarray
+    """(q, D + 1, n_inlet) W_0 … W_D in the basis"""
+    modes: np.ndarray
+    """(n_inlet, r) E"""
+    regression: np.ndarray
+    """(D,) weights of the last x in the mean of the next one"""
+    remainder: np.ndarray
+    """() variance of what the regression leaves"""
+    initial: np.ndarray
+    """(s, s) covariance at t = 0, about x = 0"""
+
+
+def inflow_model(response: Response, prior: InflowPrior) -> InflowModel:
+    """Return the reduced model of a steady flow's response and a prior of the inflow."""
+    K = response.weights.shape[1]
+    D = min(RECENT, K - 1)
+    past = np.moveaxis(response.weights @ prior.modes, 1, 0)                        # (K, Q, r)
+    root = np.linalg.cholesky(toeplitz(prior.time_covariance(K)) + 1e-9 * np.eye(K))
+    older = _directions(past[D:], root[:K - D, :K - D])[:, :OLDER]
+    rest = past[:D] - older @ (older.T @ past[:D])
+    recent = _directions(rest, root[:D, :D])[:, :DIRECTIONS - older.shape[1]]
+    directions = np.concatenate([older, recent], axis=1)
+    aged = older.T @ past[D:]                                                       # (K − D, h, r)
+    before, after = (np.concatenate(list(part), axis=1) for part in (aged[:-1], aged[1:]))
+    transition = np.linalg.lstsq(before.T, after.T, rcond=1e-5)[0].T
+    weights = np.tensordot(directions.T, response.weights[:, :D + 1], 1)
+    _, (regression, remainder) = stationary(prior.time_covariance(D + 1))
+    r = prior.modes.shape[1]
+    by_x = np.zeros((older.shape[1] + D * r, K * r))                  # of the state by all past x
+    by_x[:older.shape[1], D * r:] = np.moveaxis(aged, 0, 1).reshape(older.shape[1], -1)
+    by_x[older.shape[1]:, :D * r] = np.eye(D * r)
+    history = by_x @ np.kron(root, np.eye(r))
+    return InflowModel(response.basis @ directions, transition, weights, prior.modes, regression,
+                       np.array(remainder), history @ history.T)
+
+
+@lru_cache(maxsize=4)
+def world_prior(world: World) -> InflowPrior:
+    """Return the prior that training inflows of a world suggest."""
+    say(f"learning the inflow prior of {world.name}, some seconds once a process")
+    longer = replace(world, schedule=replace(world.schedule, scored_steps=STEPS))
+    return learned_inflow_prior(longer, SPLITS["train"][:EPISODES])
+
+
+def sample_coordinates(model: InflowModel, response: Response, prior: InflowPrior,
+                       count: int) -> np.ndarray:
+    """Return coordinates (count, q) of concentrations that inflows drawn from the prior make."""
+    K = response.weights.shape[1]
+    root = np.linalg.cholesky(toeplitz(prior.time_covariance(K)) + 1e-9 * np.eye(K))
+    draws = np.random.default_rng(0).standard_normal((count, K, prior.modes.shape[1]))
+    deviation = prior.inflow((root @ draws) @ prior.modes.T) - 1.0
+    in_response = np.tensordot(deviation, response.weights, ((1, 2), (1, 2)))
+    return np.asarray(in_response @ (response.basis.T @ model.basis))
+
+
+def _directions(past: np.ndarray, root: np.ndarray) -> np.ndarray:
+    """(Q, …) directions in which inflows of this covariance in time, root·rootᵀ, move Σ_k past_k
+    x_{t−k} most, the strongest first."""
+    moves = np.tensordot(past, root, (0, 0)).reshape(past.shape[1], -1)
+    return np.linalg.svd(moves, full_matrices=False)[0]
+
+
+class InflowStates:
+    """State space of an `InflowModel` for B episodes side by side, in the precision of the model.
+
+    A `ReducedStates`.
+    """
+
+    def __init__(self, model: InflowModel) -> None:
+        self.model = model
+        self.basis = model.basis
+        q, recent, inlet = model.weights.shape
+        h = len(model.transition)
+        self._recent = model.weights[:, :-1].reshape(q, -1)
+        self._older = model.weights[:h, -1]
+        self._shape = recent - 1, model.modes.shape[1]
+        self._inlet = inlet
+
+    def initial(self) -> tuple[np.ndarray, np.ndarray]:
+        return np.zeros(len(self.model.initial), self.model.initial.dtype), self.model.initial
+
+    def propagate(self, mean: np.ndarray,
+                  covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        h = len(self.model.transition)
+        r = self._shape[1]
+        u, slope = self._inflow(mean[:, None, -r:])
+        entering = (self._older * slope) @ self.model.modes                          # (B, h, r)
+        half = self._move(entering, covariance)
+        moved = self._move(entering, np.swapaxes(half, 1, 2))
+        new = np.arange(h, h + r)
+        moved[:, new, new] += self.model.remainder
+        mean = self._move(np.zeros_like(entering), mean[..., None])[..., 0]
+        mean[:, :h] += u[:, 0] @ self._older.T
+        return mean, moved
+
+    def _move(self, entering: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """Return F·rows, (B, s, …), for the derivative F of the step; ``entering`` (B, h, r) are
+        the derivatives of a by the oldest x."""
+        D, r = self._shape
+        A = self.model.transition
+        h = len(A)
+        moved = np.empty_like(rows)
+        moved[:, :h] = A @ rows[:, :h]
+        moved[:, :h] += entering @ rows[:, -r:]
+        past = rows[:, h:].reshape(len(rows), D, -1)
+        moved[:, h:h + r] = (self.model.regression @ past).reshape(len(rows), r, -1)
+        moved[:, h + r:] = rows[:, h:-r]
+        return moved
+
+    def step(self, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        s = len(mean)
+        slope = self._inflow(mean[None, None, -self._shape[1]:])[1]
+        transition = self._move((self._older * slope) @ self.model.modes, np.eye(s)[None])[0]
+        after, noise = self.propagate(mean[None], np.zeros((1, s, s)))
+        return transition, noise[0], after[0]
+
+    def coordinates(self, mean: np.ndarray) -> np.ndarray:
+        u, _ = self._inflow(self._window(mean))
+        coordinates = u.reshape(len(mean), -1) @ self._recent.T
+        h = len(self.model.transition)
+        coordinates[:, :h] += mean[:, :h]
+        return coordinates
+
+    def jacobian(self, mean: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+        D, r = self._shape
+        h = len(self.model.transition)
+        _, slope = self._inflow(self._window(mean))                              # (B, D, n_inlet)
+        by_u = (matrix @ self._recent).reshape(*matrix.shape[:-1], D, self._inlet)
+        by_x = (by_u * slope[:, None]) @ self.model.modes                       # (B, m, D, r)
+        aged = np.broadcast_to(matrix[..., :h], (*by_x.shape[:2], h))
+        return np.concatenate([aged, by_x.reshape(*by_x.shape[:2], D * r)], axis=2)
+
+    def constrain(self, mean: np.ndarray) -> np.ndarray:
+        return mean
+
+    def _window(self, mean: np.ndarray) -> np.ndarray:
+        """(B, D, r) the last x."""
+        return mean[:, len(self.model.transition):].reshape(len(mean), *self._shape)
+
+    def _inflow(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return u = exp(E x) − 1 and its derivative by E x, (..., n_inlet)."""
+        relative = np.exp(x @ self.model.modes.T)
+        return relative - 1.0, relative

@@ -1,0 +1,91 @@
+"""Voltages that are quadratic in the logarithm of reduced concentrations, for many episodes."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+
+from eitbench.estimation.quadratic_voltages import Resistances, ScaledVoltages
+
+MODES = 80
+"""Of the logarithms: with as many, voltages differ by 0.05 standard deviations of the noise."""
+BENT = 24
+"""The first of them, in which voltages are quadratic."""
+SMALLEST = 0.05
+"""Of the level: concentrations below do not shape the modes."""
+
+
+class NodeVoltages(NamedTuple):
+    """`ScaledVoltages` of concentrations in a basis, which a few nodes tell."""
+
+    level: np.ndarray
+    """() c_0 in mol/m³"""
+    smallest: np.ndarray
+    """() mol/m³, as which what is below counts"""
+    basis: np.ndarray
+    """(m, q) of the concentration relative to the episode's level, at the nodes"""
+    average: np.ndarray
+    """(m,) weights of the mean of u = ln(c/c_0) over the vessel"""
+    to_modes: np.ndarray
+    """(k, m) modes in which voltages are quadratic, by u at the nodes"""
+    resistance: np.ndarray
+    """(L, L) at c_0, Ω (Ω·m in 2D)"""
+    slope: np.ndarray
+    """(L, L, m) derivatives of the scaled resistances by u at the nodes"""
+    curvature: np.ndarray
+    """(k, k, L, L) second derivatives by the modes"""
+
+    def linearise(self, levels: np.ndarray, coordinates: np.ndarray,
+                  currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return voltages (B, L) in V, and their derivatives (B, L, q) by the coordinates, of
+        episodes with ``levels`` (B,) in mol/m³, ``coordinates`` (B, q) and ``currents`` (B, L)."""
+        relative = 1.0 + coordinates @ self.basis.T
+        relative = np.maximum(relative, (self.smallest / levels)[:, None])
+        u = np.log(relative) + np.log(levels / self.level)[:, None]
+        a = u @ self.to_modes.T
+        B, L = currents.shape
+        k = len(self.to_modes)
+        slope = np.tensordot(currents, self.slope, 1)                               # (B, L, m)
+        bent = np.tensordot(a, self.curvature, 1).reshape(B, k * L, L) @ currents[..., None]
+        bent = np.swapaxes(bent.reshape(B, k, L), 1, 2)
+        scale = np.exp(u @ self.average)[:, None]
+        voltages = (currents @ self.resistance + (slope @ u[..., None])[..., 0]
+                    + 0.5 * (bent @ a[..., None])[..., 0])
+        by_u = slope + bent @ self.to_modes - voltages[..., None] * self.average
+        return voltages / scale, (by_u / (relative * scale)[:, None]) @ self.basis
+
+
+def node_voltages(model: Resistances, level: float, basis: np.ndarray,
+                  samples: np.ndarray) -> NodeVoltages:
+    """Return the voltages of concentrations level·(1 + basis·y), such as ``samples`` (N, q) of y.
+
+    Twice as many nodes as modes of the samples' logarithms tell these logarithms everywhere
+    (discrete empirical interpolation by least squares; Chaturantabut and Sorensen 2010).
+    """
+    logarithms = np.log(np.maximum(1.0 + samples @ basis.T, SMALLEST))
+    logarithms -= logarithms.mean(axis=1, keepdims=True)
+    _, modes = np.linalg.eigh(logarithms.T @ logarithms)
+    modes = modes[:, :-MODES:-1]
+    level_too = np.concatenate([np.ones((len(basis), 1)), modes], axis=1)
+    span = scipy.linalg.qr(level_too, mode="economic")[0]
+    nodes = _telling(span, 2 * MODES)
+    interpolation = span @ np.linalg.pinv(span[nodes])                                # (n, m)
+    quadratic = ScaledVoltages(model, level, modes[:, :BENT]).quadratic
+    resistance, slope, to_modes, curvature = quadratic.tables
+    L = len(resistance)
+    by_node = (interpolation.T @ slope).reshape(-1, L, L).transpose(1, 2, 0)
+    return NodeVoltages(
+        np.array(level), np.array(quadratic.smallest), basis[nodes], interpolation.mean(axis=0),
+        to_modes @ interpolation, resistance, np.ascontiguousarray(by_node),
+        curvature.reshape(*curvature.shape[:2], L, L))
+
+
+def _telling(span: np.ndarray, count: int) -> np.ndarray:
+    """Return the nodes that tell combinations of the columns of ``span`` (n, k) best: pivots of a
+    QR factorisation of all, then of the remaining ones."""
+    first = scipy.linalg.qr(span.T, mode="r", pivoting=True)[1][:span.shape[1]]
+    others = np.setdiff1d(np.arange(len(span)), first)
+    second = scipy.linalg.qr(span[others].T, mode="r", pivoting=True)[1][:count - len(first)]
+    return np.concatenate([first, others[second]])
