@@ -68,8 +68,10 @@ class FullFilters:
         floor = self._rules.instrument.noise_floor
         if self._rules.inflow == "white":
             level = self._levels.linearised(self._numbers[b])
-            std = self._levels.noise_std(currents @ level.resistance, floor)
-            return *level.observe(currents, std), np.ones(level.derivative.shape[2])
+            computed = currents @ level.resistance
+            std = self._levels.noise_std(computed, floor)
+            matrix = level.by_state(currents) / std[:, None]
+            return computed, std, matrix, np.ones(matrix.shape[1])
         about = self._filters[b].concentration
         c = self.concentration[b]
         voltages, by_c = self._levels.task.observation.linearise(c * about, currents[None])

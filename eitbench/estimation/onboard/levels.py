@@ -51,21 +51,12 @@ class Linearisation(NamedTuple):
     derivative: np.ndarray
     """(L, L, k) of 𝓡 by the state"""
 
-    def observe(self, currents: np.ndarray,
-                noise_std: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return computed voltages (L,), their noise (L,) and their derivatives (L, k) divided by
-        the noise.
-
-        Without a current the derivatives are zero.
-        """
+    def by_state(self, currents: np.ndarray) -> np.ndarray:
+        """Return the derivatives (L, k) of the voltages for currents (L,) by the state."""
         driven = np.flatnonzero(currents)
-        computed = currents @ self.resistance
-        if not len(driven):
-            return computed, np.ones_like(computed), np.zeros_like(self.derivative[0])
-        L, k = self.derivative.shape[1:]
         by_driven = self.derivative[driven].reshape(len(driven), -1)
         matrix = currents[driven].astype(self.derivative.dtype) @ by_driven
-        return computed, noise_std, matrix.reshape(L, k) / noise_std[:, None].astype(matrix.dtype)
+        return matrix.reshape(self.derivative.shape[1:])
 
 
 class Levels:

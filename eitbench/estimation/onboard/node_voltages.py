@@ -40,16 +40,16 @@ class NodeVoltages(NamedTuple):
     def linearise(self, levels: np.ndarray, coordinates: np.ndarray,
                   currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return voltages (B, L) in V, and their derivatives (B, L, q) by the coordinates, of
-        episodes with ``levels`` (B,) in mol/m³, ``coordinates`` (B, q) and ``currents`` (B, L)."""
+        episodes with ``levels`` (B,) in mol/m³, ``coordinates`` (B, q) and ``currents`` (B, L).
+        One level with its coordinates may serve several currents."""
         relative = 1.0 + coordinates @ self.basis.T
         relative = np.maximum(relative, (self.smallest / levels)[:, None])
         u = np.log(relative) + np.log(levels / self.level)[:, None]
         a = u @ self.to_modes.T
-        B, L = currents.shape
-        k = len(self.to_modes)
+        k, L = len(self.to_modes), currents.shape[1]
         slope = np.tensordot(currents, self.slope, 1)                               # (B, L, m)
-        bent = np.tensordot(a, self.curvature, 1).reshape(B, k * L, L) @ currents[..., None]
-        bent = np.swapaxes(bent.reshape(B, k, L), 1, 2)
+        bent = np.tensordot(a, self.curvature, 1).reshape(-1, k * L, L) @ currents[..., None]
+        bent = np.swapaxes(bent.reshape(-1, k, L), 1, 2)
         scale = np.exp(u @ self.average)[:, None]
         voltages = (currents @ self.resistance + (slope @ u[..., None])[..., 0]
                     + 0.5 * (bent @ a[..., None])[..., 0])

@@ -37,10 +37,13 @@ class ReducedFilters:
         states = self._shared.single
         mean = self._filter.mean
         coordinates = states.coordinates(mean)
-        computed, std, matrix, about = self._shared.voltages.linearise(
-            self._numbers, coordinates, currents, self._rules.instrument.noise_floor)
-        residual = ((voltages - computed) / std).astype(np.float32)
-        residual = residual * currents.any(axis=1, keepdims=True)
+        computed, matrix, about = self._shared.voltages.linearise(
+            self._numbers, coordinates, currents)
+        driven = currents.any(axis=1, keepdims=True)
+        std = self._shared.levels.noise_std(computed, self._rules.instrument.noise_floor)
+        std = np.where(driven, std, 1.0)
+        matrix /= std[..., None].astype(np.float32)
+        residual = ((voltages - computed) / std).astype(np.float32) * driven
         innovation = residual - (matrix @ (coordinates - about)[..., None])[..., 0]
         variance, accepted = self._filter.update(
             states.jacobian(mean, matrix), innovation, np.ones_like(residual),
@@ -177,16 +180,16 @@ class LevelVoltages:
         level = self._levels.linearised(number)
         return level._replace(derivative=(level.derivative @ self._basis).astype(np.float32))
 
-    def linearise(self, numbers: list[int], coordinates: np.ndarray, currents: np.ndarray,
-                  floor: float) -> tuple[np.ndarray, ...]:
-        """Return voltages (B, L) in V, their noise in V, derivatives (B, L, q) by the coordinates
-        divided by the noise, and the coordinates (B, q) at which they are so."""
-        observed = []
-        for number, current in zip(numbers, currents, strict=True):
-            level = self._level(number)
-            std = self._levels.noise_std(current @ level.resistance, floor)
-            observed.append(level.observe(current, std))
-        return *(np.array(part) for part in zip(*observed, strict=True)), np.zeros_like(coordinates)
+    def linearise(self, numbers: list[int], coordinates: np.ndarray,
+                  currents: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return voltages (B, L) in V, derivatives (B, L, q) by the coordinates, and the
+        coordinates (B, q) about which they are linearised."""
+        levels = [self._level(number) for number in numbers]
+        resistance = np.array([level.resistance for level in levels])
+        computed = (currents[:, None] @ resistance)[:, 0]
+        matrix = np.array([level.by_state(current)
+                           for level, current in zip(levels, currents, strict=True)])
+        return computed, matrix, np.zeros_like(coordinates)
 
     def about(self, number: int, coordinates: np.ndarray) -> Linearisation:
         """Return 𝓡 and its derivatives (L, L, q) as linearised for these coordinates (q,)."""
@@ -202,22 +205,18 @@ class PredictedVoltages:
         self._voltages = voltages
         self._single = type(voltages)(*(part.astype(np.float32) for part in voltages))
 
-    def linearise(self, numbers: list[int], coordinates: np.ndarray, currents: np.ndarray,
-                  floor: float) -> tuple[np.ndarray, ...]:
+    def linearise(self, numbers: list[int], coordinates: np.ndarray,
+                  currents: np.ndarray) -> tuple[np.ndarray, ...]:
         levels = np.array([self._levels.concentration(k) for k in numbers], np.float32)
-        computed, by = self._single.linearise(levels, coordinates, currents.astype(np.float32))
-        driven = currents.any(axis=1)[:, None]
-        std = np.where(driven, self._levels.noise_std(computed, floor), 1.0)
-        by *= (driven / std)[..., None].astype(np.float32)
-        return computed, std, by, coordinates
+        single = currents.astype(np.float32)
+        return *self._single.linearise(levels, coordinates, single), coordinates
 
     def about(self, number: int, coordinates: np.ndarray) -> Linearisation:
         L = len(self._voltages.resistance)
         each = np.eye(L) - 1.0 / L                      # a potential that all share does not count
         level = self._levels.concentration(number)
-        resistance, derivative = self._voltages.linearise(
-            np.full(L, level), np.repeat(coordinates[None], L, axis=0), each)
-        return Linearisation(level, resistance, derivative)
+        return Linearisation(
+            level, *self._voltages.linearise(np.array([level]), coordinates[None], each))
 
 
 class Shared:
