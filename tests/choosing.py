@@ -34,7 +34,7 @@ def world(name: str) -> dict:
 
 def filter_of(whose):
     """The filters inside an environment that asks for injections, or those a policy's belief follows."""
-    return (whose.unwrapped.core if isinstance(whose, gym.Env) else whose)._operator
+    return (whose.unwrapped.core if isinstance(whose, gym.Env) else whose)._filters
 
 
 def play(env: gym.Env, seed: int, actions: np.ndarray) -> list[tuple]:

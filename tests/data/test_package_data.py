@@ -8,8 +8,7 @@ from eitbench.bench.tracks import own_ids
 from eitbench.data import cache, episodes
 from eitbench.data.cache import load_shipped
 from eitbench.data.recordings import beginning_file, outline_file, region_file
-from eitbench.estimation.onboard.packing import packed, unpacked
-from eitbench.estimation.onboard.reduced_operator import stored_model_key
+from eitbench.estimation.onboard.models import packed, stored_model_key, unpacked
 from eitbench.estimation.reduced import ReducedModel
 from eitbench.worlds import entry
 
@@ -52,7 +51,7 @@ def test_models_are_compared_in_one_basis():
       {"instrument": {"current": 0.2}}]),
     (lambda world: region_file(world).key,
      [{"schedule": {"scored_steps": 3}}], [{"region": [0.1, 0.2]}, {"vessel": {"electrodes_per_wall": 4}}]),
-    (lambda world: stored_model_key(world, "joint"),
+    (stored_model_key,
      [{"schedule": {"budget": 3, "scored_steps": 9}}, {"instrument": {"dead": [1, 1]}}],
      [{"instrument": {"noise_relative": 0.1}}, {"prior": {"nodal_std": 0.1}}, {"flow": {"mean_velocity": 4.0}},
       {"schedule": {"time_step": 4e-3}}, {"vessel": {"electrodes_per_wall": 4}}])])

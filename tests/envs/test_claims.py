@@ -5,8 +5,8 @@ import copy
 import numpy as np
 import pytest
 from eitbench.bench.scores import Outcome, scored
-from eitbench.estimation.onboard.operator import Levels
-from eitbench.estimation.onboard.reduced_operator import ReducedOperator
+from eitbench.estimation.onboard.levels import Levels
+from eitbench.estimation.onboard.reduced_filters import ReducedFilters, Shared
 
 from choosing import BUDGET, FAULTS, FLOW, NAME, TANK, make, some_pairs
 
@@ -16,7 +16,7 @@ def predicted(filter_, estimator: str, n: int):
     moved = copy.deepcopy(filter_)
     moved.predict()
     if estimator == "reduced":
-        r = moved.mean.shape[1] - (not hasattr(moved, "model"))     # behind it the velocity
+        r = moved.states.basis.shape[1]                             # behind it the velocity
         covariance = moved.covariance[0, :r, :r].astype(float)
         return moved.mean[0, :r].astype(float), lambda X: covariance @ X
     return moved.concentration, lambda X: moved.covariance.times(X)[:n]
@@ -31,10 +31,10 @@ def test_innovations_are_those_of_the_tasks_matrices(name, estimator):
     env = make(estimator, name).unwrapped
     env.reset(seed=5)
     core, task, rules = env.core, env.task, env.rules
-    operator = core._operator
+    operator = core._filters
     n = task.mesh.n_nodes
     level = operator.concentration[0]
-    basis = operator.basis if estimator == "reduced" else np.eye(n)
+    basis = operator._shared.states.basis if estimator == "reduced" else np.eye(n)
     sizes = []
     for k, pair in enumerate(some_pairs()[:core.length]):
         before = operator._filter if estimator == "reduced" else operator._filters[0]
@@ -76,17 +76,17 @@ def nis_of(random, noise: float) -> float:
     their own model, with the noise so many times as large."""
     env = make("reduced").unwrapped
     world, rules, B = env.world, env.rules, 32
-    shared = ReducedOperator._share(world)
-    model, level = shared.model, shared.level(0)
+    shared = Shared.of(rules)
+    model, level = shared.states.model, shared.voltages._level(0)
     root, initial = (vectors * np.sqrt(np.maximum(values, 0.0)) for values, vectors in (
         np.linalg.eigh(model.noise), np.linalg.eigh(model.initial)))
     state = random.standard_normal((B, len(root))) @ initial.T
 
     def measured(state, currents):
         volts = currents @ level.resistance
-        computed, std, H = level.observe(currents, shared.levels.noise_std(volts, 0.0))
+        std = shared.levels.noise_std(volts, 0.0)
         draws = noise * random.standard_normal((B, len(std)))
-        return computed + std * (state @ H.T.astype(float) + draws)
+        return volts + state @ level.by_state(currents).T.astype(float) + std * draws
 
     pairs = rules.table[some_pairs(40)]
     record = []
@@ -94,7 +94,7 @@ def nis_of(random, noise: float) -> float:
         state = state @ model.transition.T + random.standard_normal(state.shape) @ root.T
         record.append(measured(state, currents))
     K = len(world.currents)
-    operator = ReducedOperator(world, np.stack(record[:K], axis=1), gate=np.inf, noise_floor=0.0)
+    operator = ReducedFilters(rules, np.stack(record[:K], axis=1))
     seen = []
     for currents, voltages in zip(pairs, record[K:], strict=True):
         operator.assimilate(voltages, np.repeat(currents[None], B, axis=0))
@@ -106,7 +106,7 @@ def nis_of(random, noise: float) -> float:
 def test_nis_of_a_consistent_filter_averages_one(monkeypatch):
     """Innovations of a filter that knows its model are independent: the mean of 20,480 squares is
     within four of its standard deviations of 1, and is not where the noise is twice as large."""
-    monkeypatch.setattr(Levels, "best", lambda self, frame, broken: 0)
+    monkeypatch.setattr(Levels, "best", lambda self, frames, gate: [0] * len(frames))
     random = np.random.default_rng(0)
     spread = np.sqrt(2 / (32 * 40 * 16))
     assert abs(nis_of(random, 1.0) - 1.0) < 4 * spread

@@ -7,8 +7,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from eitbench.data.recordings import cycle_voltages, recording, score_operators
-from eitbench.estimation.onboard.operator import electrode_pairs
-from eitbench.estimation.onboard.reduced_operator import ReducedOperator
+from eitbench.estimation.onboard.levels import electrode_pairs
+from eitbench.estimation.onboard.reduced_filters import ReducedFilters
 from eitbench.worlds import entries
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
@@ -188,14 +188,14 @@ def test_with_the_full_filter_too_others_beside_change_nothing(name):
 
 def test_an_estimate_that_is_not_finite_is_an_error(monkeypatch):
     """Nobody is paid for it, or by it: the step raises, and names the episodes."""
-    errors = ReducedOperator.errors
+    errors = ReducedFilters.errors
 
     def broken(self, *recorded):
         found = errors(self, *recorded)
         found[-1] = np.nan
         return found
 
-    monkeypatch.setattr(ReducedOperator, "errors", broken)
+    monkeypatch.setattr(ReducedFilters, "errors", broken)
     env = make("reduced")
     env.reset(seed=4)
     unscored = env.unwrapped.world.warm_up - 16

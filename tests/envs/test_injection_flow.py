@@ -20,9 +20,10 @@ from eitbench.data.recordings import (
 )
 from eitbench.envs.injection_core import scaled
 from eitbench.estimation import Filter, about_reference, velocity_states
-from eitbench.estimation.onboard import joint_operator
 from eitbench.estimation.onboard.belief import Belief
-from eitbench.estimation.onboard.operator import electrode_pairs
+from eitbench.estimation.onboard.full_filters import BOUNDS
+from eitbench.estimation.onboard.levels import electrode_pairs
+from eitbench.estimation.onboard.models import stored_model
 from eitbench.estimation.reduced_joint import JointTables
 from eitbench.numerics.fem import mass_matrix
 from eitbench.worlds.catalogue import PIPE_2D_DRIFTING
@@ -38,11 +39,6 @@ WALK = 0.1
 @pytest.fixture(scope="module")
 def env():
     return make("reduced", FLOW).unwrapped
-
-
-@pytest.fixture(scope="module")
-def shared(env):
-    return joint_operator.JointShared.of(env.world)
 
 
 def integrated(mesh, values: np.ndarray, region: tuple[float, float]) -> float:
@@ -137,10 +133,10 @@ def test_velocity_is_a_walk_that_turns_back():
     assert (walks[1] != walks[2]).any()
 
 
-def test_tables_hold_between_their_velocities(env, shared):
+def test_tables_hold_between_their_velocities(env):
     """A(θ), the noise and dA/dθ at a velocity that is not tabulated against F(θ) itself, projected."""
     task = env.task
-    model = shared.model
+    model = stored_model(env.world)
     theta = 0.5 * (model.velocities[6] + model.velocities[7])
     transport = task.transport.with_velocity(task.velocity.field([theta]))
     F, Y = transport.transition()
@@ -168,7 +164,7 @@ def test_full_operator_is_the_joint_filter_of_the_baselines():
     pairs = electrode_pairs(16).tolist()
     env.reset(seed=5)
     level = filter_of(env).concentration[0]
-    filter_ = Filter(velocity_states(task, level, joint_operator.BOUNDS), about_reference(task, level))
+    filter_ = Filter(velocity_states(task, level, BOUNDS), about_reference(task, level))
     for t, voltages in enumerate(cycle_voltages(world, 5, recording(world, 5))):
         current = world.currents[t % 16]
         filter_.assimilate(voltages, current)

@@ -3,7 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from eitbench.estimation.onboard.operator import electrode_pairs
+from eitbench.estimation.onboard.levels import electrode_pairs
 from eitbench.estimation.onboard.rules import Rules
 from eitbench.worlds.catalogue import PIPE_2D
 from eitbench.worlds.instrument import Faults, Instrument

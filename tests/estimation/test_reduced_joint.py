@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from eitbench.estimation.reduced_joint import JointTables, ReducedJointFilter, joint_model
+from eitbench.estimation.reduced import ReducedFilter
+from eitbench.estimation.reduced_joint import JointStates, JointTables, joint_model
 
 
 @pytest.fixture(scope="module")
@@ -44,12 +45,14 @@ def test_filter_is_the_textbooks(model):
     mean = np.column_stack([rng.normal(size=(3, 5)), [3.0, 4.0, 4.4]])
     roots = rng.normal(size=(3, 6, 6))
     covariance = roots @ np.swapaxes(roots, 1, 2)
-    ours = ReducedJointFilter(tables, mean, covariance, walk, bounds)
+    ours = ReducedFilter(JointStates(model[0], 3.0, 1.0, walk, bounds), 3)
+    ours.mean, ours.covariance = mean.copy(), covariance.copy()
     x, P, touched = mean.copy(), covariance.copy(), False
     for _ in range(6):
         matrix, residual, variance = rng.normal(size=(3, 4, 5)), rng.normal(0.0, 5.0, (3, 4)), np.full((3, 4), 0.5)
         ours.predict()
-        innovation, predicted, kept = ours.update(matrix, residual, variance)
+        innovation = residual - (matrix @ ours.mean[:, :5, None])[..., 0]
+        predicted, accepted = ours.update(ours.states.jacobian(ours.mean, matrix), innovation, variance)
         for b in range(3):
             A, slope, W = (part[0] for part in tables.at(x[b, -1:]))
             J, Q = np.eye(6), np.zeros((6, 6))
@@ -64,7 +67,7 @@ def test_filter_is_the_textbooks(model):
             P[b] -= P[b] @ H.T @ np.linalg.solve(S, H @ P[b])
             touched |= not bounds[0] <= x[b, 5] <= bounds[1]
             x[b, 5] = np.clip(x[b, 5], *bounds)
-        assert kept.all()
+        assert accepted.all()
         np.testing.assert_allclose(ours.mean, x, rtol=1e-8, atol=1e-9)
         np.testing.assert_allclose(ours.covariance, P, rtol=1e-7, atol=1e-8)
     assert touched                                         # the bounds were needed

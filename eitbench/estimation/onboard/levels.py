@@ -54,9 +54,9 @@ class Linearisation(NamedTuple):
     def by_state(self, currents: np.ndarray) -> np.ndarray:
         """Return the derivatives (L, k) of the voltages for currents (L,) by the state."""
         driven = np.flatnonzero(currents)
-        by_driven = self.derivative[driven].reshape(len(driven), -1)
-        matrix = currents[driven].astype(self.derivative.dtype) @ by_driven
-        return matrix.reshape(self.derivative.shape[1:])
+        _, L, k = self.derivative.shape
+        by_driven = self.derivative[driven].reshape(len(driven), L * k)
+        return (currents[driven].astype(by_driven.dtype) @ by_driven).reshape(L, k)
 
 
 class Levels:

@@ -5,7 +5,7 @@ import pytest
 from eitbench import make_task
 from eitbench.data.recordings import cycle_voltages, recording
 from eitbench.estimation import FirstFrame, LinearisedObservations, kalman_filter, table_5_1
-from eitbench.estimation.onboard.operator import electrode_pairs
+from eitbench.estimation.onboard.levels import electrode_pairs
 
 from choosing import filter_of, make
 
@@ -64,7 +64,7 @@ def test_grid_of_the_full_one_is_that_of_its_covariance():
     env.reset(seed=5)
     shown = env.step(7)[0]["std"]
     operator = filter_of(env)
-    filter_, averages = operator._filters[0], operator._patches
+    filter_, averages = operator._filters[0], operator._levels.patches
     unit = np.eye(averages.shape[1])
     covariance = filter_.covariance.times(unit)
     variance = np.einsum("pn,nm,pm->p", averages, covariance, averages)

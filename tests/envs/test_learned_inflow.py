@@ -1,0 +1,203 @@
+"""The filters inside injection environments that have learned what flows in."""
+
+import numpy as np
+import pytest
+from eitbench import make_task
+from eitbench.data.recordings import score_mass
+from eitbench.estimation import inflow_filter
+from eitbench.estimation.inflow_response import steady_response
+from eitbench.estimation.onboard.belief import Belief
+from eitbench.estimation.onboard.inflow_states import (
+    InflowModel,
+    InflowStates,
+    inflow_model,
+    sample_coordinates,
+    world_prior,
+)
+from eitbench.estimation.onboard.levels import levels_of, pair_currents
+from eitbench.estimation.onboard.models import stored_voltages
+from scipy.linalg import toeplitz
+
+from choosing import BUDGET, FAULTS, FLOW, INFLOW, TANK, filter_of, make, some_pairs
+
+def begun(estimator: str, seed: int = 3):
+    env = make(estimator, INFLOW)
+    return env, env.reset(seed=seed)[0]
+
+
+def test_full_one_is_that_of_the_baseline():
+    """Step by step what `inflow_filter`, as in log_inflow_filter, makes of the same voltages."""
+    env, observation = begun("full")
+    world, task = env.unwrapped.world, env.unwrapped.task
+    core = env.unwrapped.core
+    ours = inflow_filter(task, world_prior(world), float(filter_of(env).concentration[0]))
+    for voltages, currents in zip(observation["frame"], world.currents, strict=True):
+        ours.assimilate(voltages, currents)
+    for action in some_pairs()[:world.n_steps - 16]:
+        observation = env.step(int(action))[0]
+        step = ours.assimilate(observation["voltages"], observation["currents"])
+        means, spreads = core.estimate()
+        state = ours.estimate()
+        np.testing.assert_allclose(means[0], state.mean, rtol=1e-9)
+        np.testing.assert_allclose(spreads[0], np.sqrt(state.variance), rtol=1e-6)
+        (innovation,) = core.innovations()
+        np.testing.assert_allclose(innovation.value, step.innovation, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(innovation.covariance, step.innovation_covariance, rtol=1e-9, atol=1e-15)
+
+
+def test_reduced_one_is_close_to_the_full_one():
+    """Means differ by a tenth of the filter's own standard deviation at most, root mean square."""
+    (full, _), (reduced, _) = begun("full"), begun("reduced")
+    for action in some_pairs()[:full.unwrapped.world.n_steps - 16]:
+        for env in (full, reduced):
+            env.step(int(action))
+        mean, spread = full.unwrapped.core.estimate()
+        other, _ = reduced.unwrapped.core.estimate()
+        assert 0.0 < np.sqrt(((other - mean)**2).mean()) < 0.1 * np.sqrt((spread**2).mean())
+
+
+@pytest.fixture(scope="module")
+def parts():
+    """The steady response of a short world, its prior and the reduced model of both, in double precision."""
+    world = make("none", INFLOW).unwrapped.world
+    response, prior = steady_response(make_task(world).transport), world_prior(world)
+    return response, prior, inflow_model(response, prior)
+
+
+def test_reduced_states_carry_inflows_as_the_flow_does(parts):
+    """Concentrations of inflows drawn from the prior, whose remainders drive the state, are those of
+    the response but for 2 % of what they deviate from the level, root mean square; with D values of x
+    fewer than the regression has, there would be none."""
+    response, prior, model = parts
+    states = InflowStates(model)
+    (D,), (K,) = model.regression.shape, response.weights.shape[1:2]
+    h, r = len(model.transition), prior.modes.shape[1]
+    draws = np.linalg.cholesky(toeplitz(prior.time_covariance(150)) + 1e-9 * np.eye(150))
+    x = draws @ np.random.default_rng(0).standard_normal((150, r))
+    deviation = prior.inflow(x @ prior.modes.T) - 1.0
+    mean, errors, sizes = np.zeros((1, h + D * r)), [], []
+    zero = np.zeros((1, h + D * r, h + D * r))
+    for t in range(150):
+        mean, _ = states.propagate(mean, zero)
+        mean[0, h:h + r] = x[t]                                     # what no one could predict
+        if t < K:
+            continue
+        past = deviation[t - K + 1:t + 1][::-1]
+        exact = response.basis @ np.tensordot(response.weights, past, 2)
+        errors.append(np.square(states.basis @ states.coordinates(mean)[0] - exact).mean())
+        sizes.append(np.square(exact).mean())
+    assert 0.0 < np.sqrt(np.mean(errors) / np.mean(sizes)) < 0.02
+
+
+def test_reduced_derivatives_are_those_of_the_steps(parts):
+    """Central differences of mean and coordinates; and the covariance moves with them."""
+    model = parts[2]
+    states, rng = InflowStates(model), np.random.default_rng(1)
+    mean = 0.3 * rng.standard_normal((2, len(model.initial)))
+    s, zero = mean.shape[1], np.zeros((2, mean.shape[1], mean.shape[1]))
+    root = rng.standard_normal((2, s, s))
+    covariance = root @ np.swapaxes(root, 1, 2)
+    moved = states.propagate(mean, covariance)[1]
+    matrix = rng.standard_normal((3, states.basis.shape[1]))
+    by_state = states.jacobian(mean, matrix)
+    for b in range(2):
+        transition, noise, after = states.step(mean[b])
+        np.testing.assert_allclose(after, states.propagate(mean, zero)[0][b], rtol=1e-12)
+        np.testing.assert_allclose(moved[b], transition @ covariance[b] @ transition.T + noise, rtol=1e-9, atol=1e-9)
+        direction = rng.standard_normal(s)
+        either = [mean + sign * 1e-5 * direction for sign in (1.0, -1.0)]
+        steps = [states.propagate(each, zero)[0][b] for each in either]
+        np.testing.assert_allclose(transition @ direction, (steps[0] - steps[1]) / 2e-5, atol=1e-8)
+        seen = [matrix @ states.coordinates(each)[b] for each in either]
+        np.testing.assert_allclose(by_state[b] @ direction, (seen[0] - seen[1]) / 2e-5, atol=1e-7)
+
+
+def test_initial_covariance_stays_as_it_is(parts):
+    """Before anything is measured the state is stationary: about x = 0 a step changes nothing but
+    what the pipe forgets in it."""
+    states = InflowStates(parts[2])
+    mean, covariance = states.initial()
+    after = states.propagate(mean[None], covariance[None])[1][0]
+    np.testing.assert_allclose(after, covariance, atol=0.02 * np.abs(covariance).max())
+
+
+def test_node_voltages_are_those_of_all_nodes(parts):
+    """Of concentrations that inflows make: voltages within a fifth of the noise of the complete
+    electrode model, and derivatives along directions that inflows take within 3 %."""
+    response, prior, model = parts
+    world = make("none", INFLOW).unwrapped.world
+    observation = make_task(world).observation
+    level = world.expected_concentration
+    voltages = stored_voltages(world)
+    samples = sample_coordinates(InflowModel(*model), response, prior, 540)[500:]
+    currents = pair_currents(world)[some_pairs(len(samples))]
+    levels = level * np.linspace(0.9, 1.1, len(samples))
+    computed, by = voltages.linearise(levels, samples, currents)
+    directions = np.linalg.cholesky(np.cov(samples.T) + 1e-9 * np.eye(samples.shape[1]))
+    off = []
+    for b, y in enumerate(samples):
+        exact, by_c = observation.linearise(levels[b] * (1.0 + model.basis @ y), currents[b:b + 1])
+        std = levels_of(world).noise_std(exact[0], 0.0)
+        expected = levels[b] * by_c[0] @ model.basis @ directions / std[:, None]
+        found = by[b] @ directions / std[:, None]
+        off.append([np.sqrt(np.mean(((computed[b] - exact[0]) / std)**2)),
+                    np.linalg.norm(found - expected) / np.linalg.norm(expected)])
+    voltage, derivative = np.sqrt(np.mean(np.square(off), axis=0))
+    assert 0.0 < voltage < 0.2
+    assert 0.0 < derivative < 0.03
+
+
+def test_what_a_pair_teaches_is_foretold():
+    """The criterion's variance is what the filter then has, as long as no reading is left out; and
+    gains are by how much the expected error falls."""
+    env, observation = begun("reduced")
+    belief = Belief(env.unwrapped.rules, observation)
+    rtol = 1e-3                                            # the filter has single precision
+    for pair in (7, 100, 3):
+        predicted = belief.predicted()
+        after, expected = belief.after(predicted, pair), belief.expected_error(predicted)
+        gain = belief.gains(predicted)[0][pair]
+        assert gain == pytest.approx(expected - belief.expected_error(after), rel=1e-6)
+        observation = env.step(pair)[0]
+        inside = filter_of(env).covariance
+        np.testing.assert_allclose(after, inside, atol=rtol * np.abs(inside).max())
+        assert gain < expected
+        belief.see(observation)
+
+
+def test_expected_error_is_that_of_the_spread():
+    """Integrated over the pipe, the variances shown are the expected squared error of the state
+    that is predicted without a measurement."""
+    env, observation = begun("reduced")
+    belief = Belief(env.unwrapped.rules, observation)
+    operator = filter_of(belief)
+    expected = belief.expected_error(belief.predicted())
+    silent = np.zeros((1, 16))
+    operator.assimilate(silent, silent)
+    states = operator._shared.states
+    by_state = states.jacobian(operator.state[None], states.basis)[0]
+    covariance = by_state @ operator.covariance @ by_state.T
+    mass = score_mass(env.unwrapped.world).toarray()
+    assert expected == pytest.approx((mass * covariance).sum(), rel=1e-4)
+
+
+@pytest.mark.parametrize("name", [FAULTS, BUDGET])
+def test_other_worlds_may_know_the_inflow_too(name):
+    """By an argument; what is believed is no part of the world, nor of its episodes."""
+    env = make("reduced", name, inflow="learned")
+    assert env.unwrapped.world == make("none", name).unwrapped.world
+    env.reset(seed=1)
+    assert isinstance(filter_of(env)._shared.single, InflowStates)
+    for action in some_pairs()[:4]:
+        assert np.isfinite(env.step(int(action))[1])
+
+
+@pytest.mark.parametrize(("name", "inflow", "message"), [
+    (INFLOW, "pink", "inflow must be one of white, learned, got 'pink'"),
+    (FLOW, "learned", "inflow must be 'white' where the flow is to be estimated too"),
+    (TANK, "learned", "inflow must be 'white' where nothing flows in"),
+])
+def test_wrong_inflows_are_named(name, inflow, message):
+    """Before anything is computed."""
+    with pytest.raises(ValueError, match=message):
+        make("reduced", name, inflow=inflow)
