@@ -79,11 +79,11 @@ class JointStates:
 
     def __init__(self, model: JointModel, nominal: float, std: float, walk_std: float,
                  bounds: tuple[float, float], dtype: type = np.float64) -> None:
-        self.basis = model.basis.astype(dtype)
+        self.basis: np.ndarray = model.basis.astype(dtype)
         self.tables = JointTables(model, dtype)
         r = len(model.initial)
-        self._mean = np.append(np.zeros(r), nominal).astype(dtype)
-        self._covariance = np.zeros((r + 1, r + 1), dtype)
+        self._mean: np.ndarray = np.append(np.zeros(r), nominal).astype(dtype)
+        self._covariance: np.ndarray = np.zeros((r + 1, r + 1), dtype)
         self._covariance[:r, :r] = model.initial
         self._covariance[r, r] = std**2
         self._walk_variance = walk_std**2

@@ -20,6 +20,7 @@ from scipy.linalg import toeplitz
 
 from choosing import BUDGET, FAULTS, FLOW, INFLOW, TANK, filter_of, make, some_pairs
 
+
 def begun(estimator: str, seed: int = 3):
     env = make(estimator, INFLOW)
     return env, env.reset(seed=seed)[0]

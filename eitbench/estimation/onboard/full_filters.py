@@ -10,9 +10,9 @@ import numpy as np
 from eitbench.data.recordings import score_mass, step_error
 from eitbench.estimation.filter import Filter, StateSpace
 from eitbench.estimation.gaussian import Observation
-from eitbench.estimation.onboard.inflow_states import world_prior
 from eitbench.estimation.inflow_window import InflowWindow
 from eitbench.estimation.nodal import nodal_states
+from eitbench.estimation.onboard.inflow_states import world_prior
 from eitbench.estimation.onboard.innovation import Innovation
 from eitbench.estimation.onboard.levels import cycle, deviation, levels_of
 from eitbench.estimation.velocity import velocity_states
@@ -42,7 +42,7 @@ class FullFilters:
         space = state_space(rules.world.sound, rules.inflow)
         self._filters = [Filter(space, gate=rules.gate) for _ in frames]
         self._last: list[tuple[np.ndarray, ...] | None] = []
-        for k, currents in enumerate(cycle(rules, len(frames))):
+        for k, currents in enumerate(cycle(rules.world, len(frames))):
             self.assimilate(frames[:, k], currents)
 
     def assimilate(self, voltages: np.ndarray,

@@ -13,7 +13,6 @@ from eitbench.numerics.fem import mass_matrix
 from eitbench.worlds.task import make_task
 
 if TYPE_CHECKING:
-    from eitbench.estimation.onboard.rules import Rules
     from eitbench.numerics.mesh import Mesh
     from eitbench.worlds.world import World
 
@@ -124,9 +123,9 @@ def levels_of(world: World) -> Levels:
     return _levels(world.sound)
 
 
-def cycle(rules: Rules, episodes: int) -> np.ndarray:
-    """Return the currents (K, B, L) of the first frame."""
-    return np.repeat(rules.world.currents[:, None], episodes, axis=1)
+def cycle(world: World, episodes: int) -> np.ndarray:
+    """Return the currents (K, B, L) of the first frame in A (A/m in 2D)."""
+    return np.repeat(world.currents[:, None], episodes, axis=1)
 
 
 def deviation(variance: np.ndarray) -> np.ndarray:

@@ -68,7 +68,7 @@ EXACT = ("velocities",)
 def reduced_states(world: World, inflow: str) -> tuple[ReducedStates, ReducedStates]:
     """Return the reduced state space of a world in double and in single precision."""
     if inflow == "learned":
-        learned = InflowModel(**_learned(world)[0])
+        learned = InflowModel(**_learned(world, "model"))
         return InflowStates(learned), InflowStates(_single(learned))
     model = stored_model(world)
     if isinstance(model, ReducedModel):
@@ -85,11 +85,12 @@ def _single(model: Any) -> Any:
 
 def stored_voltages(world: World) -> NodeVoltages:
     """Return the voltages of a world in the basis of its learned inflow."""
-    return NodeVoltages(**_learned(world)[1])
+    return NodeVoltages(**_learned(world, "voltages"))
 
 
-def _learned(world: World) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Return the arrays of the `InflowModel` and of the `NodeVoltages` of a world."""
+def _learned(world: World, part: str) -> dict[str, np.ndarray]:
+    """Return the arrays of a world's ``model``, an `InflowModel`, or ``voltages``,
+    `NodeVoltages`."""
     def build() -> dict[str, np.ndarray]:
         task = make_task(world)
         prior = world_prior(world)
@@ -104,8 +105,8 @@ def _learned(world: World) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]
                 for name, array in arrays.items()}
 
     arrays = cached(model_key("learned", described(world.sound), VERSION), build)
-    return tuple({name.partition(".")[2]: array for name, array in arrays.items()
-                  if name.startswith(part)} for part in ("model", "voltages"))
+    return {name.removeprefix(part + "."): array for name, array in arrays.items()
+            if name.startswith(part)}
 
 
 def stored_model(world: World) -> ReducedModel | JointModel:

@@ -28,7 +28,7 @@ class ReducedFilters:
         self._numbers = shared.levels.best(frames, rules.gate)
         self.concentration = np.array([shared.levels.concentration(k) for k in self._numbers])
         self._filter = ReducedFilter(shared.single, len(frames))
-        for k, currents in enumerate(cycle(rules, len(frames))):
+        for k, currents in enumerate(cycle(rules.world, len(frames))):
             self.assimilate(frames[:, k], currents)
 
     def assimilate(self, voltages: np.ndarray,
@@ -142,7 +142,7 @@ class ReducedFilters:
         (s, s) each, and the mean (s,) after it; at the predicted means, or at the states
         ``along`` (count, s) before each step."""
         mean = self.state
-        made = []
+        made: list[tuple[np.ndarray, ...]] = []
         for k in range(count):
             mean = mean if along is None else along[k]
             transition, noise, mean = self._shared.states.step(mean)
@@ -231,8 +231,8 @@ class Shared:
         if inflow == "learned":
             self.voltages = PredictedVoltages(self.levels, stored_voltages(world))
         with_level = np.column_stack([np.ones(len(basis)), basis])
-        half = score_mass(world)
-        self.mass = 0.5 * (with_level.T @ (half @ with_level) + with_level.T @ (half.T @ with_level))
+        half = with_level.T @ (score_mass(world) @ with_level)
+        self.mass = 0.5 * (half + half.T)
         self.basis = with_level.astype(np.float32)
         self.patches = (self.levels.patches @ basis).astype(np.float32)
         self._is_identity = (world.region is None and inflow == "white"
