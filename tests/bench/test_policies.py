@@ -77,7 +77,7 @@ def test_belief_is_the_filter_inside(name):
         np.testing.assert_array_equal(belief.mean, inside.means()[0])
         np.testing.assert_array_equal(filter_of(belief).covariance, inside.covariance)
         if name == NAME:                         # what it foretells: nothing was left out
-            expected = inside.covariance[0].astype(float)
+            expected = inside.covariance
             np.testing.assert_allclose(belief.after(predicted, pair), expected, atol=2e-5 * np.abs(expected).max())
             assert belief.gains(predicted)[0][pair] == pytest.approx((predicted - expected).trace(), rel=1e-3)
 

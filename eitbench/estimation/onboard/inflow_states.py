@@ -21,6 +21,7 @@ from eitbench.data.seeds import SPLITS
 from eitbench.estimation.inflow_prior import InflowPrior, learned_inflow_prior
 from eitbench.estimation.inflow_response import Response
 from eitbench.estimation.inflow_window import stationary
+from eitbench.estimation.onboard.node_voltages import each
 
 if TYPE_CHECKING:
     from eitbench.worlds.world import World
@@ -136,7 +137,7 @@ class InflowStates:
         new = np.arange(h, h + r)
         moved[:, new, new] += self.model.remainder
         mean = self._move(np.zeros_like(entering), mean[..., None])[..., 0]
-        mean[:, :h] += u[:, 0] @ self._older.T
+        mean[:, :h] += each(self._older, u[:, 0])
         return mean, moved
 
     def _move(self, entering: np.ndarray, rows: np.ndarray) -> np.ndarray:
@@ -162,7 +163,7 @@ class InflowStates:
 
     def coordinates(self, mean: np.ndarray) -> np.ndarray:
         u, _ = self._inflow(self._window(mean))
-        coordinates = u.reshape(len(mean), -1) @ self._recent.T
+        coordinates = each(self._recent, u.reshape(len(mean), -1))
         h = len(self.model.transition)
         coordinates[:, :h] += mean[:, :h]
         return coordinates
@@ -172,9 +173,11 @@ class InflowStates:
         h = len(self.model.transition)
         _, slope = self._inflow(self._window(mean))                              # (B, D, n_inlet)
         by_u = (matrix @ self._recent).reshape(*matrix.shape[:-1], D, self._inlet)
-        by_x = (by_u * slope[:, None]) @ self.model.modes                       # (B, m, D, r)
-        aged = np.broadcast_to(matrix[..., :h], (*by_x.shape[:2], h))
-        return np.concatenate([aged, by_x.reshape(*by_x.shape[:2], D * r)], axis=2)
+        by_u = by_u * slope[:, None]                                      # (B, m, D, n_inlet)
+        B, m = by_u.shape[:2]
+        by_x = by_u.reshape(B, m * D, -1) @ self.model.modes
+        aged = np.broadcast_to(matrix[..., :h], (B, m, h))
+        return np.concatenate([aged, by_x.reshape(B, m, D * r)], axis=2)
 
     def constrain(self, mean: np.ndarray) -> np.ndarray:
         return mean

@@ -52,7 +52,9 @@ if TYPE_CHECKING:
 RANK = 120
 """Coordinates of the concentration with a white inflow."""
 VERSION = 1
-"""Version of the models that are kept."""
+"""Version of the models with a white inflow that are kept."""
+LEARNED_VERSION = 1
+"""Version of those with a learned inflow."""
 TABLE = 16
 """Velocities within the bounds, evenly spaced, for which the joint model is computed."""
 LEARNING = (0.6, 1.0, 1.4)
@@ -90,7 +92,7 @@ def stored_voltages(world: World) -> NodeVoltages:
 
 def _learned(world: World, part: str) -> dict[str, np.ndarray]:
     """Return the arrays of a world's ``model``, an `InflowModel`, or ``voltages``,
-    `NodeVoltages`."""
+    `NodeVoltages`, rounded to single precision."""
     def build() -> dict[str, np.ndarray]:
         task = make_task(world)
         prior = world_prior(world)
@@ -101,11 +103,11 @@ def _learned(world: World, part: str) -> dict[str, np.ndarray]:
             voltages = node_voltages(task.observation, world.expected_concentration, model.basis,
                                      samples)
         parts = {"model": model._asdict(), "voltages": voltages._asdict()}
-        return {f"{part}.{name}": array for part, arrays in parts.items()
+        return {f"{part}.{name}": array.astype(np.float32) for part, arrays in parts.items()
                 for name, array in arrays.items()}
 
-    arrays = cached(model_key("learned", described(world.sound), VERSION), build)
-    return {name.removeprefix(part + "."): array for name, array in arrays.items()
+    arrays = cached(model_key("learned", described(world.sound), LEARNED_VERSION), build)
+    return {name.removeprefix(part + "."): array.astype(float) for name, array in arrays.items()
             if name.startswith(part)}
 
 

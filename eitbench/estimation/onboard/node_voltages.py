@@ -33,26 +33,27 @@ class NodeVoltages(NamedTuple):
     resistance: np.ndarray
     """(L, L) at c_0, Ω (Ω·m in 2D)"""
     slope: np.ndarray
-    """(L, L, m) derivatives of the scaled resistances by u at the nodes"""
+    """(m, L, L) derivatives of the scaled resistances by u at the nodes"""
     curvature: np.ndarray
-    """(k, k, L, L) second derivatives by the modes"""
+    """(k, L, L, k) second derivatives by the modes"""
 
     def linearise(self, levels: np.ndarray, coordinates: np.ndarray,
                   currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return voltages (B, L) in V, and their derivatives (B, L, q) by the coordinates, of
         episodes with ``levels`` (B,) in mol/m³, ``coordinates`` (B, q) and ``currents`` (B, L).
         One level with its coordinates may serve several currents."""
-        relative = 1.0 + coordinates @ self.basis.T
+        relative = 1.0 + each(self.basis, coordinates)
         relative = np.maximum(relative, (self.smallest / levels)[:, None])
         u = np.log(relative) + np.log(levels / self.level)[:, None]
-        a = u @ self.to_modes.T
-        k, L = len(self.to_modes), currents.shape[1]
-        slope = np.tensordot(currents, self.slope, 1)                               # (B, L, m)
-        bent = np.tensordot(a, self.curvature, 1).reshape(-1, k * L, L) @ currents[..., None]
-        bent = np.swapaxes(bent.reshape(-1, k, L), 1, 2)
-        scale = np.exp(u @ self.average)[:, None]
-        voltages = (currents @ self.resistance + (slope @ u[..., None])[..., 0]
-                    + 0.5 * (bent @ a[..., None])[..., 0])
+        a = each(self.to_modes, u)
+        k = len(a[0])
+        m, L, _ = self.slope.shape
+        slope = (self.slope.reshape(m * L, L) @ currents[..., None]).reshape(-1, m, L)
+        curvature = (self.curvature.reshape(k * L * L, k) @ a[..., None]).reshape(-1, k * L, L)
+        bent = (curvature @ currents[..., None]).reshape(-1, k, L)
+        scale = np.exp((u * self.average).sum(axis=1))[:, None]
+        slope, bent = np.swapaxes(slope, 1, 2), np.swapaxes(bent, 1, 2)
+        voltages = each(self.resistance, currents) + each(slope, u) + 0.5 * each(bent, a)
         by_u = slope + bent @ self.to_modes - voltages[..., None] * self.average
         return voltages / scale, (by_u / (relative * scale)[:, None]) @ self.basis
 
@@ -75,11 +76,17 @@ def node_voltages(model: Resistances, level: float, basis: np.ndarray,
     quadratic = ScaledVoltages(model, level, modes[:, :BENT]).quadratic
     resistance, slope, to_modes, curvature = quadratic.tables
     L = len(resistance)
-    by_node = (interpolation.T @ slope).reshape(-1, L, L).transpose(1, 2, 0)
+    by_modes = curvature.reshape(*curvature.shape[:2], L, L).transpose(0, 2, 3, 1)
     return NodeVoltages(
         np.array(level), np.array(quadratic.smallest), basis[nodes], interpolation.mean(axis=0),
-        to_modes @ interpolation, resistance, np.ascontiguousarray(by_node),
-        curvature.reshape(*curvature.shape[:2], L, L))
+        to_modes @ interpolation, resistance, (interpolation.T @ slope).reshape(-1, L, L),
+        np.ascontiguousarray(by_modes))
+
+
+def each(matrix: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Return products (B, m) of a matrix (m, n) or matrices (B, m, n) and vectors (B, n), one by
+    one: the bits of one product with all vectors would depend on their number."""
+    return np.asarray((matrix @ vectors[..., None])[..., 0])
 
 
 def _telling(span: np.ndarray, count: int) -> np.ndarray:

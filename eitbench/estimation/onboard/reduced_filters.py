@@ -96,7 +96,7 @@ class ReducedFilters:
 
     @staticmethod
     def project(rules: Rules, moment: np.ndarray) -> np.ndarray:
-        return (moment @ Shared.of(rules).basis).astype(float)
+        return np.asarray(moment @ Shared.of(rules).basis)
 
     # What a policy may know of the first episode (`Belief`), in double precision.
 
@@ -233,7 +233,7 @@ class Shared:
         with_level = np.column_stack([np.ones(len(basis)), basis])
         half = with_level.T @ (score_mass(world) @ with_level)
         self.mass = 0.5 * (half + half.T)
-        self.basis = with_level.astype(np.float32)
+        self.basis = with_level
         self.patches = (self.levels.patches @ basis).astype(np.float32)
         self._is_identity = (world.region is None and inflow == "white"
                              and world.velocity_model is None)
