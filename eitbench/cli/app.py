@@ -157,7 +157,8 @@ def leaderboard(
         with options.clear_errors():
             return report(out)
     from eitbench._files import write_atomically
-    from eitbench.bench.records import write_episode_table_of
+    from eitbench.bench.episode_table import table_beside, write_episode_table
+    from eitbench.bench.records import read_sound_files
     from eitbench.report.boards import read_for_boards
     from eitbench.report.site import collect, render, render_site, write_site
     with options.clear_errors():
@@ -171,7 +172,8 @@ def leaderboard(
         write_atomically(out / name, text.encode())
         options.say(f"wrote {out / name}")
     options.say(f"wrote {out / 'site' / 'index.html'}")
-    options.say(f"wrote {write_episode_table_of(records)}")
+    write_episode_table(read_sound_files(records)[0].values(), table_beside(records))
+    options.say(f"wrote {table_beside(records)}")
     for complaint in complaints:
         options.say(f"left out: {complaint}", err=True)
     raise typer.Exit(bool(complaints))
