@@ -195,15 +195,6 @@ def test_scores_are_those_of_the_exact_filter():
     assert played.errors.tolist() == errors
 
 
-def test_only_the_clairvoyant_is_privileged():
-    """All others play from observations."""
-    ours = {name: load_method(name, "injection") for name in own_methods("injection")}
-    assert [name for name, method in ours.items() if method.privileged] == ["clairvoyant"]
-    assert {name: method.role for name, method in ours.items() if method.role} == {
-        "clairvoyant": "reference", "random_pair": "floor"}
-    assert {"random_pair", "best_pair", "schedule", "greedy_a", "event_triggered"} < set(ours)
-
-
 def jobs_of(policies: list[str], seeds: str, **kwargs) -> list[Job]:
     return [Job(Environment(NAME, json.dumps(SHORT | kwargs)), policy, seed)
             for policy in policies for seed in parse_seeds(seeds)]
@@ -236,14 +227,6 @@ def test_played_episodes_are_kept(tmp_path, monkeypatch):
     run_jobs(exact, store)
     assert len(policy_rows(exact, store.results())) == 1
     assert [json.loads(asked.kwargs).get("estimator") for asked, *_ in again] == ["reduced", None]
-
-
-def test_copies_under_two_names_keep_their_rows(tmp_path):
-    """The same text under another name is another policy."""
-    copies = [write_policy(tmp_path, "def act(self, observation): return 3", name) for name in ("one", "two")]
-    todo, store = jobs_of(copies, "dev:0", estimator="reduced"), EpisodeStore(tmp_path / "results")
-    run_jobs(todo, store)
-    assert list(policy_rows(todo, store.results())["policy"]) == ["one", "two"]
 
 
 def test_a_mistake_is_the_result_of_its_policy(tmp_path):

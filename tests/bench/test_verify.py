@@ -103,16 +103,6 @@ def test_a_third_party_file_runs_under_bubblewrap(mine):
     assert code == 0 and "| bubblewrap" in said and AGREE in said, complaint
 
 
-def test_without_bubblewrap_a_third_party_file_does_not_run(mine, monkeypatch):
-    """The message says how to install it, and what the alternative is."""
-    path = submitted(mine)
-    monkeypatch.setattr(isolation, "bubblewrap_problem", lambda: "bubblewrap is not installed")
-    write_baseline(Path.cwd(), update="raise SystemExit('ran')")
-    code, _, complaint = eitbench("verify", submitted(mine, "test:1"), "--method", mine, "-j", 1)
-    assert code == 1 and "apt-get install bubblewrap" in complaint and "--isolate process" in complaint
-    assert eitbench("verify", path, "-j", 1)[0] == 1
-
-
 def test_built_in_methods_are_known_by_name(tmp_path):
     """Policies, privileged ones and failures too; the arguments are those of the record."""
     for name in ("random_pair", "clairvoyant"):
