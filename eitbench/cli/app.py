@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Annotated
 
@@ -190,12 +191,12 @@ def compare(
     """Compare two methods seed by seed: differences with intervals, and how often the first is
     better; over several environments by gains, as on the boards."""
     from eitbench.report import compare as comparison
-    from eitbench.report.tables import terminal_width
     with options.clear_errors():
         ours, theirs = (comparison.find(name, records) for name in (a, b))
         table = comparison.compare(ours, theirs, score, comparison.floors(records))
     names = comparison.names(ours[0], theirs[0])
-    options.say(comparison.in_terminal(table, *names, score, terminal_width()))
+    width = shutil.get_terminal_size().columns
+    options.say(comparison.in_terminal(table, *names, score, width))
 
 
 @app.command()
