@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib import colormaps
+from matplotlib.colors import to_rgb
 from PIL import Image
 from threadpoolctl import threadpool_limits
 
@@ -15,7 +17,14 @@ from eitbench.bench.isolation import choose_isolation
 from eitbench.bench.methods import Method
 from eitbench.bench.run import Job
 from eitbench.bench.tracks import Environment, board_of
-from eitbench.envs.rendering import draw_comparison
+from eitbench.envs.rendering import (
+    FIELD_MAP,
+    IDLE,
+    SINK,
+    SOURCE,
+    SPREAD_MAP,
+    draw_comparison,
+)
 from eitbench.report.plot import one_seed, played, states_at
 
 MOVING = (".gif", ".webp")
@@ -56,7 +65,10 @@ def animate(environment: str, methods: Sequence[str], seed: str, step: int | Non
                   for frame in draw(env, loaded, number, range(first, last + 1, every))]
     path.parent.mkdir(parents=True, exist_ok=True)
     options: dict[str, Any] = {}
-    if path.suffix == ".webp":
+    if path.suffix == ".gif":
+        palette = _palette()
+        frames = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+    elif path.suffix == ".webp":
         options = {"quality": 30, "method": 6}  # a fifth of the GIF, and letters are still sharp
     if step is None:
         options |= {"save_all": True, "append_images": frames[1:], "loop": 0,
@@ -82,3 +94,14 @@ def _compared(env: Any, loaded: list[Method], seed: int, at: range) -> Iterator[
         yield draw_comparison(env.task, fields, currents, t * env.task.transport.time_step)
 
 
+def _palette() -> Image.Image:
+    """The 256 colours of all frames, which keeps them steady: colour maps, greys, electrodes."""
+    colours = [colormaps[name](np.linspace(0, 1, n))[:, :3]
+               for name, n in ((FIELD_MAP, 120), (SPREAD_MAP, 100))]
+    greys = np.linspace(0, 1, 27)[:, None].repeat(3, axis=1)
+    pairs = [to_rgb(colour) for colour in (SOURCE, SINK, IDLE)]
+    halves = [tuple(0.5 + 0.5 * c for c in colour) for colour in pairs]  # at the edges of the bars
+    table = np.concatenate([*colours, greys, pairs, halves, halves])[:256]
+    image = Image.new("P", (1, 1))
+    image.putpalette((255 * table).round().astype(np.uint8).tobytes())
+    return image
