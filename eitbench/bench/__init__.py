@@ -45,11 +45,11 @@ def load(folder: Path | str | None = None, *, measured: bool = False) -> pd.Data
         import pandas as pd
 
         from eitbench._files import shipped
-        from eitbench.bench.records import newest, read_measured_files, read_records
+        from eitbench.bench.records import newest, read_records, read_sound_files
     path = Path(folder or shipped("leaderboards") / "results")
     records = read_records(path, keep=_without_steps)
     if measured:
-        records += read_measured_files(path)[0].values()
+        records += read_sound_files(path, measured=True)[0].values()
     groups = newest(records)
     rows = [row for group, outdated in zip(groups, (False, True), strict=True)
             for record in group for row in _rows(record, outdated)]

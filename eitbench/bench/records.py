@@ -23,6 +23,7 @@ import re
 import stat
 import warnings
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from functools import lru_cache
 from itertools import islice
 from pathlib import Path
@@ -35,7 +36,7 @@ from eitbench import _check
 from eitbench._files import shipped, write_atomically
 from eitbench._foreign import cleaned
 from eitbench.bench import tracks
-from eitbench.bench.episode_table import read_episode_table, table_beside, write_episode_table
+from eitbench.bench.episode_table import read_episode_table, table_beside
 from eitbench.data.seeds import name_seed, parse_seeds
 
 SCHEMA = 3
@@ -59,7 +60,10 @@ def write_record(folder: Path, record: dict[str, Any]) -> Path:
     """Write a record into ``folder`` atomically and return its path; a file of the same name is
     replaced. ``ValueError``, naming file and fields, if it breaks the schema."""
     record = sealed(record)
-    path = Path(folder) / _name_if_any(record)
+    name = "(nameless)"
+    with suppress(KeyError, TypeError):               # the check names the missing field
+        name = file_name(record)
+    path = Path(folder) / name
     try:
         check_record(record)
     except ValueError as error:
@@ -114,23 +118,16 @@ def read_records(folder: Path, *, keep: Callable[[dict[str, Any]], Any] = dict) 
     folder = Path(folder)
     if not folder.is_dir() and (table := table_beside(folder)).is_file():
         return [keep(record) for record in read_episode_table(table)]
-    records, complaints = read_sound_records(folder, keep=keep)
+    records, complaints = read_sound_files(folder, keep=keep)
     if complaints:
         raise ValueError("; ".join(complaints))
-    return records
-
-
-def read_sound_records(folder: Path, *, keep: Callable[[dict[str, Any]], Any] = dict,
-                       ) -> tuple[list[Any], list[str]]:
-    """Read the valid records of a folder, and a sentence for each other file that names it."""
-    sound, complaints = read_sound_files(folder, keep=keep)
-    return list(sound.values()), complaints
+    return list(records.values())
 
 
 def read_sound_files(folder: Path, *, keep: Callable[[dict[str, Any]], Any] = dict,
                      measured: bool = False) -> tuple[dict[Path, Any], list[str]]:
-    """Read as `read_sound_records`, with the path of each record; with ``measured`` only records of
-    measured cases, else only others."""
+    """Read the valid records of a folder, by path, and a sentence for each other file that names
+    it; with ``measured`` only records of measured cases, else only others."""
     kept = {}
     complaints = []
     known = set(tracks.measured_ids() if measured else tracks.ids())
@@ -147,33 +144,14 @@ def read_sound_files(folder: Path, *, keep: Callable[[dict[str, Any]], Any] = di
             kept[path] = keep(record)
         else:
             warnings.warn(f"record {cleaned(str(path))} is left out: there is no environment "
-                          f"{cleaned(id)}", stacklevel=4)
+                          f"{cleaned(id)}", stacklevel=3)
     return kept, complaints
-
-
-def read_measured_files(folder: Path) -> tuple[dict[Path, dict[str, Any]], list[str]]:
-    """Read as `read_sound_files` the records of measured cases."""
-    return read_sound_files(folder, measured=True)
-
-
-def write_episode_table_of(folder: Path) -> Path:
-    """Write the table of all valid records of a folder beside it, and return its path."""
-    path = table_beside(folder)
-    write_episode_table(read_sound_records(folder)[0], path)
-    return path
 
 
 def file_name(record: dict[str, Any]) -> str:
     """Return the name of a record's file; see `tracks.record_name`."""
     return tracks.record_name(record["environment"]["name"], record["method"], record["version"],
                               record["split"])
-
-
-def _name_if_any(record: dict[str, Any]) -> str:
-    try:
-        return file_name(record)
-    except (KeyError, TypeError):                     # the check will name the missing field
-        return "(nameless)"
 
 
 def sealed(record: dict[str, Any]) -> dict[str, Any]:

@@ -90,8 +90,6 @@ class Score:
     """Among `KINDS`."""
     factor: float = 1.0
     """Factor of displayed values: 1e3 for seconds in ms."""
-    everywhere: bool = False
-    """Whether tables show its column even if it is empty."""
     repeats: bool = True
     """Whether the same episode gives the same number, unlike times."""
 
@@ -187,7 +185,7 @@ def _claimed(outcome: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarr
 
 for _score in (
     Score("error", "ẽ_c", "relative estimation error (5.12)",
-          lambda outcome: outcome.errors.mean(), tracks=KINDS, everywhere=True),
+          lambda outcome: outcome.errors.mean(), tracks=KINDS),
     Score("prediction_error", "withheld RMSE",
           "RMS residual of withheld readings relative to the standard deviation of their noise; 1 "
           "is the noise level",
@@ -198,36 +196,35 @@ for _score in (
           lambda outcome: outcome.ktc, better="higher", tracks=("measured",)),
     Score("contrast_error", "contrast",
           "error relative to the deviation from the homogeneous estimate; 1 is no better than that",
-          _contrast, needs=("mean", "truth"), everywhere=True),
+          _contrast, needs=("mean", "truth")),
     Score("nis", "NIS/m",
           "normalised innovation squared, of all scored measurements; 1 when the filter's own "
           "uncertainty fits",
-          _nis, better="nominal", tracks=KINDS, everywhere=True),
+          _nis, better="nominal", tracks=KINDS),
     Score("crps", "CRPS", "continuous ranked probability score, mol/m³",
-          lambda outcome: scoring.crps(*_claimed(outcome)), needs=("std",), tracks=TRACKS,
-          everywhere=True),
+          lambda outcome: scoring.crps(*_claimed(outcome)), needs=("std",), tracks=TRACKS),
     Score("velocity_error", "ẽ_v",
           "relative error of the flow, ∫(v̂ − v)²/∫v² across the pipe, where it is asked for too",
           _of_velocity, needs=("velocity",)),
     Score("coverage_50", "50 %", "part of the truth inside the claimed 50 % interval",
           lambda outcome: scoring.coverage(*_claimed(outcome), 0.5),
-          better="nominal", needs=("std",), tracks=TRACKS, everywhere=True),
+          better="nominal", needs=("std",), tracks=TRACKS),
     Score("coverage_90", "90 %", "part of the truth inside the claimed 90 % interval",
           lambda outcome: scoring.coverage(*_claimed(outcome), 0.9),
-          better="nominal", needs=("std",), tracks=TRACKS, everywhere=True),
+          better="nominal", needs=("std",), tracks=TRACKS),
     Score("spread_ratio", "var/MSE",
           "claimed variance over squared error; 1 is honest, more is too modest",
           lambda outcome: scoring.spread_ratio(*_claimed(outcome)),
-          better="nominal", needs=("std",), tracks=TRACKS, everywhere=True),
+          better="nominal", needs=("std",), tracks=TRACKS),
     Score("voltage_discrepancy", "ẽ_V", "voltage discrepancy (5.13), mV²; a diagnostic",
           lambda outcome: scoring.voltage_discrepancy(outcome.measured, outcome.computed),
-          better="none", needs=("measured", "computed"), factor=1e6, everywhere=True),
+          better="none", needs=("measured", "computed"), factor=1e6),
     Score("spent", "injections", "how many the policy made, where it is asked for them",
           lambda outcome: outcome.spent, better="none", needs=("spent",), tracks=("injection",)),
     Score("seconds_per_step", "ms/step",
           "time per injection on one core, in the fastest episode: what is done once for a model "
           "is left apart",
-          lambda outcome: outcome.seconds_per_step, tracks=KINDS, factor=1e3, everywhere=True,
+          lambda outcome: outcome.seconds_per_step, tracks=KINDS, factor=1e3,
           repeats=False),
 ):
     register_score(_score)

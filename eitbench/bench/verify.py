@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,8 +27,8 @@ from eitbench.bench.methods import (
 from eitbench.bench.playing import play
 from eitbench.bench.records import (
     SHARED,
+    file_name,
     newest,
-    read_measured_files,
     read_record,
     read_sound_files,
     version_number,
@@ -51,10 +51,14 @@ MANY_ROWS = 30
 """From here on a table has a row for each environment instead of each episode."""
 
 
-class Case(NamedTuple):
-    """One episode of one record, to be rerun, or replayed if there is no job."""
+EMPTY = {"record": "", "environment": "", "method": "", "episode": "", "isolation": "", "score": "",
+         "difference": 0.0, "recorded": None, "rerun": None, "problem": "", "note": ""}
+"""Columns of `verify`, with the values of a record that cannot be read."""
 
-    file: str
+
+class Case(NamedTuple):
+    """One episode of one record, to be rerun by a job, or to be replayed."""
+
     record: dict[str, Any]
     episode: dict[str, Any]
     job: Job | None
@@ -78,7 +82,7 @@ def verify(paths: Sequence[Path], folder: Path, *, file: str | None = None, isol
         cannot agree), note.
     """
     _check.integer("episodes", episodes, low=1)
-    rows = []
+    rows: list[dict[str, Any]] = []
     cases: list[Case] = []
     for path in paths:
         try:
@@ -87,12 +91,13 @@ def verify(paths: Sequence[Path], folder: Path, *, file: str | None = None, isol
             if job is not None:
                 job.load()
         except (ValueError, WorkerError) as error:
-            rows.append(_row(path.name, problem=str(error)))
+            rows.append({"record": path.name, "problem": str(error)})
             continue
-        for k in drawn_of(record, episodes, seed):
+        drawn = np.random.default_rng(seed).permutation(len(record["episodes"]))[:episodes]
+        for k in sorted(drawn):
             episode = record["episodes"][k]
             numbered = job and job._replace(seed=parse_seeds(episode["seed"])[0])
-            cases.append(Case(path.name, record, episode, numbered))
+            cases.append(Case(record, episode, numbered))
     with cache_in((folder / "cache").absolute()):
         if replay:
             bar = tqdm(in_parallel(_replayed_row, [(case,) for case in cases], n_jobs, backend),
@@ -101,7 +106,7 @@ def verify(paths: Sequence[Path], folder: Path, *, file: str | None = None, isol
                 bar, key=lambda row: (row["record"], len(row["episode"]), row["episode"]))
         else:
             rows += _rerun_rows(cases, folder, n_jobs, backend)
-    return pd.DataFrame(rows)
+    return pd.DataFrame([EMPTY | row for row in rows])
 
 
 def select_records(folder: Path, environments: Sequence[str] = (), *, top: int = 0) -> list[Path]:
@@ -114,7 +119,7 @@ def select_records(folder: Path, environments: Sequence[str] = (), *, top: int =
     """
     read, complaints = read_sound_files(folder)
     if environments:                        # those of measurements, whose files are rarely there
-        measured, more = read_measured_files(folder)
+        measured, more = read_sound_files(folder, measured=True)
         read |= measured
         complaints += more
     if complaints:
@@ -139,12 +144,6 @@ def _first(records: dict[Path, dict[str, Any]], count: int) -> list[Path]:
             name = record["environment"]["name"]
             ranked.setdefault(name, []).append((float(np.mean(errors)), path))
     return [path for group in ranked.values() for _, path in sorted(group)[:count]]
-
-
-def drawn_of(record: dict[str, Any], episodes: int, seed: int) -> list[int]:
-    """Return the positions of ``episodes`` of a record's episodes, drawn with this ``seed``."""
-    drawn = np.random.default_rng(seed).permutation(len(record["episodes"]))[:episodes]
-    return sorted(drawn.tolist())
 
 
 # -- the method of a record ---------------------------------------------------------------------
@@ -213,18 +212,18 @@ def _rerun_rows(cases: list[Case], folder: Path, n_jobs: int, backend: str,
                 ) -> list[dict[str, Any]]:
     """Run what the folder does not hold yet, and compare. Each version of a method has its store,
     as third-party methods may share a name; so has each kind of isolation."""
-    jobs: dict[Path, list[Job]] = {}
+    found: dict[Path, list[tuple[Case, Job]]] = {}
     for case in cases:
         if case.job is not None:
-            jobs.setdefault(_store_folder(case, case.job, folder), []).append(case.job)
-    for store, asked in jobs.items():
-        run_jobs(asked, EpisodeStore(store), n_jobs=n_jobs, backend=backend, keep_estimates=False)
-    return [_rerun_row(case, case.job, EpisodeStore(_store_folder(case, case.job, folder)))
-            for case in cases if case.job is not None]
-
-
-def _store_folder(case: Case, job: Job, folder: Path) -> Path:
-    return folder / job.isolation / case.record["version"]
+            place = folder / case.job.isolation / case.record["version"]
+            found.setdefault(place, []).append((case, case.job))
+    rows = []
+    for place, pairs in found.items():
+        store = EpisodeStore(place)
+        run_jobs([job for _, job in pairs], store, n_jobs=n_jobs, backend=backend,
+                 keep_estimates=False)
+        rows += [_rerun_row(case, job, store) for case, job in pairs]
+    return rows
 
 
 def _rerun_row(case: Case, job: Job, store: EpisodeStore) -> dict[str, Any]:
@@ -249,7 +248,7 @@ def _replayed_row(case: Case) -> dict[str, Any]:
     try:
         return _compared(case, replayed(case.record, case.episode), "replay", [])
     except ValueError as error:
-        return _row(case.file, case, problem=str(error))
+        return _compared(case, case.episode, "", [str(error)]) | {"score": "", "rerun": None}
 
 
 def _compared(case: Case, result: dict[str, Any], isolation: str,
@@ -259,9 +258,11 @@ def _compared(case: Case, result: dict[str, Any], isolation: str,
     if result["status"] != case.episode["status"]:
         problems.append(f"status is {result['status']} ({result.get('message', 'no error')}), but "
                         f"{case.episode['status']} in the record")
-    return _row(case.file, case, score=worst, difference=differences.get(worst, 0.0),
-                isolation=isolation, problem="; ".join(problems),
-                rerun=result.get("scores", {}).get("error"))
+    recorded, rerun = (each.get("scores", {}).get("error") for each in (case.episode, result))
+    return {"record": file_name(case.record), "environment": case.record["environment"]["id"],
+            "method": case.record["method"], "episode": case.episode["seed"],
+            "isolation": isolation, "score": worst, "difference": differences.get(worst, 0.0),
+            "recorded": recorded, "rerun": rerun, "problem": "; ".join(problems)}
 
 
 def replayed(record: dict[str, Any], recorded: dict[str, Any]) -> dict[str, Any]:
@@ -316,17 +317,6 @@ def _relative(a: Sequence[float | None], b: Sequence[float | None]) -> float:
     return float(np.nanmax(relative, initial=0.0))
 
 
-def _row(file: str, case: Case | None = None, **known: Any) -> dict[str, Any]:
-    row = {"record": file, "environment": "", "method": "", "episode": "", "isolation": "",
-           "score": "", "difference": 0.0, "recorded": None, "rerun": None, "problem": "",
-           "note": ""}
-    if case is not None:
-        row |= {"environment": case.record["environment"]["id"], "method": case.record["method"],
-                "episode": case.episode["seed"],
-                "recorded": case.episode.get("scores", {}).get("error")}
-    return row | known
-
-
 # -- reports ------------------------------------------------------------------------------------
 
 
@@ -361,6 +351,3 @@ def table_of(rows: pd.DataFrame, tolerance: float = TOLERANCE) -> str:
     return Table.of(lines, keep=list(lines[0])).markdown() if lines else ""
 
 
-def notes_of(rows: pd.DataFrame) -> Iterable[str]:
-    """Return the notes, each once."""
-    return dict.fromkeys(note for note in rows["note"] if note)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Annotated
 
@@ -157,7 +158,8 @@ def leaderboard(
         with options.clear_errors():
             return report(out)
     from eitbench._files import write_atomically
-    from eitbench.bench.records import write_episode_table_of
+    from eitbench.bench.episode_table import table_beside, write_episode_table
+    from eitbench.bench.records import read_sound_files
     from eitbench.report.boards import read_for_boards
     from eitbench.report.site import collect, render, render_site, write_site
     with options.clear_errors():
@@ -171,7 +173,8 @@ def leaderboard(
         write_atomically(out / name, text.encode())
         options.say(f"wrote {out / name}")
     options.say(f"wrote {out / 'site' / 'index.html'}")
-    options.say(f"wrote {write_episode_table_of(records)}")
+    write_episode_table(read_sound_files(records)[0].values(), table_beside(records))
+    options.say(f"wrote {table_beside(records)}")
     for complaint in complaints:
         options.say(f"left out: {complaint}", err=True)
     raise typer.Exit(bool(complaints))
@@ -188,12 +191,12 @@ def compare(
     """Compare two methods seed by seed: differences with intervals, and how often the first is
     better; over several environments by gains, as on the boards."""
     from eitbench.report import compare as comparison
-    from eitbench.report.tables import terminal_width
     with options.clear_errors():
         ours, theirs = (comparison.find(name, records) for name in (a, b))
         table = comparison.compare(ours, theirs, score, comparison.floors(records))
     names = comparison.names(ours[0], theirs[0])
-    options.say(comparison.in_terminal(table, *names, score, terminal_width()))
+    width = shutil.get_terminal_size().columns
+    options.say(comparison.in_terminal(table, *names, score, width))
 
 
 @app.command()

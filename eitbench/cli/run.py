@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import shutil
 import sys
 from collections.abc import Sequence
 from enum import StrEnum
@@ -104,7 +105,7 @@ def report(out: Path, asked: Sequence[Job] = (), worlds: Sequence[dict[str, Any]
     from eitbench.report.page import write_page
     from eitbench.report.policies import gap_text, policy_rows
     from eitbench.report.sweep import sweeps, swept
-    from eitbench.report.tables import markdown, terminal_tables, terminal_width
+    from eitbench.report.tables import markdown, terminal_tables
     store = EpisodeStore(out)
     records = store.write_records()
     if not records and not before:
@@ -115,7 +116,7 @@ def report(out: Path, asked: Sequence[Job] = (), worlds: Sequence[dict[str, Any]
     told = asked_of(store.records(before), asked) if asked else records
     number = swept(worlds)
     found = sweeps(told, number) if number else []
-    width = terminal_width()
+    width = shutil.get_terminal_size().columns
     options.say("\n\n".join(each.text(width) for each in found) if found
                 else terminal_tables(run_boards(told, known), width))
     for name in dict.fromkeys(job.environment.name for job in asked):

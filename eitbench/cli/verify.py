@@ -92,7 +92,7 @@ def _rerun(paths: list[Path], folder: Path, tolerance: float, episodes: int, see
     with options.clear_errors():
         rows = verification.verify(paths, folder, episodes=episodes, seed=seed, **how)
     options.say(f"episodes drawn with --seed {seed}\n\n{verification.table_of(rows, tolerance)}\n")
-    for note in verification.notes_of(rows):
+    for note in dict.fromkeys(filter(None, rows["note"])):
         options.say(f"{note}\n")
     return verification.problems_of(rows, tolerance)
 

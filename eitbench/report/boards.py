@@ -24,7 +24,7 @@ from eitbench.bench.records import (
     file_name,
     finished,
     newest,
-    read_sound_records,
+    read_sound_files,
     version_number,
 )
 from eitbench.bench.scores import scores
@@ -444,11 +444,10 @@ def read_for_boards(folder: Path) -> tuple[list[dict[str, Any]], list[str]]:
     """
     if not folder.is_dir():
         raise ValueError(f"records must be a folder that exists, got {folder}")
-    read, complaints = read_sound_records(folder)
-    complaints += [f"record {folder / file_name(record)} has {record['split']} seeds, and "
-                   "leaderboards are made of test seeds"
-                   for record in read if record["split"] != "test"]
-    found = [record for record in read if record["split"] == "test"]
+    read, complaints = read_sound_files(folder)
+    complaints += [f"record {path} has {record['split']} seeds, and leaderboards are made of test "
+                   "seeds" for path, record in read.items() if record["split"] != "test"]
+    found = [record for record in read.values() if record["split"] == "test"]
     if not found:
         raise ValueError("; ".join([f"records must be a folder with records of test seeds, got "
                                     f"{folder}, where there are none that can be shown",

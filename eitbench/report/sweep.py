@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from eitbench.bench.table import NOTHING, Cell, Table
-from eitbench.bench.text import mean_and_interval, number, rounded, scores_by_seed
+from eitbench.bench.table import Table, mean_cell, number_cell
+from eitbench.bench.text import scores_by_seed
 from eitbench.bench.variants import as_typed, flat
 from eitbench.report import charts
 from eitbench.report.boards import kind_of
@@ -24,20 +24,17 @@ class Sweep(NamedTuple):
     number: str
     """Dotted name, ``instrument.noise_relative``."""
     values: list[Any]
-    errors: dict[str, list[tuple[float, float] | None]]
-    """Method -> mean ẽ_c and half its 95 % interval for each value; None without an episode."""
+    errors: dict[str, list[list[float]]]
+    """Method -> ẽ_c of the finished episodes for each value."""
 
     def table(self, *, intervals: bool = True) -> Table:
         """Return a row for each method and a column for each value."""
-        def cell(error: tuple[float, float] | None) -> Cell:
-            if error is None:
-                return Cell(NOTHING)
-            return Cell(rounded(*error) if intervals else number(error[0]), error[0])
-
         names = [as_typed(value) for value in self.values]
+        cells = {method: [mean_cell(errors) if intervals else number_cell(_mean(errors))
+                          for errors in each] for method, each in self.errors.items()}
         return Table.of(({"method": charts.shortened(method, MAX_NAME_CHARS),
-                          **dict(zip(names, map(cell, each), strict=True))}
-                         for method, each in self.errors.items()), keep=names, label=self.title)
+                          **dict(zip(names, each, strict=True))}
+                         for method, each in cells.items()), keep=names, label=self.title)
 
     def text(self, width: int) -> str:
         """Return the table, with intervals if lines of ``width`` characters hold them."""
@@ -54,14 +51,17 @@ class Sweep(NamedTuple):
         if not all(isinstance(value, int | float) for value in self.values):
             return None
         x = np.array(self.values, dtype=float)
-        series = [charts.Series(method, i, np.array([error[0] if error else np.nan
-                                                     for error in errors]))
-                  for i, (method, errors) in enumerate(self.errors.items()) if any(errors)]
+        series = [charts.Series(method, i, np.array(list(map(_mean, each))))
+                  for i, (method, each) in enumerate(self.errors.items()) if any(each)]
         if not series:
             return None
         svg = charts.lines(x, series, self.number, "relative error ẽ_c",
                            log=bool(x[0] > 0 and x[-1] >= 8 * x[0]))
         return charts.Chart(svg, charts.legend(series))
+
+
+def _mean(errors: list[float]) -> float:
+    return float(np.mean(errors)) if errors else np.nan
 
 
 def swept(worlds: Iterable[dict[str, Any]]) -> str | None:
@@ -73,15 +73,14 @@ def swept(worlds: Iterable[dict[str, Any]]) -> str | None:
 
 def sweeps(records: Iterable[dict[str, Any]], number: str) -> list[Sweep]:
     """Return a sweep for each board, from records of variants that differ in one number."""
-    boards: dict[str, dict[str, dict[str, Any]]] = {}
+    boards: dict[str, dict[str, dict[str, list[float]]]] = {}
     values: dict[str, Any] = {}
     for record in records:
         value = flat(record["environment"]["kwargs"].get("world", {})).get(number)
         values[as_typed(value)] = value
-        errors = list(scores_by_seed(record, "error").values())
         title = f"{kind_of(record['environment']['id'])}, {record['board']}"
         own = boards.setdefault(title, {}).setdefault(record["method"], {})
-        own[as_typed(value)] = mean_and_interval(errors) if errors else None
+        own[as_typed(value)] = list(scores_by_seed(record, "error").values())
 
     def order(name: str) -> tuple[bool, Any]:
         is_number = isinstance(values[name], int | float)
@@ -89,5 +88,6 @@ def sweeps(records: Iterable[dict[str, Any]], number: str) -> list[Sweep]:
 
     names = sorted(values, key=order)
     return [Sweep(title, number, [values[name] for name in names],
-                  {method: [own.get(name) for name in names] for method, own in methods.items()})
+                  {method: [own.get(name, []) for name in names]
+                   for method, own in methods.items()})
             for title, methods in boards.items()]

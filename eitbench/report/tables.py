@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 import re
-import shutil
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
@@ -305,11 +304,6 @@ def explanations(tables: Iterable[Table]) -> dict[str, str]:
 
 
 # -- text ------------------------------------------------------------------------------------------
-
-
-def terminal_width() -> int:
-    """Return the columns of the terminal; 80 without one."""
-    return shutil.get_terminal_size().columns
 
 
 def terminal_tables(boards: Sequence[Board], characters: int) -> str:

@@ -1,10 +1,11 @@
 """Loading baselines: what a file must hold, and what is said of those that do not."""
 
 import json
+import os
 import re
 
 import pytest
-from eitbench.bench.methods import is_ours, load_method, own_methods
+from eitbench.bench.methods import MOST_BYTES, is_ours, load_method, own_methods
 
 from tiny import strict
 
@@ -16,10 +17,11 @@ def test_our_baselines_load():
         baseline = load_method(name, "estimation")
         assert baseline.name == name and baseline.title and baseline.boards and len(baseline.sha256) == 64
         assert strict(json.dumps(baseline.parameters)) == baseline.parameters
-    ours = [load_method(name, "estimation") for name in own_methods("estimation")]
+    ours = [load_method(name, track) for track in ("estimation", "injection") for name in own_methods(track)]
     roles = {method.name: method.role for method in ours if method.role}
-    assert roles == {"homogeneous": "floor", "persistence": "floor", "true_model_smoother": "reference"}
-    assert [method.name for method in ours if method.privileged] == ["true_model_smoother"]
+    assert roles == {"homogeneous": "floor", "persistence": "floor", "true_model_smoother": "reference",
+                     "clairvoyant": "reference", "random_pair": "floor"}
+    assert [method.name for method in ours if method.privileged] == ["true_model_smoother", "clairvoyant"]
 
 
 @pytest.mark.parametrize(("source", "message"), [
@@ -47,8 +49,13 @@ def test_files_that_are_no_baselines(source, message, tmp_path):
     assert str(path) in str(caught.value)
 
 
-def test_unknown_baselines():
-    """A name that is none of ours: the message lists ours."""
+def test_unknown_baselines(tmp_path):
+    """A name that is none of ours: the message lists ours. A file that is too large is not read."""
+    path = tmp_path / "mine.py"
+    path.touch()
+    os.truncate(path, MOST_BYTES + 1)
+    with pytest.raises(ValueError, match="must have 256 MiB at most"):
+        load_method(str(path), "estimation")
     for name in ("kalman", "no/such/file.py", ""):
         with pytest.raises(ValueError, match=r"one of .*homogeneous.*got"):
             load_method(name, "estimation")

@@ -6,7 +6,6 @@ Those of ray and dask need the extra cluster: `pip install -c constraints.txt -e
 
 import importlib
 import importlib.util
-import warnings
 
 import pytest
 from eitbench.bench.run import Job, run_episode, run_jobs
@@ -80,20 +79,6 @@ def test_here_a_killed_worker_ends_the_run_and_nothing_is_lost(tmp_path):
     before = count(log)
     run_jobs(jobs, store, n_jobs=2)
     assert len(errors(store)) == 3 and count(log) == before + 3 - finished
-
-
-def test_loky_is_silent_when_it_renews_a_worker(recwarn):
-    """Of loky's warnings this one alone is left out, and nobody else's of the same words."""
-    def warn(words, module):
-        warnings.warn_explicit(words, UserWarning, "file.py", 1, module)
-
-    loky = "joblib.externals.loky.process_executor"
-    lost = ("A worker stopped while some jobs were given to the executor. This can be caused by a too short worker "
-            "timeout or by a memory leak.")
-    assert list(in_parallel(abs, [(-1,)], 1)) == [1]
-    for words, module in ((lost, loky), ("something else", loky), (lost, "mine")):
-        warn(words, module)
-    assert [str(each.message) for each in recwarn] == ["something else", lost]
 
 
 def test_backends_that_cannot_be_had(monkeypatch):

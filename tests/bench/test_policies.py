@@ -195,15 +195,6 @@ def test_scores_are_those_of_the_exact_filter():
     assert played.errors.tolist() == errors
 
 
-def test_only_the_clairvoyant_is_privileged():
-    """All others play from observations."""
-    ours = {name: load_method(name, "injection") for name in own_methods("injection")}
-    assert [name for name, method in ours.items() if method.privileged] == ["clairvoyant"]
-    assert {name: method.role for name, method in ours.items() if method.role} == {
-        "clairvoyant": "reference", "random_pair": "floor"}
-    assert {"random_pair", "best_pair", "schedule", "greedy_a", "event_triggered"} < set(ours)
-
-
 def jobs_of(policies: list[str], seeds: str, **kwargs) -> list[Job]:
     return [Job(Environment(NAME, json.dumps(SHORT | kwargs)), policy, seed)
             for policy in policies for seed in parse_seeds(seeds)]
@@ -238,14 +229,6 @@ def test_played_episodes_are_kept(tmp_path, monkeypatch):
     assert [json.loads(asked.kwargs).get("estimator") for asked, *_ in again] == ["reduced", None]
 
 
-def test_copies_under_two_names_keep_their_rows(tmp_path):
-    """The same text under another name is another policy."""
-    copies = [write_policy(tmp_path, "def act(self, observation): return 3", name) for name in ("one", "two")]
-    todo, store = jobs_of(copies, "dev:0", estimator="reduced"), EpisodeStore(tmp_path / "results")
-    run_jobs(todo, store)
-    assert list(policy_rows(todo, store.results())["policy"]) == ["one", "two"]
-
-
 def test_a_mistake_is_the_result_of_its_policy(tmp_path):
     """An episode that fails is recorded with its reason, and has no row; the privileged and the floor are marked."""
     store = EpisodeStore(tmp_path)
@@ -272,22 +255,10 @@ def test_errors_of_policies_are_ordered_and_pool_trainings():
 # -- mistakes ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("body", "message"), [
-    ("x = 1", r"mine\.py: Policy must have a method act\(observation\)"),
-    ("privileged = 1\n    def act(self, observation): ...", "Policy.privileged must be True or False, got 1"),
-    ("parameters = {'a': {1}}\n    def act(self, observation): ...", "Policy.parameters must be a dict fit for JSON"),
-    ("role = 'best'\n    def act(self, observation): ...", "Policy.role must be None, .*, got 'best'"),
-    ("parameters = 3\n    def act(self, observation): ...", "Policy.parameters must be a dict fit for JSON"),
-    ("1 / 0", r"mine\.py cannot be loaded: ZeroDivisionError"),
-])
-def test_wrong_files_are_named(tmp_path, body, message):
-    """What came and what was expected."""
-    with pytest.raises(ValueError, match=message):
-        load_method(write_policy(tmp_path, body), "injection")
-
-
 def test_wrong_names_are_named(tmp_path):
-    """Of policies, environments and estimators."""
+    """Of policies, environments and estimators; and a file without a policy."""
+    with pytest.raises(ValueError, match=r"mine\.py: Policy must have a method act\(observation\)"):
+        load_method(write_policy(tmp_path, "x = 1"), "injection")
     with pytest.raises(ValueError, match=r"policy must be the path of .*, or one of adjacent, .*; got 'lucky'"):
         load_method("lucky", "injection")
     with pytest.raises(ValueError, match="has the name of one of ours"):

@@ -8,19 +8,14 @@ import pytest
 from eitbench import scoring
 from eitbench.bench import playing
 from eitbench.bench.methods import load_method
-from eitbench.bench.scores import Outcome, scored, scores
-from eitbench.bench.tracks import TRACKS, Environment
+from eitbench.bench.scores import Outcome, scored
+from eitbench.bench.tracks import Environment
 from eitbench.bench.verify import differences_of
 from eitbench.data.recordings import mass_between
 from eitbench.numerics.fem import mass_matrix
-from eitbench.report.boards import run_boards
-from eitbench.report.site import collect, render
-from eitbench.report.tables import run_table
 from eitbench.worlds import entry
 
 from choosing import BUDGET, FAULTS, FLOW, NAME, make, world
-from tables import said
-from tiny import record
 
 SEED = 5
 CLAIMS = ("nis", "crps", "coverage_50", "coverage_90", "spread_ratio")
@@ -74,12 +69,6 @@ def test_claims_are_those_of_the_filter_inside(name):
     assert 0.0 < said["crps"] < env.world.expected_concentration
 
 
-def test_the_same_scores_on_both_tracks():
-    """Whatever is claimed is scored, whoever claims it."""
-    both = [name for name, score in scores().items() if set(TRACKS) <= set(score.tracks)]
-    assert both == ["error", *CLAIMS, "seconds_per_step"]
-
-
 def test_only_used_readings_count():
     """Two readings and then one: (4/1 + 4/4)/2 = 2.5 and 9/1 = 9 have a mean of 5.75."""
     innovations = ([np.array([2.0, 2.0]), np.array([3.0])], [np.diag([1.0, 4.0]), np.eye(1)])
@@ -112,30 +101,3 @@ def test_a_record_from_before_is_the_same():
     wrong = now | {"scores": now["scores"] | {"nis": 1.3}}
     assert differences_of(wrong, now)["nis"] == pytest.approx(0.1 / 1.3)
     assert differences_of(now, said)["nis"] == np.inf
-
-
-def injection(method: str, factor: float, **changes) -> dict:
-    errors = [factor * error for error in (0.2, 0.24, 0.22)]
-    return record(method, errors, board="injection", **changes)
-
-
-def rows_of(text: str, beginning: str) -> list[list[str]]:
-    """Cells of the lines of Markdown that have this in them."""
-    lines = [line for line in text.splitlines() if beginning in line]
-    return [[cell.strip() for cell in line.split("|")] for line in lines]
-
-
-def test_boards_show_it_where_it_is_known():
-    """A board of old records has no column of it; beside a new one the old ones have a dash."""
-    old = [injection("random_pair", 1.0, role="floor", scores={"spent": 40}),
-           injection("opposite", 0.9, scores={"spent": 40})]
-    new = injection("greedy_a", 0.5, scores={"spent": 40, "nis": 1.2, "crps": 0.44})
-    (heading,) = rows_of(render(collect(old))["leaderboard.md"], "rank |")
-    assert "NIS/m" not in heading and "CRPS" not in heading
-    text = render(collect([*old, new]))["leaderboard.md"]
-    (heading,) = rows_of(text, "rank |")
-    place = heading.index("NIS/m")
-    assert rows_of(text, " greedy_a@")[0][place] == "1.2"
-    assert rows_of(text, " opposite@")[0][place] == "–"
-    shown = said(run_table(run_boards([*old, new])[0]))
-    assert sorted(shown["CRPS"]) == ["0.44", "–", "–"]

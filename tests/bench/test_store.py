@@ -1,6 +1,5 @@
 """Results on disk: whole or not at all, nobody's lost, and records that say all that is needed to repeat them."""
 
-import json
 import math
 import platform
 import re
@@ -14,12 +13,11 @@ import pytest
 from eitbench.bench import store as store_module
 from eitbench.bench.run import Job, run_jobs
 from eitbench.bench.scores import SCORING
-from eitbench.bench.store import EpisodeStore, machine, portable_command, provenance, results_of
-from eitbench.bench.tracks import Environment
+from eitbench.bench.store import EpisodeStore, machine, portable_command, results_of
 from eitbench.data.cache import CACHE_VARIABLE
 from eitbench.data.seeds import name_seed
 
-from tiny import FILTER, FIXED_LAG, RUN, SCENARIO, git_says, sha, write_baseline
+from tiny import FILTER, RUN, SCENARIO, git_says, sha, write_baseline
 
 ENV, COMMAND = "eitbench/Pipe2D-v0", "eitbench run --seeds train:1-2"
 
@@ -221,17 +219,6 @@ def test_stale_results_are_not_mixed_in(what, store):
     assert [record["seeds"] for record in store.write_records()] == [["train:1", "train:2"]]
 
 
-def test_arguments_of_an_environment_make_other_records(store, tmp_path):
-    """The same id with other keyword arguments is another world: neither results nor records overwrite each other."""
-    path = write_baseline(tmp_path)
-    wider = Environment(FILTER.id, json.dumps({"world": SCENARIO | {"instrument": {"noise_relative": 0.02}}}))
-    run_jobs([Job(environment, path, 1) for environment in (FILTER, wider, FIXED_LAG)], store)
-    records = store.write_records()
-    noise = [record["environment"]["kwargs"]["world"].get("instrument", {}).get("noise_relative") for record in records]
-    assert sorted(noise, key=str) == [0.02, None, None]
-    assert len(list((store.folder / "records").iterdir())) == 3
-
-
 def test_a_record_names_the_machine_that_played(store, tmp_path, monkeypatch):
     """Not the one that started the run: the processes of a cluster may be elsewhere. Those of one machine
     say the same."""
@@ -256,14 +243,6 @@ def test_a_record_names_the_machine_that_played(store, tmp_path, monkeypatch):
 def test_a_command_names_no_folder_of_the_machine(typed, kept):
     """Output folders go; of other paths that are absolute or lead upwards the name stays."""
     assert shlex.split(portable_command(typed)) == shlex.split(kept)
-
-
-def test_provenance_without_git(monkeypatch):
-    """Outside a repository there is no commit to name, and that is no error."""
-    monkeypatch.undo()
-    monkeypatch.setenv("PATH", "")
-    provenance.cache_clear()
-    assert (provenance()["commit"], provenance()["dirty"]) == (None, None)
 
 
 def test_other_results_fill_what_is_missing_or_failed(store):

@@ -64,15 +64,6 @@ def test_failures_are_submitted_too(tmp_path):
     assert load(tmp_path / "to")["value"].isna().all() and len(load(tmp_path / "to")) == 2
 
 
-def test_policies_are_submitted_alike(tmp_path):
-    """The very same format."""
-    (path,) = submit("random_pair", [INJECTION], TEST[:1], EpisodeStore(tmp_path), tmp_path / "to", policy=True)
-    record = read_record(path)
-    assert (record["board"], record["role"], record["seeds"]) == ("injection", "floor", ["test:0"])
-    assert record["environment"]["kwargs"] == {} and record["version"] == "v1"
-    assert record["episodes"][0]["scores"]["spent"] > 0
-
-
 def test_policies_by_command(tmp_path):
     """`policies` prints scores and resumes; what it played stands in the table and on the page of `leaderboard`."""
     command = ("run", "--env", INJECTION, "--policy", "adjacent", "--policy", "random_pair", "--policy",
@@ -231,16 +222,3 @@ def test_from_a_file_to_the_boards_by_command(tmp_path):
     record.write_text(record.read_text().replace('"official": false', '"official": true'))
     code, _, complaint = eitbench("leaderboard", "--records", "leaderboards/results")
     assert code == 1 and "was changed since it was written" in complaint
-
-
-@pytest.mark.parametrize(("arguments", "message"), [
-    (["submit", "--env", FILTER.id, "--baseline", "homogeneous", "--policy", "adjacent"], "may be given, got both"),
-    (["submit", "--env", INJECTION, "--baseline", "homogeneous"], "does not ask for estimates"),
-    (["compare", "mine", "yours"], "there is no record of mine in"),
-    (["compare", "mine.json", "yours"], "record mine.json cannot be read"),
-])
-def test_mistakes_are_explained(arguments, message, tmp_path):
-    """Exit code 2 and a sentence; nothing is written."""
-    code, said, complaint = eitbench(*arguments)
-    assert code == 2 and said == "" and message in complaint
-    assert not list(tmp_path.iterdir())

@@ -2,7 +2,6 @@
 
 import json
 import re
-import runpy
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -76,17 +75,6 @@ def test_ten_lines_of_ones_own_get_a_table_and_a_page(tmp_path):
     record = json.loads(path.read_text(encoding="utf-8"))
     assert record["seeds"] == ["dev:0", "dev:1"] and record["environment"]["id"] == PIPE
     assert all(episode["status"] == "ok" for episode in record["episodes"])
-
-
-def test_same_command_resumes(tmp_path):
-    """The second time nothing is played; one seed more is one episode more."""
-    assert run_mine()[0] == 0
-    before = sorted(path.stat().st_mtime_ns for path in (tmp_path / "results" / "episodes").rglob("*.json"))
-    _, said, complaint = run_mine()
-    assert "2 of 2 episodes are already there" in said + complaint
-    run_mine("--seeds", "dev:0-2")
-    after = sorted(path.stat().st_mtime_ns for path in (tmp_path / "results" / "episodes").rglob("*.json"))
-    assert len(before) == 2 and len(after) == 3 and after[:2] == before
 
 
 def test_leaderboard_writes_the_same_again(tmp_path):
@@ -165,15 +153,6 @@ def test_every_option_has_a_help():
 def test_version():
     """That of the installed package."""
     assert eitbench("--version")[:2] == (0, f"eitbench {__version__}\n")
-
-
-def test_module_can_be_run(monkeypatch, capsys):
-    """`python -m eitbench.cli --help` is the same program."""
-    monkeypatch.setattr(sys, "argv", ["eitbench", "--help"])
-    monkeypatch.delitem(sys.modules, "eitbench.cli")
-    with pytest.raises(SystemExit) as done:
-        runpy.run_module("eitbench.cli", run_name="__main__")
-    assert done.value.code == 0 and "leaderboard" in capsys.readouterr().out
 
 
 def test_documented_commands_are_commands():

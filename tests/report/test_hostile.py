@@ -58,7 +58,8 @@ def test_text_stays_text(text, tmp_path):
     assert not re.search(r"(?<!\\)<(script|b|img)\b|(?<!\\)\]\(http://x", markdown)
     for block in re.findall(r"(?:^\|.*\n)+", markdown, flags=re.MULTILINE):
         assert len({len(re.findall(r"(?<!\\)\|", line)) for line in block.splitlines()}) == 1
-    assert ",=1+1," not in texts["leaderboard.csv"]
+    if text == "=1+1":                                        # a spreadsheet would compute it
+        assert ",'=1+1," in texts["leaderboard.csv"]
 
 
 def leaderboard(folder):

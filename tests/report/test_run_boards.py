@@ -99,6 +99,9 @@ def test_skill_needs_its_anchors():
         assert row([*others, mine], "mine", "filter")["skill"] is None
     elsewhere = made("mine", "filter", FLOOR, kwargs={"world": {"schedule": {"scored_steps": 16}}})
     assert row([*ANCHORS, elsewhere], "mine", "filter")["skill"] is None
+    theirs = [anchor | {"version": "1" * 8} for anchor in ANCHORS]             # third-party files of these names
+    assert row([*theirs, mine], "mine", "filter")["skill"] is None
+    assert row([*theirs, mine], "mine", "filter")["gain"] is None
     # an assumed velocity leaves the world, and so its anchors, as they are
     wrong = made("mine", "filter", FLOOR, kwargs={"assume": {"mean_velocity": 7.0}})
     assert row([*ANCHORS, wrong], "mine", "filter")["skill"] == pytest.approx(0.0)
