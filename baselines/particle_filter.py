@@ -1,6 +1,5 @@
 """Rao–Blackwellised particle filter for rare slugs: a particle is a sequence of regimes, quiet or
-slug, with an extended Kalman filter of the inflow's logarithm; switching_inflow_filter mixes the
-two regimes at each step instead.
+slug, with an extended Kalman filter; switching_inflow_filter mixes both at each step instead.
 """
 
 from pathlib import Path
@@ -22,13 +21,11 @@ LEVEL_STD = 0.05
 PARTICLES = 8
 """Branching at each step, so that twice as many filters run."""
 SEED = 0
-"""Every episode is filtered with the same random numbers."""
 
 
 class Estimator:
     boards = ("filter",)
-    parameters = {  # noqa: RUF012 (as a record has it)
-        "level_std": LEVEL_STD, "particles": PARTICLES, "seed": SEED}
+    parameters = {"level_std": LEVEL_STD, "particles": PARTICLES, "seed": SEED}  # noqa: RUF012
 
     def __init__(self, task: Task) -> None:
         prior = suiting_priors(PRIORS, task, LINK)[0]

@@ -1,7 +1,5 @@
 """Unscented Kalman filter of the inflow's logarithm: as log_inflow_filter, but the complete
-electrode model is evaluated at sigma points instead of differentiated.
-
-The sigma points lie on the leading principal axes of the predicted concentration.
+electrode model is evaluated at sigma points, along the principal axes of the concentration.
 """
 
 from pathlib import Path

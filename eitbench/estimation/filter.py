@@ -31,8 +31,7 @@ class StateSpace:
         raise NotImplementedError
 
     def concentration(self, mean: np.ndarray, lag: int = 0) -> np.ndarray:
-        """Return the concentrations (..., n) in mol/m³ of states (..., k), ``lag`` steps before
-        the present."""
+        """Return the concentration (..., n) in mol/m³ of states (..., k), ``lag`` steps ago."""
         return mean
 
     def jacobian(self, mean: np.ndarray, matrix: np.ndarray) -> np.ndarray:

@@ -101,8 +101,7 @@ class InflowWindow(StateSpace):
         return self.level * (1.0 + self.coordinates(mean, lag) @ self.response(lag).basis.T)
 
     def coordinates(self, mean: np.ndarray, lag: int = 0) -> np.ndarray:
-        """Return the deviations (..., q) from the level in the response's basis, relative to it,
-        of states (..., W·r)."""
+        """Return the deviations (..., q) from the level in the response's basis, relative to it."""
         deviation = self.prior.inflow(self._recent(mean, lag) @ self.prior.modes.T) - 1.0
         weights = self.response(lag).weights
         return deviation.reshape(*mean.shape[:-1], -1) @ weights.reshape(len(weights), -1).T

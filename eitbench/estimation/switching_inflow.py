@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import replace
+from itertools import cycle
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -133,10 +134,9 @@ class SwitchingInflowFilter:
 class ParticleInflowFilter(SwitchingInflowFilter):
     """Rao–Blackwellised particle filter of the same two regimes: a particle is a sequence of them.
 
-    Given its sequence, each particle has a Kalman filter of the inflow, which linearises each
-    measurement about its own prediction. Every particle branches into both regimes; before that,
-    the branches are resampled without duplicates (`resample`). As long as there are at most
-    ``particles`` sequences, the result is exact but for the linearisation.
+    Each particle has a Kalman filter, linearised about its own prediction, and branches into both
+    regimes; before that they are resampled. With at most ``particles`` sequences the result is
+    exact but for the linearisation.
 
     Parameters
     ----------
@@ -144,28 +144,22 @@ class ParticleInflowFilter(SwitchingInflowFilter):
         As in `SwitchingInflowFilter`.
     particles : int
         Number N ≥ 1 of branching particles; 2 N filters run.
-    random : Generator
     """
 
     def __init__(self, task: Task, prior: InflowPrior, level: float, level_std: float,
                  forward: Forward, particles: int, random: np.random.Generator) -> None:
         super().__init__(task, prior, level, level_std, forward)
         self.particles = _check.integer("particles", particles, low=1)
-        self.regimes = np.arange(2)
-        """(2 N,) present regime of each particle: 0 quiet, 1 slug"""
         self._spaces = [each.space for each in self.filters]
         self._random = random
 
     def predict(self) -> None:
         """Advance one time step: each particle branches into both regimes."""
         kept, weights = resample(self.probabilities, self.particles, self._random)
-        before = self.regimes[kept]
-        self.probabilities = (weights[:, None] * self._transitions[before]).ravel()
-        self.regimes = np.tile(np.arange(2), len(kept))
-        parents = np.array(self.filters, dtype=object)[np.repeat(kept, 2)]
-        self.filters = [copy(each) for each in parents]
-        for each, regime in zip(self.filters, self.regimes, strict=True):
-            each.space = self._spaces[regime]
+        self.probabilities = (weights[:, None] * self._transitions[kept % 2]).ravel()
+        self.filters = [copy(self.filters[k]) for k in kept for _ in range(2)]
+        for each, space in zip(self.filters, cycle(self._spaces)):  # in quiet, in a slug, in turn
+            each.space = space
             each.covariance = copy(each.covariance)  # a step of the window writes a new array
             each.predict()
 
@@ -178,10 +172,10 @@ class ParticleInflowFilter(SwitchingInflowFilter):
     def estimate(self, lag: int = 0) -> Estimate:
         """Return mean and variance of the particles with more than `NEGLIGIBLE` of the largest
         probability, with the last innovation."""
-        kept = np.flatnonzero(self.probabilities > NEGLIGIBLE * self.probabilities.max())
-        likely = copy(self)
+        p, likely = self.probabilities, copy(self)
+        kept = np.flatnonzero(p > NEGLIGIBLE * p.max())
         likely.filters = [self.filters[k] for k in kept]
-        likely.probabilities = self.probabilities[kept] / self.probabilities[kept].sum()
+        likely.probabilities = p[kept] / p[kept].sum()
         return super(ParticleInflowFilter, likely).estimate(lag)
 
 
@@ -195,16 +189,14 @@ def resample(probabilities: np.ndarray, count: int,
     if len(probabilities) <= count:
         return np.arange(len(probabilities)), probabilities
     order = np.argsort(-probabilities)
-    sorted_ = probabilities[order]
-    rest = sorted_[::-1].cumsum()[::-1][:count]              # of each particle and those after it
+    w = probabilities[order]
     draws = count - np.arange(count)
-    first = int(np.argmax(sorted_[:count] * draws <= rest))
-    draws, threshold = draws[first], rest[first] / draws[first]
-    places = threshold * (random.uniform() + np.arange(draws))
-    drawn = np.searchsorted(sorted_[first:].cumsum(), places)
-    kept = np.concatenate([np.arange(first), first + np.minimum(drawn, len(order) - first - 1)])
-    weights = np.concatenate([sorted_[:first], np.full(draws, threshold)])
-    return order[kept], weights
+    threshold = w[::-1].cumsum()[::-1][:count] / draws
+    first = int(np.argmax(w[:count] <= threshold))
+    places = threshold[first] * (random.uniform() + np.arange(draws[first]))
+    drawn = np.minimum(np.searchsorted(w[first:].cumsum(), places), len(w) - first - 1)
+    weights = np.where(np.arange(count) < first, w[:count], threshold[first])
+    return order[np.concatenate([np.arange(first), first + drawn])], weights
 
 
 def _log_density(step: Step) -> float:

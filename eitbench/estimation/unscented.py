@@ -16,18 +16,15 @@ if TYPE_CHECKING:
 
 SPREAD = 3.0**0.5
 """Standard deviations between the mean and a sigma point: Gauss–Hermite's, for a Gaussian."""
-NEGLIGIBLE = 1e-12
-"""Axes with less than this fraction of the largest variance carry no sigma points."""
 
 
 class UnscentedFilter(Filter):
     """Kalman filter that takes moments of voltages and concentration from sigma points.
 
     The points lie on the principal axes of the predicted concentration, `SPREAD` standard
-    deviations from its mean on both sides. Second differences along an axis raise the mean and the
-    covariance, as in central-difference filters (Nørgaard, Poulsen & Ravn, Automatica 36, 2000),
-    whose covariances have no negative eigenvalue in any number of dimensions; elsewhere they are
-    the unscented transform (Julier & Uhlmann 1997) with κ = 3 − k.
+    deviations from its mean on both sides. Means are those of the unscented transform (Julier &
+    Uhlmann 1997) with κ = 3 − k, covariances those of central differences, which have no negative
+    eigenvalue (Nørgaard, Poulsen & Ravn, Automatica 36, 2000).
 
     Parameters
     ----------
@@ -35,12 +32,10 @@ class UnscentedFilter(Filter):
         Its `concentration` accepts several states at once.
     resistance : callable
         Concentrations (N, n) in mol/m³ -> transfer resistances (N, L, L) in Ω (Ω·m in 2D).
-    noise : VoltageNoise
     basis : (n, q)
         Orthonormal columns that contain the deviations of the concentration.
     axes : int
-        Largest number k of principal axes within the basis; the others count as certain for the
-        voltages. One measurement needs 2 k + 1 forward solutions.
+        Largest number k of principal axes; the others count as certain for the voltages.
     """
 
     def __init__(self, space: StateSpace, resistance: Callable[[np.ndarray], np.ndarray],
@@ -57,7 +52,7 @@ class UnscentedFilter(Filter):
         J = self.space.jacobian(self.mean, self.basis.T)
         cross = self.covariance.times(J.T)
         variances, axes = np.linalg.eigh(J @ cross[:J.shape[1]])
-        keep = variances[-self.axes:] > NEGLIGIBLE * variances[-1]
+        keep = variances[-self.axes:] > 1e-12 * variances[-1]             # the others are certain
         scaled = axes[:, -self.axes:][:, keep] / np.sqrt(variances[-self.axes:][keep])
         offsets = SPREAD * (cross @ scaled).T
         states = self.mean + np.concatenate([np.zeros((1, len(self.mean))), offsets, -offsets])

@@ -172,7 +172,7 @@ def test_particles_that_cover_all_sequences_are_exact():
     ours = particles(0.1, 0.2)
     filtered(ours, measured)
     assert len(ours.filters) == 16 and 0.01 < slug < 0.99
-    np.testing.assert_allclose(ours.probabilities @ ours.regimes, slug, rtol=1e-9)
+    np.testing.assert_allclose(ours.probabilities[1::2].sum(), slug, rtol=1e-9)
     exact = SwitchingInflowFilter.estimate(ours)
     np.testing.assert_allclose(exact.mean, mean, rtol=1e-9)
     np.testing.assert_allclose(exact.variance, variance, rtol=1e-9)
