@@ -35,6 +35,8 @@ from eitbench.estimation import (
     smoothed_means,
 )
 from eitbench.estimation.inflow_response import newest_inflow
+from eitbench.estimation.reduced import reduced_model
+from eitbench.numerics.fem import mass_matrix
 from eitbench.worlds.catalogue import PIPE_2D
 from eitbench.worlds.registry import entry
 from eitbench.worlds.task import make_task
@@ -42,7 +44,7 @@ from eitbench.worlds.task import make_task
 CELLS = ((19, 4), (44, 10), (80, 20))
 """along and across the pipe: 100, 495 and 1,701 nodes"""
 FINE = ((80, 20), (160, 40), (320, 80))
-MODES, READINGS, MEMORY, SMOOTHED = (3, 6, 9, 18), (8, 16, 32, 64), 62, 320
+MODES, READINGS, MEMORY, SMOOTHED, REDUCED = (3, 6, 9, 18), (8, 16, 32, 64), 62, 320, 120
 GOALS = (("Pipe2D", "real_time_filter", "≤ 0.004 s"), ("Pipe3D", "fast_inflow_filter", "≤ 0.015 s"))
 NODAL, WINDOW = "filter step, Π − ZZᵀ", "filter step, inflow window"
 
@@ -254,10 +256,19 @@ def goals() -> Iterator[Row]:
             estimator.update(*each)
             times.append(time.perf_counter() - begin)
         yield row(f"{method}, a step on {name}", min(times[task.n_steps // 2:]), target=target)
-    for cells in (CELLS[0], CELLS[-1]):
-        record = problem(cells, SMOOTHED)
-        for name, smooth in (("means", smoothed_means), ("variances", fixed_interval_smoother)):
-            begin = time.perf_counter()
-            smooth(copy.copy(record.start), record.observations)
-            yield row(f"smoothing {SMOOTHED} steps, {name}, n = {record.n}",
-                      time.perf_counter() - begin, target="≤ 1 s")
+    record = problem(CELLS[-1], SMOOTHED)
+    mass = mass_matrix(pipe_model(CELLS[-1]).transport.mesh).toarray()
+    basis, A, Q, P = reduced_model(copy.copy(record.start), mass, record.observations[:WARM_UP],
+                                   REDUCED)
+    few = Filter(NodalStates(np.zeros(REDUCED), DenseCovariance(P), Motion(A, 0.0, Q)))
+    level = record.start.mean.copy()
+    projected = [seen._replace(matrix=seen.matrix @ basis, value=seen.value - seen.matrix @ level)
+                 for seen in record.observations]
+    for what, smooth, start, seen in (
+            (f"means, {REDUCED} reduced coordinates", smoothed_means, few, projected),
+            ("means, n = 1701", smoothed_means, record.start, record.observations),
+            ("variances, n = 1701", fixed_interval_smoother, record.start, record.observations)):
+        begin = time.perf_counter()
+        smooth(copy.copy(start), seen)
+        yield row(f"smoothing {SMOOTHED} steps, {what}", time.perf_counter() - begin,
+                  target="≤ 1 s")
