@@ -1,258 +1,274 @@
-"""Speed of the Kalman filter and smoother: `python benchmarks/run.py filtering`.
+"""Speed of filters and smoothers: `python benchmarks/run.py filtering`.
 
-The pipe of `Pipe2D` on three meshes, the injections taking turns. All candidates begin with the
-same mean and covariance after 60 steps, when the rank of what our filter knows has settled, and see
-the same record. Peers without an input term are given deviations from the homogeneous estimate,
-which the flow leaves as it is.
+First ours and peers on the same matrices: the pipe of `Pipe2D` on three meshes, from the same mean
+and covariance after 60 steps, when the rank of Z has settled, in deviations from the homogeneous
+estimate. Then the cost against nodes, inflow modes and readings, without the forward solution.
 """
 
 from __future__ import annotations
 
 import copy
 import time
-from collections.abc import Iterator
-from contextlib import suppress
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from itertools import cycle, islice
+from typing import NamedTuple
 
 import numpy as np
-from common import Row, compare, in_fresh_process, of_flops, peak_growth, peer, quantity
-from pipe_record import CELLS, RECORD, STEPS, WARM_UP, Problem, problem, same, textbook
+from common import Row, compare, of_flops, peer
+from pipe_record import STEPS, WARM_UP, pipe_model, problem, same
 
-from eitbench.estimation import Filter, Observation, fixed_interval_smoother, kalman_filter
-from eitbench.estimation.smoother import _backwards
+from eitbench.bench.methods import load_method
+from eitbench.estimation import (
+    DenseCovariance,
+    Filter,
+    InflowPrior,
+    InflowWindow,
+    LowRankCovariance,
+    Motion,
+    NodalStates,
+    Observation,
+    OpenLoopCovariance,
+    Response,
+    fixed_interval_smoother,
+    kalman_filter,
+    smoothed_means,
+)
+from eitbench.estimation.inflow_response import newest_inflow
+from eitbench.estimation.reduced import reduced_model
+from eitbench.numerics.fem import mass_matrix
+from eitbench.worlds.catalogue import PIPE_2D
+from eitbench.worlds.registry import entry
+from eitbench.worlds.task import make_task
+
+CELLS = ((19, 4), (44, 10), (80, 20))
+"""along and across the pipe: 100, 495 and 1,701 nodes"""
+FINE = ((80, 20), (160, 40), (320, 80))
+MODES, READINGS, MEMORY, SMOOTHED, REDUCED = (3, 6, 9, 18), (8, 16, 32, 64), 62, 320, 120
+GOALS = (("Pipe2D", "real_time_filter", "≤ 0.004 s"), ("Pipe3D", "fast_inflow_filter", "≤ 0.015 s"))
+NODAL, WINDOW = "filter step, Π − ZZᵀ", "filter step, inflow window"
 
 
-@dataclass
-class Settled:
-    """The problem after `WARM_UP` steps, with `STEPS` more to come."""
+class Model(NamedTuple):
+    """x⁺ = F x + w from N(mean, P), and a record: H (T, m, n), values (T, m) and their std."""
 
-    problem: Problem
-    ours: Filter
+    F: np.ndarray
+    Q: np.ndarray
     mean: np.ndarray
-    covariance: np.ndarray
-    """(n, n), of the textbook recursion"""
-    observations: list[Observation]
+    P: np.ndarray
+    H: np.ndarray
+    values: np.ndarray
+    std: np.ndarray
 
-    @property
-    def rounds(self) -> int:
-        """How often a peer is run: once where a run takes many seconds."""
-        return 1 if self.problem.n > 1500 else 3
+
+Run = Callable[[], np.ndarray]
+"""Returns the filtered means (T, n)."""
+
+
+def row(what: str, ours: float, against: str = "–", theirs: float | None = None, *,
+        target: str = "", limit: str = "", ceiling: str = "") -> Row:
+    return Row("filtering", what, against, ours, theirs, target, limit, ceiling)
 
 
 def rows() -> Iterator[Row]:
     for cells in CELLS:
-        settled = settle(problem(cells))
-        yield against_textbook(settled)
-        yield from against_filterpy(settled)
-        yield from against_dynamax(settled)
-    yield memory(CELLS[0], measured=True)
-    yield memory(CELLS[-1], measured=False)
+        yield from against_peers(cells)
+    yield from growth()
+    yield from goals()
 
 
-# -- the problem -----------------------------------------------------------------------------------
+# -- peers -----------------------------------------------------------------------------------------
 
 
-def settle(problem: Problem) -> Settled:
-    """Ours and the textbook's recursion from t = 0 on; they have to agree."""
-    ours = copy.copy(problem.start)
-    kalman_filter(ours, problem.observations[:WARM_UP])
-    n = problem.n
-    mean, P = problem.start.mean, problem.start.covariance.times(np.eye(n))
-    for observation in problem.observations[:WARM_UP]:
-        mean, P = textbook(problem, mean, P, observation)
-    same(ours.mean, mean)
-    return Settled(problem, ours, mean, P, problem.observations[WARM_UP:])
+def against_peers(cells: tuple[int, int]) -> Iterator[Row]:
+    """Yield a step in both forms of the covariance against each peer's; all means must agree."""
+    settled = problem(cells)
+    level, F = settled.start.mean.copy(), settled.motion.transition
+    kalman_filter(settled.start, settled.observations[:WARM_UP])
+    mean, covariance = settled.start.mean - level, settled.start.covariance
+    record = [seen._replace(value=seen.value - seen.matrix @ level)
+              for seen in settled.observations[WARM_UP:]]
+    H, values, variances = (np.stack(part) for part in list(zip(*record, strict=True))[:3])
+    model = Model(F, settled.noise, mean, covariance.array, H, values, np.sqrt(variances))
+    n, rank = covariance.assimilated.shape
+
+    def ours(covariance, noise=None) -> np.ndarray:
+        start = Filter(NodalStates(mean, covariance, Motion(F, 0.0, noise)))
+        return np.array([step.mean for step in kalman_filter(start, record)])
+
+    forms = {"Π − ZZᵀ": (lambda: ours(covariance), 2.0 * n**2 * (rank + 16) + 4.0 * n * rank**2),
+             "dense": (lambda: ours(DenseCovariance(model.P), model.Q), 4.0 * n**3)}
+    expected = ours(covariance)
+    for name, function in (("numpy", textbook), ("filterpy", filterpy), ("dynamax", dynamax),
+                           ("cuthbert", cuthbert)):
+        runs = {form: run for form, (run, _) in forms.items()}
+        try:
+            runs["theirs"] = function(model)
+            same(runs["theirs"](), expected, 1e-6)                     # compiles and warms up, too
+        except ImportError:
+            runs.pop("theirs", None)
+        seconds = compare(runs, 1 if n > 1500 else 5, warm_up=n < 1500)
+        for form, (_, flops) in forms.items():
+            step = seconds[form] / STEPS
+            yield row(f"filter step, n = {n}, 16 readings, {form}", step, peer(name),
+                      seconds["theirs"] / STEPS if "theirs" in seconds else None,
+                      limit="flops", ceiling=of_flops(flops, step))
 
 
-# -- rows ------------------------------------------------------------------------------------------
+def textbook(model: Model) -> Run:
+    """F P Fᵀ + Q, S, K, P − K (H P)."""
+    def run() -> np.ndarray:
+        mean, P, means = model.mean, model.P, []
+        for H, value, std in zip(model.H, model.values, model.std, strict=True):
+            mean, P = model.F @ mean, model.F @ P @ model.F.T + model.Q
+            K = np.linalg.solve(H @ P @ H.T + np.diag(std**2), H @ P).T
+            mean, P = mean + K @ (value - H @ mean), P - K @ (H @ P)
+            means.append(mean)
+        return np.array(means)
+    return run
 
 
-def step_flops(n: int, rank: int, m: int = 16) -> float:
-    """F Z, Π Hᵀ, and the compression of Z: its Gram matrix and the product with the directions
-    kept."""
-    return 2.0 * n**2 * (rank + m) + 4.0 * n * (rank + m)**2
+def filterpy(model: Model) -> Run:
+    from filterpy.kalman import KalmanFilter
+    them = KalmanFilter(dim_x=len(model.F), dim_z=16)
+    them.F, them.Q = model.F, model.Q
+
+    def run() -> np.ndarray:
+        them.x, them.P, means = model.mean[:, None], model.P.copy(), []
+        for H, value, std in zip(model.H, model.values, model.std, strict=True):
+            them.predict()
+            them.update(value[:, None], R=np.diag(std**2), H=H)
+            means.append(them.x[:, 0])
+        return np.array(means)
+    return run
 
 
-def against_textbook(settled: Settled) -> Row:
-    """Means are compared once more, then both run over the same steps from the same state."""
-    problem = settled.problem
-    observations = settled.observations[:4]
-
-    def theirs() -> np.ndarray:
-        mean, P = settled.mean, settled.covariance
-        for observation in observations:
-            mean, P = textbook(problem, mean, P, observation)
-        return mean
-
-    def ours() -> np.ndarray:
-        return kalman_filter(copy.copy(settled.ours), observations)[-1].mean
-
-    same(ours(), theirs())
-    seconds = compare({"ours": ours, "theirs": theirs}, 3, warm_up=False)
-    step, reference = (s / len(observations) for s in seconds.values())
-    rank, n = settled.ours.covariance.assimilated.shape[1], problem.n
-    return Row("filtering", f"Kalman filter step, n = {n}, m = 16, varying injection, rank {rank}",
-               f"numpy {np.__version__}: F P Fᵀ + Q, S, K, P − K (H P)", step, reference,
-               "≤ 0.15" if n == 1701 else "", "flops: F Z, and the eigenvectors of ZᵀZ",
-               f"{of_flops(step_flops(n, rank), step)} (the reference "
-               f"{of_flops(4.0 * n**3, reference)})")
+def dynamax(model: Model) -> Run:
+    """Compiled. It adds 1e-9 to the diagonal of S: units in which this is small, white noise."""
+    import jax
+    jax.config.update("jax_enable_x64", True)
+    from dynamax.linear_gaussian_ssm import lgssm_filter
+    from dynamax.linear_gaussian_ssm.inference import make_lgssm_params
+    units, F = 1e-4, model.F
+    parameters, record = jax.device_put((make_lgssm_params(
+        F @ model.mean / units, (F @ model.P @ F.T + model.Q) / units**2, F, model.Q / units**2,
+        model.H * units / model.std[..., None], np.stack([np.eye(16)] * STEPS)),
+        model.values / model.std))
+    compiled = jax.jit(lgssm_filter)
+    return lambda: units * np.asarray(compiled(parameters, record).filtered_means)
 
 
-def against_filterpy(settled: Settled) -> Iterator[Row]:
-    """Its filter and its RTS smoother."""
-    theirs: dict[str, float | None] = {"filter": None, "smoother": None}
-    try:
-        runs = [filterpy(settled.problem, settled.mean, settled.covariance, settled.observations)
-                for _ in range(settled.rounds)]
-        agree(settled, *runs[0][:2])
-        theirs = {"filter": min(run[2] for run in runs) / STEPS,
-                  "smoother": min(run[3] for run in runs) / STEPS}
-    except ImportError:
-        pass
-    yield from against_peer(settled, theirs, peer("filterpy"), "KalmanFilter predict and update",
-                            "the same, and rts_smoother")
+def cuthbert(model: Model) -> Run:
+    """Compiled; its covariances are square roots."""
+    import jax
+    jax.config.update("jax_enable_x64", True)
+    import cuthbert as them
+    from cuthbert.gaussian import kalman
+
+    def root(covariance: np.ndarray) -> np.ndarray:
+        values, vectors = np.linalg.eigh(covariance)
+        return vectors * np.sqrt(np.maximum(values, 0.0))
+
+    def run(F, Q, mean, P, *record):
+        zero = jax.numpy.zeros_like
+        filter_ = kalman.build_filter(
+            mean, P, lambda inputs: (F, zero(mean), Q),
+            lambda inputs: (inputs[0], zero(inputs[1]), jax.numpy.diag(inputs[2]), inputs[1]))
+        return them.filter(filter_, record, filter_.init_prepare()).mean[1:]
+
+    arguments = jax.device_put(model._replace(Q=root(model.Q), P=root(model.P)))
+    compiled = jax.jit(run)
+    return lambda: np.asarray(compiled(*arguments))
 
 
-def filterpy(problem: Problem, mean: np.ndarray, covariance: np.ndarray,
-             observations: list[Observation]
-             ) -> tuple[np.ndarray, np.ndarray, float, float]:
-    """Filtered and smoothed means; seconds until the former and until the latter."""
-    from filterpy.kalman import KalmanFilter as Peer
-    level = problem.start.mean
-    them = Peer(dim_x=problem.n, dim_z=16)
-    them.x, them.P = (mean - level)[:, None], covariance.copy()
-    them.F, them.Q = problem.motion.transition, problem.noise
-    means, covariances = [], []
-    begin = time.perf_counter()
-    for H, value, variance, _ in observations:
-        them.predict()
-        them.update((value - H @ level)[:, None], R=np.diag(variance), H=H)
-        means.append(them.x)
-        covariances.append(them.P)
-    between = time.perf_counter()
-    filtered = np.array(means)
-    smoothed = them.rts_smoother(filtered, np.array(covariances))[0]
-    end = time.perf_counter()
-    return filtered[..., 0] + level, smoothed[..., 0] + level, between - begin, end - begin
+# -- growth ----------------------------------------------------------------------------------------
 
 
-def against_dynamax(settled: Settled) -> Iterator[Row]:
-    """Compiled for this record."""
-    theirs: dict[str, float | None] = {"filter": None, "smoother": None}
-    note = ""
-    try:
-        import jax
-        jax.config.update("jax_enable_x64", True)
-        from dynamax.linear_gaussian_ssm import lgssm_filter, lgssm_smoother
-        from dynamax.linear_gaussian_ssm.inference import make_lgssm_params
-    except ImportError:
-        pass
-    else:
-        # It adds 1e-9 to the diagonal of what it solves with: units in which this is nothing, and
-        # white noise.
-        F = settled.problem.motion.transition
-        level = settled.problem.start.mean
-        units = 1e-4
-        H, values, variances = (
-            np.stack(part) for part in list(zip(*settled.observations, strict=True))[:3])
-        std = np.sqrt(variances)
-        noise = settled.problem.noise / units**2
-        parameters = make_lgssm_params(
-            F @ (settled.mean - level) / units, F @ settled.covariance @ F.T / units**2 + noise, F,
-            noise,
-            H * units / std[..., None], np.stack([np.eye(H.shape[1])] * STEPS))
-        parameters, record = jax.device_put((parameters, (values - H @ level) / std))
-        means = {}
-        busy = 0.0
-        compiling = 0.0
-        for name, function in (("filter", lgssm_filter), ("smoother", lgssm_smoother)):
+def growth() -> Iterator[Row]:
+    """Yield the cost of a step against nodes, readings and inflow modes."""
+    for cells in FINE:
+        transport = pipe_model(cells).transport
+        n = transport.mesh.n_nodes
+        if n < 10_000:
+            filter_ = nodal(transport)
+            for m in READINGS if n < 2000 else (16,):
+                yield row(f"{NODAL}, n = {n}, {m} readings", step_seconds(filter_, n, m),
+                          limit="flops: F Z" if n < 2000 else "flops: F Z; with 26,001 nodes F and "
+                          "Π take 5.4 GB each, and computing Π three times as much")
+        for modes in MODES if n < 2000 else (9,):
+            filter_ = window(transport, modes)
+            for m in READINGS if (n < 2000 and modes == 9) else (16,):
+                yield row(f"{WINDOW}, n = {n}, {modes} modes, {m} readings",
+                          step_seconds(filter_, n, m), limit="bytes: P, moved and updated")
+
+
+def step_seconds(filter_: Filter, n: int, m: int) -> float:
+    """Seconds of the fastest of `STEPS` predictions and updates after `WARM_UP`."""
+    rng, times = np.random.default_rng(0), []
+    for _ in range(WARM_UP + STEPS):
+        seen = Observation(rng.random((m, n)) / n, 30.0 + 0.3 * rng.normal(size=m), np.full(m, 0.1))
+        begin = time.perf_counter()
+        filter_.predict()
+        filter_.update(seen)
+        times.append(time.perf_counter() - begin)
+    return min(times[WARM_UP:])
+
+
+def nodal(transport) -> Filter:
+    """Return the filter of the concentration at the nodes, from its stationary covariance."""
+    model, level = transport.evolution_model(), PIPE_2D.expected_concentration
+    noise = level**2 * model.state_noise_covariance(PIPE_2D.prior.inflow_std**2,
+                                                    PIPE_2D.prior.nodal_std**2)
+    covariance = LowRankCovariance(OpenLoopCovariance(model.F, noise), 1e-4)
+    forcing = level * model.Y.sum(axis=1)
+    return Filter(NodalStates(np.full(len(noise), level), covariance, Motion(model.F, forcing)))
+
+
+def window(transport, modes: int) -> Filter:
+    """Return the filter of the inflow's logarithm, with cosines across the inlet as modes."""
+    points = transport.mesh.points[transport.inlet]
+    across = np.arange(len(points))[:, None] / (len(points) - 1)
+    E = 0.1 * np.cos(np.pi * across * np.arange(modes))
+    parts = [newest_inflow(transport)]
+    while len(parts) < MEMORY:
+        parts.append(transport.step(parts[-1], parts[-1][transport.inlet], 0.0))
+    reach = np.concatenate([part @ E for part in parts], axis=1)
+    squares, right = np.linalg.eigh(reach.T @ reach)
+    keep = squares > 1e-6 * squares[-1]
+    basis = reach @ (right[:, keep] / np.sqrt(squares[keep]))
+    response = Response(basis, np.stack([basis.T @ part for part in parts], axis=1))
+    prior = InflowPrior("logarithm", points, E, 0.9**np.arange(6)**2, transport.time_step)
+    task = replace(make_task(PIPE_2D), transport=transport)
+    return Filter(InflowWindow(task, prior, PIPE_2D.expected_concentration, responses=[response]))
+
+
+def goals() -> Iterator[Row]:
+    """Yield steps of whole methods, forward solution included, and smoothing of a long record."""
+    for name, method, target in GOALS:
+        task = make_task(entry(f"eitbench/{name}-v0").world)
+        estimator = load_method(method, "estimation").make(task)
+        currents = list(islice(cycle(task.currents), task.n_steps))
+        voltages = task.observation.voltages(
+            np.full(task.mesh.n_nodes, task.expected_concentration), task.currents)
+        times = []
+        for each in zip(cycle(voltages), currents, strict=False):
             begin = time.perf_counter()
-            compiled = jax.jit(function).lower(parameters, record).compile()
-            compiling += time.perf_counter() - begin
-            for _ in range(settled.rounds):
-                begin, cpu = time.perf_counter(), time.process_time()
-                result = jax.block_until_ready(compiled(parameters, record))
-                wall = time.perf_counter() - begin
-                busy = max(busy, (time.process_time() - cpu) / wall)
-                theirs[name] = min(theirs[name] or np.inf, wall / STEPS)
-            means[name] = result
-        agree(settled, np.asarray(means["filter"].filtered_means) * units + level,
-              np.asarray(means["smoother"].smoothed_means) * units + level)
-        note = (f" (compiling both, {compiling:.1f} s, is not counted; at most {busy:.1f} cores "
-                "were busy)")
-    yield from against_peer(settled, theirs, f"{peer('dynamax')}, {peer('jax')}", "lgssm_filter",
-                            "lgssm_smoother", note)
-
-
-def agree(settled: Settled, filtered: np.ndarray, smoothed: np.ndarray) -> None:
-    """Their means and ours; RTS inverts predicted covariances, which costs it digits."""
-    same(np.stack([step.mean
-                   for step in kalman_filter(copy.copy(settled.ours), settled.observations)]),
-                   filtered)
-    ours = fixed_interval_smoother(copy.copy(settled.ours), settled.observations)
-    same(np.stack([state.mean for state in ours]), smoothed, 1e-8)
-
-
-def against_peer(settled: Settled, theirs: dict[str, float | None], name: str, filtering: str,
-                 smoothing: str, note: str = "") -> Iterator[Row]:
-    """Both rows of a peer, each per step of the record."""
-    works = {"filter": lambda: kalman_filter(copy.copy(settled.ours), settled.observations),
-             "smoother": lambda: fixed_interval_smoother(copy.copy(settled.ours),
-                                                         settled.observations)}
-    seconds = compare(works, 3)
-    n, rank = settled.problem.n, settled.ours.covariance.assimilated.shape[1]
-    flops = {"filter": step_flops(n, rank), "smoother": step_flops(n, rank)
-             + way_back_flops(settled)}
-    for task, words in (("filter", filtering), ("smoother", smoothing)):
-        step = seconds[task] / STEPS
-        yield Row("filtering", f"{task}, a step of a record of {STEPS}, n = {n}",
-                  f"{name}: {words}{note}", step,
-                  theirs[task], "", "flops: products of n × n by n × rank",
-                  of_flops(flops[task], step))
-
-
-def way_back_flops(settled: Settled) -> float:
-    """A step's share of Fᵀ B, of Π B − Z (Zᵀ B), and of the compression of B, whose rank grows on
-    the way."""
-    n = settled.problem.n
-    steps = kalman_filter(copy.copy(settled.ours), settled.observations)
-    ranks = [later.shape[1] for _, later in _backwards(settled.ours, steps)]
-    known = settled.ours.covariance.assimilated.shape[1]
-    return sum(4.0 * n**2 * rank + 4.0 * n * known * rank + 4.0 * n * (rank + 16)**2
-               for rank in ranks) / STEPS
-
-
-# -- memory ----------------------------------------------------------------------------------------
-
-
-def memory(cells: tuple[int, int], *, measured: bool) -> Row:
-    """Of smoothing a whole episode; the reference is computed where it would take minutes."""
-    n = (cells[0] + 1) * (cells[1] + 1)
-    ours = in_fresh_process(smoothing_memory, cells, "ours")
-    stored = 2.0 * 8.0 * RECORD * n**2
-    reference: float | None = stored
-    words = "RTS with stored Γ_{t|t} and Γ_{t|t−1}: 2·T·n²·8 bytes, computed"
-    if measured:
-        reference = None
-        words = (f"{peer('filterpy')} rts_smoother, measured; two covariances a step alone: "
-                 f"{quantity(stored, 'B')}")
-        with suppress(ImportError):
-            reference = in_fresh_process(smoothing_memory, cells, "filterpy")
-    return Row("filtering", f"peak memory of smoothing {RECORD} steps, n = {n}", words, ours,
-               reference, "",
-               "bytes: Z of all steps, n × rank each, and what is left of Γ_{0|0} in Π_t", "",
-               unit="B")
-
-
-def smoothing_memory(cells: tuple[int, int], whose: str) -> float:
-    """Bytes by which smoothing raises the peak of this process; the model is there before."""
-    record = problem(cells, RECORD)
-    start = record.start
-    observations = record.observations
-    covariance = start.covariance.apply(0, np.eye(record.n))
-    # loads what is loaded once, at any length
-    fixed_interval_smoother(copy.copy(start), observations[:2])
-    if whose == "ours":
-        return peak_growth(lambda: fixed_interval_smoother(copy.copy(start), observations))
-    filterpy(record, start.mean, covariance, observations[:2])
-    return peak_growth(lambda: filterpy(record, start.mean, covariance, observations))
+            estimator.update(*each)
+            times.append(time.perf_counter() - begin)
+        yield row(f"{method}, a step on {name}", min(times[task.n_steps // 2:]), target=target)
+    record = problem(CELLS[-1], SMOOTHED)
+    mass = mass_matrix(pipe_model(CELLS[-1]).transport.mesh).toarray()
+    basis, A, Q, P = reduced_model(copy.copy(record.start), mass, record.observations[:WARM_UP],
+                                   REDUCED)
+    few = Filter(NodalStates(np.zeros(REDUCED), DenseCovariance(P), Motion(A, 0.0, Q)))
+    level = record.start.mean.copy()
+    projected = [seen._replace(matrix=seen.matrix @ basis, value=seen.value - seen.matrix @ level)
+                 for seen in record.observations]
+    for what, smooth, start, seen in (
+            (f"means, {REDUCED} reduced coordinates", smoothed_means, few, projected),
+            ("means, n = 1701", smoothed_means, record.start, record.observations),
+            ("variances, n = 1701", fixed_interval_smoother, record.start, record.observations)):
+        begin = time.perf_counter()
+        smooth(copy.copy(start), seen)
+        yield row(f"smoothing {SMOOTHED} steps, {what}", time.perf_counter() - begin,
+                  target="≤ 1 s")

@@ -63,7 +63,8 @@ from eitbench.estimation.smoother import (
     smoothed_state,
 )
 from eitbench.estimation.smoothness import smoothness_covariance
-from eitbench.estimation.switching_inflow import SwitchingInflowFilter
+from eitbench.estimation.switching_inflow import ParticleInflowFilter, SwitchingInflowFilter
+from eitbench.estimation.unscented import UnscentedFilter
 from eitbench.estimation.velocity import (
     UnknownFlow,
     VelocityStates,
@@ -76,15 +77,15 @@ __all__ = [
     "DenseCovariance", "EnsembleFilter", "Filter", "FilterEstimator", "FilterSeen", "FirstFrame",
     "IdentifiedModel", "InflowPrior", "InflowWindow", "Innovation", "LinearisedObservations",
     "LogStates", "LowRankCovariance", "Motion", "NodalStates", "Observation", "OpenLoopCovariance",
-    "QuadraticVoltages", "RecordEstimator", "Regimes", "Response", "ScaledVoltages", "StateSpace",
-    "Step", "SwitchingInflowFilter", "UnknownFlow", "VelocityInflowWindow", "VelocityStates",
-    "VoltagesSeen", "about_prediction", "about_reference", "asked_flow", "best_homogeneous",
-    "blank", "changing_responses", "condition", "corrected", "corrected_estimator",
-    "fit_inflow_prior", "fixed_interval_smoother", "gauss_newton", "identified_model",
-    "inflow_filter", "initial_covariance", "innovate", "kalman_filter", "learned_inflow_prior",
-    "linearised", "load_network", "map_inflow", "modal_states", "most_probable_inflow",
-    "network_suits", "nodal_states", "reduced_response", "remember", "said", "scaled_flow",
-    "smoothed_inflow", "smoothed_means", "smoothed_state", "smoothness_covariance",
-    "starting_filter", "steady_response", "suiting_models", "suiting_priors", "table_5_1",
-    "velocity_states",
+    "ParticleInflowFilter", "QuadraticVoltages", "RecordEstimator", "Regimes", "Response",
+    "ScaledVoltages", "StateSpace", "Step", "SwitchingInflowFilter", "UnknownFlow",
+    "UnscentedFilter", "VelocityInflowWindow", "VelocityStates", "VoltagesSeen", "about_prediction",
+    "about_reference", "asked_flow", "best_homogeneous", "blank", "changing_responses", "condition",
+    "corrected", "corrected_estimator", "fit_inflow_prior", "fixed_interval_smoother",
+    "gauss_newton", "identified_model", "inflow_filter", "initial_covariance", "innovate",
+    "kalman_filter", "learned_inflow_prior", "linearised", "load_network", "map_inflow",
+    "modal_states", "most_probable_inflow", "network_suits", "nodal_states", "reduced_response",
+    "remember", "said", "scaled_flow", "smoothed_inflow", "smoothed_means", "smoothed_state",
+    "smoothness_covariance", "starting_filter", "steady_response", "suiting_models",
+    "suiting_priors", "table_5_1", "velocity_states",
 ]

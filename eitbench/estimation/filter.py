@@ -31,7 +31,7 @@ class StateSpace:
         raise NotImplementedError
 
     def concentration(self, mean: np.ndarray, lag: int = 0) -> np.ndarray:
-        """Return the concentration (n,) in mol/m³, ``lag`` steps before the present."""
+        """Return the concentration (..., n) in mol/m³ of states (..., k), ``lag`` steps ago."""
         return mean
 
     def jacobian(self, mean: np.ndarray, matrix: np.ndarray) -> np.ndarray:
@@ -76,6 +76,10 @@ class Step(NamedTuple):
     """(n,) diagonal of P_{t|t}; only `kalman_filter` sets it"""
 
 
+Linearised = tuple[Observation, np.ndarray, np.ndarray]
+"""Observation, its derivatives (m, k) by the first k entries of x, measured minus predicted (m,)"""
+
+
 class Filter:
     """Kalman filter on a state space, extended where concentration or voltages are nonlinear.
 
@@ -117,27 +121,31 @@ class Filter:
 
     def update(self, observation: Observation) -> Step:
         """Condition on a measurement that is linear in the concentration near the present one."""
-        H = self.space.jacobian(self.mean, observation.matrix)
-        residual = observation.value - observation.matrix @ self.concentration
-        return self._condition(observation, H, residual)
+        return self._condition(*self._residual(observation))
 
     def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> Step:
         """Predict, and condition on voltages (L,) in V for an injection (L,) in A."""
-        assert self.forward is not None, "forward must be given to assimilate voltages"
         self.predict()
         before = self.mean, self.covariance.copy() if self.iterated else self.covariance
-        step = self.update(self.forward(self.concentration, voltages, currents))
+        step = self._condition(*self._linearise(voltages, currents))
         if not self.iterated:
             return step
-        observation = self.forward(self.concentration, voltages, currents)
-        H = self.space.jacobian(self.mean, observation.matrix)
-        residual = (observation.value - observation.matrix @ self.concentration
-                    + H @ (self.mean - before[0])[:H.shape[1]])
+        observation, H, residual = self._linearise(voltages, currents)
+        residual = residual + H @ (self.mean - before[0])[:H.shape[1]]
         self.mean, self.covariance = before
         again = self._condition(observation, H, residual)
         self.step = again._replace(innovation=step.innovation,
                                    innovation_covariance=step.innovation_covariance)
         return self.step
+
+    def _linearise(self, voltages: np.ndarray, currents: np.ndarray) -> Linearised:
+        """Linearise voltages (L,) in V about the present mean, for an injection (L,) in A."""
+        assert self.forward is not None, "forward must be given to assimilate voltages"
+        return self._residual(self.forward(self.concentration, voltages, currents))
+
+    def _residual(self, observation: Observation) -> Linearised:
+        H = self.space.jacobian(self.mean, observation.matrix)
+        return observation, H, observation.value - observation.matrix @ self.concentration
 
     def _condition(self, observation: Observation, H: np.ndarray, residual: np.ndarray) -> Step:
         innovation = innovate(self.covariance, H, residual, observation.noise_variance,

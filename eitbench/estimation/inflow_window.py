@@ -98,12 +98,13 @@ class InflowWindow(StateSpace):
         return self.responses[t - 1]
 
     def concentration(self, mean: np.ndarray, lag: int = 0) -> np.ndarray:
-        return self.level * (1.0 + self.response(lag).basis @ self.coordinates(mean, lag))
+        return self.level * (1.0 + self.coordinates(mean, lag) @ self.response(lag).basis.T)
 
     def coordinates(self, mean: np.ndarray, lag: int = 0) -> np.ndarray:
-        """Return the deviation (q,) from the level in the response's basis, relative to it."""
+        """Return the deviations (..., q) from the level in the response's basis, relative to it."""
         deviation = self.prior.inflow(self._recent(mean, lag) @ self.prior.modes.T) - 1.0
-        return np.tensordot(self.response(lag).weights, deviation, 2)
+        weights = self.response(lag).weights
+        return deviation.reshape(*mean.shape[:-1], -1) @ weights.reshape(len(weights), -1).T
 
     def variance(self, mean: np.ndarray, covariance: Covariance, lag: int = 0) -> np.ndarray:
         slope = self.slope(mean, lag)
@@ -131,8 +132,8 @@ class InflowWindow(StateSpace):
         return by_x.reshape(len(by_inflow), -1)
 
     def _recent(self, mean: np.ndarray, lag: int) -> np.ndarray:
-        """Return the K inflows (K, r) that have made the state ``lag`` steps ago."""
-        return mean.reshape(-1, self.modes)[lag:lag + self.memory]
+        """Return the K inflows (..., K, r) that have made the state ``lag`` steps ago."""
+        return mean.reshape(*mean.shape[:-1], -1, self.modes)[..., lag:lag + self.memory, :]
 
 
 def shifted(mean: np.ndarray, weights: np.ndarray) -> np.ndarray:

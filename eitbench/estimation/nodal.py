@@ -127,7 +127,7 @@ class LogStates(StateSpace):
 
     def concentration(self, mean: np.ndarray, lag: int = 0) -> np.ndarray:
         E = self.modes
-        return self.c_ref * np.exp(mean if E is None else E @ mean[:E.shape[1]])
+        return self.c_ref * np.exp(mean if E is None else mean[..., :E.shape[1]] @ E.T)
 
     def jacobian(self, mean: np.ndarray, matrix: np.ndarray) -> np.ndarray:
         by_logarithm = matrix * self.concentration(mean)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import replace
+from itertools import cycle
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,6 +21,9 @@ from eitbench.worlds.task import Estimate
 if TYPE_CHECKING:
     from eitbench.estimation.inflow_prior import InflowPrior
     from eitbench.worlds.task import Task
+
+NEGLIGIBLE = 1e-3
+"""Particles with less than this fraction of the largest probability do not enter estimates."""
 
 
 class SwitchingInflowFilter:
@@ -102,8 +107,11 @@ class SwitchingInflowFilter:
         self.update(self._forward(mean, voltages, currents))
 
     def update(self, observation: Observation) -> None:
-        """Condition on a measurement that is linear in the concentration near both means."""
-        steps = [each.update(observation) for each in self.filters]
+        """Condition on a measurement that is linear in the concentration near all means."""
+        self._weigh([each.update(observation) for each in self.filters])
+
+    def _weigh(self, steps: list[Step]) -> None:
+        """Update the probabilities by the likelihoods of a measurement."""
         expected = self.probabilities
         likelihoods = np.array([_log_density(step) for step in steps])
         fits = expected * np.exp(likelihoods - likelihoods.max())
@@ -123,8 +131,77 @@ class SwitchingInflowFilter:
                         *self._innovation)
 
 
+class ParticleInflowFilter(SwitchingInflowFilter):
+    """Rao–Blackwellised particle filter of the same two regimes: a particle is a sequence of them.
+
+    Each particle has a Kalman filter, linearised about its own prediction, and branches into both
+    regimes; before that they are resampled. With at most ``particles`` sequences the result is
+    exact but for the linearisation.
+
+    Parameters
+    ----------
+    task, prior, level, level_std, forward
+        As in `SwitchingInflowFilter`.
+    particles : int
+        Number N ≥ 1 of branching particles; 2 N filters run.
+    """
+
+    def __init__(self, task: Task, prior: InflowPrior, level: float, level_std: float,
+                 forward: Forward, particles: int, random: np.random.Generator) -> None:
+        super().__init__(task, prior, level, level_std, forward)
+        self.particles = _check.integer("particles", particles, low=1)
+        self._spaces = [each.space for each in self.filters]
+        self._random = random
+
+    def predict(self) -> None:
+        """Advance one time step: each particle branches into both regimes."""
+        kept, weights = resample(self.probabilities, self.particles, self._random)
+        self.probabilities = (weights[:, None] * self._transitions[kept % 2]).ravel()
+        self.filters = [copy(self.filters[k]) for k in kept for _ in range(2)]
+        for each, space in zip(self.filters, cycle(self._spaces)):  # in quiet, in a slug, in turn
+            each.space = space
+            each.covariance = copy(each.covariance)  # a step of the window writes a new array
+            each.predict()
+
+    def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> None:
+        """Predict, and condition each particle on voltages (L,) in V for an injection (L,) in A."""
+        self.predict()
+        self._weigh([each.update(self._forward(each.concentration, voltages, currents))
+                     for each in self.filters])
+
+    def estimate(self, lag: int = 0) -> Estimate:
+        """Return mean and variance of the particles with more than `NEGLIGIBLE` of the largest
+        probability, with the last innovation."""
+        p, likely = self.probabilities, copy(self)
+        kept = np.flatnonzero(p > NEGLIGIBLE * p.max())
+        likely.filters = [self.filters[k] for k in kept]
+        likely.probabilities = p[kept] / p[kept].sum()
+        return super(ParticleInflowFilter, likely).estimate(lag)
+
+
+def resample(probabilities: np.ndarray, count: int,
+             random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Return indices and new probabilities of at most ``count`` particles, without bias.
+
+    Those above a threshold stay as they are; of the others some are drawn systematically and get
+    the threshold as probability (Fearnhead & Clifford, J. R. Stat. Soc. B 65, 2003).
+    """
+    if len(probabilities) <= count:
+        return np.arange(len(probabilities)), probabilities
+    order = np.argsort(-probabilities)
+    w = probabilities[order]
+    draws = count - np.arange(count)
+    threshold = w[::-1].cumsum()[::-1][:count] / draws
+    first = int(np.argmax(w[:count] <= threshold))
+    places = threshold[first] * (random.uniform() + np.arange(draws[first]))
+    drawn = np.minimum(np.searchsorted(w[first:].cumsum(), places), len(w) - first - 1)
+    weights = np.where(np.arange(count) < first, w[:count], threshold[first])
+    return order[np.concatenate([np.arange(first), first + drawn])], weights
+
+
 def _log_density(step: Step) -> float:
     """Return ln N(ν; 0, S) up to a constant."""
-    root = np.linalg.cholesky(step.innovation_covariance)
-    whitened = solve_triangular(root, step.innovation, lower=True)
+    read = step.accepted
+    root = np.linalg.cholesky(step.innovation_covariance[np.ix_(read, read)])
+    whitened = solve_triangular(root, step.innovation[read], lower=True)
     return float(-0.5 * whitened @ whitened - np.log(root.diagonal()).sum())

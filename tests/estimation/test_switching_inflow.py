@@ -5,13 +5,16 @@ import itertools
 import numpy as np
 import pytest
 from eitbench.estimation import (
+    Filter,
     InflowPrior,
     Observation,
+    ParticleInflowFilter,
     Regimes,
     SwitchingInflowFilter,
     about_prediction,
     fit_inflow_prior,
 )
+from eitbench.estimation.switching_inflow import resample
 from models import tiny_task as task
 from models import two_modes
 from scipy.stats import multivariate_normal
@@ -155,3 +158,79 @@ def test_mistakes_are_told(tmp_path):
         fit_inflow_prior(np.full((1, 40, 3), 1.1), np.zeros((3, 2)), 0.005, quiet=0.01)
     prior(0.1, 0.2).save(tmp_path / "a.json")
     assert InflowPrior.load(tmp_path / "a.json").regimes == Regimes(0.1, 0.2, 1e-3)
+
+
+def particles(begins, ends, count=8):
+    return ParticleInflowFilter(task(), prior(begins, ends), LEVEL, 0.03, about_prediction(task()), count,
+                                np.random.default_rng(0))
+
+
+def test_particles_that_cover_all_sequences_are_exact():
+    """Three steps, 16 sequences of regimes: probability, mean and variance of exhaustive enumeration to 1e-9."""
+    measured = list(observations(3, slug=1.0))
+    slug, mean, variance = enumerated(switching(0.1, 0.2), Regimes(0.1, 0.2, 1e-3), measured)
+    ours = particles(0.1, 0.2)
+    filtered(ours, measured)
+    assert len(ours.filters) == 16 and 0.01 < slug < 0.99
+    np.testing.assert_allclose(ours.probabilities[1::2].sum(), slug, rtol=1e-9)
+    exact = SwitchingInflowFilter.estimate(ours)
+    np.testing.assert_allclose(exact.mean, mean, rtol=1e-9)
+    np.testing.assert_allclose(exact.variance, variance, rtol=1e-9)
+    shortened = ours.estimate()
+    assert (np.abs(shortened.mean - mean) < 0.05 * np.sqrt(variance)).all()
+    np.testing.assert_allclose(shortened.variance, variance, rtol=0.05)
+
+
+def test_particles_of_one_regime_are_a_kalman_filter():
+    """Where a slug has always been and never ends: mean, variance and innovations to 1e-9."""
+    ours = particles(1.0, 1e-14, count=2)
+    one = Filter(switching(1.0, 1e-14).filters[1].space)
+    one.covariance = switching(1.0, 1e-14).filters[1].covariance
+    measured = list(observations(5))
+    filtered(ours, measured)
+    for seen in measured:
+        one.predict()
+        step = one.update(seen)
+    estimate = ours.estimate()
+    np.testing.assert_allclose(estimate.mean, one.concentration, rtol=1e-9)
+    np.testing.assert_allclose(estimate.variance, one.variance, rtol=1e-9)
+    np.testing.assert_allclose(estimate.innovation, step.innovation, atol=1e-9)
+    np.testing.assert_allclose(estimate.innovation_covariance, step.innovation_covariance, rtol=1e-9)
+
+
+def test_few_particles_are_nearer_to_enumeration_than_mixing():
+    measured = list(observations(5))
+    _, mean, variance = enumerated(switching(0.1, 0.2), Regimes(0.1, 0.2, 1e-3), measured)
+    errors = [np.abs((filtered(filter_, measured)[1] - mean) / np.sqrt(variance)).max()
+              for filter_ in (particles(0.1, 0.2), switching(0.1, 0.2))]
+    assert errors[0] < 0.7 * errors[1]
+
+
+def test_resampling_is_unbiased():
+    """Expected weights are the given ones, indices differ, and their number is kept."""
+    random = np.random.default_rng(3)
+    weights = random.dirichlet(np.full(20, 0.3))
+    total = np.zeros(20)
+    for _ in range(4000):
+        kept, new = resample(weights, 6, random)
+        assert len(set(kept)) == 6
+        np.testing.assert_allclose(new.sum(), 1.0)
+        total[kept] += new
+    np.testing.assert_allclose(total / 4000, weights, atol=0.005)
+    for few, count in ((weights[:6], 6), (np.array([1.0, 0.0, 0.0]), 2)):
+        kept, new = resample(few, count, random)
+        np.testing.assert_allclose(new.sum(), few.sum())
+
+
+@pytest.mark.parametrize("make", [switching, particles], ids=["mixed", "particles"])
+def test_missing_readings_are_fewer_readings(make):
+    """NaN in place of a reading."""
+    lost, fewer = make(0.1, 0.2), make(0.1, 0.2)
+    keep = np.array([True, False, True, True])
+    for seen in observations(3):
+        lost.predict()
+        lost.update(seen._replace(value=np.where(keep, seen.value, np.nan)))
+        fewer.predict()
+        fewer.update(Observation(seen.matrix[keep], seen.value[keep], seen.noise_variance[keep]))
+    np.testing.assert_allclose(lost.probabilities, fewer.probabilities, rtol=1e-9)
+    np.testing.assert_allclose(lost.estimate().mean, fewer.estimate().mean, rtol=1e-9)

@@ -8,10 +8,12 @@ from urllib.parse import unquote, urlsplit
 
 import numpy as np
 import pytest
+from eitbench._files import PACKAGE
 from eitbench.bench.records import read_records
 from eitbench.bench.table import NOTHING
 from eitbench.bench.text import number, with_interval
 from eitbench.bench.tracks import ids
+from eitbench.report import charts
 from eitbench.report.site import (
     HEADLINE,
     LINKS,
@@ -351,3 +353,23 @@ def test_markdown_is_text_and_tables():
     """HTML and links of a docstring are text."""
     html = markdown("## A\n\n<b>x</b> [y](http://z)\n\n| a |\n|---|\n| 1 |\n")
     assert "<h3>A</h3>" in html and "<b>" not in html and "href" not in html and "<table>" in html
+
+
+def luminance(colour):
+    """WCAG's, of #rrggbb."""
+    parts = [int(colour[i:i + 2], 16) / 255 for i in (1, 3, 5)]
+    linear = [part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts]
+    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+
+@pytest.mark.parametrize("scheme", [0, 1], ids=["light", "dark"])
+def test_contrast(scheme):
+    """Text 4.5 to 1 and lines of charts 3 to 1 (WCAG AA), on paper and on cards."""
+    colours = {name: pair[scheme] for name, *pair in re.findall(
+        r"--(\w+): light-dark\((#\w{6}), (#\w{6})\)", (PACKAGE / "report" / "style.css").read_text())}
+    assert colours.keys() >= {"paper", "card", "ink", "soft", "accent", *(f"c{k}" for k in range(charts.COLOURS))}
+    for ground in ("paper", "card"):
+        for name, colour in colours.items():
+            least = 4.5 if name in ("ink", "soft", "accent", "c8") else 3.0 if re.fullmatch(r"c\d+", name) else 0.0
+            bright, dim = sorted((luminance(colour), luminance(colours[ground])), reverse=True)
+            assert (bright + 0.05) / (dim + 0.05) >= least, (name, ground)

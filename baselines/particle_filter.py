@@ -1,0 +1,42 @@
+"""Rao–Blackwellised particle filter for rare slugs: a particle is a sequence of regimes, quiet or
+slug, with an extended Kalman filter; switching_inflow_filter mixes both at each step instead.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from eitbench import Estimate, Task
+from eitbench.estimation import (
+    FilterEstimator,
+    ParticleInflowFilter,
+    about_prediction,
+    suiting_priors,
+)
+
+PRIORS = Path(__file__).with_name("priors")
+LINK = "logarithm"
+LEVEL_STD = 0.05
+"""Of the inflow between slugs, relative to the best homogeneous estimate."""
+PARTICLES = 8
+"""Branching at each step, so that twice as many filters run."""
+SEED = 0
+
+
+class Estimator:
+    boards = ("filter",)
+    parameters = {"level_std": LEVEL_STD, "particles": PARTICLES, "seed": SEED}  # noqa: RUF012
+
+    def __init__(self, task: Task) -> None:
+        prior = suiting_priors(PRIORS, task, LINK)[0]
+        self.estimator = FilterEstimator(task, lambda c_ref: ParticleInflowFilter(
+            task, prior, c_ref, LEVEL_STD, about_prediction(task), PARTICLES,
+            np.random.default_rng(SEED)))
+
+    @staticmethod
+    def suits(task: Task) -> bool:
+        priors = suiting_priors(PRIORS, task, LINK)
+        return task.velocity is None and bool(priors) and priors[0].regimes is not None
+
+    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
+        return self.estimator.update(voltages, currents)

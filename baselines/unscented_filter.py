@@ -1,0 +1,39 @@
+"""Unscented Kalman filter of the inflow's logarithm: as log_inflow_filter, but the complete
+electrode model is evaluated at sigma points, along the principal axes of the concentration.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from eitbench import Estimate, Task
+from eitbench.estimation import FilterEstimator, InflowWindow, UnscentedFilter, suiting_priors
+
+PRIORS = Path(__file__).with_name("priors")
+LINK = "logarithm"
+AXES = 40
+"""Number of principal axes; one step needs 81 forward solutions."""
+
+
+class Estimator:
+    boards = ("filter",)
+    parameters = {"axes": AXES}  # noqa: RUF012 (as a record has it)
+
+    def __init__(self, task: Task) -> None:
+        prior = suiting_priors(PRIORS, task, LINK)[0]
+
+        def start(c_ref: float) -> UnscentedFilter:
+            space = InflowWindow(task, prior, c_ref)
+            return UnscentedFilter(space, task.observation.transfer_resistance, task.noise,
+                                   space.response().basis, AXES)
+
+        self.estimator = FilterEstimator(task, start)
+
+    @staticmethod
+    def suits(task: Task) -> bool:
+        # in 3D the forward solutions of one step take seconds
+        known_flow = task.velocity is None and task.mesh.dim == 2
+        return known_flow and bool(suiting_priors(PRIORS, task, LINK))
+
+    def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
+        return self.estimator.update(voltages, currents)

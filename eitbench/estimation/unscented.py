@@ -1,0 +1,82 @@
+"""Unscented Kalman filter: sigma points in place of derivatives (docs/methods.md, 16)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from eitbench.estimation.filter import Filter, Linearised, StateSpace
+from eitbench.estimation.gaussian import Observation
+from eitbench.worlds.task import Estimate
+
+if TYPE_CHECKING:
+    from eitbench.physics.observation import VoltageNoise
+
+SPREAD = 3.0**0.5
+"""Standard deviations between the mean and a sigma point: Gauss–Hermite's, for a Gaussian."""
+
+
+class UnscentedFilter(Filter):
+    """Kalman filter that takes moments of voltages and concentration from sigma points.
+
+    The points lie on the principal axes of the predicted concentration, `SPREAD` standard
+    deviations from its mean on both sides. Means are those of the unscented transform (Julier &
+    Uhlmann 1997) with κ = 3 − k, covariances those of central differences, which have no negative
+    eigenvalue (Nørgaard, Poulsen & Ravn, Automatica 36, 2000).
+
+    Parameters
+    ----------
+    space : StateSpace
+        Its `concentration` accepts several states at once.
+    resistance : callable
+        Concentrations (N, n) in mol/m³ -> transfer resistances (N, L, L) in Ω (Ω·m in 2D).
+    basis : (n, q)
+        Orthonormal columns that contain the deviations of the concentration.
+    axes : int
+        Largest number k of principal axes; the others count as certain for the voltages.
+    """
+
+    def __init__(self, space: StateSpace, resistance: Callable[[np.ndarray], np.ndarray],
+                 noise: VoltageNoise, basis: np.ndarray, axes: int) -> None:
+        super().__init__(space)
+        self.resistance = resistance
+        self.noise = noise
+        self.basis = basis
+        self.axes = axes
+
+    def _sigma_points(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return concentrations (2 k + 1, n), the mean's first, and the derivatives (k, n_x) of
+        the standardised coordinates along the axes by the state."""
+        J = self.space.jacobian(self.mean, self.basis.T)
+        cross = self.covariance.times(J.T)
+        variances, axes = np.linalg.eigh(J @ cross[:J.shape[1]])
+        keep = variances[-self.axes:] > 1e-12 * variances[-1]             # the others are certain
+        scaled = axes[:, -self.axes:][:, keep] / np.sqrt(variances[-self.axes:][keep])
+        offsets = SPREAD * (cross @ scaled).T
+        states = self.mean + np.concatenate([np.zeros((1, len(self.mean))), offsets, -offsets])
+        return self.space.concentration(states), scaled.T @ J
+
+    def _linearise(self, voltages: np.ndarray, currents: np.ndarray) -> Linearised:
+        points, along = self._sigma_points()
+        mean, slope, bend = moments(self.resistance(points) @ currents)
+        observation = Observation(slope, voltages - mean, self.noise.std(mean)**2, bend)
+        return observation, slope @ along, voltages - mean
+
+    def estimate(self, lag: int = 0) -> Estimate:
+        """Return mean and variance of the present concentration, with the last innovation."""
+        mean, _, bend = moments(self._sigma_points()[0])
+        estimate = super().estimate()
+        return estimate._replace(mean=mean, variance=estimate.variance + (bend**2).sum(axis=1))
+
+
+def moments(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return mean (m,) of a function of k independent standard normal numbers, its derivatives
+    (m, k), and a root (m, k) of the covariance that its curvature adds.
+
+    ``values`` (2 k + 1, m) are those at zero, at `SPREAD` along each axis, and at its negative.
+    """
+    middle, (more, less) = values[0], np.split(values[1:], 2)
+    bend = (0.5 * (more + less) - middle).T / SPREAD**2
+    return middle + bend.sum(axis=1), (more - less).T / (2.0 * SPREAD), bend * (SPREAD**2 - 1)**0.5
