@@ -97,7 +97,7 @@ def against_peers(cells: tuple[int, int]) -> Iterator[Row]:
         return np.array([step.mean for step in kalman_filter(start, record)])
 
     forms = {"Π − ZZᵀ": (lambda: ours(covariance), 2.0 * n**2 * (rank + 16) + 4.0 * n * rank**2),
-             "dense": (lambda: ours(DenseCovariance(model.P), model.Q), 4.0 * n**3)}
+             "dense": (lambda: ours(DenseCovariance(model.P), model.Q), 3.0 * n**3)}
     expected = ours(covariance)
     for name, function in (("numpy", textbook), ("filterpy", filterpy), ("dynamax", dynamax),
                            ("cuthbert", cuthbert)):
