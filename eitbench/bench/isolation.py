@@ -519,7 +519,11 @@ class Worker:
         if sum(_status(pid, "Threads") for pid in family) > self._limits.threads:
             raise WorkerError(f"ResourceLimitError: it started more than {self._limits.threads} "
                               "processes and threads")
-        if sum(_status(pid, "VmRSS") for pid in family) > self._limits.memory:
+        if sum(_status(pid, "VmRSS") for pid in family) <= self._limits.memory:
+            return
+        # VmRSS counts a page once for each process that shares it, Pss once in all.
+        if sum(_status(pid, "Pss", "smaps_rollup") or _status(pid, "VmRSS")
+               for pid in family) > self._limits.memory:
             raise WorkerError("ResourceLimitError: it held more than "
                               f"{self._limits.memory >> 20} MiB")
 
@@ -551,10 +555,10 @@ class Worker:
         self._process.wait()
 
 
-def _status(pid: int, field: str) -> int:
-    """Return a number of /proc/PID/status, bytes if it is a size; 0 if it is missing."""
+def _status(pid: int, field: str, file: str = "status") -> int:
+    """Return a number of a file of /proc/PID, bytes if it is a size; 0 if it is missing."""
     try:
-        text = Path(f"/proc/{pid}/status").read_text(errors="replace")
+        text = Path(f"/proc/{pid}/{file}").read_text(errors="replace")
     except OSError:
         return 0
     found = re.search(rf"^{field}:\s+(\d+)( kB)?", text, re.MULTILINE)

@@ -6,6 +6,7 @@ Those of ray and dask need the extra cluster: `pip install -c constraints.txt -e
 
 import importlib
 import importlib.util
+import warnings
 
 import pytest
 from eitbench.bench.run import Job, run_episode, run_jobs
@@ -93,3 +94,17 @@ def test_backends_that_cannot_be_had(monkeypatch):
             with pytest.raises(ValueError, match=f"backend {backend} needs {package}, which the extra cluster"):
                 list(in_parallel(print, [(1,)], 1, backend))
     assert set(BACKENDS) == {"loky", *CLUSTERS}
+
+
+def test_loky_is_silent_when_it_renews_a_worker(recwarn):
+    """Of loky's warnings this one alone is left out, and nobody else's of the same words."""
+    def warn(words, module):
+        warnings.warn_explicit(words, UserWarning, "file.py", 1, module)
+
+    loky = "joblib.externals.loky.process_executor"
+    lost = ("A worker stopped while some jobs were given to the executor. This can be caused by a too short worker "
+            "timeout or by a memory leak.")
+    assert list(in_parallel(abs, [(-1,)], 1)) == [1]
+    for words, module in ((lost, loky), ("something else", loky), (lost, "mine")):
+        warn(words, module)
+    assert [str(each.message) for each in recwarn] == ["something else", lost]

@@ -15,8 +15,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from eitbench.bench import isolation, suites
+from eitbench.bench import isolation, run, suites
 from eitbench.bench.isolation import (
+    MAX_HEADER_BYTES,
     Limits,
     Worker,
     WorkerError,
@@ -489,3 +490,33 @@ def test_malformed_messages_are_rejected(head, body):
     content = io.BytesIO(len(head).to_bytes(8, "little") + len(body).to_bytes(8, "little") + head + body)
     with pytest.raises(ValueError, match="message must"):
         decode_message(content.read)
+
+
+def test_a_run_leaves_no_worker(tmp_path, monkeypatch):
+    """One worker for all episodes of a method, and none at the end."""
+    made = []
+
+    class Counted(Worker):
+        def __init__(self, *arguments, **rest):
+            assert not any(each.is_alive for each in made)
+            super().__init__(*arguments, **rest)
+            made.append(self)
+
+    monkeypatch.setattr(isolation, "Worker", Counted)
+    jobs = [Job(FILTER, write_baseline(tmp_path, name), seed, "process")
+            for name in ("first", "second") for seed in (1, 2)]
+    run.run_jobs(jobs, EpisodeStore(tmp_path / "results"))
+    assert len(made) == 4 and not any(each.is_alive or each._home.exists() for each in made)
+
+
+def test_long_messages_are_not_read():
+    """Their lengths come first."""
+    asked = []
+
+    def read(n):
+        asked.append(n)
+        return (MAX_HEADER_BYTES + 1).to_bytes(8, "little") + bytes(8)
+
+    with pytest.raises(ValueError, match="message must have at most"):
+        decode_message(read)
+    assert asked == [16]

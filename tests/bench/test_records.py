@@ -102,24 +102,40 @@ def test_the_digest_is_what_the_schema_says():
 
 @pytest.mark.parametrize(("path", "value", "message"), [
     ("schema", 1, r"\$\.schema: 3 was expected"),
+    ("source", sha("code"), "'source' was unexpected"),
+    ("version", "1", r'\$\.version: "1" does not match'),
     ("version", "deadbeef", r"\$\.version: must be v1, v2, … of ours, or begin as method_sha256 does"),
     ("version", ..., '"version" is a required property'),
+    ("title", "Fine |\n| 1 | Forged |", r"\$\.title: "),
     ("title", "a\x1b[2Jb", r"\$\.title: .* is not allowed"),
+    ("title", "a\u202eb", r"\$\.title: .* is not allowed"),
     ("method", "mi\u200bne", r"\$\.method: "),
     ("board", "smooth", r'\$\.board: "smooth" is not one of'),
+    ("role", "best", r'\$\.role: "best" is not one of'),
+    ("official", "no", r'\$\.official: "no" is not of type "boolean"'),
     ("method", "../mine", r'\$\.method: "../mine" does not match'),
+    ("checkpoint_sha256", "5ha", r"\$\.checkpoint_sha256: "),
+    ("seeds", [], r"\$\.seeds: "),
+    ("score", 1, "'score' was unexpected"),
     ("seeds", ["test:0"] * 10_001, r"\$\.seeds: .*has more than 10000 items"),
+    ("episodes.0.step_errors", [0.1] * 100_001, r"\$\.episodes\[0\]\.step_errors: .*has more than 100000 items"),
     ("episodes.1.step_errors", [0.25, 0.25], r"\$\.episodes: must have the same number of step_errors each"),
     ("episodes.0.scores.nis", 1e51, r"\$\.episodes\[0\]\.scores\.nis: 1e\+51 is greater than the maximum"),
+    ("episodes.0.scores.nis", 1e-101, r"\$\.episodes\[0\]\.scores\.nis: .* is not allowed for 1e-101"),
     ("episodes.0.step_errors", [1e60], r"\$\.episodes\[0\]\.scores\.error: must be the mean of step_errors"),
+    ("environment.id", "Pipe2D", r'\$\.environment\.id: "Pipe2D" does not match'),
     ("environment.name", "eitbench-Pipe3D-v0", r"\$\.environment\.name: must be eitbench-Pipe2D-v0, as id and"),
+    ("environment.kwargs", {"lag": 3}, r"\$\.environment\.name: must be eitbench-Pipe2D-v0-\w{8}, as id and"),
     ("environment.kwargs", {"scenario": 10_000 * "x"}, r"\$\.environment\.kwargs: must have 10000 characters at most"),
     ("runs.0.commit", ..., r'\$\.runs\[0\]: "commit" is a required property'),
+    ("runs.0.isolation", "jail", r'\$\.runs\[0\]\.isolation: "jail" is not one of'),
     ("episodes.0.scores.error", -1.0, r"\$\.episodes\[0\]\.scores\.error: -1.0 is less than the minimum"),
     ("episodes.0.scores.error", 0.05, r"\$\.episodes\[0\]\.scores\.error: must be the mean of step_errors"),
     ("episodes.0.scores.beauty", "much", r'\$\.episodes\[0\]\.scores\.beauty: "much" is not of type'),
+    ("episodes.0.scores.Beauty", 1.0, r"\$\.episodes\[0\]\.scores: Additional properties are not allowed \('Beauty'"),
     ("episodes.2.message", ..., r'\$\.episodes\[2\]: "message" is a required property'),
     ("episodes.2.scores", {"error": 0.1, "seconds_per_step": 0.1}, r"\$\.episodes\[2\]\.scores: "),
+    ("episodes.1.finished", "yesterday", r'\$\.episodes\[1\]\.finished: "yesterday" does not match'),
     ("episodes.1.run", 1, r"\$\.episodes\[1\]\.run: there are only 1 runs"),
     ("episodes.1.seed", "test:0", r"\$\.seeds: must be those of the episodes"),
     ("seeds", ["test:0", "dev:1", "test:2"], r"\$\.seeds: must all be of the split test"),
@@ -330,3 +346,19 @@ def test_another_validator_agrees():
             valid += fits
             assert fits == theirs.is_valid(made), (place, value)
     assert valid > 30
+
+
+def test_names_of_files_are_spelt_out_in_messages(tmp_path):
+    """A message never prints the control characters of a file's name."""
+    path = write_unchecked(tmp_path, record("mine", [0.1]), name="a\x1b[31m\u202e.json")
+    with pytest.raises(ValueError, match="must have the name") as caught:
+        read_record(path)
+    assert "\\x1b[31m\\u202e.json" in str(caught.value) and "\x1b" not in str(caught.value)
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe", b"[]", b"null", b'{"schema": NaN}'])
+def test_what_is_no_record_is_refused(content, tmp_path):
+    """Unlike a run's own episodes, published records must all be sound."""
+    (tmp_path / "it.json").write_bytes(content)
+    with pytest.raises(ValueError, match=r"record .*it\.json (cannot be read|is not valid)"):
+        read_records(tmp_path)

@@ -312,3 +312,23 @@ def test_errors_name_the_argument(call, message):
     """What cannot be computed says why."""
     with pytest.raises(ValueError, match=message):
         call()
+
+
+@pytest.mark.parametrize("statistic", [interquartile_mean, mean_over_environments])
+def test_constant_environments_have_no_interval(statistic):
+    """Nothing is uncertain about two environments that always score 0.25 and 0.75, however far apart they are."""
+    scores = {"pipe": [0.25] * 8, "tank": [0.75] * 8}
+    assert stratified_bootstrap(scores, statistic) == (0.5, 0.5, 0.5)
+
+
+@pytest.mark.parametrize("order", range(3))
+def test_the_order_of_episodes_does_not_matter(order):
+    """Pairs are found by their seeds, and the intervals are the same to the last bit."""
+    random = np.random.default_rng(order)
+    a, b = two_methods()
+    one, other = shuffled(a, random), shuffled(b, random)
+    assert list(one["pipe"]) != list(a["pipe"])
+    assert paired_difference(one, other) == paired_difference(a, b)
+    assert paired_probability_of_improvement(one, other) == paired_probability_of_improvement(a, b)
+    for statistic in (interquartile_mean, mean_over_environments):
+        assert stratified_bootstrap(plain(one), statistic) == stratified_bootstrap(plain(a), statistic)

@@ -1,5 +1,6 @@
 """Results on disk: whole or not at all, nobody's lost, and records that say all that is needed to repeat them."""
 
+import json
 import math
 import platform
 import re
@@ -13,11 +14,12 @@ import pytest
 from eitbench.bench import store as store_module
 from eitbench.bench.run import Job, run_jobs
 from eitbench.bench.scores import SCORING
-from eitbench.bench.store import EpisodeStore, machine, portable_command, results_of
+from eitbench.bench.store import EpisodeStore, machine, portable_command, provenance, results_of
+from eitbench.bench.tracks import Environment
 from eitbench.data.cache import CACHE_VARIABLE
 from eitbench.data.seeds import name_seed
 
-from tiny import FILTER, RUN, SCENARIO, git_says, sha, write_baseline
+from tiny import FILTER, FIXED_LAG, RUN, SCENARIO, git_says, sha, write_baseline
 
 ENV, COMMAND = "eitbench/Pipe2D-v0", "eitbench run --seeds train:1-2"
 
@@ -259,3 +261,22 @@ def test_other_results_fill_what_is_missing_or_failed(store):
     assert [record["runs"][row["run"]]["source"] for row in record["episodes"]] == [sha("code")] * 2 + [sha("older")]
     (same,) = EpisodeStore(store.folder / "empty").records(also=results_of(record))
     assert same == record
+
+
+def test_provenance_without_git(monkeypatch):
+    """Outside a repository there is no commit to name, and that is no error."""
+    monkeypatch.undo()
+    monkeypatch.setenv("PATH", "")
+    provenance.cache_clear()
+    assert (provenance()["commit"], provenance()["dirty"]) == (None, None)
+
+
+def test_arguments_of_an_environment_make_other_records(store, tmp_path):
+    """The same id with other keyword arguments is another world: neither results nor records overwrite each other."""
+    path = write_baseline(tmp_path)
+    wider = Environment(FILTER.id, json.dumps({"world": SCENARIO | {"instrument": {"noise_relative": 0.02}}}))
+    run_jobs([Job(environment, path, 1) for environment in (FILTER, wider, FIXED_LAG)], store)
+    records = store.write_records()
+    noise = [record["environment"]["kwargs"]["world"].get("instrument", {}).get("noise_relative") for record in records]
+    assert sorted(noise, key=str) == [0.02, None, None]
+    assert len(list((store.folder / "records").iterdir())) == 3

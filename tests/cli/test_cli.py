@@ -2,6 +2,7 @@
 
 import json
 import re
+import runpy
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -231,3 +232,23 @@ def test_a_missing_extra_is_named(monkeypatch, tmp_path):
     code, said, complaint = eitbench("train", "--env", INJECTION)
     assert code == 1 and said == "" and "needs the extra bench, pip install 'eitbench[bench]'" in complaint
     assert not (tmp_path / "results").exists()
+
+
+def test_same_command_resumes(tmp_path):
+    """The second time nothing is played; one seed more is one episode more."""
+    assert run_mine()[0] == 0
+    before = sorted(path.stat().st_mtime_ns for path in (tmp_path / "results" / "episodes").rglob("*.json"))
+    _, said, complaint = run_mine()
+    assert "2 of 2 episodes are already there" in said + complaint
+    run_mine("--seeds", "dev:0-2")
+    after = sorted(path.stat().st_mtime_ns for path in (tmp_path / "results" / "episodes").rglob("*.json"))
+    assert len(before) == 2 and len(after) == 3 and after[:2] == before
+
+
+def test_module_can_be_run(monkeypatch, capsys):
+    """`python -m eitbench.cli --help` is the same program."""
+    monkeypatch.setattr(sys, "argv", ["eitbench", "--help"])
+    monkeypatch.delitem(sys.modules, "eitbench.cli")
+    with pytest.raises(SystemExit) as done:
+        runpy.run_module("eitbench.cli", run_name="__main__")
+    assert done.value.code == 0 and "leaderboard" in capsys.readouterr().out

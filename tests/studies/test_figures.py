@@ -6,17 +6,23 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from eitbench.bench.methods import load_method
+from eitbench.bench.text import seed_ranges
 from eitbench.data.cache import CACHE_VARIABLE
+from eitbench.data.seeds import name_seed
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.estimation import FirstFrame, initial_covariance
 from eitbench.physics.rest import AtRest
+from eitbench.worlds import entry
 from eitbench.worlds.flows import FlowPastBulge, _past_bulge
 from eitbench.worlds.task import Estimate
 from matplotlib.image import imread
+from PIL import Image
 
-from short import merged
+from choosing import SHORT
+from short import merged, shorten
 from tiny_worlds import CHANGES
 
 sys.path.append(str(Path(__file__).parents[2] / "studies"))
@@ -167,3 +173,37 @@ def test_map_estimate_is_the_most_probable():
     assert objective(best) < objective(linear)
     for direction in (linear - best, first.mean - best):
         assert objective(best + 0.05 * direction) > 0.999 * objective(best)
+
+
+def test_injection_is_drawn(monkeypatch, run_cache, tmp_path):
+    """Scores as they were played, told in a table for each world, and an animation with a frame for
+    every step; when not told which episodes, in those of the boards."""
+    played = {}
+
+    def rows(jobs, results):
+        names = list(dict.fromkeys(job.load().name for job in jobs))
+        return pd.DataFrame([{"policy": name, "seed": f"dev:{k}",
+                              "error": 0.01 * (1 + place) + 0.001 * k, "spent": 5,
+                              "seconds_per_step": 0.001} for place, name in enumerate(names)
+                              for k in range(3)])
+
+    monkeypatch.setattr(injection, "run_jobs", lambda jobs, *_, **__: played.update({
+        jobs[0].environment: seed_ranges(list(dict.fromkeys(name_seed(job.seed)
+                                                            for job in jobs)))}))
+    monkeypatch.setattr(injection, "policy_rows", rows)
+    monkeypatch.setattr(injection, "results_in", lambda folder: [])
+    shorten(monkeypatch, {injection.AT_WORK[0]: SHORT})
+    monkeypatch.setenv(CACHE_VARIABLE, run_cache)           # where other tests' reduced model lies
+    path, remark = FIGURES["injection"](None, 1, tmp_path / "new")
+    picture = imread(path)
+    assert min(picture.shape[:2]) > 250 and picture[..., :3].std() > 0.05
+    assert list(played.items()) == [((env, "{}"), entry(env).seeds) for env in injection.WORLDS]
+    assert remark.count("best_pair ") == 6
+    with Image.open(tmp_path / "new" / "injection.gif") as moving:
+        assert moving.n_frames == 4                        # the first frame of 16, then four steps
+
+
+def test_thesis_figures_show_dev_episodes_when_not_told(monkeypatch, tmp_path):
+    """Nothing is drawn from test episodes by chance."""
+    monkeypatch.setattr(pipe2d, "fig5_4", lambda seeds, jobs, out: (out, " ".join(map(name_seed, seeds))))
+    assert FIGURES["fig5.4"](None, 1, tmp_path)[1] == "dev:0 dev:1"
