@@ -93,11 +93,19 @@ def main_directions(learnt: np.ndarray, mass: np.ndarray, rank: int) -> np.ndarr
     return basis
 
 
+def matvec(matrix: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Return products (B, m) of a matrix (m, n) or matrices (B, m, n) and vectors (B, n).
+
+    They are computed one by one: the bits of one product with all vectors depend on their number.
+    """
+    return np.asarray((matrix @ vectors[..., None])[..., 0])
+
+
 class ReducedStates(Protocol):
     """State space of few coordinates for B episodes side by side, in the precision of its arrays.
 
-    The state has s entries, the concentration q coordinates in a basis. No episode's numbers depend
-    on what is filtered beside it, to the bit.
+    The state has s entries, the concentration q coordinates in a basis. The numbers of an episode
+    do not depend on the other episodes, to the bit.
     """
 
     basis: np.ndarray
@@ -118,8 +126,8 @@ class ReducedStates(Protocol):
         """Return the coordinates (B, q) of the concentration."""
 
     def jacobian(self, mean: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-        """Return derivatives (B, m, s) by the state from those by the coordinates, (B, m, q) or
-        (m, q)."""
+        """Return derivatives (B, m, s) by the state from derivatives (B, m, q) or (m, q) by the
+        coordinates."""
 
     def constrain(self, mean: np.ndarray) -> np.ndarray:
         """Return the nearest mean (B, s) within bounds."""
@@ -150,7 +158,7 @@ class SteadyStates:
         for begin, end in pairwise(self._edges):
             np.matmul(AP[:, :, begin:], A[begin:end, begin:].T, out=APA[:, :, begin:end])
         APA += self.model.noise
-        return (A @ mean[..., None])[..., 0], APA
+        return matvec(A, mean), APA
 
     def step(self, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         return self.model.transition, self.model.noise, self.model.transition @ mean
@@ -179,7 +187,7 @@ class ReducedFilter:
     mean, covariance : (B, s), (B, s, s)
         Of the present states.
     innovation_covariance : (B, m, m)
-        S of the last measurement; rows and columns of rejected readings are those of 1.
+        S of the last measurement; rows and columns of rejected readings are of the identity.
     """
 
     def __init__(self, states: ReducedStates, episodes: int) -> None:
@@ -207,7 +215,7 @@ class ReducedFilter:
         S[:, np.arange(m), np.arange(m)] += noise_variance
         variance = S.diagonal(axis1=1, axis2=2).copy()
         accepted = gate_mask(innovation, variance, gate)
-        if not accepted.all():  # a rejected reading is one that does not depend on the state
+        if not accepted.all():  # a rejected reading does not depend on the state
             cross = cross * accepted[..., None]
             innovation = innovation * accepted
             S *= accepted[:, :, None] & accepted[:, None, :]
@@ -216,7 +224,7 @@ class ReducedFilter:
         inverse_root = np.linalg.inv(np.linalg.cholesky(S))
         W = inverse_root @ cross
         gained = np.swapaxes(W, -1, -2)
-        whitened = inverse_root @ innovation[..., None]
-        self.mean = self.states.constrain(self.mean + (gained @ whitened)[..., 0])
+        whitened = matvec(inverse_root, innovation)
+        self.mean = self.states.constrain(self.mean + matvec(gained, whitened))
         P -= gained @ W
         return variance, accepted

@@ -12,6 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from eitbench.estimation.reduced import matvec
+
 
 class JointModel(NamedTuple):
     """a⁺ = A(θ) a + w, θ⁺ = θ + ω, for c − s = Φ a about a liquid that the flow leaves as it is."""
@@ -109,7 +111,7 @@ class JointStates:
         transition, noise = np.zeros((2, B, r + 1, r + 1), A.dtype)
         transition[:, :r, :r] = A
         transition[:, r, r] = 1.0
-        transition[:, :r, r] = (slope @ mean[:, :r, None])[..., 0]
+        transition[:, :r, r] = matvec(slope, mean[:, :r])
         noise[:, :r, :r] = W
         noise[:, r, r] = self._walk_variance
         return transition, noise
@@ -127,7 +129,7 @@ class JointStates:
 
 def _moved(transition: np.ndarray, mean: np.ndarray) -> np.ndarray:
     """Return (A a, θ) of (a, θ), (B, r + 1)."""
-    a = (transition[:, :-1, :-1] @ mean[:, :-1, None])[..., 0]
+    a = matvec(transition[:, :-1, :-1], mean[:, :-1])
     return np.concatenate([a, mean[:, -1:]], axis=1)
 
 

@@ -120,8 +120,8 @@ class Belief:
         return transition @ now @ transition.T + noise
 
     def _step(self, ahead: int) -> tuple[np.ndarray, ...]:
-        """How deviations move in the step that begins so many steps from now, their noise, and the
-        mean after it."""
+        """Return the derivative of the step that begins ``ahead`` steps from now, the covariance of
+        its noise, and the mean after it."""
         if ahead >= len(self._steps):
             count = max(ahead + 1, 2 * len(self._steps))
             if self._along is not None:
@@ -131,16 +131,14 @@ class Belief:
 
     def expected_error(self, covariance: np.ndarray) -> float:
         """Expected squared error, integrated over what counts, in parts of the level's square."""
-        weight = self._weight
-        return float(covariance.trace() if weight is None else (weight * covariance).sum())
+        return float((self._weight * covariance).sum())
 
     def foresight(self, steps: int, ahead: int = 0) -> np.ndarray:
         """(s, s) weight of errors at the next measurement (the first after ``ahead`` more steps) by
         all that they will do: the flow carries them, and the squared errors over what counts are
         summed over this and so many steps more.
         """
-        first = self._weight
-        weight = total = np.eye(len(self._step(ahead)[0])) if first is None else first
+        weight = total = self._weight
         # The states of an episode are one more than the steps between them.
         last = len(self._along) - 1 if self._along is not None else ahead + steps + 1
         for k in range(min(ahead + steps, last - 1), ahead, -1):
@@ -165,8 +163,7 @@ class Belief:
         if sound is not None:
             variance = np.where(sound, variance, np.inf)
         weight = self._weight if weight is None else weight
-        DPW = DP if weight is None else DP @ weight
-        tables = ((DP @ D.T).reshape(L, L, L, L), (DPW @ DP.T).reshape(L, L, L, L))
+        tables = ((DP @ D.T).reshape(L, L, L, L), (DP @ weight @ DP.T).reshape(L, L, L, L))
         gains = pair_gains(*tables, self.rules.pairs, variance)
         if sound is not None:
             usable = sound[self.rules.pairs].all(axis=1)
@@ -214,8 +211,8 @@ class Belief:
 
     @cached_property
     def linearised(self) -> Linearisation:
-        """Of 𝓡 by the state (L, L, s), as the filter linearises the next measurement: about the
-        level, or with a learned inflow about the prediction."""
+        """Linearisation of 𝓡 that the filter uses for the next measurement: about the level, or
+        with a learned inflow about the prediction."""
         return self._filters.linearised(self._step(0)[2])
 
     @property
@@ -228,7 +225,7 @@ class Belief:
         return self._filters.relinearised()
 
     @cached_property
-    def _weight(self) -> np.ndarray | None:
+    def _weight(self) -> np.ndarray:
         return self._filters.weight(self._step(0)[2])
 
     @property

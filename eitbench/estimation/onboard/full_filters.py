@@ -82,8 +82,7 @@ class FullFilters:
         return [None if last is None else Innovation.of(*last) for last in self._last]
 
     def grid(self) -> tuple[np.ndarray, np.ndarray]:
-        # Episode by episode: the bits of one product of matrices would depend on how many play side
-        # by side.
+        # Episode by episode: the bits of one product of matrices depend on the number of episodes.
         patches = self._levels.patches
         mean = (patches @ self.means()[..., None])[..., 0]
         variance = np.array([each.covariance.variance_of(each.space.jacobian(each.mean, patches))

@@ -2,7 +2,7 @@
 
 The flow carries an inflow through the pipe (`steady_response`): c_t = c_bh (1 + Σ_k W_k u_{t−k}),
 with u = exp(E x) − 1 and x the Gaussian moments of the inflow's logarithm (`InflowPrior`). The last
-D values of x are part of the state, so that voltages are linearised about them anew at each step.
+D values of x are part of the state, so that voltages are linearised about them at each step.
 What older inflows leave is a few coordinates a with a⁺ = A a + W_D u_{t−D}; A is fitted to the
 response. The exact filter (`InflowWindow`) keeps as many x as the pipe remembers.
 """
@@ -21,7 +21,7 @@ from eitbench.data.seeds import SPLITS
 from eitbench.estimation.inflow_prior import InflowPrior, learned_inflow_prior
 from eitbench.estimation.inflow_response import Response
 from eitbench.estimation.inflow_window import stationary
-from eitbench.estimation.onboard.node_voltages import each
+from eitbench.estimation.reduced import matvec
 
 if TYPE_CHECKING:
     from eitbench.worlds.world import World
@@ -35,7 +35,7 @@ EPISODES = 200
 STEPS = 80
 """Scored steps of these, whatever the world has: short records would not show how inflows last."""
 DIRECTIONS = 100
-"""Coordinates of the concentration, the first of which are those of what older inflows leave."""
+"""Coordinates of the concentration, including the `OLDER` ones."""
 
 
 class InflowModel(NamedTuple):
@@ -137,7 +137,7 @@ class InflowStates:
         new = np.arange(h, h + r)
         moved[:, new, new] += self.model.remainder
         mean = self._move(np.zeros_like(entering), mean[..., None])[..., 0]
-        mean[:, :h] += each(self._older, u[:, 0])
+        mean[:, :h] += matvec(self._older, u[:, 0])
         return mean, moved
 
     def _move(self, entering: np.ndarray, rows: np.ndarray) -> np.ndarray:
@@ -163,7 +163,7 @@ class InflowStates:
 
     def coordinates(self, mean: np.ndarray) -> np.ndarray:
         u, _ = self._inflow(self._window(mean))
-        coordinates = each(self._recent, u.reshape(len(mean), -1))
+        coordinates = matvec(self._recent, u.reshape(len(mean), -1))
         h = len(self.model.transition)
         coordinates[:, :h] += mean[:, :h]
         return coordinates

@@ -18,8 +18,8 @@ class Innovation(NamedTuple):
     @classmethod
     def of(cls, innovation: np.ndarray, covariance: np.ndarray, std: np.ndarray,
            used: np.ndarray) -> Innovation | None:
-        """Return that of ν (L,) and S (L, L) divided by ``std`` (L,) V, of the readings ``used``
-        (L,); None if there are none."""
+        """Return the innovation of the readings ``used`` (L,), from ν (L,) and S (L, L) divided by
+        ``std`` (L,) V; None if no reading was used."""
         if not used.any():
             return None
         scale = std[used]

@@ -74,7 +74,7 @@ class Levels:
         return self
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Another process makes its own."""
+        """Pickle the world only."""
         return levels_of, (self.world,)
 
     def best(self, frames: np.ndarray, gate: float) -> list[int]:

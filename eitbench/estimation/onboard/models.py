@@ -54,7 +54,7 @@ RANK = 120
 VERSION = 1
 """Version of the models with a white inflow that are kept."""
 LEARNED_VERSION = 1
-"""Version of those with a learned inflow."""
+"""Version of the models with a learned inflow that are kept."""
 TABLE = 16
 """Velocities within the bounds, evenly spaced, for which the joint model is computed."""
 LEARNING = (0.6, 1.0, 1.4)
@@ -137,8 +137,8 @@ def stored_model_key(world: World) -> Key:
 
 def packed_model(world: World) -> dict[str, np.ndarray]:
     """Make a model on one thread, whose number changes rounding, and return it as it is stored."""
-    make: Callable[[World], Any] = (steady_model if world.velocity_model is None
-                                    else velocity_model)
+    make: Callable[[World], Any] = (make_steady_model if world.velocity_model is None
+                                    else make_joint_model)
     with threadpool_limits(1):
         return packed(make(world))
 
@@ -166,7 +166,7 @@ def unpacked(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     return model
 
 
-def steady_model(world: World) -> ReducedModel:
+def make_steady_model(world: World) -> ReducedModel:
     """Return the model of a known flow in double precision, in half a minute."""
     task = make_task(world)
     start = starting_filter(task.transport, task.prior, 1.0)
@@ -174,7 +174,7 @@ def steady_model(world: World) -> ReducedModel:
                          min(RANK, task.mesh.n_nodes))
 
 
-def velocity_model(world: World) -> JointModel:
+def make_joint_model(world: World) -> JointModel:
     """Return the model of an unknown mean velocity in double precision, in some 45 s."""
     task = make_task(world)
     flow = one_velocity(task)

@@ -8,17 +8,19 @@ import numpy as np
 import scipy.linalg
 
 from eitbench.estimation.quadratic_voltages import Resistances, ScaledVoltages
+from eitbench.estimation.reduced import matvec
 
 MODES = 80
-"""Of the logarithms: with as many, voltages differ by 0.05 standard deviations of the noise."""
+"""Number of modes of the logarithms; voltages then differ by 0.05 standard deviations of the
+noise."""
 BENT = 24
-"""The first of them, in which voltages are quadratic."""
+"""Number of the first modes, in which voltages are quadratic."""
 SMALLEST = 0.05
-"""Of the level: concentrations below do not shape the modes."""
+"""Relative to the level; smaller concentrations count as this one when modes are computed."""
 
 
 class NodeVoltages(NamedTuple):
-    """`ScaledVoltages` of concentrations in a basis, which a few nodes tell."""
+    """`ScaledVoltages` of concentrations in a basis, evaluated at a few nodes."""
 
     level: np.ndarray
     """() c_0 in mol/m³"""
@@ -42,10 +44,10 @@ class NodeVoltages(NamedTuple):
         """Return voltages (B, L) in V, and their derivatives (B, L, q) by the coordinates, of
         episodes with ``levels`` (B,) in mol/m³, ``coordinates`` (B, q) and ``currents`` (B, L).
         One level with its coordinates may serve several currents."""
-        relative = 1.0 + each(self.basis, coordinates)
+        relative = 1.0 + matvec(self.basis, coordinates)
         relative = np.maximum(relative, (self.smallest / levels)[:, None])
         u = np.log(relative) + np.log(levels / self.level)[:, None]
-        a = each(self.to_modes, u)
+        a = matvec(self.to_modes, u)
         k = len(a[0])
         m, L, _ = self.slope.shape
         slope = (self.slope.reshape(m * L, L) @ currents[..., None]).reshape(-1, m, L)
@@ -53,7 +55,7 @@ class NodeVoltages(NamedTuple):
         bent = (curvature @ currents[..., None]).reshape(-1, k, L)
         scale = np.exp((u * self.average).sum(axis=1))[:, None]
         slope, bent = np.swapaxes(slope, 1, 2), np.swapaxes(bent, 1, 2)
-        voltages = each(self.resistance, currents) + each(slope, u) + 0.5 * each(bent, a)
+        voltages = matvec(self.resistance, currents) + matvec(slope, u) + 0.5 * matvec(bent, a)
         by_u = slope + bent @ self.to_modes - voltages[..., None] * self.average
         return voltages / scale, (by_u / (relative * scale)[:, None]) @ self.basis
 
@@ -62,16 +64,15 @@ def node_voltages(model: Resistances, level: float, basis: np.ndarray,
                   samples: np.ndarray) -> NodeVoltages:
     """Return the voltages of concentrations level·(1 + basis·y), such as ``samples`` (N, q) of y.
 
-    Twice as many nodes as modes of the samples' logarithms tell these logarithms everywhere
-    (discrete empirical interpolation by least squares; Chaturantabut and Sorensen 2010).
+    Twice as many nodes as modes determine the samples' logarithms at all nodes by least squares
+    (discrete empirical interpolation; Chaturantabut and Sorensen 2010).
     """
     logarithms = np.log(np.maximum(1.0 + samples @ basis.T, SMALLEST))
     logarithms -= logarithms.mean(axis=1, keepdims=True)
-    _, modes = np.linalg.eigh(logarithms.T @ logarithms)
-    modes = modes[:, :-MODES:-1]
+    modes = np.linalg.svd(logarithms, full_matrices=False)[2][:MODES - 1].T
     level_too = np.concatenate([np.ones((len(basis), 1)), modes], axis=1)
     span = scipy.linalg.qr(level_too, mode="economic")[0]
-    nodes = _telling(span, 2 * MODES)
+    nodes = _interpolation_nodes(span, 2 * MODES)
     interpolation = span @ np.linalg.pinv(span[nodes])                                # (n, m)
     quadratic = ScaledVoltages(model, level, modes[:, :BENT]).quadratic
     resistance, slope, to_modes, curvature = quadratic.tables
@@ -83,15 +84,9 @@ def node_voltages(model: Resistances, level: float, basis: np.ndarray,
         np.ascontiguousarray(by_modes))
 
 
-def each(matrix: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """Return products (B, m) of a matrix (m, n) or matrices (B, m, n) and vectors (B, n), one by
-    one: the bits of one product with all vectors would depend on their number."""
-    return np.asarray((matrix @ vectors[..., None])[..., 0])
-
-
-def _telling(span: np.ndarray, count: int) -> np.ndarray:
-    """Return the nodes that tell combinations of the columns of ``span`` (n, k) best: pivots of a
-    QR factorisation of all, then of the remaining ones."""
+def _interpolation_nodes(span: np.ndarray, count: int) -> np.ndarray:
+    """Return the nodes that determine combinations of the columns of ``span`` (n, k) best: pivots
+    of a QR factorisation of all, then of the remaining ones."""
     first = scipy.linalg.qr(span.T, mode="r", pivoting=True)[1][:span.shape[1]]
     others = np.setdiff1d(np.arange(len(span)), first)
     second = scipy.linalg.qr(span[others].T, mode="r", pivoting=True)[1][:count - len(first)]

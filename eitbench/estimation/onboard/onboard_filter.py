@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from eitbench.estimation.onboard.rules import Rules
 
 ESTIMATORS = ("reduced", "full", "none")
-"""By name: for training, for scores, and nobody."""
+"""Names: reduced filter for training, exact filter for scores, or no filter."""
 DOUBT = 0.2
 """Weight of the last injection in the running share of readings that were rejected."""
 
@@ -106,7 +106,7 @@ class OnboardFilter:
         injected = currents.any(axis=1, keepdims=True)
         drives = currents != 0.0
         failed = ~accepted.any(axis=1, keepdims=True)
-        # A failed injection tells nothing about the electrodes that only measured.
+        # A failed injection has no information on the electrodes that only measured.
         reading += DOUBT * (injected & ~failed) * (~accepted - reading)
         driving += DOUBT * drives * (failed - driving)
 

@@ -11,7 +11,7 @@ from eitbench.data.recordings import outline, score_mass
 from eitbench.estimation.onboard.innovation import Innovation
 from eitbench.estimation.onboard.levels import Levels, Linearisation, cycle, deviation, levels_of
 from eitbench.estimation.onboard.models import reduced_states, stored_voltages
-from eitbench.estimation.reduced import ReducedFilter
+from eitbench.estimation.reduced import ReducedFilter, matvec
 
 if TYPE_CHECKING:
     from eitbench.estimation.onboard.node_voltages import NodeVoltages
@@ -44,7 +44,7 @@ class ReducedFilters:
         std = np.where(driven, std, 1.0)
         matrix /= std[..., None].astype(np.float32)
         residual = ((voltages - computed) / std).astype(np.float32) * driven
-        innovation = residual - (matrix @ (coordinates - about)[..., None])[..., 0]
+        innovation = residual - matvec(matrix, coordinates - about)
         variance, accepted = self._filter.update(
             states.jacobian(mean, matrix), innovation, np.ones_like(residual),
             gate=self._rules.gate)
@@ -64,7 +64,7 @@ class ReducedFilters:
 
     def grid(self) -> tuple[np.ndarray, np.ndarray]:
         patches = self._shared.patches
-        mean = 1.0 + (patches @ self.coordinates[..., None])[..., 0]
+        mean = 1.0 + matvec(patches, self.coordinates)
         level = self.concentration[:, None]
         return level * mean, level * self._deviation(patches)
 
@@ -78,7 +78,7 @@ class ReducedFilters:
         level = self.concentration[:, None]
         state = np.concatenate([level - self._rules.world.background, level * self.coordinates],
                                axis=1)
-        quadratic = (state * (self._shared.mass @ state[..., None])[..., 0]).sum(axis=1)
+        quadratic = (state * matvec(self._shared.mass, state)).sum(axis=1)
         return (quadratic - 2.0 * (state * moments).sum(axis=1) + deviations) / squares
 
     def means(self) -> np.ndarray:
@@ -98,7 +98,7 @@ class ReducedFilters:
     def project(rules: Rules, moment: np.ndarray) -> np.ndarray:
         return np.asarray(moment @ Shared.of(rules).basis)
 
-    # What a policy may know of the first episode (`Belief`), in double precision.
+    # Of the first episode, in double precision, for `Belief`:
 
     @property
     def state(self) -> np.ndarray:
@@ -126,15 +126,17 @@ class ReducedFilters:
         return self._by_state(self.state, by_coordinates)
 
     def _by_state(self, state: np.ndarray, table: np.ndarray) -> np.ndarray:
-        """Return derivatives (L, L, s) by the state from those by the coordinates."""
+        """Return derivatives (…, …, s) by the state from derivatives (…, …, q) by the
+        coordinates."""
         flat = table.reshape(-1, table.shape[-1])
         by_state = self._shared.states.jacobian(state[None], flat).reshape(len(flat), -1)
         return by_state.reshape(*table.shape[:2], -1)
 
-    def weight(self, state: np.ndarray) -> np.ndarray | None:
+    def weight(self, state: np.ndarray) -> np.ndarray:
         """Return W (s, s) at a mean (s,): tr(W P) is the expected squared error, integrated over
-        what counts, relative to the square of the level. None: the identity."""
-        return self._shared.weight(state)
+        the region that is scored, relative to the square of the level."""
+        half = self._by_state(state, self._shared.weight[None])[0]
+        return self._by_state(state, half.T[None])[0]
 
     def steps(self, count: int,
               along: np.ndarray | None = None) -> list[tuple[np.ndarray, ...]]:
@@ -220,7 +222,7 @@ class PredictedVoltages:
 
 
 class Shared:
-    """What all episodes of a world share, by what is assumed of the inflow."""
+    """State space, voltages and scoring constants that all episodes of a world share."""
 
     def __init__(self, world: World, inflow: str) -> None:
         self._made_of = world, inflow
@@ -234,30 +236,23 @@ class Shared:
         half = with_level.T @ (score_mass(world) @ with_level)
         self.mass = 0.5 * (half + half.T)
         self.basis = with_level
+        self.weight = self.mass[1:, 1:]
+        if world.region is None and inflow == "white":
+            # Φᵀ M Φ = I but for the single precision in which Φ is stored, which would break ties.
+            self.weight = np.eye(len(self.weight))
         self.patches = (self.levels.patches @ basis).astype(np.float32)
-        self._is_identity = (world.region is None and inflow == "white"
-                             and world.velocity_model is None)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Shared:
         return self
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Another process makes its own."""
+        """Pickle the arguments only."""
         return _shared, self._made_of
 
     @staticmethod
     def of(rules: Rules) -> Shared:
-        """Return that of a world; made once a process."""
+        """Return the cached object of a world and an inflow."""
         return _shared(rules.world.sound, rules.inflow)
-
-    def weight(self, state: np.ndarray) -> np.ndarray | None:
-        """See `ReducedFilters.weight`."""
-        if self._is_identity:
-            return None
-        half = self.states.jacobian(state[None], self.mass[1:, 1:])
-        half = half.reshape(len(self.mass) - 1, -1)
-        weight = self.states.jacobian(state[None], half.T)
-        return np.asarray(weight.reshape(half.shape[1], -1))
 
 
 @lru_cache(maxsize=4)
