@@ -43,8 +43,6 @@ def pair_currents(world: World) -> np.ndarray:
 class Linearisation(NamedTuple):
     """Voltages linearised about a level, as functions of the state relative to the level."""
 
-    concentration: float
-    """mol/m³"""
     resistance: np.ndarray
     """(L, L) 𝓡 of the homogeneous liquid, Ω (Ω·m in 2D)"""
     derivative: np.ndarray
@@ -112,7 +110,7 @@ class Levels:
         c = self.concentration(number)
         level = np.full(self.task.mesh.n_nodes, c)
         resistance, table = self.task.observation.resistance_derivatives(level)
-        return Linearisation(c, resistance, c * np.ascontiguousarray(np.moveaxis(table, 0, 2)))
+        return Linearisation(resistance, c * np.ascontiguousarray(np.moveaxis(table, 0, 2)))
 
 
 _levels = lru_cache(maxsize=2)(Levels)

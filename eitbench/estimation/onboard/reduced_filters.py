@@ -218,7 +218,7 @@ class PredictedVoltages:
         each = np.eye(L) - 1.0 / L                      # a potential that all share does not count
         level = self._levels.concentration(number)
         return Linearisation(
-            level, *self._voltages.linearise(np.array([level]), coordinates[None], each))
+            *self._voltages.linearise(np.array([level]), coordinates[None], each))
 
 
 class Shared:
