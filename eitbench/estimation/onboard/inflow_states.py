@@ -147,7 +147,7 @@ class InflowStates:
         A = self.model.transition
         h = len(A)
         moved = np.empty_like(rows)
-        moved[:, :h] = A @ rows[:, :h]
+        np.matmul(A, rows[:, :h], out=moved[:, :h])
         moved[:, :h] += entering @ rows[:, -r:]
         past = rows[:, h:].reshape(len(rows), D, -1)
         moved[:, h:h + r] = (self.model.regression @ past).reshape(len(rows), r, -1)
