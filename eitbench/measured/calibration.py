@@ -71,19 +71,17 @@ def calibrate(electrodes: CompleteElectrodeModel, currents: np.ndarray, matrix: 
 
     A prior draws contact impedances to their common mean, and outliers have less weight. Voltages
     scale as gain/σ at a given σz, so the gain is fitted only if the ``conductivity`` is specified.
-    ``ValueError`` names an argument of the wrong shape, and reports voltages without numbers or
-    with the wrong sign.
+    ``ValueError`` names an argument of the wrong shape, and voltages without numbers or with the
+    wrong sign.
 
     Parameters
     ----------
     electrodes : CompleteElectrodeModel
         Electrode model of the vessel, with any contact impedances.
-    currents, matrix : (K, L) and (M, L)
-        Injections in A, and the map from potentials to measured voltages.
+    currents, matrix, depth
+        As in `MeasurementModel`.
     voltages : (F, K, M)
         V, F frames; NaN where nothing was measured.
-    depth : float
-        See `MeasurementModel`.
     conductivity : float, optional
         σ in S/m if it is known.
     correction : "offset" or "gain"
@@ -150,17 +148,18 @@ def calibrate(electrodes: CompleteElectrodeModel, currents: np.ndarray, matrix: 
         model_voltages, _ = model(x)
         misfit = _fit_noise((mean - model_voltages)[used]**2, np.abs(mean[used]))
         weight = used / misfit.std(mean)
-    repeated = bool(count.max() > 1)
-    from_repeats = noise is not None or repeated
-    if noise is None:
-        noise = _repeat_noise(voltages, mean, used, count) if repeated else misfit
+    repeated = used & (count > 1)
+    from_repeats = noise is not None or bool(repeated.any())
+    if noise is None and from_repeats:
+        squares = (np.where(finite, voltages - mean, 0.0)**2).sum(axis=0)[repeated]
+        noise = _fit_noise(squares / (count[repeated] - 1), np.abs(mean[repeated]))
     fitted = float(np.exp(-x[0]))                                   # σ if the gain is 1
     sigma, gain = (fitted, 1.0) if conductivity is None else (conductivity, conductivity / fitted)
     covariance = np.linalg.inv(J.T @ J)
     to_log_contact = np.hstack([np.ones((L, 2)), np.eye(L)])        # ln z = ln ρ + mean + δ
     contact_std = np.sqrt(np.einsum("lp,pq,lq->l", to_log_contact, covariance, to_log_contact))
     return Calibration(sigma, float(np.sqrt(covariance[0, 0])), np.exp(x[1] + x[2:]) / sigma,
-                       contact_std, gain, noise, from_repeats, np.where(used, mean, np.nan),
+                       contact_std, gain, noise or misfit, from_repeats, np.where(used, mean, np.nan),
                        model_voltages, correction)
 
 
@@ -183,15 +182,6 @@ def electrode_sizes(electrodes: CompleteElectrodeModel) -> np.ndarray:
         size = np.sqrt(np.linalg.det(edges @ edges.transpose(0, 2, 1))).sum()  # lengths, or areas·2
         sizes.append(size if edges.shape[1] == 1 else np.sqrt(0.5 * size))
     return np.array(sizes)
-
-
-def _repeat_noise(voltages: np.ndarray, mean: np.ndarray, used: np.ndarray,
-                  count: np.ndarray) -> VoltageNoise:
-    """Fit a noise model to the scatter of the frames."""
-    difference = np.where(np.isfinite(voltages), voltages - mean, 0.0)
-    repeated = used & (count > 1)
-    variance = (difference**2).sum(axis=0)[repeated] / (count[repeated] - 1)
-    return _fit_noise(variance, np.abs(mean[repeated]))
 
 
 def noise_from_frames(frames: np.ndarray) -> VoltageNoise | None:

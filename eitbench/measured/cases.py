@@ -68,18 +68,16 @@ class MeasuredCase:
                 raise ValueError(f"case.{name} must be entries like 'name: value', got {entries!r}")
         if self.truth is not None and set(self.truth) != {"file", "sha256"}:
             raise ValueError(f"case.truth must have file and sha256, got {self.truth!r}")
-        digests = {"sha256": self.sha256, **self.auxiliary_files}
-        if self.truth:
-            digests["truth.sha256"] = self.truth["sha256"]
+        digests = {"sha256": self.sha256, **self.auxiliary_files,
+                   **({"truth.sha256": self.truth["sha256"]} if self.truth else {})}
         for name, digest in digests.items():
             if not isinstance(digest, str) or not re.fullmatch("[0-9a-f]{64}", digest):
                 raise ValueError(f"case.{name} must be 64 hexadecimal digits, got {digest!r}")
-        match self.settings.get("span", [0, 1]):
-            case [int(first), int(end)] if 0 <= first < end:
-                pass
-            case span:
-                raise ValueError("case.span must be two increasing numbers such as [0, 800], got "
-                                 f"{span!r}")
+        span = self.settings.get("span", [0, 1])
+        if not (isinstance(span, list) and [*map(type, span)] == [int, int]
+                and 0 <= span[0] < span[1]):
+            raise ValueError("case.span must be two increasing numbers such as [0, 800], got "
+                             f"{span!r}")
         if unknown := sorted(set(self.settings) - set(_SETTINGS)):
             names = (*_TEXTS, "vessel", *_OPTIONAL, *_SETTINGS)
             raise ValueError(f"case must have entries of {', '.join(names)}, got "

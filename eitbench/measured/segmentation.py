@@ -17,7 +17,7 @@ from eitbench.worlds.task import Task
 from eitbench.worlds.vessels import RoundTank
 
 PIXELS = 256
-"""Pixels along the tank's diameter."""
+"""Along the diameter of the tank."""
 WATER, RESISTIVE, CONDUCTIVE = 0, 1, 2
 """Classes of pixels."""
 SSIM_SIGMA, SSIM_RADIUS = 80.0, 160

@@ -57,10 +57,10 @@ def task_from_measurements(vessel: VesselConfig, calibration: Calibration,
 
     Parameters
     ----------
-    vessel, calibration, measurements
     mask : (K, M) bool, optional
         Measurements that are visible to the estimator. Default: all complete channels.
     moves : bool
+        Whether the target moves.
     molar_conductivity : float
         Λ in S·m²/mol.
     model_error : float

@@ -105,9 +105,8 @@ class VesselConfig:
         # finer than estimates need, as calibration corrects its error for homogeneous fluid only
         model = self.shape.electrode_model(fine=self.shape.carrier(fine=False)[0].dim == 2)
         mesh = self._rotate_mesh(model.mesh)
-        if mesh is model.mesh:
-            return model
-        return CompleteElectrodeModel(mesh, model.electrodes, model.contact_impedance, model.order)
+        return model if mesh is model.mesh else CompleteElectrodeModel(
+            mesh, model.electrodes, model.contact_impedance, model.order)
 
     def _rotate_mesh(self, mesh: Mesh) -> Mesh:
         """Mirror a mesh at y = 0 if electrodes are numbered clockwise, then rotate it."""
@@ -138,11 +137,9 @@ def read_vessel(source: Path | str | Mapping[str, Any]) -> VesselConfig:
     ``ValueError`` names the entry and the error.
     """
     if isinstance(source, Mapping):
-        return _vessel(dict(source), Path())
-    return _vessel(load_yaml(Path(source), "vessel"), Path(source).parent)
-
-
-def _vessel(entries: dict[str, Any], folder: Path) -> VesselConfig:
+        entries, folder = dict(source), Path()
+    else:
+        entries, folder = load_yaml(Path(source), "vessel"), Path(source).parent
     kind = entries.pop("kind", None)
     if kind not in VESSEL_ENTRIES:
         raise ValueError(f"vessel.kind must be one of {', '.join(VESSEL_ENTRIES)}, got {kind!r}")
@@ -152,12 +149,15 @@ def _vessel(entries: dict[str, Any], folder: Path) -> VesselConfig:
     if unknown := sorted(set(entries) - required - optional - {"conductivity"}):
         raise ValueError(f"vessel of kind {kind} has no {', '.join(unknown)}; there are "
                          f"{', '.join(sorted(required | optional))} and conductivity")
-    options: dict[str, Any] = {
-        field: entries[name] for name, field in (
-            ("first", "first_electrode_deg"), ("direction", "direction"), ("depth", "depth"),
-            ("conductivity", "conductivity")) if name in entries}
+    options: dict[str, Any] = {"first_electrode_deg" if name == "first" else name: entries[name]
+                               for name in ("first", "direction", "depth", "conductivity")
+                               if name in entries}
     if "flow" in entries:
-        options["flow"] = _flow(entries["flow"])
+        flow, names = entries["flow"], [each.name for each in fields(FlowConfig)]
+        if not isinstance(flow, Mapping) or not {"mean_velocity"} <= set(flow) <= set(names):
+            raise ValueError("vessel.flow must have mean_velocity (m/s), and may have "
+                             f"{', '.join(names[1:])}, got {flow!r}")
+        options["flow"] = FlowConfig(**flow)
     return VesselConfig(_shape(kind, entries, folder), **options)
 
 
@@ -184,14 +184,6 @@ def _shape(kind: str, entries: dict[str, Any], folder: Path) -> Any:
         raise ValueError(f"vessel.file must be a mesh file, got {path}")
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
     return MeshVessel(str(path), digest, str(path), digest, count, scale=entries.get("scale", 1.0))
-
-
-def _flow(entries: Any) -> FlowConfig:
-    names = [each.name for each in fields(FlowConfig)]
-    if not isinstance(entries, Mapping) or not {"mean_velocity"} <= set(entries) <= set(names):
-        raise ValueError("vessel.flow must have mean_velocity (m/s), and may have "
-                         f"{', '.join(names[1:])}, got {entries!r}")
-    return FlowConfig(**entries)
 
 
 def _cover(entries: Mapping[str, Any], width: str, density: float) -> float:

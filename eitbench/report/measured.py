@@ -213,14 +213,13 @@ def _contacts(env: MeasuredEnv) -> Figure:
     calibration = env.calibration
     figure, (impedance, misfit) = _panels(2, (10.5, 3.2))
     z = 1e3 * calibration.contact_impedance
-    number = np.arange(1, len(z) + 1)
-    factor = np.exp(calibration.contact_impedance_std)
+    number, factor = np.arange(1, len(z) + 1), np.exp(calibration.contact_impedance_std)
     impedance.errorbar(number, z, [z - z / factor, z * factor - z], fmt="o", color=COLOURS[0],
                        markersize=4, linewidth=1)
     impedance.set(xlabel="electrode", ylabel="contact impedance / (mΩ·m²)", yscale="log")
     misfits = electrode_misfits(calibration, env.measurements.matrix)
-    mean_voltage = np.nanmean(np.abs(calibration.mean_voltages))
-    misfit.bar(number, 100 * misfits / mean_voltage, color=COLOURS[1])
+    misfits *= 100 / np.nanmean(np.abs(calibration.mean_voltages))
+    misfit.bar(number, misfits, color=COLOURS[1])
     misfit.set(xlabel="electrode", ylabel="misfit of its readings / %\nof the mean reading")
     return figure
 
