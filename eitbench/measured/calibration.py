@@ -155,12 +155,13 @@ def calibrate(electrodes: CompleteElectrodeModel, currents: np.ndarray, matrix: 
         noise = _fit_noise(squares / (count[repeated] - 1), np.abs(mean[repeated]))
     fitted = float(np.exp(-x[0]))                                   # σ if the gain is 1
     sigma, gain = (fitted, 1.0) if conductivity is None else (conductivity, conductivity / fitted)
+    measured = np.where(used, mean, np.nan)
     covariance = np.linalg.inv(J.T @ J)
     to_log_contact = np.hstack([np.ones((L, 2)), np.eye(L)])        # ln z = ln ρ + mean + δ
     contact_std = np.sqrt(np.einsum("lp,pq,lq->l", to_log_contact, covariance, to_log_contact))
     return Calibration(sigma, float(np.sqrt(covariance[0, 0])), np.exp(x[1] + x[2:]) / sigma,
-                       contact_std, gain, noise or misfit, from_repeats, np.where(used, mean, np.nan),
-                       model_voltages, correction)
+                       contact_std, gain, noise or misfit, from_repeats, measured, model_voltages,
+                       correction)
 
 
 def electrode_misfits(calibration: Calibration, matrix: np.ndarray) -> np.ndarray:

@@ -24,20 +24,12 @@ TIMESTAMP_FORMAT = "%Y.%m.%d. %H:%M:%S.%f"
 
 def read(path: Path | str, format: str | None = None, steps: slice | None = None,
          **options: Any) -> Measurements:
-    """Read measurements from a file or a folder.
+    """Read measurements, or only the measurement vectors ``steps``, from a file or a folder.
 
-    Parameters
-    ----------
-    path : path
-    format : str, optional
-        One of `READERS`; default: by the suffix and the variables of the file.
-    steps : slice, optional
-        Only these measurement vectors; others of an HDF5 file are not read.
-    options
-        Arguments of the reader. A table may have them in a YAML file of the same name:
-        ``electrodes: 16`` and ``current: 0.001``, one per line.
-
-    ``ValueError`` names the file and the error.
+    ``format`` is one of `READERS`; by default the suffix and the variables of the file determine
+    it. ``options`` are arguments of the reader; a table may have them in a YAML file of the same
+    name: ``electrodes: 16`` and ``current: 0.001``, one per line. ``ValueError`` names the file
+    and the error.
     """
     path = Path(path)
     if not path.exists():
@@ -150,7 +142,6 @@ def read_table(path: Path, *, electrodes: int, current: float, time_step: float 
 
     Parameters
     ----------
-    path : path
     electrodes : int
         Number of electrodes L.
     current : float
