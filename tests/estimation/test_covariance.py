@@ -6,9 +6,9 @@ import scipy.linalg
 from eitbench.estimation import (
     DenseCovariance,
     Filter,
+    LinearMeasurement,
     Motion,
     NodalStates,
-    Observation,
     OpenLoopCovariance,
     kalman_filter,
     linearised,
@@ -82,7 +82,7 @@ def test_variances_are_never_negative():
     root = np.random.default_rng(9).normal(size=(n, n))
     covariance = DenseCovariance(1e6 * (root @ root.T + np.eye(n)))
     filter_ = Filter(NodalStates(np.zeros(n), covariance, Motion()))
-    filter_.update(Observation(np.eye(n), np.zeros(n), np.full(n, 1e-12)))
+    filter_.update(LinearMeasurement(np.eye(n), np.zeros(n), np.full(n, 1e-12)))
     assert 0.0 <= filter_.variance.min() <= filter_.variance.max() < 1e-6
 
 

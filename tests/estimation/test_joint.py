@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from eitbench.estimation import Filter, Observation, UnknownFlow, VelocityStates
+from eitbench.estimation import Filter, LinearMeasurement, VelocityPrior, VelocityStates
 from models import MESH, averages, coarse_transport, directions, shapes
 
 C_BH, N = 30.0, 147
@@ -27,7 +27,7 @@ def joint_filter(k=1, **changes):
     given = {"start": NOMINAL[:k], "start_std": STD[:k], "walk_std": np.full(k, 0.02), "profiles": shapes(k),
              "bounds": (0.01, 4.0), "mean": np.full(N, C_BH), "covariance": 50.0 * np.eye(N), "inflow": C_BH,
              "inflow_std": C_BH / 4, "nodal_noise": nodal_noise()} | changes
-    flow = UnknownFlow(transport_at, directions(k), *(given.pop(name) for name in (
+    flow = VelocityPrior(transport_at, directions(k), *(given.pop(name) for name in (
         "start", "start_std", "walk_std", "profiles", "bounds")))
     return Filter(VelocityStates(flow, **given))
 
@@ -47,8 +47,8 @@ def started(rng, k=3):
     for _ in range(3):
         filter_.predict()
         H = sensors(rng)
-        filter_.update(Observation(H, C_BH + rng.normal(size=16), np.full(16, 0.1)))
-    return filter_, Observation(sensors(rng), C_BH + rng.normal(size=16), np.full(16, 0.1))
+        filter_.update(LinearMeasurement(H, C_BH + rng.normal(size=16), np.full(16, 0.1)))
+    return filter_, LinearMeasurement(sensors(rng), C_BH + rng.normal(size=16), np.full(16, 0.1))
 
 
 def textbook_update(mean, P, observation, k):
@@ -121,7 +121,7 @@ def test_velocity_is_found(truth):
         c = transport.step(c, c[:7], C_BH + C_BH / 4 * rng.normal(size=7))
         H = sensors(rng)
         filter_.predict()
-        filter_.update(Observation(H, H @ c + 0.3 * rng.normal(size=16), np.full(16, 0.09)))
+        filter_.update(LinearMeasurement(H, H @ c + 0.3 * rng.normal(size=16), np.full(16, 0.09)))
     theta, variance = theta_of(filter_)
     miss, std = theta - truth, np.sqrt(variance)
     assert (np.abs(miss) < 3 * std).all()
