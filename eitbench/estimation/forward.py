@@ -48,8 +48,8 @@ class LinearisedForwardModel:
 
 
 def linearise_at_reference(task: Task, c_ref: float) -> Forward:
-    """Return the linearisation of the task's voltages about homogeneous fluid of ``c_ref`` in mol/m³,
-    computed once for each pattern (linearised Kalman filter)."""
+    """Return the linearisation of the task's voltages about homogeneous fluid of ``c_ref`` in
+    mol/m³, computed once for each pattern (linearised Kalman filter)."""
     reference = LinearisedForwardModel(task.observation, task.noise,
                                        np.full(task.mesh.n_nodes, c_ref))
     return lambda point, voltages, currents: reference(voltages, currents)

@@ -103,7 +103,7 @@ def test_members_move_with_their_own_flow():
 def test_many_members_give_the_kalman_filter(monkeypatch):
     """With a linear prior in a flow that is known, from inflows that have filled the pipe to its walls: after four
     measurements the mean to a tenth (rms) of how far it has moved, variances to 15 %, five standard errors of 2,000."""
-    monkeypatch.setattr(inflow_response, "FORGOTTEN", 1e-6)
+    monkeypatch.setattr(inflow_response, "DECAY_TOLERANCE", 1e-6)
     filter_ = ensemble("linear", 2000, std=0.0, spin_up_steps=60)
     exact = Filter(InflowWindow(task(), prior("linear"), LEVEL))
     for seed in range(4):

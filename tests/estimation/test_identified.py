@@ -18,7 +18,7 @@ from eitbench.estimation import (
     full_window_filter,
     identify_model,
     inflow_filter,
-    linearised,
+    linearise_voltages,
     maximise_posterior,
     steady_response,
 )
@@ -125,7 +125,7 @@ def test_scatter_is_that_of_linearised_readings():
         for t in range(first.length):
             first.add(example.voltages[t], example.currents[t])
         for voltages, currents, truth in zip(example.voltages, example.currents, example.truth, strict=True):
-            at = linearised(task().observation, task().noise, first.mean, voltages, currents)
+            at = linearise_voltages(task().observation, task().noise, first.mean, voltages, currents)
             std = np.sqrt(at.noise_variance)
             off = at.value - at.matrix @ truth.astype(float) - once().mean_error(currents, std)
             whitened.append(np.linalg.solve(once().error_root(currents, std), off))
@@ -147,7 +147,7 @@ def test_filter_linearises_once_if_the_model_says_so():
         before = copy.deepcopy(filter_.mean), filter_.covariance.copy()
         step = filter_.assimilate(voltages, currents)
         mean, covariance = filter_.space.propagate(*before, filter_.time)
-        at = linearised(task().observation, task().noise, level, voltages, currents)
+        at = linearise_voltages(task().observation, task().noise, level, voltages, currents)
         std = np.sqrt(at.noise_variance)
         slope = filter_.space.jacobian(mean, at.matrix)
         known = covariance.array[:slope.shape[1], :slope.shape[1]]
@@ -212,7 +212,7 @@ def test_filter_is_gaussian_conditioning():
 def surprise(space, before, covariance, x, voltages, currents):
     """−2 ln of the density of the newest inflows x given what was known before, and the readings."""
     concentration = space.concentration(x)
-    observation = linearised(task().observation, task().noise, concentration, voltages, currents)
+    observation = linearise_voltages(task().observation, task().noise, concentration, voltages, currents)
     off = (observation.value - observation.matrix @ concentration) / np.sqrt(observation.noise_variance)
     return (x - before) @ np.linalg.solve(covariance, x - before) + (off**2).sum()
 
@@ -269,10 +269,10 @@ def test_other_files_are_told(tmp_path):
         (tmp_path / "b.npz").write_bytes(content)
         with pytest.raises(ValueError, match=r"b\.npz must be a model of `eitbench fit model`"):
             IdentifiedModel.load(tmp_path / "b.npz")
-    with pytest.raises(ValueError, match=r"spread must have shape \(24, 24\)"):
-        replace(model(), spread=np.eye(3))
-    with pytest.raises(ValueError, match=r"scatter must have shape"):
-        replace(model(), scatter=np.eye(4))
+    with pytest.raises(ValueError, match=r"residual_covariance must have shape \(24, 24\)"):
+        replace(model(), residual_covariance=np.eye(3))
+    with pytest.raises(ValueError, match=r"voltage_error_covariance must have shape"):
+        replace(model(), voltage_error_covariance=np.eye(4))
 
 
 @lru_cache(maxsize=1)

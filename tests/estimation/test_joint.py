@@ -158,7 +158,7 @@ def test_velocity_stays_within_its_bounds(k, far):
 
 @pytest.mark.parametrize(("changes", "name"), [
     ({"mean": np.zeros((N, 1))}, "^mean"), ({"covariance": np.eye(N - 1)}, "^covariance"),
-    ({"start": np.array([4.5, 0.0])}, "^start"), ({"start": np.array([np.nan])}, "^start"),
+    ({"start": np.array([4.5, 0.0])}, "^initial"), ({"start": np.array([np.nan])}, "^initial"),
     ({"inflow_std": -1.0}, "^inflow_std"), ({"nodal_noise": np.ones(N)}, "^nodal_noise"),
     ({"profiles": np.ones((5, 2))}, "^profiles"), ({"profiles": np.zeros((5, 1))}, "^profiles"),
     ({"bounds": (0.0, 5.0)}, "^bounds"), ({"bounds": (0.1, 0.9)}, "^bounds"), ({"bounds": (1.5, 2.0)}, "^bounds"),

@@ -180,7 +180,7 @@ def test_what_does_not_fit_is_told():
         scaled_velocity_prior(make_task(STATIONARY_TANK_2D), 0.3, 0.0)
     with pytest.raises(ValueError, match="walk_std"):
         flow(walk=(0.1,))
-    with pytest.raises(ValueError, match=r"profiles must give a positive velocity with start, got -4\.5"):
+    with pytest.raises(ValueError, match=r"profiles must give a positive velocity with initial, got -4\.5"):
         replace(flow(), profiles=-np.ones((3, 2)))
     with pytest.raises(ValueError, match="window"):
         started(flow(), 0)

@@ -56,7 +56,7 @@ def enumerated(filter_, regimes, measured):
     G = LEVEL * basis @ np.tensordot(weights, space.prior.modes, 1).reshape(len(weights), -1)
     G = np.concatenate([G, np.zeros((len(G), (W - weights.shape[1]) * r))], axis=1)
     steps = []
-    for move, variance in (each.space.regression for each in filter_.filters):
+    for move, variance in (each.space.ar_model for each in filter_.filters):
         A = np.eye(W * r, k=-r)
         A[:r] = np.concatenate([np.diag(row) for row in np.broadcast_to(move, (W, r))], axis=1)
         Q = np.zeros((W * r, W * r))
@@ -155,7 +155,7 @@ def test_mistakes_are_told(tmp_path):
         SwitchingInflowFilter(task(), prior(0.1, 0.1), LEVEL, 0.0, linearise_at_prediction(task()))
     with pytest.raises(ValueError, match="p_onset must be"):
         Regimes(0.0, 0.1, 0.1)
-    with pytest.raises(ValueError, match="quiet_threshold must be a size that some steps exceed"):
+    with pytest.raises(ValueError, match="quiet_threshold must be exceeded in some steps only"):
         fit_inflow_prior(np.full((1, 40, 3), 1.1), np.zeros((3, 2)), 0.005, quiet_threshold=0.01)
     prior(0.1, 0.2).save(tmp_path / "a.json")
     assert InflowPrior.load(tmp_path / "a.json").regimes == Regimes(0.1, 0.2, 1e-3)
