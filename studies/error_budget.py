@@ -21,11 +21,11 @@ import eitbench
 from eitbench.data.dataset import Example
 from eitbench.data.seeds import parse_seeds
 from eitbench.estimation import (
-    Observation,
+    LinearMeasurement,
     best_homogeneous,
+    compatible_models,
+    compatible_priors,
     inflow_filter,
-    suiting_models,
-    suiting_priors,
 )
 from eitbench.physics.observation import VoltageNoise
 from eitbench.worlds.streams import randomness
@@ -60,8 +60,8 @@ class ErrorBudget:
     def __init__(self) -> None:
         self.examples = eitbench.dataset(ID, EPISODES)
         self.task = make_task(self.examples.world)
-        self.prior = suiting_priors(BASELINES / "priors", self.task, "logarithm")[0]
-        self.model = suiting_models(BASELINES / "models", self.task)[0]
+        self.prior = compatible_priors(BASELINES / "priors", self.task, "logarithm")[0]
+        self.model = compatible_models(BASELINES / "models", self.task)[0]
         self.mass = self.examples.mass
         x = self.task.mesh.points[:, 0]
         self.near = x < x.min() + INLET_REGION_M
@@ -79,7 +79,7 @@ class ErrorBudget:
             lags = np.abs(np.subtract.outer(np.arange(steps), np.arange(steps)))
             x = np.linalg.cholesky(correlation[lags]) @ randomness(seed).policy.normal(
                 size=(steps, self.prior.modes.shape[1]))
-            inflow = self.prior.inflow(x @ self.prior.modes.T)
+            inflow = self.prior.inverse_link(x @ self.prior.modes.T)
         else:
             inflow = world.sample_inflow(seed) / world.background
         basis, weights = self.model.response
@@ -99,8 +99,8 @@ class ErrorBudget:
         for t, state in enumerate(states, start=1):
             currents = injections(t)
             voltages = self.task.observation.voltages(state, currents)
-            measurements.append((voltages + noise.std(voltages) * random.normal(size=voltages.shape),
-                                 currents))
+            error = noise.std(voltages) * random.normal(size=voltages.shape)
+            measurements.append((voltages + error, currents))
         return measurements
 
     def cycle(self, t: int) -> np.ndarray:
@@ -143,7 +143,7 @@ class ErrorBudget:
                 predicted, jacobian = task.observation.linearise(point, currents)
                 matrix = jacobian.reshape(-1, jacobian.shape[-1])
                 value = (voltages - predicted).ravel() + matrix @ point
-                filter_.update(Observation(matrix, value, noise.std(predicted).ravel()**2))
+                filter_.update(LinearMeasurement(matrix, value, noise.std(predicted).ravel()**2))
             yield filter_.concentration, filter_.variance
 
     def score(self, estimates: Iterator[tuple[np.ndarray, np.ndarray]], truth: np.ndarray,

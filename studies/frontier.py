@@ -32,7 +32,8 @@ from eitbench.worlds.task import Estimate
 
 ID = "eitbench/Pipe2D-v0"
 DOCS = Path(__file__).parents[1] / "docs"
-SNAPSHOT_METHODS = {"kalman_filter": "Kalman filter (thesis)", "identified_flow": "fitted inflow and flow"}
+SNAPSHOT_METHODS = {"kalman_filter": "Kalman filter (thesis)",
+                    "identified_flow": "fitted inflow and flow"}
 COLOURS = {"kalman_filter": "0.6", "extended_kalman_filter": "0.35", "log_inflow_filter": ACCENT,
            "identified_flow": INK}
 """Colours of the methods whose coverage is drawn."""

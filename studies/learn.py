@@ -26,8 +26,14 @@ from eitbench.data.bank import fill
 from eitbench.data.dataset import Dataset, Example, strongest
 from eitbench.data.parallel import in_parallel
 from eitbench.data.seeds import parse_seeds
-from eitbench.estimation import FilterSeen, FirstFrame, VoltagesSeen, suiting_models, suiting_priors
-from eitbench.estimation.identified import told as told_of
+from eitbench.estimation import (
+    CalibrationFrame,
+    FilterFeatures,
+    VoltageFeatures,
+    compatible_models,
+    compatible_priors,
+)
+from eitbench.estimation.identified import task_fingerprint
 from eitbench.worlds.streams import randomness
 from eitbench.worlds.task import make_task
 from eitbench.worlds.world import World
@@ -114,22 +120,22 @@ def features(examples: Dataset, example: Example, basis: np.ndarray,
     episode the lag is shorter.
     """
     task = make_task(examples.world)
-    first = FirstFrame(task)
+    first = CalibrationFrame(task)
     measurements = list(zip(example.voltages, example.currents, strict=True))
     for measurement in measurements[:first.length]:
         first.add(*measurement)
-    truth, weight, rest = project(examples, example, basis, first.c_bh)
+    truth, weight, rest = project(examples, example, basis, first.c_ref)
     if input_features == "voltages":
-        extract = VoltagesSeen(task, first.c_bh, basis)
+        extract = VoltageFeatures(task, first.c_ref, basis)
         steps = [extract(*measurement) for measurement in measurements]
         inputs, reduced = (np.array(each) for each in zip(*steps, strict=True))
         lagged = {}
     else:
-        prior = suiting_priors(ROOT / "baselines" / "priors", task, "logarithm")[0]
+        prior = compatible_priors(ROOT / "baselines" / "priors", task, "logarithm")[0]
         model = None
         if input_features == "identified":
-            model = suiting_models(ROOT / "baselines" / "models", task)[0]
-        extract = FilterSeen(task, prior, first.c_bh, basis, max(LAGS), model)
+            model = compatible_models(ROOT / "baselines" / "models", task)[0]
+        extract = FilterFeatures(task, prior, first.c_ref, basis, max(LAGS), model)
         inputs, (reduced, *each) = extract.record(measurements, 0, *LAGS)
         lagged = {f"reduced {lag}": modes for lag, modes in zip(LAGS, each, strict=True)}
     return {"inputs": inputs.astype(np.float32), "reduced": reduced, "truth": truth, "rest": rest,
@@ -308,7 +314,7 @@ def main(
         ROOT / "baselines" / "networks" / setup.network,
         **average_networks(networks[:setup.ensemble_size]),
         basis=modes["basis"].astype(np.float16), rest=modes["rest"].astype(np.float32),
-        task=told_of(make_task(world)))
+        task=task_fingerprint(make_task(world)))
     draw(name, setup.episodes, scores, filter_error)
 
 

@@ -41,7 +41,8 @@ def main() -> None:
     replayed = [roll_out(envs, seeds, lambda k, _, offset=offset: np.roll(actions[k], offset))[0]
                 for offset in EPISODE_OFFSETS]
     increase, half = mean_and_interval(list(adaptive - np.mean(replayed, axis=0)))
-    print(f"with the injections of another episode the error increases by {increase:.5f} ± {half:.5f}")
+    print("with the injections of another episode the error increases by "
+          f"{increase:.5f} ± {half:.5f}")
 
 
 def roll_out(env: InjectionVectorEnv, seeds: list[int],

@@ -11,10 +11,10 @@ import numpy as np
 from scipy.optimize import minimize, minimize_scalar
 
 from eitbench import _check
-from eitbench.estimation.forward import LinearisedObservations
+from eitbench.estimation.forward import LinearisedForwardModel
 from eitbench.estimation.gaussian import condition, innovate
 from eitbench.estimation.nodal import modal_states
-from eitbench.estimation.walk import RandomWalk, smooth_modes, steady
+from eitbench.estimation.walk import RandomWalk, matern32_transition, matern_modes
 from eitbench.measured.calibration import Calibration
 from eitbench.measured.measurements import Measurements
 from eitbench.measured.model import MeasurementModel, complete_channels, visible_measurement
@@ -157,12 +157,13 @@ def maximise_evidence(task: Task, measurements: Measurements, free: list[str],
 
 
 def maximise_rate_evidence(task: Task, measurements: Measurements) -> float:
-    """Return the rate λ in 1/s of a Matérn-3/2 motion (`steady`) that maximises the evidence, with
-    the task's noise and initial standard deviation."""
+    """Return the rate λ in 1/s of a Matérn-3/2 motion that maximises the evidence, with the task's
+    noise and initial standard deviation."""
     evidence = _NegTwoLogEvidence(task, measurements)
     frame = max(task.warm_up, 1)
     optimum = minimize_scalar(
-        lambda x: evidence(1.0, task.prior.initial_std, lambda steps: steady(np.exp(x) * steps)),
+        lambda x: evidence(1.0, task.prior.initial_std,
+                           lambda steps: matern32_transition(np.exp(x) * steps)),
         bounds=np.log([each / frame for each in RATE_LIMITS]), method="bounded",
         options={"xatol": 0.05})
     return float(np.exp(optimum.x)) / task.transport.time_step
@@ -189,9 +190,9 @@ class _NegTwoLogEvidence:
         starts = np.linspace(0, max(task.n_steps - frames, 0), N_SPANS).round().astype(int)
         used = np.unique(np.minimum(starts[:, None] + np.arange(frames), task.n_steps - 1))
         self._steps = np.diff(used, prepend=-1)
-        modes = task.expected_concentration * smooth_modes(task.mesh, task.prior.initial_length)
+        modes = task.expected_concentration * matern_modes(task.mesh, task.prior.initial_length)
         point = np.full(task.mesh.n_nodes, task.expected_concentration)
-        linear = LinearisedObservations(task.observation, task.noise, point)
+        linear = LinearisedForwardModel(task.observation, task.noise, point)
         self._data = []
         for voltages, currents in (visible_measurement(model, measurements, t) for t in used):
             H, value, variance, _ = linear(voltages, currents)

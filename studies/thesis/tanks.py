@@ -13,7 +13,7 @@ from matplotlib.patches import Circle
 
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.rendering import draw_field
-from eitbench.estimation import FirstFrame
+from eitbench.estimation import CalibrationFrame
 from eitbench.numerics.fem import mass_matrix
 from eitbench.numerics.mesh import Mesh
 from eitbench.scoring import deficit_centre
@@ -238,9 +238,9 @@ def fig7_4(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
 def _initial_estimate(env: EstimationEnv, seed: int) -> float:
     """Return ĉ_bh of the first injection in mol/m³, the filter's estimate at t = 0."""
     observation, _ = env.reset(seed=seed)
-    first = FirstFrame(env.task)
+    first = CalibrationFrame(env.task)
     first.add(observation["voltages"], observation["currents"])
-    return first.c_bh
+    return first.c_ref
 
 
 def _both_located(mesh: Mesh, values: np.ndarray,

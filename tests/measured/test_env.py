@@ -150,9 +150,9 @@ def test_the_random_walk_conserves_mass_and_the_initial_variance(env):
     np.testing.assert_allclose(model.F @ c, walk.step(c))
     weights = mass_matrix(env.task.mesh).sum(axis=0)
     assert weights @ walk.step(c) == pytest.approx(weights @ c)
-    np.testing.assert_allclose(np.diff(walk.step(c)), walk.memory * np.diff(c))
+    np.testing.assert_allclose(np.diff(walk.step(c)), walk.ar_coefficient * np.diff(c))
     prior = env.task.prior
-    assert prior.nodal_std**2 / (1 - walk.memory**2) == pytest.approx(prior.initial_std**2)
+    assert prior.nodal_std**2 / (1 - walk.ar_coefficient**2) == pytest.approx(prior.initial_std**2)
     np.testing.assert_allclose(model.H @ model.H.T, walk.covariance, atol=1e-8)
     assert np.diag(walk.covariance).mean() == pytest.approx(1.0, rel=0.05)
 

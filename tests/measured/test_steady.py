@@ -4,18 +4,18 @@ import numpy as np
 import pytest
 from eitbench.bench.playing import run_on_measurements
 from eitbench.envs.measured import MeasuredEnv
-from eitbench.estimation.walk import smooth_modes, steady
+from eitbench.estimation.walk import matern32_transition, matern_modes
 from tanks import FIXED_STDS, VESSEL, moving
 
 
 def test_correlation_is_matern():
     """The correlation is (1 + λτ) e^−λτ; short steps compose to a long step, and the variance is stationary."""
     for phase in (0.1, 1.0, 4.0):
-        A, Q = steady(phase)
+        A, Q = matern32_transition(phase)
         assert A[0, 0] == pytest.approx((1 + phase) * np.exp(-phase))
         np.testing.assert_allclose(A @ A.T + Q, np.eye(2))
         assert np.linalg.eigvalsh(Q).min() > -1e-15
-        short, _ = steady(phase / 8)
+        short, _ = matern32_transition(phase / 8)
         np.testing.assert_allclose(np.linalg.matrix_power(short, 8), A, atol=1e-12)
 
 
@@ -23,15 +23,16 @@ def test_process_noise_is_integrated_white_noise():
     """Q is ∫ e^Fs L Lᵀ e^Fᵀs ds of dx = F x dt + L dw, with λ = 1 and a spectral density of 4."""
     phase = 0.7
     s = (np.arange(20_000) + 0.5) / 20_000 * phase
-    responses = np.array([steady(each)[0] @ [0.0, 1.0] for each in s])
-    np.testing.assert_allclose(steady(phase)[1], 4 * responses.T @ responses * phase / len(s), rtol=1e-6, atol=1e-9)
+    responses = np.array([matern32_transition(each)[0] @ [0.0, 1.0] for each in s])
+    np.testing.assert_allclose(matern32_transition(phase)[1], 4 * responses.T @ responses * phase / len(s),
+                               rtol=1e-6, atol=1e-9)
 
 
 def test_modes_reproduce_the_covariance_of_the_field():
     """The residual is at most a thousandth of the variance of the strongest mode."""
     env = MeasuredEnv(moving(frames=3), VESSEL, **FIXED_STDS)
     walk = env.task.transport
-    modes = smooth_modes(walk.mesh, walk.length)
+    modes = matern_modes(walk.mesh, walk.length)
     strongest = (modes**2).sum(axis=0).max()
     residual = np.linalg.eigvalsh(walk.covariance - modes @ modes.T)
     assert -1e-9 * strongest < residual.min()

@@ -13,7 +13,7 @@ from eitbench.bench.text import seed_ranges
 from eitbench.data.cache import CACHE_VARIABLE
 from eitbench.data.seeds import name_seed
 from eitbench.envs.estimation import EstimationEnv
-from eitbench.estimation import FirstFrame, initial_covariance
+from eitbench.estimation import CalibrationFrame, initial_covariance
 from eitbench.physics.rest import AtRest
 from eitbench.worlds import entry
 from eitbench.worlds.flows import FlowPastBulge, _past_bulge
@@ -158,7 +158,7 @@ def test_map_estimate_minimises_its_objective():
     env = make_environment("StationaryTank2D", {"schedule": {"scored_steps": 3}})
     assert load_method("map_estimate", "estimation").make.suits(env.task)
     assert not load_method("map_estimate", "estimation").make.suits(make_environment("RotatingTank2D", None).task)
-    task, first = env.task, FirstFrame(env.task)
+    task, first = env.task, CalibrationFrame(env.task)
     observation, _ = env.reset(seed=SEED)
     measurements = []
     for _ in range(3):
@@ -166,11 +166,11 @@ def test_map_estimate_minimises_its_objective():
         observation, *_ = env.step(np.full(task.mesh.n_nodes, 30.0))
     first.add(*measurements[0])
     V, I = (np.array(part) for part in zip(*measurements, strict=True))
-    precision = np.linalg.inv(first.c_bh**2 * initial_covariance(task.mesh, task.prior))
+    precision = np.linalg.inv(first.c_ref**2 * initial_covariance(task.mesh, task.prior))
 
     def objective(c):
         misfit = (V - task.observation.voltages(c, I)) / task.noise.std(V)
-        return (misfit**2).sum() + (c - first.c_bh) @ precision @ (c - first.c_bh)
+        return (misfit**2).sum() + (c - first.c_ref) @ precision @ (c - first.c_ref)
 
     best, linear = (run_baseline(env, name, SEED)[2].mean for name in ("map_estimate", "kalman_filter"))
     assert objective(best) < objective(linear)
