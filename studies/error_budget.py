@@ -29,7 +29,7 @@ from eitbench.estimation import (
     suiting_priors,
 )
 from eitbench.physics.observation import VoltageNoise
-from eitbench.worlds.streams import randomness
+from eitbench.worlds.random_streams import episode_streams
 from eitbench.worlds.task import make_task
 
 ID = "eitbench/Pipe2D-v0"
@@ -77,10 +77,10 @@ class Budget:
         task = self.task
         world = self.examples.world
         if drawn:
-            steps = world.lead_in + task.n_steps + 1
+            steps = world.spin_up_steps + task.n_steps + 1
             correlation = self.prior.time_covariance(steps)
             apart = np.abs(np.subtract.outer(np.arange(steps), np.arange(steps)))
-            x = np.linalg.cholesky(correlation[apart]) @ randomness(seed).policy.normal(
+            x = np.linalg.cholesky(correlation[apart]) @ episode_streams(seed).policy.normal(
                 size=(steps, self.prior.modes.shape[1]))
             inflow = self.prior.inflow(x @ self.prior.modes.T)
         else:
@@ -97,7 +97,7 @@ class Budget:
     def measured(self, states: np.ndarray, injections: Injections, noise: VoltageNoise,
                  seed: int) -> list[tuple[np.ndarray, np.ndarray]]:
         """Voltages and currents (J, L) of each state, by the model that the filter has."""
-        random = randomness(seed).noise
+        random = episode_streams(seed).noise
         record = []
         for t, state in enumerate(states, start=1):
             currents = injections(t)
@@ -168,7 +168,8 @@ class Budget:
     def own(self, seed: int, injections: Injections, *, drawn: bool = False, noise: float = 1.0,
             times: int = 2) -> Played:
         """In the filter's own world, the noise so many times what it is."""
-        told = VoltageNoise(noise * self.task.noise.relative, noise * self.task.noise.of_largest)
+        told = VoltageNoise(noise * self.task.noise.relative,
+                            noise * self.task.noise.relative_to_max)
         states = self.states(seed, drawn)
         record = self.measured(states, injections, told, seed)
         square = np.einsum("tn,nt->t", states, self.mass @ states.T)

@@ -16,7 +16,7 @@ from matplotlib.ticker import FuncFormatter
 from thesis.common import ACCENT, INK, bare, comparison, error_of, estimates_of, save
 
 from eitbench import scoring
-from eitbench.data.recordings import score_operators
+from eitbench.data.episode_cache import score_operators
 from eitbench.data.seeds import parse_seeds
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.worlds.task import Estimate

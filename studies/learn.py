@@ -22,13 +22,13 @@ from tqdm import tqdm, trange
 
 import eitbench
 from eitbench._files import write_atomically
-from eitbench.data.bank import fill
-from eitbench.data.dataset import Dataset, Example, strongest
-from eitbench.data.parallel import in_parallel
+from eitbench.data.dataset import Dataset, Example, pod_basis
+from eitbench.data.parallel import run_parallel
+from eitbench.data.presimulation import presimulate
 from eitbench.data.seeds import parse_seeds
 from eitbench.estimation import FilterSeen, FirstFrame, VoltagesSeen, suiting_models, suiting_priors
 from eitbench.estimation.identified import told as told_of
-from eitbench.worlds.streams import randomness
+from eitbench.worlds.random_streams import episode_streams
 from eitbench.worlds.task import make_task
 from eitbench.worlds.world import World
 
@@ -99,7 +99,7 @@ FEATURES = ("inputs", "reduced", "truth", "rest", "weight")
 def modes(examples: Dataset, q: int) -> dict[str, np.ndarray]:
     """``basis`` (n, q), orthonormal in M̃: the strongest modes of the scored states; ``rest`` (n,):
     the mean square of what they leave of c/c_0 − 1."""
-    basis, left = strongest(examples, q)
+    basis, left = pod_basis(examples, q)
     return {"basis": basis, "rest": left / examples.world.background**2}
 
 
@@ -139,7 +139,7 @@ def features(examples: Dataset, example: Example, basis: np.ndarray,
 def in_modes(examples: Dataset, example: Example, basis: np.ndarray,
              level: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """True modes (T, q) of c/level − 1, and two numbers a step as of `features`."""
-    found = examples.reduced(level * basis, level).of(example)
+    found = examples.project(level * basis, level).project_example(example)
     return found.truth, level**2 / found.square, found.unresolved / found.square
 
 
@@ -199,7 +199,7 @@ def of_episodes(lesson: Lesson, seeds: list[int]) -> Tensors:
 def velocities(world: World, seeds: Sequence[int]) -> torch.Tensor:
     """(N, 1) of the episodes' flows, as the memory must tell them."""
     mean, std = USUAL
-    drawn = [world.flow.draw(world, randomness(seed).flow)(1).mean_velocity for seed in seeds]
+    drawn = [world.flow.draw(world, episode_streams(seed).flow)(1).mean_velocity for seed in seeds]
     return (torch.tensor(drawn, dtype=torch.float32)[:, None] - mean) / std
 
 
@@ -279,11 +279,11 @@ def main(
     train = parse_seeds(f"train:0-{max(what.episodes) - 1}")
     dev = parse_seeds("dev:0-31")
     world = eitbench.dataset(what.env, train).world
-    fill(world, train + dev, n_jobs=jobs)
+    presimulate(world, train + dev, n_jobs=jobs)
     told = basis_and_rest(what)
     nodes = (told["basis"], told["rest"]) if what.likelihood == "nodes" else ()
     todo = [(what, seed, told["basis"]) for seed in train + dev]
-    looking = in_parallel(of_episode, todo, jobs)
+    looking = run_parallel(of_episode, todo, jobs)
     list(tqdm(looking, total=len(todo), desc="looking", unit="episode", disable=None))
     data = of_episodes(what, train)
     held = of_episodes(what, dev)

@@ -18,7 +18,7 @@ CACHE_BYTES = 2**27
 class Resistances(Protocol):
     """What the quadratic is of; such as `ObservationModel`."""
 
-    smallest_concentration: float
+    min_concentration: float
     """mol/m³, as which what is below counts"""
 
     def resistance_derivatives(self, concentration: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -43,7 +43,7 @@ class QuadraticVoltages:
 
     def __init__(self, model: Resistances, level: float, modes: np.ndarray) -> None:
         self.level = _check.number("level", level, low=0.0, open_low=True, units="mol/m³")
-        self.smallest = model.smallest_concentration
+        self.smallest = model.min_concentration
         modes = _check.array("modes", modes, (None, None))
         n, q = modes.shape
         self._to_modes = np.linalg.pinv(modes)
@@ -120,7 +120,7 @@ class ScaledVoltages:
 
     def __init__(self, model: Resistances, level: float, modes: np.ndarray) -> None:
         self.level = _check.number("level", level, low=0.0, open_low=True, units="mol/m³")
-        self.smallest = model.smallest_concentration
+        self.smallest = model.min_concentration
         modes = _check.array("modes", modes, (None, None))
         with_level, _ = np.linalg.qr(np.column_stack([np.ones(len(modes)), modes]))
         self.quadratic = QuadraticVoltages(_Scaled(model, level), level, with_level)
@@ -145,7 +145,7 @@ class _Scaled:
     def __init__(self, model: Resistances, level: float) -> None:
         self.model = model
         self.level = level
-        self.smallest_concentration = model.smallest_concentration
+        self.min_concentration = model.min_concentration
 
     def resistance_derivatives(self, concentration: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         R, by_c = self.model.resistance_derivatives(concentration)

@@ -161,7 +161,7 @@ def asked_flow(task: Task, bounds: tuple[float, float] = (0.05, 4.0)) -> Unknown
     flow = task.velocity
     if flow is None:
         raise ValueError("task must ask for the flow, got one that does not")
-    return UnknownFlow(task.transport_at, flow.directions, np.array(flow.nominal),
+    return UnknownFlow(task.transport_at, flow.basis_fields, np.array(flow.nominal),
                        np.array(flow.initial_std), np.array(flow.walk_std), flow.profiles, bounds)
 
 

@@ -113,8 +113,8 @@ def _changed(env: EstimationEnv, factors: Factors) -> Task:
 def _transport(world: World, factor: float) -> Transport:
     """The model's transport with another diffusivity; kept, since filters keep what they derive
     from it with it."""
-    return world.changed({"flow": {"diffusivity": factor
-                                   * world.flow.diffusivity}}).model().transport
+    return world.with_changes({"flow": {"diffusivity": factor
+                                   * world.flow.diffusivity}}).estimator_model().transport
 
 
 def _played(env: EstimationEnv, task: Task, seed: int) -> float:

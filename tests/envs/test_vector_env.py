@@ -20,7 +20,7 @@ from short import PLAIN, short
 
 LAGS = [name for name in PLAIN if name in ESTIMATION]
 """The plain pipe with its three lags; what does not depend on the world is tested on these."""
-TINY = PIPE_2D.changed(CHANGES)
+TINY = PIPE_2D.with_changes(CHANGES)
 """Seven measurements, of which five are scored."""
 
 

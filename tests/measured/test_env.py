@@ -15,7 +15,7 @@ from eitbench.estimation.walk import RandomWalk
 from eitbench.measured import Measurements
 from eitbench.measured.model import MeasurementModel
 from eitbench.numerics.fem import mass_matrix
-from eitbench.physics.rest import AtRest
+from eitbench.physics.stationary import StationaryTransport
 from gymnasium.utils.env_checker import check_env
 from tanks import BELIEVED, PIPE, VESSEL, measurements_of, still
 
@@ -101,7 +101,7 @@ def test_repeated_injections_in_a_frame_are_not_motion(record):
     twice = [*range(8), 2, 5]
     once = Measurements(record.currents, record.injections[twice], record.matrix, record.readings[twice],
                         0.01 * np.arange(10), record.reference)
-    assert isinstance(MeasuredEnv(once, VESSEL, initial_std=0.2).task.transport, AtRest)
+    assert isinstance(MeasuredEnv(once, VESSEL, initial_std=0.2).task.transport, StationaryTransport)
 
 
 @pytest.mark.parametrize(("changed", "message"), [

@@ -13,7 +13,7 @@ from eitbench.bench.run import Job, run_episode
 from eitbench.bench.tracks import Environment
 from eitbench.data.seeds import parse_seeds
 from eitbench.scoring import deficit_centre
-from eitbench.worlds.streams import randomness
+from eitbench.worlds.random_streams import episode_streams
 
 SEED = parse_seeds("dev:0")[0]
 
@@ -117,7 +117,7 @@ def test_ball_is_followed_from_one_pair_of_electrodes():
     env = environment("RotatingTank2D")
     world, points = env.world, env.task.mesh.points
     ball = world.target
-    path = ball.path(world, randomness(SEED).flow)[1:]
+    path = ball.path(world, episode_streams(SEED).flow)[1:]
     weights = np.ones(len(points))
 
     def distance(baseline):
