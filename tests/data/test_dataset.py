@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from eitbench.data import bank
+from eitbench.data import presimulation
 from eitbench.data.episode_cache import cached_episode, integrals, region_operators, score_mass, step_error
 from eitbench.data.episodes import simulate
 from eitbench.data.export import export
@@ -151,7 +151,7 @@ def test_iterating_simulates_few_at_a_time(monkeypatch, tmp_path):
         asked.append(list(seeds))
         return simulated(world, seeds, *more)
 
-    monkeypatch.setattr(bank, "simulate_batch", counting)
+    monkeypatch.setattr(presimulation, "simulate_batch", counting)
     stream = iter(eitbench.dataset(PIPE, "train:0-8", world=CHANGES))
     assert next(stream).seed == 0 and asked == [list(range(8))]
     assert [example.seed for example in stream] == list(range(1, 9)) and asked[1:] == [[8]]

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import gymnasium as gym
 import numpy as np
 import pytest
-from eitbench.data import bank, cache, recordings
+from eitbench.data import cache, presimulation
 from eitbench.data.cache import CACHE_VARIABLE, folder
 from eitbench.data.episode_cache import build_cached_episode, cached_episode, cached_episode_key, is_episode_cached
 from eitbench.data.episodes import simulate, simulate_batch
@@ -51,7 +51,7 @@ def asked(monkeypatch):
         batches.append(list(seeds))
         return simulate_batch(world, seeds, *more, **options)
 
-    monkeypatch.setattr(bank, "simulate_batch", counting)
+    monkeypatch.setattr(presimulation, "simulate_batch", counting)
     return batches
 
 
@@ -71,7 +71,7 @@ def test_recordings_have_the_bits_of_those_made_alone(n_jobs, place, alone, monk
     get_reusable_executor().shutdown(wait=True)      # workers keep the cache folder they began with
     assert presimulate(TINY, SEEDS, n_jobs=n_jobs) == 10
     assert names(place) == sorted(f"{seed}.npy" for seed in SEEDS)
-    monkeypatch.setattr(recordings, "simulate", None)               # all are there
+    monkeypatch.setattr(episode_cache, "simulate", None)               # all are there
     assert {seed: cached_episode(TINY, seed).tobytes() for seed in SEEDS} == alone
 
 

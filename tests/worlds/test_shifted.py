@@ -7,7 +7,7 @@ from eitbench.data.episodes import cached_truth_model, simulate
 from eitbench.physics.cem import CompleteElectrodeModel
 from eitbench.worlds import entries, entry, register, registry
 from eitbench.worlds.catalogue import (
-    HOME,
+    NOMINAL_ID,
     PIPE_2D,
     PIPE_2D_DOUBLE_NOISE,
     PIPE_2D_OTHER_CONTACTS,
@@ -23,7 +23,7 @@ from scipy.stats import kstest
 
 from short import register_apart, world
 
-SHIFTS = [id for id, each in entries().items() if each.nominal == HOME]
+SHIFTS = [id for id, each in entries().items() if each.nominal == NOMINAL_ID]
 
 
 def small(id):
@@ -34,7 +34,7 @@ def small(id):
 @pytest.mark.parametrize("id", SHIFTS)
 def test_the_task_is_that_of_home(id):
     """Numbers, and what the models compute: where fluid is carried, and voltages with their derivatives."""
-    here, there = make_task(small(id)), make_task(small(HOME))
+    here, there = make_task(small(id)), make_task(small(NOMINAL_ID))
     for name in ("noise", "n_steps", "warm_up", "lag", "expected_concentration", "calibration", "prior",
                  "velocity", "vessel"):
         assert getattr(here, name) == getattr(there, name), name
@@ -50,9 +50,9 @@ def test_the_task_is_that_of_home(id):
 @pytest.mark.parametrize(("id", "changes", "home", "message"), [
     ("me/Shift-v0", {}, "eitbench/Nowhere-v0", "nominal must be a registered id that is not shifted itself, got 'e"),
     ("me/Shift-v0", {}, SHIFTS[0], "nominal must be a registered id that is not shifted itself"),
-    ("me/Shift-v0", {"instrument": {"noise_relative": 0.02}}, HOME, "me/Shift-v0 and .* differ in noise$"),
-    ("me/Shift-v0", {"schedule": {"scored_steps": 9}}, HOME, "differ in schedule, steps$"),
-    ("me/Shift-v0", {"prior": {"nodal_std": 0.1}}, HOME, "differ in prior$"),
+    ("me/Shift-v0", {"instrument": {"noise_relative": 0.02}}, NOMINAL_ID, "me/Shift-v0 and .* differ in noise$"),
+    ("me/Shift-v0", {"schedule": {"scored_steps": 9}}, NOMINAL_ID, "differ in schedule, steps$"),
+    ("me/Shift-v0", {"prior": {"nodal_std": 0.1}}, NOMINAL_ID, "differ in prior$"),
     ("me/Shift-v0", {}, "eitbench/Pipe2DFixedLag-v0", "differ in settings$"),
     ("me/Shift-v0", {}, "eitbench/Pipe2DInjection-v0", "differ in track$"),
 ])
@@ -101,7 +101,7 @@ def test_readings_have_twice_the_noise_that_is_told():
         read = instrument.measure(Faults.none(16), np.arange(2000), resistance, currents, draws)
         told = instrument.model_noise.std(clean)
         assert np.std((read - clean) / told) == pytest.approx(2.0, rel=0.02)
-    here, there = small(SHIFTS[2]), small(HOME)
+    here, there = small(SHIFTS[2]), small(NOMINAL_ID)
     assert here.instrument.noise_mismatch == 2.0
     entries = build_cached_episode(there, simulate(there, 7))
     task = make_task(here)
@@ -115,7 +115,7 @@ def test_readings_have_twice_the_noise_that_is_told():
 @pytest.mark.parametrize("seed", [3, 4])
 def test_voltages_are_those_of_electrodes_with_these_contacts(seed):
     """A complete electrode model built anew with the impedances drawn; with those told it is another."""
-    shifted, home = small("eitbench/Pipe2DOtherContacts-v0"), small(HOME)
+    shifted, home = small("eitbench/Pipe2DOtherContacts-v0"), small(NOMINAL_ID)
     assert shifted.instrument == PIPE_2D_OTHER_CONTACTS.instrument
     assert shifted.instrument.contact_impedance_spread == 0.5
     episode, sound = (simulate(each, seed, cache=False) for each in (shifted, home))
