@@ -12,7 +12,7 @@ from eitbench.estimation import (
     Filter,
     FilterEstimator,
     LogStates,
-    about_prediction,
+    linearise_at_prediction,
     nodal_states,
 )
 from eitbench.estimation.walk import RandomWalk
@@ -25,7 +25,7 @@ class Estimator:
     def __init__(self, task: Task) -> None:
         states = nodal_states(task.transport, task.prior, 1.0)
         self.estimator = FilterEstimator(task, lambda c_ref: Filter(
-            LogStates(states, c_ref), about_prediction(task)))
+            LogStates(states, c_ref), linearise_at_prediction(task)))
 
     @staticmethod
     def suits(task: Task) -> bool:

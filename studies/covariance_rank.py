@@ -16,14 +16,14 @@ from threadpoolctl import threadpool_limits
 from eitbench.data.episode_cache import cached_episode, cycle_voltages, score_operators
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.estimation import (
+    CalibrationFrame,
     DenseCovariance,
     Filter,
-    FirstFrame,
-    LinearisedObservations,
+    LinearisedForwardModel,
     Motion,
     NodalStates,
     kalman_filter,
-    table_5_1,
+    table_5_1_filter,
 )
 from eitbench.scoring import relative_error
 
@@ -37,14 +37,14 @@ def main() -> None:
     env.reset(seed=0)
     voltages = cycle_voltages(world, 0, cached_episode(world, 0))
     currents = task.currents[np.arange(task.n_steps) % len(task.currents)]
-    first = FirstFrame(task)
+    first = CalibrationFrame(task)
     for k in range(first.length):
         first.add(voltages[k], currents[k])
     begin = time.perf_counter()
-    start = table_5_1(task.transport, task.prior, first.c_bh)
+    start = table_5_1_filter(task.transport, task.prior, first.c_ref)
     print(f"n = {task.mesh.n_nodes}, {task.currents.shape[1]} readings an injection; evolution "
           f"model and covariance without data, once a process: {time.perf_counter() - begin:.0f} s")
-    linear = LinearisedObservations(task.observation, task.noise, start.mean)
+    linear = LinearisedForwardModel(task.observation, task.noise, start.mean)
     observations = [linear(*measured) for measured in zip(voltages, currents, strict=True)]
     interpolation, mass = score_operators(world)
     scored = slice(task.warm_up, None)
@@ -72,7 +72,8 @@ def main() -> None:
     print("|---|---|---|---|---|---|")
     row("full, n × n", steps, seconds, n)
     for tolerance in TOLERANCES:
-        filter_ = table_5_1(task.transport, task.prior, first.c_bh, rank_tolerance=tolerance)
+        filter_ = table_5_1_filter(task.transport, task.prior, first.c_ref,
+                                   rank_tolerance=tolerance)
         begin = time.perf_counter()
         steps = kalman_filter(filter_, observations)
         row(f"Π − ZZᵀ, tolerance {tolerance:g}", steps, (time.perf_counter() - begin) / len(steps),

@@ -22,11 +22,11 @@ import eitbench
 from eitbench.data.dataset import Example
 from eitbench.data.seeds import parse_seeds
 from eitbench.estimation import (
-    Observation,
+    LinearMeasurement,
     best_homogeneous,
+    compatible_models,
+    compatible_priors,
     inflow_filter,
-    suiting_models,
-    suiting_priors,
 )
 from eitbench.physics.observation import VoltageNoise
 from eitbench.worlds.random_streams import episode_streams
@@ -63,8 +63,8 @@ class Budget:
     def __init__(self) -> None:
         self.examples = eitbench.dataset(ID, PLAYED)
         self.task = make_task(self.examples.world)
-        self.prior = suiting_priors(BASELINES / "priors", self.task, "logarithm")[0]
-        self.model = suiting_models(BASELINES / "models", self.task)[0]
+        self.prior = compatible_priors(BASELINES / "priors", self.task, "logarithm")[0]
+        self.model = compatible_models(BASELINES / "models", self.task)[0]
         self.mass = self.examples.mass
         x = self.task.mesh.points[:, 0]
         self.near = x < x.min() + NEAR
@@ -82,7 +82,7 @@ class Budget:
             apart = np.abs(np.subtract.outer(np.arange(steps), np.arange(steps)))
             x = np.linalg.cholesky(correlation[apart]) @ episode_streams(seed).policy.normal(
                 size=(steps, self.prior.modes.shape[1]))
-            inflow = self.prior.inflow(x @ self.prior.modes.T)
+            inflow = self.prior.inverse_link(x @ self.prior.modes.T)
         else:
             inflow = world.sample_inflow(seed) / world.background
         basis, weights = self.model.response
@@ -145,7 +145,7 @@ class Budget:
                 computed, by_c = task.observation.linearise(point, currents)
                 matrix = by_c.reshape(-1, by_c.shape[-1])
                 value = (voltages - computed).ravel() + matrix @ point
-                filter_.update(Observation(matrix, value, noise.std(computed).ravel()**2))
+                filter_.update(LinearMeasurement(matrix, value, noise.std(computed).ravel()**2))
             yield filter_.concentration, filter_.variance
 
     def score(self, estimates: Iterator[tuple[np.ndarray, np.ndarray]], truth: np.ndarray,

@@ -14,7 +14,7 @@ from tqdm import tqdm
 import eitbench
 from eitbench.bench.text import mean_and_interval, rounded
 from eitbench.data.seeds import parse_seeds
-from eitbench.estimation import FilterEstimator, InflowPrior, inflow_filter, learned_inflow_prior
+from eitbench.estimation import FilterEstimator, InflowPrior, fit_prior_from_episodes, inflow_filter
 from eitbench.worlds.registry import entry
 
 ID = "eitbench/Pipe2D-v0"
@@ -42,7 +42,7 @@ def play(prior: InflowPrior, seed: int) -> tuple[float, float]:
 def main() -> None:
     print("| training episodes | modes | ẽ_c | NIS/m |\n|---:|---:|---:|---:|")
     for count in COUNTS:
-        prior = learned_inflow_prior(entry(ID).world, parse_seeds(f"train:0-{count - 1}"))
+        prior = fit_prior_from_episodes(entry(ID).world, parse_seeds(f"train:0-{count - 1}"))
         played = [play(prior, seed)
                   for seed in tqdm(PLAYED, desc=f"{count} episodes", leave=False, disable=None)]
         errors, surprises = zip(*played, strict=True)

@@ -26,8 +26,14 @@ from eitbench.data.dataset import Dataset, Example, pod_basis
 from eitbench.data.parallel import run_parallel
 from eitbench.data.presimulation import presimulate
 from eitbench.data.seeds import parse_seeds
-from eitbench.estimation import FilterSeen, FirstFrame, VoltagesSeen, suiting_models, suiting_priors
-from eitbench.estimation.identified import told as told_of
+from eitbench.estimation import (
+    CalibrationFrame,
+    FilterFeatures,
+    VoltageFeatures,
+    compatible_models,
+    compatible_priors,
+)
+from eitbench.estimation.identified import task_fingerprint
 from eitbench.worlds.random_streams import episode_streams
 from eitbench.worlds.task import make_task
 from eitbench.worlds.world import World
@@ -109,22 +115,22 @@ def features(examples: Dataset, example: Example, basis: np.ndarray,
     so that ẽ_c of modes a is the mean of weight·‖a − truth‖² + rest. Of a filter also what it
     thinks of each state ``LAGS`` later, (T, q) each, or at the record's end."""
     task = make_task(examples.world)
-    first = FirstFrame(task)
+    first = CalibrationFrame(task)
     record = list(zip(example.voltages, example.currents, strict=True))
     for measurement in record[:first.length]:
         first.add(*measurement)
-    truth, weight, rest = in_modes(examples, example, basis, first.c_bh)
+    truth, weight, rest = in_modes(examples, example, basis, first.c_ref)
     if sees == "voltages":
-        see = VoltagesSeen(task, first.c_bh, basis)
+        see = VoltageFeatures(task, first.c_ref, basis)
         seen = [see(*measurement) for measurement in record]
         inputs, reduced = (np.array(each) for each in zip(*seen, strict=True))
         later = {}
     else:
-        prior = suiting_priors(ROOT / "baselines" / "priors", task, "logarithm")[0]
+        prior = compatible_priors(ROOT / "baselines" / "priors", task, "logarithm")[0]
         model = None
         if sees == "identified":
-            model = suiting_models(ROOT / "baselines" / "models", task)[0]
-        see = FilterSeen(task, prior, first.c_bh, basis, max(LAGS), model)
+            model = compatible_models(ROOT / "baselines" / "models", task)[0]
+        see = FilterFeatures(task, prior, first.c_ref, basis, max(LAGS), model)
         inputs, (reduced, *each) = see.record(record, 0, *LAGS)
         later = {f"reduced {lag}": modes for lag, modes in zip(LAGS, each, strict=True)}
     return {
@@ -303,7 +309,7 @@ def main(
         **joined(networks[:what.joined]),
         basis=told["basis"].astype(np.float16),
         rest=told["rest"].astype(np.float32),
-        task=told_of(make_task(world)),
+        task=task_fingerprint(make_task(world)),
     )
     draw(lesson, what.episodes, scores, alone)
 

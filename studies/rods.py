@@ -50,7 +50,7 @@ def main(folder: Path) -> None:
         case = read_case(rod.case)
         record = read(folder / case.file, name=rod.variable)
         env = MeasuredEnv(record, dict(case.vessel), **case.options)
-        ends = np.arange(FIRST * record.frame, len(record.readings) + 1, record.frame)
+        ends = np.arange(FIRST * record.frame_length, len(record.voltages) + 1, record.frame_length)
         run = run_on_measurements(env, "log_steady_filter", kept=set(ends.tolist()))
         path = np.array([middle(env, estimate) for estimate in run.mean])
         nearest = circle(path) if rod.is_round else line(path)

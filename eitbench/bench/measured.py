@@ -128,7 +128,7 @@ class _ElectrodeResiduals:
     def __init__(self, env: MeasuredEnv) -> None:
         measurements = env.measurements
         self._env = env
-        self._frame = measurements.frame
+        self._frame = measurements.frame_length
         T, L = env.episode_steps, measurements.currents.shape[1]
         begins = np.arange(0, max(T - self._frame, 0) + 1, self._frame)
         chosen = np.linspace(0, len(begins) - 1, N_PLOTTED_FRAMES).round().astype(int)
@@ -144,7 +144,7 @@ class _ElectrodeResiduals:
         """Add the residuals of an estimate (n,) at t = 1 … T, if its frame is one of these."""
         if (row := self._row.get((t - 1) // self._frame)) is None:
             return
-        counted = self._counted[self._env.measurements.injections[t - 1]]
+        counted = self._counted[self._env.measurements.injection_index[t - 1]]
         self._squares[row] += np.nan_to_num(self._env.residuals(t, estimate))**2 @ counted
         self._count[row] += counted.sum(axis=0)
 
@@ -173,5 +173,5 @@ def _nis(env: MeasuredEnv, t: int, estimate: Estimate) -> float:
     if estimate.innovation is None or estimate.innovation_covariance is None:
         return float("nan")
     whitened = np.linalg.solve(estimate.innovation_covariance, estimate.innovation)
-    count = int(env.model.mask[env.measurements.injections[t - 1]].sum())
+    count = int(env.model.mask[env.measurements.injection_index[t - 1]].sum())
     return float(estimate.innovation @ whitened) / count if count else float("nan")

@@ -76,7 +76,7 @@ def play(asked: Environment, method: Method, seed: int) -> Episode:
     if is_measured(asked.id):
         run = run_on_measurements(env, method, seed, kept={env.episode_steps})
         measurements = env.measurements
-        return Episode(run.outcome(env), measurements.currents[measurements.injections], {})
+        return Episode(run.outcome(env), measurements.currents[measurements.injection_index], {})
     return estimated(env, method, seed)
 
 

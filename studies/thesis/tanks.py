@@ -13,7 +13,7 @@ from matplotlib.patches import Circle
 
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.rendering import draw_field
-from eitbench.estimation import FirstFrame
+from eitbench.estimation import CalibrationFrame
 from eitbench.numerics.fem import mass_matrix
 from eitbench.numerics.mesh import Mesh
 from eitbench.scoring import deficit_centre
@@ -241,9 +241,9 @@ def fig7_4(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
 def _before(env: EstimationEnv, seed: int) -> float:
     """ĉ_bh of the first injection: the filter's estimate at t = 0, mol/m³."""
     seen, _ = env.reset(seed=seed)
-    first = FirstFrame(env.task)
+    first = CalibrationFrame(env.task)
     first.add(seen["voltages"], seen["currents"])
-    return first.c_bh
+    return first.c_ref
 
 
 def _both_found(mesh: Mesh, values: np.ndarray,

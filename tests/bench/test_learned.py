@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from eitbench.bench.methods import load_method
-from eitbench.estimation import FirstFrame, corrected, inflow_filter, remember, suiting_priors
+from eitbench.estimation import CalibrationFrame, apply_correction, compatible_priors, gru_step, inflow_filter
 from eitbench.worlds import entry
 from eitbench.worlds.task import make_task
 
@@ -61,7 +61,7 @@ def test_numpy_answers_as_torch(study, both_ways, many):
     def memories(inputs, way=""):
         memory = np.zeros(24 * many)
         for seen in inputs:
-            memory = remember(arrays, seen, memory, way)
+            memory = gru_step(arrays, seen, memory, way)
             yield memory
 
     ways = [list(memories(inputs))]
@@ -69,7 +69,7 @@ def test_numpy_answers_as_torch(study, both_ways, many):
         ways.append(list(memories(inputs[::-1], "backward_"))[::-1])
     tolerance = 1e-6 if many == 1 else 2e-3  # means of biases are rounded once more
     for t, memory in enumerate(np.concatenate(ways, axis=1)):
-        mean, variance = corrected(arrays, 2.0, np.ones(3), inputs[t], memory)[:2]
+        mean, variance = apply_correction(arrays, 2.0, np.ones(3), inputs[t], memory)[:2]
         expected = 2.0 * (1.0 + basis @ (1.0 + (scale * correction)[0, t].numpy()))
         spread = 4.0 * (basis**2 @ (scale**2 * log_variance.exp())[0, t].numpy() + 0.1)
         np.testing.assert_allclose(mean, expected, rtol=tolerance, atol=1e-3 * tolerance)
@@ -97,10 +97,10 @@ def short(study):
     random = np.random.default_rng(0)
     root = np.linalg.cholesky(examples.mass.toarray())
     basis = np.linalg.solve(root.T, np.linalg.qr(random.normal(size=(len(root), 3)))[0])
-    first = FirstFrame(make_task(examples.world))
+    first = CalibrationFrame(make_task(examples.world))
     for measurement in zip(example.voltages[:first.length], example.currents, strict=False):
         first.add(*measurement)
-    return examples, example, basis, first.c_bh
+    return examples, example, basis, first.c_ref
 
 
 def test_scores_in_modes_are_scores(study, short):
@@ -119,7 +119,7 @@ def test_what_is_thought_later_is_of_the_same_state(study, short, monkeypatch):
     monkeypatch.setattr(study, "LAGS", (2,))
     found = study.features(examples, example, basis)
     task = make_task(examples.world)
-    prior = suiting_priors(ROOT / "baselines" / "priors", task, "logarithm")[0]
+    prior = compatible_priors(ROOT / "baselines" / "priors", task, "logarithm")[0]
     filter = inflow_filter(task, prior, level, lag=2)
     modes = np.linalg.pinv(basis)
     T = len(example.voltages)

@@ -145,7 +145,7 @@ def test_iterating_simulates_few_at_a_time(monkeypatch, tmp_path):
     """Eight together, and those only that come next: memory is bounded."""
     monkeypatch.setenv("EITBENCH_CACHE", str(tmp_path))
     asked = []
-    simulated = bank.simulate_batch
+    simulated = presimulation.simulate_batch
 
     def counting(world, seeds, *more):
         asked.append(list(seeds))

@@ -71,7 +71,7 @@ def test_recordings_have_the_bits_of_those_made_alone(n_jobs, place, alone, monk
     get_reusable_executor().shutdown(wait=True)      # workers keep the cache folder they began with
     assert presimulate(TINY, SEEDS, n_jobs=n_jobs) == 10
     assert names(place) == sorted(f"{seed}.npy" for seed in SEEDS)
-    monkeypatch.setattr(episode_cache, "simulate", None)               # all are there
+    monkeypatch.setattr("eitbench.data.episode_cache.simulate", None)               # all are there
     assert {seed: cached_episode(TINY, seed).tobytes() for seed in SEEDS} == alone
 
 

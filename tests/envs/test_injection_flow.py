@@ -19,12 +19,12 @@ from eitbench.data.episode_cache import (
 )
 from eitbench.data.presimulation import presimulate
 from eitbench.envs.injection_core import scaled
-from eitbench.estimation import Filter, about_reference, velocity_states
+from eitbench.estimation import Filter, linearise_at_reference, velocity_states
 from eitbench.estimation.onboard.belief import Belief
 from eitbench.estimation.onboard.full_filters import BOUNDS
 from eitbench.estimation.onboard.levels import electrode_pairs
 from eitbench.estimation.onboard.models import stored_model
-from eitbench.estimation.reduced_joint import JointTables
+from eitbench.estimation.reduced_joint import TransitionSplines
 from eitbench.numerics.fem import mass_matrix
 from eitbench.worlds.catalogue import PIPE_2D_DRIFTING
 from eitbench.worlds.task import make_task
@@ -141,7 +141,7 @@ def test_tables_hold_between_their_velocities(env):
     transport = task.transport.with_velocity(task.velocity.field([theta]))
     F, Y = transport.transition()
     weighted = mass_matrix(task.mesh) @ model.basis
-    A, slope, W = (part[0] for part in JointTables(model).at(np.array([theta])))
+    A, slope, W = (part[0] for part in TransitionSplines(model).evaluate(np.array([theta])))
     exact = weighted.T @ F @ model.basis
     assert np.linalg.norm(A - exact) < 2e-3 * np.linalg.norm(exact)
     nodal = task.evolution.state_noise_covariance(0.0, task.prior.nodal_std**2)
@@ -164,7 +164,7 @@ def test_full_operator_is_the_joint_filter_of_the_baselines():
     pairs = electrode_pairs(16).tolist()
     env.reset(seed=5)
     level = filter_of(env).concentration[0]
-    filter_ = Filter(velocity_states(task, level, BOUNDS), about_reference(task, level))
+    filter_ = Filter(velocity_states(task, level, BOUNDS), linearise_at_reference(task, level))
     for t, voltages in enumerate(cycle_voltages(world, 5, cached_episode(world, 5))):
         current = world.currents[t % 16]
         filter_.assimilate(voltages, current)

@@ -13,7 +13,7 @@ from eitbench.bench.text import seed_ranges
 from eitbench.data.cache import CACHE_VARIABLE
 from eitbench.data.seeds import format_seed
 from eitbench.envs.estimation import EstimationEnv
-from eitbench.estimation import FirstFrame, initial_covariance
+from eitbench.estimation import CalibrationFrame, initial_covariance
 from eitbench.physics.stationary import StationaryTransport
 from eitbench.worlds import entry
 from eitbench.worlds.flows import FlowPastBulge, _past_bulge
@@ -155,7 +155,7 @@ def test_map_estimate_is_the_most_probable():
     env = played_in("StationaryTank2D", {"schedule": {"scored_steps": 3}})
     assert load_method("map_estimate", "estimation").make.suits(env.task)
     assert not load_method("map_estimate", "estimation").make.suits(played_in("RotatingTank2D", None).task)
-    task, first = env.task, FirstFrame(env.task)
+    task, first = env.task, CalibrationFrame(env.task)
     observation, _ = env.reset(seed=SEED)
     seen = []
     for _ in range(3):
@@ -163,11 +163,11 @@ def test_map_estimate_is_the_most_probable():
         observation, *_ = env.step(np.full(task.mesh.n_nodes, 30.0))
     first.add(*seen[0])
     V, I = (np.array(part) for part in zip(*seen, strict=True))
-    precision = np.linalg.inv(first.c_bh**2 * initial_covariance(task.mesh, task.prior))
+    precision = np.linalg.inv(first.c_ref**2 * initial_covariance(task.mesh, task.prior))
 
     def objective(c):
         misfit = (V - task.observation.voltages(c, I)) / task.noise.std(V)
-        return (misfit**2).sum() + (c - first.c_bh) @ precision @ (c - first.c_bh)
+        return (misfit**2).sum() + (c - first.c_ref) @ precision @ (c - first.c_ref)
 
     best, linear = (estimates_of(env, name, SEED)[2].mean for name in ("map_estimate", "kalman_filter"))
     assert objective(best) < objective(linear)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from eitbench.estimation.design import pair_gains
+from eitbench.estimation.design import pair_design_criteria
 from eitbench.estimation.onboard.levels import levels_of
 from eitbench.estimation.onboard.reduced_filters import ReducedFilters
 
@@ -149,8 +149,8 @@ class Belief:
     def gains(self, covariance: np.ndarray, sound: np.ndarray | None = None,
               derivative: np.ndarray | None = None,
               weight: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """What each pair would teach about a state with this covariance: `pair_gains`, (pairs,)
-        each.
+        """What each pair would teach about a state with this covariance: `pair_design_criteria`,
+        (pairs,) each.
 
         Of electrodes that are not ``sound`` no reading counts, and pairs with one of them teach
         nothing. ``derivative`` is that about the level, or another, such as `relinearised`.
@@ -164,7 +164,7 @@ class Belief:
             variance = np.where(sound, variance, np.inf)
         weight = self._weight if weight is None else weight
         tables = ((DP @ D.T).reshape(L, L, L, L), (DP @ weight @ DP.T).reshape(L, L, L, L))
-        gains = pair_gains(*tables, self.rules.pairs, variance)
+        gains = pair_design_criteria(*tables, self.rules.pairs, variance)
         if sound is not None:
             usable = sound[self.rules.pairs].all(axis=1)
             gains = gains[0] * usable, gains[1] * usable

@@ -9,7 +9,7 @@ import numpy as np
 
 from eitbench.data.episode_cache import score_mass, step_error
 from eitbench.estimation.filter import Filter, StateSpace
-from eitbench.estimation.gaussian import Observation
+from eitbench.estimation.gaussian import LinearMeasurement
 from eitbench.estimation.inflow_window import InflowWindow
 from eitbench.estimation.nodal import nodal_states
 from eitbench.estimation.onboard.inflow_states import world_prior
@@ -56,7 +56,7 @@ class FullFilters:
                 continue
             computed, std, matrix, about = self._linearise(b, currents[b])
             value = (voltages[b] - computed) / std + matrix @ about
-            step = filter_.update(Observation(matrix, value, np.ones(len(value))))
+            step = filter_.update(LinearMeasurement(matrix, value, np.ones(len(value))))
             accepted[b] = step.accepted
             innovations[b] = step.innovation / np.sqrt(step.innovation_covariance.diagonal())
             self._last[b] = step.innovation, step.innovation_covariance, std, accepted[b]

@@ -12,15 +12,15 @@ from eitbench._notice import say
 from eitbench.data.cache import Key, cached, config_dict, model_key
 from eitbench.estimation.covariance import LowRankCovariance, OpenLoopCovariance
 from eitbench.estimation.filter import Filter
-from eitbench.estimation.forward import LinearisedObservations
-from eitbench.estimation.gaussian import Observation
+from eitbench.estimation.forward import LinearisedForwardModel
+from eitbench.estimation.gaussian import LinearMeasurement
 from eitbench.estimation.inflow_response import steady_response
 from eitbench.estimation.nodal import (
-    RANK_TOLERANCE,
+    FILTER_RANK_TOLERANCE,
     Motion,
     NodalStates,
     initial_covariance,
-    starting_filter,
+    nodal_filter,
 )
 from eitbench.estimation.onboard.full_filters import BOUNDS
 from eitbench.estimation.onboard.inflow_states import (
@@ -36,8 +36,8 @@ from eitbench.estimation.reduced import (
     ReducedModel,
     ReducedStates,
     SteadyStates,
-    learnt_of,
-    main_directions,
+    covariance_reduction,
+    dominant_directions,
     reduced_model,
 )
 from eitbench.estimation.reduced_joint import JointModel, JointStates, joint_model
@@ -169,7 +169,7 @@ def unpacked(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 def make_steady_model(world: World) -> ReducedModel:
     """Return the model of a known flow in double precision, in half a minute."""
     task = make_task(world)
-    start = starting_filter(task.transport, task.prior, 1.0)
+    start = nodal_filter(task.transport, task.prior, 1.0)
     return reduced_model(start, mass_matrix(task.mesh).toarray(), _record(world, 90),
                          min(RANK, task.mesh.n_nodes))
 
@@ -193,11 +193,11 @@ def make_joint_model(world: World) -> JointModel:
     learnt = np.zeros_like(mass)
     for part in LEARNING:
         F, Y, noise = step(part)
-        covariance = LowRankCovariance(OpenLoopCovariance(F, noise), RANK_TOLERANCE)
+        covariance = LowRankCovariance(OpenLoopCovariance(F, noise), FILTER_RANK_TOLERANCE)
         states = NodalStates(np.ones(len(F)), covariance, Motion(F, Y.sum(axis=1)))
-        learnt += learnt_of(Filter(states), record, 10)
+        learnt += covariance_reduction(Filter(states), record, 10)
     parts = np.linspace(*BOUNDS, TABLE)
-    basis = main_directions(learnt, mass, min(RANK, len(mass)))
+    basis = dominant_directions(learnt, mass, min(RANK, len(mass)))
     return joint_model(basis, mass, initial, parts * flow.nominal[0],
                        (step(part)[::2] for part in parts))
 
@@ -210,13 +210,13 @@ def one_velocity(task: Task) -> VelocityModel:
     return task.velocity
 
 
-def _record(world: World, length: int) -> list[Observation]:
+def _record(world: World, length: int) -> list[LinearMeasurement]:
     """Return observations of random pairs, about the expected level and relative to it."""
     task = make_task(world)
     every = pair_currents(world)
     level = world.expected_concentration
     currents = every[np.random.default_rng(0).integers(len(every), size=length)]
-    linear = LinearisedObservations(task.observation, task.noise, np.full(task.mesh.n_nodes, level))
+    linear = LinearisedForwardModel(task.observation, task.noise, np.full(task.mesh.n_nodes, level))
     record = []
     for current in currents:
         seen = linear(np.zeros(current.shape), current)
