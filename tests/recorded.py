@@ -5,9 +5,9 @@ from eitbench.data import cache, episode_cache
 
 
 def forget():
-    """Forget what a new process does not know: verified files, outlines and beginnings."""
+    """Forget what a new process does not know: verified files, scoring constants and prefixes."""
     cache._sound.clear()
-    episode_cache.outline.__wrapped__.cache_clear()
+    episode_cache.scoring_constants.__wrapped__.cache_clear()
     episode_cache._beginning.cache_clear()
 
 

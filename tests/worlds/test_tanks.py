@@ -184,7 +184,7 @@ def test_cylinders_stand_inside_apart_and_anywhere():
         assert low <= of_kind.min() and of_kind.max() <= high
         assert kstest(of_kind, "uniform", (low, high - low)).pvalue > 1e-3
     apart = np.linalg.norm(centres[:, 0] - centres[:, 1], axis=1) - radii.sum(axis=1)
-    assert apart.min() > cylinders.gap and apart.max() > 2.0 * cylinders.gap
+    assert apart.min() > cylinders.min_gap and apart.max() > 2.0 * cylinders.min_gap
     distance = np.linalg.norm(centres, axis=2)
     assert distance.max() <= cylinders.max_centre_radius * radius and (distance + radii).max() < radius
     angle = np.arctan2(centres[:, 0, 1], centres[:, 0, 0])
