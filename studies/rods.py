@@ -16,7 +16,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from scipy.optimize import least_squares
-from thesis.common import bare, save
+from thesis.common import despine, save_figure
 
 from eitbench.bench.playing import run_on_measurements
 from eitbench.envs.measured import MeasuredEnv
@@ -64,8 +64,8 @@ def main(folder: Path) -> None:
         figure.colorbar(shown, ax=axes, label="time / s", shrink=0.7)
         axes.set(title=rod.title, xlabel="x / cm", aspect="equal", xlim=(-radius, radius),
                  ylim=(-radius, radius))
-        bare(axes)
-    save(figure, ROOT / "docs" / "rods.png")
+        despine(axes)
+    save_figure(figure, ROOT / "docs" / "rods.png")
 
 
 def middle(env: MeasuredEnv, estimate: np.ndarray) -> np.ndarray:

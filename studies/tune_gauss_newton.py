@@ -1,9 +1,9 @@
 """Tune α of the stationary Gauss–Newton on stationary targets: `python
 studies/tune_gauss_newton.py`.
 
-The rule: one frame of 16 injections for each of a few states of training episodes, the target
-standing still; of a grid with two values an octave take the α with the smallest mean relative
-error. Dev and test seeds are not touched.
+The rule: α with the smallest mean relative error on a grid of two values per octave, for one frame
+of 16 injections of a stationary target, which is one of three states of each of four training
+episodes. Dev and test episodes are not used.
 """
 
 import numpy as np

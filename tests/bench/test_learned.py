@@ -50,7 +50,7 @@ def test_numpy_answers_as_torch(study, both_ways, many):
         torch.nn.init.normal_(network.output.weight, std=0.1)
         network.half().double().eval()
     basis = np.random.default_rng(1).normal(size=(5, 3))
-    arrays = {name: each.astype(float) for name, each in study.joined(networks).items()} | {
+    arrays = {name: each.astype(float) for name, each in study.average_networks(networks).items()} | {
         "basis": basis, "rest": np.full(5, 0.1)}
     inputs = np.random.default_rng(0).normal(size=(20, 7))
     with torch.no_grad():
@@ -78,15 +78,15 @@ def test_numpy_answers_as_torch(study, both_ways, many):
 
 @pytest.mark.parametrize("likelihood", ["modes", "nodes"])
 def test_a_seed_repeats_and_something_is_learned(study, data, likelihood):
-    lesson = replace(study.LESSONS["obstacle"], noise=0.1)
+    setup = replace(study.SETUPS["obstacle"], noise=0.1)
     modes = () if likelihood == "modes" else (np.eye(2), np.full(2, 1e-6))
-    judge = study.Judge(2, *modes)
-    first, error = study.trained(lesson, data, data, judge, seed=3, epochs=60)
-    again, same = study.trained(lesson, data, data, judge, seed=3, epochs=60)
-    _, other = study.trained(lesson, data, data, judge, seed=4, epochs=60)
+    loss = study.Loss(2, *modes)
+    first, error = study.train(setup, data, data, loss, seed=3, epochs=60)
+    again, same = study.train(setup, data, data, loss, seed=3, epochs=60)
+    _, other = study.train(setup, data, data, loss, seed=4, epochs=60)
     assert error == same != other
     assert all(torch.equal(a, b) for a, b in zip(first.parameters(), again.parameters(), strict=True))
-    assert error < 0.3 * study.filters_errors(data)[:, 2:].mean()
+    assert error < 0.3 * study.filter_errors(data)[:, 2:].mean()
 
 
 @pytest.fixture(scope="module")
@@ -129,8 +129,8 @@ def test_what_is_thought_later_is_of_the_same_state(study, short, monkeypatch):
             if state >= 0:
                 np.testing.assert_allclose(found["reduced 2"][state],
                                            modes @ (filter.estimate(t - state).mean / level - 1.0), rtol=1e-10)
-    lesson = replace(study.LESSONS["lag"], lag=2)
-    seen = study.asked(lesson, found)
+    setup = replace(study.SETUPS["lag"], lag=2)
+    seen = study.select_lag(setup, found)
     np.testing.assert_array_equal(seen["truth"], found["truth"][:-2])
     np.testing.assert_array_equal(seen["inputs"], np.concatenate([found["inputs"][2:], seen["reduced"]], axis=1))
 
