@@ -174,7 +174,7 @@ def test_model_of_the_stirred_tank_has_no_ball_and_keeps_what_it_holds():
 
 
 def test_cylinders_stand_inside_apart_and_anywhere():
-    """Radii evenly from their ranges, walls apart by more than ``gap``, centres no further out than ``furthest``."""
+    """Radii are uniform in their ranges, gaps exceed ``min_gap``, centres are within ``max_centre_radius``."""
     cylinders, radius = STATIONARY.target, STATIONARY.vessel.radius
     drawn = [cylinders.draw(STATIONARY, flow_stream(seed)) for seed in range(300)]
     centres = np.array([[centre for centre, _ in pair] for pair in drawn])
