@@ -165,5 +165,5 @@ def test_numba_that_does_not_work_is_named(monkeypatch):
     system = Condensation(random_pattern(30, 2, seed=0), 2)
     monkeypatch.setitem(sys.modules, "eitbench.numerics.kernels", None)
     monkeypatch.delattr("eitbench.numerics.kernels", raising=False)
-    with pytest.raises(RuntimeError, match=r"numba cannot be used \(.*\); install eitbench anew"):
+    with pytest.raises(RuntimeError, match=r"numba cannot be used \(.*\); reinstall eitbench"):
         system.port_inverse(np.ones(len(system.rows)))
