@@ -32,7 +32,7 @@ def facet_counts(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
 
 
 def polygon_area(points: np.ndarray) -> float:
-    """Of corners (n, 2) in order, by the shoelace formula."""
+    """Return the area of a polygon with corners (n, 2), by the shoelace formula."""
     x, y = points.T
     return 0.5 * (x @ np.roll(y, -1) - y @ np.roll(x, -1))
 

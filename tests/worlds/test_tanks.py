@@ -31,7 +31,7 @@ def flow_stream(seed):
 
 
 def stirred(rings):
-    """The stirred tank's flow on a mesh with so many rings."""
+    """Return the stirred tank's flow on a mesh with this number of rings."""
     return _stirred(ROTATING.flow, ROTATING.vessel.radius, rings)
 
 
@@ -73,7 +73,7 @@ def test_electrodes_lie_where_the_spans_say(n_electrodes, cover):
 
 @each_world
 def test_truth_is_finer_than_the_model(world):
-    """Other nodes, and more than three times as many, for the target; more than twice as many for the voltages."""
+    """The truth has over three times the transport nodes, all different, and over twice the EIT unknowns."""
     truth, model = both(world)
     assert truth.transport.mesh.n_nodes > 3 * model.transport.mesh.n_nodes
     assert truth.observation.cem.n_unknowns > 2 * model.observation.cem.n_unknowns
@@ -88,7 +88,7 @@ def test_truth_is_finer_than_the_model(world):
 
 @each_world
 def test_seed_decides_the_episode(world):
-    """Same seed, same bits, alone or beside others; another seed, another target and other noise."""
+    """Equal seeds give equal bits, alone or in a batch; another seed gives another target and noise."""
     one, other = episode(world, 7), episode(world, 8)
     together = list(simulate_batch(world, [8, 7], progress=False))
     for mine, theirs in ((one, together[1]), (other, together[0])):

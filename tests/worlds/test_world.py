@@ -89,7 +89,7 @@ def test_every_number_can_be_named(id):
     (STATIONARY_TANK_2D, {"target": {"small_radius": 0.02}}, r"small_radius must have shape \(2,\)"),
 ], ids=str)
 def test_what_is_wrong_is_named(world, changes, message):
-    """By the place of the part, the name of the number, what came and what is allowed."""
+    """The message contains the part, the field, the value and the allowed range."""
     with pytest.raises(ValueError, match=message):
         world.with_changes(changes)
 
