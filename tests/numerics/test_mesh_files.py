@@ -228,7 +228,7 @@ def with_elements(*elements: str) -> str:
     (SQUARE.replace('0 9 "corner"', '1 9 "outlet"'), "group 'outlet' must hold facets, got none"),
     (SQUARE[:-80], "must be a complete mesh file in a format that meshio reads"),
     (SQUARE.replace("2.2 0 8", "1.0 0 8"), "cannot be read .*Need mesh format"),
-    ("a picture of a pipe", "must be a whole mesh file"), ("", "must be a whole mesh file"),
+    ("a picture of a pipe", "must be a complete mesh file"), ("", "must be a complete mesh file"),
 ])
 def test_files_that_are_refused(text, match, tmp_path, capsys):
     """Messages contain the file, the problem and the expectation; nothing is printed."""
