@@ -5,7 +5,7 @@ from dataclasses import replace
 from eitbench.worlds import entries, entry, registry
 
 PLAIN = [name for name, each in entries().items() if each.world == entry("eitbench/Pipe2D-v0").world]
-"""Ids that play the thesis' pipe as it is."""
+"""Ids with the thesis' pipe as it is."""
 
 
 def merged(*changes: dict) -> dict:
@@ -19,7 +19,7 @@ def merged(*changes: dict) -> dict:
 
 
 FAST = {"flow": {"mean_velocity": 45.0}, "schedule": {"scored_steps": 5, "pattern": {"frame": 2}}}
-"""A fast fluid flushes a pipe in two steps: seven measurements, of which five are scored."""
+"""With a fast flow the residence time is two steps: seven measurements, five of them scored."""
 PIPE = merged(FAST, {"vessel": {"electrodes_per_wall": 2}})
 FLOW = merged(PIPE, {"flow": {"velocity_range": [40.0, 50.0]}})
 WANDERING = merged(FLOW, {"region": [0.28, 0.40]})
@@ -63,14 +63,14 @@ def short(name: str) -> dict:
 
 
 def register_apart(monkeypatch) -> None:
-    """What is registered from now on is forgotten after the test."""
+    """Undo registrations after the test."""
     hands = {each.id for each in registry.runtime_entries()}
     monkeypatch.setattr(registry, "_entries", registry.entries())
     monkeypatch.setattr(registry, "_runtime_ids", hands)
 
 
 def shorten(monkeypatch, changes: dict[str, dict]) -> None:
-    """Let registered ids play other worlds, in other processes too: id -> changes of the world."""
+    """Give registered ids other worlds, in other processes too: id -> changes of the world."""
     register_apart(monkeypatch)
     registry.import_entries([replace(entry(name), world=entry(name).world.with_changes(each))
                              for name, each in changes.items()])

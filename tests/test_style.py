@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "eitbench"
 BUDGETS = {"numerics": 1580, "scoring": 110, "physics": 1420, "worlds": 2700, "data": 1515, "estimation": 5800,
-           "measured": 1770, "envs": 1630, "bench": 5050, "report": 3077, "rl": 725, "cli": 945}
+           "measured": 1770, "envs": 1630, "bench": 5050, "report": 3077, "rl": 725, "cli": 950}
 """Package (or module) -> lines of Python allowed, blank lines and docstrings included. Each imports only from those
 before it."""
 TOP = 430

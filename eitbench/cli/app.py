@@ -42,17 +42,24 @@ def list_() -> None:
     """Show the environments, the baselines and policies, and which boards they play on."""
     from eitbench.bench.methods import load_method, own_methods
     from eitbench.bench.tracks import boards_of, ids, measured_ids
-    from eitbench.worlds.registry import entry
+    from eitbench.worlds.registry import GROUPS, entry
     from eitbench.worlds.task import lag_steps
-    lines = [("environments", "", "")]
-    for name in ids():
-        world = entry(name).world
-        lag = lag_steps(world, entry(name).settings.get("lag", 0))
-        budget = world.schedule.budget
-        allowed = "" if budget is None else f", {budget} injections allowed"
-        lines.append((f"  {name}", boards_of(name, {})[0],
-                      f"lag {lag}, {world.schedule.scored_steps} scored of {world.n_steps} states"
-                      f"{allowed}"))
+    lines = []
+    for group in GROUPS:
+        names = [name for name in ids() if entry(name).group == group]
+        lines += [(f"environments: {group}", "", "")] * bool(names)
+        for name in names:
+            each = entry(name)
+            schedule = each.world.schedule
+            about = (f"lag {lag_steps(each.world, each.settings.get('lag', 0))}, "
+                     f"{schedule.scored_steps} scored of {each.world.n_steps} states")
+            if schedule.budget is not None:
+                about += f", {schedule.budget} injections allowed"
+            if each.nominal:
+                about += f", variant {each.variant} of {each.nominal}"
+            about += ", starting point" * each.is_starting_point
+            lines.append((f"  {name}", boards_of(name, {})[0], about))
+    lines.append(("environments: measured data", "", ""))
     lines += [(f"  {name}", "measured", "data are downloaded separately")
               for name in measured_ids()]
     for track, heading in (("estimation", "baselines"), ("injection", "policies")):

@@ -70,8 +70,8 @@ class File(NamedTuple):
 
 def episode_key(world: World, name: str) -> Key:
     """Return the key of arrays that depend on `World.truth_config` and, by ``name``, on a seed."""
-    fluid = world.truth_config
-    return Key(f"{fluid.name}-{world_digest(fluid)[:16]}", name)
+    config = world.truth_config
+    return Key(f"{config.name}-{world_digest(config)[:16]}", name)
 
 
 def model_key(name: str, configuration: Any, version: int) -> Key:
@@ -102,7 +102,7 @@ def store(key: Key, arrays: Arrays) -> None:
 
 
 def is_cached(key: Key) -> bool:
-    """Return whether the cache holds a sound file of this key."""
+    """Return whether the cache holds a valid file of this key."""
     return _load(key) is not None
 
 
@@ -116,15 +116,15 @@ def ship(key: Key, arrays: Arrays) -> None:
 
 
 def load_shipped(key: Key) -> dict[str, np.ndarray] | None:
-    """Return the arrays that the package ships for a key; None without a sound file."""
+    """Return the arrays that the package ships for a key; None without a valid file."""
     try:
         packed = key.shipped_path.read_bytes()
         regrouped = np.frombuffer(lzma.decompress(packed[1:]), np.uint8)
         content = regrouped.reshape(packed[0], -1).T.tobytes()
     except (FileNotFoundError, lzma.LZMAError, ValueError, IndexError):
         return None
-    is_sound = _checksum(key, content[:-WORD]) == content[-WORD:]
-    return _fields(np.load(io.BytesIO(content))) if is_sound else None
+    is_valid = _checksum(key, content[:-WORD]) == content[-WORD:]
+    return _fields(np.load(io.BytesIO(content))) if is_valid else None
 
 
 def warn_cache_unwritable(place: Path, error: OSError) -> None:
@@ -234,7 +234,7 @@ _sound: dict[Path, tuple[int, int]] = {}
 
 
 def _load(key: Key) -> dict[str, np.ndarray] | None:
-    """Return the memory-mapped arrays of a sound file; None where there is none."""
+    """Return the memory-mapped arrays of a valid file; None without such a file."""
     path = key.path
     try:
         status = os.stat(path)

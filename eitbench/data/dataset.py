@@ -1,10 +1,9 @@
-"""Episodes as examples to learn from: measurements, and the true concentration.
+"""Data sets for machine learning: measurements and true concentrations of episodes.
 
-The truth is given on the estimators' nodes, as the concentration p_t nearest to it in the norm of
-the score. With M̃ and b_t of `eitbench.data.episode_cache`, M̃ p_t = b_t, and for every ĉ on these
-nodes
+The target is the projection p_t of the truth onto the estimators' nodes in the norm of the score.
+With M̃ and b_t of `eitbench.data.episode_cache`, M̃ p_t = b_t, and for every ĉ on these nodes
     ∫(ĉ − c_t)² = (ĉ − p_t)ᵀ M̃ (ĉ − p_t) + ∫(p_t − c_t)².
-In reduced coordinates, ĉ = c̄ + B â and G = Bᵀ M̃ B, with a_t nearest to the truth, likewise
+In reduced coordinates, with ĉ = c̄ + B â, G = Bᵀ M̃ B and the projection a_t,
     ∫(c̄ + B â − c_t)² = (â − a_t)ᵀ G (â − a_t) + ∫(c̄ + B a_t − c_t)².
 """
 
@@ -36,51 +35,51 @@ from eitbench.worlds.registry import entry
 from eitbench.worlds.world import World
 
 if TYPE_CHECKING:
-    from eitbench.numerics.mesh import Mesh  # finite elements: not needed to read examples
+    from eitbench.numerics.mesh import Mesh  # finite elements: examples do not need them
 
 MIN_MASS = 1e-9
-"""Fraction of the largest diagonal mass below which a node only touches a region by rounding."""
+"""Diagonal mass relative to the largest, below which a node is outside the region."""
 SNAPSHOT_STRIDE = 2
-"""Steps between the states from which modes are computed."""
+"""Steps between snapshots for POD modes."""
 RANK_TOLERANCE = 1e-12
-"""Directions with a smaller fraction of the largest squared singular value are dependent."""
+"""Squared singular value relative to the largest, below which directions are dependent."""
 
 
 class Example(NamedTuple):
-    """An episode, t = 1 … T: L readings and n nodes of the estimators' mesh at each t."""
+    """Measurements and truth of an episode, t = 1 … T, with L electrodes and n nodes."""
 
     seed: int
     """see `eitbench.data.seeds`"""
     voltages: np.ndarray
-    """(T, L) V, measured under the world's injection cycle"""
+    """(T, L) V, measured with the world's injection cycle"""
     currents: np.ndarray
     """(T, L) A (A/m in 2D), injected"""
     truth: np.ndarray
-    """(T, n) float32 mol/m³, the true concentration's projection p_t, or (T, q) its coordinates"""
+    """(T, n) float32 mol/m³, projection p_t of the true concentration, or its coordinates (T, q)"""
     unresolved: np.ndarray
     """(T,) ∫(p_t − c_t)² in (mol/m³)²·m² (m³ in 3D): the error of the best estimate"""
     square: np.ndarray
     """(T,) ∫c_t² in the same unit"""
     velocity: np.ndarray
-    """(T, k) m/s, the flow parameters that fit the true flow best; k = 0 where the flow is known"""
+    """(T, k) m/s, parameters of the best fit to the true flow; k = 0 if the flow is specified"""
 
 
 @dataclass(frozen=True, eq=False)
 class Dataset:
-    """Examples of a world, in the order of their seeds; `dataset` makes it.
+    """Examples of a world in the order of their seeds; see `dataset`.
 
-    Iterating holds one example at a time. Missing episodes are simulated, eight together, and kept
-    in the cache; `eitbench bank` does so beforehand, in several processes.
+    Iteration loads one example at a time. Missing episodes are simulated in batches of eight and
+    cached; `eitbench bank` simulates them in advance, in several processes.
     """
 
     env: str
-    """the environment's id"""
+    """id of the environment"""
     world: World
     seeds: tuple[int, ...]
     basis: np.ndarray | None = None
-    """(n, q) B in mol/m³ of reduced coordinates, or None: nodes"""
+    """(n, q) B in mol/m³ of reduced coordinates; None: nodal values"""
     mean: float | np.ndarray = 0.0
-    """c̄ in mol/m³, one or (n,)"""
+    """c̄ in mol/m³, a number or (n,)"""
 
     def __len__(self) -> int:
         return len(self.seeds)
@@ -95,7 +94,7 @@ class Dataset:
         return self.example(self.seeds[index])
 
     def example(self, seed: int) -> Example:
-        """Return the example of one episode, which is simulated if the cache does not hold it."""
+        """Return the example of one episode, simulated if it is not cached."""
         world = self.world
         entries = cached_episode(world, seed)
         cycle = world.currents
@@ -108,11 +107,11 @@ class Dataset:
         return nodal if self.basis is None else self.project_example(nodal)
 
     def project_example(self, example: Example) -> Example:
-        """Return an example on the nodes in these coordinates."""
+        """Return an example with nodal values in these coordinates."""
         deviation = example.truth.astype(float) - self.mean
         a = np.linalg.solve(self.mass, self._weighted.T @ deviation.T).T
-        left = deviation - a @ self._columns.T
-        square = np.einsum("tn,nt->t", left, self._nodal_mass @ left.T)
+        residual = deviation - a @ self._columns.T
+        square = np.einsum("tn,nt->t", residual, self._nodal_mass @ residual.T)
         return example._replace(truth=a, unresolved=example.unresolved + square)
 
     @property
@@ -127,23 +126,26 @@ class Dataset:
 
     @cached_property
     def mass(self) -> Any:
-        """Sparse M̃ (n, n) in m² (m³ in 3D): ∫f² = fᵀ M̃ f of nodal values f, over what counts; or
-        G (q, q) in (mol/m³)²·m², the identity for a basis of `pod_modes`."""
+        """Sparse M̃ (n, n) in m² (m³ in 3D), ∫f² = fᵀ M̃ f over the scored region for nodal values
+        f, or G (q, q) in (mol/m³)²·m², the identity for `pod_modes`."""
         if self.basis is None:
             return self._nodal_mass
         gram = self._columns.T @ self._weighted
         return 0.5 * (gram + gram.T)
 
     def errors(self, example: Example, estimate: np.ndarray) -> np.ndarray:
-        """Return ∫(ĉ_t − c_t)²/∫c_t² (T,) of an ``estimate`` of the shape of `Example.truth`; ẽ_c
-        (thesis 5.12) is the mean over t > warm_up, as the environment scores it."""
+        """Return ∫(ĉ_t − c_t)²/∫c_t² (T,) of an ``estimate`` of the shape of `Example.truth`.
+
+        The score ẽ_c (thesis 5.12) is the mean over t > warm_up.
+        """
         estimate = _check.array("estimate", estimate, example.truth.shape)
-        off = estimate - example.truth
-        return (np.einsum("tn,nt->t", off, self.mass @ off.T) + example.unresolved) / example.square
+        error = estimate - example.truth
+        projected = np.einsum("tn,nt->t", error, self.mass @ error.T)
+        return (projected + example.unresolved) / example.square
 
     def pod_modes(self, q: int) -> np.ndarray:
-        """Return the best basis (n, q), in the norm of the score, for the scored states relative to
-        the background; orthonormal in that norm. ``ValueError`` if they have fewer modes."""
+        """Return the POD basis (n, q) of the scored states relative to the background, optimal and
+        orthonormal in the norm of the score. ``ValueError`` if the states have fewer modes."""
         return pod_basis(self, q)[0]
 
     def project(self, basis: np.ndarray, mean: float | np.ndarray | None = None) -> Dataset:
@@ -152,9 +154,9 @@ class Dataset:
         Parameters
         ----------
         basis : (n, q) array, mol/m³
-            Such as `pod_modes`. ``ValueError`` if its columns depend on each other.
+            Such as `pod_modes`. ``ValueError`` if its columns are linearly dependent.
         mean : float or (n,) array, mol/m³
-            Default: the world's background.
+            Default: the background of the world.
         """
         n = self.mesh.n_nodes
         basis = _check.array("basis", basis, (n, None), units="mol/m³")
@@ -167,7 +169,7 @@ class Dataset:
         reduced = Dataset(self.env, self.world, self.seeds, basis, mean)
         squares = np.linalg.eigvalsh(reduced.mass)
         if not squares[0] > RANK_TOLERANCE * squares[-1]:
-            raise ValueError("basis must have independent columns over what is scored; some of "
+            raise ValueError("basis must have independent columns over the scored region; some of "
                              f"these {len(squares)} depend on others")
         return reduced
 
@@ -177,8 +179,10 @@ class Dataset:
         return found
 
     def torch(self) -> TorchDataset:
-        """Return the same as a map-style dataset for torch. ``ModuleNotFoundError`` without torch.
-        Missing episodes are simulated one by one; `eitbench bank` is faster."""
+        """Return a map-style dataset for torch; ``ModuleNotFoundError`` without torch.
+
+        Missing episodes are simulated one by one; `eitbench bank` is faster.
+        """
         with needed_by("a dataset for torch"):
             import torch  # noqa: F401
         return TorchDataset(self)
@@ -190,7 +194,7 @@ class Dataset:
     @property
     def _columns(self) -> np.ndarray:
         if self.basis is None:
-            raise ValueError("coordinates are those of `Dataset.project`, which has a basis")
+            raise ValueError("the dataset must have a basis, see Dataset.project; got None")
         return self.basis
 
     @cached_property
@@ -199,7 +203,7 @@ class Dataset:
 
 
 class TorchDataset:
-    """A dataset whose items hold the fields of an `Example` as tensors in single precision."""
+    """A map-style dataset of the fields of each `Example` as single-precision tensors."""
 
     def __init__(self, examples: Dataset) -> None:
         self.examples = examples
@@ -217,17 +221,17 @@ class TorchDataset:
 
 def dataset(env: str, seeds: str | Sequence[int], *,
             world: Mapping[str, Any] | None = None) -> Dataset:
-    """Return episodes of an environment as examples to learn from.
+    """Return episodes of an environment as training examples.
 
     Parameters
     ----------
     env : str
-        A registered id. Of an injection environment, the voltages of its world's own cycle.
+        A registered id. An injection environment uses the injection cycle of its world.
     seeds : str or sequence of int
-        As in ``"train:0-199"``, or the seeds themselves. Test episodes, on which methods are
-        scored, require that their split is named: ``"test:0-9"``.
+        Such as ``"train:0-199"``, or integers. Test episodes, on which methods are scored, require
+        the name of their split: ``"test:0-9"``.
     world : dict, optional
-        Numbers of the world's parts to change; see `World.with_changes`.
+        Changes of the world's parts; see `World.with_changes`.
 
     Raises
     ------
@@ -238,7 +242,7 @@ def dataset(env: str, seeds: str | Sequence[int], *,
 
 
 def resolve_seeds(seeds: str | Sequence[int]) -> tuple[int, ...]:
-    """Return each seed once; ``ValueError`` for none, or a test episode without its split."""
+    """Return the seeds without duplicates; ``ValueError`` for none or an unnamed test split."""
     numbers = parse_seeds(seeds) if isinstance(seeds, str) else [
         _check.integer("seeds", seed, low=0) for seed in seeds]
     if not numbers:
@@ -262,30 +266,32 @@ def pod_basis(examples: Dataset, q: int) -> tuple[np.ndarray, np.ndarray]:
         second += deviation.T @ deviation
         states += len(deviation)
     second /= states
-    # R Rᵀ = second; modes R v/√λ of the eigenvectors v of Rᵀ M̃ R, since M̃ may be singular
+    # R Rᵀ = second; modes are R v/√λ with eigenvectors v of Rᵀ M̃ R, because M̃ may be singular
     values, vectors = np.linalg.eigh(second)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     values, vectors = np.linalg.eigh(root.T @ (examples.mass @ root))
-    many = int((values > RANK_TOLERANCE * values[-1]).sum())
-    if q > many:
-        raise ValueError(f"q must be at most {many}, as many modes as these states have; got {q}")
+    rank = int((values > RANK_TOLERANCE * values[-1]).sum())
+    if q > rank:
+        raise ValueError(f"q must be at most {rank}, the number of modes of these states; got {q}")
     last = slice(None, -q - 1, -1)
     basis = root @ vectors[:, last] / np.sqrt(values[last])
-    left = second.diagonal() - basis**2 @ values[last]
-    return basis, np.maximum(left, 0.0)
+    residual = second.diagonal() - basis**2 @ values[last]
+    return basis, np.maximum(residual, 0.0)
 
 
 def _projected(world: World, entries: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return p_t (T, n) in mol/m³, ∫(p_t − c_t)² and ∫c_t² (T,). With a region these are of the
-    region; nodes beyond it have the projection of the whole vessel."""
+    """Return p_t (T, n) in mol/m³, ∫(p_t − c_t)² and ∫c_t² (T,) over the scored region.
+
+    Nodes outside a region have the projection over the whole vessel.
+    """
     truth = _solver(world)(entries["moment"].astype(float).T).T
-    counted = integrals(world, entries)
-    moment = counted.moment.astype(float)
+    scored = integrals(world, entries)
+    moment = scored.moment.astype(float)
     if world.region is not None:
         inside, solve = _region_solver(world)
         truth[:, inside] = solve(moment[:, inside].T).T
-    unresolved = counted.deviation - np.einsum("tn,tn->t", moment, truth)
-    return (world.background + truth).astype(np.float32), unresolved, np.array(counted.square)
+    unresolved = scored.deviation - np.einsum("tn,tn->t", moment, truth)
+    return (world.background + truth).astype(np.float32), unresolved, np.array(scored.square)
 
 
 @cache_per_truth(4)
@@ -296,7 +302,7 @@ def _solver(world: World) -> Any:
 
 @cache_per_truth(4)
 def _region_solver(world: World) -> tuple[np.ndarray, Any]:
-    """Return the nodes that the world's region touches, and M̃⁻¹ of them."""
+    """Return the nodes of the world's region, and a solver with M̃ restricted to them."""
     mass = _symmetric(score_mass(world))
     diagonal = mass.diagonal()
     inside = np.flatnonzero(diagonal > MIN_MASS * diagonal.max())
@@ -304,5 +310,5 @@ def _region_solver(world: World) -> tuple[np.ndarray, Any]:
 
 
 def _symmetric(half: sp.csr_array) -> sp.csr_array:
-    """Return M̃ from its triangle with doubled entries."""
+    """Return M̃ from its upper triangle, which is doubled off the diagonal."""
     return (0.5 * (half + half.T)).tocsr()

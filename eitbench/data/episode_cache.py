@@ -1,10 +1,10 @@
-"""Recordings: what environments play and score an episode from, of all steps or of the first ones.
+"""Cached episodes: transfer resistances, noise and scoring integrals of all or the first steps.
 
-Scores need of the truth two integrals a step and one vector on the estimators' nodes, and none of
-its meshes. With P the interpolation from those nodes to the truth's, M the truth's mass matrix over
-what counts, and all concentrations relative to the world's background,
+Scores need two integrals and one vector on the estimators' nodes per step, without the mesh of the
+truth. Let P be the interpolation from these nodes to the truth's, M the truth's mass matrix over
+the scored region, and all concentrations relative to the world's background. Then
     ∫(ĉ − c)² = ĉᵀ M̃ ĉ − 2 ĉᵀ b_t + d_t,      M̃ = Pᵀ M P,   b_t = Pᵀ M c_t,   d_t = c_tᵀ M c_t.
-A world with a ``region`` counts errors between two cross-sections only.
+The scored region is the whole vessel, or `World.region`.
 """
 
 from __future__ import annotations
@@ -34,30 +34,30 @@ from eitbench.worlds.task import make_task
 from eitbench.worlds.world import World
 
 if TYPE_CHECKING:
-    from eitbench.numerics.mesh import Mesh  # finite elements: not needed to play recordings
+    from eitbench.numerics.mesh import Mesh  # finite elements: cached episodes do not need them
 
 SCORING_VERSION = 1
-"""Version of the outlines and region masses that are kept."""
+"""Version of the cached scoring constants and region masses."""
 EXTRA_STEPS = 12
-"""Steps simulated beyond those that the first observation needs: environment checkers take ten."""
+"""Simulated steps after the first observation: environment checkers take ten."""
 BUNDLED_SEED = 0
-"""Seed of the episode whose first steps are shipped: a growing pool starts with it."""
+"""Seed of the episode with a shipped prefix; a growing `EpisodeSampler` starts with it."""
 CSR_ARRAYS = ("data", "indices", "indptr")
-"""Arrays that hold a sparse matrix."""
+"""Arrays of a sparse matrix."""
 
 
 class ScoringConstants(NamedTuple):
-    """The scoring constants that all episodes of a world share."""
+    """Constants of a world that scores of all its episodes need."""
 
     mass: sp.csr_array
     """(n, n) upper triangle of M̃ over the whole vessel, m² (m³ in 3D), doubled off the diagonal:
     ĉᵀ·mass·ĉ = ĉᵀM̃ĉ."""
     largest_voltage: float
-    """V, of the cycle's injections into liquid of the expected concentration."""
+    """V, largest voltage of the cycle's injections at the expected concentration"""
 
 
 class ScoreIntegrals(NamedTuple):
-    """The integrals that score an episode, t = 1 … T, over what counts."""
+    """Scoring integrals of an episode over the scored region, t = 1 … T."""
 
     moment: np.ndarray
     """(T, n) float32, b_t"""
@@ -67,11 +67,11 @@ class ScoreIntegrals(NamedTuple):
     """(T,) ∫c_t²"""
 
 
-# -- recordings --
+# -- cached episodes --
 
 
 def cached_episode(world: World, seed: int) -> np.ndarray:
-    """Return the recording of an episode, from the cache or simulated.
+    """Return an episode from the cache, or simulate and cache it.
 
     Returns
     -------
@@ -83,8 +83,8 @@ def cached_episode(world: World, seed: int) -> np.ndarray:
     ``deviation``            ∫(c_t − background)²
     ``square``               ∫c_t²
     ``region_…``             the last three over the world's region, if it has one
-    ``velocity_moment``      (k,) ∫φ_k v_t across the pipe, where the flow is to be estimated too
-    ``velocity_square``      ∫v_t², there too
+    ``velocity_moment``      (k,) ∫φ_k v_t across the pipe, if the task requests the flow
+    ``velocity_square``      ∫v_t², if the task requests the flow
     """
     seed = _check.integer("seed", seed, low=0)
 
@@ -95,14 +95,14 @@ def cached_episode(world: World, seed: int) -> np.ndarray:
 
 
 def cached_episode_prefix(world: World, seed: int, needed: int) -> np.ndarray:
-    """Return the recording of the whole episode if the cache holds it, else of the ``needed`` first
-    steps and some more, in a quarter of the time."""
+    """Return the whole episode if it is cached; otherwise simulate the first ``needed`` steps and
+    some more, in a quarter of the time."""
     last = needed + EXTRA_STEPS
     if last >= world.n_steps or is_episode_cached(world, seed):
         return cached_episode(world, seed)
     entries = _shipped(world.truth_config) if seed == BUNDLED_SEED else None
     if entries is None or len(entries) < needed:
-        entries = build_cached_episode(world, _beginning(world.truth_config, seed, last))
+        entries = build_cached_episode(world, _prefix(world.truth_config, seed, last))
     return entries
 
 
@@ -111,27 +111,27 @@ def concentration_at(world: World, seed: int, t: int, needed: int) -> np.ndarray
     `cached_episode_prefix`."""
     last = needed + EXTRA_STEPS
     is_early = t <= last < world.n_steps and not is_simulated(world, seed)
-    episode = _beginning(world.truth_config, seed, last) if is_early else simulate(world, seed)
+    episode = _prefix(world.truth_config, seed, last) if is_early else simulate(world, seed)
     return episode.concentration[t].astype(float)
 
 
 @lru_cache(maxsize=8)
-def _beginning(fluid: World, seed: int, last: int) -> Episode:
-    return next(simulate_batch(fluid, [seed], last=last))
+def _prefix(config: World, seed: int, last: int) -> Episode:
+    return next(simulate_batch(config, [seed], last=last))
 
 
 def cached_episode_key(world: World, seed: int) -> cache.Key:
-    """Return the key of an episode's recording."""
+    """Return the key of a cached episode."""
     return cache.episode_key(world, str(seed))
 
 
 def is_episode_cached(world: World, seed: int) -> bool:
-    """Return whether the cache holds a sound recording."""
+    """Return whether the cache holds a valid file of the episode."""
     return cache.is_cached(cached_episode_key(world, seed))
 
 
 def build_cached_episode(world: World, episode: Episode) -> np.ndarray:
-    """Compute the recording of an episode, or of its beginning."""
+    """Compute the entries of a cached episode from a simulated one or its prefix."""
     operators = {"": score_operators(world)}
     if world.region is not None:
         operators["region_"] = region_operators(world)
@@ -150,7 +150,7 @@ def build_cached_episode(world: World, episode: Episode) -> np.ndarray:
 
 
 def step_dtype(world: World, n_nodes: int) -> np.dtype:
-    """Return the type of one step of a recording; ``n_nodes`` are those of the estimators' mesh."""
+    """Return the type of one step of a cached episode; ``n_nodes``: of the estimators' mesh."""
     L = world.vessel.n_electrodes
     prefixes = ("",) if world.region is None else ("", "region_")
     scores = [(prefix + name, *layout) for prefix in prefixes for name, *layout in (
@@ -163,8 +163,8 @@ def step_dtype(world: World, n_nodes: int) -> np.dtype:
 
 
 def prefix_file(world: World, needed: int = 0) -> cache.File:
-    """Return the shipped beginning: the transfer resistances of the first steps that are not
-    scored; the ``needed`` ones must be among them."""
+    """Return the file of the shipped prefix: transfer resistances of the first steps that are not
+    scored, at least the ``needed`` ones."""
     def build() -> dict[str, np.ndarray]:
         steps = min(needed + EXTRA_STEPS, world.warm_up)
         (episode,) = simulate_batch(world.truth_config, [BUNDLED_SEED], False, steps)
@@ -176,8 +176,8 @@ def prefix_file(world: World, needed: int = 0) -> cache.File:
 
 @cache_per_truth(4)
 def _shipped(world: World) -> np.ndarray | None:
-    """Return the shipped steps as entries of a recording; their integrals, which no score needs,
-    are not those of the truth."""
+    """Return the shipped steps as entries of a cached episode, with placeholder integrals: these
+    steps are not scored."""
     arrays = cache.load_shipped(prefix_file(world).key)
     if arrays is None:
         return None
@@ -198,7 +198,7 @@ def _shipped(world: World) -> np.ndarray | None:
 
 
 def instrument_faults(world: World, seed: int) -> Faults:
-    """Return the faults of the instrument in an episode."""
+    """Return the instrument faults of an episode."""
     random = episode_streams(seed).faults
     return world.instrument.draw(random, world.vessel.n_electrodes, world.n_steps)
 
@@ -213,7 +213,7 @@ def cycle_voltages(world: World, seed: int, entries: np.ndarray) -> np.ndarray:
 
 
 def integrals(world: World, entries: np.ndarray) -> ScoreIntegrals:
-    """Return the integrals of a recording over what counts."""
+    """Return the integrals of a cached episode over the scored region."""
     prefix = "" if world.region is None else "region_"
     return ScoreIntegrals(*(entries[f"{prefix}{name}"] for name in ScoreIntegrals._fields))
 
@@ -225,14 +225,14 @@ def integrate(episode: Episode, background: float, interpolation: sp.csr_array,
     deviation = c - background
     weighted = mass @ deviation.T
     return ScoreIntegrals((interpolation.T @ weighted).T.astype(np.float32),
-                     np.einsum("tn,nt->t", deviation, weighted),
-                     np.einsum("tn,nt->t", c, mass @ c.T))
+                          np.einsum("tn,nt->t", deviation, weighted),
+                          np.einsum("tn,nt->t", c, mass @ c.T))
 
 
 def step_error(mass: sp.csr_array, estimate: np.ndarray, moment: np.ndarray,
                deviation: np.ndarray | float, square: np.ndarray | float) -> np.ndarray:
-    """Return ∫(ĉ_t − c_t)² / ∫c_t² of ``estimate`` (..., n) less the background, by a recording."""
-    # Contiguous: otherwise the order of the sums, and so the last bit, depends on the number of
+    """Return ∫(ĉ_t − c_t)² / ∫c_t² of ``estimate`` (..., n) less the background."""
+    # Contiguous: otherwise the summation order, and so the last bit, depends on the number of
     # estimates.
     quadratic = np.einsum("...n,...n->...", estimate, np.ascontiguousarray((mass @ estimate.T).T))
     return (quadratic - 2.0 * np.einsum("...n,...n->...", estimate, moment) + deviation) / square
@@ -240,8 +240,7 @@ def step_error(mass: sp.csr_array, estimate: np.ndarray, moment: np.ndarray,
 
 def velocity_error(velocity: VelocityModel, parameters: np.ndarray, moment: np.ndarray,
                    square: np.ndarray | float) -> np.ndarray:
-    """Return ∫(v̂_t − v_t)² / ∫v_t² across the pipe of ``parameters`` (..., k) in m/s, by a
-    recording."""
+    """Return ∫(v̂_t − v_t)² / ∫v_t² across the pipe of ``parameters`` (..., k) in m/s."""
     quadratic = np.einsum("...k,kl,...l->...", parameters, velocity.gram, parameters)
     return (quadratic - 2.0 * np.einsum("...k,...k->...", parameters, moment) + square) / square
 
@@ -251,24 +250,24 @@ def velocity_error(velocity: VelocityModel, parameters: np.ndarray, moment: np.n
 
 @cache_per_truth(4)
 def scoring_constants(world: World) -> ScoringConstants:
-    """Return the outline of a world, shipped, cached or computed."""
+    """Return the scoring constants of a world, shipped, cached or computed."""
     arrays = cache.cached(*scoring_constants_file(world))
     return ScoringConstants(csr_of(arrays), float(arrays["largest"]))
 
 
 def scoring_constants_file(world: World) -> cache.File:
-    """Return the arrays of a world's outline, which neither flow, target nor contacts change."""
+    """Return the file of a world's scoring constants; flow, target and contacts do not matter."""
     def build() -> dict[str, np.ndarray]:
         task = make_task(world.truth_config)
-        level = np.full(task.mesh.n_nodes, world.expected_concentration)
-        largest = np.abs(task.observation.voltages(level, world.truth_config.currents)).max()
+        homogeneous = np.full(task.mesh.n_nodes, world.expected_concentration)
+        largest = np.abs(task.observation.voltages(homogeneous, world.truth_config.currents)).max()
         return _half_mass(*score_operators(world)) | {"largest": np.array(largest)}
 
     instrument = Instrument(current=world.instrument.current)
-    fluid = cache.config_dict(replace(world.truth_config, instrument=instrument))
-    numbers = {name: fluid[name] for name in ("vessel", "instrument", "prior")}
-    numbers["pattern"] = fluid["schedule"]["pattern"]
-    return cache.File(cache.model_key("outline", numbers, SCORING_VERSION), build)
+    config = cache.config_dict(replace(world.truth_config, instrument=instrument))
+    parts = {name: config[name] for name in ("vessel", "instrument", "prior")}
+    parts["pattern"] = config["schedule"]["pattern"]
+    return cache.File(cache.model_key("outline", parts, SCORING_VERSION), build)
 
 
 @cache_per_truth(4)
@@ -280,7 +279,7 @@ def score_mass(world: World) -> sp.csr_array:
 
 
 def region_file(world: World) -> cache.File:
-    """Return the arrays of the mass matrix of a world's region."""
+    """Return the file of the mass matrix of a world's region."""
     configuration = [cache.config_dict(world.vessel), world.region]
     key = cache.model_key("region", configuration, SCORING_VERSION)
     return cache.File(key, lambda: _half_mass(*region_operators(world)))
@@ -297,7 +296,7 @@ def score_operators(world: World) -> tuple[sp.csr_array, sp.csr_array]:
 
 @cache_per_truth(2)
 def region_operators(world: World) -> tuple[sp.csr_array, sp.csr_array]:
-    """Return P and M over what counts."""
+    """Return P and M over the scored region."""
     interpolation, mass = score_operators(world)
     if world.region is not None:
         mass = mass_between(cached_truth_model(world).transport.mesh, *world.region)
@@ -307,8 +306,8 @@ def region_operators(world: World) -> tuple[sp.csr_array, sp.csr_array]:
 def mass_between(mesh: Mesh, begin: float, end: float) -> sp.csr_array:
     """Return the P1 mass matrix (n, n) in m² (m³ in 3D) of the cells with centroids in
     begin < x < end (m)."""
-    middle = mesh.points[mesh.cells][:, :, 0].mean(axis=1)
-    inside = (begin < middle) & (middle < end)
+    centroids = mesh.points[mesh.cells][:, :, 0].mean(axis=1)
+    inside = (begin < centroids) & (centroids < end)
     cells = mesh.cells[inside]
     corners = mesh.dim + 1
     local = mesh.volumes[inside, None, None] * (1.0 + np.eye(corners)) / (corners * (corners + 1))
@@ -318,7 +317,7 @@ def mass_between(mesh: Mesh, begin: float, end: float) -> sp.csr_array:
 
 
 def _half_mass(interpolation: sp.csr_array, mass: sp.csr_array) -> dict[str, np.ndarray]:
-    """Return M̃'s upper triangle with doubled entries off the diagonal as `CSR_ARRAYS` arrays."""
+    """Return the upper triangle of M̃, doubled off the diagonal, as `CSR_ARRAYS` arrays."""
     full = interpolation.T @ mass @ interpolation
     half = sp.csr_array(sp.triu(full) + sp.triu(full, 1))
     return {name: getattr(half, name) for name in CSR_ARRAYS}

@@ -1,7 +1,7 @@
-"""`simulate(world, seed) -> Episode`: the truth, computed once and kept in a cache on disk.
+"""Simulation of episodes: `simulate(world, seed) -> Episode`, with a cache on disk.
 
-Currents do not move the fluid, so an episode's whole measurement content is one transfer-resistance
-matrix a step.
+Currents do not influence the flow, so that one transfer-resistance matrix per step determines the
+voltages of any injection.
 """
 
 from __future__ import annotations
@@ -21,25 +21,25 @@ from eitbench.worlds.random_streams import episode_streams
 from eitbench.worlds.world import Discretisation, World
 
 Made = TypeVar("Made")
-PRESIMULATE_HINT = "`eitbench bank --env ID --seeds train:0-99` makes episodes beforehand"
-"""What to say to those who wait for one."""
+PRESIMULATE_HINT = "`eitbench bank --env ID --seeds train:0-99` simulates episodes in advance"
+"""Advice in messages about long simulations."""
 
 
 class Episode(NamedTuple):
-    """What happened, t = 0 … T. The truth: no estimator or policy ever holds one."""
+    """Ground truth of an episode, t = 0 … T; estimators and policies have no access to it."""
 
     concentration: np.ndarray
-    """(T + 1, n_truth) float32 nodal concentration in mol/m³ on the truth's CD mesh."""
+    """(T + 1, n_truth) float32 nodal concentration in mol/m³ on the truth's transport mesh."""
     transfer_resistance: np.ndarray
     """(T, L, L) 𝓡 at t = 1 … T in Ω (Ω·m in 2D)."""
     noise: np.ndarray
-    """(T, L) standard normal draws, one a reading."""
+    """(T, L) standard normal draws, one for each measurement."""
     velocity: np.ndarray
-    """(T, p) m/s at `VelocityModel.points`, t = 1 … T; p = 0 where nobody is asked for the flow."""
+    """(T, p) m/s at `VelocityModel.points`, t = 1 … T; p = 0 if the task does not request it."""
 
     def voltages(self, step: int, currents: np.ndarray, world: World) -> np.ndarray:
-        """Noisy voltages (L,) in V of a sound instrument when ``currents`` (L,) in A (A/m in 2D)
-        are injected at step 1 … T."""
+        """Return noisy voltages (L,) in V of an intact instrument that injects ``currents`` (L,)
+        in A (A/m in 2D) at ``step`` 1 … T."""
         k = slice(step - 1, step)
         return world.instrument.measure(Faults.none(len(currents)), step,
                                         self.transfer_resistance[k], currents[None],
@@ -58,7 +58,7 @@ def simulate(world: World, seed: int, *, cache: bool = True, progress: bool = Tr
         Read from and write to the cache folder ($EITBENCH_CACHE, by default in the user's cache
         folder).
     progress : bool
-        Show a progress bar, on a terminal only, and report what takes longer than two seconds.
+        Show a progress bar, on a terminal only, and report a simulation of over two seconds.
     """
     seed = _check.integer("seed", seed, low=0)
 
@@ -79,27 +79,26 @@ def _key(world: World, seed: int) -> Key:
     return episode_key(world, f"{seed}.truth")
 
 
-def cache_per_truth(many: int) -> Callable[[Callable[[World], Made]], Callable[[World], Made]]:
-    """Decorate a function of a world: it runs once a process for all worlds with the same
-    `World.truth_config`, and results of ``many`` are kept."""
-    def decorated(make: Callable[[World], Made]) -> Callable[[World], Made]:
-        kept = lru_cache(maxsize=many)(make)
-        return wraps(kept)(lambda world: kept(world.truth_config))
+def cache_per_truth(size: int) -> Callable[[Callable[[World], Made]], Callable[[World], Made]]:
+    """Cache a function of a world by `World.truth_config`, for ``size`` of them."""
+    def decorate(function: Callable[[World], Made]) -> Callable[[World], Made]:
+        cached_function = lru_cache(maxsize=size)(function)
+        return wraps(cached_function)(lambda world: cached_function(world.truth_config))
 
-    return decorated
+    return decorate
 
 
 @cache_per_truth(4)
 def cached_truth_model(world: World) -> Discretisation:
-    """``world.truth_model()``."""
+    """Return ``world.truth_model()``, cached."""
     return world.truth_model()
 
 
 def simulate_batch(world: World, seeds: Sequence[int], progress: bool = True,
-                      last: int | None = None) -> Iterator[Episode]:
-    """Simulate several seeds, with the bits of `simulate`, up to the state ``last`` (default: all).
+                   last: int | None = None) -> Iterator[Episode]:
+    """Simulate several seeds up to the state ``last`` (default: all), bit-identical to `simulate`.
 
-    In one flow eight episodes take the time of two.
+    With a common flow eight episodes take the time of two.
     """
     truth = cached_truth_model(world)
     label = f"simulating {world.name}, seed {', '.join(map(str, seeds))}"
@@ -115,10 +114,11 @@ def simulate_batch(world: World, seeds: Sequence[int], progress: bool = True,
                 wait.tick(steps)
 
         streams = [episode_streams(seed) for seed in seeds]
-        for history, random in zip(world.evolve(streams, truth, tick, steps), streams, strict=True):
+        trajectories = world.evolve(streams, truth, tick, steps)
+        for trajectory, random in zip(trajectories, streams, strict=True):
             noise = random.noise.standard_normal((world.n_steps, electrodes))[:steps]
             observation = world.true_observation(truth, random.contacts)
-            resistance = observation.transfer_resistance(history.concentration[1:])
+            resistance = observation.transfer_resistance(trajectory.concentration[1:])
             tick(steps)
-            concentration = history.concentration.astype(np.float32)
-            yield Episode(concentration, resistance, noise, history.velocity)
+            concentration = trajectory.concentration.astype(np.float32)
+            yield Episode(concentration, resistance, noise, trajectory.velocity)

@@ -1,4 +1,4 @@
-"""Examples as files that can be read without this package: one per episode, and a README."""
+"""Export of examples to files that do not need this package: one per episode, and a README."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ INTEGRAL = "(mol/m³)²·m² (m³ in 3D)"
 UNITS = {"seed": "", "voltages": "V", "currents": "A (A/m in 2D)", "truth": "mol/m³",
          "unresolved": INTEGRAL, "square": INTEGRAL, "velocity": "m/s"}
 """Unit of each field."""
-WARNING = "Test episodes are among them: report on them, and neither learn nor choose."
+WARNING = "Test episodes are included: use them to report scores, not for training or selection."
 
 
 def export(examples: Dataset, folder: Path, format: str = "npz", *, n_jobs: int = 1,
            backend: str = "loky") -> int:
-    """Write each example into a file beside the mesh and a README; return the number of new ones.
+    """Write a file for each example, the mesh and a README; return the number of new examples.
 
     The same call resumes after an interruption, and other seeds may be added.
 
@@ -77,7 +77,7 @@ def export(examples: Dataset, folder: Path, format: str = "npz", *, n_jobs: int 
 
 
 def _about(examples: Dataset, format: str) -> dict[str, Any]:
-    """Return what all files of a folder have in common, as JSON."""
+    """Return the common properties of all files of a folder, JSON-ready."""
     from eitbench import __version__
     world = examples.world
     flow = world.velocity_model
@@ -93,7 +93,7 @@ def _check_or_write_manifest(folder: Path, manifest: str) -> None:
     path = folder / "dataset.json"
     if path.exists():
         if path.read_text(encoding="utf-8") != manifest:
-            raise ValueError(f"out must be another folder: {path} is of another environment, "
+            raise ValueError(f"out must be another folder: {path} has another environment, "
                              "format or version of eitbench")
     elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ValueError(f"out must be a new or empty folder, or one of an export; got {folder}")

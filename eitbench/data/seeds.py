@@ -1,4 +1,4 @@
-"""Public episode seeds in disjoint splits: learn on `train`, choose on `dev`, report on `test`."""
+"""Episode seeds in three splits: `train` for training, `dev` for selection, `test` for scores."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 
 INTERNAL_PACKAGES = ("eitbench", "gymnasium")
-"""Packages whose lines no user wrote."""
+"""Packages that warnings skip when they name a line of the user."""
 SPLITS = {"train": range(0, 100_000), "dev": range(100_000, 200_000),
           "test": range(200_000, 300_000)}
 
 
 def parse_seeds(text: str) -> list[int]:
-    """Episode seeds from text such as ``test:0-4``, ``dev:3``, ``dev:0-9,15`` or plain ``17``.
+    """Return episode seeds of text such as ``test:0-4``, ``dev:3``, ``dev:0-9,15`` or ``17``.
 
-    Within a split numbers count from its beginning; without one they are the seeds themselves.
-    ``ValueError`` if the text has another form, names an unknown split, or leaves its range.
+    Numbers within a split are relative to its beginning; without a split they are seeds.
+    ``ValueError`` for another form, an unknown split, or a number out of range.
     """
     split, colon, numbers = text.rpartition(":")
     allowed = SPLITS.get(split, range(0)) if colon else range(0, 2**31)
@@ -39,7 +39,7 @@ def parse_seeds(text: str) -> list[int]:
 
 
 def format_seed(seed: int) -> str:
-    """``test:4`` for the seed that `parse_seeds` makes of it; ``300017`` outside the splits."""
+    """Return text such as ``test:4`` that `parse_seeds` accepts; ``300017`` outside the splits."""
     for split, seeds in SPLITS.items():
         if seed in seeds:
             return f"{split}:{seed - seeds.start}"
@@ -47,7 +47,7 @@ def format_seed(seed: int) -> str:
 
 
 def seed_ranges(names: Iterable[str]) -> str:
-    """``test:0-3,7`` for test:0, test:1, test:2, test:3 and test:7; ``;`` between splits."""
+    """Return ``test:0-3,7`` for test:0, test:1, test:2, test:3 and test:7; ``;`` between splits."""
     numbers: dict[str, set[int]] = {}
     for name in names:
         split, _, number = name.rpartition(":")
@@ -62,20 +62,19 @@ def seed_ranges(names: Iterable[str]) -> str:
 
 
 def is_test(seed: int) -> bool:
-    """Return whether scores are reported of this episode."""
+    """Return whether an episode is of the test split."""
     return seed in SPLITS["test"]
 
 
 class ReservedSeedWarning(UserWarning):
-    """Somebody plays an episode of which scores are reported."""
+    """Warning of a reset to a test episode outside an evaluation."""
 
 
 _FOR_SCORES = ContextVar("allow_test_seeds", default=False)
 
 
 def warn_test_seeds(seeds: Iterable[int]) -> None:
-    """A `ReservedSeedWarning`, which Python shows once a line of the user's, if one of these
-    episodes is of the test split and nobody said that it is played `allow_test_seeds`."""
+    """Warn of test seeds outside `allow_test_seeds`; Python shows it once per line of the user."""
     if _FOR_SCORES.get():
         return
     if reserved := [seed for seed in seeds if is_test(seed)]:
@@ -88,7 +87,7 @@ def warn_test_seeds(seeds: Iterable[int]) -> None:
 
 @contextmanager
 def allow_test_seeds() -> Iterator[None]:
-    """Within, test episodes are played as they are meant to be."""
+    """Suppress `ReservedSeedWarning` within: an evaluation uses test seeds."""
     token = _FOR_SCORES.set(True)
     try:
         yield
@@ -97,8 +96,8 @@ def allow_test_seeds() -> Iterator[None]:
 
 
 def _user_stacklevel() -> int:
-    """The ``stacklevel`` of the first caller that is neither of this package nor of gymnasium, for
-    a warning that the caller of this function gives."""
+    """Return the ``stacklevel`` of the first caller outside `INTERNAL_PACKAGES`, for a warning by
+    the caller of this function."""
     level = 1
     frame = sys._getframe(1)
     while frame.f_back and frame.f_globals.get("__name__", "").split(".")[0] in INTERNAL_PACKAGES:

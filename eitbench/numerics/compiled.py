@@ -1,4 +1,4 @@
-"""What the compiled kernels need: numba, loaded when something is computed, and working memory."""
+"""Access to the compiled kernels, which need numba, and their working memory."""
 
 from __future__ import annotations
 
@@ -15,32 +15,29 @@ from eitbench._notice import say
 
 
 def compiled_kernels() -> Any:
-    """The module `eitbench.numerics.kernels`.
-
-    ``RuntimeError`` if numba is missing or does not work.
-    """
-    _tell_of_compiling(Path(__file__).with_name("__pycache__"))
+    """Import `eitbench.numerics.kernels`; ``RuntimeError`` if numba is missing or fails."""
+    _announce_compilation(Path(__file__).with_name("__pycache__"))
     try:
         from eitbench.numerics import kernels
     except Exception as error:
-        # ImportError beside a numpy that numba does not know, RuntimeError without a cache folder
-        raise RuntimeError(f"numba cannot be used ({error}); install eitbench anew, so that numba "
-                           "and numpy fit together, or name a writable folder in "
-                           "$NUMBA_CACHE_DIR") from error
+        # ImportError with an unsupported numpy, RuntimeError without a cache folder
+        raise RuntimeError(f"numba cannot be used ({error}); reinstall eitbench with compatible "
+                           "versions of numba and numpy, or set $NUMBA_CACHE_DIR to a writable "
+                           "folder") from error
     return kernels
 
 
 @lru_cache(maxsize=1)
-def _tell_of_compiling(place: Path) -> None:
-    """Say so, where numba has compiled nothing yet and will keep in ``place`` what it compiles."""
-    elsewhere = "NUMBA_CACHE_DIR" in os.environ or not os.access(place.parent, os.W_OK)
-    if not elsewhere and not any(place.glob("kernels.*.nbi")):
+def _announce_compilation(folder: Path) -> None:
+    """Print a message before the first compilation, whose result numba stores in ``folder``."""
+    is_elsewhere = "NUMBA_CACHE_DIR" in os.environ or not os.access(folder.parent, os.W_OK)
+    if not is_elsewhere and not any(folder.glob("kernels.*.nbi")):
         say("compiling the kernels, some 20 s, once after installation; "
-            "`eitbench bank --seeds train:0` does so beforehand")
+            "`eitbench bank --seeds train:0` does so in advance")
 
 
 def aligned_zeros(shape: tuple[int, ...]) -> np.ndarray:
-    """Fresh doubles that begin a cache line: vectors across two lines cost up to twice as much."""
+    """Return an array at a cache-line boundary: vectors across two lines are up to twice slower."""
     size = math.prod(shape)
     memory = np.zeros(size + 8)
     skip = -(memory.ctypes.data // 8) % 8
@@ -51,9 +48,9 @@ _memory = threading.local()
 
 
 def scratch(size: int) -> np.ndarray:
-    """(size,) aligned doubles of this thread, good until the next call.
+    """Return (size,) aligned doubles of this thread, valid until the next call.
 
-    They are kept, since fresh memory is slow to touch.
+    They are reused, because first access to new memory is slow.
     """
     if getattr(_memory, "doubles", np.empty(0)).size < size:
         _memory.doubles = aligned_zeros((size,))

@@ -1,9 +1,8 @@
-"""Sparse symmetric positive definite systems, seen from their last few unknowns.
+"""Static condensation of sparse symmetric positive definite systems onto their last unknowns.
 
-Of K = [[A, B], [Bᵀ, C]] the electrodes ask only for (C − Bᵀ A⁻¹ B)⁻¹, the block of K⁻¹ that belongs
-to them. With their unknowns ordered last, the Schur complement is what a Cholesky factorisation has
-left when it comes to them: no substitution is needed, and every injection is served at the price of
-one factorisation.
+For K = [[A, B], [Bᵀ, C]] the electrodes need only their block of K⁻¹, (C − Bᵀ A⁻¹ B)⁻¹. With their
+unknowns ordered last, a Cholesky factorisation of the other columns leaves the Schur complement:
+one factorisation serves all injections, without substitutions.
 
 The unknowns are ordered once for a fixed pattern: by minimum degree, or in 3D by nested dissection.
 """
@@ -17,9 +16,9 @@ from eitbench.numerics.compiled import compiled_kernels, scratch
 from eitbench.numerics.sparse_lu import factorise_no_pivot
 
 _LEAF = 200
-"""Unknowns of a part of the body that is not cut any more."""
+"""Largest number of unknowns of a leaf of nested dissection."""
 _WIDEST = 1200
-"""Rows of a front up to which eight matrices side by side stay in the processor's own memory."""
+"""Largest number of rows of a front with which eight matrices fit into the processor's caches."""
 
 
 class Condensation:
@@ -31,15 +30,15 @@ class Condensation:
         Symmetric, with a full diagonal.
     n_ports : int
     places : (n − n_ports, d), optional
-        Where the unknowns lie; if given, they are ordered by nested dissection. In 3D that takes
-        half of minimum degree's operations, and less on large meshes; in 2D that is better.
+        Coordinates of the unknowns, for nested dissection. In 3D it needs at most half of the
+        operations of minimum degree; in 2D minimum degree is better.
 
     Attributes
     ----------
     rows, columns : (k,) int
-        Where the values belong that the methods take: the entries of K, in this order.
+        Positions in K of the values that methods take, in this order.
     batch : int
-        How many matrices are best given at once.
+        Best number of matrices per call.
     """
 
     def __init__(self, pattern: sp.csc_array, n_ports: int,
@@ -72,9 +71,9 @@ class Condensation:
         self.batch = 8 if self._front_size <= _WIDEST**2 else 1
 
     def port_inverse(self, values: np.ndarray) -> np.ndarray:
-        """The ports' block of K⁻¹: (m, m) for values (k,), (b, m, m) for values (k, b).
+        """Return the ports' block of K⁻¹: (m, m) for values (k,), (b, m, m) for values (k, b).
 
-        b is padded to eights.
+        b is padded to multiples of eight.
         """
         if values.ndim == 1:
             return np.linalg.inv(self._schur(self._factorise(values)))
@@ -98,7 +97,7 @@ class Condensation:
         return result
 
     def port_columns(self, values: np.ndarray) -> np.ndarray:
-        """The ports' columns of K⁻¹, (n, m), for values (k,)."""
+        """Return the ports' columns (n, m) of K⁻¹ for values (k,)."""
         factor = self._factorise(values)
         solution = np.zeros((self.n, -(-self.n_ports // 8) * 8))
         solution[-self.n_ports:, :self.n_ports] = np.linalg.inv(self._schur(factor))

@@ -1,4 +1,4 @@
-"""The bridge to scikit-fem, which assembles our forms at set-up time."""
+"""Assembly of finite-element forms with scikit-fem."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ _ELEMENTS = {
 
 
 def element(dim: int, order: int) -> skfem.Element:
-    """Lagrange element of first or second order on triangles or tetrahedra."""
+    """Return a Lagrange element of first or second order on triangles or tetrahedra."""
     if (dim, order) not in _ELEMENTS:
         raise ValueError(f"order must be 1 or 2, got {order!r}")
     return _ELEMENTS[dim, order]()
 
 
 def to_skfem(mesh: Mesh) -> skfem.Mesh:
-    """The same mesh, node by node, as a scikit-fem mesh."""
+    """Return a mesh as a scikit-fem mesh with the same order of nodes."""
     kind = skfem.MeshTri if mesh.dim == 2 else skfem.MeshTet
     return kind(np.ascontiguousarray(mesh.points.T), np.ascontiguousarray(mesh.cells.T))
 
 
 def basis(mesh: Mesh, order: int, intorder: int) -> skfem.CellBasis:
-    """Elements of this order on a mesh; integrals exact for polynomials of degree ``intorder``."""
+    """Return a basis with a quadrature that is exact for polynomials of degree ``intorder``."""
     return skfem.Basis(to_skfem(mesh), element(mesh.dim, order), intorder=intorder)
 
 
@@ -52,7 +52,7 @@ def integral(v, _w):
 
 
 def facet_numbers(mesh: skfem.Mesh, facets: np.ndarray) -> np.ndarray:
-    """(...) number in a scikit-fem mesh of each of the facets (..., d), given by their nodes."""
+    """Return numbers (...) in a scikit-fem mesh of facets (..., d), given by their nodes."""
     sides = np.sort(mesh.facets, axis=0).T.tolist()
     number = {tuple(side): i for i, side in enumerate(sides)}
     flat = np.sort(facets, axis=-1).reshape(-1, mesh.dim())
@@ -60,10 +60,10 @@ def facet_numbers(mesh: skfem.Mesh, facets: np.ndarray) -> np.ndarray:
 
 
 def mass_matrix(mesh: Mesh) -> sp.csr_array:
-    """(n, n) P1 mass matrix ∫φᵢφⱼ in m^d."""
+    """Return the P1 mass matrix (n, n) ∫φᵢφⱼ in m^d."""
     return sp.csr_array(product.assemble(basis(mesh, 1, intorder=2)))
 
 
 def stiffness_matrix(mesh: Mesh) -> sp.csr_array:
-    """(n, n) P1 stiffness matrix ∫∇φᵢ·∇φⱼ in m^(d-2)."""
+    """Return the P1 stiffness matrix (n, n) ∫∇φᵢ·∇φⱼ in m^(d-2)."""
     return sp.csr_array(laplace.assemble(basis(mesh, 1, intorder=1)))

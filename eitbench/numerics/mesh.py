@@ -107,11 +107,10 @@ class Mesh:
         return _tree(self.points[self.boundary_facets])
 
     def locate(self, points: np.ndarray, candidates: int = 32) -> tuple[np.ndarray, np.ndarray]:
-        """The cell (k,) int that holds each of ``points``, and its weights (k, d + 1) there.
+        """Return the cell (k,) int of each of ``points``, and barycentric coordinates (k, d + 1).
 
-        Weights are barycentric coordinates, in the order of the cell's nodes: not negative, with
-        rows that sum to one. For a point outside the mesh it is the cell that the nearest boundary
-        facet belongs to.
+        The coordinates are in the order of the cell's nodes, nonnegative, with row sums of one. The
+        cell of a point outside the mesh is the cell of the nearest boundary facet.
 
         ``ValueError`` if ``points`` has the wrong shape or is not finite.
 
@@ -122,8 +121,8 @@ class Mesh:
             is moved to the nearest point of the boundary (in 3D, where that is on an edge of a
             facet, to one nearly as near).
         candidates : int
-            How many cells, nearest by centroid, are searched first; points found in none are
-            searched in all cells whose centroid is near enough.
+            Number of cells, nearest by centroid, to search first; other points are searched in all
+            cells with a centroid near enough.
         """
         points = _check.array("points", points, (None, self.dim), units="m")
         k = min(candidates, len(self.cells))
@@ -145,13 +144,12 @@ class Mesh:
         return best, weights
 
     def interpolation_to(self, points: np.ndarray, candidates: int = 32) -> sp.csr_array:
-        """(k, n_nodes) matrix of linear interpolation to ``points``, with rows that sum to one.
+        """Return the matrix (k, n_nodes) of linear interpolation to ``points``; row sums are one.
 
         Parameters
         ----------
         points : (k, d) float
-            Where to interpolate, in m. A point outside the mesh takes the value at the nearest
-            point of the boundary.
+            In m. A point outside the mesh takes the value at the nearest point of the boundary.
         candidates : int
             See `locate`.
         """
@@ -163,7 +161,7 @@ class Mesh:
         return matrix
 
     def _nearest_wall(self, point: np.ndarray) -> tuple[int, np.ndarray]:
-        """The cell at the nearest boundary facet, and the coordinates of the projection onto it."""
+        """Return the cell of the nearest boundary facet, and coordinates of the projection."""
         tree, reach = self._wall_tree
         wall = self.points[np.unique(self.boundary_facets)]
         distance = np.sqrt(((wall - point)**2).sum(axis=1).min())
@@ -182,7 +180,7 @@ class Mesh:
 
     def _best_cell(self, points: np.ndarray,
                    candidates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Of each point's candidates the cell that holds it best, and its coordinates there."""
+        """Return the best cell among each point's candidates, and barycentric coordinates."""
         corner = self.points[self.cells[candidates]]  # (k, c, d+1, d)
         edges = np.swapaxes(corner[:, :, 1:] - corner[:, :, :1], 2, 3)
         local = np.linalg.solve(edges, (points[:, None] - corner[:, :, 0])[..., None])[..., 0]
@@ -193,7 +191,7 @@ class Mesh:
 
 
 def _tree(corner: np.ndarray) -> tuple[cKDTree, float]:
-    """Middles of cells or facets (k, nodes, d), and how far from them their points may lie, m."""
+    """Return a tree of the centroids of cells or facets (k, nodes, d), and their largest radius."""
     middle = corner.mean(axis=1)
     return cKDTree(middle), float(np.linalg.norm(corner - middle[:, None], axis=2).max())
 
@@ -265,10 +263,10 @@ def graded(start: float, stop: float, cells: int, grading: float,
 
 def graded_line(length: float, name: str, spans: np.ndarray, cells: int,
                 grading: float) -> np.ndarray:
-    """Coordinates 0 … length (m) that crowd at both ends of each electrode's span along a pipe.
+    """Return coordinates 0 … length (m), refined at both ends of each electrode's span on a pipe.
 
-    So many cells on each electrode and in each gap between two, half as many before the first and
-    after the last. ``ValueError`` with the name of ``spans`` if they do not fit.
+    Each electrode and each gap has ``cells`` cells; the sections before the first and after the
+    last electrode have half of that. ``ValueError`` with the name of ``spans`` if they do not fit.
     """
     edges = _check.array(name, spans, (None, 2), units="m").ravel()
     if len(edges) == 0 or (np.diff([0.0, *edges, length]) <= 0).any():
@@ -284,7 +282,7 @@ def graded_line(length: float, name: str, spans: np.ndarray, cells: int,
 def graded_pipe_mesh(length: float, half_width: float, electrode_spans: np.ndarray,
                      cells_along: int, cells_across: int,
                      grading: tuple[float, float] = (2.5, 1.75)) -> Mesh:
-    """EIT mesh of the pipe [0, length] × [-half_width, half_width], fine at electrodes and walls.
+    """Return an EIT mesh of [0, length] × [-half_width, half_width], fine at electrodes and walls.
 
     Parameters
     ----------
@@ -293,14 +291,14 @@ def graded_pipe_mesh(length: float, half_width: float, electrode_spans: np.ndarr
     electrode_spans : (n, 2) float
         Start and end (m) of each electrode along the wall, increasing and disjoint.
     cells_along : int
-        Cells on each electrode and in each gap between two; half as many before the first and after
-        the last.
+        Cells on each electrode and in each gap; before the first and after the last electrode half
+        of that.
     cells_across : int
         Cells from wall to wall.
     grading : (float, float)
-        Exponents of the clustering towards the electrode edges and towards the walls, see `graded`;
-        the default had the smallest voltage error for random slugs of those tried at equal numbers
-        of unknowns.
+        Exponents of the refinement towards electrode edges and walls, see `graded`; among the tried
+        values the default has the smallest voltage error for random slugs at equal numbers of
+        unknowns.
     """
     along, across = grading
     x = graded_line(length, "electrode_spans", electrode_spans, cells_along, along)

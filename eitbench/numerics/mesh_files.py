@@ -1,6 +1,6 @@
-"""Read meshes with named groups of boundary facets from files, by meshio.
+"""Meshes with named groups of boundary facets from files, read by meshio.
 
-Draw a geometry with gmsh, give the electrodes, the inlet and the walls a physical group each, and
+Define a geometry in gmsh with a physical group for each electrode, the inlet and the walls, and
 save it as a .msh file::
 
     pipe = read_mesh("pipe.msh", scale=1e-3)                          # drawn in mm
@@ -47,12 +47,12 @@ def read_mesh(path: str | PathLike[str], sha256: str | None = None, *,
     Parameters
     ----------
     path : path of a file
-        In a format that meshio reads. Groups are known from gmsh (.msh, version 2.2 or 4.1, saved
-        without Mesh.SaveAll, which drops them) and from meshio's sets of cells.
+        In a format that meshio reads. Groups are read from gmsh files (.msh, version 2.2 or 4.1,
+        saved without Mesh.SaveAll, which drops them) and from meshio's cell sets.
     sha256 : str, optional
         Expected SHA-256 of the file, in hexadecimal digits.
     scale : float
-        Metres in a unit of the file, > 0: 1e-3 for one in mm.
+        Metres per unit of the file, > 0: 1e-3 for mm.
 
     Raises
     ------
@@ -91,7 +91,7 @@ def read_mesh(path: str | PathLike[str], sha256: str | None = None, *,
 
 def _check_file(path: Path, sha256: str | None) -> None:
     if not path.is_file():
-        raise ValueError(f"{path}: there is no such file")
+        raise ValueError(f"{path}: file not found")
     if sha256 is not None:
         found = hashlib.sha256(path.read_bytes()).hexdigest()
         if found != sha256.lower():
@@ -112,7 +112,7 @@ def _content(path: Path) -> Any:
             return meshio.gmsh.read(path) if path.suffix == ".msh" else meshio.read(path)
     except (Exception, SystemExit) as error:           # meshio exits for a broken file
         reason = " ".join(printed.getvalue().split()) or f"{type(error).__name__}: {error}"
-        raise ValueError(f"{path}: must be a whole mesh file in a format that meshio knows, "
+        raise ValueError(f"{path}: must be a complete mesh file in a format that meshio reads, "
                          f"and cannot be read ({reason})") from error
 
 

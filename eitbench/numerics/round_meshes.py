@@ -19,19 +19,19 @@ TWO_PI = 2.0 * np.pi
 
 
 def disc_mesh(radii: Sequence[float] | np.ndarray, angles: Sequence[np.ndarray]) -> Mesh:
-    """Triangles of a disc with nodes at its centre (0), then on rings, outwards, by their angles.
+    """Return a triangle mesh of a disc, with nodes at the centre (0) and on rings, outwards.
 
-    Rings need not hold equally many. Every edge of either of two rings is joined to that node of
-    the other whose share of the turn, from the middle of the edge before it to the middle of the
-    edge behind it, holds the middle of this edge. ``ValueError`` naming the argument if a shape or
-    an order is wrong, or if the rings are so unlike that triangles overlap.
+    Rings may have different numbers of nodes. Each edge of a ring forms a triangle with the node of
+    the neighbouring ring whose sector contains the middle of the edge; the sector of a node extends
+    to the middles of its two edges. ``ValueError`` naming the argument if a shape or an order is
+    wrong, or if neighbouring rings differ so much that triangles overlap.
 
     Parameters
     ----------
     radii : (K,) float
         Radius of each ring in m, > 0 and increasing; the last one is the wall, a polygon.
     angles : K sequences of (n_k ≥ 3,) float
-        Where each ring's nodes stand, in rad, increasing and within one turn.
+        Angles of each ring's nodes in rad, increasing and within one turn.
     """
     radii = _check.array("radii", radii, (None,), units="m", positive=True)
     if len(radii) == 0 or (np.diff(radii) <= 0).any():
@@ -59,9 +59,9 @@ def disc_mesh(radii: Sequence[float] | np.ndarray, angles: Sequence[np.ndarray])
     a, b, c = np.moveaxis(points[triangles], 1, 0)
     area = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
     if area.min() <= 0:
-        raise ValueError("angles must be so dense, and those of neighbouring rings so alike, that "
-                         "no triangle is turned over; one with node "
-                         f"{triangles[area.argmin()].max()} is")
+        raise ValueError("angles must be dense, and similar on neighbouring rings, so that no "
+                         "triangle is turned over; got one at node "
+                         f"{triangles[area.argmin()].max()}")
     return Mesh(points, triangles)
 
 
@@ -185,12 +185,12 @@ def round_pipe_mesh(length: float, radius: float, spans_around: np.ndarray,
     spans_along : (m, 2) float
         Start and end (m) of each ring of electrodes, increasing and disjoint.
     cells_at_electrodes : (int, int)
-        Cells on each electrode and in each gap between two, around and along the pipe; half as many
-        before the first ring and after the last.
+        Cells on each electrode and in each gap, around and along the pipe; before the first and
+        after the last ring half of that.
     rings : int
         Cells from the axis to the wall.
     grading : (float, float, float)
-        Exponents of the clustering around, across and along the pipe, see `graded`.
+        Exponents of the refinement around, across and along the pipe, see `graded`.
     """
     _check.number("length", length, low=0.0, open_low=True, units="m")
     around, along = cells_at_electrodes

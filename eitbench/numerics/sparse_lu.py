@@ -1,4 +1,4 @@
-"""One sparse matrix, factorised once and solved with very often."""
+"""Sparse LU factorisation for many solves."""
 
 from __future__ import annotations
 
@@ -11,39 +11,38 @@ from scipy.sparse.linalg import SuperLU, splu
 from eitbench.numerics.compiled import compiled_kernels, scratch
 
 CsrArrays = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Pointers, indices and values of a sparse matrix, as the kernels want it."""
+"""Pointers, indices and values of a sparse matrix, as in the kernels."""
 
 
 class LUFactors(NamedTuple):
-    """L and U, for those who substitute themselves."""
+    """Factors L and U with permutations."""
 
     row_perm: np.ndarray
-    """(n,) at which place in the order of elimination each row stands"""
+    """(n,) position of each row in the elimination order"""
     column_perm: np.ndarray
-    """(n,) and each column"""
+    """(n,) position of each column in the elimination order"""
     lower: CsrArrays
     """(n, n) L without its diagonal, which is 1"""
     upper: CsrArrays
     """(n, n) U without its diagonal"""
     scale: np.ndarray
-    """(n,) the inverse of U's diagonal"""
+    """(n,) inverse of U's diagonal"""
 
 
 class SparseLU:
-    """A = L U in an order by minimum degree on A + Aᵀ, which suits the matrices of finite elements.
+    """Factorisation A = L U, ordered by minimum degree on A + Aᵀ as suits finite elements.
 
-    The compiled substitution takes eight right-hand sides in the time of one, and gives a
-    right-hand side the same bits whatever stands beside it.
+    The compiled substitution solves eight right-hand sides in the time of one. The solution of a
+    right-hand side does not depend on the others, bit by bit.
 
     Parameters
     ----------
     matrix : (n, n) sparse
-        With a symmetric pattern and a large diagonal: nothing is pivoted.
+        With a symmetric pattern and a dominant diagonal: rows are not pivoted.
 
     Attributes
     ----------
     factors : LUFactors
-        For those who substitute themselves.
     """
 
     def __init__(self, matrix: sp.csr_array) -> None:
@@ -51,11 +50,11 @@ class SparseLU:
         L = sp.csr_array(sp.tril(factors.L, -1))
         U = sp.csr_array(sp.triu(factors.U, 1))
         self.factors = LUFactors(factors.perm_r.astype(np.int64), factors.perm_c.astype(np.int64),
-                               (L.indptr, L.indices, L.data), (U.indptr, U.indices, U.data),
-                               1.0 / factors.U.diagonal())
+                                 (L.indptr, L.indices, L.data), (U.indptr, U.indices, U.data),
+                                 1.0 / factors.U.diagonal())
 
     def solve(self, right: np.ndarray) -> np.ndarray:
-        """A⁻¹ b for (n, k)."""
+        """Return A⁻¹ b for b (n, k)."""
         n, k = right.shape
         result = np.empty((n, k))
         rows, columns, lower, upper, scale = self.factors
@@ -69,6 +68,6 @@ class SparseLU:
 
 
 def factorise_no_pivot(matrix: sp.csr_array | sp.csc_array, order: str) -> SuperLU:
-    """L U without pivoting; ``order`` of the columns by SuperLU's name, the rows in the same."""
+    """Factorise without pivoting; ``order`` is SuperLU's name of the order of rows and columns."""
     return splu(sp.csc_matrix(matrix), permc_spec=order, diag_pivot_thresh=0.0,
                 options={"SymmetricMode": True})

@@ -76,8 +76,7 @@ class CompleteElectrodeModel:
     # -- public ------------------------------------------------------------------------------------
 
     def with_contacts(self, contact_impedance: float | np.ndarray) -> CompleteElectrodeModel:
-        """The same electrodes with other z_l in Ω·m², > 0, one or (L,); in a small part of the time
-        that a new model takes."""
+        """Return this model with other z_l in Ω·m², > 0, one or (L,), faster than a new model."""
         made = copy(self)
         made.contact_impedance = self._checked_contacts(contact_impedance)
         contact = made._contact_terms()
@@ -138,9 +137,9 @@ class CompleteElectrodeModel:
     def contact_derivatives(self, conductivity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """𝓡 (L, L) and its derivatives by each electrode's contact impedance, (L, L, L).
 
-        They are in Ω and Ω/(Ω·m²) (2D: Ω·m, and per Ω·m²); the first index of the second is that of
-        z_l. With w_m the field and W_m the electrode potentials of a unit current at m, taken out
-        evenly at all electrodes, ∂𝓡_mk/∂z_l = (1/z_l²) ∫_{e_l} (w_m − W_m)(w_k − W_k).
+        Units are Ω and Ω/(Ω·m²) (2D: Ω·m, and per Ω·m²); l is the first index of the derivatives.
+        Let w_m be the field and W_m the electrode potentials of a unit current at m that leaves in
+        equal shares at all electrodes. Then ∂𝓡_mk/∂z_l = (1/z_l²) ∫_{e_l} (w_m − W_m)(w_k − W_k).
         """
         values = self._assemble(self._checked_conductivity(conductivity))
         columns = self._system.port_columns(values)

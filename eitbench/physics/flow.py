@@ -24,7 +24,7 @@ class AxialFlow:
 
 @dataclass(frozen=True)
 class PlugFlow(AxialFlow):
-    """The same velocity everywhere, v̄ along x: the limit of strong mixing, or without friction."""
+    """A uniform velocity v̄ along x: the limit of strong mixing or of no friction."""
 
     mean_velocity: float
     """v̄ in m/s, ≥ 0"""

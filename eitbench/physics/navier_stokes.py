@@ -48,13 +48,12 @@ def steady_flow(mesh: Mesh, viscosity: float, walls: Sequence[tuple[np.ndarray, 
     """A steady flow by Newton's method from the Stokes flow, or else by continuation in viscosity.
 
     The error is of third order in the cell size for the velocity and of second for the pressure (L2
-    norms). Nothing is upwinded: a mesh too coarse for the Reynolds number gives wiggles, or no
-    solution. Where there are several steady flows one of them is found, be it stable or not.
+    norms). Terms are not upwinded: a mesh too coarse for the Reynolds number leads to oscillations
+    or no solution. If several steady flows exist, the result is one of them, stable or not.
     ``ValueError`` naming the argument if the mesh is not 2D, if a value is out of range, of the
-    wrong shape or not finite, if a facet is not on the boundary, or if walls all round let more
-    fluid in than out: by more than 10⁻⁴ of the largest speed times the perimeter. (Less is the
-    error of interpolation, and spread as a uniform divergence.) ``RuntimeError`` if no steady flow
-    was found.
+    wrong shape or not finite, if a facet is not on the boundary, or if the net flux through closed
+    walls exceeds 10⁻⁴ of the largest speed times the perimeter. (A smaller flux is interpolation
+    error, and distributed as a uniform divergence.) ``RuntimeError`` if no steady flow was found.
 
     Parameters
     ----------
@@ -64,10 +63,10 @@ def steady_flow(mesh: Mesh, viscosity: float, walls: Sequence[tuple[np.ndarray, 
         Kinematic viscosity ν in m²/s, > 0.
     walls : sequence of (facets, velocity)
         Boundary facets, (k, 2) node numbers as from `Mesh.facets_where`, and the velocity imposed
-        on them: points (k, 2) in m -> velocity (k, 2) in m/s, asked at the ends and the middle of
-        each facet. A node that several entries share takes the value of the last: of a moving lid
-        and walls at rest, or an inlet and walls, the walls should come last. All other boundary
-        facets are outflow, ν∂v/∂n − pn = 0; without any, the pressure has mean zero.
+        on them: points (k, 2) in m -> velocity (k, 2) in m/s, evaluated at the ends and the middle
+        of each facet. A node that several entries share takes the value of the last entry: walls
+        should come after a moving lid or an inlet. All other boundary facets are outflow,
+        ν∂v/∂n − pn = 0; without an outflow the pressure has mean zero.
     force : callable, optional
         Force per mass, points (k, 2) in m -> acceleration (k, 2) in m/s²; default: none.
     """
@@ -97,7 +96,7 @@ class _Equations(NamedTuple):
     load: np.ndarray
     """(2n,) ∫φᵢ f."""
     source: np.ndarray
-    """(n_nodes,) what walls all round let out by errors of interpolation, spread evenly; else 0."""
+    """(n_nodes,) uniform source that balances the net flux of closed walls; otherwise 0."""
     given: np.ndarray
     """(2n + n_nodes,) wall values, zero elsewhere."""
     free: np.ndarray
@@ -105,7 +104,7 @@ class _Equations(NamedTuple):
     weights: np.ndarray
     """(n_nodes,) ∫ψᵢ."""
     closed: bool
-    """Whether walls are all round: only the pressure's gradient matters, and one value is given."""
+    """True without outflow: the pressure is determined up to a constant, and one value is fixed."""
     cell_dofs: np.ndarray
     """(n_cells, 6) numbers of the scalar unknowns at the nodes and edge middles of each cell."""
 

@@ -1,4 +1,4 @@
-"""What EIT sees of a concentration: σ(c), voltages, their derivatives by c, and their noise."""
+"""Observation model of EIT: σ(c), voltages, their derivatives by c, and their noise."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class ConductivityLaw(Protocol):
-    """σ(c) in S/m for c in mol/m³, and its derivative in S·m²/mol, entry by entry."""
+    """Elementwise σ(c) in S/m for c in mol/m³, and its derivative in S·m²/mol."""
 
     def __call__(self, concentration: np.ndarray) -> np.ndarray: ...
 
@@ -43,18 +43,18 @@ class LinearConductivity:
 
 @dataclass(frozen=True)
 class VoltageNoise:
-    """Independent Gaussian noise (thesis 5.1.1), largest being that of the same injection.
+    """Independent Gaussian noise of voltages (thesis 5.1.1).
 
-    std² = (relative·voltage)² + (relative_to_max·largest voltage)² + floor². Without ``floor`` the
-    noise scales with the current.
+    std² = (relative·voltage)² + (relative_to_max·largest voltage of the injection)² + floor².
+    Without the noise floor the noise scales with the current.
     """
 
     relative: float = 0.01
-    """part of the reading, ≥ 0; the thesis has 0.01"""
+    """std relative to the measurement, ≥ 0; 0.01 in the thesis"""
     relative_to_max: float = 0.001
-    """part of the largest voltage of the injection, ≥ 0; the thesis has 0.001"""
+    """std relative to the largest voltage of the injection, ≥ 0; 0.001 in the thesis"""
     floor: float = 0.0
-    """absolute std in V, ≥ 0; the thesis has none"""
+    """V, std of the absolute noise, ≥ 0; absent in the thesis"""
 
     def __post_init__(self) -> None:
         for name in ("relative", "relative_to_max"):
@@ -62,14 +62,14 @@ class VoltageNoise:
         _check.number("floor", self.floor, low=0.0, units="V")
 
     def std(self, voltages: np.ndarray) -> np.ndarray:
-        """Standard deviation (V) of each reading for noise-free ``voltages`` (..., L)."""
+        """Return the standard deviation in V for noise-free ``voltages`` (..., L)."""
         largest = np.abs(voltages).max(axis=-1, keepdims=True)
-        of_both = (self.relative * voltages)**2 + (self.relative_to_max * largest)**2
-        return np.sqrt(of_both + self.floor**2)
+        variance = (self.relative * voltages)**2 + (self.relative_to_max * largest)**2
+        return np.sqrt(variance + self.floor**2)
 
 
 class VoltageModel(Protocol):
-    """What computes voltages, and their derivatives, as estimators ask for them."""
+    """Interface of voltage models for estimators."""
 
     def voltages(self, concentration: np.ndarray, currents: np.ndarray) -> np.ndarray:
         """Noise-free voltages (K, L) in V for currents (K, L) in A (A/m in 2D)."""
@@ -80,17 +80,17 @@ class VoltageModel(Protocol):
 
 
 class ObservationModel:
-    """Voltages for a nodal concentration on the CD mesh: V = R(c).
+    """Model of the voltages V = R(c) for a nodal concentration on the transport mesh.
 
-    The concentration is interpolated linearly to the EIT mesh, which does not conform, and turned
-    into a conductivity there. A concentration below ``min_concentration`` counts as that value
-    with the law's slope there, so that σ stays positive whatever an estimator proposes.
+    The concentration is interpolated linearly to the non-conforming EIT mesh and converted to a
+    conductivity. Values below ``min_concentration`` are replaced by it, with the slope of the law
+    there, so that σ is positive for any estimate.
 
     Parameters
     ----------
     cem : CompleteElectrodeModel
     interpolation : (n_eit, n_cd) sparse
-        From CD nodes to EIT nodes, see `Mesh.interpolation_to`.
+        From transport nodes to EIT nodes, see `Mesh.interpolation_to`.
     conductivity : ConductivityLaw
     min_concentration : float
         In mol/m³, > 0.
@@ -106,12 +106,12 @@ class ObservationModel:
             units="mol/m³")
 
     def with_contacts(self, contact_impedance: np.ndarray) -> ObservationModel:
-        """The same with electrodes of these contact impedances (L,) in Ω·m², > 0."""
+        """Return this model with other contact impedances (L,) in Ω·m², > 0."""
         return ObservationModel(self.cem.with_contacts(contact_impedance), self.interpolation,
                                 self.conductivity, self.min_concentration)
 
     def transfer_resistance(self, concentration: np.ndarray) -> np.ndarray:
-        """𝓡 (..., L, L) in Ω (Ω·m in 2D) for nodal ``concentration`` (..., n_cd) in mol/m³."""
+        """Return 𝓡 (..., L, L) in Ω (Ω·m in 2D) for ``concentration`` (..., n_cd) in mol/m³."""
         return self.cem.transfer_resistance(self.conductivity(self._at_eit_nodes(concentration)))
 
     def voltages(self, concentration: np.ndarray, currents: np.ndarray) -> np.ndarray:
@@ -119,9 +119,9 @@ class ObservationModel:
         return self.cem.voltages(self.conductivity(self._at_eit_nodes(concentration)), currents)
 
     def resistance_derivatives(self, concentration: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """𝓡 (L, L) in Ω (Ω·m in 2D) and its derivatives by nodal concentration, (n_cd, L, L).
+        """Return 𝓡 (L, L) in Ω (Ω·m in 2D) and d𝓡/dc (n_cd, L, L), per mol/m³.
 
-        They are per mol/m³ and hold `linearise` for every injection: V = 𝓡 I, dV/dc_j = table[j] I.
+        They linearise the voltages of any injection: V = 𝓡 I, dV/dc_j = (d𝓡/dc_j) I.
         """
         n_nodes = self.interpolation.shape[1]
         c = self._at_eit_nodes(_check.array("concentration", concentration, (n_nodes,)))
@@ -132,7 +132,7 @@ class ObservationModel:
 
     def linearise(self, concentration: np.ndarray,
                   currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Voltages (K, L) and their derivatives by c, (K, L, n_cd) in V·m³/mol (thesis 5.2)."""
+        """Return voltages (K, L) and dV/dc (K, L, n_cd) in V·m³/mol (thesis 5.2)."""
         c = self._at_eit_nodes(concentration)
         voltages, by_conductivity = self.cem.linearise(self.conductivity(c), currents)
         by_node = (by_conductivity * self.conductivity.derivative(c)).reshape(-1, len(c))
@@ -141,5 +141,5 @@ class ObservationModel:
     def _at_eit_nodes(self, concentration: np.ndarray) -> np.ndarray:
         shape = (*np.shape(concentration)[:-1], self.interpolation.shape[1])
         c = _check.array("concentration", concentration, shape, units="mol/m³")
-        there = (self.interpolation @ c.reshape(-1, c.shape[-1]).T).T.reshape(*c.shape[:-1], -1)
-        return np.maximum(there, self.min_concentration)
+        nodal = (self.interpolation @ c.reshape(-1, c.shape[-1]).T).T.reshape(*c.shape[:-1], -1)
+        return np.maximum(nodal, self.min_concentration)

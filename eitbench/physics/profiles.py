@@ -1,4 +1,4 @@
-"""Axial flow in a plane channel by its profile: one that is drawn, and a family to be estimated."""
+"""Axial flows in a plane channel: a skewed profile, and parametrised profiles for estimation."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class SkewedChannelFlow(ChannelFlow):
     """v = C·(1 − η²)·exp(k·η) along x with η = y/R; C makes the mean v̄; k = 0: a parabola."""
 
     skewness: float = 0.0
-    """k: how far the fastest fluid moves towards the upper wall (k > 0) or the lower one"""
+    """k: shifts the maximum towards the upper wall (k > 0) or the lower wall (k < 0)"""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -50,18 +50,18 @@ class PolynomialFlow(AxialFlow):
 
 @dataclass(frozen=True)
 class VelocityModel:
-    """An unknown flow written as v = Σ θ_k φ_k(y/R) along x, θ a random walk (thesis ch. 6)."""
+    """Parametrisation v = Σ θ_k φ_k(y/R) along x of a flow; θ is a random walk (thesis ch. 6)."""
 
     half_width: float
     """R in m"""
     basis: tuple[tuple[float, ...], ...]
     """φ_k as polynomials in y/R: coefficients of 1, y/R, (y/R)², …; no unit"""
     nominal: tuple[float, ...]
-    """(k,) θ_0 in m/s: what is believed at first"""
+    """(k,) prior mean of θ in m/s"""
     initial_std: tuple[float, ...]
-    """(k,) its standard deviation in m/s"""
+    """(k,) prior standard deviation of θ in m/s"""
     walk_std: tuple[float, ...]
-    """(k,) standard deviation in m/s of the random walk's steps, one a time step"""
+    """(k,) standard deviation in m/s of the random walk per time step"""
 
     def __post_init__(self) -> None:
         _check.number("half_width", self.half_width, low=0.0, open_low=True, units="m")
@@ -75,12 +75,12 @@ class VelocityModel:
 
     @property
     def n_parameters(self) -> int:
-        """k, the number of parameters."""
+        """Number of parameters, k."""
         return len(self.basis)
 
     @property
     def points(self) -> np.ndarray:
-        """(p,) heights in m at which profiles are compared."""
+        """(p,) heights in m of the quadrature points."""
         return self.half_width * _ETA
 
     @property
@@ -100,11 +100,11 @@ class VelocityModel:
 
     @property
     def basis_fields(self) -> list[PolynomialFlow]:
-        """The k basis fields: dv/dθ_k."""
+        """Velocity fields dv/dθ_k."""
         return [PolynomialFlow(shape, self.half_width) for shape in self.basis]
 
     def field(self, parameters: np.ndarray | Sequence[float]) -> PolynomialFlow:
-        """The velocity field with these ``parameters`` (k,) in m/s."""
+        """Return the velocity field of ``parameters`` (k,) in m/s."""
         theta = _check.array("parameters", parameters, (self.n_parameters,), units="m/s")
         degree = max(map(len, self.basis))
         shapes = np.array([np.pad(shape, (0, degree - len(shape))) for shape in self.basis])
@@ -112,7 +112,7 @@ class VelocityModel:
 
 
 def parabolic_model(half_width: float, mean_velocity: float, initial_std: float,
-             walk_std: float) -> VelocityModel:
-    """The parabolic profile with an unknown mean velocity, all in m/s: θ is that mean."""
+                    walk_std: float) -> VelocityModel:
+    """Return a parabolic profile with one parameter, the mean velocity; arguments in m and m/s."""
     basis = ((1.5, 0.0, -1.5),)
     return VelocityModel(half_width, basis, (mean_velocity,), (initial_std,), (walk_std,))

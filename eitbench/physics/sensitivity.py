@@ -1,7 +1,4 @@
-"""−∫ φ_j ∇w_m·∇w_l for all nodes j and all pairs of fields.
-
-It is what a conductivity at node j changes in every voltage.
-"""
+"""Sensitivity of voltages to nodal conductivities: −∫ φ_j ∇w_m·∇w_l for all pairs of fields."""
 
 from __future__ import annotations
 
@@ -12,19 +9,18 @@ from eitbench.numerics.compiled import aligned_zeros, compiled_kernels, scratch
 
 
 class Sensitivity:
-    """The products of the gradients of several potentials, tested with the mesh's hat functions.
+    """Integrals of products of gradients with the hat functions of a mesh.
 
-    Exact: the gradient of a potential of first or second order is linear on a simplex, so its
-    values at the vertices hold all of it, and the integrals of products of three hat functions are
-    known: with w = |T|/((d+1)(d+2)(d+3)),
-    ∫ λ_j λ_v λ_v' = w (1 + [j=v] + [j=v'] + [v=v'] + 2[j=v=v']). With G_v the gradient at vertex v
+    They are exact: the gradient of a potential of first or second order is linear on a simplex and
+    determined by its values at the vertices. With w = |T|/((d+1)(d+2)(d+3)),
+    ∫ λ_j λ_v λ_v' = w (1 + [j=v] + [j=v'] + [v=v'] + 2[j=v=v']). With the gradient G_v at vertex v
     and S = Σ_v G_v,
     ∫ φ_j ∇w_m·∇w_l = w ((S + G_j)_m·(S + G_j)_l + Σ_v G_vm·G_vl + G_jm·G_jl).
 
     Parameters
     ----------
     basis : skfem.CellBasis
-        Of the potential.
+        Basis of the potential.
     """
 
     def __init__(self, basis: skfem.CellBasis) -> None:
@@ -41,7 +37,7 @@ class Sensitivity:
         self._gradient = np.sqrt(weight)[:, None, None] * gradient
 
     def __call__(self, fields: np.ndarray) -> np.ndarray:
-        """−∫ φ_j ∇w_m·∇w_l as (n_nodes, k, k), for potentials w (n_potential, k)."""
+        """Return −∫ φ_j ∇w_m·∇w_l (n_nodes, k, k) for potentials w (n_potential, k)."""
         k = fields.shape[1]
         width = -(-k // 8) * 8
         padded = aligned_zeros((len(fields), width))

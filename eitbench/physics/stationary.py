@@ -1,4 +1,4 @@
-"""A target that stands still: the evolution model of stationary tomography, c⁺ = c (thesis 7.2)."""
+"""Evolution model of stationary tomography, c⁺ = c (thesis 7.2)."""
 
 from __future__ import annotations
 
@@ -14,30 +14,29 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class StationaryTransport:
-    """A `Transport` in which nothing flows, spreads or enters."""
+    """A `Transport` without advection, diffusion and inflow."""
 
     mesh: Mesh
-    """where the concentration lives"""
     time_step: float
     """s between two injections"""
 
     @property
     def inlet(self) -> np.ndarray:
-        """No node."""
+        """Empty array."""
         return np.empty(0, dtype=np.int64)
 
     def step(self, c: np.ndarray, inflow_before: np.ndarray | float = 0.0,
              inflow_after: np.ndarray | float = 0.0) -> np.ndarray:
-        """The same concentration; there is no inlet for an inflow to enter by."""
+        """Return a copy of the concentration."""
         return np.array(c, dtype=float)
 
     def evolution_model(self) -> EvolutionModel:
-        """F = I without any inlet; nodal noise adds up as it is."""
-        # finite elements: not needed to play recordings
+        """Return F = H = I and an empty Y."""
+        # finite elements: cached episodes do not need them
         from eitbench.physics.transport import EvolutionModel
         identity = np.eye(self.mesh.n_nodes)
         return EvolutionModel(identity, np.zeros((self.mesh.n_nodes, 0)), identity)
 
     def transition(self) -> tuple[np.ndarray, np.ndarray]:
-        """F and Y of `evolution_model`."""
+        """Return F and Y of `evolution_model`."""
         return self.evolution_model()[:2]

@@ -23,21 +23,21 @@ from eitbench.numerics.sparse_lu import SparseLU
 
 VelocityField = Callable[[np.ndarray], np.ndarray]
 MIN_WIDE_COLUMNS = 16
-"""From so many columns on they go through the sub-steps side by side."""
+"""Least number of columns for which the kernel of wide batches is used."""
 
 
 class EvolutionModel(NamedTuple):
     """c⁺ = F c + Y c_in⁺ + w, w = Y η + H e (thesis 5.14–5.16), for nodal concentrations."""
 
     F: np.ndarray
-    """(n, n) state transition over one time step; it carries the inlet's old value along."""
+    """(n, n) state transition over one time step, including the old inlet values."""
     Y: np.ndarray
     """(n, n_inlet) effect of the new inlet values."""
     H: np.ndarray
-    """(n, n) effect of nodal noise e, what an unknown source adds to c over the time step."""
+    """(n, n) effect of nodal noise e, an unknown source during the time step."""
 
     def state_noise_covariance(self, inflow_variance: float, nodal_variance: float) -> np.ndarray:
-        """(n, n) Γ_w = Y Γ_η Yᵀ + H Γ_e Hᵀ (thesis 5.16), with both variances times I for Γ."""
+        """Return Γ_w = Y Γ_η Yᵀ + H Γ_e Hᵀ (n, n) (thesis 5.16) for Γ = variance · I."""
         return inflow_variance * (self.Y @ self.Y.T) + nodal_variance * (self.H @ self.H.T)
 
 
@@ -49,7 +49,7 @@ class Transport(Protocol):
 
     @property
     def mesh(self) -> Mesh:
-        """Where the concentration lives."""
+        """Mesh of the concentration."""
 
     @property
     def time_step(self) -> float:
@@ -57,31 +57,30 @@ class Transport(Protocol):
 
     @property
     def inlet(self) -> np.ndarray:
-        """(n_inlet,) int, nodes where the concentration is given."""
+        """(n_inlet,) int, nodes with a prescribed concentration."""
 
     def step(self, c: np.ndarray, inflow_before: np.ndarray | float,
              inflow_after: np.ndarray | float) -> np.ndarray:
-        """The concentration (n,) or (n, batch) one time step later."""
+        """Return the concentration (n,) or (n, batch) after one time step."""
 
     def evolution_model(self) -> EvolutionModel:
-        """F, Y and H of (5.14–5.16) as dense matrices."""
+        """Return F, Y and H of (5.14–5.16) as dense matrices."""
 
     def transition(self) -> tuple[np.ndarray, np.ndarray]:
-        """F and Y of it."""
+        """Return F and Y of `evolution_model`."""
 
 
 class ConvectionDiffusion:
-    """One time step of the CD model: P1 elements with SUPG, sub-stepped Crank–Nicolson.
+    """Time step of convection-diffusion: P1 elements with SUPG, Crank–Nicolson sub-steps.
 
-    The SUPG test function φ + τ v·∇φ also weighs the mass matrix, so the scheme is consistent in
-    time. The first sub-step is taken as two backward-Euler halves (Rannacher), which damp
-    node-to-node noise that Crank–Nicolson would keep; they use the same matrix, so a step costs one
-    factorisation for ever and ``substeps + 1`` solves. Within a step the inlet value moves linearly
-    from the old to the new one. Second order in space and in the sub-step; between those, at cell
-    Péclet numbers of about 2–8, the order in space sinks to 1.5, as P1 has no ∇·(κ∇c) to weigh.
-    Because every step starts anew with the two halves, shorter steps at equal ``substeps`` are
-    first order only. ``ValueError`` naming the argument if it is out of range, of the wrong shape,
-    or not finite.
+    The SUPG test function φ + τ v·∇φ also weights the mass matrix, so that the scheme is consistent
+    in time. The first sub-step consists of two backward-Euler half steps (Rannacher), which damp
+    node-to-node noise. They have the same matrix, so that a step costs ``substeps + 1`` solves with
+    one factorisation. The inlet value is linear in time within a step. The scheme is of second
+    order in space and in the sub-step; at cell Péclet numbers of about 2–8 the order in space is
+    1.5, because P1 elements have no ∇·(κ∇c). It is of first order for shorter steps at equal
+    ``substeps``, because every step begins with the two half steps. ``ValueError`` naming the
+    argument if it is out of range, of the wrong shape, or not finite.
 
     Parameters
     ----------
@@ -96,7 +95,7 @@ class ConvectionDiffusion:
     substeps : int
         Crank–Nicolson steps per time step, ≥ 1.
     inlet : (n_inlet,) int, optional
-        Nodes where the concentration is given; default: those where fluid enters.
+        Nodes with a prescribed concentration; default: nodes where fluid enters.
     """
 
     def __init__(self, mesh: Mesh, velocity: VelocityField, diffusivity: float, time_step: float, *,
@@ -124,13 +123,13 @@ class ConvectionDiffusion:
         self._mass = sp.csr_matrix(mass[free])
 
     def with_velocity(self, velocity: VelocityField) -> ConvectionDiffusion:
-        """The same model with another velocity, its inlet nodes the same."""
+        """Return this model with another velocity and the same inlet nodes."""
         return ConvectionDiffusion(self.mesh, velocity, self.diffusivity, self.time_step,
                                    substeps=self.substeps, inlet=self.inlet)
 
     def step(self, c: np.ndarray, inflow_before: np.ndarray | float,
              inflow_after: np.ndarray | float) -> np.ndarray:
-        """The concentration one time step later, shaped like ``c``.
+        """Return the concentration after one time step, in the shape of ``c``.
 
         Parameters
         ----------
@@ -151,17 +150,17 @@ class ConvectionDiffusion:
     def velocity_derivatives(self, c: np.ndarray, inflow_before: np.ndarray | float,
                              inflow_after: np.ndarray | float,
                              directions: Sequence[VelocityField]) -> tuple[np.ndarray, np.ndarray]:
-        """The step (n,) and its derivatives (n, K) by θ, at θ = 0, for the velocity v + Σ θ_k v_k.
+        """Return the step (n,) and its derivatives (n, K) by θ at θ = 0, for v + Σ θ_k v_k.
 
-        They are those of the discrete step, with the test functions, which depend on the velocity
-        too, the Rannacher start and all sub-steps; the inlet nodes stay what they are. For k
-        directions this costs the step, the assembly of 2k matrices, and one more solve with k
-        right-hand sides a sub-step.
+        These are exact derivatives of the discrete step, including the velocity dependence of the
+        test functions; the inlet nodes are fixed. The cost is the step, the assembly of 2K
+        matrices, and a solve with K right-hand sides per sub-step.
 
-        The cell's length along the flow has a kink where the flow passes along the side of a cell;
-        there the derivative is the mean of both one-sided ones. Where v = 0 it is exact along each
-        direction, but the scheme is not linear in the direction there unless all directions are
-        parallel. ``ValueError`` naming the argument if it is of the wrong shape or not finite.
+        The length of a cell along the flow has a kink where the flow is parallel to a side of the
+        cell; the derivative there is the mean of both one-sided derivatives. Where v = 0 it is
+        exact along each direction, but the scheme is nonlinear in the direction unless all
+        directions are parallel. ``ValueError`` naming the argument if it is of the wrong shape or
+        not finite.
 
         Parameters
         ----------
@@ -272,10 +271,10 @@ class ConvectionDiffusion:
 
     def _substeps(self, c: np.ndarray, before: np.ndarray, after: np.ndarray,
                   loads: Iterable[np.ndarray | float]) -> Iterator[np.ndarray]:
-        """(n, batch) columns at the beginning and after each solve, always in the same array.
+        """Yield columns (n, batch) at the beginning and after each solve, in the same array.
 
-        ``loads`` holds for each of the ``substeps + 1`` solves what is added to the right-hand side
-        of the free nodes.
+        ``loads`` contains an additional right-hand side of the free nodes for each of the
+        ``substeps + 1`` solves.
         """
         c = c.copy()
         c[self.inlet] = before
@@ -283,8 +282,8 @@ class ConvectionDiffusion:
         slope = (after - before) / self.substeps
         rate = self.substeps / self.time_step
         for k, load in enumerate(loads):
-            # The first two are backward Euler, each half a sub-step: (2M/Δt + K) c⁺ = (2M/Δt) c
-            # + f, whose matrix is twice that of Crank–Nicolson.
+            # The first two are backward Euler over half a sub-step: (2M/Δt + K) c⁺ = (2M/Δt) c + f,
+            # with twice the matrix of Crank–Nicolson.
             inlet = before + (k or 0.5) * slope
             explicit = rate * (self._mass @ c) if k < 2 else self._explicit @ c
             c[self._free] = self._solver.solve(explicit - self._implicit_inlet @ inlet + load)

@@ -204,7 +204,7 @@ to 9 mm, in the nominal environment 10 to 25 mm.
 
 PIPE_3D = World("Pipe3D", RoundPipe(), LaminarFlow(), Slugs(),
                 schedule=Schedule(scored_steps=48, pattern=RotatingRingPattern()))
-"""The available page of the thesis shows the figure only: times, velocity and noise are those of
+"""The available page of the thesis shows the figure only; times, velocity and noise are taken from
 its 2D pipe. Three frames are scored [ours]."""
 
 PIPE_3D_TEXT = """
@@ -238,7 +238,7 @@ electrodes are on the wall, and one pair of them injects all the time. A station
 injection shows nothing, but the flow carries the target through the field of the pair, and a filter
 with a flow model can track it (Seppänen 2005, 7.1, Figs 7.2 and 7.3).
 
-The truth is a rigid ball with a path of its own; the model in `env.unwrapped.task` is a liquid
+The truth is a rigid ball with a separate path; the model in `env.unwrapped.task` is a liquid
 without a ball, in which concentration is advected and diffuses, as in the thesis. The ball starts
 between 0.25 and 0.48 of the radius from the centre, at any angle; the flow is steady.
 """)
@@ -339,7 +339,7 @@ register_extension(PIPE_2D_INTERMITTENT, "eitbench/Pipe2DIntermittent-v0", test_
 The pipe of `eitbench/Pipe2D-v0` with rare slugs: strong slugs come one at a time, at random times,
 about three in an episode. Between them the inflow is constant. A Gaussian prior of the inflow
 assigns a moderate variance to every step; a method that detects slugs can use a small variance
-between them and a large one during a slug. The episodes are those of
+between them and a large one during a slug. The episodes are the same as in
 `eitbench/Pipe2DInjectionBudget-v0`, with an injection at every step.
 """)
 register_injection(PIPE_2D_BUDGET, "eitbench/Pipe2DInjectionInflowBudget-v0",

@@ -1,22 +1,22 @@
-"""Checks of the fields of a world's parts."""
+"""Checks of fields of a world's parts."""
 
 from __future__ import annotations
 
 from eitbench import _check
 
 ADDED_LATER = {"later": True}
-"""Metadata of a number that a part was given later: at its default it is left out of the names
-under which things are kept, so that what was kept before it came is still found."""
+"""Metadata of a field that was added later: cache keys omit it at its default, so that earlier keys
+stay valid."""
 
 
 def check_positive(part: object, **units: str) -> None:
-    """``ValueError`` unless these numbers of a part, each with its unit, are above 0."""
+    """Raise ``ValueError`` unless these fields of a part, each with its unit, are positive."""
     for name, unit in units.items():
         _check.number(name, getattr(part, name), low=0.0, open_low=True, units=unit)
 
 
 def check_range(part: object, name: str, units: str = "", open_low: bool = True) -> None:
-    """``ValueError`` unless this pair of a part's numbers is 0 < low ≤ high, or 0 ≤ low ≤ high."""
+    """Raise ``ValueError`` unless a field is a range 0 < low ≤ high, or 0 ≤ low ≤ high."""
     given = getattr(part, name)
     low, high = _check.array(name, given, (2,), units=units)
     if not 0 <= low <= high or (open_low and low == 0):

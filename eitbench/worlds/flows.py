@@ -1,4 +1,4 @@
-"""How the fluid moves: known, drawn for an episode, wandering, past a bulge, stirred, or not."""
+"""Flow configurations: laminar, random, random walk, past a bulge, stirred, and none."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ if TYPE_CHECKING:
     from eitbench.physics.transport import Transport, VelocityField
 
 PROFILES = ("parabolic", "plug", "power-law")
-"""Shapes of the velocity profile that a model of a plane pipe may assume."""
+"""Velocity profiles that a model of a plane pipe may assume."""
 BULGE_FLOW_ASSUMPTIONS = ("parabolic", "real")
-"""What a model of the flow past a bulge may assume."""
+"""Flows that a model of the pipe with a bulge may assume."""
 
 
 @dataclass(frozen=True)
 class PipeFlow(Flow):
-    """Flow through a straight pipe whose estimators are told a laminar one of ``mean_velocity``."""
+    """Flow through a straight pipe; the task specifies a laminar one of ``mean_velocity``."""
 
     mean_velocity: float = 4.5
-    """v̄ in m/s [T], as estimators are told it"""
+    """v̄ in m/s [T], as the task specifies it"""
     diffusivity: float = 5e-4
-    """κ in m²/s [ours]: small, yet resolved by the model's mesh"""
+    """κ in m²/s [ours]: small, but resolved by the mesh of the estimator model"""
 
     def __post_init__(self) -> None:
         check_positive(self, mean_velocity="m/s", diffusivity="m²/s")
@@ -46,7 +46,7 @@ class PipeFlow(Flow):
         self.assumed_velocity(world, **assumed)
 
     def assumed_velocity(self, world: World, **assumed: Any) -> VelocityField:
-        """``mean_velocity`` in m/s, and in a plane pipe ``profile``, one of `PROFILES`."""
+        """Accept ``mean_velocity`` in m/s and, in a plane pipe, ``profile``, one of `PROFILES`."""
         plane = isinstance(world.vessel, PlanePipe)
         reject_unknown_assumptions(assumed, ("mean_velocity", "profile")[:1 + plane])
         mean = assumed.get("mean_velocity")
@@ -69,31 +69,31 @@ class PipeFlow(Flow):
 
 @dataclass(frozen=True)
 class LaminarFlow(PipeFlow):
-    """Laminar flow with a known mean velocity; [T]: the thesis' number; [ours]: our choice."""
+    """Laminar flow with the mean velocity that the task specifies."""
 
 
 @dataclass(frozen=True)
 class RandomFlow(PipeFlow):
-    """A flow through a plane pipe that is drawn for each episode (thesis 5.1.2 and ch. 6).
+    """Flow through a plane pipe that is drawn for each episode (thesis 5.1.2 and ch. 6).
 
-    v̄(t) = mean·(1 + swing·sin(2πt/period + phase)), its profile (1 − η²)·exp(kη). Estimators are
-    told of a laminar one.
+    v̄(t) = mean·(1 + amplitude·sin(2πt/period + phase)), with the profile (1 − η²)·exp(kη). The task
+    specifies a laminar flow.
     """
 
     velocity_range: tuple[float, float] = (2.5, 7.0)
-    """m/s, of the true mean, drawn evenly; the thesis assumes 2 and 7 for a true 4.5 [ours]"""
+    """m/s, true mean, uniform; the thesis assumes 2 and 7 for a true 4.5 [ours]"""
     oscillation_range: tuple[float, float] = (0.0, 0.0)
-    """amplitude of the mean velocity's sine in time, in parts of the mean"""
+    """amplitude of the mean velocity's sine in time, relative to the mean"""
     period_range: tuple[float, float] = (0.4, 0.8)
     """s, period of that sine"""
     skewness_range: tuple[float, float] = (0.0, 0.0)
-    """|k|, either sign; 0 is the parabola"""
+    """|k|, with a random sign; 0 is the parabola"""
     profiles: str | None = None
-    """what is asked for: None, the ``mean`` of a parabola, or ``three`` numbers of a profile"""
+    """requested estimate: None, the ``mean`` of a parabola, or ``three`` numbers of a profile"""
     velocity_std: float = 1.0
-    """m/s, standard deviation of what is believed of it at first [ours]"""
+    """m/s, standard deviation of the prior [ours]"""
     velocity_walk: float = 0.02
-    """m/s a time step, standard deviation of the believed random walk [ours]"""
+    """m/s per time step, standard deviation of the assumed random walk [ours]"""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -119,7 +119,7 @@ class RandomFlow(PipeFlow):
         if self.profiles == "mean":
             return parabolic_model(half_width, self.mean_velocity, self.velocity_std,
                                    self.velocity_walk)
-        # the parabola, a skew cubic, and a quartic without a net flux that flattens or sharpens it
+        # a parabola, a skew cubic, and a quartic without net flux that flattens or sharpens it
         basis = ((1.5, 0.0, -1.5), (0.0, 1.5, 0.0, -1.5), (-1.5, 0.0, 9.0, 0.0, -7.5))
         nominal = (self.mean_velocity, 0.0, 0.0)
         std = (self.velocity_std, 3.0 * self.velocity_std, self.velocity_std)
@@ -127,14 +127,14 @@ class RandomFlow(PipeFlow):
 
     def draw(self, world: World, random: np.random.Generator) -> Callable[[int], SkewedChannelFlow]:
         mean = random.uniform(*self.velocity_range)
-        swing = random.uniform(*self.oscillation_range)
+        amplitude = random.uniform(*self.oscillation_range)
         period = random.uniform(*self.period_range)
         phase = random.uniform(0.0, 2.0 * math.pi)
         skewness = random.choice([-1.0, 1.0]) * random.uniform(*self.skewness_range)
 
         def flow(t: int) -> SkewedChannelFlow:
             angle = 2.0 * math.pi * (t - 0.5) * world.time_step / period + phase
-            velocity = mean * (1.0 + swing * math.sin(angle))
+            velocity = mean * (1.0 + amplitude * math.sin(angle))
             return SkewedChannelFlow(velocity, world.vessel.half_width, skewness)
 
         return flow
@@ -142,18 +142,18 @@ class RandomFlow(PipeFlow):
 
 @dataclass(frozen=True)
 class RandomWalkFlow(PipeFlow):
-    """A parabolic flow in a plane pipe whose mean velocity is a random walk; numbers are ours.
+    """Parabolic flow in a plane pipe with a random walk of the mean velocity; all numbers [ours].
 
-    At every time step it goes up or down by ``velocity_walk``, which is also the walk that
-    estimators are told of; at the ends of ``velocity_range`` it turns back.
+    At every time step the velocity changes by ±``velocity_walk``, which is also the walk in the
+    task. It is reflected at the ends of ``velocity_range``.
     """
 
     velocity_range: tuple[float, float] = (2.5, 6.5)
-    """m/s; the mean velocity stays within it, and begins anywhere in it"""
+    """m/s, range of the mean velocity; it starts anywhere within"""
     velocity_std: float = 1.0
-    """m/s, standard deviation of what is believed of it at first"""
+    """m/s, standard deviation of the prior"""
     velocity_walk: float = 0.1
-    """m/s a time step: 0.4 m/s (std) while the fluid passes through the pipe"""
+    """m/s per time step: 0.4 m/s (std) in a residence time"""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -166,16 +166,17 @@ class RandomWalkFlow(PipeFlow):
 
     def velocity_model(self, world: World) -> VelocityModel:
         return parabolic_model(world.vessel.half_width, self.mean_velocity, self.velocity_std,
-                        self.velocity_walk)
+                               self.velocity_walk)
 
     def draw(self, world: World, random: np.random.Generator) -> Callable[[int], SkewedChannelFlow]:
         low, high = self.velocity_range
-        places = int((high - low) / self.velocity_walk + 1e-9)  # from the lowest to the highest
-        walk = random.integers(2 * places) if places else 0
+        intervals = int((high - low) / self.velocity_walk + 1e-9)
+        start = random.integers(2 * intervals) if intervals else 0
         signs = random.choice([-1, 1], world.spin_up_steps + world.n_steps)
-        steps = walk + np.concatenate([[0], np.cumsum(signs)])[:-1]
-        # turned back at the ends
-        folded = np.abs((steps + places) % (2 * places) - places) if places else 0 * steps
+        steps = start + np.concatenate([[0], np.cumsum(signs)])[:-1]
+        # reflected at the ends
+        folded = np.abs((steps + intervals) % (2 * intervals) - intervals) if intervals \
+            else 0 * steps
         velocity = low + folded * self.velocity_walk
 
         def flow(t: int) -> SkewedChannelFlow:
@@ -187,33 +188,31 @@ class RandomWalkFlow(PipeFlow):
 
 @dataclass(frozen=True)
 class FlowPastBulge(PipeFlow):
-    """The steady Navier–Stokes flow through a plane pipe with a bulge, behind which it separates.
+    """Steady Navier–Stokes flow through a plane pipe with a bulge, behind which it separates.
 
-    Better fluid models are what the thesis names as its next step (5.1.1). Estimators know the
-    walls, but of the flow only that it is parabolic between them at each x, unless they are given
-    the real one. All numbers are ours.
+    The thesis names better fluid models as its next step (5.1.1). The task contains the walls and,
+    by default, a flow that is parabolic between them at each x. All numbers [ours].
     """
 
     viscosity: float = 5e-4
-    """m²/s, the eddy viscosity; as κ, a turbulent Schmidt number of one. Re = v̄·2R/ν = 900"""
+    """m²/s, eddy viscosity; equals κ (turbulent Schmidt number 1). Re = v̄·2R/ν = 900"""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_positive(self, viscosity="m²/s")
 
     def nominal(self, world: World, fine: bool) -> SteadyFlow:
-        """The real flow, by so many cells along and across the pipe; computed once a process."""
+        """Return the true flow, computed once per process."""
         return _past_bulge(world.vessel, self, (96, 24) if fine else (64, 16))
 
     def check_assumed(self, world: World, assumed: Mapping[str, Any]) -> None:
-        """``flow``, one of `BULGE_FLOW_ASSUMPTIONS`."""
+        """Accept ``flow``, one of `BULGE_FLOW_ASSUMPTIONS`."""
         reject_unknown_assumptions(assumed, ("flow",))
         if (flow := assumed.get("flow", "parabolic")) not in BULGE_FLOW_ASSUMPTIONS:
             known = ", ".join(BULGE_FLOW_ASSUMPTIONS)
             raise ValueError(f"assume.flow must be one of {known}, got {flow!r}")
 
     def assumed_velocity(self, world: World, **assumed: Any) -> VelocityField:
-        """By default what those believe who know the walls only."""
         self.check_assumed(world, assumed)
         if assumed.get("flow") == "real":
             return self.nominal(world, fine=False)
@@ -227,23 +226,24 @@ class FlowPastBulge(PipeFlow):
 
 @dataclass(frozen=True)
 class StirredFlow(Flow):
-    """A steady Navier–Stokes flow in a round tank with a stirrer (thesis 7.1); numbers are ours.
+    """Steady Navier–Stokes flow in a round tank with a stirrer (thesis 7.1); all numbers [ours].
 
-    At rest on the wall, driven along the stirrer's circle: force·exp(−((d − swept)/width)²/2).
+    The velocity is zero on the wall; at a distance d from the stirrer's axis the force along its
+    circle is force·exp(−((d − radius)/width)²/2).
     """
 
     viscosity: float = 2e-4
-    """m²/s; the eddy viscosity of stirred water, not that of water at rest"""
+    """m²/s, eddy viscosity of stirred water"""
     stirrer_position: tuple[float, float] = (0.025, 0.0)
-    """m, off the middle, so that the flow is not symmetric"""
+    """m, outside the centre, so that the flow is not symmetric"""
     stirrer_radius: float = 0.09
-    """m, of the circle that its blades' tips sweep: there it drives the fluid"""
+    """m, radius of the circle that the tips of the blades sweep and where the force is largest"""
     stirrer_width: float = 0.015
-    """m, standard deviation across that circle"""
+    """m, standard deviation of the force across that circle"""
     stirrer_force: float = 0.2
     """m/s², force per mass on that circle"""
     diffusivity: float = 2e-5
-    """κ of the estimators' model in m²/s: as little as its mesh can do with"""
+    """κ of the estimator model in m²/s: the smallest that its mesh resolves"""
 
     def __post_init__(self) -> None:
         check_positive(self, viscosity="m²/s", stirrer_radius="m", stirrer_width="m",
@@ -251,13 +251,13 @@ class StirredFlow(Flow):
         _check.array("stirrer_position", self.stirrer_position, (2,), units="m")
 
     def nominal(self, world: World, fine: bool) -> SteadyFlow:
-        """The velocity field; computed once a process."""
+        """Return the velocity field, computed once per process."""
         return _stirred(self, world.vessel.radius, 24 if fine else 16)
 
 
 @dataclass(frozen=True)
 class NoFlow(Flow):
-    """Nothing moves, spreads or enters."""
+    """No advection, diffusion or inflow."""
 
     diffusivity = 0.0
 
@@ -267,9 +267,9 @@ class NoFlow(Flow):
 
 @dataclass(frozen=True)
 class LocalParabola:
-    """The flow along a bent wall with the stream function 1.5·v̄·R·(η − η³/3), without divergence.
+    """Divergence-free flow along a bulge with the stream function 1.5·v̄·R·(η − η³/3).
 
-    η goes from −1 at the lower wall to 1 at the upper one: a parabola at each x.
+    η is −1 at the lower wall and 1 at the upper wall: at each x the profile is a parabola.
     """
 
     mean_velocity: float
@@ -277,7 +277,7 @@ class LocalParabola:
     half_width: float
     """R in m"""
     bulge: Bulge | None
-    """of the lower wall; an estimator is given this, and through it nothing else of the world"""
+    """of the lower wall"""
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
         if self.bulge is None:
@@ -286,25 +286,25 @@ class LocalParabola:
         bulge = self.bulge(x)
         slope = -2.0 * (x - self.bulge.position) / self.bulge.width**2 * bulge
         gap = 2.0 * self.half_width - bulge
-        part = (y + self.half_width - bulge) / gap
-        by_eta = 1.5 * self.mean_velocity * self.half_width * (1.0 - (2.0 * part - 1.0)**2)
-        return np.stack([by_eta * 2.0 / gap, by_eta * 2.0 * slope / gap * (1.0 - part)], axis=1)
+        height = (y + self.half_width - bulge) / gap
+        by_eta = 1.5 * self.mean_velocity * self.half_width * (1.0 - (2.0 * height - 1.0)**2)
+        return np.stack([by_eta * 2.0 / gap, by_eta * 2.0 * slope / gap * (1.0 - height)], axis=1)
 
 
 def transit_steps(world: World, velocity: float) -> int:
-    """Time steps in which a fluid of this velocity in m/s passes through a pipe."""
+    """Return the time steps in which fluid with this velocity in m/s passes the pipe."""
     return math.ceil(world.vessel.length / (velocity * world.time_step))
 
 
 @lru_cache(maxsize=1)
 def _real_model(world: World) -> Discretisation:
-    """Made once a process, since a filter keeps with a transport model what it derives from it."""
+    """Return one model per process: filters cache derived matrices by transport model."""
     return world.estimator_model(flow="real")
 
 
 @lru_cache(maxsize=4)
 def _past_bulge(vessel: PlanePipe, flow: FlowPastBulge, cells: tuple[int, int]) -> SteadyFlow:
-    """On a pipe 1.75 times as long, so that the free outlet does not shorten the eddy."""
+    """Solve on a pipe 1.75 times as long, so that the free outlet does not shorten the eddy."""
     from eitbench.numerics.mesh import rectangle_mesh
     from eitbench.physics.navier_stokes import steady_flow
     along = math.ceil(1.75 * cells[0])
@@ -327,9 +327,9 @@ def _stirred(flow: StirredFlow, radius: float, rings: int) -> SteadyFlow:
     def stirrer(points: np.ndarray) -> np.ndarray:
         offset = points - np.array(flow.stirrer_position)
         distance = np.hypot(*offset.T)[:, None]
-        off = (distance - flow.stirrer_radius) / flow.stirrer_width
+        relative = (distance - flow.stirrer_radius) / flow.stirrer_width
         along = np.stack([-offset[:, 1], offset[:, 0]], axis=1)
-        strength = flow.stirrer_force * np.exp(-0.5 * off**2)
+        strength = flow.stirrer_force * np.exp(-0.5 * relative**2)
         return strength / np.maximum(distance, 1e-9) * along
 
     return steady_flow(mesh, flow.viscosity, [(mesh.boundary_facets, np.zeros_like)], force=stirrer)

@@ -1,4 +1,4 @@
-"""The instrument: wires break, contacts come loose, amplifiers are noisy."""
+"""Instrument model: open circuits, loose contacts and amplifier noise."""
 
 from __future__ import annotations
 
@@ -16,62 +16,61 @@ CURRENT_NORMS = ("L1", "L2", "Linf")
 
 
 class Faults(NamedTuple):
-    """What is wrong in one episode; nobody announces it."""
+    """Instrument faults of one episode, which the task does not specify."""
 
     open_circuit_from: np.ndarray
-    """(L,) first t at which an electrode's wire is broken; never, if beyond the episode's end"""
+    """(L,) first t at which an electrode's wire is broken; beyond the episode's end: never"""
     resistance: np.ndarray
     """(L,) Ω (Ω·m in 2D) between the instrument and the electrode"""
     noise_factor: np.ndarray
-    """(L,) by which an electrode's noise exceeds a sound one's"""
+    """(L,) noise relative to an intact electrode"""
 
     @classmethod
     def none(cls, n_electrodes: int) -> Faults:
-        """Of an instrument that is sound."""
+        """Return the faults of an intact instrument."""
         never = np.full(n_electrodes, np.iinfo(np.int64).max)
         return cls(never, np.zeros(n_electrodes), np.ones(n_electrodes))
 
 
 @dataclass(frozen=True)
 class Instrument:
-    """Current sources and voltmeters, by default sound. [T]: the thesis' number; others are ours.
+    """Current sources and voltmeters, intact by default. [T]: number of the thesis; others [ours].
 
-    A broken wire leaves the electrode in place, so the field is that of an electrode without net
-    current: the transfer resistances of the episode stay exact. A current that would have to pass a
-    broken wire does not flow at all, and the electrode's reading is what the open input picks up. A
-    loose contact is a resistance in the wire; it shows only while current flows through it, and it
-    is noisy.
+    A broken wire leaves the electrode in place as an electrode without net current, so that the
+    episode's transfer resistances stay exact. A current through a broken wire does not flow, and
+    the measurement at the open input is interference. A loose contact is a noisy resistance in the
+    wire; it adds a voltage only while current flows through it.
     """
 
     current: float = 0.1
     """A (A/m in 2D); with relative noise the amplitude does not matter [ours]"""
     noise_relative: float = 0.01
-    """std in parts of the reading [T]"""
+    """std relative to the measurement [T]"""
     noise_relative_to_max: float = 0.001
-    """std in parts of the largest voltage [T]"""
+    """std relative to the largest voltage [T]"""
     noise_floor: float = 0.0
-    """V; std of an absolute noise beside the relative one"""
+    """V; std of an additional absolute noise"""
     current_norm: str | None = None
-    """what an agent may ask for. None: pairs of electrodes. "L1", "L2" or "Linf": a current for
-    each electrode, cut to ±1 in parts of `current`, freed of its mean, and scaled down to this norm
-    of a pair's currents where it exceeds it"""
+    """actions of an agent. None: pairs of electrodes. "L1", "L2" or "Linf": a current for each
+    electrode relative to `current`, clipped to ±1 and less its mean; if it exceeds this norm of a
+    pair, it is scaled down to it"""
     n_dead_range: tuple[int, int] = (0, 0)
-    """least and most electrodes whose wire is broken from the beginning"""
+    """least and most electrodes with a wire that is broken from the beginning"""
     n_failing_range: tuple[int, int] = (0, 0)
-    """least and most electrodes whose wire breaks on the way"""
+    """least and most electrodes with a wire that breaks during the episode"""
     n_loose_range: tuple[int, int] = (0, 0)
     """least and most electrodes with a bad contact"""
     loose_resistance: tuple[float, float] = (0.5, 2.0)
-    """Ω (Ω·m in 2D); a sound contact of the 2D pipe has 0.08"""
+    """Ω (Ω·m in 2D); an intact contact of the 2D pipe has 0.08"""
     loose_noise: float = 5.0
-    """factor of a bad contact's noise"""
+    """noise of a bad contact relative to an intact one"""
     interference: float = 0.1
-    """V; std of what a broken wire reads"""
+    """V; std of the measurement at a broken wire"""
     noise_mismatch: float = field(default=1.0, metadata=ADDED_LATER)
-    """factor by which the noise of all readings exceeds what estimators are told"""
+    """true noise of all measurements relative to the noise in the task"""
     contact_impedance_spread: float = field(default=0.0, metadata=ADDED_LATER)
-    """how far each electrode's contact impedance may be from what estimators are told, in parts of
-    it; drawn evenly, anew for each episode"""
+    """half range of each electrode's contact impedance, relative to the value in the task; drawn
+    uniformly for each episode"""
 
     def __post_init__(self) -> None:
         check_positive(self, current="A")
@@ -95,21 +94,21 @@ class Instrument:
 
     @property
     def max_faulty(self) -> int:
-        """The most electrodes that have a fault."""
+        """Largest number of faulty electrodes."""
         return self.n_dead_range[1] + self.n_failing_range[1] + self.n_loose_range[1]
 
     @property
     def noise(self) -> VoltageNoise:
-        """What estimators take for that of a sound electrode's reading, without the floor."""
+        """Assumed noise of a fault-free measurement without the noise floor."""
         return VoltageNoise(self.noise_relative, self.noise_relative_to_max)
 
     @property
     def model_noise(self) -> VoltageNoise:
-        """What estimators take for the noise of a reading: with the floor, of faults nothing."""
+        """Noise that the task specifies: with the noise floor, without faults."""
         return VoltageNoise(self.noise_relative, self.noise_relative_to_max, self.noise_floor)
 
     def draw(self, random: np.random.Generator, n_electrodes: int, n_steps: int) -> Faults:
-        """The faults of one episode: which electrodes, and when in t = 1 … n_steps wires break."""
+        """Draw the faults of an episode: electrodes, and times in t = 1 … n_steps of breaks."""
         order = random.permutation(n_electrodes)
         ranges = (self.n_dead_range, self.n_failing_range, self.n_loose_range)
         dead, failing, loose = (int(random.integers(low, high + 1)) for low, high in ranges)
@@ -124,13 +123,13 @@ class Instrument:
         return Faults(broken, resistance, factor)
 
     def draw_contacts(self, random: np.random.Generator, n_electrodes: int) -> np.ndarray:
-        """(L,) of one episode: contact impedances in parts of what estimators are told."""
+        """Draw contact impedances (L,) of an episode relative to the value in the task."""
         spread = self.contact_impedance_spread
         return random.uniform(1.0 - spread, 1.0 + spread, n_electrodes)
 
     def measure(self, faults: Faults, t: np.ndarray | int, transfer_resistance: np.ndarray,
                 currents: np.ndarray, draws: np.ndarray) -> np.ndarray:
-        """Voltages (B, L) in V, 𝓡 I and noise: B episodes at one step, or one at steps t (B,).
+        """Return voltages (B, L) in V, 𝓡 I plus noise: B episodes at one step, or one at steps t.
 
         Parameters
         ----------
@@ -138,12 +137,12 @@ class Instrument:
             Its arrays (B, L), or (L,) for all.
         t : int or (B,)
         transfer_resistance, currents, draws : (B, L, L), (B, L), (B, L)
-            𝓡, the currents asked for in A (A/m in 2D), and standard normal numbers.
+            𝓡, the requested currents in A (A/m in 2D), and standard normal numbers.
         """
         broken = np.asarray(t)[..., None] >= faults.open_circuit_from
         flows = ~(broken & (currents != 0.0)).any(axis=1, keepdims=True)
         driven = currents * flows
         clean = (transfer_resistance @ driven[..., None])[..., 0] + faults.resistance * driven
-        told = np.hypot(self.noise.std(clean) * faults.noise_factor, self.noise_floor)
-        std = self.noise_mismatch * told
+        std = np.hypot(self.noise.std(clean) * faults.noise_factor, self.noise_floor)
+        std = self.noise_mismatch * std
         return np.where(broken, self.interference * draws, clean + std * draws)

@@ -1,4 +1,4 @@
-"""Registry of environments: built-in ids, those of installed packages, and those of a script."""
+"""Registry of environments: built-in ids, ids of installed packages and ids of a script."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def register(world: World, id: str, *, track: str = "estimation", description: s
     id : str
         ``namespace/Name-vN``. A world with other numbers needs another version.
     track : "estimation" or "injection"
-        Whether actions are estimates of the concentration or the next injection.
+        Kind of the actions: estimates of the concentration, or the next injection.
     description : str
         Markdown for the environment's page.
     test_seeds : str
@@ -89,15 +89,15 @@ def register(world: World, id: str, *, track: str = "estimation", description: s
     group : str
         One of `GROUPS`, for lists of environments.
     is_starting_point : bool
-        Whether lists recommend this environment to new users.
+        Recommend this environment to new users in lists.
     settings
         ``lag`` and ``assume`` of estimation, ``gate`` and ``inflow`` of injection.
 
     Raises
     ------
     ValueError
-        If the id has another form or belongs to another world, a setting is unknown, or the task
-        differs from that of ``nominal``.
+        If the id has another form or belongs to another world, a setting is unknown, or ``nominal``
+        has another task.
     """
     texts = {"description": description, "test_seeds": test_seeds, "nominal": nominal}
     for old in EARLIER_KEYWORDS.keys() & settings:

@@ -1,4 +1,4 @@
-"""When something is injected and read, and which currents those are."""
+"""Schedules and current patterns of injections."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ if TYPE_CHECKING:
 
 
 class Pattern(Protocol):
-    """The cycle of injections, in parts of the current: a frozen dataclass of plain numbers."""
+    """A cycle of current patterns: a frozen dataclass of plain numbers."""
 
     def __call__(self, vessel: Any) -> np.ndarray:
-        """(K, L), each row summing to zero."""
+        """Return (K, L) currents relative to `Instrument.current`; each row has the sum zero."""
 
 
 @dataclass(frozen=True)
 class OppositeDiagonalPattern:
-    """Straight across a plane pipe, then aslant, three electrodes further down [ours].
+    """Alternating opposite and diagonal pairs of a plane pipe; diagonals span three electrodes.
 
-    Successive injections are far apart, so that each part of the pipe is seen anew before the fluid
-    has left it. Electrodes 0 … L/2−1 lie on the lower wall, L/2 … L−1 on the upper one, both along
-    the flow.
+    Successive injections are far apart, so that each section of the pipe is measured before the
+    fluid has left it [ours]. Electrodes 0 … L/2−1 are on the lower wall, L/2 … L−1 on the upper
+    wall, both in flow direction.
     """
 
     frame: int = 16
@@ -46,10 +46,10 @@ class OppositeDiagonalPattern:
 
 @dataclass(frozen=True)
 class RotatingRingPattern:
-    """Straight across a ring of a round pipe, then aslant into the next ring down the flow [ours].
+    """Opposite pairs within a ring of a round pipe, alternating with pairs into the next ring.
 
-    The rings take turns, and the angle moves on by three places each time. Electrode number =
-    ring·(electrodes per ring) + place around.
+    The rings alternate, and the angle advances by three positions each time [ours]. Electrode
+    number = ring·(electrodes per ring) + position in the ring.
     """
 
     frame: int = 16
@@ -70,7 +70,7 @@ class RotatingRingPattern:
 
 @dataclass(frozen=True)
 class SinglePairPattern:
-    """The same pair all the time: electrode 0, and the one opposite [T: one pair; ours: which]."""
+    """One pair in all injections: electrode 0 and its opposite [T: one pair; ours: this one]."""
 
     def __call__(self, vessel: RoundTank) -> np.ndarray:
         return _pairs(np.array([0]), np.array([vessel.n_electrodes // 2]), vessel.n_electrodes)
@@ -78,7 +78,7 @@ class SinglePairPattern:
 
 @dataclass(frozen=True)
 class TankOppositeDiagonalPattern:
-    """Eight injections straight across a tank, then eight aslant, far from the last ones [ours]."""
+    """Eight opposite pairs of a tank, then eight diagonal ones, far from the last ones [ours]."""
 
     def __call__(self, vessel: RoundTank) -> np.ndarray:
         half = vessel.n_electrodes // 2
@@ -88,7 +88,7 @@ class TankOppositeDiagonalPattern:
 
 
 def _pairs(sources: np.ndarray, sinks: np.ndarray, n_electrodes: int) -> np.ndarray:
-    """(K, L): current enters at one electrode and leaves at another, numbers modulo L."""
+    """Return (K, L) unit currents of pairs; electrode numbers are taken modulo L."""
     k = np.arange(len(sources))
     currents = np.zeros((len(k), n_electrodes))
     currents[k, sources % n_electrodes] += 1.0
@@ -98,20 +98,20 @@ def _pairs(sources: np.ndarray, sinks: np.ndarray, n_electrodes: int) -> np.ndar
 
 @dataclass(frozen=True)
 class Schedule:
-    """When something is injected and read."""
+    """Times and pattern of injections."""
 
     time_step: float = 5e-3
     """s between two injections [T]"""
     scored_steps: int = 80
-    """injections scored: five frames [ours]"""
+    """scored injections: five frames [ours]"""
     pattern: Pattern = field(default_factory=OppositeDiagonalPattern)
-    """the cycle of injections"""
+    """cycle of current patterns"""
     warm_up: int | None = None
-    """injections not scored; None: until the mean flow has flushed the vessel, and a whole frame"""
+    """first injections, not scored; None: one residence time, at least one cycle"""
     calibration: int | None = None
-    """first injections, from which ĉ_bh is found; None: a whole turn of the pattern"""
+    """first injections, from which ĉ_bh is computed; None: one cycle"""
     budget: int | None = None
-    """injections that an agent may make, who may make none; None: it injects at every step"""
+    """largest number of injections by an agent; None: it injects at every step"""
 
     def __post_init__(self) -> None:
         check_positive(self, time_step="s")

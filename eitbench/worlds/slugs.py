@@ -1,4 +1,4 @@
-"""Slugs: liquid of higher or lower concentration that enters a pipe at random and is carried on."""
+"""Slugs: volumes of higher or lower concentration that enter a pipe at random times."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ if TYPE_CHECKING:
 Inflow = Callable[[np.ndarray, float], np.ndarray]
 """(points (k, d) in m, time in s) -> concentration (k,) in mol/m³"""
 MAX_CACHED_MODELS = 48
-"""Transport models of a fine mesh that are kept: a wandering flow comes back to its velocities."""
+"""Cached transport models of a fine mesh: a random-walk flow returns to earlier velocities."""
 
 
 class Arrivals(Protocol):
-    """When slugs come. A frozen dataclass of plain numbers."""
+    """Arrival times of slugs: a frozen dataclass of plain numbers."""
 
     def draw(self, random: np.random.Generator, begin: float, end: float) -> np.ndarray:
-        """Times in s at which slugs' centres pass the inlet."""
+        """Draw the times in s at which centres of slugs pass the inlet."""
 
 
 @dataclass(frozen=True)
 class JitteredArrivals:
-    """One slug in each interval, at random within it."""
+    """One slug in each interval, at a uniform time within it."""
 
     interval: float = 0.020
     """s [ours]"""
@@ -47,23 +47,23 @@ class JitteredArrivals:
 
 @dataclass(frozen=True)
 class DeadTimePoissonArrivals:
-    """Slugs one at a time, at times nobody foresees; all numbers are ours.
+    """Poisson arrivals with a dead time after each slug; all numbers [ours].
 
-    Between two lies at least ``interval``, and then for every moment the same probability that the
-    next one comes: how long it has been quiet says nothing of what will be.
+    After the dead time the arrival rate is constant, so that the time without a slug does not
+    predict the next arrival.
     """
 
     dead_time: float = 0.10
-    """s; least time between the centres of two slugs: the first has left the pipe"""
+    """s, least time between the centres of two slugs: the first has left the pipe"""
     mean_wait: float = 0.20
-    """s; mean time beyond that"""
+    """s, mean time from the end of the dead time to the next slug"""
 
     def __post_init__(self) -> None:
         check_positive(self, dead_time="s", mean_wait="s")
 
     def draw(self, random: np.random.Generator, begin: float, end: float) -> np.ndarray:
         n = math.ceil((end - begin) / self.dead_time) + 1
-        # The first wait is shortened at random: the record begins anywhere between two slugs.
+        # A random fraction of the first wait: the episode begins anywhere between two slugs.
         waits = self.dead_time + random.exponential(self.mean_wait, n)
         waits[0] *= random.uniform()
         when = begin + np.cumsum(waits)
@@ -77,15 +77,15 @@ class Slugs(Target):
     background: float = 30.0
     """mol/m³, about 0.3 S/m: weak saline"""
     log_amplitude: tuple[float, float] = (0.22, 0.40)
-    """|ln(c/background)| at a slug's centre, either sign"""
+    """|ln(c/background)| at a slug's centre, with a random sign"""
     time_std: tuple[float, float] = (6e-3, 14e-3)
-    """s, standard deviation in time of a slug's Gaussian"""
+    """s, standard deviation in time"""
     transverse_std: tuple[float, float] = (0.010, 0.025)
     """m, standard deviation across the pipe"""
     radial_range: tuple[float, float] = field(default=(0.0, 0.7), metadata=ADDED_LATER)
-    """least and largest distance of a slug's centre from the axis, in parts of R"""
+    """distance of a slug's centre from the axis, relative to R"""
     arrivals: Arrivals = field(default_factory=JitteredArrivals)
-    """when they come"""
+    """arrival times"""
 
     is_advected = True
 
@@ -100,7 +100,7 @@ class Slugs(Target):
                              f"got {self.radial_range!r}")
 
     def draw_inflow(self, world: World, random: np.random.Generator) -> Inflow:
-        """What enters in one episode."""
+        """Draw the inflow of an episode."""
         begin = -world.spin_up_steps * world.time_step - 0.05
         end = world.n_steps * world.time_step + 0.05
         when = self.arrivals.draw(random, begin, end)
@@ -122,7 +122,7 @@ class Slugs(Target):
                tick: Callable[[int], object], last: int) -> Iterator[TruthTrajectory]:
         flows = [world.flow.draw(world, episode.flow) for episode in episodes]
         inflows = [self.draw_inflow(world, episode.inflow) for episode in episodes]
-        if flows[0] is None:  # one flow carries all of them together
+        if flows[0] is None:  # all episodes have the same flow
             for concentration in advect(world, lambda t: truth.transport, inflows, tick, last):
                 yield TruthTrajectory(concentration, np.empty((last, 0)))
             return
@@ -136,18 +136,18 @@ class Slugs(Target):
         for flow, inflow in zip(flows, inflows, strict=True):
             assert flow is not None
             (concentration,) = advect(world, lambda t: transport(flow(t)),  # noqa: B023
-                                     [inflow], tick, last)
+                                      [inflow], tick, last)
             velocity = np.array([flow(t).profile(points) for t in range(1, last + 1)])
             yield TruthTrajectory(concentration, velocity)
 
 
 def advect(world: World, transport_at: Callable[[int], Transport], inflows: Sequence[Inflow],
-          tick: Callable[[int], object], last: int) -> np.ndarray:
-    """Concentrations (B, last + 1, n) in mol/m³ that B inflows make in one flow, t = 0 … last.
+           tick: Callable[[int], object], last: int) -> np.ndarray:
+    """Return concentrations (B, last + 1, n) in mol/m³ of B inflows in one flow, t = 0 … last.
 
-    ``transport_at(t)`` moves the fluid from t − 1 to t, perhaps in several steps of its own; its
-    mesh and inlet do not change. The vessel holds the background when the lead-in begins. ``tick``
-    as in `Target.evolve`.
+    ``transport_at(t)`` is the transport from t − 1 to t, in one or several steps; its mesh and
+    inlet do not change. The spin-up begins with the background concentration. ``tick``: see
+    `Target.evolve`.
     """
     first = transport_at(1 - world.spin_up_steps)
     inlet = first.mesh.points[first.inlet]

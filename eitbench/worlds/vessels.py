@@ -1,4 +1,4 @@
-"""What holds the liquid: plane and round pipes, flat round tanks, and any shape from mesh files."""
+"""Vessels: plane and round pipes, flat round tanks, and any shape from mesh files."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Bulge:
-    """A dent of the lower wall, electrodes and all: y = −R + h·exp(−((x − x₀)/w)²) [all ours]."""
+    """A bulge of the lower wall and its electrodes: y = −R + h·exp(−((x − x₀)/w)²) [ours]."""
 
     height: float = 0.02
     """h in m: a fifth of the pipe's width"""
@@ -36,15 +36,15 @@ class Bulge:
                              f"straight; got {self.position!r} and {self.width!r} m")
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
-        """m by which the wall is raised at ``x`` in m."""
+        """Return the height of the bulge in m at ``x`` in m."""
         return np.asarray(self.height * np.exp(-((x - self.position) / self.width)**2))
 
 
 @dataclass(frozen=True)
 class PlanePipe:
-    """A straight plane channel along x between walls y = ±R, or one with a bulge in its lower wall.
+    """A plane channel along x between walls y = ±R, possibly with a bulge in the lower wall.
 
-    [T]: the thesis' number (5.1.1); [ours]: our choice.
+    [T]: number of the thesis (5.1.1); [ours]: choice of this project.
     """
 
     length: float = 0.40
@@ -52,20 +52,20 @@ class PlanePipe:
     half_width: float = 0.05
     """R in m [T]"""
     electrodes_per_wall: int = 8
-    """16 in all, on both walls [ours]"""
+    """16 electrodes on both walls [ours]"""
     electrode_coverage: float = 0.5
-    """part of the wall that electrodes cover, evenly spaced [ours]"""
+    """fraction of the wall that electrodes cover, evenly spaced [ours]"""
     contact_impedance: float = 2e-3
     """z in Ω·m² [ours]"""
     molar_conductivity: float = 0.01
-    """Λ in S·m²/mol; σ = Λc is linear [T], the slope is about that of NaCl [ours]"""
+    """Λ in S·m²/mol; σ = Λc is linear [T], with about the slope of NaCl [ours]"""
     bulge: Bulge | None = None
     """of the lower wall"""
 
     coarse_grid_shape = (12, 3)
     is_elongated = True
     n_truth_steps = 2
-    n_mesh_lines = 40  # parts of its length whose ends are lines of both carriers' meshes
+    n_mesh_lines = 40  # equal sections of the length, with ends on lines of both transport meshes
 
     def __post_init__(self) -> None:
         check_positive(self, length="m", half_width="m")
@@ -76,7 +76,7 @@ class PlanePipe:
 
     @property
     def n_electrodes(self) -> int:
-        """0 … L/2−1 lie on the lower wall, L/2 … L−1 on the upper one, both along the flow."""
+        """0 … L/2−1 on the lower wall, L/2 … L−1 on the upper wall, both in flow direction."""
         return 2 * self.electrodes_per_wall
 
     @property
@@ -87,7 +87,7 @@ class PlanePipe:
         return centres[:, None] + 0.5 * self.electrode_coverage * pitch * np.array([-1.0, 1.0])
 
     def electrodes(self, mesh: Mesh) -> list[np.ndarray]:
-        """Boundary facets of each electrode, on a mesh of the straight pipe with nodes at edges."""
+        """Return the electrodes' facets on a mesh of the straight pipe with nodes at edges."""
         tiny = 1e-9 * self.length
         x, y = mesh.points.T
         walls = [np.abs(y - wall) < tiny for wall in (-self.half_width, self.half_width)]
@@ -95,15 +95,15 @@ class PlanePipe:
         return [mesh.facets_of(wall & span) for wall in walls for span in spans]
 
     def laminar_velocity(self, mean_velocity: float) -> PlaneChannelFlow:
-        """Laminar flow through the straight pipe with this mean velocity in m/s."""
+        """Return laminar flow through the straight pipe with this mean velocity in m/s."""
         return PlaneChannelFlow(mean_velocity, self.half_width)
 
     def transverse_coordinates(self, points: np.ndarray) -> np.ndarray:
-        """(k, 1) coordinates across the pipe of points (k, 2), in m."""
+        """Return coordinates (k, 1) across the pipe of points (k, 2), in m."""
         return points[:, 1:2]
 
     def sample_inlet_points(self, random: np.random.Generator, n: int,
-                    reach: tuple[float, float] = (0.0, 0.7)) -> np.ndarray:
+                            reach: tuple[float, float] = (0.0, 0.7)) -> np.ndarray:
         """Draw n points of the inlet: their `transverse_coordinates` (n, 1) in m, at distances from
         the axis in the range ``reach``, relative to R."""
         low, high = reach
@@ -114,8 +114,8 @@ class PlanePipe:
         return 16 if fine else 8
 
     def transport_mesh(self, fine: bool) -> tuple[Mesh, np.ndarray]:
-        """10,251 nodes for the truth, 1,701 for the model."""
-        # finite elements: not needed to play recordings
+        """Return a mesh of 10,251 nodes for the truth or 1,701 for the model, and its inlet."""
+        # finite elements: cached episodes do not need them
         from eitbench.numerics.mesh import rectangle_mesh
         along, across = (200, 50) if fine else (80, 20)
         mesh = rectangle_mesh(np.linspace(0.0, self.length, along + 1),
@@ -123,7 +123,7 @@ class PlanePipe:
         return self.deform(mesh), np.arange(across + 1)
 
     def electrode_model(self, fine: bool) -> CompleteElectrodeModel:
-        """About 18,000 unknowns for the truth, 4,600 for the model."""
+        """Return a model with about 18,000 unknowns for the truth, 4,600 for the model."""
         from eitbench.numerics.mesh import graded_pipe_mesh
         from eitbench.physics.cem import CompleteElectrodeModel
         at_electrodes, across = (10, 28) if fine else (5, 14)
@@ -133,11 +133,11 @@ class PlanePipe:
                                       self.contact_impedance)
 
     def lower_wall(self, x: np.ndarray) -> np.ndarray:
-        """y of the lower wall in m at ``x`` in m."""
+        """Return y of the lower wall in m at ``x`` in m."""
         return (0.0 if self.bulge is None else self.bulge(x)) - self.half_width * np.ones_like(x)
 
     def deform(self, mesh: Mesh) -> Mesh:
-        """A mesh of the straight pipe, bent to this pipe's walls."""
+        """Deform a mesh of the straight pipe to the walls of this pipe."""
         if self.bulge is None:
             return mesh
         from eitbench.numerics.mesh import Mesh
@@ -149,9 +149,9 @@ class PlanePipe:
 
 @dataclass(frozen=True)
 class RoundPipe:
-    """A straight round pipe along z, with rings of electrodes on its wall (thesis 5.2, Fig. 5.10).
+    """A straight round pipe along z with rings of electrodes on its wall (thesis 5.2, Fig. 5.10).
 
-    The page at hand shows the figure only: sizes and electrodes are ours.
+    The available page of the thesis shows the figure only: sizes and electrodes are [ours].
     """
 
     length: float = 0.40
@@ -165,14 +165,14 @@ class RoundPipe:
     electrode_length: float = 0.04
     """m along the pipe [ours]"""
     electrode_coverage: float = 0.5
-    """part of a ring that electrodes cover, evenly spaced [ours]"""
+    """fraction of a ring that electrodes cover, evenly spaced [ours]"""
     contact_impedance: float = 2e-3
     """z in Ω·m² [ours]"""
     molar_conductivity: float = 0.01
     """Λ in S·m²/mol; σ = Λc [ours]"""
     potential_order: int = 2
-    """of the elements for the potential. At equal numbers of unknowns P1 errs three times as much,
-    by more than the noise: ``docs/pipe3d.md``"""
+    """order of the elements for the potential. With P1 and the same number of unknowns the error is
+    three times larger and exceeds the noise: ``docs/pipe3d.md``"""
 
     coarse_grid_shape = (6, 6)
     is_elongated = True
@@ -190,7 +190,7 @@ class RoundPipe:
 
     @property
     def n_electrodes(self) -> int:
-        """Ring by ring, down the flow."""
+        """Number of electrodes, numbered ring by ring in flow direction."""
         return self.electrode_rings * self.electrodes_per_ring
 
     @property
@@ -200,12 +200,12 @@ class RoundPipe:
 
     @property
     def spans_along(self) -> np.ndarray:
-        """(electrode_rings, 2) where each ring begins and ends along the pipe, m."""
+        """(electrode_rings, 2) begin and end of each ring along the pipe, m."""
         centres = (np.arange(self.electrode_rings) + 0.5) * self.length / self.electrode_rings
         return centres[:, None] + 0.5 * self.electrode_length * np.array([-1.0, 1.0])
 
     def electrodes(self, mesh: Mesh) -> list[np.ndarray]:
-        """Boundary facets of each electrode, ring by ring, on an EIT mesh with nodes at edges."""
+        """Return the facets of each electrode, ring by ring, on a mesh with nodes at edges."""
         z = mesh.points[:, 2]
         tiny = 1e-9 * self.length
         facets = []
@@ -215,15 +215,15 @@ class RoundPipe:
         return facets
 
     def laminar_velocity(self, mean_velocity: float) -> RoundPipeFlow:
-        """Laminar flow with this mean velocity in m/s."""
+        """Return laminar flow with this mean velocity in m/s."""
         return RoundPipeFlow(mean_velocity, self.radius)
 
     def transverse_coordinates(self, points: np.ndarray) -> np.ndarray:
-        """(k, 2) coordinates across the pipe of points (k, 3), in m."""
+        """Return coordinates (k, 2) across the pipe of points (k, 3), in m."""
         return points[:, :2]
 
     def sample_inlet_points(self, random: np.random.Generator, n: int,
-                    reach: tuple[float, float] = (0.0, 0.7)) -> np.ndarray:
+                            reach: tuple[float, float] = (0.0, 0.7)) -> np.ndarray:
         """Draw n points of the inlet, uniformly by area: their `transverse_coordinates` (n, 2) in
         m, at distances from the axis in the range ``reach``, relative to R."""
         low, high = reach
@@ -236,8 +236,8 @@ class RoundPipe:
         return 8
 
     def transport_mesh(self, fine: bool) -> tuple[Mesh, np.ndarray]:
-        """13,689 nodes for the truth, 3,003 for the model."""
-        # finite elements: not needed to play recordings
+        """Return a mesh of 13,689 nodes for the truth or 3,003 for the model, and its inlet."""
+        # finite elements: cached episodes do not need them
         from eitbench.numerics.round_meshes import extrude, uniform_disc
         rings, layers = (7, 80) if fine else (5, 32)
         section = uniform_disc(self.radius, rings)
@@ -245,7 +245,7 @@ class RoundPipe:
         return mesh, np.arange(section.n_nodes)
 
     def electrode_model(self, fine: bool) -> CompleteElectrodeModel:
-        """About 42,000 unknowns for the truth, 21,000 for the model."""
+        """Return a model with about 42,000 unknowns for the truth, 21,000 for the model."""
         from eitbench.numerics.round_meshes import round_pipe_mesh
         from eitbench.physics.cem import CompleteElectrodeModel
         at_electrodes, rings, across = ((4, 5), 5, 1.75) if fine else ((3, 4), 4, 1.5)
@@ -257,14 +257,14 @@ class RoundPipe:
 
 @dataclass(frozen=True)
 class RoundTank:
-    """A flat round tank with electrodes around its wall (thesis ch. 7). All numbers are ours."""
+    """A flat round tank with electrodes on its wall (thesis ch. 7). All numbers [ours]."""
 
     radius: float = 0.14
     """m"""
     n_electrodes: int = 16
-    """around the wall; number 0 at angle 0, counted counter-clockwise"""
+    """counted counter-clockwise from electrode 0 at angle 0"""
     electrode_coverage: float = 0.5
-    """part of the wall that electrodes cover, evenly spaced"""
+    """fraction of the wall that electrodes cover, evenly spaced"""
     contact_impedance: float = 2e-3
     """z in Ω·m²"""
     molar_conductivity: float = 0.01
@@ -285,19 +285,19 @@ class RoundTank:
         return _spans_around(self.n_electrodes, self.electrode_coverage)
 
     def electrodes(self, mesh: Mesh) -> list[np.ndarray]:
-        """Boundary facets of each electrode, on an EIT mesh with nodes at their edges."""
+        """Return the facets of each electrode on a mesh with nodes at edges."""
         return _electrodes_around(mesh, self.radius, self.electrode_spans)
 
     def substeps(self, fine: bool) -> int:
         return 8
 
     def transport_mesh(self, fine: bool) -> tuple[Mesh, np.ndarray]:
-        """4,921 nodes for the truth, 1,261 for the model; nothing flows in."""
-        from eitbench.numerics.round_meshes import uniform_disc  # not needed to play recordings
+        """Return a mesh of 4,921 nodes for the truth or 1,261 for the model, without an inlet."""
+        from eitbench.numerics.round_meshes import uniform_disc
         return uniform_disc(self.radius, 40 if fine else 20), np.empty(0, dtype=int)
 
     def electrode_model(self, fine: bool) -> CompleteElectrodeModel:
-        """About 9,300 unknowns for the truth, 3,100 for the model."""
+        """Return a model with about 9,300 unknowns for the truth, 3,100 for the model."""
         from eitbench.numerics.round_meshes import electrode_disc
         from eitbench.physics.cem import CompleteElectrodeModel
         at_electrodes, rings = (8, 22) if fine else (4, 13)
@@ -307,33 +307,33 @@ class RoundTank:
 
 @dataclass(frozen=True)
 class MeshVessel:
-    """A vessel whose meshes are drawn elsewhere, with gmsh say; see `eitbench.numerics.mesh_files`.
+    """A vessel with meshes of another program such as gmsh; see `eitbench.numerics.mesh_files`.
 
-    Concentration and potential live on the same mesh. The truth has a finer one than the
-    estimators' model: no inverse crime. Boundary facets of electrode l = 0 … L−1 form the group
-    "electrode l", those through which the fluid enters the group "inlet", if there is one.
+    Concentration and potential have the same mesh. The truth has a finer mesh than the estimator
+    model, to avoid an inverse crime. The boundary facets of electrode l = 0 … L−1 are the group
+    "electrode l", the facets of an inlet the group "inlet".
     """
 
     truth_mesh_file: str
     """path of the truth's mesh"""
     truth_mesh_sha256: str
-    """of that file, in hexadecimal digits: another file is another world"""
+    """SHA-256 of this file in hexadecimal digits: another file makes another world"""
     model_mesh_file: str
-    """path of the model's mesh"""
+    """path of the estimator model's mesh"""
     model_mesh_sha256: str
-    """of that file"""
+    """SHA-256 of this file"""
     n_electrodes: int
     """L"""
     scale: float = 1.0
-    """m in a unit of the files; 1e-3 for mm"""
+    """m per unit of the files; 1e-3 for mm"""
     contact_impedance: float = 2e-3
     """z in Ω·m²"""
     molar_conductivity: float = 0.01
     """Λ in S·m²/mol; σ = Λc"""
     coarse_grid_shape: tuple[int, int] = (6, 6)
-    """along x and y: the coarse grid on which an agent sees an estimate"""
+    """cells along x and y of the grid on which an agent observes the estimate"""
     is_elongated: bool = False
-    """whether pictures of it are laid one below the other"""
+    """whether figures stack its images vertically"""
 
     n_truth_steps = 2
 
@@ -351,7 +351,7 @@ class MeshVessel:
         return mesh, np.unique(groups.get("inlet", np.empty(0, dtype=int)))
 
     def electrode_model(self, fine: bool) -> CompleteElectrodeModel:
-        from eitbench.physics.cem import CompleteElectrodeModel  # not needed to play recordings
+        from eitbench.physics.cem import CompleteElectrodeModel
         mesh, groups = self._read(fine)
         names = [f"electrode {number}" for number in range(self.n_electrodes)]
         if missing := [name for name in names if name not in groups]:
@@ -370,21 +370,21 @@ class MeshVessel:
 
 
 def _check_electrodes(vessel: PlanePipe | RoundPipe | RoundTank) -> None:
-    """``ValueError`` unless these numbers of its electrodes and liquid are within their ranges."""
+    """Raise ``ValueError`` unless numbers of electrodes and liquid are in range."""
     check_positive(vessel, contact_impedance="Ω·m²", molar_conductivity="S·m²/mol")
     _check.number("electrode_coverage", vessel.electrode_coverage, low=0.0, high=0.95,
                   open_low=True)
 
 
 def _spans_around(count: int, cover: float) -> np.ndarray:
-    """(count, 2) first and last angle in rad of electrodes evenly spaced around a wall."""
+    """Return (count, 2) first and last angle in rad of electrodes evenly spaced on a wall."""
     pitch = 2.0 * np.pi / count
     return pitch * (np.arange(count)[:, None] + 0.5 * cover * np.array([-1.0, 1.0]))
 
 
 def _electrodes_around(mesh: Mesh, radius: float, spans: np.ndarray,
                        where: np.ndarray | bool = True) -> list[np.ndarray]:
-    """Boundary facets of electrodes at these angles of a round wall, at the nodes ``where``."""
+    """Return the facets of electrodes at these angles of a round wall, at the nodes ``where``."""
     x, y = mesh.points[:, :2].T
     angle = np.arctan2(y, x)
     wall = (np.hypot(x, y) > (1.0 - 1e-9) * radius) & where

@@ -1,4 +1,4 @@
-"""A world: vessel × flow × target × instrument × schedule, and the prior of its estimators."""
+"""Simulation configuration (a world): vessel, flow, target, instrument, schedule and prior."""
 
 from __future__ import annotations
 
@@ -30,23 +30,23 @@ if TYPE_CHECKING:
 
 
 class Discretisation(NamedTuple):
-    """A world on meshes: how the concentration moves and how it is seen."""
+    """Transport and observation model of a world on meshes."""
 
     transport: Transport
     observation: ObservationModel
 
 
 class TruthTrajectory(NamedTuple):
-    """What moved in one episode."""
+    """Ground truth of one episode."""
 
     concentration: np.ndarray
     """(T + 1, n) mol/m³ at the nodes of the truth's CD mesh, t = 0 … T"""
     velocity: np.ndarray
-    """(T, p) m/s at `VelocityModel.points`, t = 1 … T; p = 0 where nobody is asked for the flow"""
+    """(T, p) m/s at `VelocityModel.points`, t = 1 … T; p = 0 if the task does not request it"""
 
 
 class Vessel(Protocol):
-    """What holds the liquid, with electrodes on its wall: a frozen dataclass of SI numbers."""
+    """A container with electrodes on its wall: a frozen dataclass of SI numbers."""
 
     @property
     def contact_impedance(self) -> float:
@@ -62,60 +62,60 @@ class Vessel(Protocol):
 
     @property
     def coarse_grid_shape(self) -> tuple[int, int]:
-        """Along x and y: the coarse grid on which an agent sees an estimate."""
+        """Cells along x and y of the grid on which an agent observes the estimate."""
 
     @property
     def is_elongated(self) -> bool:
-        """Whether pictures of it are laid one below the other."""
+        """True if figures stack its images vertically."""
 
     def transport_mesh(self, fine: bool) -> tuple[Mesh, np.ndarray]:
-        """The mesh on which concentration moves, ``fine`` for the truth, and its inlet's nodes."""
+        """Return the transport mesh, ``fine`` for the truth, and the nodes of its inlet."""
 
     @property
     def n_truth_steps(self) -> int:
-        """Steps of the truth's transport in a time step."""
+        """Transport steps of the truth in a time step."""
 
     def substeps(self, fine: bool) -> int:
-        """Crank–Nicolson steps in each of them, or in a time step of the model."""
+        """Return the Crank–Nicolson steps in a transport step of the truth or of the model."""
 
     def electrode_model(self, fine: bool) -> CompleteElectrodeModel:
-        """The complete electrode model, on a mesh of its own."""
+        """Return the complete electrode model, on a separate mesh."""
 
 
 class Flow(Protocol):
-    """How the fluid moves: a frozen dataclass of SI numbers. What is said here is the default."""
+    """A flow configuration: a frozen dataclass of SI numbers. This class holds the defaults."""
 
     @property
     def diffusivity(self) -> float:
-        """κ in m²/s; of the estimators' model where the truth is not carried."""
+        """κ in m²/s; for the estimator model only, if the truth is not advected."""
 
     def nominal(self, world: World, fine: bool) -> VelocityField | None:
-        """The velocity of the truth (``fine``) or the estimators' model; None: nothing moves."""
+        """Return the velocity of the truth (``fine``) or the estimator model; None: no flow."""
 
     def check_assumed(self, world: World, assumed: Mapping[str, Any]) -> None:
-        """``ValueError`` if `assumed_velocity` knows nothing of what is assumed; at no cost."""
+        """Raise ``ValueError`` if `assumed_velocity` does not accept ``assumed``; cheap."""
         reject_unknown_assumptions(assumed, ())
 
     def assumed_velocity(self, world: World, **assumed: Any) -> VelocityField | None:
-        """The velocity of the estimators' model; ``assumed``: what they are told instead."""
+        """Return the velocity of the estimator model under other assumptions than the default."""
         self.check_assumed(world, assumed)
         return self.nominal(world, fine=False)
 
     def residence_steps(self, world: World) -> int:
-        """Time steps in which the mean flow passes through the vessel; 0 where nothing does."""
+        """Return the time steps in which the mean flow passes the vessel; 0 without a flow."""
         return 0
 
     def spin_up_steps(self, world: World) -> int:
-        """Time steps that the fluid flows before t = 0: the slowest flow has flushed the vessel."""
+        """Return the time steps before t = 0 in which the slowest flow passes the vessel."""
         return self.residence_steps(world)
 
     def velocity_model(self, world: World) -> VelocityModel | None:
-        """How the flow may be written where it is to be estimated too."""
+        """Return the parametrisation of the flow if the task requests its estimate."""
         return None
 
     def draw(self, world: World,
              random: np.random.Generator) -> Callable[[int], SkewedChannelFlow] | None:
-        """t -> the flow from t − 1 to t in one episode; None: the nominal one in all of them."""
+        """Draw t -> the flow from t − 1 to t of an episode; None: all have the nominal flow."""
         return None
 
     def true_transport(self, world: World, model: Discretisation,
@@ -131,32 +131,32 @@ class Flow(Protocol):
 
 
 class Target(Protocol):
-    """What is to be seen: a frozen dataclass of SI numbers."""
+    """A concentration field that moves or rests: a frozen dataclass of SI numbers."""
 
     @property
     def background(self) -> float:
-        """Concentration (mol/m³) that fills the vessel at first."""
+        """Initial concentration (mol/m³) of the whole vessel."""
 
     @property
     def is_advected(self) -> bool:
-        """Whether the fluid carries the truth; else the target has a way of its own."""
+        """True if the flow advects the truth; otherwise the target computes its own motion."""
 
     @property
     def is_stationary(self) -> bool:
-        """Whether nothing has to be followed: such worlds have boards of their own."""
+        """True if the truth is stationary; such worlds have separate subtracks."""
         return False
 
     def evolve(self, world: World, episodes: Sequence[EpisodeStreams], truth: Discretisation,
                tick: Callable[[int], object], last: int) -> Iterator[TruthTrajectory]:
-        """What moves in each episode up to state ``last``; to the bit the same beside any others.
+        """Simulate episodes up to state ``last``; results do not depend on the batch, bit by bit.
 
-        ``tick(k)`` is called when k more steps of one episode are done.
+        ``tick(k)`` is called after k further steps of one episode.
         """
 
 
 @dataclass(frozen=True)
 class Prior:
-    """What is believed before any measurement; deviations in parts of ĉ_bh (thesis Table 5.1)."""
+    """Prior of the estimators; standard deviations relative to ĉ_bh (thesis Table 5.1)."""
 
     expected_concentration: float = 25.0
     """mol/m³; a rough level, deliberately not the background [ours]"""
@@ -167,7 +167,7 @@ class Prior:
     initial_std: float = 1 / 4
     """of the initial state [ours; illegible in the table]"""
     initial_length: float = 0.0
-    """m over which the initial state is smooth; 0: nodes are independent"""
+    """m, correlation length of the initial state; 0: nodes are independent"""
 
     def __post_init__(self) -> None:
         check_positive(self, expected_concentration="mol/m³")
@@ -178,13 +178,13 @@ class Prior:
 
 @dataclass(frozen=True)
 class World:
-    """What is simulated: parts that can be swapped, each a frozen dataclass of plain numbers.
+    """A simulation configuration of interchangeable parts, frozen dataclasses of plain numbers.
 
-    A part may ask more of another than its protocol promises, as slugs ask for an inlet.
+    A part may require more of another part than its protocol, as slugs require an inlet.
     """
 
     name: str
-    """under which its episodes are kept"""
+    """folder of its episodes in the cache"""
     vessel: Any
     """a `Vessel`"""
     flow: Any
@@ -192,13 +192,13 @@ class World:
     target: Any
     """a `Target`"""
     instrument: Instrument = field(default_factory=Instrument)
-    """what injects and measures"""
+    """current sources and voltmeters"""
     schedule: Schedule = field(default_factory=Schedule)
-    """when, for how long, and in which pattern"""
+    """times and pattern of injections"""
     prior: Prior = field(default_factory=Prior)
-    """what estimators are told to believe"""
+    """prior in the task"""
     region: tuple[float, float] | None = None
-    """m along the vessel's first axis; only errors between these cross-sections count. None: all"""
+    """m along the vessel's first axis, to which errors are restricted. None: the whole vessel"""
 
     def __post_init__(self) -> None:
         for name, protocol in (("vessel", Vessel), ("flow", Flow), ("target", Target)):
@@ -209,7 +209,7 @@ class World:
                 part.check(self)
         if self.instrument.max_faulty > self.vessel.n_electrodes - 2:
             raise ValueError("instrument: n_dead_range, n_failing_range and n_loose_range must "
-                             "leave two electrodes sound, got up to "
+                             "leave two electrodes without fault, got up to "
                              f"{self.instrument.max_faulty} of {self.vessel.n_electrodes}")
         if self.region is not None:
             self._check_region(self.region)
@@ -231,7 +231,7 @@ class World:
 
     @property
     def time_step(self) -> float:
-        """s between two injections."""
+        """Time between two injections in s."""
         return self.schedule.time_step
 
     @property
@@ -246,23 +246,22 @@ class World:
 
     @property
     def warm_up(self) -> int:
-        """Injections that are measured but not scored: by default the mean flow flushes the vessel
-        once, and there is a whole turn of the pattern."""
+        """First injections, not scored: by default one residence time, at least one cycle."""
         if self.schedule.warm_up is not None:
             return self.schedule.warm_up
         return max(self.residence_steps, len(self.currents))
 
     @property
     def n_steps(self) -> int:
-        """Injections measured, t = 1 … n_steps."""
+        """Measured injections, t = 1 … n_steps."""
         return self.warm_up + self.schedule.scored_steps
 
     @property
     def calibration(self) -> int:
-        """First injections, from which an estimator finds ĉ_bh."""
+        """First injections, from which estimators compute ĉ_bh."""
         return self.schedule.calibration or len(self.currents)
 
-    # -- what is injected and read --
+    # -- injections and measurements --
 
     @property
     def currents(self) -> np.ndarray:
@@ -275,35 +274,35 @@ class World:
 
     @property
     def noise(self) -> VoltageNoise:
-        """What estimators take for that of a sound electrode's reading."""
+        """Assumed noise of a fault-free measurement."""
         return self.instrument.noise
 
-    # -- what is believed --
+    # -- initial state and prior --
 
     @property
     def background(self) -> float:
-        """Concentration (mol/m³) that fills the vessel when the lead-in begins."""
+        """Concentration (mol/m³) in the vessel at the beginning of the spin-up."""
         return self.target.background
 
     @property
     def expected_concentration(self) -> float:
-        """Rough level in mol/m³ that an operator would expect; not the background."""
+        """Rough expectation of a user in mol/m³; not the background."""
         return self.prior.expected_concentration
 
     @property
     def velocity_model(self) -> VelocityModel | None:
-        """How the flow may be written where it is to be estimated too."""
+        """Parametrisation of the flow if the task requests its estimate."""
         return self.flow.velocity_model(self)
 
     # -- discretisations --
 
     def truth_model(self) -> Discretisation:
-        """The fine one that is simulated."""
+        """Return the fine discretisation, which is simulated."""
         velocity = self.flow.nominal(self, fine=True) if self.target.is_advected else None
         return self._discretise(velocity, fine=True)
 
     def estimator_model(self, **assumed: Any) -> Discretisation:
-        """The coarser one that estimators are given.
+        """Return the coarser discretisation of the task.
 
         ``assumed`` holds wrong assumptions on the flow, arguments of `Flow.assumed_velocity`;
         ``ValueError`` for an unknown one.
@@ -312,26 +311,28 @@ class World:
 
     def true_transport(self, model: Discretisation,
                        flow: np.random.Generator) -> Callable[[int], Transport]:
-        """t -> what moves an episode's c from t − 1 to t, on the model's mesh; for references only.
+        """Return t -> an episode's true transport from t − 1 to t, on the mesh of ``model``.
 
-        ``model`` is what estimators are given when they are told nothing wrong, ``flow`` the
-        episode's fresh stream.
+        For oracles. ``model`` is the estimator model without wrong assumptions, ``flow`` the
+        unused stream of the episode.
         """
         return self.flow.true_transport(self, model, flow)
 
     def true_observation(self, truth: Discretisation,
                          contacts: np.random.Generator) -> ObservationModel:
-        """What the voltages of an episode are computed by, of ``truth``: with its electrodes'
-        contact impedances, drawn from the episode's fresh stream where they are not those told."""
-        seen = truth.observation
+        """Return the observation model of an episode, with its drawn contact impedances.
+
+        ``contacts`` is the unused stream of the episode.
+        """
+        model = truth.observation
         if self.instrument.contact_impedance_spread == 0.0:
-            return seen
+            return model
         factor = self.instrument.draw_contacts(contacts, self.vessel.n_electrodes)
-        return seen.with_contacts(factor * seen.cem.contact_impedance)
+        return model.with_contacts(factor * model.cem.contact_impedance)
 
     def evolve(self, episodes: Sequence[EpisodeStreams], truth: Discretisation,
                tick: Callable[[int], object], last: int | None = None) -> Iterator[TruthTrajectory]:
-        """What moves in each episode, up to state ``last`` (default: all); see `Target.evolve`."""
+        """Simulate episodes up to state ``last`` (default: all); see `Target.evolve`."""
         until = self.n_steps if last is None else last
         return self.target.evolve(self, episodes, truth, tick, until)
 
@@ -339,7 +340,7 @@ class World:
         """Draw the inflow of an episode, (spin_up_steps + n_steps + 1, n_inlet) in mol/m³, at the
         nodes of the estimators' inlet from the beginning of the spin-up, without a simulation.
 
-        ``ValueError`` if this world has no inlet, or its target does not say what flows in.
+        ``ValueError`` if the target has no inflow.
         """
         seed = _check.integer("seed", seed, low=0)
         if not hasattr(self.target, "draw_inflow"):
@@ -351,9 +352,8 @@ class World:
                          for t in range(-self.spin_up_steps, self.n_steps + 1)])
 
     def _discretise(self, velocity: VelocityField | None, fine: bool) -> Discretisation:
-        from eitbench.physics.stationary import (
-            StationaryTransport,  # finite elements: not needed to play recordings
-        )
+        # finite elements: cached episodes do not need them
+        from eitbench.physics.stationary import StationaryTransport
         from eitbench.physics.transport import ConvectionDiffusion
         mesh, inlet = self.vessel.transport_mesh(fine)
         transport: Transport
@@ -385,28 +385,31 @@ class World:
         return hash(tuple(getattr(self, each.name) for each in fields(self)))
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without what is derived: a hash holds in its own process only."""
+        """Return the fields without cached values: a hash is valid in one process only."""
         return {each.name: getattr(self, each.name) for each in fields(self)}
 
     # -- variants --
 
     def with_changes(self, changes: Mapping[str, Any] | None) -> World:
-        """This world with some numbers changed, as in ``{"instrument": {"noise_relative": 0.02}}``.
+        """Return this world with changes such as ``{"instrument": {"noise_relative": 0.02}}``.
 
-        ``ValueError`` naming what there is, if a part or a number has another name, or what is
-        allowed, if it is out of range.
+        ``ValueError`` for an unknown part or field, which lists the known ones, or for a value out
+        of range.
         """
         if changes is None:
             return self
         if not isinstance(changes, Mapping):
             raise ValueError(f"world must be a dict of parts and their numbers, got {changes!r}")
         if "name" in changes:
-            raise ValueError("world must not change its name, under which its episodes are kept")
+            raise ValueError("world must not change its name, the folder of its episodes")
         return _changed(self, changes, "world")
 
     @cached_property
     def fault_free(self) -> World:
-        """What a filter without faults and floor depends on: variants share theirs."""
+        """Configuration without instrument faults and noise floor.
+
+        Worlds that differ only in these share one reduced filter.
+        """
         given = self.instrument
         instrument = Instrument(current=given.current, noise_relative=given.noise_relative,
                                 noise_relative_to_max=given.noise_relative_to_max)
@@ -414,8 +417,10 @@ class World:
 
     @cached_property
     def truth_config(self) -> World:
-        """What the truth depends on: variants share their episodes. Of the instrument those are the
-        currents and the contacts, which show in the transfer resistances."""
+        """Configuration of the ground truth: worlds with the same one share their episodes.
+
+        It includes the current and the contacts, on which transfer resistances depend.
+        """
         instrument = Instrument(current=self.instrument.current,
                                 contact_impedance_spread=self.instrument.contact_impedance_spread)
         prior = Prior(self.expected_concentration)
@@ -457,7 +462,7 @@ def _changed(part: Any, changes: Mapping[str, Any], where: str) -> Any:
 
 
 def reject_unknown_assumptions(assumed: Mapping[str, Any], known: Sequence[str]) -> None:
-    """``ValueError`` if estimators are told something that this flow knows nothing of."""
+    """Raise ``ValueError`` for assumptions that a flow does not accept."""
     for name in assumed:
         if name not in known:
             there = f"there are {', '.join(known)}" if known else "this world has nothing to assume"

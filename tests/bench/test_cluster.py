@@ -73,7 +73,7 @@ def test_here_a_killed_worker_ends_the_run_and_nothing_is_lost(tmp_path):
     log, store = tmp_path / "log", EpisodeStore(tmp_path / "results")
     path = write_baseline(tmp_path, init=KILL.format(log=str(log)))
     jobs = [Job(FILTER, path, seed) for seed in (1, 2, 3)]
-    with pytest.raises(WorkerLostError, match="the same command goes on from there"):
+    with pytest.raises(WorkerLostError, match="the same command resumes"):
         run_jobs(jobs, store, n_jobs=2)
     finished = len(errors(store))
     assert finished < 3

@@ -84,7 +84,7 @@ def test_damaged_file_is_built_again(damage, place):
 
 
 def test_any_flipped_byte_is_noticed():
-    """In the header, the numbers or the checksum."""
+    """Damage of the header, the numbers or the checksum."""
     cached(KEY, lambda: ARRAYS)
     data = KEY.path.read_bytes()
     for position in range(0, len(data), 17):
@@ -134,7 +134,7 @@ def test_unwritable_cache_warns_and_still_returns_the_arrays(how, place, monkeyp
 
 @pytest.mark.parametrize("error", [OSError, KeyboardInterrupt])
 def test_failed_write_leaves_no_trace(error, tmp_path, monkeypatch):
-    """The old file stays as it was, and nothing beside it."""
+    """The old file is unchanged, and there is no other file."""
     path = tmp_path / "folder" / "file"
     write_atomically(path, b"old")
 
@@ -150,7 +150,7 @@ def test_failed_write_leaves_no_trace(error, tmp_path, monkeypatch):
 
 
 def test_shipped_arrays_come_first_and_damaged_ones_are_ignored(tmp_path, monkeypatch, place):
-    """To the bit, without a look at the cache; a damaged or foreign file is as good as none."""
+    """Shipped arrays are bit-identical and loaded without the cache; a damaged or other file counts as missing."""
     monkeypatch.setattr(cache, "PACKAGE_DATA", tmp_path / "shipped")
     cache.ship(KEY, ARRAYS)
     assert bits(cached(KEY, None)) == bits(ARRAYS) and not place.exists()

@@ -47,7 +47,7 @@ def test_they_are_what_the_environment_shows_and_scores(tiny):
 
 @pytest.mark.parametrize("env, changes", [(PIPE, CHANGES), (REGION, WANDERING)])
 def test_truth_is_the_best_there_is_on_these_nodes(env, changes):
-    """What is left over is orthogonal, over what counts of the truth's own mesh, to all that there is."""
+    """The residual is orthogonal to all nodal functions, over the scored region of the truth's mesh."""
     examples = eitbench.dataset(env, "train:0", world=changes)
     (example,) = examples
     truth = simulate(examples.world, 0).concentration[1:].astype(float)
@@ -71,7 +71,7 @@ def test_errors_over_a_region_are_those_of_its_scores():
 
 @pytest.mark.parametrize("env, changes", [(PIPE, CHANGES), (REGION, WANDERING)])
 def test_scores_are_the_same_in_few_coordinates(env, changes):
-    """Of any estimate in the span of a basis, which need not be orthonormal, about any mean."""
+    """Errors of estimates in the span of a basis, orthonormal or not, about any mean."""
     examples = eitbench.dataset(env, "train:0", world=changes)
     random = np.random.default_rng(2)
     basis = random.normal(size=(examples.mesh.n_nodes, 3))
@@ -201,7 +201,7 @@ def test_files_hold_the_same_and_more_can_be_added(tiny, tmp_path, format, suffi
 
 
 def test_the_score_on_the_card_is_ours(tiny, tmp_path, monkeypatch):
-    """Its lines, executed beside its files."""
+    """The lines of the README run in the folder of its files."""
     export(tiny, tmp_path)
     monkeypatch.chdir(tmp_path)
     (lines,) = re.findall(r"```python\n(.*?)```", (tmp_path / "README.md").read_text(), re.DOTALL)

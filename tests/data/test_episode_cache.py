@@ -1,5 +1,5 @@
-"""Recordings: they score as the truth does, and are bit for bit the simulation's. Of the first steps alone they are
-those of the whole, and the rest comes when it is needed."""
+"""Cached episodes: they give the scores of the truth and equal the simulation bit by bit. A prefix equals the first
+steps of the whole episode, and the remaining steps follow on demand."""
 
 import subprocess
 import sys
@@ -94,7 +94,7 @@ def test_outline_holds_one_triangle_of_the_mass_on_the_estimators_nodes(to_truth
 
 
 def test_outline_knows_the_largest_voltage():
-    """That of the whole injection cycle into liquid of the expected concentration."""
+    """The largest voltage of the injection cycle at the expected concentration."""
     observation, level = TINY.estimator_model().observation, np.full(1701, TINY.expected_concentration)
     largest = max(np.abs(observation.transfer_resistance(level) @ currents).max() for currents in TINY.currents)
     assert scoring_constants(TINY).largest_voltage == pytest.approx(largest, rel=1e-10)
@@ -110,7 +110,7 @@ def test_resistances_and_noise_are_those_of_the_episode(episode):
 
 
 def test_cycle_voltages_are_those_of_the_episode(episode):
-    """Step by step what `Episode.voltages` says of the cycle's currents, which begin anew after each frame."""
+    """Each step equals `Episode.voltages` for the currents of the cycle, which repeats after each frame."""
     voltages = cycle_voltages(TINY, 7, cached_episode(TINY, 7))
     assert voltages.shape == (5, 4)
     for t, currents in enumerate(TINY.currents[[0, 1, 0, 1, 0]], start=1):
@@ -118,8 +118,8 @@ def test_cycle_voltages_are_those_of_the_episode(episode):
 
 
 def test_cycle_voltages_have_the_faults_of_the_episode():
-    """What is broken reads interference, and a current that would have to pass it does not flow;
-    the recording is the same."""
+    """A broken electrode measures interference, and a current through it does not flow;
+    the cached episode is the same."""
     faulty = TINY.with_changes({"instrument": {"n_dead_range": [1, 1], "interference": 50.0}})
     entries = cached_episode(TINY, 7)
     assert bits(cached_episode(faulty, 7)) == bits(entries)
@@ -134,7 +134,7 @@ def test_cycle_voltages_have_the_faults_of_the_episode():
 
 
 def test_playing_what_is_stored_needs_no_finite_elements(episode):
-    """With recording and outline on disk, making, resetting and stepping an environment builds no mesh."""
+    """With cached episode and scoring constants, making, resetting and stepping an environment builds no mesh."""
     cached_episode(TINY, 7), scoring_constants(TINY)
     program = (f"import sys, gymnasium as gym, numpy as np, eitbench\n"
                f"env = gym.make('eitbench/Pipe2D-v0', world={CHANGES!r})\n"
@@ -147,7 +147,7 @@ def test_playing_what_is_stored_needs_no_finite_elements(episode):
 
 
 def longer(id):
-    """Changes to a world of some 20 steps; that of the tank keeps its electrodes, for which a filter is shipped."""
+    """Changes to a world of some 20 steps; the tank keeps its electrodes, for which a filter is shipped."""
     if "Tank" in id:
         return {"schedule": {"warm_up": 1, "scored_steps": 18}}
     return merged(short(id)["world"], {"schedule": {"scored_steps": 18}})

@@ -27,8 +27,8 @@ def bits(arrays):
 
 
 def test_same_bits_in_this_process_from_the_cache_and_side_by_side(episode, monkeypatch):
-    """Only the seed is random, and numpy's global state is neither used nor changed. Up to an
-    earlier step the bits are those of the whole."""
+    """Only the seed is random, and numpy's global state is neither used nor changed. A simulation up to an
+    earlier step has the same bits."""
     np.random.seed(1)  # noqa: NPY002 (the global state is what this is about)
     before = np.random.get_state()[1].copy()  # noqa: NPY002
     assert bits(simulate(TINY, 7, cache=False)) == bits(episode)
@@ -89,7 +89,7 @@ def test_truth_is_finer_than_the_model():
 
 
 def test_resistances_belong_to_the_concentrations(episode):
-    """𝓡 at index t − 1 is that of the concentration at t, seen on the truth's EIT mesh."""
+    """𝓡 at index t − 1 belongs to the concentration at t, on the truth's EIT mesh."""
     observation = cached_truth_model(TINY).observation
     for t in (1, 5):
         expected = observation.transfer_resistance(episode.concentration[t].astype(float))
@@ -98,7 +98,7 @@ def test_resistances_belong_to_the_concentrations(episode):
 
 
 def test_voltages_follow_the_noise_formula(episode):
-    """V = 𝓡I + std·n with std² = (1 % of the reading)² + (0.1 % of the largest)², at the step asked for."""
+    """V = 𝓡I + std·n with std² = (1 % of the measurement)² + (0.1 % of the largest)², at the requested step."""
     for step, currents in itertools.product((1, 2, 5), TINY.currents):
         clean = episode.transfer_resistance[step - 1] @ currents
         noisy = clean + np.sqrt((0.01 * clean)**2 + (0.001 * np.abs(clean).max())**2) * episode.noise[step - 1]

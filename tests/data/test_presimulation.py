@@ -28,7 +28,7 @@ SEEDS = range(10)
 
 @pytest.fixture(autouse=True)
 def place(tmp_path, monkeypatch):
-    """The ids of the plain pipe play the tiny world; recordings lie in a folder of this test."""
+    """The ids of the plain pipe have the tiny world, and the cache is a folder of this test."""
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
     shorten(monkeypatch, dict.fromkeys(PLAIN, CHANGES))
     forget()
@@ -61,13 +61,13 @@ def names(place):
 
 
 def stamps(place):
-    """Which files there are and when they were written."""
+    """Return the files with their modification times."""
     return {path.name: (path.stat().st_ino, path.stat().st_mtime_ns) for path in place.iterdir()}
 
 
 @pytest.mark.parametrize("n_jobs", [1, 2])
 def test_recordings_have_the_bits_of_those_made_alone(n_jobs, place, alone, monkeypatch):
-    """Eight at once or spread over processes: each recording is the one of its seed, and no truth lies beside it."""
+    """In a batch of eight or in processes, each cached episode belongs to its seed, and no truth is stored."""
     get_reusable_executor().shutdown(wait=True)      # workers keep the cache folder they began with
     assert presimulate(TINY, SEEDS, n_jobs=n_jobs) == 10
     assert names(place) == sorted(f"{seed}.npy" for seed in SEEDS)
@@ -76,7 +76,7 @@ def test_recordings_have_the_bits_of_those_made_alone(n_jobs, place, alone, monk
 
 
 def test_only_what_is_missing_is_made(place, asked, alone):
-    """In batches of eight. Seeds asked for twice are made once, and a damaged recording counts as missing."""
+    """Batches have eight episodes; duplicate seeds are simulated once, a damaged file counts as missing."""
     cached_episode(TINY, 2)
     (place / "2.truth.npy").unlink()
     assert presimulate(TINY, [4, 2, 1, 4]) == 2 and asked == [[4, 1]]
@@ -141,7 +141,7 @@ def test_workers_write_where_the_parent_looks(monkeypatch, tmp_path):
 
 
 def test_command_fills_and_resumes(place, asked, alone):
-    """It says what it made and what was there, and keeps it where environments look; dev:0 is not train:0."""
+    """The command prints the numbers of new and cached episodes, and environments find them; dev:0 is not train:0."""
     code, said, _ = command("bank", "--seeds", "train:0-2", "-j", "1")
     assert code == 0
     assert "3 simulated, 0 were there" in said

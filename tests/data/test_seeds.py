@@ -12,7 +12,7 @@ numbers = st.integers(0, 99_999)
 
 
 def test_splits_are_disjoint():
-    """What is learned on, chosen on and reported on never meet."""
+    """Splits for training, selection and scores are disjoint."""
     assert list(SPLITS) == ["train", "dev", "test"]
     for a, b in combinations(SPLITS.values(), 2):
         assert not set(a) & set(b)
@@ -55,7 +55,7 @@ def test_errors_say_what_was_expected(text, message):
 
 
 def test_playing_for_scores_leaves_other_warnings_alone():
-    """What Python shows once is not shown again after each episode, and nothing is said within."""
+    """The warning appears once per line of the user, and not within `allow_test_seeds`."""
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("default")
         for _ in range(2):

@@ -54,7 +54,7 @@ CASES = pytest.mark.parametrize(("n", "n_ports"),
 @both
 @CASES
 def test_dense_inverse(kind, n, n_ports):
-    """The ports' block and columns of K⁻¹ are those of the dense inverse; one matrix or many."""
+    """The ports' block and columns of K⁻¹ equal the dense inverse, for one matrix and for many."""
     pattern = random_pattern(n, n_ports, seed=n)
     system = kind(pattern, n_ports)
     matrices = random_matrices(pattern, 11, seed=n + 1)
@@ -84,7 +84,7 @@ def box_pattern(shape, n_ports):
 @both
 @pytest.mark.parametrize("shape", [(4, 4, 30), (9, 9, 9), (1, 1, 5)])
 def test_nested_dissection(kind, shape):
-    """Ordered by where the unknowns lie, block and columns are those of the dense inverse too."""
+    """Block and columns equal the dense inverse also with nested dissection."""
     pattern, places = box_pattern(shape, 2)
     system = kind(pattern, 2, places)
     (matrix,) = random_matrices(pattern, 1, seed=1)
@@ -95,7 +95,7 @@ def test_nested_dissection(kind, shape):
 
 
 def test_wide_fronts_are_taken_one_by_one(monkeypatch):
-    """Where eight matrices would not fit side by side, each is factorised alone, equally well."""
+    """If eight matrices do not fit into the caches, each is factorised alone, with the same accuracy."""
     pattern = random_pattern(180, 7, seed=2)
     system = Condensation(pattern, 7)
     values = np.stack([K[system.rows, system.columns]
@@ -109,7 +109,7 @@ def test_wide_fronts_are_taken_one_by_one(monkeypatch):
 
 @both
 def test_entries_are_complete(kind):
-    """The entries asked for make up the pattern: at least one triangle, none twice or outside."""
+    """The requested entries form the pattern: at least one triangle, no duplicates, no other entries."""
     pattern = random_pattern(120, 5, seed=3)
     system = kind(pattern, 5)
     entries = (np.ones(len(system.rows)), (system.rows, system.columns))
@@ -132,7 +132,7 @@ def test_a_state_keeps_its_bits_wherever_it_stands_in_a_batch():
 
 
 def test_systems_and_threads_do_not_disturb_each_other():
-    """Working memory is shared by all systems of a thread and by nobody else."""
+    """Working memory is shared by all systems of a thread, and by no other thread."""
     systems = []
     values = []
     alone = []
@@ -161,9 +161,9 @@ def test_pickled():
 
 
 def test_numba_that_does_not_work_is_named(monkeypatch):
-    """Beside a numpy that is too new, say: one sentence says what is wrong and what helps."""
+    """With an unsupported numpy, for example, one sentence names the problem and the remedy."""
     system = Condensation(random_pattern(30, 2, seed=0), 2)
     monkeypatch.setitem(sys.modules, "eitbench.numerics.kernels", None)
     monkeypatch.delattr("eitbench.numerics.kernels", raising=False)
-    with pytest.raises(RuntimeError, match=r"numba cannot be used \(.*\); install eitbench anew"):
+    with pytest.raises(RuntimeError, match=r"numba cannot be used \(.*\); reinstall eitbench"):
         system.port_inverse(np.ones(len(system.rows)))

@@ -131,7 +131,7 @@ def test_points_behind_a_polygonal_wall_take_the_value_at_the_wall():
 @in_both_dimensions
 @pytest.mark.parametrize("candidates", [1, 4, 32])
 def test_located_points_are_where_their_coordinates_say(dim, candidates):
-    """Inside, the barycentric coordinates are those of the point in the cell found, however few are tried first."""
+    """Inside, the barycentric coordinates belong to the point in the found cell, for any number of candidates."""
     mesh = MESHES[dim]
     points = np.random.default_rng(3).uniform(size=(200, dim)) * SIZE[:dim]
     cells, barycentric = mesh.locate(points, candidates)
@@ -209,7 +209,7 @@ def test_graded(start, length, cells, grading, ends):
 
 
 def test_graded_exponent():
-    """The exponent is that of the distance from the crowded end; 1 is uniform; symmetric when both ends crowd."""
+    """The exponent applies to the distance from the refined end; 1 is uniform; both ends are symmetric."""
     assert_allclose(graded(0.0, 4.0, 4, 2.0, "start"), [0.0, 0.25, 1.0, 2.25, 4.0])
     assert_allclose(graded(0.0, 4.0, 4, 2.0, "stop"), [0.0, 1.75, 3.0, 3.75, 4.0])
     assert_allclose(graded(0.0, 4.0, 4, 2.0), [0.0, 0.5, 2.0, 3.5, 4.0])
@@ -255,7 +255,7 @@ def test_graded_pipe_mesh():
     (np.vstack([TRIANGLE, [[1.0, 1.0]]]), [[0, 1, 2], [3, 1, 1]], r"cell 1 has nodes \[3, 1, 1\]"),
     (np.hstack([TRIANGLE, np.zeros((3, 1))]), [[0, 1, 2]], r"cells must be integers of shape \(n_cells, 4\) in 3D")])
 def test_mesh_refuses(points, cells, match):
-    """Wrong shapes, numbers out of range, idle nodes and flat cells are refused; the message says which."""
+    """Wrong shapes, numbers out of range, unused nodes and flat cells are rejected with a message."""
     with pytest.raises(ValueError, match=match):
         Mesh(np.asarray(points), np.asarray(cells))
 

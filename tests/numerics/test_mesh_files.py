@@ -59,7 +59,7 @@ def test_round_trip(dim, tmp_path):
 @pytest.mark.parametrize(("format", "ending", "binary"), [
     ("gmsh22", "msh", True), ("gmsh22", "msh", False), ("vtk", "vtk", True), ("vtu", "vtu", True)])
 def test_other_formats(dim, format, ending, binary, tmp_path):
-    """What meshio reads is read; a file without groups has none."""
+    """Formats of meshio are read; a file without groups has an empty dictionary."""
     mesh = MESHES[dim]
     file = tmp_path / f"box.{ending}"
     points = np.pad(mesh.points, ((0, 0), (0, 3 - dim)))
@@ -114,7 +114,7 @@ $Elements
 7 2 2 3 1 20 40 50
 $EndElements
 """
-"""2 × 1, with centres of circles that are no nodes, sparse node numbers and a named corner."""
+"""2 × 1, with centres of circles that are not nodes, sparse node numbers and a named corner."""
 
 SQUARE_41 = """$MeshFormat
 4.1 0 8
@@ -226,12 +226,12 @@ def with_elements(*elements: str) -> str:
      "groups of boundary facets must have a name, .* got group 2 without one"),
     (SQUARE.replace('2 3 "fluid"', '2 3 "walls"'), "must have a name, which no group of another"),
     (SQUARE.replace('0 9 "corner"', '1 9 "outlet"'), "group 'outlet' must hold facets, got none"),
-    (SQUARE[:-80], "must be a whole mesh file in a format that meshio knows"),
+    (SQUARE[:-80], "must be a complete mesh file in a format that meshio reads"),
     (SQUARE.replace("2.2 0 8", "1.0 0 8"), "cannot be read .*Need mesh format"),
-    ("a picture of a pipe", "must be a whole mesh file"), ("", "must be a whole mesh file"),
+    ("a picture of a pipe", "must be a complete mesh file"), ("", "must be a complete mesh file"),
 ])
 def test_files_that_are_refused(text, match, tmp_path, capsys):
-    """What came and what was expected, after the name of the file; nothing is printed."""
+    """Messages contain the file, the problem and the expectation; nothing is printed."""
     file = written(tmp_path, text)
     with pytest.raises(ValueError, match=f"^{re.escape(str(file))}: .*{match}"):
         read_mesh(file)
@@ -241,7 +241,7 @@ def test_files_that_are_refused(text, match, tmp_path, capsys):
 @pytest.mark.parametrize("name", ["pipe.msh", "pipe.vtu", "", "pipe.xyzzy"])
 def test_files_that_are_not_there(name, tmp_path):
     """Nor is a folder a file, and an ending that meshio does not know is named."""
-    with pytest.raises(ValueError, match="there is no such file"):
+    with pytest.raises(ValueError, match="file not found"):
         read_mesh(tmp_path / name)
     if name:
         (tmp_path / name).write_text("nonsense")

@@ -32,7 +32,7 @@ def facet_counts(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
 
 
 def polygon_area(points: np.ndarray) -> float:
-    """Of corners (n, 2) in order, by the shoelace formula."""
+    """Return the area of a polygon with corners (n, 2), by the shoelace formula."""
     x, y = points.T
     return 0.5 * (x @ np.roll(y, -1) - y @ np.roll(x, -1))
 
@@ -186,8 +186,8 @@ SQUARE = np.pi / 2 * np.arange(4)
     (lambda: disc_mesh([1.0, 2.0], [SQUARE, SQUARE[::-1]]), r"angles\[1\] must .* strictly increasing"),
     (lambda: disc_mesh([1.0], [4 / 3 * SQUARE]), r"angles\[0\] must .* within one turn"),
     (lambda: disc_mesh([1.0], [SQUARE * np.nan]), r"angles\[0\] must be finite"),
-    (lambda: disc_mesh([1.0], [SQUARE / 2]), "angles must be so dense"),
-    (lambda: disc_mesh([1.0, 1.1], [2 * np.pi * np.arange(12) / 12, SQUARE]), "angles must be so dense"),
+    (lambda: disc_mesh([1.0], [SQUARE / 2]), "angles must be dense"),
+    (lambda: disc_mesh([1.0, 1.1], [2 * np.pi * np.arange(12) / 12, SQUARE]), "angles must be dense"),
     (lambda: uniform_disc(0.0, 3), "radius must be a finite number"),
     (lambda: uniform_disc(1.0, 0), "rings must be an integer"),
     (lambda: electrode_disc(-1.0, SPANS, 3, 3), "radius must be a finite number"),
@@ -198,7 +198,7 @@ SQUARE = np.pi / 2 * np.arange(4)
     (lambda: electrode_disc(R, np.array([[0.0, 1.0], [1.0, 2.0]]), 3, 3), "spans must .* keep a gap"),
     (lambda: electrode_disc(R, np.array([[0.0, 1.0], [5.0, 6.5]]), 3, 3), "spans must .* within one turn"),
     (lambda: electrode_disc(R, SPANS, 3, 3, (0.5, 1.0)), "grading must be a finite number"),
-    (lambda: electrode_disc(R, SPANS[:1], 8, 8), "angles must be so dense"),
+    (lambda: electrode_disc(R, SPANS[:1], 8, 8), "angles must be dense"),
     (lambda: extrude(extrude(SECTIONS["uniform"], Z), Z), "section must be a mesh of triangles, got one in 3D"),
     (lambda: extrude(SECTIONS["uniform"], [0.0]), "z must hold at least two strictly increasing"),
     (lambda: extrude(SECTIONS["uniform"], [0.0, 1.0, 1.0]), "z must hold at least two strictly increasing"),

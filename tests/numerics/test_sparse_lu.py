@@ -36,7 +36,7 @@ def random_matrix(n, seed):
 @pytest.mark.parametrize("n", [1, 2, 9, 60, 300])
 @pytest.mark.parametrize("k", WIDTHS)
 def test_dense_solution(kind, n, k):
-    """A⁻¹ b for some right-hand sides is that of dense elimination; b stays as it was."""
+    """A⁻¹ b equals dense elimination for several right-hand sides; b is unchanged."""
     A = random_matrix(n, seed=n)
     right = np.random.default_rng(k).normal(size=(n, k))
     kept = right.copy()
@@ -63,7 +63,7 @@ def test_any_memory_layout(kind, layout):
 
 @both
 def test_a_column_keeps_its_bits_whatever_stands_beside_it(kind):
-    """Alone, in a batch of any length, in any place, and beside numbers that are none."""
+    """A solution does not depend on the batch, its length, the position, or NaN in other columns."""
     solver = kind(sp.csr_array(random_matrix(200, seed=3)))
     right = np.random.default_rng(4).normal(size=(200, 20))
     whole = solver.solve(right)

@@ -120,7 +120,7 @@ def test_power_balance(dim, order):
     assert_allclose(power, dense.volume_loss + dense.contact_loss, rtol=1e-10)
     assert_allclose(dense.electrode_currents, currents, atol=1e-10)
     assert (dense.volume_loss > 0.05 * power).all() and (dense.contact_loss > 0.05 * power).all()
-    # Scaling σ alone: I·(∂U/∂σ)σ = −∫σ|∇u|², so the Jacobian knows the same loss.
+    # Scaling σ alone: I·(∂U/∂σ)σ = −∫σ|∇u|², so the Jacobian contains the same loss.
     assert_allclose(-np.einsum("kl,kln,n->k", currents, jacobian, sigma), dense.volume_loss, rtol=1e-10)
 
 
@@ -213,7 +213,7 @@ def test_disc():
 
 @every_element
 def test_reciprocity(dim, order):
-    """I₁·U(I₂) = I₂·U(I₁), already in scipy's grounded solution, which nobody symmetrised."""
+    """I₁·U(I₂) = I₂·U(I₁), already in scipy's grounded solution, which is not symmetrised."""
     mesh, electrodes, sigma = small(dim)
     cem = reference_model(mesh, electrodes, IMPEDANCE, order)
     currents = patterns(4)
@@ -239,7 +239,7 @@ def test_batch():
 
 @every_element
 def test_jacobian(dim, order):
-    """dU/dσ of every pattern, electrode and node is that of central differences to 1e-6 of the row's largest entry."""
+    """dU/dσ of each pattern, electrode and node equals central differences to 1e-6 of the row's largest entry."""
     cem, sigma = small_cem(dim, order), small(dim)[2]
     currents = patterns(4)
     step = 1e-4 * np.diag(sigma)
@@ -264,7 +264,7 @@ def slugs(points: np.ndarray) -> np.ndarray:
 
 
 def test_pipe_meshes_are_fine_enough():
-    """In units of the noise the P2 mesh error is below 0.25 for estimators and 0.05 for the truth; P1 is useless."""
+    """The P2 mesh error is below 0.25 noise std for estimators and 0.05 for the truth; the P1 error is too large."""
     pipe = PIPE_2D.vessel
     currents = PIPE_2D.currents
     mesh = graded_pipe_mesh(pipe.length, pipe.half_width, pipe.electrode_spans, 24, 44)

@@ -62,7 +62,7 @@ def test_power_law_has_the_mean_it_is_asked_for(exponent):
 
 
 def test_power_law_is_flatter_than_laminar_flow():
-    """With 1/7: (8/7)·v̄ on the axis, half of that at 1/128 of R from the wall, rest on the wall and just outside."""
+    """The exponent 1/7 gives (8/7)·v̄ on the axis, half of it at 1/128 of R from the wall, and zero at the wall."""
     y = R * np.array([0.0, 127 / 128, -127 / 128, 1.0, -1.0 - 1e-15])
     velocity = PowerLawFlow(7.0, R)(np.column_stack([np.zeros(5), y]))
     np.testing.assert_allclose(velocity[:, 0], [8.0, 4.0, 4.0, 0.0, 0.0], atol=1e-12)
@@ -191,7 +191,7 @@ def test_basis_of_the_skewed_pipe_holds_its_truth_well_but_not_exactly(k):
 
 
 def test_skewed_basis_rests_on_the_walls_and_only_the_first_carries_fluid():
-    """φ_k(±1) = 0; the mean of the parabola is 1, that of the others 0, so that θ_1 is the mean velocity."""
+    """φ_k(±1) = 0; the mean is 1 for the parabola and 0 for the others, so that θ_1 is the mean velocity."""
     model = PIPE_2D_SKEWED.velocity_model
     for direction in model.basis_fields:
         np.testing.assert_allclose(direction(np.array([[0.1, -R], [0.2, R]])), 0.0, atol=1e-14)
@@ -221,7 +221,7 @@ def test_errors_name_the_argument(field, arguments, name):
     ({"nominal": ("fast",)}, "nominal must be an array"), ({"initial_std": (-1.0,)}, "initial_std must be"),
 ])
 def test_errors_of_the_model_name_the_argument(change, message):
-    """One number in m/s for each profile, and standard deviations that are none below zero."""
+    """One number in m/s for each profile, and nonnegative standard deviations."""
     fields = {"half_width": R, "basis": ((1.5, 0.0, -1.5),), "nominal": (4.5,), "initial_std": (1.0,),
               "walk_std": (0.02,)}
     with pytest.raises(ValueError, match=message):
@@ -233,6 +233,6 @@ def test_errors_of_the_model_name_the_argument(change, message):
     ([1.0, np.nan, 0.0], "parameters must be finite"),
 ])
 def test_wrong_parameters_are_named(parameters, message):
-    """As many as there are profiles, and finite."""
+    """One finite number for each profile."""
     with pytest.raises(ValueError, match=message):
         MODEL.field(parameters)

@@ -230,7 +230,7 @@ def test_field_outside_is_that_of_the_nearest_wall():
 
 
 def test_field_is_reproducible_and_travels():
-    """The same arguments give the same bits, and so does the field after pickling; it joins up between the cells."""
+    """Equal arguments give equal bits, also after pickling; the field is continuous between cells."""
     flow, again = cavity(8, 1e-2), cavity(8, 1e-2)
     points = points_within(0.0, 1.0, 100)
     assert_array_equal(flow.cell_velocity, again.cell_velocity)
@@ -275,6 +275,6 @@ def test_three_dimensions_are_refused():
 
 
 def test_flow_that_is_not_found_is_an_error():
-    """At a Reynolds number of 10⁶ a coarse cavity has no solution within reach; the message says how far it went."""
+    """At a Reynolds number of 10⁶ a coarse cavity has no solution; the message contains the number reached."""
     with pytest.raises(RuntimeError, match="no steady flow was found at a viscosity of 1e-06 m²/s, only down to"):
         cavity(6, 1e-6)

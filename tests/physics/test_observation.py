@@ -1,4 +1,4 @@
-"""From a concentration to voltages and noise: conductivity laws, the chain rule, the floor, the noise formula."""
+"""Observation model: conductivity laws, the chain rule, the least concentration, the noise formula."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def difference_quotients(model: ObservationModel, c: np.ndarray, step: float = 1
 
 @each_law
 def test_derivative_of_the_law(law):
-    """dσ/dc is that of central differences."""
+    """dσ/dc equals central differences."""
     c = np.geomspace(0.5, 500.0, 30)
     step = 1e-5 * c
     assert_allclose(law.derivative(c), (law(c + step) - law(c - step)) / (2 * step), rtol=1e-8)
@@ -77,7 +77,7 @@ def test_noise_formula():
 
 @each_law
 def test_linearisation_of_the_observation(law):
-    """dV/dc of every reading and node agrees with central differences; the voltages are those of the model."""
+    """dV/dc of each voltage and node equals central differences; the voltages equal the model's."""
     model = observation(law)
     c = concentration(model)
     voltages, jacobian = model.linearise(c, PATTERNS)
@@ -99,10 +99,10 @@ def test_a_uniform_concentration_is_a_uniform_conductivity(law):
 
 @each_law
 def test_concentration_below_the_floor_counts_as_the_floor(law):
-    """Negative and tiny values leave σ positive and the voltages those of the floor, with the law's slope there."""
+    """Negative and tiny values give a positive σ and the voltages of the least concentration, with its slope."""
     model = observation(law)
     c = concentration(model)
-    # A whole cross-section below the floor, so that there are EIT nodes that see nothing else.
+    # A whole cross-section below the least concentration, so that some EIT nodes depend on such nodes only.
     low, at_floor = c.copy(), c.copy()
     low[:8], at_floor[:8] = -1e3, FLOOR
     assert np.isfinite(model.voltages(low, PATTERNS)).all()
@@ -112,12 +112,12 @@ def test_concentration_below_the_floor_counts_as_the_floor(law):
     _, expected = model.linearise(np.full_like(c, FLOOR), PATTERNS)
     assert_allclose(jacobian, expected, rtol=1e-12)
     assert np.abs(jacobian).max() > 0
-    # At EIT nodes that mix both, the mixture is what is floored, so the voltages differ from those of a floored state.
+    # At EIT nodes that mix both, the mixture is limited, so the voltages differ from a state that is limited first.
     assert not np.allclose(model.voltages(low, PATTERNS), model.voltages(at_floor, PATTERNS), rtol=1e-6)
 
 
 def test_wrong_concentrations_are_refused():
-    """Not finite, or not one number a node of the concentration's mesh; a floor must be positive."""
+    """Not finite, or another shape than the concentration's mesh; the least concentration must be positive."""
     model = observation(LAWS[0])
     c = concentration(model)
     for bad in (c[:-1], np.where(np.arange(len(c)) == 2, np.nan, c)):

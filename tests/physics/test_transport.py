@@ -46,7 +46,7 @@ def orders(errors):
 
 
 def dense_step(cd, c, before, after, velocity, source=None):
-    """The scheme of the docstring, anew: full matrices, inlet rows replaced by the given values, no reuse."""
+    """The scheme of the docstring with full matrices, inlet rows replaced by the given values, no reuse."""
     M, K = (matrix.toarray() for matrix in _supg_matrices(cd.mesh, velocity, cd.diffusivity))
     load = M @ (np.zeros_like(c) if source is None else source)
     dt = cd.time_step / cd.substeps
@@ -271,7 +271,7 @@ def test_node_to_node_noise_is_damped():
 
 
 def test_evolution_model_is_the_step():
-    """F c + Y c_in is the step from a state to new inlet values; F, Y and H are those of scipy."""
+    """F c + Y c_in is the step from a state to new inlet values; F, Y and H equal scipy's."""
     cd, rng = channel(), np.random.default_rng(3)
     F, Y, _ = cd.evolution_model()
     c, inflow = rng.normal(size=(91, 5)), rng.normal(size=(7, 5))
@@ -351,7 +351,7 @@ def test_cube_of_tetrahedra():
 
 
 def test_inlet_entries_of_the_state_are_replaced():
-    """What c holds at the inlet does not matter, ``inflow_before`` does; ``inflow_after`` comes out; c stays."""
+    """Inlet values of c are ignored in favour of ``inflow_before``; ``inflow_after`` is returned; c is unchanged."""
     cd, rng = channel(), np.random.default_rng(7)
     c, before, after = rng.normal(size=91), rng.normal(size=7), rng.normal(size=7)
     np.testing.assert_array_equal(cd.step(c, before, after)[cd.inlet], after)

@@ -55,7 +55,7 @@ def build(velocity, mesh=CHANNEL, inlet=INLET, **changes):
 
 
 def by_differences(velocity, direction, state, h=1e-4, **settings):
-    """∂step/∂θ by differences of steps of models built anew, with errors of fourth order in h."""
+    """∂step/∂θ by differences of steps of new models, with errors of fourth order in h."""
     def slope(h):
         ahead, behind = (build(moved(velocity, direction, theta), **settings).step(*state) for theta in (h, -h))
         return (ahead - behind) / (2 * h)
@@ -67,7 +67,7 @@ def random_state(rng, n=91, inlet=7):
 
 
 def assert_derivatives(velocity, directions, state, tolerance=1e-8, **settings):
-    """Step and derivatives are those of `step`, relative to the largest derivative."""
+    """Step and derivatives equal `step`, relative to the largest derivative."""
     after, derivatives = build(velocity, **settings).velocity_derivatives(*state, directions)
     np.testing.assert_array_equal(after, build(velocity, **settings).step(*state))
     assert derivatives.shape == (len(after), len(directions))
@@ -94,13 +94,13 @@ def test_derivatives_in_the_channel(speed, changes):
 
 
 def test_derivatives_in_a_flow_of_any_direction():
-    """With flow and directions oblique to all cells the upwinding turns too: central differences to 1e-8."""
+    """A flow and directions oblique to all cells, with rotated upwinding: central differences to 1e-8."""
     flow = moved(lambda points: np.full_like(points, [1.0, 0.37]), eddy, 0.1)
     assert_derivatives(flow, [eddy, PARABOLA], random_state(np.random.default_rng(1)))
 
 
 def test_derivatives_on_tetrahedra():
-    """The same in a bent cube, in three dimensions."""
+    """Derivatives in a bent cube, in three dimensions."""
     mesh = box()
     inlet = np.flatnonzero(np.arange(60) < 15)
     flow, other = (lambda points, a=a, b=b: np.array(a) + np.sin(points[:, [1, 2, 0]]) * b
@@ -134,7 +134,7 @@ def test_a_kink_counts_half_from_either_side():
 
 
 def test_derivatives_at_the_inlet_are_zero():
-    """What flows in is given, whatever the velocity; what c holds there does not matter."""
+    """The inflow is prescribed for any velocity; inlet values of c are ignored."""
     cd, (c, before, after) = build(eddy), random_state(np.random.default_rng(6))
     _, derivatives = cd.velocity_derivatives(c, before, after, [PARABOLA])
     np.testing.assert_array_equal(derivatives[INLET], 0.0)
@@ -144,7 +144,7 @@ def test_derivatives_at_the_inlet_are_zero():
 
 
 def test_transition_is_that_of_the_evolution_model():
-    """F and Y come out the same with and without H, whichever is asked for first."""
+    """F and Y are the same with and without H, in either order."""
     first, second = build(eddy), build(eddy)
     F, Y = first.transition()
     for model in (first.evolution_model(), second.evolution_model()):

@@ -20,7 +20,7 @@ TANK = RoundTank(n_electrodes=8)
 
 
 class RoundMeshVessel(MeshVessel):
-    """As a test needs it: the cylinders ask for the tank's radius."""
+    """A mesh vessel with a radius, which the cylinders require."""
 
     radius = TANK.radius
 
@@ -46,7 +46,7 @@ def vessel(files):
 
 
 def test_electrodes_are_those_of_the_groups(files, vessel):
-    """The transfer resistance is that of a model made from the same mesh in memory, to the bit."""
+    """The transfer resistance is bit-identical to a model of the same mesh in memory."""
     for fine, name in ((True, "fine"), (False, "coarse")):
         mesh = files[name][2]
         direct = CompleteElectrodeModel(mesh, TANK.electrodes(mesh), vessel.contact_impedance)
@@ -57,7 +57,7 @@ def test_electrodes_are_those_of_the_groups(files, vessel):
 
 
 def test_a_world_of_it_is_played(vessel, monkeypatch):
-    """Registered by a script it plays as any other; no inlet, so that nothing flows in."""
+    """A script registers it, and it runs as any other id; without an inlet there is no inflow."""
     register_apart(monkeypatch)
     world = World("Meshed", vessel, NoFlow(), Cylinders(), schedule=Schedule(
         time_step=0.02, scored_steps=4, pattern=TankOppositeDiagonalPattern(), warm_up=0, calibration=1))

@@ -1,4 +1,4 @@
-"""Flows that differ from episode to episode: drawn from where the world says, and those that carry."""
+"""Flows that are drawn for each episode: their distributions and the transport by them."""
 
 import numpy as np
 import pytest
@@ -84,7 +84,7 @@ def test_skewness_has_either_sign():
 
 
 def test_known_velocity_makes_the_episode_of_the_plain_pipe():
-    """With nothing left to draw, and so the same lead-in, it is `PIPE_2D`: the same inflow and noise, to rounding."""
+    """Without randomness, and so the same spin-up, it is `PIPE_2D`: the same inflow and noise, to rounding."""
     def of(velocity):
         return PIPE_2D_BIASED.with_changes(merged(CHANGES, {"flow": {"velocity_range": [velocity] * 2}}))
 
@@ -131,7 +131,7 @@ def test_recorded_flow_is_the_drawn_one(world):
 
 
 def test_recorded_flow_is_the_one_that_carries():
-    """From one recorded state to the next with the recorded mean velocity, in the truth's two steps: to rounding."""
+    """From one cached state to the next with the cached mean velocity, in the truth's two steps: to rounding."""
     world = PIPE_2D_TIME_VARYING.with_changes(FAST)
     half_width = world.vessel.half_width
     truth = cached_truth_model(world)
@@ -162,7 +162,7 @@ def test_a_reference_is_given_the_flow_that_carries(world):
 
 
 def test_simulated_together_same_bits():
-    """Flows that differ are carried on one by one: each episode is the one that its seed has alone."""
+    """Episodes with different flows are simulated one by one, with the same results as alone."""
     world = PIPE_2D_TIME_VARYING.with_changes(FAST)
     together = list(episodes.simulate_batch(world, [8, 7], progress=False))
     alone = [simulate(world, seed, cache=False) for seed in (8, 7)]

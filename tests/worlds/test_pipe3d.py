@@ -1,4 +1,4 @@
-"""The 3D pipe: electrodes and injections are where they are said to be, and the truth is finer than the model."""
+"""The 3D pipe: electrode positions and injections, and a truth that is finer than the model."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ def areas(cem):
 
 
 def test_electrodes_have_their_size_and_place(model):
-    """Each is as long as said and a part of the polygon around, and its middle lies at its angle and ring."""
+    """Each electrode has the specified length and fraction of the circumference, centred at its angle and ring."""
     cem, pipe = model.observation.cem, SMALL.vessel
     arc = 2.0 * np.pi * pipe.radius / 4 * pipe.electrode_coverage
     measured = areas(cem)
@@ -63,7 +63,7 @@ def test_slugs_enter_anywhere_within_seven_tenths_of_the_radius():
 
 
 def test_inlet_is_the_first_section_and_flow_is_along_the_pipe(model):
-    """Concentration enters over the whole of z = 0, with the mean velocity asked for."""
+    """Concentration enters over the whole of z = 0, with the requested mean velocity."""
     transport = model.transport
     assert (transport.mesh.points[transport.inlet, 2] == 0).all()
     assert len(transport.inlet) == np.count_nonzero(transport.mesh.points[:, 2] == 0)

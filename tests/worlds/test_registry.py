@@ -1,4 +1,4 @@
-"""Worlds that others register: by hand, or in a package that says so when it is installed."""
+"""Third-party worlds, registered by a script or by the entry points of a package."""
 
 import pickle
 import subprocess
@@ -42,7 +42,7 @@ register(World("Theirs", PlanePipe(length=0.3), LaminarFlow(), Slugs()), "theirs
 
 @pytest.fixture(autouse=True)
 def restored(monkeypatch):
-    """What is registered by a test is forgotten after it."""
+    """Undo registrations after a test."""
     register_apart(monkeypatch)
     before = set(gym.registry)
     yield
@@ -56,7 +56,7 @@ def hands() -> list[str]:
 
 
 def test_a_world_is_played_under_its_id():
-    """By gymnasium's own `make`; in a pipe into which nothing comes the background is the truth."""
+    """`gymnasium.make` works; in a pipe without slugs the background is the truth."""
     register(QUIET, ID, description="Nothing happens.", lag=1)
     assert list(entries())[-1] == ID
     assert entry(ID) == registry.Entry(ID, QUIET, "estimation", {"lag": 1}, "Nothing happens.")
@@ -77,7 +77,7 @@ def test_a_world_is_played_under_its_id():
 
 
 def test_an_id_belongs_to_one_world():
-    """The same again is nothing new; another world, track, setting or text under it is refused."""
+    """Equal registrations are accepted; another world, track, setting or text under the id is rejected."""
     register(QUIET, ID, lag=1)
     register(replace(QUIET), ID, lag=1)
     for world, settings in ((OTHER, {"lag": 1}), (QUIET, {}), (QUIET, {"lag": 1, "about": "!"}),
@@ -118,13 +118,13 @@ def test_settings_of_another_track_are_refused(settings, message):
 
 
 def test_an_id_that_nobody_registered_is_named():
-    """With those that there are."""
+    """The message lists the registered ids."""
     with pytest.raises(ValueError, match=r"env must be one of eitbench/Pipe2D-v0, .*; got 'mine/"):
         entry(ID)
 
 
 def test_another_process_takes_over(tmp_path):
-    """What was registered by hand here is played there, with the same bits."""
+    """An id of a script runs in other processes, bit-identical."""
     world = PIPE_2D.with_changes(PIPE)
     register(world, ID, lag=2, description="Mine.", test_seeds="test:0-2")
     told = tmp_path / "told"
@@ -145,7 +145,7 @@ def test_another_process_takes_over(tmp_path):
 
 
 def test_who_is_told_last_counts():
-    """A process that works for one script after another plays what the present one means."""
+    """A process that works for several scripts uses the registration of the current one."""
     register(QUIET, ID)
     registry.import_entries([replace(entry(ID), world=OTHER, settings={"lag": 2})])
     assert entry(ID).world == OTHER
@@ -213,7 +213,7 @@ def test_a_variant_is_the_environment_of_its_id(id):
 
 
 def test_episodes_of_a_variant(monkeypatch):
-    """Observations and rewards of a variant are those of its id, single and vectorised, bit by bit."""
+    """Observations and rewards of a variant and its id are equal, single and vectorised, bit by bit."""
     strong = entry("eitbench/Pipe2DStrongSlugs-v0")
     registry.import_entries([replace(strong, world=strong.world.with_changes(PIPE))])
     envs = gym.make("eitbench/Pipe2D-v0", variant="strong-slugs"), gym.make(strong.id)

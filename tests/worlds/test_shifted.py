@@ -1,4 +1,4 @@
-"""Shifts of the thesis' pipe: the task of home to the last number, and a truth that is what is said."""
+"""Robustness variants of the thesis' pipe: the task of the nominal environment, and the stated ground truth."""
 
 import numpy as np
 import pytest
@@ -114,7 +114,7 @@ def test_readings_have_twice_the_noise_that_is_told():
 
 @pytest.mark.parametrize("seed", [3, 4])
 def test_voltages_are_those_of_electrodes_with_these_contacts(seed):
-    """A complete electrode model built anew with the impedances drawn; with those told it is another."""
+    """Voltages equal a new complete electrode model with the drawn impedances, and differ from the task's."""
     shifted, home = small("eitbench/Pipe2DOtherContacts-v0"), small(NOMINAL_ID)
     assert shifted.instrument == PIPE_2D_OTHER_CONTACTS.instrument
     assert shifted.instrument.contact_impedance_spread == 0.5

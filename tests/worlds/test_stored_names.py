@@ -57,7 +57,7 @@ def test_third_party_fields_keep_their_names():
 
 
 def test_the_map_names_existing_fields():
-    """Each new name is that of a class or field."""
+    """Each new name is the name of a class or field."""
     def names(part) -> set[str]:
         own = {type(part).__name__} | {each.name for each in fields(part)}
         return own.union(*(names(value) for value in vars(part).values() if is_dataclass(value)))
@@ -74,7 +74,7 @@ def test_the_map_names_existing_fields():
     (PIPE_2D_FAULTS, {"instrument": {"dead": [1, 1]}}, {"instrument": {"n_dead_range": [1, 1]}}),
     (ROTATING_TANK_2D, {"target": {"start_radius": [0.3, 0.4]}}, {"target": {"initial_radius_range": [0.3, 0.4]}})])
 def test_earlier_names_of_fields_are_accepted(world, old, new):
-    """With a warning that gives the new name."""
+    """The warning contains the new name."""
     with pytest.warns(DeprecationWarning, match=r"\w+ is now \w+"):
         changed = world.with_changes(old)
     assert changed == world.with_changes(new)

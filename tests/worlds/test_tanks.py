@@ -31,7 +31,7 @@ def flow_stream(seed):
 
 
 def stirred(rings):
-    """The stirred tank's flow on a mesh with so many rings."""
+    """Return the stirred tank's flow on a mesh with this number of rings."""
     return _stirred(ROTATING.flow, ROTATING.vessel.radius, rings)
 
 
@@ -73,7 +73,7 @@ def test_electrodes_lie_where_the_spans_say(n_electrodes, cover):
 
 @each_world
 def test_truth_is_finer_than_the_model(world):
-    """Other nodes, and more than three times as many, for the target; more than twice as many for the voltages."""
+    """The truth has over three times the transport nodes, all different, and over twice the EIT unknowns."""
     truth, model = both(world)
     assert truth.transport.mesh.n_nodes > 3 * model.transport.mesh.n_nodes
     assert truth.observation.cem.n_unknowns > 2 * model.observation.cem.n_unknowns
@@ -88,7 +88,7 @@ def test_truth_is_finer_than_the_model(world):
 
 @each_world
 def test_seed_decides_the_episode(world):
-    """Same seed, same bits, alone or beside others; another seed, another target and other noise."""
+    """Equal seeds give equal bits, alone or in a batch; another seed gives another target and noise."""
     one, other = episode(world, 7), episode(world, 8)
     together = list(simulate_batch(world, [8, 7], progress=False))
     for mine, theirs in ((one, together[1]), (other, together[0])):
@@ -174,7 +174,7 @@ def test_model_of_the_stirred_tank_has_no_ball_and_keeps_what_it_holds():
 
 
 def test_cylinders_stand_inside_apart_and_anywhere():
-    """Radii evenly from their ranges, walls apart by more than ``gap``, centres no further out than ``furthest``."""
+    """Radii are uniform in their ranges, gaps exceed ``min_gap``, centres are within ``max_centre_radius``."""
     cylinders, radius = STATIONARY.target, STATIONARY.vessel.radius
     drawn = [cylinders.draw(STATIONARY, flow_stream(seed)) for seed in range(300)]
     centres = np.array([[centre for centre, _ in pair] for pair in drawn])

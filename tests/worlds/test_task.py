@@ -18,13 +18,13 @@ from tiny_worlds import CHANGES, TINY
 
 
 def environment(**kwargs):
-    """The tiny world, to be played."""
+    """The tiny world."""
     return EstimationEnv("eitbench/Pipe2D-v0", world=CHANGES, **kwargs)
 
 
 @pytest.fixture(autouse=True)
 def cache(tmp_path, monkeypatch):
-    """A cache folder of its own for each test."""
+    """A separate cache folder for each test."""
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
     return tmp_path / "cache"
 
@@ -36,20 +36,20 @@ def test_says_what_the_world_says():
     np.testing.assert_array_equal(task.currents, TINY.currents)
     assert task.noise == TINY.noise
     assert task.prior == TINY.prior and task.vessel == TINY.vessel
-    # The rough level is no disguised truth: as an estimate it would beat the homogeneous one.
+    # The expected concentration must not reveal the truth: as an estimate it would beat the homogeneous one.
     assert PIPE_2D.expected_concentration != PIPE_2D.background
     assert task.mesh is task.transport.mesh and task.mesh.n_nodes == 1701
 
 
 @pytest.mark.parametrize(("lag", "steps"), [(0, 0), (2, 2), (np.int64(4), 4), ("all", 4)])
 def test_lag(lag, steps):
-    """A number of steps, or the whole record: then the first state is asked for after the last measurement."""
+    """``lag`` is a number of steps, or "all": the first state is requested after the last measurement."""
     assert make_task(TINY, lag).lag == steps
 
 
 @pytest.mark.parametrize("lag", [-1, 5, 1.5, True, None, "some", "2", ""])
 def test_wrong_lags(lag):
-    """What is no number of steps within the record is refused, with the range and what came."""
+    """Another lag than a number of steps within the episode is rejected, with the range and the value."""
     with pytest.raises(ValueError, match=r"lag must be .*integer.* 0 .* 4") as caught:
         make_task(TINY, lag)
     assert repr(lag) in str(caught.value)
@@ -114,7 +114,7 @@ def sizes(discretisation):
 
 
 def traces_of_truth(task, world):
-    """What in ``task`` tells of the truth: episodes, worlds, the fine discretisation, arrays of its size."""
+    """Return objects of ``task`` that reveal the truth: episodes, worlds, fine discretisations, large arrays."""
     truth = cached_truth_model(world)
     its_own = {id(thing) for thing in reachable(truth) if isinstance(thing, np.ndarray)}
     fine = sizes(truth)
