@@ -101,8 +101,8 @@ def describe_fit(path: np.ndarray, nearest: np.ndarray, is_round: bool) -> str:
         length = np.linalg.norm(nearest[1] - nearest[0])
         direction = (nearest[1] - nearest[0]) / length
         across = np.array([-direction[1], direction[0]])
-        return (f"{len(path)} frames, line of {length:.1f} cm at {abs(nearest[0] @ across):.1f} cm from "
-                f"the centre, RMS distance {_rms((path - nearest[0]) @ across):.1f} cm")
+        return (f"{len(path)} frames, line of {length:.1f} cm at {abs(nearest[0] @ across):.1f} cm "
+                f"from the centre, RMS distance {_rms((path - nearest[0]) @ across):.1f} cm")
     centre = nearest[:-1].mean(axis=0)
     radius = float(np.linalg.norm(nearest[0] - centre))
     distance = np.hypot(*(path - centre).T) - radius
