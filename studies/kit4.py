@@ -1,8 +1,8 @@
-"""Bodies in a real tank, beside where photographs have them: `python studies/kit4.py FOLDER`.
+"""Estimates and photographs of bodies in a real tank: `python studies/kit4.py FOLDER`.
 
 FOLDER holds KIT4's datamat_1_0.mat, datamat_2_3.mat, datamat_4_1.mat and datamat_4_4.mat (Hauptmann
-et al. 2017, doi:10.5281/zenodo.1203914). Prints by how much the estimates' bodies are off, and
-draws docs/kit4.png; half a minute.
+et al. 2017, doi:10.5281/zenodo.1203914). Prints centroid errors and draws docs/kit4.png; half a
+minute.
 """
 
 from __future__ import annotations
@@ -21,26 +21,24 @@ from eitbench.bench.playing import run_on_measurements
 from eitbench.envs.measured import MeasuredEnv, case_env
 
 ROOT = Path(__file__).parents[1]
-RADIUS = 14.0
-"""cm"""
-STEP = 0.1
-"""cm"""
+RADIUS_CM = 14.0
+PIXEL_CM = 0.1
 
 
 class Body(NamedTuple):
-    """As a photograph of the water's surface shows it, in cm; to about 2 mm."""
+    """A body in a photograph of the water surface, in cm, with an accuracy of about 2 mm."""
 
     outline: np.ndarray
     conducts: bool
 
     @property
-    def middle(self) -> np.ndarray:
-        """Of its outline."""
+    def centroid(self) -> np.ndarray:
+        """Mean of the points of the outline."""
         return self.outline.mean(axis=0)
 
 
 def round_body(x: float, y: float, radius: float, conducts: bool) -> Body:
-    """A ring or a disk."""
+    """Create a ring or a disk."""
     angle = np.linspace(0.0, 2.0 * np.pi, 60, endpoint=False)
     outline = np.stack([x + radius * np.cos(angle), y + radius * np.sin(angle)], axis=1)
     return Body(outline, conducts)
@@ -60,35 +58,36 @@ def main(folder: Path) -> None:
         env = case_env(name, folder / f"datamat_{number.replace('.', '_')}.mat")
         run = run_on_measurements(env, "log_map")
         estimate = np.log10(run.mean[-1] / env.task.expected_concentration)
-        off = [distance(env, estimate, body) for body in bodies]
-        print(f"{name}: bodies are off by {', '.join(f'{each:.1f}' for each in off)} cm; "
+        errors = [centroid_error(env, estimate, body) for body in bodies]
+        print(f"{name}: centroid errors {', '.join(f'{each:.1f}' for each in errors)} cm; "
               f"withheld RMSE {run.withheld_rmse:.1f} noise std", flush=True)
         draw(axes, env, estimate, bodies, name)
-    shown = figure.axes[-1].collections[0]
-    figure.colorbar(shown, ax=figure.axes, label="conductivity / background (decades)")
+    mappable = figure.axes[-1].collections[0]
+    figure.colorbar(mappable, ax=figure.axes, label="conductivity / background (decades)")
     save_figure(figure, ROOT / "docs" / "kit4.png")
 
 
-def distance(env: MeasuredEnv, estimate: np.ndarray, body: Body) -> float:
-    """cm from the body to the middle of where the estimate is more than half of its extreme."""
-    side = np.arange(-RADIUS, RADIUS + STEP, STEP)
+def centroid_error(env: MeasuredEnv, estimate: np.ndarray, body: Body) -> float:
+    """Return the distance in cm of the body from the centroid of the region where the estimate
+    exceeds half of its extreme near the body."""
+    side = np.arange(-RADIUS_CM, RADIUS_CM + PIXEL_CM, PIXEL_CM)
     x, y = np.meshgrid(side, side)
-    inside = np.hypot(x, y) < 0.99 * RADIUS
+    inside = np.hypot(x, y) < 0.99 * RADIUS_CM
     field = np.zeros_like(x)
     points = 1e-2 * np.stack([x[inside], y[inside]], axis=1)
     field[inside] = env.task.mesh.interpolation_to(points) @ estimate
     field *= 1.0 if body.conducts else -1.0
-    here = np.hypot(x - body.middle[0], y - body.middle[1]) < 2.0
-    parts, _ = label(field > 0.5 * field[here].max())
-    part = np.bincount(parts[here & (parts > 0)]).argmax()
-    row, column = center_of_mass(parts == part)
-    return float(np.hypot(side[0] + STEP * column - body.middle[0],
-                          side[0] + STEP * row - body.middle[1]))
+    near = np.hypot(x - body.centroid[0], y - body.centroid[1]) < 2.0
+    regions, _ = label(field > 0.5 * field[near].max())
+    region = np.bincount(regions[near & (regions > 0)]).argmax()
+    row, column = center_of_mass(regions == region)
+    return float(np.hypot(side[0] + PIXEL_CM * column - body.centroid[0],
+                          side[0] + PIXEL_CM * row - body.centroid[1]))
 
 
 def draw(axes: Axes, env: MeasuredEnv, estimate: np.ndarray, bodies: list[Body],
          title: str) -> None:
-    """The estimate, with the bodies' outlines."""
+    """Draw the estimate and the outlines of the bodies."""
     x, y = 100.0 * env.task.mesh.points.T
     axes.tripcolor(x, y, env.task.mesh.cells, estimate, shading="gouraud", cmap="RdBu_r",
                    vmin=-1.6, vmax=1.6)

@@ -1,1 +1,1 @@
-"""A world, a method and a score for eitbench, from outside."""
+"""Third-party package for eitbench with a world, a method and a score."""

@@ -1,6 +1,6 @@
-"""Bubble tracker: a Kalman filter whose estimate is cut off above.
+"""Bubble tracker: a Kalman filter whose estimate is clipped from above.
 
-A bubble conducts less than its liquid.
+A bubble conducts less than the liquid.
 """
 
 import numpy as np
@@ -10,6 +10,8 @@ from eitbench.estimation import CalibrationFrame, LinearisedForwardModel, nodal_
 
 
 class Estimator:
+    """Linearised Kalman filter with clipped estimates."""
+
     boards = ("filter",)
 
     def __init__(self, task: Task) -> None:
@@ -20,18 +22,18 @@ class Estimator:
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate:
         if self.filter is None:
             if self.first.add(voltages, currents):
-                self.start()
+                self.start_filter()
             return Estimate(self.first.mean)
-        return self.take_in(voltages, currents)
+        return self.assimilate(voltages, currents)
 
-    def start(self) -> None:
+    def start_filter(self) -> None:
         task = self.task
         self.filter = nodal_filter(task.transport, task.prior, self.first.c_ref)
         self.linear = LinearisedForwardModel(task.observation, task.noise, self.first.mean)
         for measurement in self.first.measurements:
-            self.take_in(*measurement)
+            self.assimilate(*measurement)
 
-    def take_in(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate:
+    def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate:
         self.filter.predict()
         self.filter.update(self.linear(voltages, currents))
         c = np.clip(self.filter.concentration, 0.0, 1.05 * self.first.c_ref)

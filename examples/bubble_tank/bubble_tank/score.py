@@ -1,4 +1,4 @@
-"""How far the estimated bubble is from the true one."""
+"""Score of the position of the bubble."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from eitbench.bench.scores import Outcome, Score, register_score
 from eitbench.scoring import deficit_centre
 
 
-def distance(outcome: Outcome) -> float | None:
-    """Mean distance in m; in worlds of others there is no bubble."""
+def mean_distance(outcome: Outcome) -> float | None:
+    """Return the mean distance of the estimated from the true bubble in m; None in other worlds."""
     if outcome.world.name != "BubbleTank":
         return None
     estimated, true = (
@@ -19,5 +19,5 @@ def distance(outcome: Outcome) -> float | None:
 
 
 register_score(Score(
-    "bubble_distance", "distance", "how far the bubble is from where the estimate has it, mm",
-    distance, needs=("mean", "truth"), factor=1e3))
+    "bubble_distance", "distance", "mean distance of the estimated from the true bubble, mm",
+    mean_distance, needs=("mean", "truth"), factor=1e3))

@@ -1,6 +1,6 @@
-"""A square tank with twelve electrodes, in which a bubble rises: two parts of our own.
+"""World of a bubble that rises in a square tank with twelve electrodes.
 
-All others are eitbench's.
+Vessel, target and pattern are defined here; the other parts are built-in.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from eitbench.worlds.schedule import Schedule
 
 @dataclass(frozen=True)
 class SquareTank:
-    """A flat square tank with three electrodes on each side, counter-clockwise; number 0 is the
-    first of the bottom."""
+    """A flat square tank with three electrodes on each side, numbered counter-clockwise from the
+    bottom left."""
 
     side: float = 0.20
     """m"""
@@ -50,7 +50,7 @@ class SquareTank:
         return rectangle_mesh(line, line), np.empty(0, dtype=int)
 
     def electrode_model(self, fine: bool):
-        """Electrodes begin and end at lines of the mesh, which are twelfths of the side."""
+        """Return the electrode model; electrodes end at multiples of side/12, on mesh lines."""
         from eitbench.numerics.mesh import rectangle_mesh
         from eitbench.physics.cem import CompleteElectrodeModel
         line = np.linspace(0.0, self.side, 49 if fine else 25)
@@ -58,7 +58,7 @@ class SquareTank:
         return CompleteElectrodeModel(mesh, self.electrodes(mesh), self.contact_impedance)
 
     def electrodes(self, mesh) -> list[np.ndarray]:
-        """Boundary facets of each electrode; a half of each third of a side."""
+        """Return the boundary facets of each electrode, the central half of a third of a side."""
         x, y = mesh.points.T
         tiny = 1e-9 * self.side
         around = [(np.abs(y) < tiny, x), (np.abs(x - self.side) < tiny, y),
@@ -66,20 +66,20 @@ class SquareTank:
         facets = []
         for wall, along in around:
             for third in range(3):
-                begin, end = (self.side * (third + part) / 3 for part in (0.25, 0.75))
-                inside = wall & (along > begin - tiny) & (along < end + tiny)
+                start, end = (self.side * (third + fraction) / 3 for fraction in (0.25, 0.75))
+                inside = wall & (along > start - tiny) & (along < end + tiny)
                 facets.append(mesh.facets_where(lambda points, inside=inside: inside))
         return facets
 
 
 @dataclass(frozen=True)
 class Bubble(Target):
-    """A bubble that rises along a wavy line; it hardly conducts."""
+    """A bubble of low conductivity that rises along a sinusoidal path."""
 
     background: float = 30.0
     """mol/m³"""
     concentration: float = 3.0
-    """mol/m³, of the bubble"""
+    """mol/m³ in the bubble"""
     radius: float = 0.025
     """m"""
     speed: float = 0.10
@@ -106,7 +106,7 @@ class Bubble(Target):
 
 @dataclass(frozen=True)
 class Opposite:
-    """Each electrode and the one six further on, ordered to come back to the same side soon."""
+    """Pairs of opposite electrodes, ordered so that successive pairs have different directions."""
 
     def __call__(self, vessel: SquareTank) -> np.ndarray:
         currents = np.zeros((6, vessel.n_electrodes))
@@ -123,8 +123,8 @@ BUBBLE_TANK = World(
     prior=Prior(nodal_std=0.1, initial_std=0.25, initial_length=0.02))
 
 ABOUT = """
-A bubble rises through a square tank of saline with twelve electrodes. Nobody knows how it moves:
-the estimators' model is a liquid at rest in which every node changes a little at every step.
+A bubble rises through a square tank of saline with twelve electrodes. Its motion is unknown to
+estimators: they assume a random walk of the concentration at each node, without flow.
 """
 
 register(BUBBLE_TANK, "bubbles/BubbleTank-v0", description=ABOUT)
