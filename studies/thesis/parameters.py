@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from eitbench.bench.methods import load_method
 from eitbench.envs.estimation import EstimationEnv
-from eitbench.envs.rendering import FIELD_MAP
+from eitbench.envs.rendering import FIELD_COLORMAP
 from eitbench.physics.transport import Transport
 from eitbench.worlds.task import Task
 from eitbench.worlds.world import World
@@ -134,7 +134,7 @@ def _heat_map(ax: Axes, errors: dict[Factors, float], up: str, across: str,
     """ẽ_c in colours and numbers; the table's own cell is framed. Returns the mappable."""
     values = 1e3 * np.array([[errors[Factors(**{up: a, across: b})] for b in FACTORS]
                              for a in FACTORS])
-    image = ax.imshow(values, origin="lower", cmap=FIELD_MAP, vmin=1e3 * scale[0],
+    image = ax.imshow(values, origin="lower", cmap=FIELD_COLORMAP, vmin=1e3 * scale[0],
                       vmax=1e3 * scale[1])
     for (row, column), value in np.ndenumerate(values):
         dark = value < 500 * sum(scale)

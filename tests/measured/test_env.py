@@ -53,7 +53,7 @@ def test_rewards_are_withheld_residuals(quick):
 def test_withheld_readings_are_never_shown(env, record):
     """They may have any value: the estimates stay bit-identical."""
     env.reset(seed=0)
-    hidden = env.hidden[record.injections]
+    hidden = env.withheld_mask[record.injections]
     assert 0.1 < hidden.mean() < 0.2
     changed = record.readings.copy()
     changed[hidden] += 1e-4
@@ -65,7 +65,7 @@ def test_withheld_readings_are_never_shown(env, record):
 
 def hidden_after(env, **how):
     env.reset(**how)
-    return env.unwrapped.hidden.copy()
+    return env.unwrapped.withheld_mask.copy()
 
 
 def test_seeds_draw_the_withheld_readings(quick):

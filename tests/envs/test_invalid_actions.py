@@ -3,7 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from estimating import BIASED, PIPE, UNKNOWN, make
+from estimation_envs import BIASED, PIPE, UNKNOWN, make
 
 OBSTACLE, SOLID = "eitbench/Pipe2DObstacle-v0", "eitbench/Pipe3D-v0"
 STIRRED, STILL = "eitbench/RotatingTank2D-v0", "eitbench/StationaryTank2D-v0"
