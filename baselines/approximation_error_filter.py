@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from eitbench import Estimate, Task
-from eitbench.estimation import FilterEstimator, inflow_filter, suiting_models, suiting_priors
+from eitbench.estimation import FilterEstimator, compatible_models, compatible_priors, inflow_filter
 
 HERE = Path(__file__).parent
 LINK = "logarithm"
@@ -20,15 +20,15 @@ class Estimator:
     boards = ("filter", "fixed-lag")
 
     def __init__(self, task: Task) -> None:
-        prior = suiting_priors(HERE / "priors", task, LINK)[0]
-        model = suiting_models(MODELS, task)[0]
+        prior = compatible_priors(HERE / "priors", task, LINK)[0]
+        model = compatible_models(MODELS, task)[0]
         self.estimator = FilterEstimator(
             task, lambda c_ref: inflow_filter(task, prior, c_ref, task.lag, model=model))
 
     @staticmethod
     def suits(task: Task) -> bool:
-        known_inlet = bool(suiting_priors(HERE / "priors", task, LINK))
-        return task.velocity is None and known_inlet and bool(suiting_models(MODELS, task))
+        known_inlet = bool(compatible_priors(HERE / "priors", task, LINK))
+        return task.velocity is None and known_inlet and bool(compatible_models(MODELS, task))
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
         return self.estimator.update(voltages, currents)

@@ -14,23 +14,23 @@ from eitbench.estimation import (
     Filter,
     FilterEstimator,
     LogStates,
-    RecordEstimator,
+    SmootherEstimator,
     SwitchingInflowFilter,
     VelocityInflowWindow,
-    about_prediction,
-    about_reference,
-    asked_flow,
+    compatible_models,
+    compatible_priors,
     inflow_filter,
+    linearise_at_prediction,
+    linearise_at_reference,
     map_inflow,
     nodal_states,
-    scaled_flow,
-    suiting_models,
-    suiting_priors,
+    scaled_velocity_prior,
+    task_velocity_prior,
     velocity_states,
 )
-from eitbench.estimation.inflow_prior import learned_in, nominal_worlds
+from eitbench.estimation.inflow_prior import nominal_worlds, source_world
 from eitbench.estimation.walk import RandomWalk
-from eitbench.physics.rest import AtRest
+from eitbench.physics.stationary import StationaryTransport
 
 HERE = Path(__file__).parent
 BOUNDS = (0.05, 4.0)
@@ -49,13 +49,13 @@ class Estimator:
         "bounds": list(BOUNDS), "window": WINDOW, "factor_std": FACTOR_STD, "level_std": LEVEL_STD}
 
     def __init__(self, task: Task) -> None:
-        prior = next(iter(suiting_priors(HERE / "priors", task, "logarithm")), None)
-        models = [model for model in suiting_models(HERE / "models", task)
-                  if learned_in(model.source) in nominal_worlds(task.world)]
+        prior = next(iter(compatible_priors(HERE / "priors", task, "logarithm")), None)
+        models = [model for model in compatible_models(HERE / "models", task)
+                  if source_world(model.source) in nominal_worlds(task.world)]
         model = models[0] if models else None
-        self.estimator: FilterEstimator | RecordEstimator
+        self.estimator: FilterEstimator | SmootherEstimator
         if prior is not None and task.velocity is None and task.lag == task.n_steps - 1:
-            self.estimator = RecordEstimator(task, lambda c_ref, record: map_inflow(
+            self.estimator = SmootherEstimator(task, lambda c_ref, record: map_inflow(
                 task, prior, c_ref, record, model=model))
         else:
             self.estimator = FilterEstimator(task, lambda c_ref: choose(task, c_ref, prior, model))
@@ -64,7 +64,7 @@ class Estimator:
     def suits(task: Task) -> bool:
         """Return whether present states are requested, or a prior allows to look back."""
         return not task.lag or (task.velocity is None
-                                and bool(suiting_priors(HERE / "priors", task, "logarithm")))
+                                and bool(compatible_priors(HERE / "priors", task, "logarithm")))
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
         return self.estimator.update(voltages, currents)
@@ -72,22 +72,22 @@ class Estimator:
 
 def choose(task: Task, c_ref: float, prior, model):
     """Return the filter at t = 0."""
-    extended = about_prediction(task)
-    if isinstance(task.transport, AtRest | RandomWalk):
+    extended = linearise_at_prediction(task)
+    if isinstance(task.transport, StationaryTransport | RandomWalk):
         return Filter(LogStates(nodal_states(task.transport, task.prior, 1.0), c_ref), extended)
     if prior is None and task.velocity is None:
         states = nodal_states(task.transport, task.prior, c_ref)
-        return Filter(states, about_reference(task, c_ref))
+        return Filter(states, linearise_at_reference(task, c_ref))
     if prior is None:
         return Filter(velocity_states(task, c_ref, BOUNDS), extended)
     if task.velocity is not None:
-        flow = asked_flow(task, BOUNDS)
+        flow = task_velocity_prior(task, BOUNDS)
         return Filter(VelocityInflowWindow(task, prior, c_ref, flow, WINDOW), extended)
     if model is not None:
         return inflow_filter(task, prior, c_ref, task.lag, model=model, iterated=True)
     if prior.regimes is not None and not task.lag:
         return SwitchingInflowFilter(task, prior, c_ref, LEVEL_STD, extended)
     if task.mesh.dim == 2 and not task.lag:
-        flow = scaled_flow(task, FACTOR_STD, 0.0)
+        flow = scaled_velocity_prior(task, FACTOR_STD, 0.0)
         return Filter(VelocityInflowWindow(task, prior, c_ref, flow, WINDOW), extended)
     return inflow_filter(task, prior, c_ref, task.lag)

@@ -13,10 +13,10 @@ from eitbench import Estimate, Task
 from eitbench.estimation import (
     EnsembleFilter,
     FilterEstimator,
-    about_prediction,
-    asked_flow,
-    scaled_flow,
-    suiting_priors,
+    compatible_priors,
+    linearise_at_prediction,
+    scaled_velocity_prior,
+    task_velocity_prior,
 )
 
 PRIORS = Path(__file__).with_name("priors")
@@ -36,17 +36,17 @@ class Estimator:
         "members": MEMBERS, "lead_in": LEAD_IN, "bounds": list(BOUNDS), "seed": SEED}
 
     def __init__(self, task: Task) -> None:
-        prior = suiting_priors(PRIORS, task, LINK)[0]
-        flow = (scaled_flow(task, 0.0, 0.0) if task.velocity is None
-                else asked_flow(task, BOUNDS))
+        prior = compatible_priors(PRIORS, task, LINK)[0]
+        flow = (scaled_velocity_prior(task, 0.0, 0.0) if task.velocity is None
+                else task_velocity_prior(task, BOUNDS))
         self.estimator = FilterEstimator(task, lambda c_ref: EnsembleFilter(
             task, prior, c_ref, flow, MEMBERS, LEAD_IN, np.random.default_rng(SEED),
-            about_prediction(task)))
+            linearise_at_prediction(task)))
 
     @staticmethod
     def suits(task: Task) -> bool:
         # a 3D inlet has more modes than an ensemble of this size can tell apart
-        return task.mesh.dim == 2 and bool(suiting_priors(PRIORS, task, LINK))
+        return task.mesh.dim == 2 and bool(compatible_priors(PRIORS, task, LINK))
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
         return self.estimator.update(voltages, currents)

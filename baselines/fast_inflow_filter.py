@@ -13,11 +13,11 @@ import numpy as np
 from eitbench import Estimate, Task
 from eitbench.estimation import (
     FilterEstimator,
-    ScaledVoltages,
+    ScaledVoltageModel,
+    compatible_priors,
     inflow_filter,
     reduced_response,
     steady_response,
-    suiting_priors,
 )
 
 PRIORS = Path(__file__).with_name("priors")
@@ -32,7 +32,7 @@ class Estimator:
     boards = ("filter",)
 
     def __init__(self, task: Task) -> None:
-        prior = suiting_priors(PRIORS, task, LINK)[0]
+        prior = compatible_priors(PRIORS, task, LINK)[0]
         response, fast = reduced(task.transport, task.observation, task.expected_concentration,
                                  prior)
         task = replace(task, observation=fast)
@@ -42,7 +42,7 @@ class Estimator:
     @staticmethod
     def suits(task: Task) -> bool:
         known_flow = task.velocity is None
-        return known_flow and bool(suiting_priors(PRIORS, task, LINK))
+        return known_flow and bool(compatible_priors(PRIORS, task, LINK))
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
         return self.estimator.update(voltages, currents)
@@ -52,4 +52,4 @@ class Estimator:
 def reduced(transport, observation, level, prior):
     """Made once for all episodes."""
     response = reduced_response(steady_response(transport), prior, MODES)
-    return response, ScaledVoltages(observation, level, response.basis[:, :BENT])
+    return response, ScaledVoltageModel(observation, level, response.basis[:, :BENT])

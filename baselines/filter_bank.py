@@ -11,7 +11,7 @@ from functools import lru_cache
 import numpy as np
 
 from eitbench import Estimate, Task
-from eitbench.estimation import FilterEstimator, about_reference, starting_filter
+from eitbench.estimation import FilterEstimator, linearise_at_reference, nodal_filter
 
 FACTORS = tuple(np.linspace(0.5, 1.5, 9).tolist())
 WINDOW = 16  # injections
@@ -38,8 +38,8 @@ class FilterBank:
     def __init__(self, task: Task, c_ref: float) -> None:
         assert task.velocity is not None
         self.nominal = np.array(task.velocity.nominal)
-        forward = about_reference(task, c_ref)
-        self.filters = [starting_filter(transport, task.prior, c_ref, forward)
+        forward = linearise_at_reference(task, c_ref)
+        self.filters = [nodal_filter(transport, task.prior, c_ref, forward)
                         for transport in transports(task.transport, task.velocity)]
         self.misfits: list[np.ndarray] = []
 

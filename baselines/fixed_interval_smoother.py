@@ -7,10 +7,10 @@ import numpy as np
 
 from eitbench import Estimate, Task
 from eitbench.estimation import (
-    LinearisedObservations,
-    RecordEstimator,
+    LinearisedForwardModel,
+    SmootherEstimator,
     fixed_interval_smoother,
-    table_5_1,
+    table_5_1_filter,
 )
 
 
@@ -19,13 +19,13 @@ class Estimator:
 
     def __init__(self, task: Task) -> None:
         self.task = task
-        self.estimator = RecordEstimator(task, self.smooth)
+        self.estimator = SmootherEstimator(task, self.smooth)
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
         return self.estimator.update(voltages, currents)
 
     def smooth(self, c_ref: float, record: Sequence[tuple[np.ndarray, np.ndarray]]):
         task = self.task
-        start = table_5_1(task.transport, task.prior, c_ref)
-        linear = LinearisedObservations(task.observation, task.noise, start.mean)
+        start = table_5_1_filter(task.transport, task.prior, c_ref)
+        linear = LinearisedForwardModel(task.observation, task.noise, start.mean)
         return fixed_interval_smoother(start, [linear(*measurement) for measurement in record])

@@ -6,9 +6,9 @@ from eitbench import Estimate, Task
 from eitbench.estimation import (
     FilterEstimator,
     Step,
-    about_reference,
-    smoothed_state,
-    starting_filter,
+    linearise_at_reference,
+    nodal_filter,
+    smooth_state,
 )
 
 
@@ -27,8 +27,8 @@ class FixedLagSmoother:
 
     def __init__(self, task: Task, c_ref: float) -> None:
         self.lag = task.lag
-        self.filter = starting_filter(task.transport, task.prior, c_ref,
-                                      about_reference(task, c_ref))
+        self.filter = nodal_filter(task.transport, task.prior, c_ref,
+                                      linearise_at_reference(task, c_ref))
         self.steps: list[Step] = []
 
     def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> None:
@@ -36,4 +36,4 @@ class FixedLagSmoother:
         self.steps = [*self.steps[-self.lag:], step]
 
     def estimate(self, lag: int = 0) -> Estimate:
-        return smoothed_state(self.filter, self.steps[-lag - 1:])
+        return smooth_state(self.filter, self.steps[-lag - 1:])

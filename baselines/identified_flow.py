@@ -12,11 +12,11 @@ import numpy as np
 from eitbench import Estimate, Task
 from eitbench.estimation import (
     FilterEstimator,
-    RecordEstimator,
+    SmootherEstimator,
+    compatible_models,
+    compatible_priors,
     inflow_filter,
     map_inflow,
-    suiting_models,
-    suiting_priors,
 )
 
 HERE = Path(__file__).parent
@@ -26,11 +26,11 @@ class Estimator:
     boards = ("filter", "fixed-lag", "smoothing")
 
     def __init__(self, task: Task) -> None:
-        prior = suiting_priors(HERE / "priors", task, "logarithm")[0]
-        model = suiting_models(HERE / "models", task)[0]
-        self.estimator: FilterEstimator | RecordEstimator
+        prior = compatible_priors(HERE / "priors", task, "logarithm")[0]
+        model = compatible_models(HERE / "models", task)[0]
+        self.estimator: FilterEstimator | SmootherEstimator
         if task.lag == task.n_steps - 1:
-            self.estimator = RecordEstimator(task, lambda c_ref, record: map_inflow(
+            self.estimator = SmootherEstimator(task, lambda c_ref, record: map_inflow(
                 task, prior, c_ref, record, model=model))
         else:
             self.estimator = FilterEstimator(task, lambda c_ref: inflow_filter(
@@ -38,8 +38,9 @@ class Estimator:
 
     @staticmethod
     def suits(task: Task) -> bool:
-        known_inlet = bool(suiting_priors(HERE / "priors", task, "logarithm"))
-        return task.velocity is None and known_inlet and bool(suiting_models(HERE / "models", task))
+        known_inlet = bool(compatible_priors(HERE / "priors", task, "logarithm"))
+        known_flow = bool(compatible_models(HERE / "models", task))
+        return task.velocity is None and known_inlet and known_flow
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
         return self.estimator.update(voltages, currents)

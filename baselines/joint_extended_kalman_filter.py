@@ -8,7 +8,7 @@ and an estimate that runs away returns.
 import numpy as np
 
 from eitbench import Estimate, Task
-from eitbench.estimation import Filter, FilterEstimator, about_prediction, velocity_states
+from eitbench.estimation import Filter, FilterEstimator, linearise_at_prediction, velocity_states
 
 BOUNDS = (0.05, 4.0)
 
@@ -19,7 +19,7 @@ class Estimator:
 
     def __init__(self, task: Task) -> None:
         self.estimator = FilterEstimator(task, lambda c_ref: Filter(
-            velocity_states(task, c_ref, BOUNDS), about_prediction(task)))
+            velocity_states(task, c_ref, BOUNDS), linearise_at_prediction(task)))
 
     @staticmethod
     def suits(task: Task) -> bool:

@@ -13,10 +13,10 @@ from eitbench.estimation import (
     Filter,
     FilterEstimator,
     VelocityInflowWindow,
-    about_prediction,
-    asked_flow,
-    scaled_flow,
-    suiting_priors,
+    compatible_priors,
+    linearise_at_prediction,
+    scaled_velocity_prior,
+    task_velocity_prior,
 )
 
 PRIORS = Path(__file__).with_name("priors")
@@ -37,16 +37,16 @@ class Estimator:
         "factor_walk": FACTOR_WALK}
 
     def __init__(self, task: Task) -> None:
-        prior = suiting_priors(PRIORS, task, LINK)[0]
-        flow = (scaled_flow(task, FACTOR_STD, FACTOR_WALK) if task.velocity is None
-                else asked_flow(task, BOUNDS))
+        prior = compatible_priors(PRIORS, task, LINK)[0]
+        flow = (scaled_velocity_prior(task, FACTOR_STD, FACTOR_WALK) if task.velocity is None
+                else task_velocity_prior(task, BOUNDS))
         self.estimator = FilterEstimator(task, lambda c_ref: Filter(
-            VelocityInflowWindow(task, prior, c_ref, flow, WINDOW), about_prediction(task)))
+            VelocityInflowWindow(task, prior, c_ref, flow, WINDOW), linearise_at_prediction(task)))
 
     @staticmethod
     def suits(task: Task) -> bool:
         # a 3D inlet has four times the nodes, whose traces all have to be carried along
-        return task.mesh.dim == 2 and bool(suiting_priors(PRIORS, task, LINK))
+        return task.mesh.dim == 2 and bool(compatible_priors(PRIORS, task, LINK))
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
         return self.estimator.update(voltages, currents)

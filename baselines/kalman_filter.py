@@ -4,15 +4,15 @@ Table 5.1."""
 import numpy as np
 
 from eitbench import Estimate, Task
-from eitbench.estimation import FilterEstimator, about_reference, starting_filter
+from eitbench.estimation import FilterEstimator, linearise_at_reference, nodal_filter
 
 
 class Estimator:
     boards = ("filter",)
 
     def __init__(self, task: Task) -> None:
-        self.estimator = FilterEstimator(task, lambda c_ref: starting_filter(
-            task.transport, task.prior, c_ref, about_reference(task, c_ref)))
+        self.estimator = FilterEstimator(task, lambda c_ref: nodal_filter(
+            task.transport, task.prior, c_ref, linearise_at_reference(task, c_ref)))
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
         return self.estimator.update(voltages, currents)

@@ -12,11 +12,11 @@ import numpy as np
 
 from eitbench import Estimate, Task
 from eitbench.estimation import (
-    FilterSeen,
-    corrected_estimator,
+    FilterFeatures,
+    compatible_priors,
     load_network,
-    network_suits,
-    suiting_priors,
+    network_estimator,
+    network_matches_task,
 )
 
 HERE = Path(__file__).parent
@@ -30,17 +30,17 @@ class Estimator:
 
     def __init__(self, task: Task) -> None:
         network = load_network(HERE / NETWORK)
-        prior = suiting_priors(HERE / "priors", task, "logarithm")[0]
-        self.estimator = corrected_estimator(
+        prior = compatible_priors(HERE / "priors", task, "logarithm")[0]
+        self.estimator = network_estimator(
             task, network,
-            lambda level: FilterSeen(task, prior, level, network["basis"], LAG))
+            lambda level: FilterFeatures(task, prior, level, network["basis"], LAG))
 
     @staticmethod
     def suits(task: Task) -> bool:
         """Only the task that it was trained for: that lag, that vessel, those injections, that
         model of the flow."""
-        known_inlet = bool(suiting_priors(HERE / "priors", task, "logarithm"))
-        return task.lag == LAG and known_inlet and network_suits(HERE / NETWORK, task)
+        known_inlet = bool(compatible_priors(HERE / "priors", task, "logarithm"))
+        return task.lag == LAG and known_inlet and network_matches_task(HERE / NETWORK, task)
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
         return self.estimator.update(voltages, currents)

@@ -11,12 +11,12 @@ import numpy as np
 
 from eitbench import Estimate, Task
 from eitbench.estimation import (
-    FilterSeen,
-    corrected_estimator,
+    FilterFeatures,
+    compatible_models,
+    compatible_priors,
     load_network,
-    network_suits,
-    suiting_models,
-    suiting_priors,
+    network_estimator,
+    network_matches_task,
 )
 
 HERE = Path(__file__).parent
@@ -29,19 +29,19 @@ class Estimator:
 
     def __init__(self, task: Task) -> None:
         network = load_network(HERE / NETWORK)
-        prior = suiting_priors(HERE / "priors", task, "logarithm")[0]
-        model = suiting_models(HERE / "models", task)[0]
-        self.estimator = corrected_estimator(
+        prior = compatible_priors(HERE / "priors", task, "logarithm")[0]
+        model = compatible_models(HERE / "models", task)[0]
+        self.estimator = network_estimator(
             task, network,
-            lambda level: FilterSeen(task, prior, level, network["basis"], model=model))
+            lambda level: FilterFeatures(task, prior, level, network["basis"], model=model))
 
     @staticmethod
     def suits(task: Task) -> bool:
         """Only the task that it was trained for: that vessel, those injections, that model of the
         flow."""
-        known = (suiting_priors(HERE / "priors", task, "logarithm")
-                 and suiting_models(HERE / "models", task))
-        return bool(known) and network_suits(HERE / NETWORK, task)
+        known = (compatible_priors(HERE / "priors", task, "logarithm")
+                 and compatible_models(HERE / "models", task))
+        return bool(known) and network_matches_task(HERE / NETWORK, task)
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
         return self.estimator.update(voltages, currents)

@@ -14,14 +14,14 @@ import numpy as np
 
 from eitbench import Estimate, Task
 from eitbench.estimation import (
-    FilterSeen,
-    RecordEstimator,
-    blank,
-    corrected,
+    FilterFeatures,
+    SmootherEstimator,
+    apply_correction,
+    compatible_priors,
+    gru_step,
+    initial_hidden_state,
     load_network,
-    network_suits,
-    remember,
-    suiting_priors,
+    network_matches_task,
 )
 
 HERE = Path(__file__).parent
@@ -37,34 +37,34 @@ class Estimator:
     def __init__(self, task: Task) -> None:
         self.task = task
         self.network = load_network(HERE / NETWORK)
-        self.estimator = RecordEstimator(task, self.read)
+        self.estimator = SmootherEstimator(task, self.read)
 
     @staticmethod
     def suits(task: Task) -> bool:
         """Only the task that it was trained for: that vessel, those injections, that model of the
         flow."""
-        known_inlet = bool(suiting_priors(HERE / "priors", task, "logarithm"))
+        known_inlet = bool(compatible_priors(HERE / "priors", task, "logarithm"))
         long_enough = task.n_steps > LAG
-        return long_enough and known_inlet and network_suits(HERE / NETWORK, task)
+        return long_enough and known_inlet and network_matches_task(HERE / NETWORK, task)
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
         return self.estimator.update(voltages, currents)
 
     def read(self, c_ref: float, record) -> list[Estimate]:
-        """Return the corrected states of a whole record."""
-        prior = suiting_priors(HERE / "priors", self.task, "logarithm")[0]
-        see = FilterSeen(self.task, prior, c_ref, self.network["basis"], LAG)
+        """Return the corrected states of a whole measurement sequence."""
+        prior = compatible_priors(HERE / "priors", self.task, "logarithm")[0]
+        see = FilterFeatures(self.task, prior, c_ref, self.network["basis"], LAG)
         seen, (reduced,) = see.record(record, LAG)
         inputs = np.concatenate([seen, reduced], axis=1)
         forward = list(self.memories(inputs, ""))
         backward = list(self.memories(inputs[::-1], "backward_"))
         memories = np.concatenate([forward, backward[::-1]], axis=1)
-        return [corrected(self.network, c_ref, *each)
+        return [apply_correction(self.network, c_ref, *each)
                 for each in zip(reduced, inputs, memories, strict=True)]
 
     def memories(self, inputs: np.ndarray, way: str) -> Iterator[np.ndarray]:
         """(h,) of each step."""
-        memory = blank(self.network)
+        memory = initial_hidden_state(self.network)
         for seen in inputs:
-            memory = remember(self.network, seen, memory, way)
+            memory = gru_step(self.network, seen, memory, way)
             yield memory

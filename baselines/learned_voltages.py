@@ -12,10 +12,10 @@ import numpy as np
 
 from eitbench import Estimate, Task
 from eitbench.estimation import (
-    VoltagesSeen,
-    corrected_estimator,
+    VoltageFeatures,
     load_network,
-    network_suits,
+    network_estimator,
+    network_matches_task,
 )
 
 HERE = Path(__file__).parent
@@ -28,13 +28,13 @@ class Estimator:
 
     def __init__(self, task: Task) -> None:
         network = load_network(HERE / NETWORK)
-        self.estimator = corrected_estimator(
-            task, network, lambda level: VoltagesSeen(task, level, network["basis"]))
+        self.estimator = network_estimator(
+            task, network, lambda level: VoltageFeatures(task, level, network["basis"]))
 
     @staticmethod
     def suits(task: Task) -> bool:
         """Only the task that it was trained for: that vessel, and those injections."""
-        return network_suits(HERE / NETWORK, task)
+        return network_matches_task(HERE / NETWORK, task)
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
         return self.estimator.update(voltages, currents)

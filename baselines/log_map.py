@@ -9,8 +9,8 @@ gives the concentration in parts of the best homogeneous estimate.
 import numpy as np
 
 from eitbench import Estimate, Task
-from eitbench.estimation import FirstFrame, gauss_newton, initial_covariance
-from eitbench.physics.rest import AtRest
+from eitbench.estimation import CalibrationFrame, gauss_newton, initial_covariance
+from eitbench.physics.stationary import StationaryTransport
 
 
 class Estimator:
@@ -18,12 +18,12 @@ class Estimator:
 
     def __init__(self, task: Task) -> None:
         self.task = task
-        self.first = FirstFrame(task)
+        self.first = CalibrationFrame(task)
         self.measurements: list[tuple[np.ndarray, np.ndarray]] = []
 
     @staticmethod
     def suits(task: Task) -> bool:
-        return isinstance(task.transport, AtRest)
+        return isinstance(task.transport, StationaryTransport)
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate:
         task = self.task
@@ -34,12 +34,12 @@ class Estimator:
             self.penalty = np.linalg.inv(initial_covariance(task.mesh, task.prior))
             self.logarithm = np.zeros(task.mesh.n_nodes)
         V, I = (np.array(part) for part in zip(*self.measurements, strict=True))
-        model = OfLogarithm(task.observation, self.first.c_bh)
+        model = LogConcentrationModel(task.observation, self.first.c_ref)
         self.logarithm = gauss_newton(model, V, I, task.noise.std(V), self.penalty, self.logarithm)
-        return Estimate(self.first.c_bh * np.exp(self.logarithm))
+        return Estimate(self.first.c_ref * np.exp(self.logarithm))
 
 
-class OfLogarithm:
+class LogConcentrationModel:
     """Voltages by u = ln(c/ĉ_bh)."""
 
     def __init__(self, observation, level: float) -> None:

@@ -12,11 +12,11 @@ from eitbench.estimation import (
     Filter,
     FilterEstimator,
     LogStates,
-    about_prediction,
+    linearise_at_prediction,
     modal_states,
 )
-from eitbench.estimation.walk import RandomWalk, smooth_modes, steady
-from eitbench.physics.rest import AtRest
+from eitbench.estimation.walk import RandomWalk, matern32_transition, matern_modes
+from eitbench.physics.stationary import StationaryTransport
 
 
 class Estimator:
@@ -24,16 +24,16 @@ class Estimator:
 
     def __init__(self, task: Task) -> None:
         transport = task.transport
-        rate = transport.rate if isinstance(transport, RandomWalk) else 0.0
-        modes = smooth_modes(task.mesh, task.prior.initial_length)
+        rate = transport.matern_rate if isinstance(transport, RandomWalk) else 0.0
+        modes = matern_modes(task.mesh, task.prior.initial_length)
         states = modal_states(modes.shape[1], task.prior.initial_std,
-                              lambda time: steady(rate * transport.time_step))
+                              lambda time: matern32_transition(rate * transport.time_step))
         self.estimator = FilterEstimator(task, lambda c_ref: Filter(
-            LogStates(states, c_ref, modes), about_prediction(task)))
+            LogStates(states, c_ref, modes), linearise_at_prediction(task)))
 
     @staticmethod
     def suits(task: Task) -> bool:
-        return isinstance(task.transport, AtRest | RandomWalk)
+        return isinstance(task.transport, StationaryTransport | RandomWalk)
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
         return self.estimator.update(voltages, currents)

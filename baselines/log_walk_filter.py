@@ -12,11 +12,11 @@ from eitbench.estimation import (
     Filter,
     FilterEstimator,
     LogStates,
-    about_prediction,
+    linearise_at_prediction,
     nodal_states,
 )
 from eitbench.estimation.walk import RandomWalk
-from eitbench.physics.rest import AtRest
+from eitbench.physics.stationary import StationaryTransport
 
 
 class Estimator:
@@ -25,11 +25,11 @@ class Estimator:
     def __init__(self, task: Task) -> None:
         states = nodal_states(task.transport, task.prior, 1.0)
         self.estimator = FilterEstimator(task, lambda c_ref: Filter(
-            LogStates(states, c_ref), about_prediction(task)))
+            LogStates(states, c_ref), linearise_at_prediction(task)))
 
     @staticmethod
     def suits(task: Task) -> bool:
-        return isinstance(task.transport, AtRest | RandomWalk)
+        return isinstance(task.transport, StationaryTransport | RandomWalk)
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
         return self.estimator.update(voltages, currents)

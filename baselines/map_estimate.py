@@ -8,8 +8,8 @@ For targets that stand still: what the linearised filter approximates, and is to
 import numpy as np
 
 from eitbench import Estimate, Task
-from eitbench.estimation import FirstFrame, gauss_newton, initial_covariance
-from eitbench.physics.rest import AtRest
+from eitbench.estimation import CalibrationFrame, gauss_newton, initial_covariance
+from eitbench.physics.stationary import StationaryTransport
 
 
 class Estimator:
@@ -17,12 +17,12 @@ class Estimator:
 
     def __init__(self, task: Task) -> None:
         self.task = task
-        self.first = FirstFrame(task)
+        self.first = CalibrationFrame(task)
         self.measurements: list[tuple[np.ndarray, np.ndarray]] = []
 
     @staticmethod
     def suits(task: Task) -> bool:
-        return isinstance(task.transport, AtRest)
+        return isinstance(task.transport, StationaryTransport)
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate:
         task = self.task
@@ -30,16 +30,16 @@ class Estimator:
         if not self.first.complete:
             if not self.first.add(voltages, currents):
                 return Estimate(self.first.mean)
-            covariance = self.first.c_bh**2 * initial_covariance(task.mesh, task.prior)
+            covariance = self.first.c_ref**2 * initial_covariance(task.mesh, task.prior)
             self.penalty = np.linalg.inv(covariance)
             self.deviation = np.zeros(task.mesh.n_nodes)
         V, I = (np.array(part) for part in zip(*self.measurements, strict=True))
-        model = Deviations(task.observation, self.first.mean)
+        model = DeviationModel(task.observation, self.first.mean)
         self.deviation = gauss_newton(model, V, I, task.noise.std(V), self.penalty, self.deviation)
         return Estimate(self.first.mean + self.deviation)
 
 
-class Deviations:
+class DeviationModel:
     """Voltages by the deviation from the prior's mean: `gauss_newton` draws towards zero."""
 
     def __init__(self, observation, mean: np.ndarray) -> None:

@@ -10,8 +10,8 @@ from eitbench import Estimate, Task
 from eitbench.estimation import (
     FilterEstimator,
     ParticleInflowFilter,
-    about_prediction,
-    suiting_priors,
+    compatible_priors,
+    linearise_at_prediction,
 )
 
 PRIORS = Path(__file__).with_name("priors")
@@ -28,14 +28,14 @@ class Estimator:
     parameters = {"level_std": LEVEL_STD, "particles": PARTICLES, "seed": SEED}  # noqa: RUF012
 
     def __init__(self, task: Task) -> None:
-        prior = suiting_priors(PRIORS, task, LINK)[0]
+        prior = compatible_priors(PRIORS, task, LINK)[0]
         self.estimator = FilterEstimator(task, lambda c_ref: ParticleInflowFilter(
-            task, prior, c_ref, LEVEL_STD, about_prediction(task), PARTICLES,
+            task, prior, c_ref, LEVEL_STD, linearise_at_prediction(task), PARTICLES,
             np.random.default_rng(SEED)))
 
     @staticmethod
     def suits(task: Task) -> bool:
-        priors = suiting_priors(PRIORS, task, LINK)
+        priors = compatible_priors(PRIORS, task, LINK)
         return task.velocity is None and bool(priors) and priors[0].regimes is not None
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:

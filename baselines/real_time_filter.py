@@ -15,10 +15,10 @@ from eitbench import Estimate, Task
 from eitbench.estimation import (
     FilterEstimator,
     IdentifiedModel,
-    QuadraticVoltages,
+    QuadraticVoltageModel,
+    compatible_models,
+    compatible_priors,
     inflow_filter,
-    suiting_models,
-    suiting_priors,
 )
 
 HERE = Path(__file__).parent
@@ -28,16 +28,17 @@ class Estimator:
     boards = ("filter",)
 
     def __init__(self, task: Task) -> None:
-        prior = suiting_priors(HERE / "priors", task, "logarithm")[0]
-        model = suiting_models(HERE / "models", task)[0]
+        prior = compatible_priors(HERE / "priors", task, "logarithm")[0]
+        model = compatible_models(HERE / "models", task)[0]
         task = replace(task, observation=quadratic(task.observation, model))
         self.estimator = FilterEstimator(
             task, lambda c_ref: inflow_filter(task, prior, c_ref, model=model))
 
     @staticmethod
     def suits(task: Task) -> bool:
-        known_inlet = bool(suiting_priors(HERE / "priors", task, "logarithm"))
-        return task.velocity is None and known_inlet and bool(suiting_models(HERE / "models", task))
+        known_inlet = bool(compatible_priors(HERE / "priors", task, "logarithm"))
+        known_flow = bool(compatible_models(HERE / "models", task))
+        return task.velocity is None and known_inlet and known_flow
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
         return self.estimator.update(voltages, currents)
@@ -46,4 +47,4 @@ class Estimator:
 @lru_cache(maxsize=2)
 def quadratic(observation, model: IdentifiedModel):
     """Made once for all episodes."""
-    return QuadraticVoltages(observation, model.level, model.basis)
+    return QuadraticVoltageModel(observation, model.c_ref, model.basis)

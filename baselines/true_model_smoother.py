@@ -15,19 +15,19 @@ import numpy as np
 
 from eitbench import Estimate, Task
 from eitbench.estimation import (
+    CalibrationFrame,
     DenseCovariance,
     Filter,
-    FirstFrame,
-    LinearisedObservations,
+    LinearisedForwardModel,
     Motion,
     NodalStates,
-    changing_responses,
+    compatible_priors,
     initial_covariance,
     map_inflow,
-    smoothed_means,
-    starting_filter,
+    nodal_filter,
+    smooth_means,
     steady_response,
-    suiting_priors,
+    time_varying_responses,
 )
 
 PRIORS = Path(__file__).with_name("priors")
@@ -40,12 +40,12 @@ class Estimator:
 
     def __init__(self, task: Task, revealed) -> None:
         self.record = list(zip(revealed.voltages, revealed.currents, strict=True))
-        self.first = FirstFrame(task)
+        self.first = CalibrationFrame(task)
         for measurement in self.record[:self.first.length]:
             self.first.add(*measurement)
         flow = revealed.transport(1)
         steady = all(revealed.transport(t) is flow for t in range(1, task.n_steps + 1))
-        prior = next(iter(suiting_priors(PRIORS, task, "logarithm")), None)
+        prior = next(iter(compatible_priors(PRIORS, task, "logarithm")), None)
         self.means = (self.from_states(task, revealed, steady) if prior is None
                       else self.from_inflows(task, revealed, steady, prior))
         self.velocities = ([None] * task.n_steps if task.velocity is None
@@ -54,15 +54,15 @@ class Estimator:
 
     def from_inflows(self, task: Task, revealed, steady: bool, prior) -> np.ndarray:
         responses = ([steady_response(revealed.transport(1))] if steady
-                     else changing_responses(revealed.transport, task.n_steps))
-        states = map_inflow(task, prior, self.first.c_bh, self.record, responses)
+                     else time_varying_responses(revealed.transport, task.n_steps))
+        states = map_inflow(task, prior, self.first.c_ref, self.record, responses)
         return np.array([state.mean for state in states])
 
     def from_states(self, task: Task, revealed, steady: bool) -> np.ndarray:
-        start = (starting_filter(revealed.transport(1), task.prior, self.first.c_bh) if steady
-                 else Filter(changing_states(task, revealed.transport, self.first.c_bh)))
-        observations = LinearisedObservations(task.observation, task.noise, self.first.mean)
-        return smoothed_means(start, [observations(*measurement) for measurement in self.record])
+        start = (nodal_filter(revealed.transport(1), task.prior, self.first.c_ref) if steady
+                 else Filter(changing_states(task, revealed.transport, self.first.c_ref)))
+        observations = LinearisedForwardModel(task.observation, task.noise, self.first.mean)
+        return smooth_means(start, [observations(*measurement) for measurement in self.record])
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
         self.t += 1

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from eitbench import Estimate, Task
-from eitbench.estimation import FilterEstimator, InflowWindow, UnscentedFilter, suiting_priors
+from eitbench.estimation import FilterEstimator, InflowWindow, UnscentedFilter, compatible_priors
 
 PRIORS = Path(__file__).with_name("priors")
 LINK = "logarithm"
@@ -20,7 +20,7 @@ class Estimator:
     parameters = {"axes": AXES}  # noqa: RUF012 (as a record has it)
 
     def __init__(self, task: Task) -> None:
-        prior = suiting_priors(PRIORS, task, LINK)[0]
+        prior = compatible_priors(PRIORS, task, LINK)[0]
 
         def start(c_ref: float) -> UnscentedFilter:
             space = InflowWindow(task, prior, c_ref)
@@ -33,7 +33,7 @@ class Estimator:
     def suits(task: Task) -> bool:
         # in 3D the forward solutions of one step take seconds
         known_flow = task.velocity is None and task.mesh.dim == 2
-        return known_flow and bool(suiting_priors(PRIORS, task, LINK))
+        return known_flow and bool(compatible_priors(PRIORS, task, LINK))
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate | None:
         return self.estimator.update(voltages, currents)

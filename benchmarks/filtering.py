@@ -22,19 +22,19 @@ from eitbench.bench.methods import load_method
 from eitbench.estimation import (
     DenseCovariance,
     Filter,
+    ImpulseResponse,
     InflowPrior,
     InflowWindow,
+    LinearMeasurement,
     LowRankCovariance,
     Motion,
     NodalStates,
-    Observation,
     OpenLoopCovariance,
-    Response,
     fixed_interval_smoother,
     kalman_filter,
-    smoothed_means,
+    smooth_means,
 )
-from eitbench.estimation.inflow_response import newest_inflow
+from eitbench.estimation.inflow_response import one_step_response
 from eitbench.estimation.reduced import reduced_model
 from eitbench.numerics.fem import mass_matrix
 from eitbench.worlds.catalogue import PIPE_2D
@@ -206,7 +206,8 @@ def step_seconds(filter_: Filter, n: int, m: int) -> float:
     """Seconds of the fastest of `STEPS` predictions and updates after `WARM_UP`."""
     rng, times = np.random.default_rng(0), []
     for _ in range(WARM_UP + STEPS):
-        seen = Observation(rng.random((m, n)) / n, 30.0 + 0.3 * rng.normal(size=m), np.full(m, 0.1))
+        seen = LinearMeasurement(rng.random((m, n)) / n, 30.0 + 0.3 * rng.normal(size=m),
+                                 np.full(m, 0.1))
         begin = time.perf_counter()
         filter_.predict()
         filter_.update(seen)
@@ -229,14 +230,14 @@ def window(transport, modes: int) -> Filter:
     points = transport.mesh.points[transport.inlet]
     across = np.arange(len(points))[:, None] / (len(points) - 1)
     E = 0.1 * np.cos(np.pi * across * np.arange(modes))
-    parts = [newest_inflow(transport)]
+    parts = [one_step_response(transport)]
     while len(parts) < MEMORY:
         parts.append(transport.step(parts[-1], parts[-1][transport.inlet], 0.0))
     reach = np.concatenate([part @ E for part in parts], axis=1)
     squares, right = np.linalg.eigh(reach.T @ reach)
     keep = squares > 1e-6 * squares[-1]
     basis = reach @ (right[:, keep] / np.sqrt(squares[keep]))
-    response = Response(basis, np.stack([basis.T @ part for part in parts], axis=1))
+    response = ImpulseResponse(basis, np.stack([basis.T @ part for part in parts], axis=1))
     prior = InflowPrior("logarithm", points, E, 0.9**np.arange(6)**2, transport.time_step)
     task = replace(make_task(PIPE_2D), transport=transport)
     return Filter(InflowWindow(task, prior, PIPE_2D.expected_concentration, responses=[response]))
@@ -265,8 +266,8 @@ def goals() -> Iterator[Row]:
     projected = [seen._replace(matrix=seen.matrix @ basis, value=seen.value - seen.matrix @ level)
                  for seen in record.observations]
     for what, smooth, start, seen in (
-            (f"means, {REDUCED} reduced coordinates", smoothed_means, few, projected),
-            ("means, n = 1701", smoothed_means, record.start, record.observations),
+            (f"means, {REDUCED} reduced coordinates", smooth_means, few, projected),
+            ("means, n = 1701", smooth_means, record.start, record.observations),
             ("variances, n = 1701", fixed_interval_smoother, record.start, record.observations)):
         begin = time.perf_counter()
         smooth(copy.copy(start), seen)

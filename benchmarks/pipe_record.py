@@ -7,7 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from eitbench.estimation import Filter, LinearisedObservations, Motion, Observation, table_5_1
+from eitbench.estimation import (
+    Filter,
+    LinearisedForwardModel,
+    LinearMeasurement,
+    Motion,
+    table_5_1_filter,
+)
 from eitbench.numerics.mesh import rectangle_mesh
 from eitbench.physics.observation import ObservationModel
 from eitbench.physics.transport import ConvectionDiffusion
@@ -26,7 +32,7 @@ class Problem:
     """at t = 0"""
     noise: np.ndarray
     """(n, n) Γ_w"""
-    observations: list[Observation]
+    observations: list[LinearMeasurement]
 
     @property
     def n(self) -> int:
@@ -42,18 +48,18 @@ def problem(cells: tuple[int, int], steps: int = WARM_UP + STEPS) -> Problem:
     transport, seen = pipe_model(cells)
     level = PIPE_2D.expected_concentration
     evolution = transport.evolution_model()
-    start = table_5_1(transport, PIPE_2D.prior, level, rank_tolerance=1e-6)
+    start = table_5_1_filter(transport, PIPE_2D.prior, level, rank_tolerance=1e-6)
     rng = np.random.default_rng(0)
     inflow = PIPE_2D.target.draw_inflow(PIPE_2D, rng)
     at_inlet = transport.mesh.points[transport.inlet]
-    linearised = LinearisedObservations(seen, PIPE_2D.noise, start.mean)
+    linearised = LinearisedForwardModel(seen, PIPE_2D.noise, start.mean)
     state = np.full(len(start.mean), PIPE_2D.background)
     observations = []
     currents = PIPE_2D.currents
     for t in range(steps):
         state = evolution.F @ state + evolution.Y @ inflow(at_inlet, t * PIPE_2D.time_step)
         H, _, variance, _ = linearised(np.zeros(16), currents[t % len(currents)])
-        observations.append(Observation(H, H @ state + np.sqrt(variance)
+        observations.append(LinearMeasurement(H, H @ state + np.sqrt(variance)
                                         * rng.standard_normal(len(H)), variance))
     noise = level**2 * evolution.state_noise_covariance(PIPE_2D.prior.inflow_std**2,
                                                         PIPE_2D.prior.nodal_std**2)
@@ -62,7 +68,7 @@ def problem(cells: tuple[int, int], steps: int = WARM_UP + STEPS) -> Problem:
 
 def pipe_model(cells: tuple[int, int]) -> Discretisation:
     """The estimators' model, but with so many cells of concentration along and across the pipe."""
-    told = PIPE_2D.model()
+    told = PIPE_2D.estimator_model()
     pipe = PIPE_2D.vessel
     known = told.transport
     assert isinstance(known, ConvectionDiffusion)
@@ -73,7 +79,7 @@ def pipe_model(cells: tuple[int, int]) -> Discretisation:
                                     substeps=known.substeps, inlet=np.arange(cells[1] + 1))
     cem = told.observation.cem
     seen = ObservationModel(cem, mesh.interpolation_to(cem.mesh.points),
-                            told.observation.conductivity, told.observation.smallest_concentration)
+                            told.observation.conductivity, told.observation.min_concentration)
     return Discretisation(transport, seen)
 
 

@@ -1,12 +1,12 @@
-"""Discretisation errors, of voltages and of transport: `python studies/forward_error.py`.
+"""Discretisation errors of voltages and of transport: `python studies/forward_error.py`.
 
-Voltages of all 16 injections for states of training episodes, as they are on the truth's CD mesh,
-against an EIT mesh of 68,000 unknowns. For the estimators' model the state is first taken at its
-own CD nodes, so its figure holds all of its error: the coarser concentration, the interpolation,
-and the coarser EIT mesh. Voltage errors are in noise standard deviations.
+Voltages of all 16 injections, for states of training episodes on the convection–diffusion (CD) mesh
+of the truth, are compared with an EIT mesh of 68,000 unknowns. For the estimator model the state is
+first interpolated to its CD nodes, so that its error includes the coarser concentration, the
+interpolation, and the coarser EIT mesh. Voltage errors are relative to the noise std.
 
-Transport: the model carries the true inlet values through the pipe until it has forgotten where it
-began; its error is relative to the true deviation from the background.
+Transport: the model advects the true inlet values until its initial state has left the pipe. The
+error is relative to the true deviation from the background.
 """
 
 import itertools
@@ -30,7 +30,7 @@ SEEDS, STATES = "train:0-3", range(20, 99, 6)
 def main() -> None:
     world = PIPE_2D
     pipe = world.vessel
-    truth, model = world.truth(), world.model()
+    truth, model = world.truth_model(), world.estimator_model()
     mesh = graded_pipe_mesh(pipe.length, pipe.half_width, pipe.electrode_spans, 24, 44)
     reference = ObservationModel(
         CompleteElectrodeModel(mesh, pipe.electrodes(mesh), pipe.contact_impedance),

@@ -1,8 +1,9 @@
-"""Discretisation errors in 3D, of voltages and of transport: `python studies/forward_error_3d.py`.
+"""Discretisation errors of voltages and of transport in 3D: `python studies/forward_error_3d.py`.
 
-As `forward_error.py`, for `Pipe3D`: EIT meshes with potentials of first and second order against
-one of about 100,000 unknowns (2 GB, some minutes), and the estimators' whole model. Voltage errors
-are in noise standard deviations, of all 16 injections for states of a training episode.
+Like `forward_error.py`, for `Pipe3D`: EIT meshes with potentials of first and second order, and the
+complete estimator model, are compared with a mesh of about 100,000 unknowns (2 GB, some minutes).
+Voltage errors, for all 16 injections and states of a training episode, are relative to the noise
+std.
 """
 
 import time
@@ -12,7 +13,7 @@ from forward_error import _transport_error
 from threadpoolctl import threadpool_limits
 
 from eitbench import simulate
-from eitbench.numerics.round import round_pipe_mesh
+from eitbench.numerics.round_meshes import round_pipe_mesh
 from eitbench.physics.cem import CompleteElectrodeModel
 from eitbench.physics.observation import ObservationModel
 from eitbench.worlds.catalogue import PIPE_3D
@@ -28,7 +29,7 @@ STATES = range(20, 66, 15)
 def main() -> None:
     world = PIPE_3D
     pipe = world.vessel
-    truth, model = world.truth(), world.model()
+    truth, model = world.truth_model(), world.estimator_model()
     concentration = simulate(world, 0).concentration.astype(float)
     states = concentration[list(STATES)]
 
@@ -40,23 +41,23 @@ def main() -> None:
         return ObservationModel(cem, truth.transport.mesh.interpolation_to(mesh.points),
                                 truth.observation.conductivity, 0.01)
 
-    def voltages(seen: ObservationModel, fields: np.ndarray) -> np.ndarray:
-        return np.array([seen.voltages(c, world.currents) for c in fields])
+    def voltages(model: ObservationModel, fields: np.ndarray) -> np.ndarray:
+        return np.array([model.voltages(c, world.currents) for c in fields])
 
     reference = observation(*REFERENCE)
     exact = voltages(reference, states)
     std = world.noise.std(exact)
     print(f"reference: {reference.cem.n_unknowns:,} unknowns, {len(states)} states")
-    print("| mesh | EIT unknowns | s a state | error rms | 99 % below | largest "
+    print("| mesh | EIT unknowns | s per state | error rms | 99 % below | largest "
           "|\n|---|---|---|---|---|---|")
 
-    def row(name: str, seen: ObservationModel, fields: np.ndarray) -> None:
-        seen.transfer_resistance(fields[:1])                        # compiled, and memory at hand
-        begin = time.perf_counter()
-        seen.transfer_resistance(fields)
-        seconds = (time.perf_counter() - begin) / len(fields)
-        e = np.abs((voltages(seen, fields) - exact) / std)
-        print(f"| {name} | {seen.cem.n_unknowns:,} | {seconds:.3f} | "
+    def row(name: str, model: ObservationModel, fields: np.ndarray) -> None:
+        model.transfer_resistance(fields[:1])                       # compiles, allocates memory
+        start = time.perf_counter()
+        model.transfer_resistance(fields)
+        seconds = (time.perf_counter() - start) / len(fields)
+        e = np.abs((voltages(model, fields) - exact) / std)
+        print(f"| {name} | {model.cem.n_unknowns:,} | {seconds:.3f} | "
               f"{np.sqrt((e**2).mean()):.2f} | "
               f"{np.quantile(e, 0.99):.2f} | {e.max():.2f} |", flush=True)
 

@@ -1,8 +1,8 @@
-"""How many training episodes the inflow's prior needs: `python studies/inflow_prior.py`, minutes
-once the episodes are simulated.
+"""Number of training episodes of the inflow prior: `python studies/inflow_prior.py`, minutes once
+the episodes are simulated.
 
-The filter of the inflow's logarithm plays dev:0-7 of Pipe2D with priors from the first so many
-training inflows; printed are its errors, and how well it knows them.
+The log-inflow filter runs on dev:0-7 of Pipe2D with priors fitted to 1, 10 and 100 training
+inflows. The table has its error and NIS.
 """
 
 from __future__ import annotations
@@ -14,40 +14,40 @@ from tqdm import tqdm
 import eitbench
 from eitbench.bench.text import mean_and_interval, rounded
 from eitbench.data.seeds import parse_seeds
-from eitbench.estimation import FilterEstimator, InflowPrior, inflow_filter, learned_inflow_prior
+from eitbench.estimation import FilterEstimator, InflowPrior, fit_prior_from_episodes, inflow_filter
 from eitbench.worlds.registry import entry
 
 ID = "eitbench/Pipe2D-v0"
 COUNTS = (1, 10, 100)
-PLAYED = parse_seeds("dev:0-7")
+EPISODES = parse_seeds("dev:0-7")
 
 
-def play(prior: InflowPrior, seed: int) -> tuple[float, float]:
-    """Mean relative error, and NIS per reading, of the states that are scored."""
+def run_filter(prior: InflowPrior, seed: int) -> tuple[float, float]:
+    """Return the mean relative error, and the NIS per measurement, of the scored states."""
     env = gym.make(ID).unwrapped
     task: eitbench.Task = env.task
     estimator = FilterEstimator(task, lambda c_ref: inflow_filter(task, prior, c_ref))
     observation, _ = env.reset(seed=seed)
-    rewards, surprises = [], []
+    rewards, nis = [], []
     for _ in range(task.n_steps):
         estimate = estimator.update(**observation)
         if estimate.innovation is not None:
             whitened = np.linalg.solve(estimate.innovation_covariance, estimate.innovation)
-            surprises.append(estimate.innovation @ whitened / len(whitened))
+            nis.append(estimate.innovation @ whitened / len(whitened))
         observation, reward, *_ = env.step(estimate.mean)
         rewards.append(reward)
-    return -np.mean(rewards[task.warm_up:]), float(np.mean(surprises))
+    return -np.mean(rewards[task.warm_up:]), float(np.mean(nis))
 
 
 def main() -> None:
     print("| training episodes | modes | ẽ_c | NIS/m |\n|---:|---:|---:|---:|")
     for count in COUNTS:
-        prior = learned_inflow_prior(entry(ID).world, parse_seeds(f"train:0-{count - 1}"))
-        played = [play(prior, seed)
-                  for seed in tqdm(PLAYED, desc=f"{count} episodes", leave=False, disable=None)]
-        errors, surprises = zip(*played, strict=True)
+        prior = fit_prior_from_episodes(entry(ID).world, parse_seeds(f"train:0-{count - 1}"))
+        runs = [run_filter(prior, seed)
+                for seed in tqdm(EPISODES, desc=f"{count} episodes", leave=False, disable=None)]
+        errors, nis = zip(*runs, strict=True)
         print(f"| {count} | {prior.modes.shape[1]} | {rounded(*mean_and_interval(list(errors)))} | "
-              f"{np.mean(surprises):.2f} |", flush=True)
+              f"{np.mean(nis):.2f} |", flush=True)
 
 
 if __name__ == "__main__":

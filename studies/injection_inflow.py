@@ -1,9 +1,9 @@
-"""Does it change what to inject if the filter knows what flows in? `python
-studies/injection_inflow.py`, ten minutes.
+"""Influence of the inflow prior on the best injections: `python studies/injection_inflow.py`, ten
+minutes.
 
-Schedules that are fixed beforehand are played on the same dev episodes with each of the four
-filters: white noise for inflow (Table 5.1) or learned, reduced or exact. Printed is the mean of ẽ_c
-with its 95 % interval over episodes.
+Open-loop schedules run on the same dev episodes with four filters: white-noise inflow (Table 5.1)
+or fitted inflow prior, reduced or full. The table has the mean of ẽ_c with its 95 % interval over
+episodes.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from eitbench.worlds import entry
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Fixed schedules by filter.")
+    parser = argparse.ArgumentParser(description="Scores of open-loop schedules by filter.")
     parser.add_argument("--env", default="eitbench/Pipe2DInjection-v0")
     parser.add_argument("--seeds", default="dev:0-7")
     parser.add_argument("--estimators", nargs="+", default=["reduced", "full"])
@@ -31,7 +31,7 @@ def main() -> None:
     world = entry(arguments.env).world
     gate = entry(arguments.env).settings.get("gate", np.inf)
     filters = [(inflow, each) for inflow in INFLOW_MODELS for each in arguments.estimators]
-    schedules = schedules_of(Rules(world), world.n_steps - len(world.currents))
+    schedules = fixed_schedules(Rules(world), world.n_steps - len(world.currents))
     print("| schedule | " + " | ".join(f"{inflow}, {each}" for inflow, each in filters)
           + " |\n|---|" + "---:|" * len(filters))
     for name, pairs in schedules.items():
@@ -42,8 +42,8 @@ def main() -> None:
         print(f"| {name} | " + " | ".join(cells) + " |", flush=True)
 
 
-def schedules_of(rules: Rules, steps: int) -> dict[str, np.ndarray]:
-    """Numbers of the pairs that are injected, by what the schedule is called."""
+def fixed_schedules(rules: Rules, steps: int) -> dict[str, np.ndarray]:
+    """Return the pair indices of each schedule."""
     pairs = rules.pairs.tolist()
     L = rules.world.currents.shape[1]
 
@@ -51,19 +51,19 @@ def schedules_of(rules: Rules, steps: int) -> dict[str, np.ndarray]:
         return np.resize([pairs.index(sorted(pair)) for pair in chosen], steps)
 
     # near the inlet, in the middle, near the outlet
-    forever = ([0, 8], [0, 9], [0, 10], [3, 11], [7, 15])
-    singles = {f"{i} → {j} for ever": cycle([[i, j]]) for i, j in forever}
-    world_own = [np.flatnonzero(current).tolist() for current in rules.world.currents]
+    constant = ([0, 8], [0, 9], [0, 10], [3, 11], [7, 15])
+    singles = {f"{i} → {j} constantly": cycle([[i, j]]) for i, j in constant}
+    world_cycle = [np.flatnonzero(current).tolist() for current in rules.world.currents]
     return singles | {
-        "0 → 8 and 1 → 9 in turn": cycle([[0, 8], [1, 9]]),
-        "pairs at random": np.random.default_rng(0).integers(len(pairs), size=steps),
-        "the world's own cycle": cycle(world_own),
-        "opposite pairs in turn": cycle([[k, k + L // 2] for k in range(L // 2)]),
-        "adjacent pairs in turn": cycle([[k, (k + 1) % L] for k in range(L)])}
+        "0 → 8 and 1 → 9 alternating": cycle([[0, 8], [1, 9]]),
+        "random pairs": np.random.default_rng(0).integers(len(pairs), size=steps),
+        "cycle of the world": cycle(world_cycle),
+        "cycle of opposite pairs": cycle([[k, k + L // 2] for k in range(L // 2)]),
+        "cycle of adjacent pairs": cycle([[k, (k + 1) % L] for k in range(L)])}
 
 
 def errors(core: InjectionCore, seeds: list[int], pairs: np.ndarray) -> np.ndarray:
-    """(B,) ẽ_c of each episode under these injections."""
+    """Return ẽ_c (B,) of each episode under these injections."""
     core.reset(seeds)
     scored = []
     for pair in pairs:

@@ -1,7 +1,7 @@
-"""How good intervals are: `python studies/intervals.py`, a minute.
+"""Coverage of confidence intervals: `python studies/intervals.py`, a minute.
 
-In how many of 1000 simulated data sets a 95 % interval holds the truth, as we make it and as a
-plain percentile interval.
+The table has the coverage of 95 % intervals in 1000 simulated data sets, for the intervals of
+`eitbench.bench.statistics` and for plain percentile intervals.
 """
 
 from __future__ import annotations
@@ -15,34 +15,34 @@ from threadpoolctl import threadpool_limits
 from eitbench.bench import statistics
 from eitbench.bench.statistics import mean_over_environments, stratified_bootstrap
 
-SPREAD = 0.8
-"""of the logarithm of a lognormal number"""
+LOG_STD = 0.8
+"""Standard deviation of the logarithm of lognormal numbers."""
 
 
 def main() -> None:
-    draws: dict[str, tuple[Callable[..., np.ndarray], float]] = {
+    distributions: dict[str, tuple[Callable[..., np.ndarray], float]] = {
         "normal": (lambda random, n: random.normal(size=n), 0.0),
-        "lognormal": (lambda random, n: random.lognormal(0.0, SPREAD, n),
-                      float(np.exp(SPREAD**2 / 2))),
-        "difference of lognormals": (lambda random, n: random.lognormal(0.0, SPREAD, n)
-                                     - random.lognormal(0.0, SPREAD, n), 0.0)}
-    print("| numbers | n | of 100 intervals hold the truth | plain ones |\n|---|---:|---:|---:|")
-    for name, (draw, truth) in draws.items():
+        "lognormal": (lambda random, n: random.lognormal(0.0, LOG_STD, n),
+                      float(np.exp(LOG_STD**2 / 2))),
+        "difference of lognormals": (lambda random, n: random.lognormal(0.0, LOG_STD, n)
+                                     - random.lognormal(0.0, LOG_STD, n), 0.0)}
+    print("| distribution | n | coverage / % | plain percentile / % |\n|---|---:|---:|---:|")
+    for name, (draw, truth) in distributions.items():
         for n in (6, 10, 30, 50):
-            ours = coverage(draw, truth, n)
+            adjusted = coverage(draw, truth, n)
             with mock.patch.object(statistics, "tail", lambda sizes: 2.5):
-                print(f"| {name} | {n} | {ours:.1f} | {coverage(draw, truth, n):.1f} |")
+                print(f"| {name} | {n} | {adjusted:.1f} | {coverage(draw, truth, n):.1f} |")
 
 
 def coverage(draw: Callable[..., np.ndarray], truth: float, n: int) -> float:
-    """In %, of the mean of n numbers."""
+    """Return the coverage in % of intervals for the mean of n numbers."""
     random = np.random.default_rng(0)
-    held = 0
+    covered = 0
     for seed in range(1000):
         _, low, high = stratified_bootstrap({"": draw(random, n)}, mean_over_environments,
                                             draws=2000, seed=seed)
-        held += low <= truth <= high
-    return held / 10
+        covered += low <= truth <= high
+    return covered / 10
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.ndimage import center_of_mass, label
-from thesis.common import bare, save
+from thesis.common import despine, save_figure
 
 from eitbench.bench.playing import run_on_measurements
 from eitbench.envs.measured import MeasuredEnv, case_env
@@ -66,7 +66,7 @@ def main(folder: Path) -> None:
         draw(axes, env, estimate, bodies, name)
     shown = figure.axes[-1].collections[0]
     figure.colorbar(shown, ax=figure.axes, label="conductivity / background (decades)")
-    save(figure, ROOT / "docs" / "kit4.png")
+    save_figure(figure, ROOT / "docs" / "kit4.png")
 
 
 def distance(env: MeasuredEnv, estimate: np.ndarray, body: Body) -> float:
@@ -96,7 +96,7 @@ def draw(axes: Axes, env: MeasuredEnv, estimate: np.ndarray, bodies: list[Body],
         closed = np.vstack([body.outline, body.outline[:1]])
         axes.plot(*closed.T, color="k", linewidth=1.5)
     axes.set(title=title, xlabel="x / cm", aspect="equal")
-    bare(axes)
+    despine(axes)
 
 
 if __name__ == "__main__":

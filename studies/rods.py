@@ -16,7 +16,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from scipy.optimize import least_squares
-from thesis.common import bare, save
+from thesis.common import despine, save_figure
 
 from eitbench.bench.playing import run_on_measurements
 from eitbench.envs.measured import MeasuredEnv
@@ -50,7 +50,7 @@ def main(folder: Path) -> None:
         case = read_case(rod.case)
         record = read(folder / case.file, name=rod.variable)
         env = MeasuredEnv(record, dict(case.vessel), **case.options)
-        ends = np.arange(FIRST * record.frame, len(record.readings) + 1, record.frame)
+        ends = np.arange(FIRST * record.frame_length, len(record.voltages) + 1, record.frame_length)
         run = run_on_measurements(env, "log_steady_filter", kept=set(ends.tolist()))
         path = np.array([middle(env, estimate) for estimate in run.mean])
         nearest = circle(path) if rod.is_round else line(path)
@@ -64,8 +64,8 @@ def main(folder: Path) -> None:
         figure.colorbar(shown, ax=axes, label="time / s", shrink=0.7)
         axes.set(title=rod.title, xlabel="x / cm", aspect="equal", xlim=(-radius, radius),
                  ylim=(-radius, radius))
-        bare(axes)
-    save(figure, ROOT / "docs" / "rods.png")
+        despine(axes)
+    save_figure(figure, ROOT / "docs" / "rods.png")
 
 
 def middle(env: MeasuredEnv, estimate: np.ndarray) -> np.ndarray:

@@ -1,16 +1,16 @@
 """Tune α of the stationary Gauss–Newton on stationary targets: `python
 studies/tune_gauss_newton.py`.
 
-The rule: one frame of 16 injections for each of a few states of training episodes, the target
-standing still; of a grid with two values an octave take the α with the smallest mean relative
-error. Dev and test seeds are not touched.
+The rule: α with the smallest mean relative error on a grid of two values per octave, for one frame
+of 16 injections of a stationary target, which is one of three states of each of four training
+episodes. Dev and test episodes are not used.
 """
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from eitbench import make_task, simulate
-from eitbench.data.recordings import score_operators
+from eitbench.data.episode_cache import score_operators
 from eitbench.data.seeds import parse_seeds
 from eitbench.estimation import best_homogeneous, gauss_newton
 from eitbench.numerics.fem import stiffness_matrix

@@ -13,7 +13,7 @@ import numpy as np
 from eitbench._files import write_atomically
 from eitbench.bench.scores import Outcome
 from eitbench.measured.segmentation import ktc_score, segment
-from eitbench.physics.rest import AtRest
+from eitbench.physics.stationary import StationaryTransport
 
 if TYPE_CHECKING:
     from eitbench.envs.measured import MeasuredEnv
@@ -68,7 +68,7 @@ class MeasuredRun:
         residual, nis = np.full(T, np.nan), np.full(T, np.nan)
         theta = None if velocity is None else np.tile(velocity.nominal, (T, 1))
         electrodes = _ElectrodeResiduals(env)
-        at_rest = isinstance(env.task.transport, AtRest)
+        at_rest = isinstance(env.task.transport, StationaryTransport)
         estimates: dict[int, Estimate] = {}
         seconds = 0.0
         mean = before = np.empty(0)
@@ -128,7 +128,7 @@ class _ElectrodeResiduals:
     def __init__(self, env: MeasuredEnv) -> None:
         measurements = env.measurements
         self._env = env
-        self._frame = measurements.frame
+        self._frame = measurements.frame_length
         T, L = env.episode_steps, measurements.currents.shape[1]
         begins = np.arange(0, max(T - self._frame, 0) + 1, self._frame)
         chosen = np.linspace(0, len(begins) - 1, N_PLOTTED_FRAMES).round().astype(int)
@@ -144,7 +144,7 @@ class _ElectrodeResiduals:
         """Add the residuals of an estimate (n,) at t = 1 … T, if its frame is one of these."""
         if (row := self._row.get((t - 1) // self._frame)) is None:
             return
-        counted = self._counted[self._env.measurements.injections[t - 1]]
+        counted = self._counted[self._env.measurements.injection_index[t - 1]]
         self._squares[row] += np.nan_to_num(self._env.residuals(t, estimate))**2 @ counted
         self._count[row] += counted.sum(axis=0)
 
@@ -173,5 +173,5 @@ def _nis(env: MeasuredEnv, t: int, estimate: Estimate) -> float:
     if estimate.innovation is None or estimate.innovation_covariance is None:
         return float("nan")
     whitened = np.linalg.solve(estimate.innovation_covariance, estimate.innovation)
-    count = int(env.model.mask[env.measurements.injections[t - 1]].sum())
+    count = int(env.model.mask[env.measurements.injection_index[t - 1]].sum())
     return float(estimate.innovation @ whitened) / count if count else float("nan")

@@ -52,7 +52,7 @@ def estimate(
         if out.suffix != ".html":
             raise ValueError(f"--out must end in .html, got {out}")
         measurements = read(file, format, None if span is None else _steps(span))
-        T, M = measurements.readings.shape
+        T, M = measurements.voltages.shape
         options.say(f"{file}: {T} times {M} readings of {measurements.currents.shape[1]} "
                     f"electrodes; a method takes about {10 + 0.03 * T:.0f} s")
         env = MeasuredEnv(measurements, vessel, withheld=withheld, moves=False if still else None,

@@ -30,15 +30,15 @@ def bank(
     """
     import shutil
 
-    from eitbench.data.bank import fill, missing_seeds, recording_bytes
     from eitbench.data.cache import folder
+    from eitbench.data.presimulation import cached_episode_bytes, missing_seeds, presimulate
     from eitbench.data.seeds import parse_seeds
     from eitbench.worlds.registry import entry
     with options.clear_errors():
         numbers = parse_seeds(seeds)
         world = entry(env).world
     place = folder(world)
-    each = recording_bytes(world)
+    each = cached_episode_bytes(world)
     try:
         place.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -51,7 +51,7 @@ def bank(
         raise typer.BadParameter(f"seeds need {missing * each / 1e9:.1f} GB more, and "
                                  f"{free / 1e9:.1f} GB are free")
     with options.clear_errors():
-        made = fill(world, numbers, n_jobs=jobs, backend=backend)
+        made = presimulate(world, numbers, n_jobs=jobs, backend=backend)
     options.say(f"{made} simulated, {len(numbers) - made} were there")
 
 
@@ -142,20 +142,21 @@ def fit_prior(
     """Learn what to expect of the inflow from training episodes, which are not simulated for it,
     and write it as a prior for filters (`eitbench.estimation.InflowPrior`)."""
     from eitbench.data.seeds import parse_seeds
-    from eitbench.estimation import learned_inflow_prior
+    from eitbench.estimation import fit_prior_from_episodes
     from eitbench.worlds.registry import entry
     regimes = {} if quiet is None else {"quiet": quiet}
     with options.clear_errors():
-        prior = learned_inflow_prior(
-            entry(env).world, parse_seeds(seeds), link=link.value, nugget=nugget, kept=kept,
-            quiet=quiet, source={"environment": env, "seeds": seeds, "nugget": nugget,
-                                 "kept": kept, **regimes})
+        prior = fit_prior_from_episodes(
+            entry(env).world, parse_seeds(seeds), link=link.value, nugget=nugget,
+            variance_cutoff=kept, quiet_threshold=quiet,
+            source={"environment": env, "seeds": seeds, "nugget": nugget, "kept": kept,
+                    **regimes})
         prior.save(out)
     options.say(f"{out}: {prior.modes.shape[1]} modes across {len(prior.points)} nodes of the "
-                f"inlet, correlated over {prior.memory} steps of {prior.time_step:g} s")
+                f"inlet, correlated over {prior.correlation_steps} steps of {prior.time_step:g} s")
     if prior.regimes is not None:
         options.say(f"slugs enter {prior.regimes.share:.0%} of the time and last "
-                    f"{1.0 / prior.regimes.ends:.1f} steps on average")
+                    f"{1.0 / prior.regimes.p_end:.1f} steps on average")
 
 
 @fit.command("model")
@@ -178,17 +179,17 @@ def fit_model(
     from tqdm import tqdm
 
     import eitbench
-    from eitbench.estimation import identified_model
+    from eitbench.estimation import identify_model
     with options.clear_errors():
         examples = eitbench.dataset(env, seeds)
-        model = identified_model(
-            examples, modes=modes, correct=correct, linearised=linearised,
+        model = identify_model(
+            examples, modes=modes, residual_only=correct, linearised=linearised,
             progress=lambda each: tqdm(each, desc="learning", unit="episode", disable=None),
             source={"environment": env, "seeds": seeds, "modes": modes}
             | {name: True for name, said in (("correct", correct), ("linearised", linearised))
                if said})
         model.save(out)
-    left = float(model.spread.trace() / examples.mass.sum())
+    left = float(model.residual_covariance.trace() / examples.mass.sum())
     options.say(f"{out}: {modes} modes of the concentration, which remembers "
-                f"{model.weights.shape[1]} inflows; {100 * left**0.5:.2g} % (root mean square) "
-                "is left")
+                f"{model.impulse_response.shape[1]} inflows; {100 * left**0.5:.2g} % "
+                "(root mean square) is left")

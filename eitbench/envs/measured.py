@@ -15,17 +15,17 @@ from eitbench._extras import needed_by
 from eitbench.envs.episodes import RENDER_MODES, RESET_NEEDED, FixedLengthEnv, Observation
 from eitbench.envs.estimation import check_actions
 from eitbench.measured import Measurements, quality, read
-from eitbench.measured.calibration import calibrate, noise_of_frames
+from eitbench.measured.calibration import calibrate, noise_from_frames
 from eitbench.measured.cases import MeasuredCase, read_case
 from eitbench.measured.model import (
     MeasurementModel,
     complete_channels,
     sample_withheld,
-    visible_reading,
+    visible_measurement,
 )
 from eitbench.measured.task import task_from_measurements
 from eitbench.measured.vessel import INITIAL_CONTACT_IMPEDANCE, VesselConfig, read_vessel
-from eitbench.physics.rest import AtRest
+from eitbench.physics.stationary import StationaryTransport
 from eitbench.worlds.task import Task
 
 NOISE_FRAMES = 1000
@@ -91,20 +91,20 @@ class MeasuredEnv(FixedLengthEnv):
         self.vessel = vessel if isinstance(vessel, VesselConfig) else read_vessel(vessel)
         self.case: MeasuredCase | None = None
         measurements = self.measurements
-        T, (M, L) = len(measurements.injections), measurements.matrix.shape
+        T, (M, L) = len(measurements.injection_index), measurements.matrix.shape
         if self.vessel.n_electrodes != L:
             raise ValueError(f"vessel must have the {L} electrodes of the measurements, got "
                              f"{self.vessel.n_electrodes}")
         self.withheld = _check.number("withheld", withheld, low=0.0, high=0.5)
-        reference = measurements.homogeneous(homogeneous_frames)
+        reference = measurements.reference_frames(homogeneous_frames)
         self._electrodes = self.vessel.electrode_model(INITIAL_CONTACT_IMPEDANCE)
         self.calibration = calibrate(
             self._electrodes, measurements.currents, measurements.matrix, reference,
             depth=self.vessel.depth, conductivity=self.vessel.conductivity, correction=correction,
             noise=(None if len(reference) > 1
-                   else noise_of_frames(measurements.frames(NOISE_FRAMES))))
+                   else noise_from_frames(measurements.frames(NOISE_FRAMES))))
         if moves is None:
-            moves = self.vessel.flow is not None or 2 * measurements.frame <= T
+            moves = self.vessel.flow is not None or 2 * measurements.frame_length <= T
         self._options = {"moves": moves, **options}
         self.available = complete_channels(measurements)
         """(K, M) bool: readings that exist at every use of their injection"""
@@ -115,7 +115,7 @@ class MeasuredEnv(FixedLengthEnv):
         self._seed = -1
         self._step = 0
         self._withhold(0)
-        voltage = 100.0 * measurements.largest
+        voltage = 100.0 * measurements.max_abs_voltage
         current = float(np.abs(measurements.currents).max())
         self.observation_space: spaces.Dict = spaces.Dict({  # type: ignore[assignment]
             "voltages": spaces.Box(-voltage, voltage, (M,), np.float64),
@@ -186,7 +186,7 @@ class MeasuredEnv(FixedLengthEnv):
         estimate = self._last
         if estimate is None:
             estimate = np.full(self.task.mesh.n_nodes, self.task.expected_concentration)
-        currents = self.measurements.currents[self.measurements.injections[t]]
+        currents = self.measurements.currents[self.measurements.injection_index[t]]
         return draw_comparison(self.task, [("estimate", self.task.mesh, estimate)], currents,
                                float(self.measurements.times[t]))
 
@@ -196,20 +196,21 @@ class MeasuredEnv(FixedLengthEnv):
 
     def scoring_steps(self, t: int) -> range:
         """Return the injections, 1 … T, whose withheld readings score an estimate at t."""
-        if isinstance(self.task.transport, AtRest):
+        if isinstance(self.task.transport, StationaryTransport):
             return range(1, self.episode_steps + 1) if t == self.episode_steps else range(0)
         return range(t, t + 1) if t > self.task.warm_up else range(0)
 
     def withheld_residuals(self, t: int, estimate: np.ndarray) -> np.ndarray:
         """Residuals of an estimate (n,) at the readings withheld at t = 1 … T, relative to the
         standard deviation of their noise."""
-        return self.residuals(t, estimate)[self.withheld_mask[self.measurements.injections[t - 1]]]
+        injection = self.measurements.injection_index[t - 1]
+        return self.residuals(t, estimate)[self.withheld_mask[injection]]
 
     def residuals(self, t: int, estimate: np.ndarray) -> np.ndarray:
         """(M,) residuals of an estimate (n,) at all readings of t = 1 … T, relative to the
         standard deviation of their noise; NaN where nothing was measured."""
-        reading = self.measurements.readings[t - 1]
-        k = self.measurements.injections[t - 1]
+        reading = self.measurements.voltages[t - 1]
+        k = self.measurements.injection_index[t - 1]
         predicted = self._full_model.voltages(estimate, self.measurements.currents[k][None])[0]
         residuals = (reading - predicted) / self.task.noise.std(np.nan_to_num(reading))
         found: np.ndarray = np.where(self.available[k], residuals, np.nan)
@@ -219,7 +220,7 @@ class MeasuredEnv(FixedLengthEnv):
         if self._step > self.episode_steps:
             return {name: np.zeros_like(space.low)  # type: ignore[attr-defined]
                     for name, space in self.observation_space.items()}
-        voltages, currents = visible_reading(self.model, self.measurements, self._step - 1)
+        voltages, currents = visible_measurement(self.model, self.measurements, self._step - 1)
         return {"voltages": voltages, "currents": currents.copy()}
 
 

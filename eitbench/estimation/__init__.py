@@ -1,15 +1,15 @@
 """Estimators: filters, smoothers and reconstructions; matrices in, estimates out."""
 
 from eitbench.estimation.correction import (
-    FilterSeen,
-    VoltagesSeen,
-    blank,
-    corrected,
-    corrected_estimator,
+    FilterFeatures,
+    VoltageFeatures,
+    apply_correction,
+    gru_step,
+    initial_hidden_state,
     load_network,
-    network_suits,
-    remember,
-    said,
+    network_estimator,
+    network_matches_task,
+    network_output,
 )
 from eitbench.estimation.covariance import (
     DenseCovariance,
@@ -17,32 +17,32 @@ from eitbench.estimation.covariance import (
     OpenLoopCovariance,
 )
 from eitbench.estimation.ensemble import EnsembleFilter
-from eitbench.estimation.estimators import FilterEstimator, FirstFrame, RecordEstimator
+from eitbench.estimation.estimators import CalibrationFrame, FilterEstimator, SmootherEstimator
 from eitbench.estimation.filter import Filter, StateSpace, Step, kalman_filter
 from eitbench.estimation.forward import (
-    LinearisedObservations,
-    about_prediction,
-    about_reference,
-    linearised,
+    LinearisedForwardModel,
+    linearise_at_prediction,
+    linearise_at_reference,
+    linearise_voltages,
 )
 from eitbench.estimation.gauss_newton import gauss_newton
-from eitbench.estimation.gaussian import Innovation, Observation, condition, innovate
+from eitbench.estimation.gaussian import Innovation, LinearMeasurement, condition, innovate
 from eitbench.estimation.homogeneous import best_homogeneous
-from eitbench.estimation.identification import identified_model
-from eitbench.estimation.identified import IdentifiedModel, suiting_models
-from eitbench.estimation.inflow_map import map_inflow, most_probable_inflow, smoothed_inflow
+from eitbench.estimation.identification import identify_model
+from eitbench.estimation.identified import IdentifiedModel, compatible_models
+from eitbench.estimation.inflow_map import full_window_filter, map_inflow, maximise_posterior
 from eitbench.estimation.inflow_prior import (
     InflowPrior,
     Regimes,
+    compatible_priors,
     fit_inflow_prior,
-    learned_inflow_prior,
-    suiting_priors,
+    fit_prior_from_episodes,
 )
 from eitbench.estimation.inflow_response import (
-    Response,
-    changing_responses,
+    ImpulseResponse,
     reduced_response,
     steady_response,
+    time_varying_responses,
 )
 from eitbench.estimation.inflow_window import InflowWindow, inflow_filter
 from eitbench.estimation.joint_inflow import VelocityInflowWindow
@@ -52,40 +52,42 @@ from eitbench.estimation.nodal import (
     NodalStates,
     initial_covariance,
     modal_states,
+    nodal_filter,
     nodal_states,
-    starting_filter,
-    table_5_1,
+    table_5_1_filter,
 )
-from eitbench.estimation.quadratic_voltages import QuadraticVoltages, ScaledVoltages
+from eitbench.estimation.quadratic_voltages import QuadraticVoltageModel, ScaledVoltageModel
 from eitbench.estimation.smoother import (
     fixed_interval_smoother,
-    smoothed_means,
-    smoothed_state,
+    smooth_means,
+    smooth_state,
 )
 from eitbench.estimation.smoothness import smoothness_covariance
 from eitbench.estimation.switching_inflow import ParticleInflowFilter, SwitchingInflowFilter
 from eitbench.estimation.unscented import UnscentedFilter
 from eitbench.estimation.velocity import (
-    UnknownFlow,
+    VelocityPrior,
     VelocityStates,
-    asked_flow,
-    scaled_flow,
+    scaled_velocity_prior,
+    task_velocity_prior,
     velocity_states,
 )
 
 __all__ = [
-    "DenseCovariance", "EnsembleFilter", "Filter", "FilterEstimator", "FilterSeen", "FirstFrame",
-    "IdentifiedModel", "InflowPrior", "InflowWindow", "Innovation", "LinearisedObservations",
-    "LogStates", "LowRankCovariance", "Motion", "NodalStates", "Observation", "OpenLoopCovariance",
-    "ParticleInflowFilter", "QuadraticVoltages", "RecordEstimator", "Regimes", "Response",
-    "ScaledVoltages", "StateSpace", "Step", "SwitchingInflowFilter", "UnknownFlow",
-    "UnscentedFilter", "VelocityInflowWindow", "VelocityStates", "VoltagesSeen", "about_prediction",
-    "about_reference", "asked_flow", "best_homogeneous", "blank", "changing_responses", "condition",
-    "corrected", "corrected_estimator", "fit_inflow_prior", "fixed_interval_smoother",
-    "gauss_newton", "identified_model", "inflow_filter", "initial_covariance", "innovate",
-    "kalman_filter", "learned_inflow_prior", "linearised", "load_network", "map_inflow",
-    "modal_states", "most_probable_inflow", "network_suits", "nodal_states", "reduced_response",
-    "remember", "said", "scaled_flow", "smoothed_inflow", "smoothed_means", "smoothed_state",
-    "smoothness_covariance", "starting_filter", "steady_response", "suiting_models",
-    "suiting_priors", "table_5_1", "velocity_states",
+    "CalibrationFrame", "DenseCovariance", "EnsembleFilter", "Filter", "FilterEstimator",
+    "FilterFeatures", "IdentifiedModel", "ImpulseResponse", "InflowPrior", "InflowWindow",
+    "Innovation", "LinearMeasurement", "LinearisedForwardModel", "LogStates", "LowRankCovariance",
+    "Motion", "NodalStates", "OpenLoopCovariance", "ParticleInflowFilter", "QuadraticVoltageModel",
+    "Regimes", "ScaledVoltageModel", "SmootherEstimator", "StateSpace", "Step",
+    "SwitchingInflowFilter", "UnscentedFilter", "VelocityInflowWindow", "VelocityPrior",
+    "VelocityStates", "VoltageFeatures", "apply_correction", "best_homogeneous",
+    "compatible_models", "compatible_priors", "condition", "fit_inflow_prior",
+    "fit_prior_from_episodes", "fixed_interval_smoother", "full_window_filter", "gauss_newton",
+    "gru_step", "identify_model", "inflow_filter", "initial_covariance", "initial_hidden_state",
+    "innovate", "kalman_filter", "linearise_at_prediction", "linearise_at_reference",
+    "linearise_voltages", "load_network", "map_inflow", "maximise_posterior", "modal_states",
+    "network_estimator", "network_matches_task", "network_output", "nodal_filter", "nodal_states",
+    "reduced_response", "scaled_velocity_prior", "smooth_means", "smooth_state",
+    "smoothness_covariance", "steady_response", "table_5_1_filter", "task_velocity_prior",
+    "time_varying_responses", "velocity_states",
 ]

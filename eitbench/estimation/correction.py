@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from eitbench.estimation.estimators import FilterEstimator, Measurement
-from eitbench.estimation.identified import told
+from eitbench.estimation.identified import FINGERPRINT_ATOL, task_fingerprint
 from eitbench.estimation.inflow_window import inflow_filter
 from eitbench.worlds.task import Estimate
 
@@ -34,7 +34,7 @@ def load_network(path: Path) -> dict[str, np.ndarray]:
         return {name: file[name].astype(float) for name in file.files}
 
 
-def network_suits(path: Path, task: Task) -> bool:
+def network_matches_task(path: Path, task: Task) -> bool:
     """Whether the network at ``path`` is there and was trained for this vessel, these injections
     and this model of the flow."""
     if not path.is_file():
@@ -42,55 +42,56 @@ def network_suits(path: Path, task: Task) -> bool:
     known = load_network(path)
     if task.velocity is not None or task.mesh.n_nodes != len(known["basis"]):
         return False
-    there = told(task)
-    return there.shape == known["task"].shape and np.allclose(there, known["task"], atol=1e-4)
+    fingerprint = task_fingerprint(task)
+    return fingerprint.shape == known["task"].shape and np.allclose(
+        fingerprint, known["task"], atol=FINGERPRINT_ATOL)
 
 
 # -- the network -----------------------------------------------------------------------------------
 
 
-def remember(network: Network, inputs: np.ndarray, memory: np.ndarray,
-             way: str = "") -> np.ndarray:
-    """The new memory (h,) of a gated recurrent unit (Cho et al. 2014).
+def gru_step(network: Network, inputs: np.ndarray, hidden_state: np.ndarray,
+             direction: str = "") -> np.ndarray:
+    """The new hidden state (h,) of a gated recurrent unit (Cho et al. 2014).
 
-    ``inputs`` (d,) are raw; ``way`` is ``"backward_"`` of the unit that reads from the end.
+    ``inputs`` (d,) are raw; ``direction`` is ``"backward_"`` of the unit that reads from the end.
     """
     inputs = inputs / network["input_scale"]
-    seen = network[f"{way}input_weight"] @ inputs + network[f"{way}input_bias"]
-    kept = network[f"{way}hidden_weight"] @ memory + network[f"{way}hidden_bias"]
+    seen = network[f"{direction}input_weight"] @ inputs + network[f"{direction}input_bias"]
+    kept = network[f"{direction}hidden_weight"] @ hidden_state + network[f"{direction}hidden_bias"]
     seen_reset, seen_keep, seen_new = np.split(seen, 3)
     kept_reset, kept_keep, kept_new = np.split(kept, 3)
     reset = _sigmoid(seen_reset + kept_reset)
     keep = _sigmoid(seen_keep + kept_keep)
-    return (1.0 - keep) * np.tanh(seen_new + reset * kept_new) + keep * memory
+    return (1.0 - keep) * np.tanh(seen_new + reset * kept_new) + keep * hidden_state
 
 
-def said(network: Network, inputs: np.ndarray,
-         memory: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The correction (q,) and its variance (q,): linear in the memory, or in those of both ways one
-    after the other, and linear maps of the inputs (d,) that the memory mixes."""
+def network_output(network: Network, inputs: np.ndarray,
+         hidden_state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The correction (q,) and its variance (q,): linear in the hidden state, or in those
+    of both directions, and linear maps of the inputs (d,) that the hidden state mixes."""
     inputs = inputs / network["input_scale"]
-    told = network["output_weight"] @ memory + network["output_bias"]
+    told = network["output_weight"] @ hidden_state + network["output_bias"]
     correction, log_variance = np.split(told, 2)
-    mixed = network["mixing_weight"] @ memory + network["mixing_bias"]
+    mixed = network["mixing_weight"] @ hidden_state + network["mixing_bias"]
     correction = correction + mixed @ (network["maps"] @ inputs)
     scale = network["output_scale"]
     return scale * correction, scale**2 * np.exp(log_variance)
 
 
-def blank(network: Network) -> np.ndarray:
-    """(h,) the memory before anything is seen."""
+def initial_hidden_state(network: Network) -> np.ndarray:
+    """(h,) the hidden state before anything is seen."""
     return np.zeros(network["hidden_weight"].shape[1])
 
 
-def corrected(network: Network, level: float, reduced: np.ndarray, inputs: np.ndarray,
-              memory: np.ndarray) -> Estimate:
+def apply_correction(network: Network, c_ref: float, reduced: np.ndarray, inputs: np.ndarray,
+              hidden_state: np.ndarray) -> Estimate:
     """ĉ_bh (1 + B (a + Δ)) of the modes a = ``reduced`` (q,), and its variance."""
     basis = network["basis"]
-    correction, variance = said(network, inputs, memory)
+    correction, variance = network_output(network, inputs, hidden_state)
     mean = 1.0 + basis @ (reduced + correction)
     spread = basis**2 @ variance + network["rest"]
-    return Estimate(level * mean, level**2 * spread)
+    return Estimate(c_ref * mean, c_ref**2 * spread)
 
 
 def _sigmoid(x: np.ndarray) -> np.ndarray:
@@ -100,7 +101,7 @@ def _sigmoid(x: np.ndarray) -> np.ndarray:
 # -- what it sees ----------------------------------------------------------------------------------
 
 
-class FilterSeen:
+class FilterFeatures:
     """What a network sees of an episode from the `InflowWindow`.
 
     Parameters
@@ -108,7 +109,7 @@ class FilterSeen:
     task : Task
     prior : InflowPrior
         Of the task's inlet.
-    level : float
+    c_ref : float
         ĉ_bh in mol/m³.
     basis : (n, q)
         Modes of c/ĉ_bh − 1.
@@ -118,12 +119,12 @@ class FilterSeen:
         With it, the filter is that of `baselines/identified_flow.py`.
     """
 
-    def __init__(self, task: Task, prior: InflowPrior, level: float, basis: np.ndarray,
+    def __init__(self, task: Task, prior: InflowPrior, c_ref: float, basis: np.ndarray,
                  lag: int = 0, model: IdentifiedModel | None = None) -> None:
         self.task = task
         self.reduce = np.linalg.pinv(basis)
-        self.level = level
-        self.filter = inflow_filter(task, prior, level, lag, model=model,
+        self.c_ref = c_ref
+        self.filter = inflow_filter(task, prior, c_ref, lag, model=model,
                                     iterated=model is not None)
 
     def __call__(self, voltages: np.ndarray, currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -136,14 +137,14 @@ class FilterSeen:
         after = self.modes()
         std = self.task.noise.std(voltages - innovation)
         return np.concatenate([np.arcsinh(innovation / std), after, after - before,
-                               pattern(self.task, currents)]), after
+                               injection_one_hot(self.task, currents)]), after
 
     def modes(self, lag: int = 0) -> np.ndarray:
         """(q,) of the filter's mean, ``lag`` steps ago."""
         return self._modes(self.filter.space.concentration(self.filter.mean, lag))
 
     def _modes(self, concentration: np.ndarray) -> np.ndarray:
-        return self.reduce @ (concentration / self.level - 1.0)
+        return self.reduce @ (concentration / self.c_ref - 1.0)
 
     def record(self, record: Sequence[Measurement],
                *lags: int) -> tuple[np.ndarray, list[np.ndarray]]:
@@ -161,19 +162,19 @@ class FilterSeen:
         return np.array(inputs), [np.array(known) for known in modes]
 
 
-class VoltagesSeen:
-    """What a network sees of an episode from voltages alone; parameters as of `FilterSeen`."""
+class VoltageFeatures:
+    """What a network sees of an episode from voltages alone; parameters as of `FilterFeatures`."""
 
-    def __init__(self, task: Task, level: float, basis: np.ndarray) -> None:
+    def __init__(self, task: Task, c_ref: float, basis: np.ndarray) -> None:
         self.task = task
-        homogeneous = np.full(task.mesh.n_nodes, level)
+        homogeneous = np.full(task.mesh.n_nodes, c_ref)
         self.expected = task.observation.voltages(homogeneous, task.currents)
         self.none = np.zeros(basis.shape[1])
 
     def __call__(self, voltages: np.ndarray, currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Inputs (frame·L,), zero but for this injection's: where the voltages lie beside those of
         homogeneous fluid, in parts of the noise; and modes (q,) of homogeneous fluid, zero."""
-        here = pattern(self.task, currents)
+        here = injection_one_hot(self.task, currents)
         expected = here @ self.expected
         off = (voltages - expected) / self.task.noise.std(expected)
         return np.outer(here, off).ravel(), self.none
@@ -182,7 +183,7 @@ class VoltagesSeen:
 # -- from the first measurement to the last --------------------------------------------------------
 
 
-class CorrectedFilter:
+class NetworkCorrectedFilter:
     """Filter that a network corrects, for `FilterEstimator`.
 
     After the last measurement, when the lag shrinks, it returns the estimates of the filter alone.
@@ -191,48 +192,49 @@ class CorrectedFilter:
     ----------
     network : mapping
         As `load_network` returns it.
-    seen : FilterSeen or VoltagesSeen
-        Inputs of the network; `VoltagesSeen` has no lag.
+    seen : FilterFeatures or VoltageFeatures
+        Inputs of the network; `VoltageFeatures` has no lag.
     lag : int
         Of the task.
     """
 
-    def __init__(self, network: Network, seen: FilterSeen | VoltagesSeen, level: float,
+    def __init__(self, network: Network, seen: FilterFeatures | VoltageFeatures, c_ref: float,
                  lag: int = 0) -> None:
         self.network = network
         self.seen = seen
-        self.level = level
+        self.c_ref = c_ref
         self.lag = lag
-        self._memory = blank(network)
+        self._hidden_state = initial_hidden_state(network)
         self._measured = 0
 
     def assimilate(self, voltages: np.ndarray, currents: np.ndarray) -> None:
         """Show the network one more measurement, (L,) in V and in A."""
         inputs, reduced = self.seen(voltages, currents)
         self._measured += 1
-        if self.lag and isinstance(self.seen, FilterSeen):
+        if self.lag and isinstance(self.seen, FilterFeatures):
             if self._measured <= self.lag:
                 return
             reduced = self.seen.modes(self.lag)
             inputs = np.concatenate([inputs, reduced])
-        self._memory = remember(self.network, inputs, self._memory)
+        self._hidden_state = gru_step(self.network, inputs, self._hidden_state)
         self._last = reduced, inputs
 
     def estimate(self, lag: int = 0) -> Estimate:
         """Return the state ``lag`` steps ago."""
         if lag < self.lag:
-            assert isinstance(self.seen, FilterSeen)
+            assert isinstance(self.seen, FilterFeatures)
             return self.seen.filter.estimate(lag)
-        return corrected(self.network, self.level, *self._last, self._memory)
+        return apply_correction(self.network, self.c_ref, *self._last, self._hidden_state)
 
 
-def corrected_estimator(task: Task, network: Network,
-                        see: Callable[[float], FilterSeen | VoltagesSeen]) -> FilterEstimator:
+def network_estimator(
+        task: Task, network: Network,
+        see: Callable[[float], FilterFeatures | VoltageFeatures]) -> FilterEstimator:
     """Return the estimator of a network; ``see`` maps ĉ_bh in mol/m³ to its inputs."""
-    return FilterEstimator(task, lambda level: CorrectedFilter(network, see(level), level,
+    return FilterEstimator(task, lambda c_ref: NetworkCorrectedFilter(network, see(c_ref), c_ref,
                                                                task.lag))
 
 
-def pattern(task: Task, currents: np.ndarray) -> np.ndarray:
+def injection_one_hot(task: Task, currents: np.ndarray) -> np.ndarray:
     """(frame,) one for this injection of the task's cycle, zero for the others."""
     return (task.currents == currents).all(axis=1).astype(float)

@@ -9,8 +9,9 @@ from __future__ import annotations
 import numpy as np
 
 
-def pair_gains(covariance_of: np.ndarray, weighted: np.ndarray, pairs: np.ndarray,
-               noise_variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def pair_design_criteria(
+        voltage_covariance: np.ndarray, weighted_voltage_covariance: np.ndarray,
+        pairs: np.ndarray, noise_variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """What each pair would teach if it were injected now, (p,) and (p,).
 
     By how much tr(W P) falls (A-optimality), and ½ ln by what factor det P does (D-optimality).
@@ -19,9 +20,9 @@ def pair_gains(covariance_of: np.ndarray, weighted: np.ndarray, pairs: np.ndarra
 
     Parameters
     ----------
-    covariance_of : (L, L, L, L)
+    voltage_covariance : (L, L, L, L)
         D P Dᵀ, P the state's covariance just before the measurement.
-    weighted : (L, L, L, L)
+    weighted_voltage_covariance : (L, L, L, L)
         D P W P Dᵀ, W the weight of the states' errors.
     pairs : (p, 2)
         Where the current enters and leaves.
@@ -29,16 +30,16 @@ def pair_gains(covariance_of: np.ndarray, weighted: np.ndarray, pairs: np.ndarra
         Of each pair's voltages, per current squared; infinite for readings not to be believed.
     """
     i, j = pairs.T
-    L = covariance_of.shape[0]
+    L = voltage_covariance.shape[0]
 
     def between(table: np.ndarray) -> np.ndarray:
         return table[i, :, i] - table[i, :, j] - table[j, :, i] + table[j, :, j]
 
     # In parts of the noise; a reading without end to its noise has no part in it.
     root = 1.0 / np.sqrt(noise_variance)
-    S = between(covariance_of) * root[:, :, None] * root[:, None, :]
+    S = between(voltage_covariance) * root[:, :, None] * root[:, None, :]
     S[:, np.arange(L), np.arange(L)] += 1.0
     factor = np.linalg.cholesky(S)
-    learnt = between(weighted) * root[:, :, None] * root[:, None, :]
+    learnt = between(weighted_voltage_covariance) * root[:, :, None] * root[:, None, :]
     gains = np.linalg.solve(S, learnt).trace(axis1=1, axis2=2)
     return gains, np.log(factor.diagonal(axis1=1, axis2=2)).sum(axis=1)

@@ -9,16 +9,16 @@ import numpy as np
 
 from eitbench import _check
 from eitbench.estimation.forward import Forward
-from eitbench.estimation.gaussian import Observation
-from eitbench.estimation.inflow_window import stationary
+from eitbench.estimation.gaussian import LinearMeasurement
+from eitbench.estimation.inflow_window import yule_walker
 from eitbench.worlds.task import Estimate
 
 if TYPE_CHECKING:
     from eitbench.estimation.inflow_prior import InflowPrior
-    from eitbench.estimation.velocity import UnknownFlow
+    from eitbench.estimation.velocity import VelocityPrior
     from eitbench.worlds.task import Task
 
-NODES = 3.0**0.5
+QUADRATURE_NODE = 3.0**0.5
 """Standard deviations of θ about its mean at which the transport is computed: Gauss–Hermite's."""
 
 
@@ -27,9 +27,9 @@ class EnsembleFilter:
 
     Each member's inflow goes on by the prior's regression and its flow by a random walk; the fluid
     moves with the member's own θ, by quadratic interpolation of the step between transports at the
-    mean θ and `NODES` standard deviations off it along each axis. A measurement is linearised about
-    the mean concentration and moves mean and deviations by the symmetric square root (Hunt,
-    Kostelich & Szunyogh, Physica D 230, 2007), without noise of its own.
+    mean θ and `QUADRATURE_NODE` standard deviations off it along each axis. A measurement is
+    linearised about the mean concentration and moves mean and deviations by the symmetric square
+    root (Hunt, Kostelich & Szunyogh, Physica D 230, 2007), without perturbed measurements.
 
     The velocity of each member stays within the flow's bounds. ``ValueError`` naming the argument
     if it is out of range, or the prior is of another inlet.
@@ -39,42 +39,42 @@ class EnsembleFilter:
     task : Task
     prior : InflowPrior
         Of the task's inlet.
-    level : float
+    c_ref : float
         ĉ_bh in mol/m³, which fills the pipe before the first of the inflows.
-    flow : UnknownFlow
+    flow : VelocityPrior
         Numbers of zero deviation are known.
     members : int
         N ≥ 2.
-    lead_in : int
+    spin_up_steps : int
         Time steps that the members' inflows have flowed before t = 0, ≥ 0.
     random : Generator
     forward : callable
         Linearises voltages about a concentration; for `assimilate`.
     """
 
-    def __init__(self, task: Task, prior: InflowPrior, level: float, flow: UnknownFlow,
-                 members: int, lead_in: int, random: np.random.Generator,
+    def __init__(self, task: Task, prior: InflowPrior, c_ref: float, flow: VelocityPrior,
+                 members: int, spin_up_steps: int, random: np.random.Generator,
                  forward: Forward) -> None:
         prior.check_task(task)
         N = _check.integer("members", members, low=2)
-        _check.integer("lead_in", lead_in, low=0)
+        _check.integer("spin_up_steps", spin_up_steps, low=0)
         self.prior = prior
-        self.level = level
+        self.c_ref = c_ref
         self.flow = flow
         self._random = random
         self._forward = forward
         self._innovation: tuple[np.ndarray, np.ndarray] | tuple[None, None] = (None, None)
-        covariance = prior.time_covariance(prior.memory + 2)
-        before, (self._weights, self._variance) = stationary(covariance)
+        covariance = prior.time_covariance(prior.correlation_steps + 2)
+        before, (self._weights, self._variance) = yule_walker(covariance)
         independent = random.standard_normal((len(before), prior.modes.shape[1], N))
         self.inflows = np.tensordot(np.linalg.cholesky(before), independent, 1)
         """(P, r, N) last x of each member, the newest first"""
-        self.parameters = self._drawn(flow.start[:, None], flow.start_std, N)
+        self.parameters = self._drawn(flow.initial[:, None], flow.initial_std, N)
         """(k, N) θ of each member"""
         self._keep_physical()
-        self.concentration = np.full((task.mesh.n_nodes, N), level)
+        self.concentration = np.full((task.mesh.n_nodes, N), c_ref)
         """(n, N) mol/m³ of each member"""
-        for _ in range(lead_in):
+        for _ in range(spin_up_steps):
             self._advance(0.0 * flow.walk_std)
 
     def predict(self) -> None:
@@ -97,7 +97,7 @@ class EnsembleFilter:
 
     def _inflow(self) -> np.ndarray:
         """(n_inlet, N) mol/m³ that enters now."""
-        return self.level * self.prior.inflow(self.prior.modes @ self.inflows[0])
+        return self.c_ref * self.prior.inverse_link(self.prior.modes @ self.inflows[0])
 
     def _carried(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
         """(n, N) of each member in a flow of its own, one time step later."""
@@ -106,7 +106,7 @@ class EnsembleFilter:
             return self.flow.transport_at(theta).step(self.concentration, before, after)
 
         theta = self.parameters.mean(axis=1)
-        spread = NODES * self.parameters.std(axis=1, ddof=1)
+        spread = QUADRATURE_NODE * self.parameters.std(axis=1, ddof=1)
         middle = moved(theta)
         carried = middle.copy()
         for axis in np.flatnonzero(spread):
@@ -123,7 +123,7 @@ class EnsembleFilter:
         self.predict()
         self.update(self._forward(self.concentration.mean(axis=1), voltages, currents))
 
-    def update(self, observation: Observation) -> None:
+    def update(self, observation: LinearMeasurement) -> None:
         """Condition on a measurement that is linear in the concentration near its mean."""
         N = self.concentration.shape[1]
         std = np.sqrt(observation.noise_variance)

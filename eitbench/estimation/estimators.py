@@ -14,7 +14,7 @@ Measurement = tuple[np.ndarray, np.ndarray]
 """Voltages (L,) in V and currents (L,) in A (A/m in 2D) of one injection."""
 
 
-class FirstFrame:
+class CalibrationFrame:
     """Calibration frame: the first injections, which determine ĉ_bh and with it all of Table 5.1.
 
     The frame lies within the warm-up, so that no scored estimate waits for it.
@@ -24,7 +24,7 @@ class FirstFrame:
         self.task = task
         self.length = task.calibration
         self.measurements: list[Measurement] = []
-        self.c_bh = task.expected_concentration
+        self.c_ref = task.expected_concentration
         """mol/m³; the task's rough level until the frame is complete, then ĉ_bh"""
 
     @property
@@ -38,14 +38,14 @@ class FirstFrame:
         if self.complete:
             task = self.task
             V, I = (np.array(part) for part in zip(*self.measurements, strict=True))
-            self.c_bh = best_homogeneous(task.observation, task.noise, task.mesh.n_nodes, V, I,
-                                         self.c_bh)
+            self.c_ref = best_homogeneous(task.observation, task.noise, task.mesh.n_nodes, V, I,
+                                         self.c_ref)
         return self.complete
 
     @property
     def mean(self) -> np.ndarray:
         """(n,) homogeneous concentration: the estimate while the frame lasts."""
-        return np.full(self.task.mesh.n_nodes, self.c_bh)
+        return np.full(self.task.mesh.n_nodes, self.c_ref)
 
 
 class Sequential(Protocol):
@@ -73,7 +73,7 @@ class FilterEstimator:
 
     def __init__(self, task: Task, start: Callable[[float], Sequential]) -> None:
         self.task = task
-        self.first = FirstFrame(task)
+        self.first = CalibrationFrame(task)
         self._start = start
         self.filter: Sequential
         self._measured = 0
@@ -91,7 +91,7 @@ class FilterEstimator:
         if self.first.complete:
             self.filter.assimilate(voltages, currents)
         elif self.first.add(voltages, currents):
-            self.filter = self._start(self.first.c_bh)
+            self.filter = self._start(self.first.c_ref)
             for measurement in self.first.measurements:
                 self.filter.assimilate(*measurement)
         elif self._requested > 0:
@@ -105,7 +105,7 @@ class FilterEstimator:
         return estimate
 
 
-class RecordEstimator:
+class SmootherEstimator:
     """Smoother of a whole record as an estimator: it is silent until the last measurement.
 
     Parameters
@@ -129,9 +129,9 @@ class RecordEstimator:
             self._record.append((voltages, currents))
             if len(self._record) < self.task.n_steps:
                 return None
-            first = FirstFrame(self.task)
+            first = CalibrationFrame(self.task)
             for measurement in self._record[:first.length]:
                 first.add(*measurement)
-            self._estimates = self._smooth(first.c_bh, self._record)
+            self._estimates = self._smooth(first.c_ref, self._record)
         self._requested += 1
         return self._estimates[self._requested - 1]

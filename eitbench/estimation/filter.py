@@ -10,7 +10,7 @@ import numpy as np
 
 from eitbench.estimation.covariance import Covariance
 from eitbench.estimation.forward import Forward
-from eitbench.estimation.gaussian import Observation, condition, innovate
+from eitbench.estimation.gaussian import LinearMeasurement, condition, innovate
 from eitbench.worlds.task import Estimate
 
 
@@ -76,8 +76,8 @@ class Step(NamedTuple):
     """(n,) diagonal of P_{t|t}; only `kalman_filter` sets it"""
 
 
-Linearised = tuple[Observation, np.ndarray, np.ndarray]
-"""Observation, its derivatives (m, k) by the first k entries of x, measured minus predicted (m,)"""
+LinearisedMeasurement = tuple[LinearMeasurement, np.ndarray, np.ndarray]
+"""Linear measurement, its derivatives (m, k) by the first k entries of x, residual (m,)"""
 
 
 class Filter:
@@ -119,7 +119,7 @@ class Filter:
         self.time += 1
         self.mean, self.covariance = self.space.propagate(self.mean, self.covariance, self.time)
 
-    def update(self, observation: Observation) -> Step:
+    def update(self, observation: LinearMeasurement) -> Step:
         """Condition on a measurement that is linear in the concentration near the present one."""
         return self._condition(*self._residual(observation))
 
@@ -138,16 +138,17 @@ class Filter:
                                    innovation_covariance=step.innovation_covariance)
         return self.step
 
-    def _linearise(self, voltages: np.ndarray, currents: np.ndarray) -> Linearised:
+    def _linearise(self, voltages: np.ndarray, currents: np.ndarray) -> LinearisedMeasurement:
         """Linearise voltages (L,) in V about the present mean, for an injection (L,) in A."""
         assert self.forward is not None, "forward must be given to assimilate voltages"
         return self._residual(self.forward(self.concentration, voltages, currents))
 
-    def _residual(self, observation: Observation) -> Linearised:
+    def _residual(self, observation: LinearMeasurement) -> LinearisedMeasurement:
         H = self.space.jacobian(self.mean, observation.matrix)
         return observation, H, observation.value - observation.matrix @ self.concentration
 
-    def _condition(self, observation: Observation, H: np.ndarray, residual: np.ndarray) -> Step:
+    def _condition(self, observation: LinearMeasurement, H: np.ndarray,
+                   residual: np.ndarray) -> Step:
         innovation = innovate(self.covariance, H, residual, observation.noise_variance,
                               observation.noise_root)
         predicted = self.mean, self.covariance
@@ -171,7 +172,7 @@ class Filter:
                         space.variance(self.mean, self.covariance, lag), *innovation, *velocity)
 
 
-def kalman_filter(start: Filter, observations: Iterable[Observation]) -> list[Step]:
+def kalman_filter(start: Filter, observations: Iterable[LinearMeasurement]) -> list[Step]:
     """Run ``start`` over a record: predict, then update, for each observation."""
     steps = []
     for observation in observations:

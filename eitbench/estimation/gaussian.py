@@ -11,7 +11,7 @@ from scipy.linalg import cholesky, solve_triangular
 from eitbench.estimation.covariance import Covariance
 
 
-class Observation(NamedTuple):
+class LinearMeasurement(NamedTuple):
     """Linear measurement: value = matrix x + v + N e, with independent v and e ~ N(0, I)."""
 
     matrix: np.ndarray

@@ -10,28 +10,28 @@ import numpy as np
 
 from eitbench import _check
 from eitbench.data.dataset import Dataset, Example
-from eitbench.data.seeds import SPLITS, name_seed
-from eitbench.estimation.estimators import FirstFrame
-from eitbench.estimation.forward import LinearisedObservations
-from eitbench.estimation.identified import IdentifiedModel, told
+from eitbench.data.seeds import SPLITS, format_seed
+from eitbench.estimation.estimators import CalibrationFrame
+from eitbench.estimation.forward import LinearisedForwardModel
+from eitbench.estimation.identified import IdentifiedModel, task_fingerprint
 from eitbench.estimation.inflow_response import steady_response
 from eitbench.worlds.task import Task, make_task
 from eitbench.worlds.world import World
 
-KEPT = 1e-4
+INLET_VARIANCE_CUTOFF = 1e-4
 """Modes across the inlet of less than this part of the inflow's variance are left out."""
-RIDGE = 1e-6
+DEFAULT_RIDGE = 1e-6
 """of the mean square of what an inflow is known by: keeps apart what never came apart."""
-RIDGES = 10.0**np.arange(-6, 3)
+CV_RIDGES = 10.0**np.arange(-6, 3)
 """The same, of which cross-validation chooses where the flow as told is corrected."""
-FOLDS = 4
+CV_FOLDS = 4
 """of the episodes, each left out in turn"""
-EVERY = 3
+VOLTAGE_STRIDE = 3
 """Voltages are compared at each third step only: neighbours say much the same, and three turns pass
 all injections of a cycle that is no multiple of it."""
 
 
-class Moments(NamedTuple):
+class RegressionSums(NamedTuple):
     """Sums over states of training episodes, s being past inflows and d = c/c_0 − 1, of which l is
     what the flow that is told does not explain, or all."""
 
@@ -52,7 +52,7 @@ class Moments(NamedTuple):
     """(P,) of so many readings"""
 
 
-def identified_model(examples: Dataset, *, modes: int = 64, correct: bool = False,
+def identify_model(examples: Dataset, *, modes: int = 64, residual_only: bool = False,
                      linearised: bool = False, progress: Any = iter,
                      source: Mapping[str, Any] | None = None) -> IdentifiedModel:
     """What an inflow leaves in the pipe, by ridge regression of the true states on the inflows
@@ -67,7 +67,7 @@ def identified_model(examples: Dataset, *, modes: int = 64, correct: bool = Fals
         Episodes of the split train.
     modes : int
         q.
-    correct : bool
+    residual_only : bool
         Take what the flow as told leaves for granted, and regress only what that is off, with the
         ridge that predicts episodes best which it has not seen: where the flow is known and only
         its mesh is coarse, or episodes are few.
@@ -87,14 +87,14 @@ def identified_model(examples: Dataset, *, modes: int = 64, correct: bool = Fals
     """
     if others := [seed for seed in examples.seeds if seed not in SPLITS["train"]]:
         raise ValueError("examples' seeds must be of the split train, from which alone is learned; "
-                         f"got {name_seed(others[0])}")
+                         f"got {format_seed(others[0])}")
     world = examples.world
     q = _check.integer("modes", modes, low=1, high=examples.mesh.n_nodes)
     if len(examples) * world.n_steps <= q:
         raise ValueError(f"examples must have more states than modes, {q}; got "
                          f"{len(examples) * world.n_steps}")
-    if correct and len(examples) < FOLDS:
-        raise ValueError(f"examples must be at least {FOLDS} episodes to correct the flow as told, "
+    if residual_only and len(examples) < CV_FOLDS:
+        raise ValueError(f"examples must be at least {CV_FOLDS} episodes with residual_only, "
                          f"got {len(examples)}")
     task = make_task(world)
     across = _across(world, examples.seeds)
@@ -102,9 +102,9 @@ def identified_model(examples: Dataset, *, modes: int = 64, correct: bool = Fals
     memory = told_response.weights.shape[1]
     known = np.zeros((examples.mesh.n_nodes, memory * across.shape[1]))
     folds = 1
-    if correct:
+    if residual_only:
         known = told_response.basis @ (told_response.weights @ across).reshape(-1, known.shape[1])
-        folds = FOLDS
+        folds = CV_FOLDS
     parts = [_moments(progress(replace(examples, seeds=examples.seeds[fold::folds])), world, task,
                       across, known, linearised) for fold in range(folds)]
     moments = _together(parts)
@@ -122,15 +122,16 @@ def identified_model(examples: Dataset, *, modes: int = 64, correct: bool = Fals
     bias = moments.off / compared[:, None]
     scatter = moments.scatter / compared[:, None, None] - bias[:, :, None] * bias[:, None]
     return IdentifiedModel(basis, weights.T.reshape(q, memory, -1), across,
-                           0.5 * (left + left.T) / free, task.currents, bias, told(task),
-                           world.background, source or {}, scatter if linearised else None)
+                           0.5 * (left + left.T) / free, task.currents, bias,
+                           task_fingerprint(task), world.background, source or {},
+                           scatter if linearised else None)
 
 
-def _together(parts: list[Moments]) -> Moments:
-    return Moments(*(sum(each) for each in zip(*parts, strict=True)))  # type: ignore[arg-type]
+def _together(parts: list[RegressionSums]) -> RegressionSums:
+    return RegressionSums(*(sum(each) for each in zip(*parts, strict=True)))  # type: ignore[arg-type]
 
 
-def _regressed(moments: Moments, to_modes: np.ndarray,
+def _regressed(moments: RegressionSums, to_modes: np.ndarray,
                ridge: float) -> tuple[np.ndarray, np.ndarray, float]:
     """What is left (K·r, q) for each inflow, Σ s lᵀ in modes, and how many states are free."""
     cross = moments.cross @ to_modes
@@ -140,37 +141,37 @@ def _regressed(moments: Moments, to_modes: np.ndarray,
     return solved[:, :q], cross, float(moments.states - np.trace(solved[:, q:]))
 
 
-def _mean_square(moments: Moments) -> float:
+def _mean_square(moments: RegressionSums) -> float:
     return float(np.trace(moments.inflow) / len(moments.inflow))
 
 
-def _ridge(parts: list[Moments], to_modes: np.ndarray) -> float:
-    """The one that predicts each part best from the others; `RIDGE` if there is only one."""
+def _ridge(parts: list[RegressionSums], to_modes: np.ndarray) -> float:
+    """The one that predicts each part best from the others; of one part `DEFAULT_RIDGE`."""
     if len(parts) == 1:
-        return RIDGE
-    losses = np.zeros(len(RIDGES))
+        return DEFAULT_RIDGE
+    losses = np.zeros(len(CV_RIDGES))
     for part in parts:
         others = _together([each for each in parts if each is not part])
         values, directions = np.linalg.eigh(others.inflow)
         theirs = directions.T @ others.cross @ to_modes
         ours = directions.T @ part.cross @ to_modes
         inflow = directions.T @ part.inflow @ directions
-        for k, ridge in enumerate(RIDGES):
+        for k, ridge in enumerate(CV_RIDGES):
             weights = theirs / (values + ridge * _mean_square(others))[:, None]
             # the squared error of the part, but for what does not depend on the weights
             losses[k] += (weights * (inflow @ weights)).sum() - 2.0 * (ours * weights).sum()
-    return float(RIDGES[losses.argmin()])
+    return float(CV_RIDGES[losses.argmin()])
 
 
 def _across(world: World, seeds: Iterable[int]) -> np.ndarray:
     """(n_inlet, r) orthonormal: the strongest modes of the inflow across the inlet."""
     s = np.concatenate([world.sample_inflow(seed) for seed in seeds]) / world.background - 1.0
     values, vectors = np.linalg.eigh(s.T @ s)
-    return vectors[:, values > KEPT * values.sum()][:, ::-1]
+    return vectors[:, values > INLET_VARIANCE_CUTOFF * values.sum()][:, ::-1]
 
 
 def _moments(examples: Iterable[Example], world: World, task: Task, across: np.ndarray,
-             known: np.ndarray, linearised: bool) -> Moments:
+             known: np.ndarray, linearised: bool) -> RegressionSums:
     """Where past inflows are known (n, K·r) to leave something."""
     n, size = known.shape
     count = 0
@@ -180,7 +181,7 @@ def _moments(examples: Iterable[Example], world: World, task: Task, across: np.n
     off, scatter = np.zeros((P, L)), np.zeros((P, L, L))
     compared = np.zeros(P)
     for example in examples:
-        s = recent_inflows(world.sample_inflow(example.seed) / world.background - 1.0, across,
+        s = inflow_regressors(world.sample_inflow(example.seed) / world.background - 1.0, across,
                            len(example.truth), size // across.shape[1])
         d = example.truth / world.background - 1.0
         l = d - s @ known.T
@@ -193,7 +194,7 @@ def _moments(examples: Iterable[Example], world: World, task: Task, across: np.n
             off[t % P] += error
             scatter[t % P] += np.outer(error, error)
             compared[t % P] += 1
-    return Moments(count, inflow, cross, left, state, off, scatter, compared)
+    return RegressionSums(count, inflow, cross, left, state, off, scatter, compared)
 
 
 def _errors(task: Task, example: Example, linearised: bool) -> Iterator[tuple[int, np.ndarray]]:
@@ -201,20 +202,20 @@ def _errors(task: Task, example: Example, linearised: bool) -> Iterator[tuple[in
     deviations of their noise."""
     truth = example.truth.astype(float)
     if linearised:
-        first = FirstFrame(task)
+        first = CalibrationFrame(task)
         for t in range(first.length):
             first.add(example.voltages[t], example.currents[t])
-        observe = LinearisedObservations(task.observation, task.noise, first.mean)
+        observe = LinearisedForwardModel(task.observation, task.noise, first.mean)
         for t, c in enumerate(truth):
             seen = observe(example.voltages[t], example.currents[t])
             yield t, (seen.value - seen.matrix @ c) / np.sqrt(seen.noise_variance)
         return
-    for t in range(0, len(truth), EVERY):
+    for t in range(0, len(truth), VOLTAGE_STRIDE):
         computed = task.observation.voltages(truth[t], example.currents[t:t + 1])[0]
         yield t, (example.voltages[t] - computed) / task.noise.std(computed)
 
 
-def recent_inflows(s: np.ndarray, across: np.ndarray, steps: int, memory: int) -> np.ndarray:
+def inflow_regressors(s: np.ndarray, across: np.ndarray, steps: int, memory: int) -> np.ndarray:
     """(T, K·r) of each of the last T states: its K last inflows, in modes; nothing deviates before
     the record of inflows (·, n_inlet) begins."""
     reduced = s @ across

@@ -15,19 +15,22 @@ import numpy as np
 
 from eitbench import _check
 from eitbench._files import write_atomically
-from eitbench.estimation.forward import Forward, about_prediction, about_reference
-from eitbench.estimation.gaussian import Observation
-from eitbench.estimation.inflow_prior import learned_in, nominal_worlds
-from eitbench.estimation.inflow_response import Response
+from eitbench.estimation.forward import Forward, linearise_at_prediction, linearise_at_reference
+from eitbench.estimation.gaussian import LinearMeasurement
+from eitbench.estimation.inflow_prior import nominal_worlds, source_world
+from eitbench.estimation.inflow_response import ImpulseResponse
 
 if TYPE_CHECKING:
     from eitbench.worlds.task import Task
 
-ARRAYS = ("basis", "weights", "across", "spread", "patterns", "bias", "told")
-"""What every file holds; `scatter` is there if voltages are linearised once."""
-CLOSE = 1e-4
+FILE_KEYS = {"basis": "basis", "impulse_response": "weights", "inlet_modes": "across",
+             "residual_covariance": "spread", "current_patterns": "patterns",
+             "mean_voltage_error": "bias", "task_fingerprint": "told",
+             "voltage_error_covariance": "scatter"}
+"""Field of `IdentifiedModel` -> its key in files; the last may be missing."""
+FINGERPRINT_ATOL = 1e-4
 """Tasks whose `told` differ by less are the same."""
-SPOT = 0.02
+PROBE_WIDTH_M = 0.02
 """m: standard deviation of the blob that `told` lets the flow carry."""
 
 
@@ -43,48 +46,48 @@ class IdentifiedModel:
 
     basis: np.ndarray
     """(n, q) B, orthonormal in M̃"""
-    weights: np.ndarray
+    impulse_response: np.ndarray
     """(q, K, r) of the inflow k = 0 … K − 1 steps ago, in modes across the inlet: W_k = weights_k
     acrossᵀ"""
-    across: np.ndarray
+    inlet_modes: np.ndarray
     """(n_inlet, r)"""
-    spread: np.ndarray
+    residual_covariance: np.ndarray
     """(q, q) Γ_e"""
-    patterns: np.ndarray
+    current_patterns: np.ndarray
     """(P, L) A (A/m in 2D): injections that were seen"""
-    bias: np.ndarray
+    mean_voltage_error: np.ndarray
     """(P, L) b of each, in standard deviations of the reading's noise"""
-    told: np.ndarray
+    task_fingerprint: np.ndarray
     """(J,) of the task, by `told`"""
-    level: float
+    c_ref: float
     """mol/m³ with which the pipe was filled"""
     source: Mapping[str, Any] = field(default_factory=dict)
     """where it comes from, fit for JSON"""
-    scatter: np.ndarray | None = None
+    voltage_error_covariance: np.ndarray | None = None
     """(P, L, L) covariance of v where R is linearised once, in products of noise standard
     deviations; None: R is not, and v is the noise"""
 
     def __post_init__(self) -> None:
         q = _check.array("basis", self.basis, (None, None)).shape[1]
-        *_, r = _check.array("weights", self.weights, (q, None, None)).shape
-        _check.array("across", self.across, (None, r))
-        _check.array("spread", self.spread, (q, q))
-        P, L = _check.array("patterns", self.patterns, (None, None)).shape
-        _check.array("bias", self.bias, (P, L))
-        if self.scatter is not None:
-            _check.array("scatter", self.scatter, (P, L, L))
-        _check.array("told", self.told, (None,))
-        _check.number("level", self.level, low=0.0, open_low=True, units="mol/m³")
+        *_, r = _check.array("impulse_response", self.impulse_response, (q, None, None)).shape
+        _check.array("inlet_modes", self.inlet_modes, (None, r))
+        _check.array("residual_covariance", self.residual_covariance, (q, q))
+        P, L = _check.array("current_patterns", self.current_patterns, (None, None)).shape
+        _check.array("mean_voltage_error", self.mean_voltage_error, (P, L))
+        if self.voltage_error_covariance is not None:
+            _check.array("voltage_error_covariance", self.voltage_error_covariance, (P, L, L))
+        _check.array("task_fingerprint", self.task_fingerprint, (None,))
+        _check.number("c_ref", self.c_ref, low=0.0, open_low=True, units="mol/m³")
 
     @property
-    def response(self) -> Response:
+    def response(self) -> ImpulseResponse:
         """B and W."""
-        return Response(self.basis, self.weights @ self.across.T)
+        return ImpulseResponse(self.basis, self.impulse_response @ self.inlet_modes.T)
 
     @cached_property
     def root(self) -> np.ndarray:
         """(n, q) N with N Nᵀ = B Γ_e Bᵀ."""
-        values, vectors = np.linalg.eigh(self.spread)
+        values, vectors = np.linalg.eigh(self.residual_covariance)
         root: np.ndarray = self.basis @ (vectors * np.sqrt(np.maximum(values, 0.0)))
         return root
 
@@ -92,53 +95,56 @@ class IdentifiedModel:
         """(L,) V by which readings of an injection (L,) exceed R(c), with ``std`` (L,) V of their
         noise; zero if that injection never was seen."""
         number = self._number(currents)
-        return np.zeros_like(std) if number is None else self.bias[number] * std
+        return np.zeros_like(std) if number is None else self.mean_voltage_error[number] * std
 
     def error_root(self, currents: np.ndarray, std: np.ndarray) -> np.ndarray:
         """(L, L) V: N with N Nᵀ the covariance of v for an injection (L,), with ``std`` (L,) V of
         the noise alone; that of the noise if the injection never was seen, or without `scatter`."""
         number = self._number(currents)
-        if self.scatter is None or number is None:
+        if self.voltage_error_covariance is None or number is None:
             return np.diag(std)
-        root: np.ndarray = std[:, None] * np.linalg.cholesky(self.scatter[number])
+        root: np.ndarray = std[:, None] * np.linalg.cholesky(self.voltage_error_covariance[number])
         return root
 
     def _number(self, currents: np.ndarray) -> int | None:
         """Of the injection among the `patterns`."""
-        seen = np.flatnonzero(np.isclose(self.patterns, currents).all(axis=1))
+        seen = np.flatnonzero(np.isclose(self.current_patterns, currents).all(axis=1))
         return int(seen[0]) if len(seen) else None
 
-    def forward(self, task: Task, level: float) -> Forward:
+    def forward(self, task: Task, c_ref: float) -> Forward:
         """Return the task's voltages with the model's errors, about each prediction, or linearised
-        once about ``level`` in mol/m³ where there is a `scatter`."""
-        linearise = about_prediction(task) if self.scatter is None else about_reference(task, level)
+        once about ``c_ref`` in mol/m³ where there is a `scatter`."""
+        linearise = (linearise_at_prediction(task) if self.voltage_error_covariance is None
+                     else linearise_at_reference(task, c_ref))
 
-        def measure(point: np.ndarray, voltages: np.ndarray, currents: np.ndarray) -> Observation:
+        def measure(point: np.ndarray, voltages: np.ndarray,
+                    currents: np.ndarray) -> LinearMeasurement:
             matrix, value, variance, _ = linearise(point, voltages, currents)
             std = np.sqrt(variance)
-            root = level * (matrix @ self.root)
-            if self.scatter is not None:
+            root = c_ref * (matrix @ self.root)
+            if self.voltage_error_covariance is not None:
                 root = np.concatenate([root, self.error_root(currents, std)], axis=1)
                 variance = np.zeros_like(variance)
-            return Observation(matrix, value - self.mean_error(currents, std), variance, root)
+            return LinearMeasurement(matrix, value - self.mean_error(currents, std), variance, root)
 
         return measure
 
-    def suits(self, task: Task) -> bool:
+    def matches_task(self, task: Task) -> bool:
         """Whether it was made for a task with this mesh, these injections and this told flow."""
-        if task.mesh.n_nodes != len(self.basis) or task.currents.shape[1] != self.bias.shape[1]:
+        n_electrodes = self.mean_voltage_error.shape[1]
+        if task.mesh.n_nodes != len(self.basis) or task.currents.shape[1] != n_electrodes:
             return False
-        there = told(task)
-        return there.shape == self.told.shape and bool(np.allclose(there, self.told, atol=CLOSE))
+        fingerprint = task_fingerprint(task)
+        return fingerprint.shape == self.task_fingerprint.shape and bool(
+            np.allclose(fingerprint, self.task_fingerprint, atol=FINGERPRINT_ATOL))
 
     def save(self, path: Path) -> None:
         """Write a file that `load` reads, in single precision."""
         buffer = io.BytesIO()
-        arrays = {name: getattr(self, name).astype(np.float32) for name in ARRAYS}
-        if self.scatter is not None:
-            arrays["scatter"] = self.scatter.astype(np.float32)
+        arrays = {key: getattr(self, name).astype(np.float32) for name, key in FILE_KEYS.items()
+                  if getattr(self, name) is not None}
         np.savez_compressed(buffer, source=np.array(json.dumps(dict(self.source))),
-                            level=self.level, **arrays)
+                            level=self.c_ref, **arrays)
         write_atomically(path, buffer.getvalue())
 
     @classmethod
@@ -146,31 +152,32 @@ class IdentifiedModel:
         """What `save` has written; ``ValueError`` naming the file if it is nothing of the kind."""
         try:
             with np.load(path, allow_pickle=False) as file:
-                there = [*ARRAYS, "scatter"] if "scatter" in file else ARRAYS
-                arrays = {name: file[name].astype(float) for name in there}
-                return cls(**arrays, level=float(file["level"]),
+                arrays = {name: file[key].astype(float) for name, key in FILE_KEYS.items()
+                          if key in file or key != "scatter"}
+                return cls(**arrays, c_ref=float(file["level"]),
                            source=json.loads(str(file["source"])))
         except (OSError, ValueError, KeyError, EOFError) as error:
             raise ValueError(f"{path} must be a model of `eitbench fit model`: {error}") from None
 
 
-def told(task: Task) -> np.ndarray:
+def task_fingerprint(task: Task) -> np.ndarray:
     """What a task tells of vessel, injections and flow: voltages of a homogeneous vessel in parts
     of the largest, and where (m) one time step carries a blob in its middle."""
-    level = task.expected_concentration
+    c_ref = task.expected_concentration
     x = task.mesh.points
-    blob = np.exp(-0.5 * ((x - x.mean(axis=0))**2).sum(axis=1) / SPOT**2)
+    blob = np.exp(-0.5 * ((x - x.mean(axis=0))**2).sum(axis=1) / PROBE_WIDTH_M**2)
     still = np.zeros(len(task.transport.inlet))
     moved = task.transport.step(blob, still, still)
-    voltages = task.observation.voltages(np.full(len(x), level), task.currents)
+    voltages = task.observation.voltages(np.full(len(x), c_ref), task.currents)
     return np.concatenate([voltages.ravel() / np.abs(voltages).max(), moved @ x / moved.sum()])
 
 
-def suiting_models(folder: Path, task: Task) -> list[IdentifiedModel]:
+def compatible_models(folder: Path, task: Task) -> list[IdentifiedModel]:
     """Those in a folder's files that are of this task: first those that were learned in the task's
     own world, then the others, by name."""
-    suiting = [model for model in map(_loaded, sorted(folder.glob("*.npz"))) if model.suits(task)]
-    return sorted(suiting, key=lambda model: learned_in(model.source) not in
+    models = map(_loaded, sorted(folder.glob("*.npz")))
+    suiting = [model for model in models if model.matches_task(task)]
+    return sorted(suiting, key=lambda model: source_world(model.source) not in
                   nominal_worlds(task.world))
 
 

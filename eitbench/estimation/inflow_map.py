@@ -12,53 +12,53 @@ from eitbench.estimation.estimators import Measurement
 from eitbench.estimation.filter import Filter
 from eitbench.estimation.identified import IdentifiedModel
 from eitbench.estimation.inflow_prior import InflowPrior
-from eitbench.estimation.inflow_response import Response
+from eitbench.estimation.inflow_response import ImpulseResponse
 from eitbench.estimation.inflow_window import InflowWindow, inflow_filter
 from eitbench.worlds.task import Estimate, Task
 
-SETTLED = 1e-3
+STEP_TOLERANCE = 1e-3
 """Largest change of an inflow, in prior standard deviations, of the last iteration."""
-MOST = 12
+MAX_ITERATIONS = 12
 """Iterations."""
 
 
-def smoothed_inflow(task: Task, prior: InflowPrior, level: float, record: Sequence[Measurement],
-                    responses: Sequence[Response] | None = None,
+def full_window_filter(task: Task, prior: InflowPrior, c_ref: float, record: Sequence[Measurement],
+                    responses: Sequence[ImpulseResponse] | None = None,
                     model: IdentifiedModel | None = None) -> Filter:
     """Return the filter at the end of a record, whose window holds the whole record: its
     `Filter.estimate` returns all states, with everything measured known."""
-    smoother = inflow_filter(task, prior, level, len(record), responses=responses, model=model)
+    smoother = inflow_filter(task, prior, c_ref, len(record), responses=responses, model=model)
     for measurement in record:
         smoother.assimilate(*measurement)
     return smoother
 
 
-def map_inflow(task: Task, prior: InflowPrior, level: float, record: Sequence[Measurement],
-               responses: Sequence[Response] | None = None,
+def map_inflow(task: Task, prior: InflowPrior, c_ref: float, record: Sequence[Measurement],
+               responses: Sequence[ImpulseResponse] | None = None,
                model: IdentifiedModel | None = None) -> list[Estimate]:
-    """Return the states t = 1 … T of a record that the `most_probable_inflow` makes."""
-    smoother = smoothed_inflow(task, prior, level, record, responses, model)
-    most_probable_inflow(smoother, task, record, model)
+    """Return the states t = 1 … T of a record that the `maximise_posterior` makes."""
+    smoother = full_window_filter(task, prior, c_ref, record, responses, model)
+    maximise_posterior(smoother, task, record, model)
     return [smoother.estimate(lag)._replace(innovation=None, innovation_covariance=None)
             for lag in reversed(range(len(record)))]
 
 
-def most_probable_inflow(smoother: Filter, task: Task, record: Sequence[Measurement],
+def maximise_posterior(smoother: Filter, task: Task, record: Sequence[Measurement],
                          model: IdentifiedModel | None = None) -> None:
-    """Move what `smoothed_inflow` has found to the maximum of the posterior density, with the
+    """Move what `full_window_filter` has found to the maximum of the posterior density, with the
     covariance there, linearised at all states anew.
 
     With x = L z, z ~ N(0, I), it minimises ‖z‖² + Σ_t ‖A_t (V_t − R(c_t(x)))‖² by Gauss–Newton with
     step halving. A_t whitens the voltage errors; the noise is that of the voltages computed from
     the smoothed states. ``ValueError`` if voltages are linearised once in the model.
     """
-    if model is not None and model.scatter is not None:
+    if model is not None and model.voltage_error_covariance is not None:
         raise ValueError("model must have voltages that are linearised anew, got one whose "
                          "voltages are linearised once")
     posterior = _Posterior(smoother, task, record, model)
     z = solve_triangular(posterior.root, smoother.mean.reshape(len(posterior.root), -1), lower=True)
     value = posterior.value(z)
-    for _ in range(MOST):
+    for _ in range(MAX_ITERATIONS):
         residual, jacobian = posterior.linearise(z)
         factor = cho_factor(np.eye(z.size) + jacobian.T @ jacobian, lower=True)
         change = cho_solve(factor, jacobian.T @ residual - z.ravel()).reshape(z.shape)
@@ -69,7 +69,7 @@ def most_probable_inflow(smoother: Filter, task: Task, record: Sequence[Measurem
             break
         z = z + length * change
         value = after
-        if np.abs(length * change).max() < SETTLED:
+        if np.abs(length * change).max() < STEP_TOLERANCE:
             break
     _, jacobian = posterior.linearise(z)
     factor = cho_factor(np.eye(z.size) + jacobian.T @ jacobian, lower=True)
@@ -89,9 +89,9 @@ class _Posterior:
         self.observation = task.observation
         voltages, currents = (np.array(part) for part in zip(*record, strict=True))
         self.by_lag = list(zip(reversed(range(len(record))), currents, strict=True))
-        covariance = toeplitz(self.space.prior.time_covariance(self.space.window))
+        covariance = toeplitz(self.space.prior.time_covariance(self.space.window_steps))
         self.root = np.linalg.cholesky(covariance)
-        errors = [_errors(task, model, self.space.level,
+        errors = [_errors(task, model, self.space.c_ref,
                           self.space.concentration(smoother.mean, lag), each)
                   for lag, each in self.by_lag]
         self.voltages = voltages - [mean for mean, _ in errors]
@@ -112,6 +112,7 @@ class _Posterior:
         mean = (self.root @ z).ravel()
         space = self.space
         W, r = z.shape
+        K = space.response_steps
         residuals = np.empty(self.voltages.shape)
         jacobian = np.zeros((*self.voltages.shape, W, r))
         for t, (lag, currents) in enumerate(self.by_lag):
@@ -119,12 +120,12 @@ class _Posterior:
                                                         currents[None])
             residuals[t] = self.whitener[t] @ (self.voltages[t] - computed[0])
             by_x = self.whitener[t] @ space.jacobian(mean, by_c[0], lag)
-            jacobian[t, :, lag:lag + space.memory] = by_x.reshape(-1, space.memory, r)
+            jacobian[t, :, lag:lag + K] = by_x.reshape(-1, K, r)
         by_z = np.tensordot(jacobian, self.root, (2, 0)).swapaxes(2, 3)
         return residuals.ravel(), by_z.reshape(residuals.size, -1)
 
 
-def _errors(task: Task, model: IdentifiedModel | None, level: float, point: np.ndarray,
+def _errors(task: Task, model: IdentifiedModel | None, c_ref: float, point: np.ndarray,
             currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return mean (L,) and covariance (L, L) of the voltage errors of an injection."""
     if model is None:
@@ -132,5 +133,5 @@ def _errors(task: Task, model: IdentifiedModel | None, level: float, point: np.n
         return np.zeros_like(std), np.diag(std**2)
     computed, by_c = task.observation.linearise(point, currents[None])
     std = task.noise.std(computed[0])
-    shared = level * (by_c[0] @ model.root)
+    shared = c_ref * (by_c[0] @ model.root)
     return model.mean_error(currents, std), np.diag(std**2) + shared @ shared.T

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,18 +15,20 @@ import numpy as np
 from eitbench import _check
 from eitbench._files import write_atomically
 from eitbench._notice import say
-from eitbench.data.seeds import SPLITS, name_seed
+from eitbench.data.seeds import SPLITS, format_seed
 from eitbench.worlds.registry import entries
 
 if TYPE_CHECKING:
     from eitbench.worlds.task import Task
     from eitbench.worlds.world import World
 
-LINKS = ("linear", "logarithm")
+REGIME_KEYS = {"p_onset": "begins", "p_end": "ends", "quiet_variance_ratio": "quiet"}
+"""Field of `Regimes` -> its key in files of priors."""
+LINK_NAMES = ("linear", "logarithm")
 """What is Gaussian: c_in/ĉ_bh − 1, or ln(c_in/ĉ_bh)."""
-NEAR = 1e-6
+NODE_ATOL_M = 1e-6
 """m between nodes that are taken for the same: an obstacle downstream moves them a little."""
-FEWEST = 16
+MIN_STEPS = 16
 """Steps that an inflow must have to learn a correlation from."""
 
 
@@ -35,27 +37,28 @@ class Regimes:
     """Where slugs are rare: a Markov chain of two regimes, quiet and slug. ``ValueError`` naming
     what is out of range."""
 
-    begins: float
+    p_onset: float
     """probability that a slug begins after a quiet step"""
-    ends: float
+    p_end: float
     """probability that quiet begins after a step of a slug"""
-    quiet: float
+    quiet_variance_ratio: float
     """variance of a quiet inflow, in parts of that within slugs"""
 
     def __post_init__(self) -> None:
-        _check.number("begins", self.begins, low=0.0, high=1.0, open_low=True)
-        _check.number("ends", self.ends, low=0.0, high=1.0, open_low=True)
-        _check.number("quiet", self.quiet, low=0.0, high=1.0, open_low=True)
+        _check.number("p_onset", self.p_onset, low=0.0, high=1.0, open_low=True)
+        _check.number("p_end", self.p_end, low=0.0, high=1.0, open_low=True)
+        _check.number("quiet_variance_ratio", self.quiet_variance_ratio, low=0.0, high=1.0,
+                      open_low=True)
 
     @property
     def share(self) -> float:
         """Of the steps in which a slug enters."""
-        return self.begins / (self.begins + self.ends)
+        return self.p_onset / (self.p_onset + self.p_end)
 
     @property
     def variance(self) -> float:
         """Of all inflows, in parts of that within slugs."""
-        return self.share + (1.0 - self.share) * self.quiet
+        return self.share + (1.0 - self.share) * self.quiet_variance_ratio
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +70,7 @@ class InflowPrior:
     """
 
     link: str
-    """one of `LINKS`"""
+    """one of `LINK_NAMES`"""
     points: np.ndarray
     """(n_inlet, d) m; the nodes of the model's inlet"""
     modes: np.ndarray
@@ -82,8 +85,8 @@ class InflowPrior:
     """for filters that tell slugs from quiet; None: not learned"""
 
     def __post_init__(self) -> None:
-        if self.link not in LINKS:
-            raise ValueError(f"link must be one of {', '.join(LINKS)}, got {self.link!r}")
+        if self.link not in LINK_NAMES:
+            raise ValueError(f"link must be one of {', '.join(LINK_NAMES)}, got {self.link!r}")
         _check.number("time_step", self.time_step, low=0.0, open_low=True, units="s")
         points = _check.array("points", self.points, (None, None), units="m")
         modes = _check.array("modes", self.modes, (len(points), None))
@@ -95,16 +98,16 @@ class InflowPrior:
             object.__setattr__(self, name, array)
 
     @property
-    def memory(self) -> int:
+    def correlation_steps(self) -> int:
         """Time steps from which on two moments have less than a tenth in common."""
         return int(np.flatnonzero(np.abs(self.correlation) >= 0.1)[-1]) + 1
 
-    def inflow(self, u: np.ndarray) -> np.ndarray:
+    def inverse_link(self, u: np.ndarray) -> np.ndarray:
         """c_in/ĉ_bh (..., n_inlet) for u of the same shape."""
         return 1.0 + u if self.link == "linear" else np.exp(u)
 
-    def slope(self, u: np.ndarray) -> np.ndarray:
-        """Derivative of `inflow` by u, entry by entry."""
+    def inverse_link_derivative(self, u: np.ndarray) -> np.ndarray:
+        """Derivative of `inverse_link` by u, entry by entry."""
         return np.ones_like(u) if self.link == "linear" else np.exp(u)
 
     def time_covariance(self, steps: int) -> np.ndarray:
@@ -114,16 +117,16 @@ class InflowPrior:
         entries[:known] = self.correlation[:known]
         return entries
 
-    def suits(self, task: Task) -> bool:
+    def matches_task(self, task: Task) -> bool:
         """Whether it was made for this task's inlet and time step."""
         there = task.mesh.points[task.transport.inlet]
         return (there.shape == self.points.shape
-                and bool(np.allclose(there, self.points, atol=NEAR))
+                and bool(np.allclose(there, self.points, atol=NODE_ATOL_M))
                 and bool(np.isclose(self.time_step, task.transport.time_step)))
 
     def check_task(self, task: Task) -> None:
         """``ValueError`` if it was made for another inlet or another time step."""
-        if not self.suits(task):
+        if not self.matches_task(task):
             raise ValueError(
                 f"the prior must be of the task's inlet, {len(task.transport.inlet)} nodes in "
                 f"steps of {task.transport.time_step:g} s; got one of {len(self.points)} nodes in "
@@ -132,7 +135,8 @@ class InflowPrior:
     def save(self, path: Path) -> None:
         """Write a file that `load` reads."""
         regimes = {} if self.regimes is None else {
-            "regimes": {name: _rounded(value) for name, value in asdict(self.regimes).items()}}
+            "regimes": {key: _rounded(getattr(self.regimes, name))
+                        for name, key in REGIME_KEYS.items()}}
         text = json.dumps({
             "link": self.link, "time_step": self.time_step, "source": dict(self.source), **regimes,
             "correlation": _rounded(self.correlation), "points": _rounded(self.points),
@@ -145,14 +149,15 @@ class InflowPrior:
         try:
             said = json.loads(path.read_text(encoding="utf-8"))
             regimes = said.pop("regimes", None)
-            return cls(**said, regimes=None if regimes is None else Regimes(**regimes))
-        except (OSError, ValueError, TypeError, AttributeError) as error:
+            return cls(**said, regimes=None if regimes is None else Regimes(
+                **{name: regimes[key] for name, key in REGIME_KEYS.items()}))
+        except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
             raise ValueError(f"{path} must be a prior of `eitbench fit prior`: {error}") from None
 
 
 def fit_inflow_prior(ratios: np.ndarray, points: np.ndarray, time_step: float, *,
-                     link: str = "logarithm", nugget: float = 0.01, kept: float = 1e-4,
-                     quiet: float | None = None,
+                     link: str = "logarithm", nugget: float = 0.01, variance_cutoff: float = 1e-4,
+                     quiet_threshold: float | None = None,
                      source: Mapping[str, Any] | None = None) -> InflowPrior:
     """The prior that inflows of the past suggest.
 
@@ -168,17 +173,17 @@ def fit_inflow_prior(ratios: np.ndarray, points: np.ndarray, time_step: float, *
         As in `InflowPrior`.
     nugget : float
         Part of the variance that is white in time: what the model does not know of.
-    kept : float
+    variance_cutoff : float
         Modes across the inlet of less than this part of the variance are left out.
-    quiet : float, optional
+    quiet_threshold : float, optional
         Learn `Regimes` too: a step counts as quiet if |u| is less than this at all nodes.
     """
     ratios = _check.array("ratios", ratios, (None, None, len(points)))
     _check.number("nugget", nugget, low=0.0, high=1.0)
-    _check.number("kept", kept, low=0.0, high=1.0)
+    _check.number("variance_cutoff", variance_cutoff, low=0.0, high=1.0)
     N, T, _ = ratios.shape
-    if not N or T < FEWEST:
-        raise ValueError(f"ratios must be of at least one episode of {FEWEST} steps, got {N} of "
+    if not N or T < MIN_STEPS:
+        raise ValueError(f"ratios must be of at least one episode of {MIN_STEPS} steps, got {N} of "
                          f"{T}")
     if (ratios <= 0).any():
         raise ValueError(f"ratios must be above 0, got {ratios.min():g}")
@@ -186,46 +191,46 @@ def fit_inflow_prior(ratios: np.ndarray, points: np.ndarray, time_step: float, *
     if not u.any():
         raise ValueError("ratios must change, got inflows that are always the same")
     values, vectors = np.linalg.eigh(np.einsum("nti,ntj->ij", u, u) / (N * T))
-    keep = values > kept * values.sum()
+    keep = values > variance_cutoff * values.sum()
     modes = (vectors[:, keep] * np.sqrt(values[keep]))[:, ::-1]
     lags = np.arange(T // 2)
     products = np.array([(u[:, k:] * u[:, :T - k]).sum() for k in lags])
     taper = (1.0 - lags / len(lags))**4 * (1.0 + 4.0 * lags / len(lags))
     correlation = (1.0 - nugget) * taper * products / products[0]
     correlation[0] = 1.0
-    regimes = None if quiet is None else _fit_regimes(u, quiet)
+    regimes = None if quiet_threshold is None else _fit_regimes(u, quiet_threshold)
     return InflowPrior(link, points, modes, correlation, time_step, source or {}, regimes)
 
 
-def _fit_regimes(u: np.ndarray, quiet: float) -> Regimes:
+def _fit_regimes(u: np.ndarray, threshold: float) -> Regimes:
     """How often slugs begin and end in u (N, T, n_inlet), and how quiet it is between them."""
-    _check.number("quiet", quiet, low=0.0, open_low=True)
-    slug = np.abs(u).max(axis=2) >= quiet
+    _check.number("quiet_threshold", threshold, low=0.0, open_low=True)
+    slug = np.abs(u).max(axis=2) >= threshold
     if slug.all() or not slug.any():
-        raise ValueError(f"quiet must be a size that some steps exceed and some do not, got {quiet}"
+        raise ValueError(f"quiet_threshold must be exceeded in some steps only, got {threshold}"
                          f" where {slug.mean():.0%} do")
     before = slug[:, :-1]
     after = slug[:, 1:]
     variance = np.square(u).sum(axis=2)
-    return Regimes(begins=float(after[~before].mean()), ends=float((~after[before]).mean()),
-                   quiet=float(variance[~slug].mean() / variance[slug].mean()))
+    return Regimes(float(after[~before].mean()), float((~after[before]).mean()),
+                   float(variance[~slug].mean() / variance[slug].mean()))
 
 
-def learned_inflow_prior(world: World, seeds: Sequence[int], **how: Any) -> InflowPrior:
+def fit_prior_from_episodes(world: World, seeds: Sequence[int], **how: Any) -> InflowPrior:
     """`fit_inflow_prior` from what flows in in these episodes, which are not simulated for it.
 
     ``ValueError`` if the world has no inflow, or an episode is not of the split ``train``.
     """
     if others := [seed for seed in seeds if seed not in SPLITS["train"]]:
         raise ValueError("seeds must be of the split train, from which alone is learned; got "
-                         f"{name_seed(others[0])}")
+                         f"{format_seed(others[0])}")
     inflows = np.array([world.sample_inflow(seed) for seed in seeds])
-    mesh, inlet = world.vessel.carrier(fine=False)
+    mesh, inlet = world.vessel.transport_mesh(fine=False)
     return fit_inflow_prior(inflows / world.background, mesh.points[np.unique(inlet)],
                             world.time_step, **how)
 
 
-def suiting_priors(folder: Path, task: Task, link: str) -> list[InflowPrior]:
+def compatible_priors(folder: Path, task: Task, link: str) -> list[InflowPrior]:
     """Return the priors in a folder's files with this link, for this task's inlet and time step.
 
     Priors learned in the task's own world come first, the others by file name. If several worlds
@@ -233,11 +238,11 @@ def suiting_priors(folder: Path, task: Task, link: str) -> list[InflowPrior]:
     first, since the inflow may differ from the task's.
     """
     priors = map(_loaded, sorted(folder.glob("*.json")))
-    suiting = [prior for prior in priors if prior.link == link and prior.suits(task)]
-    worlds = {learned_in(prior.source) for prior in suiting}
+    suiting = [prior for prior in priors if prior.link == link and prior.matches_task(task)]
+    worlds = {source_world(prior.source) for prior in suiting}
     if len(worlds) > 1 and not worlds & nominal_worlds(task.world):
-        _say_other_world(task.world, str(learned_in(suiting[0].source)))
-    return sorted(suiting, key=lambda prior: learned_in(prior.source) not in
+        _say_other_world(task.world, str(source_world(suiting[0].source)))
+    return sorted(suiting, key=lambda prior: source_world(prior.source) not in
                   nominal_worlds(task.world))
 
 
@@ -250,7 +255,8 @@ def _say_other_world(world: str, learned: str) -> None:
 
 def nominal_worlds(name: str) -> set[str]:
     """Return the name of a world and of the world that its estimators are told of."""
-    homes = {each.home for each in entries().values() if each.home and each.world.name == name}
+    homes = {each.nominal for each in entries().values()
+             if each.nominal and each.world.name == name}
     return {name} | {entries()[home].world.name for home in homes}
 
 
@@ -260,7 +266,7 @@ def _loaded(path: Path) -> InflowPrior:
     return InflowPrior.load(path)
 
 
-def learned_in(source: Mapping[str, Any]) -> str | None:
+def source_world(source: Mapping[str, Any]) -> str | None:
     """Name of the world in which something was learned that comes from there."""
     where = entries().get(source.get("environment", ""))
     return None if where is None else where.world.name

@@ -13,15 +13,15 @@ if TYPE_CHECKING:
     from eitbench.estimation.inflow_prior import InflowPrior
     from eitbench.physics.transport import Transport
 
-FORGOTTEN = 0.01
+DECAY_TOLERANCE = 0.01
 """The pipe has forgotten an inflow of which less than this part is left, in the Frobenius norm."""
-LONGEST = 400
+MAX_RESPONSE_STEPS = 400
 """Steps after which it has to be forgotten."""
-DROPPED = 1e-3
+RANK_RTOL = 1e-3
 """Directions that past inflows reach this much less than the first are left out."""
 
 
-class Response(NamedTuple):
+class ImpulseResponse(NamedTuple):
     """c_t = level + basis · Σ_k weights_k (c_in,t−k − level): what past inflows leave in a pipe."""
 
     basis: np.ndarray
@@ -31,21 +31,22 @@ class Response(NamedTuple):
 
 
 @lru_cache(maxsize=4)
-def steady_response(transport: Transport) -> Response:
+def steady_response(transport: Transport) -> ImpulseResponse:
     """Of a flow that stays as it is; ``ValueError`` if it never forgets what flowed in."""
     parts = _steady(transport)
     together = np.concatenate(parts, axis=1)
     # the smaller of both products holds the singular values
     if together.shape[1] <= len(together):
         squares, right = np.linalg.eigh(together.T @ together)
-        keep = squares > DROPPED**2 * squares[-1]
+        keep = squares > RANK_RTOL**2 * squares[-1]
         basis = together @ (right[:, keep] / np.sqrt(squares[keep]))
     else:
         basis = _leading(together @ together.T)
     return _projected(parts, basis)
 
 
-def changing_responses(transport_at: Callable[[int], Transport], n_steps: int) -> list[Response]:
+def time_varying_responses(transport_at: Callable[[int], Transport],
+                           n_steps: int) -> list[ImpulseResponse]:
     """Of the states t = 1 … n_steps in a flow that is ``transport_at(t)`` in the step to t, and was
     as in the first step before; all in one basis, and of as many steps as the first flow needs to
     forget an inflow.
@@ -62,7 +63,7 @@ def changing_responses(transport_at: Callable[[int], Transport], n_steps: int) -
     return [_projected(parts, basis) for parts in _changing(transport_at, n_steps)]
 
 
-def reduced_response(response: Response, prior: InflowPrior, modes: int) -> Response:
+def reduced_response(response: ImpulseResponse, prior: InflowPrior, modes: int) -> ImpulseResponse:
     """The same in so many directions, or all if there are fewer: those in which inflows of the
     prior move the concentration most, strongest first.
 
@@ -74,10 +75,11 @@ def reduced_response(response: Response, prior: InflowPrior, modes: int) -> Resp
     by_x = response.weights @ prior.modes                                            # (q, K, r)
     moves = np.tensordot(by_x, root, (1, 0)).reshape(q, -1)
     directions = svd(moves, full_matrices=False)[0][:, :modes]
-    return Response(response.basis @ directions, np.tensordot(directions.T, response.weights, 1))
+    return ImpulseResponse(response.basis @ directions,
+                           np.tensordot(directions.T, response.weights, 1))
 
 
-def newest_inflow(transport: Transport) -> np.ndarray:
+def one_step_response(transport: Transport) -> np.ndarray:
     """Y (n, n_inlet): what an inflow leaves by the end of the step in which it comes."""
     inlet = len(transport.inlet)
     return transport.step(np.zeros((transport.mesh.n_nodes, inlet)), 0.0, np.eye(inlet))
@@ -92,7 +94,7 @@ def _changing(transport_at: Callable[[int], Transport],
         transport = transport_at(t)
         older = np.concatenate(parts[:-1], axis=1)
         moved = transport.step(older, older[transport.inlet], 0.0)
-        parts = [newest_inflow(transport), *np.split(moved, len(parts) - 1, axis=1)]
+        parts = [one_step_response(transport), *np.split(moved, len(parts) - 1, axis=1)]
         yield parts
 
 
@@ -102,9 +104,10 @@ def _steady(transport: Transport) -> list[np.ndarray]:
     if not Y.shape[1]:
         raise ValueError("the transport must have an inlet, got one without")
     parts = [Y]
-    while np.linalg.norm(parts[-1]) > FORGOTTEN * np.linalg.norm(Y):
-        if len(parts) == LONGEST:
-            raise ValueError(f"the transport must forget an inflow within {LONGEST} steps")
+    while np.linalg.norm(parts[-1]) > DECAY_TOLERANCE * np.linalg.norm(Y):
+        if len(parts) == MAX_RESPONSE_STEPS:
+            raise ValueError("the transport must forget an inflow within "
+                             f"{MAX_RESPONSE_STEPS} steps")
         parts.append(F @ parts[-1])
     return parts
 
@@ -112,9 +115,9 @@ def _steady(transport: Transport) -> list[np.ndarray]:
 def _leading(squared: np.ndarray) -> np.ndarray:
     """(n, q) the directions that matter of M for M Mᵀ."""
     squares, directions = np.linalg.eigh(squared)
-    return directions[:, squares > DROPPED**2 * squares[-1]]
+    return directions[:, squares > RANK_RTOL**2 * squares[-1]]
 
 
-def _projected(parts: list[np.ndarray], basis: np.ndarray) -> Response:
+def _projected(parts: list[np.ndarray], basis: np.ndarray) -> ImpulseResponse:
     weights = basis.T @ np.concatenate(parts, axis=1)
-    return Response(basis, weights.reshape(basis.shape[1], len(parts), parts[0].shape[1]))
+    return ImpulseResponse(basis, weights.reshape(basis.shape[1], len(parts), parts[0].shape[1]))

@@ -11,8 +11,8 @@ from scipy.linalg import toeplitz
 
 from eitbench.estimation.covariance import Covariance, DenseCovariance
 from eitbench.estimation.filter import Filter, StateSpace
-from eitbench.estimation.forward import Forward, about_prediction
-from eitbench.estimation.inflow_response import Response, steady_response
+from eitbench.estimation.forward import Forward, linearise_at_prediction
+from eitbench.estimation.inflow_response import ImpulseResponse, steady_response
 
 if TYPE_CHECKING:
     from eitbench.estimation.identified import IdentifiedModel
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from eitbench.worlds.task import Task
 
 
-class Regression(NamedTuple):
+class ArModel(NamedTuple):
     """Autoregressive model: the next value from the last W values, the newest first."""
 
     weights: np.ndarray
@@ -29,14 +29,14 @@ class Regression(NamedTuple):
     """of the remainder"""
 
 
-def stationary(covariance: np.ndarray) -> tuple[np.ndarray, Regression]:
+def yule_walker(covariance: np.ndarray) -> tuple[np.ndarray, ArModel]:
     """Return the covariance (W, W) of W values and the regression of the next one (Yule–Walker).
 
     ``covariance`` (W + 1,) has the covariances of two values 0 … W steps apart.
     """
     before = toeplitz(covariance[:-1])
     weights = np.linalg.solve(before, covariance[1:])
-    return before, Regression(weights, float(covariance[0] - weights @ covariance[1:]))
+    return before, ArModel(weights, float(covariance[0] - weights @ covariance[1:]))
 
 
 class InflowWindow(StateSpace):
@@ -50,36 +50,36 @@ class InflowWindow(StateSpace):
     transport : Transport
         Only for the default of ``responses``.
     prior : InflowPrior
-    level : float
+    c_ref : float
         ĉ_bh in mol/m³.
     lag : int
         The oldest state to be estimated, in steps before the present one.
-    responses : sequence of Response, optional
+    responses : sequence of ImpulseResponse, optional
         Of the states t = 1, 2, …, where the last holds from then on; default: that of the task's
         flow for all.
-    residual : (q, q), optional
-        Covariance of the deviation from the response in its basis, relative to the level.
+    residual_covariance : (q, q), optional
+        Covariance of the deviation from the response in its basis, relative to c_ref.
     """
 
-    def __init__(self, task: Task, prior: InflowPrior, level: float, lag: int = 0, *,
-                 responses: Sequence[Response] | None = None,
-                 residual: np.ndarray | None = None) -> None:
+    def __init__(self, task: Task, prior: InflowPrior, c_ref: float, lag: int = 0, *,
+                 responses: Sequence[ImpulseResponse] | None = None,
+                 residual_covariance: np.ndarray | None = None) -> None:
         prior.check_task(task)
         self.prior = prior
-        self.level = level
-        self.residual = residual
+        self.c_ref = c_ref
+        self.residual_covariance = residual_covariance
         self.responses = responses or [steady_response(task.transport)]
-        self.memory = self.responses[0].weights.shape[1]
+        self.response_steps = self.responses[0].weights.shape[1]
         """K, steps until the pipe has forgotten an inflow"""
-        self.modes = prior.modes.shape[1]
+        self.n_modes = prior.modes.shape[1]
         """r"""
-        self.window = self.memory + lag
+        self.window_steps = self.response_steps + lag
         """W"""
-        self.present = 0
+        self.time = 0
         """t"""
-        before, (weights, variance) = stationary(prior.time_covariance(self.window + 1))
-        self._prior_covariance = np.kron(before, np.eye(self.modes))
-        self.regression = weights[:, None], np.full(self.modes, variance)
+        before, (weights, variance) = yule_walker(prior.time_covariance(self.window_steps + 1))
+        self._prior_covariance = np.kron(before, np.eye(self.n_modes))
+        self.ar_model = weights[:, None], np.full(self.n_modes, variance)
         """Weights (W, r) or (W, 1) and variances (r,) of the entries of the next x."""
 
     def initial(self) -> tuple[np.ndarray, Covariance]:
@@ -87,31 +87,31 @@ class InflowWindow(StateSpace):
 
     def propagate(self, mean: np.ndarray, covariance: Covariance,
                   time: int) -> tuple[np.ndarray, Covariance]:
-        self.present = time
-        weights, variance = self.regression
+        self.time = time
+        weights, variance = self.ar_model
         assert isinstance(covariance, DenseCovariance)
-        return shifted(mean, weights), covariance.shift(weights, variance)
+        return shift_window(mean, weights), covariance.shift(weights, variance)
 
-    def response(self, lag: int = 0) -> Response:
+    def response(self, lag: int = 0) -> ImpulseResponse:
         """Return the response of the state ``lag`` steps ago."""
-        t = min(max(self.present - lag, 1), len(self.responses))
+        t = min(max(self.time - lag, 1), len(self.responses))
         return self.responses[t - 1]
 
     def concentration(self, mean: np.ndarray, lag: int = 0) -> np.ndarray:
-        return self.level * (1.0 + self.coordinates(mean, lag) @ self.response(lag).basis.T)
+        return self.c_ref * (1.0 + self.coordinates(mean, lag) @ self.response(lag).basis.T)
 
     def coordinates(self, mean: np.ndarray, lag: int = 0) -> np.ndarray:
-        """Return the deviations (..., q) from the level in the response's basis, relative to it."""
-        deviation = self.prior.inflow(self._recent(mean, lag) @ self.prior.modes.T) - 1.0
+        """Return the deviations (..., q) from c_ref in the response's basis, relative to it."""
+        deviation = self.prior.inverse_link(self._recent(mean, lag) @ self.prior.modes.T) - 1.0
         weights = self.response(lag).weights
         return deviation.reshape(*mean.shape[:-1], -1) @ weights.reshape(len(weights), -1).T
 
     def variance(self, mean: np.ndarray, covariance: Covariance, lag: int = 0) -> np.ndarray:
-        slope = self.slope(mean, lag)
-        here = slice(lag * self.modes, (lag + self.memory) * self.modes)
+        slope = self.concentration_jacobian(mean, lag)
+        here = slice(lag * self.n_modes, (lag + self.response_steps) * self.n_modes)
         reduced = slope @ covariance.array[here, here] @ slope.T
-        if self.residual is not None:
-            reduced = reduced + self.level**2 * self.residual
+        if self.residual_covariance is not None:
+            reduced = reduced + self.c_ref**2 * self.residual_covariance
         basis = self.response(lag).basis
         return ((basis @ reduced) * basis).sum(axis=1)
 
@@ -119,13 +119,13 @@ class InflowWindow(StateSpace):
         basis, weights = self.response(lag)
         return self._by_x(mean, np.tensordot(matrix @ basis, weights, 1), lag)
 
-    def slope(self, mean: np.ndarray, lag: int = 0) -> np.ndarray:
+    def concentration_jacobian(self, mean: np.ndarray, lag: int = 0) -> np.ndarray:
         """Return the derivatives (q, K·r) of the concentration in the basis by x."""
         return self._by_x(mean, self.response(lag).weights, lag)
 
     def _by_x(self, mean: np.ndarray, by_inflow: np.ndarray, lag: int) -> np.ndarray:
         """Return derivatives (m, K·r) by x from those by the inflows (m, K, n_inlet)."""
-        by_u = by_inflow * (self.level * self.prior.slope(self._recent(mean, lag)
+        by_u = by_inflow * (self.c_ref * self.prior.inverse_link_derivative(self._recent(mean, lag)
                                                           @ self.prior.modes.T))
         # one product of matrices; of three dimensions it would be many small ones
         by_x = by_u.reshape(-1, by_u.shape[-1]) @ self.prior.modes
@@ -133,34 +133,35 @@ class InflowWindow(StateSpace):
 
     def _recent(self, mean: np.ndarray, lag: int) -> np.ndarray:
         """Return the K inflows (..., K, r) that have made the state ``lag`` steps ago."""
-        return mean.reshape(*mean.shape[:-1], -1, self.modes)[..., lag:lag + self.memory, :]
+        values = mean.reshape(*mean.shape[:-1], -1, self.n_modes)
+        return values[..., lag:lag + self.response_steps, :]
 
 
-def shifted(mean: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return the mean (W·d,) of a window one step later, by the weights of `Regression`."""
+def shift_window(mean: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return the mean (W·d,) of a window one step later, by the weights of `ArModel`."""
     values = mean.reshape(len(weights), -1)
     return np.concatenate([(weights * values).sum(axis=0)[None], values[:-1]]).ravel()
 
 
-def inflow_filter(task: Task, prior: InflowPrior, level: float, lag: int = 0, *,
-                  responses: Sequence[Response] | None = None,
+def inflow_filter(task: Task, prior: InflowPrior, c_ref: float, lag: int = 0, *,
+                  responses: Sequence[ImpulseResponse] | None = None,
                   model: IdentifiedModel | None = None, iterated: bool = False) -> Filter:
     """Return the extended Kalman filter of the inflow's history.
 
     Parameters
     ----------
-    task, prior, level, lag, responses
+    task, prior, c_ref, lag, responses
         As in `InflowWindow`.
     model : IdentifiedModel, optional
         Its response and its errors take the place of the task's flow.
     iterated : bool
         Each measurement is linearised once more, about the first estimate.
     """
-    forward: Forward = about_prediction(task)
+    forward: Forward = linearise_at_prediction(task)
     if model is None:
-        space = InflowWindow(task, prior, level, lag, responses=responses)
+        space = InflowWindow(task, prior, c_ref, lag, responses=responses)
     else:
-        space = InflowWindow(task, prior, level, lag, responses=[model.response],
-                             residual=model.spread)
-        forward = model.forward(task, level)
+        space = InflowWindow(task, prior, c_ref, lag, responses=[model.response],
+                             residual_covariance=model.residual_covariance)
+        forward = model.forward(task, c_ref)
     return Filter(space, forward, iterated=iterated)

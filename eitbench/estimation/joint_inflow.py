@@ -9,12 +9,12 @@ import numpy as np
 from eitbench import _check
 from eitbench.estimation.covariance import Covariance, DenseCovariance
 from eitbench.estimation.filter import StateSpace
-from eitbench.estimation.inflow_response import newest_inflow
-from eitbench.estimation.inflow_window import shifted, stationary
+from eitbench.estimation.inflow_response import one_step_response
+from eitbench.estimation.inflow_window import shift_window, yule_walker
 
 if TYPE_CHECKING:
     from eitbench.estimation.inflow_prior import InflowPrior
-    from eitbench.estimation.velocity import UnknownFlow
+    from eitbench.estimation.velocity import VelocityPrior
     from eitbench.worlds.task import Task
 
 
@@ -34,23 +34,23 @@ class VelocityInflowWindow(StateSpace):
     task : Task
     prior : InflowPrior
         Of the task's inlet.
-    level : float
+    c_ref : float
         ĉ_bh in mol/m³.
-    flow : UnknownFlow
-    window : int
+    flow : VelocityPrior
+    window_steps : int
         W, time steps; the fluid should pass the pipe in fewer.
     """
 
-    def __init__(self, task: Task, prior: InflowPrior, level: float, flow: UnknownFlow,
-                 window: int) -> None:
+    def __init__(self, task: Task, prior: InflowPrior, c_ref: float, flow: VelocityPrior,
+                 window_steps: int) -> None:
         prior.check_task(task)
-        W = self.window = _check.integer("window", window, low=1)
+        W = self.window_steps = _check.integer("window_steps", window_steps, low=1)
         self.prior = prior
-        self.level = level
+        self.c_ref = c_ref
         self.flow = flow
-        r = self.modes = prior.modes.shape[1]
-        k = len(flow.start)
-        before, (weights, variance) = stationary(prior.time_covariance(W + 1))
+        r = self.n_modes = prior.modes.shape[1]
+        k = len(flow.initial)
+        before, (weights, variance) = yule_walker(prior.time_covariance(W + 1))
         self._weights = np.zeros((W, r + k))
         self._weights[:, :r] = weights[:, None]
         self._weights[0, r:] = 1.0
@@ -59,27 +59,27 @@ class VelocityInflowWindow(StateSpace):
         for part in range(r):
             covariance[:, part, :, part] = before
         for part in range(k):
-            covariance[:, r + part, :, r + part] = flow.start_std[part]**2
+            covariance[:, r + part, :, r + part] = flow.initial_std[part]**2
         self._covariance = covariance.reshape(W * (r + k), -1)
-        self._fill(W, k)
+        self._initialise_window(W, k)
 
-    def _fill(self, W: int, k: int) -> None:
+    def _initialise_window(self, W: int, k: int) -> None:
         """Let past inflows fill the pipe at the nominal velocity."""
-        transport = self.flow.transport_at(self.flow.start)
+        transport = self.flow.transport_at(self.flow.initial)
         self._inlet = transport.inlet
-        parts = [newest_inflow(transport)]
+        parts = [one_step_response(transport)]
         for _ in range(W - 1):
             parts.append(transport.step(parts[-1], parts[-1][self._inlet], 0.0))
         by_inflow = np.stack(parts, axis=1)
         n = len(by_inflow)
-        self._constant = self.level * (1.0 - by_inflow.sum(axis=(1, 2)))
+        self._constant = self.c_ref * (1.0 - by_inflow.sum(axis=(1, 2)))
         """(n,) contribution of neither the last inflows nor the last θ"""
         self._parts = np.concatenate([by_inflow, np.zeros((n, W, k))], axis=2)
         """(n, W, n_inlet + k) contributions of c_in (mol/m³) and θ of each step, per unit"""
 
     def initial(self) -> tuple[np.ndarray, Covariance]:
         mean = np.zeros(self._weights.shape)
-        mean[:, self.modes:] = self.flow.start
+        mean[:, self.n_modes:] = self.flow.initial
         return mean.ravel(), DenseCovariance(self._covariance)
 
     def propagate(self, mean: np.ndarray, covariance: Covariance,
@@ -87,19 +87,19 @@ class VelocityInflowWindow(StateSpace):
         assert isinstance(covariance, DenseCovariance)
         before = self.concentration(mean)
         oldest = self._parts[:, -1] @ self._sources(mean)[-1]
-        mean = shifted(mean, self._weights)
+        mean = shift_window(mean, self._weights)
         inlet = self._inlet
         theta = self._theta(mean)
         transport = self.flow.transport_at(theta)
         _, by_flow = transport.velocity_derivatives(before, before[inlet],
                                                     self._sources(mean)[0, :len(inlet)],
-                                                    self.flow.directions)
+                                                    self.flow.basis_fields)
         n, W, parts = self._parts.shape
         columns = np.concatenate([(self._constant + oldest)[:, None],
                                   self._parts[:, :-1].reshape(n, -1)], axis=1)
         columns = transport.step(columns, columns[inlet], 0.0)
         self._constant = columns[:, 0] - by_flow @ theta
-        self._parts = np.concatenate([newest_inflow(transport), by_flow, columns[:, 1:]],
+        self._parts = np.concatenate([one_step_response(transport), by_flow, columns[:, 1:]],
                                      axis=1).reshape(n, W, parts)
         return mean, covariance.shift(self._weights, self._new_variance)
 
@@ -117,9 +117,11 @@ class VelocityInflowWindow(StateSpace):
     def _by_state(self, mean: np.ndarray, parts: np.ndarray) -> np.ndarray:
         """Return derivatives (m, W·(r + k)) by z, from contributions (m, W, n_inlet + k)."""
         m = len(self._inlet)
-        by_inflow = parts[:, :, :m] * (self.level * self.prior.slope(self._deviation(mean)))
+        by_u = self.c_ref * self.prior.inverse_link_derivative(self._deviation(mean))
+        by_inflow = parts[:, :, :m] * by_u
         # one product of matrices; of three dimensions it would be many small ones
-        by_x = (by_inflow.reshape(-1, m) @ self.prior.modes).reshape(len(parts), self.window, -1)
+        by_x = by_inflow.reshape(-1, m) @ self.prior.modes
+        by_x = by_x.reshape(len(parts), self.window_steps, -1)
         return np.concatenate([by_x, parts[:, :, m:]], axis=2).reshape(len(parts), -1)
 
     def constrain(self, mean: np.ndarray) -> np.ndarray:
@@ -127,22 +129,23 @@ class VelocityInflowWindow(StateSpace):
         kept = self.flow.within_bounds(free)
         self._constant += self._parts[:, 0, len(self._inlet):] @ (free - kept)
         mean = mean.copy()
-        mean[self.modes:self.modes + len(kept)] = kept
+        mean[self.n_modes:self.n_modes + len(kept)] = kept
         return mean
 
     def velocity(self, mean: np.ndarray,
                  covariance: Covariance) -> tuple[np.ndarray, np.ndarray]:
-        newest = slice(self.modes, self._weights.shape[1])
+        newest = slice(self.n_modes, self._weights.shape[1])
         return mean[newest].copy(), covariance.diagonal()[newest]
 
     def _theta(self, mean: np.ndarray) -> np.ndarray:
-        return mean[self.modes:self._weights.shape[1]]
+        return mean[self.n_modes:self._weights.shape[1]]
 
     def _deviation(self, mean: np.ndarray) -> np.ndarray:
         """Return u (W, n_inlet)."""
-        return mean.reshape(self.window, -1)[:, :self.modes] @ self.prior.modes.T
+        return mean.reshape(self.window_steps, -1)[:, :self.n_modes] @ self.prior.modes.T
 
     def _sources(self, mean: np.ndarray) -> np.ndarray:
         """Return c_in in mol/m³ and θ of each step (W, n_inlet + k)."""
-        inflows = self.level * self.prior.inflow(self._deviation(mean))
-        return np.concatenate([inflows, mean.reshape(self.window, -1)[:, self.modes:]], axis=1)
+        inflows = self.c_ref * self.prior.inverse_link(self._deviation(mean))
+        theta = mean.reshape(self.window_steps, -1)[:, self.n_modes:]
+        return np.concatenate([inflows, theta], axis=1)

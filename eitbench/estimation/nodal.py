@@ -20,14 +20,14 @@ from eitbench.estimation.filter import Filter, StateSpace
 from eitbench.estimation.forward import Forward
 from eitbench.estimation.smoothness import smoothness_covariance
 from eitbench.estimation.walk import RandomWalk
-from eitbench.physics.rest import AtRest
+from eitbench.physics.stationary import StationaryTransport
 
 if TYPE_CHECKING:
     from eitbench.numerics.mesh import Mesh
     from eitbench.physics.transport import Transport
     from eitbench.worlds.world import Prior
 
-RANK_TOLERANCE = 1e-4
+FILTER_RANK_TOLERANCE = 1e-4
 """See `LowRankCovariance`: the estimates are those of the exact filter to 1e-7 of their standard
 deviation, in a quarter of the time where n = 3,003 (``docs/pipe3d.md``)."""
 
@@ -142,8 +142,8 @@ class LogStates(StateSpace):
 def nodal_states(transport: Transport, prior: Prior, c_ref: float) -> NodalStates:
     """Return the concentration of a target with a motion and the parameters of Table 5.1.
 
-    Where fluid flows through the vessel they are those of `table_5_1`. Where nothing flows in, the
-    covariance without data has no limit, and a dense covariance is kept.
+    Where fluid flows through the vessel they are those of `table_5_1_filter`. Where nothing flows
+    in, the covariance without data has no limit, and a dense covariance is kept.
 
     Parameters
     ----------
@@ -154,12 +154,12 @@ def nodal_states(transport: Transport, prior: Prior, c_ref: float) -> NodalState
     c_ref : float
         Best homogeneous estimate ĉ_bh in mol/m³.
     """
-    if len(transport.inlet) and not isinstance(transport, AtRest):
+    if len(transport.inlet) and not isinstance(transport, StationaryTransport):
         return _flowing_states(transport, prior, c_ref)
     mean = np.full(transport.mesh.n_nodes, c_ref)
     if isinstance(transport, RandomWalk):
         motion = Motion(transport.step, noise=(c_ref * prior.nodal_std)**2 * transport.covariance)
-    elif isinstance(transport, AtRest):
+    elif isinstance(transport, StationaryTransport):
         walk = (c_ref * prior.nodal_std)**2
         motion = Motion(noise=walk * np.eye(len(mean)) if walk else None)
     else:
@@ -169,9 +169,9 @@ def nodal_states(transport: Transport, prior: Prior, c_ref: float) -> NodalState
     return NodalStates(mean, DenseCovariance(covariance), motion)
 
 
-def modal_states(count: int, std: float,
+def modal_states(n_modes: int, std: float,
                  motion: Callable[[int], tuple[np.ndarray, np.ndarray]]) -> NodalStates:
-    """Return independent weights of ``count`` modes that all move alike, of variance ``std``².
+    """Return independent weights of ``n_modes`` modes that all move alike, of variance ``std``².
 
     Each is the first of p numbers, such as a weight and its rate of change, which move by A (p, p)
     with noise Q (p, p) for a variance of 1; ``motion`` gives both for the step to t.
@@ -184,20 +184,20 @@ def modal_states(count: int, std: float,
         def apply(X: np.ndarray) -> np.ndarray:
             return (A @ X.reshape(order, -1)).reshape(X.shape)
 
-        return Motion(apply, noise=np.kron(std**2 * Q, np.eye(count)))
+        return Motion(apply, noise=np.kron(std**2 * Q, np.eye(n_modes)))
 
-    covariance = DenseCovariance(std**2 * np.eye(order * count))
-    return NodalStates(np.zeros(order * count), covariance, motion_at)
+    covariance = DenseCovariance(std**2 * np.eye(order * n_modes))
+    return NodalStates(np.zeros(order * n_modes), covariance, motion_at)
 
 
-def starting_filter(transport: Transport, prior: Prior, c_ref: float,
+def nodal_filter(transport: Transport, prior: Prior, c_ref: float,
                     forward: Forward | None = None) -> Filter:
     """Return a filter of `nodal_states` at t = 0."""
     return Filter(nodal_states(transport, prior, c_ref), forward)
 
 
-def table_5_1(transport: Transport, prior: Prior, c_ref: float, *,
-              rank_tolerance: float = RANK_TOLERANCE) -> Filter:
+def table_5_1_filter(transport: Transport, prior: Prior, c_ref: float, *,
+              rank_tolerance: float = FILTER_RANK_TOLERANCE) -> Filter:
     """Return the Kalman filter of c⁺ = F c + Y c_in + w; arguments as in `nodal_states`.
 
     Inflow and initial state have mean ĉ_bh; Γ_η and Γ_e are diagonal, Γ_{0|0} is diagonal or
@@ -208,7 +208,7 @@ def table_5_1(transport: Transport, prior: Prior, c_ref: float, *,
 
 
 def _flowing_states(transport: Transport, prior: Prior, c_ref: float,
-                    rank_tolerance: float = RANK_TOLERANCE) -> NodalStates:
+                    rank_tolerance: float = FILTER_RANK_TOLERANCE) -> NodalStates:
     F, Y, _ = transport.evolution_model()
     covariance = LowRankCovariance(_open_loop(transport, prior).scaled(c_ref**2), rank_tolerance)
     return NodalStates(np.full(len(F), c_ref), covariance, Motion(F, Y.sum(axis=1) * c_ref))

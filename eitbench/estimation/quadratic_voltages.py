@@ -9,23 +9,23 @@ import numpy as np
 
 from eitbench import _check
 
-STEP = 0.1
+DIFFERENCE_STEP = 0.1
 """By how much a mode raises the logarithm, root mean square, where differences are taken."""
 CACHE_BYTES = 2**27
 """Memory for what a model keeps of each injection: in 2D that of 250, more than there are pairs."""
 
 
-class Resistances(Protocol):
+class TransferResistanceModel(Protocol):
     """What the quadratic is of; such as `ObservationModel`."""
 
-    smallest_concentration: float
+    min_concentration: float
     """mol/m³, as which what is below counts"""
 
     def resistance_derivatives(self, concentration: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Transfer resistances (L, L) in Ω (Ω·m in 2D), and by each node's c (n, L, L)."""
 
 
-class QuadraticVoltages:
+class QuadraticVoltageModel:
     """𝓡(c) = 𝓡_0 + Σ_i D_i u_i + ½ Σ_jk H_jk a_j a_k, with u = ln(c/c_0) and a its modes.
 
     D is exact; H are central differences of the model's derivatives. About c_0 it costs a hundredth
@@ -34,24 +34,24 @@ class QuadraticVoltages:
 
     Parameters
     ----------
-    model : Resistances
-    level : float
+    model : TransferResistanceModel
+    c_ref : float
         c_0 in mol/m³.
     modes : (n, q)
         Of u, linearly independent; what they leave of u enters linearly.
     """
 
-    def __init__(self, model: Resistances, level: float, modes: np.ndarray) -> None:
-        self.level = _check.number("level", level, low=0.0, open_low=True, units="mol/m³")
-        self.smallest = model.smallest_concentration
+    def __init__(self, model: TransferResistanceModel, c_ref: float, modes: np.ndarray) -> None:
+        self.c_ref = _check.number("c_ref", c_ref, low=0.0, open_low=True, units="mol/m³")
+        self.smallest = model.min_concentration
         modes = _check.array("modes", modes, (None, None))
         n, q = modes.shape
         self._to_modes = np.linalg.pinv(modes)
-        self._resistance, table = model.resistance_derivatives(np.full(n, level))
-        self._slope = level * table.reshape(n, -1)                       # (n, L·L)
+        self._resistance, table = model.resistance_derivatives(np.full(n, c_ref))
+        self._slope = c_ref * table.reshape(n, -1)                       # (n, L·L)
         self._curvature = np.empty((q, q, self._slope.shape[1]))
         for k, mode in enumerate(modes.T):
-            h = STEP / np.sqrt((mode**2).mean())
+            h = DIFFERENCE_STEP / np.sqrt((mode**2).mean())
             ahead, back = (self._by_mode(model, modes, sign * h * mode) for sign in (1.0, -1.0))
             self._curvature[k] = (ahead - back) / (2.0 * h)
         self._curvature = 0.5 * (self._curvature + self._curvature.swapaxes(0, 1))
@@ -61,9 +61,10 @@ class QuadraticVoltages:
         """𝓡_0 (L, L), D (n, L·L), the modes by u (q, n), and H (q, q, L·L)"""
         self._of_injection = lru_cache(maxsize=max(1, injections))(self._contracted)
 
-    def _by_mode(self, model: Resistances, modes: np.ndarray, u: np.ndarray) -> np.ndarray:
+    def _by_mode(self, model: TransferResistanceModel, modes: np.ndarray,
+                 u: np.ndarray) -> np.ndarray:
         """(q, L·L) derivatives by the modes at ln(c/c_0) = u."""
-        c = self.level * np.exp(u)
+        c = self.c_ref * np.exp(u)
         table = model.resistance_derivatives(c)[1]
         by_mode: np.ndarray = (modes.T * c) @ table.reshape(len(c), -1)
         return by_mode
@@ -106,54 +107,54 @@ class QuadraticVoltages:
     def _logarithm(self, concentration: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """u, its modes, and c with too small ones raised."""
         c = np.maximum(concentration, self.smallest)
-        u = np.log(c / self.level)
+        u = np.log(c / self.c_ref)
         return u, self._to_modes @ u, c
 
 
-class ScaledVoltages:
-    """Voltages that are quadratic at any level: 𝓡(c) = e^−ū 𝓖(u), with u = ln(c/c_0), ū its mean
-    over the nodes, and 𝓖 = e^ū 𝓡 as in `QuadraticVoltages`.
+class ScaledVoltageModel:
+    """Voltages that are quadratic at any c_ref: 𝓡(c) = e^−ū 𝓖(u), with u = ln(c/c_0), ū its mean
+    over the nodes, and 𝓖 = e^ū 𝓡 as in `QuadraticVoltageModel`.
 
     Were it not for the contacts, 𝓖 would be the same at all levels. It is a `VoltageModel`;
     arguments and ``ValueError`` as there.
     """
 
-    def __init__(self, model: Resistances, level: float, modes: np.ndarray) -> None:
-        self.level = _check.number("level", level, low=0.0, open_low=True, units="mol/m³")
-        self.smallest = model.smallest_concentration
+    def __init__(self, model: TransferResistanceModel, c_ref: float, modes: np.ndarray) -> None:
+        self.c_ref = _check.number("c_ref", c_ref, low=0.0, open_low=True, units="mol/m³")
+        self.smallest = model.min_concentration
         modes = _check.array("modes", modes, (None, None))
         with_level, _ = np.linalg.qr(np.column_stack([np.ones(len(modes)), modes]))
-        self.quadratic = QuadraticVoltages(_Scaled(model, level), level, with_level)
+        self.quadratic = QuadraticVoltageModel(_Scaled(model, c_ref), c_ref, with_level)
 
     def voltages(self, concentration: np.ndarray, currents: np.ndarray) -> np.ndarray:
         """(K, L) V for currents (K, L) in A (A/m in 2D) and a concentration (n,) in mol/m³."""
         c = np.maximum(concentration, self.smallest)
-        return self.quadratic.voltages(c, currents) / _scale(c, self.level)
+        return self.quadratic.voltages(c, currents) / _scale(c, self.c_ref)
 
     def linearise(self, concentration: np.ndarray,
                   currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Voltages (K, L) in V and their derivatives by c, (K, L, n) in V·m³/mol."""
         c = np.maximum(concentration, self.smallest)
         scaled, by_c = self.quadratic.linearise(c, currents)
-        scale = _scale(c, self.level)
+        scale = _scale(c, self.c_ref)
         return scaled / scale, (by_c - scaled[..., None] / (len(c) * c)) / scale
 
 
 class _Scaled:
     """𝓖 and its derivatives."""
 
-    def __init__(self, model: Resistances, level: float) -> None:
+    def __init__(self, model: TransferResistanceModel, c_ref: float) -> None:
         self.model = model
-        self.level = level
-        self.smallest_concentration = model.smallest_concentration
+        self.c_ref = c_ref
+        self.min_concentration = model.min_concentration
 
     def resistance_derivatives(self, concentration: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         R, by_c = self.model.resistance_derivatives(concentration)
-        scale = _scale(concentration, self.level)
+        scale = _scale(concentration, self.c_ref)
         of_scale = R / (len(concentration) * concentration)[:, None, None]
         return scale * R, scale * (by_c + of_scale)
 
 
-def _scale(c: np.ndarray, level: float) -> float:
+def _scale(c: np.ndarray, c_ref: float) -> float:
     """e^ū"""
-    return float(np.exp(np.log(c / level).mean()))
+    return float(np.exp(np.log(c / c_ref).mean()))

@@ -18,7 +18,7 @@ import scipy.linalg
 
 from eitbench.estimation.covariance import LowRankCovariance
 from eitbench.estimation.filter import Filter
-from eitbench.estimation.gaussian import Observation, gate_mask
+from eitbench.estimation.gaussian import LinearMeasurement, gate_mask
 from eitbench.estimation.nodal import NodalStates
 
 
@@ -36,7 +36,7 @@ class ReducedModel(NamedTuple):
 
 
 def reduced_model(start: Filter, mass: np.ndarray,
-                  observations: Iterable[Observation], rank: int, *,
+                  observations: Iterable[LinearMeasurement], rank: int, *,
                   skip: int = 20) -> ReducedModel:
     """The model of ``start`` in the ``rank`` directions in which it learns most.
 
@@ -57,7 +57,7 @@ def reduced_model(start: Filter, mass: np.ndarray,
     assert isinstance(space, NodalStates)
     initial = space.initial()[1]
     F = space.transition_matrix(1)
-    basis = main_directions(learnt_of(start, observations, skip), mass, rank)
+    basis = dominant_directions(covariance_reduction(start, observations, skip), mass, rank)
     transition, rotation = scipy.linalg.schur(basis.T @ mass @ F @ basis)
     basis = basis @ rotation
     weighted = mass @ basis
@@ -65,7 +65,8 @@ def reduced_model(start: Filter, mass: np.ndarray,
                         weighted.T @ initial.times(weighted))
 
 
-def learnt_of(start: Filter, observations: Iterable[Observation], skip: int) -> np.ndarray:
+def covariance_reduction(start: Filter, observations: Iterable[LinearMeasurement],
+                         skip: int) -> np.ndarray:
     """Return the reduction (n, n) of the covariance by a record, summed after ``skip`` steps."""
     open_loop = start.covariance.copy()
     total = np.zeros((len(start.mean), len(start.mean)))
@@ -84,11 +85,11 @@ def learnt_of(start: Filter, observations: Iterable[Observation], skip: int) -> 
     return total
 
 
-def main_directions(learnt: np.ndarray, mass: np.ndarray, rank: int) -> np.ndarray:
-    """(n, r) directions that carry most of ``learnt`` (n, n) by the mass matrix M: Φᵀ M Φ = I."""
+def dominant_directions(reduction: np.ndarray, mass: np.ndarray, rank: int) -> np.ndarray:
+    """(n, r) directions of most ``reduction`` (n, n) by the mass matrix M: Φᵀ M Φ = I."""
     root = np.linalg.cholesky(mass)
     n = len(mass)
-    _, vectors = scipy.linalg.eigh(root.T @ learnt @ root, subset_by_index=[n - rank, n - 1])
+    _, vectors = scipy.linalg.eigh(root.T @ reduction @ root, subset_by_index=[n - rank, n - 1])
     basis: np.ndarray = scipy.linalg.solve_triangular(root.T, vectors[:, ::-1], lower=False)
     return basis
 

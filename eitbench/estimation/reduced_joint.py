@@ -30,7 +30,7 @@ class JointModel(NamedTuple):
     """(r, r) covariance of a at t = 0"""
 
 
-class JointTables:
+class TransitionSplines:
     """A(θ) and the covariance of w between the velocities of a model, by cubic splines.
 
     Parameters
@@ -51,7 +51,7 @@ class JointTables:
         coefficients = np.moveaxis(CubicSpline(self.velocities, table).c, 0, 1)
         return np.ascontiguousarray(coefficients.astype(dtype))
 
-    def at(self, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def evaluate(self, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """A(θ), dA/dθ and w's covariance, (B, r, r) each; θ (B,) in m/s, kept within the table."""
         knots = self.velocities
         theta = np.clip(np.asarray(velocity, dtype=float), knots[0], knots[-1])
@@ -82,7 +82,7 @@ class JointStates:
     def __init__(self, model: JointModel, nominal: float, std: float, walk_std: float,
                  bounds: tuple[float, float], dtype: type = np.float64) -> None:
         self.basis: np.ndarray = model.basis.astype(dtype)
-        self.tables = JointTables(model, dtype)
+        self.tables = TransitionSplines(model, dtype)
         r = len(model.initial)
         self._mean: np.ndarray = np.append(np.zeros(r), nominal).astype(dtype)
         self._covariance: np.ndarray = np.zeros((r + 1, r + 1), dtype)
@@ -106,7 +106,7 @@ class JointStates:
 
     def _step(self, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return [[A, (dA/dθ) a], [0, 1]] and the covariance of (w, ω), (B, r + 1, r + 1)."""
-        A, slope, W = self.tables.at(mean[:, -1])
+        A, slope, W = self.tables.evaluate(mean[:, -1])
         B, r = mean[:, :-1].shape
         transition, noise = np.zeros((2, B, r + 1, r + 1), A.dtype)
         transition[:, :r, :r] = A

@@ -9,12 +9,13 @@ from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from eitbench.estimation.covariance import LowRankCovariance, truncate_columns
 from eitbench.estimation.filter import Filter, Step, kalman_filter
-from eitbench.estimation.gaussian import Observation
+from eitbench.estimation.gaussian import LinearMeasurement
 from eitbench.estimation.nodal import NodalStates
 from eitbench.worlds.task import Estimate
 
 
-def fixed_interval_smoother(start: Filter, observations: Iterable[Observation]) -> list[Estimate]:
+def fixed_interval_smoother(start: Filter,
+                            observations: Iterable[LinearMeasurement]) -> list[Estimate]:
     """Return c_{t|T} and its variances for t = 1 … T: filter the record, then go back over it.
 
     ``start`` has a `LowRankCovariance` and a motion that does not change.
@@ -23,7 +24,7 @@ def fixed_interval_smoother(start: Filter, observations: Iterable[Observation]) 
     return [_smoothed(step, adjoint) for step, adjoint in _backwards(start, steps)][::-1]
 
 
-def smoothed_state(filter_: Filter, steps: Sequence[Step]) -> Estimate:
+def smooth_state(filter_: Filter, steps: Sequence[Step]) -> Estimate:
     """Return the state of the first of consecutive ``steps``, given the measurements of all.
 
     With the last k + 1 steps of ``filter_`` this is the fixed-lag smoother c_{t−k|t}.
@@ -32,7 +33,7 @@ def smoothed_state(filter_: Filter, steps: Sequence[Step]) -> Estimate:
     return _smoothed(step, adjoint)
 
 
-def smoothed_means(start: Filter, observations: Iterable[Observation]) -> np.ndarray:
+def smooth_means(start: Filter, observations: Iterable[LinearMeasurement]) -> np.ndarray:
     """Return the means c_{t|T} (T, n) of a filter of `NodalStates`, whose motion may change.
 
     The adjoint λ_t = Hᵀ S⁻¹ ν + (I − K H)ᵀ Fᵀ_{t+1} λ_{t+1} runs back over the innovations, and the

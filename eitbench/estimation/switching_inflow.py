@@ -14,8 +14,8 @@ from eitbench import _check
 from eitbench.estimation.covariance import DenseCovariance
 from eitbench.estimation.filter import Filter, Step
 from eitbench.estimation.forward import Forward
-from eitbench.estimation.gaussian import Observation
-from eitbench.estimation.inflow_window import InflowWindow, stationary
+from eitbench.estimation.gaussian import LinearMeasurement
+from eitbench.estimation.inflow_window import InflowWindow, yule_walker
 from eitbench.worlds.task import Estimate
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ class SwitchingInflowFilter:
     Two filters of an `InflowWindow` run side by side. In a slug a new x follows by the prior's
     regression; in quiet it is independent and small. Before each step the first two moments of
     both are mixed by the probabilities of the preceding regimes, which each measurement updates by
-    its likelihood. A homogeneous deviation from the level, which remains where a slug was in the
+    its likelihood. A homogeneous deviation from c_ref, which remains where a slug was in the
     first frame, is a separate mode that does not change.
 
     Parameters
@@ -40,7 +40,7 @@ class SwitchingInflowFilter:
     task : Task
     prior : InflowPrior
         Of the task's inlet and with `Regimes`; ``ValueError`` if it is not.
-    level : float
+    c_ref : float
         ĉ_bh in mol/m³.
     level_std : float
         Of what enters between slugs, relative to ĉ_bh, > 0.
@@ -48,7 +48,7 @@ class SwitchingInflowFilter:
         Linearises voltages about a concentration; for `assimilate`.
     """
 
-    def __init__(self, task: Task, prior: InflowPrior, level: float, level_std: float,
+    def __init__(self, task: Task, prior: InflowPrior, c_ref: float, level_std: float,
                  forward: Forward) -> None:
         if prior.regimes is None:
             raise ValueError("prior must have regimes, got one without; make one by "
@@ -58,22 +58,22 @@ class SwitchingInflowFilter:
         flat = np.full((len(prior.points), 1), level_std)
         modes = np.concatenate([prior.modes / np.sqrt(regimes.variance), flat], axis=1)
         within = replace(prior, modes=modes)
-        spaces = [InflowWindow(task, within, level) for _ in range(2)]
+        spaces = [InflowWindow(task, within, c_ref) for _ in range(2)]
         self.probabilities = np.array([1.0 - regimes.share, regimes.share])
         """(2,) that the present regime is quiet, or a slug"""
-        self._transitions = np.array([[1.0 - regimes.begins, regimes.begins],
-                                      [regimes.ends, 1.0 - regimes.ends]])
+        self._transitions = np.array([[1.0 - regimes.p_onset, regimes.p_onset],
+                                      [regimes.p_end, 1.0 - regimes.p_end]])
         r = modes.shape[1]
-        W = spaces[0].window
-        before, (weights, variance) = stationary(prior.time_covariance(W + 1))
+        W = spaces[0].window_steps
+        before, (weights, variance) = yule_walker(prior.time_covariance(W + 1))
         quiet = np.zeros((W, r))
         quiet[0, -1] = 1.0
         slug = quiet.copy()
         slug[:, :-1] = weights[:, None]
         stays = np.eye(r)[-1]
         leaves = 1.0 - stays
-        spaces[0].regression = quiet, regimes.quiet * leaves
-        spaces[1].regression = slug, variance * leaves
+        spaces[0].ar_model = quiet, regimes.quiet_variance_ratio * leaves
+        spaces[1].ar_model = slug, variance * leaves
         self.filters = [Filter(space) for space in spaces]
         """in quiet, in a slug"""
         covariance = np.kron(regimes.variance * before, np.diag(leaves))
@@ -106,7 +106,7 @@ class SwitchingInflowFilter:
         mean = self.probabilities @ [each.concentration for each in self.filters]
         self.update(self._forward(mean, voltages, currents))
 
-    def update(self, observation: Observation) -> None:
+    def update(self, observation: LinearMeasurement) -> None:
         """Condition on a measurement that is linear in the concentration near all means."""
         self._weigh([each.update(observation) for each in self.filters])
 
@@ -140,15 +140,15 @@ class ParticleInflowFilter(SwitchingInflowFilter):
 
     Parameters
     ----------
-    task, prior, level, level_std, forward
+    task, prior, c_ref, level_std, forward
         As in `SwitchingInflowFilter`.
     particles : int
         Number N ≥ 1 of branching particles; 2 N filters run.
     """
 
-    def __init__(self, task: Task, prior: InflowPrior, level: float, level_std: float,
+    def __init__(self, task: Task, prior: InflowPrior, c_ref: float, level_std: float,
                  forward: Forward, particles: int, random: np.random.Generator) -> None:
-        super().__init__(task, prior, level, level_std, forward)
+        super().__init__(task, prior, c_ref, level_std, forward)
         self.particles = _check.integer("particles", particles, low=1)
         self._spaces = [each.space for each in self.filters]
         self._random = random

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from eitbench.estimation.filter import Filter, Linearised, StateSpace
-from eitbench.estimation.gaussian import Observation
+from eitbench.estimation.filter import Filter, LinearisedMeasurement, StateSpace
+from eitbench.estimation.gaussian import LinearMeasurement
 from eitbench.worlds.task import Estimate
 
 if TYPE_CHECKING:
@@ -58,10 +58,10 @@ class UnscentedFilter(Filter):
         states = self.mean + np.concatenate([np.zeros((1, len(self.mean))), offsets, -offsets])
         return self.space.concentration(states), scaled.T @ J
 
-    def _linearise(self, voltages: np.ndarray, currents: np.ndarray) -> Linearised:
+    def _linearise(self, voltages: np.ndarray, currents: np.ndarray) -> LinearisedMeasurement:
         points, along = self._sigma_points()
         mean, slope, bend = moments(self.resistance(points) @ currents)
-        observation = Observation(slope, voltages - mean, self.noise.std(mean)**2, bend)
+        observation = LinearMeasurement(slope, voltages - mean, self.noise.std(mean)**2, bend)
         return observation, slope @ along, voltages - mean
 
     def estimate(self, lag: int = 0) -> Estimate:

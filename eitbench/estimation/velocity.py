@@ -12,7 +12,7 @@ import numpy as np
 from eitbench import _check
 from eitbench.estimation.covariance import Covariance, DenseCovariance
 from eitbench.estimation.filter import StateSpace
-from eitbench.estimation.inflow_response import newest_inflow
+from eitbench.estimation.inflow_response import one_step_response
 from eitbench.estimation.nodal import initial_covariance
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class UnknownFlow:
+class VelocityPrior:
     """v = Σ θ_k v_k, with θ a random walk that begins at N(θ_0, diag(std²)).
 
     ``ValueError`` naming what is of the wrong shape, or not positive for θ_0.
@@ -29,11 +29,11 @@ class UnknownFlow:
 
     transport_at: Callable[[np.ndarray], ConvectionDiffusion]
     """θ (k,) -> the model with that velocity; all with one mesh and one inlet"""
-    directions: Sequence[VelocityField]
+    basis_fields: Sequence[VelocityField]
     """the k fields v_k"""
-    start: np.ndarray
+    initial: np.ndarray
     """(k,) θ_0"""
-    start_std: np.ndarray
+    initial_std: np.ndarray
     """(k,)"""
     walk_std: np.ndarray
     """(k,) of the steps of the walk, one a time step; zero for a constant velocity"""
@@ -45,14 +45,14 @@ class UnknownFlow:
     wall bind no more than others; 0 < least < 1 < largest"""
 
     def __post_init__(self) -> None:
-        k = len(self.directions)
-        for name in ("start", "start_std", "walk_std"):
+        k = len(self.basis_fields)
+        for name in ("initial", "initial_std", "walk_std"):
             object.__setattr__(self, name, _check.array(name, getattr(self, name), (k,)))
         profiles = _check.array("profiles", self.profiles, (None, k))
         object.__setattr__(self, "profiles", profiles)
-        if not (profiles @ self.start > 0).all():
-            raise ValueError("profiles must give a positive velocity with start, "
-                             f"got {(profiles @ self.start).min():g}")
+        if not (profiles @ self.initial > 0).all():
+            raise ValueError("profiles must give a positive velocity with initial, "
+                             f"got {(profiles @ self.initial).min():g}")
         low, high = _check.array("bounds", self.bounds, (2,))
         if not 0 < low < 1 < high:
             raise ValueError("bounds must be a range 0 < least < 1 < largest, got "
@@ -61,13 +61,13 @@ class UnknownFlow:
     def within_bounds(self, parameters: np.ndarray) -> np.ndarray:
         """Return the parameters θ (k,), or the nearest point within the bounds on the line towards
         θ_0."""
-        nominal = self.profiles @ self.start
-        change = self.profiles @ (parameters - self.start) / nominal
+        nominal = self.profiles @ self.initial
+        change = self.profiles @ (parameters - self.initial) / nominal
         allowed = np.where(change < 0, *self.bounds) - 1.0
         beyond = np.abs(change) > np.abs(allowed)
         if not beyond.any():
             return parameters
-        return self.start + (allowed[beyond] / change[beyond]).min() * (parameters - self.start)
+        return self.initial + (allowed[beyond] / change[beyond]).min() * (parameters - self.initial)
 
 
 class VelocityStates(StateSpace):
@@ -84,7 +84,7 @@ class VelocityStates(StateSpace):
 
     Parameters
     ----------
-    flow : UnknownFlow
+    flow : VelocityPrior
         Prior of θ.
     mean, covariance : (n,), (n, n)
         Of the concentration at t = 0, in mol/m³ and its square.
@@ -94,19 +94,19 @@ class VelocityStates(StateSpace):
         H Γ_e Hᵀ at the nominal velocity, (mol/m³)².
     """
 
-    def __init__(self, flow: UnknownFlow, mean: np.ndarray, covariance: np.ndarray, *,
+    def __init__(self, flow: VelocityPrior, mean: np.ndarray, covariance: np.ndarray, *,
                  inflow: float, inflow_std: float, nodal_noise: np.ndarray) -> None:
         self.flow = flow
         c = _check.array("mean", mean, (None,), units="mol/m³")
         n = self._n = len(c)
-        k = len(flow.start)
+        k = len(flow.initial)
         self._inflow = _check.number("inflow", inflow, units="mol/m³")
         self._inflow_std = _check.number("inflow_std", inflow_std, low=0.0, units="mol/m³")
         self._nodal_noise = _check.array("nodal_noise", nodal_noise, (n, n))
-        self._mean = np.concatenate([c, flow.start])
+        self._mean = np.concatenate([c, flow.initial])
         self._covariance = np.zeros((n + k, n + k))
         self._covariance[:n, :n] = _check.array("covariance", covariance, (n, n))
-        self._covariance[n:, n:] = np.diag(flow.start_std**2)
+        self._covariance[n:, n:] = np.diag(flow.initial_std**2)
 
     def initial(self) -> tuple[np.ndarray, Covariance]:
         return self._mean.copy(), DenseCovariance(self._covariance)
@@ -118,7 +118,7 @@ class VelocityStates(StateSpace):
         transport = self.flow.transport_at(theta)
         inlet = transport.inlet
         after, by_theta = transport.velocity_derivatives(c, c[inlet], self._inflow,
-                                                         self.flow.directions)
+                                                         self.flow.basis_fields)
 
         def advance(X: np.ndarray) -> np.ndarray:
             """[[F, ∂c⁺/∂θ], [0, I]] X; with its sparse matrices a step costs far less than F."""
@@ -126,7 +126,7 @@ class VelocityStates(StateSpace):
             moved += by_theta @ X[n:]
             return np.concatenate([moved, X[n:]])
 
-        Y = self._inflow_std * newest_inflow(transport)
+        Y = self._inflow_std * one_step_response(transport)
         noise = np.zeros_like(self._covariance)
         noise[:n, :n] = Y @ Y.T + self._nodal_noise
         noise[n:, n:] = np.diag(self.flow.walk_std**2)
@@ -151,21 +151,21 @@ def velocity_states(task: Task, c_ref: float, bounds: tuple[float, float]) -> Ve
     the velocity."""
     prior = task.prior
     nodal = task.evolution.state_noise_covariance(0.0, (prior.nodal_std * c_ref)**2)
-    return VelocityStates(asked_flow(task, bounds), np.full(task.mesh.n_nodes, c_ref),
+    return VelocityStates(task_velocity_prior(task, bounds), np.full(task.mesh.n_nodes, c_ref),
                           c_ref**2 * initial_covariance(task.mesh, prior), inflow=c_ref,
                           inflow_std=prior.inflow_std * c_ref, nodal_noise=nodal)
 
 
-def asked_flow(task: Task, bounds: tuple[float, float] = (0.05, 4.0)) -> UnknownFlow:
+def task_velocity_prior(task: Task, bounds: tuple[float, float] = (0.05, 4.0)) -> VelocityPrior:
     """Return the prior of the velocity that a task asks for; ``ValueError`` if it asks for none."""
     flow = task.velocity
     if flow is None:
         raise ValueError("task must ask for the flow, got one that does not")
-    return UnknownFlow(task.transport_at, flow.directions, np.array(flow.nominal),
+    return VelocityPrior(task.transport_at, flow.basis_fields, np.array(flow.nominal),
                        np.array(flow.initial_std), np.array(flow.walk_std), flow.profiles, bounds)
 
 
-def scaled_flow(task: Task, std: float, walk_std: float) -> UnknownFlow:
+def scaled_velocity_prior(task: Task, std: float, walk_std: float) -> VelocityPrior:
     """Return the flow that a task specifies times a factor, which begins at 1 ± ``std`` and walks:
     a prior for a nominal flow that may be wrong. ``ValueError`` if nothing flows."""
     from eitbench.physics.transport import ConvectionDiffusion
@@ -177,5 +177,5 @@ def scaled_flow(task: Task, std: float, walk_std: float) -> UnknownFlow:
     def transport_at(factor: np.ndarray) -> ConvectionDiffusion:
         return transport.with_velocity(lambda points: factor[0] * nominal(points))
 
-    return UnknownFlow(transport_at, [nominal], np.ones(1), np.array([std]), np.array([walk_std]),
+    return VelocityPrior(transport_at, [nominal], np.ones(1), np.array([std]), np.array([walk_std]),
                        np.ones((1, 1)))

@@ -14,11 +14,11 @@ if TYPE_CHECKING:
     from eitbench.numerics.mesh import Mesh
     from eitbench.physics.transport import EvolutionModel
 
-KEPT = 1e-3
+MODE_VARIANCE_CUTOFF = 1e-3
 """Modes that hold less than this part of the strongest one's variance are left out."""
 
 
-def steady(phase: float) -> tuple[np.ndarray, np.ndarray]:
+def matern32_transition(phase: float) -> tuple[np.ndarray, np.ndarray]:
     """A and Q (2, 2) of a number of variance 1 that moves steadily, and of its change in 1/λ, after
     ``phase`` = λτ: a second-order walk that forgets, a Matérn process of order 3/2 in time with the
     correlation (1 + λτ) e^−λτ (Hartikainen & Särkkä 2010, "Kalman filtering and smoothing solutions
@@ -28,14 +28,14 @@ def steady(phase: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 @lru_cache(maxsize=4)
-def smooth_modes(mesh: Mesh, length: float) -> np.ndarray:
+def matern_modes(mesh: Mesh, length: float) -> np.ndarray:
     """(n, K) modes of a Matérn field over ``length`` in m, of mean variance 1: what is smooth is
     their sum with independent standard normal weights. Read-only: whoever asks again is given the
     same."""
     from eitbench.numerics.fem import mass_matrix, stiffness_matrix
     covariance = smoothness_covariance(mass_matrix(mesh), stiffness_matrix(mesh), length, 1.0)
     values, vectors = np.linalg.eigh(covariance)
-    kept = values > KEPT * values[-1]
+    kept = values > MODE_VARIANCE_CUTOFF * values[-1]
     modes: np.ndarray = vectors[:, kept] * np.sqrt(values[kept])
     modes.flags.writeable = False
     return modes
@@ -55,10 +55,10 @@ class RandomWalk:
     """s between two readings"""
     length: float
     """ℓ in m, > 0, over which what changes is alike; see `smoothness_covariance`"""
-    memory: float = 1.0
+    ar_coefficient: float = 1.0
     """φ, from 0 to 1"""
-    rate: float = 0.0
-    """λ in 1/s of `steady` motion that is as likely, for those who believe in it; 0: not known"""
+    matern_rate: float = 0.0
+    """λ in 1/s of a Matérn 3/2 motion that is as likely; 0: unknown"""
 
     @property
     def inlet(self) -> np.ndarray:
@@ -68,8 +68,8 @@ class RandomWalk:
     def step(self, c: np.ndarray, inflow_before: np.ndarray | float = 0.0,
              inflow_after: np.ndarray | float = 0.0) -> np.ndarray:
         """φ c + (1 − φ) c̄ for c (n,) or (n, k); there is no inlet for an inflow to enter by."""
-        mean = (1.0 - self.memory) * (self._shares @ c)
-        return self.memory * np.asarray(c, dtype=float) + mean
+        mean = (1.0 - self.ar_coefficient) * (self._shares @ c)
+        return self.ar_coefficient * np.asarray(c, dtype=float) + mean
 
     @cached_property
     def _shares(self) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Measured cases: public measurements with vessel, settings and truth, each an environment id.
 
-A case is a YAML file in the folder ``cases``. It identifies its data by sha256 and does not hold
-them: users download them into a folder of their own.
+A case is a YAML file in the folder ``cases``. It identifies its data by sha256 and does not contain
+them: users download them into `measured_folder`.
 """
 
 from __future__ import annotations
@@ -25,18 +25,19 @@ from eitbench.measured.segmentation import read_truth
 
 CASES = Path(__file__).with_name("cases")
 WITHHELD_FRACTION = 0.1
+"""Fraction of the measurements that scores methods."""
 FOLDER_VARIABLE = "EITBENCH_MEASURED"
 _TEXTS = ("title", "file", "sha256", "licence", "source")
-_OPTIONAL = ("beside", "truth")
+_OPTIONAL = ("auxiliary_files", "truth")
 _SETTINGS = ("format", "span", "correction", "homogeneous_frames", "moves", "model_error")
-"""Arguments of `read` and `MeasuredEnv`, and ``span``: first reading, from 0, and end."""
+"""Arguments of `read` and `MeasuredEnv`, and ``span``: start and stop of the injections used."""
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredCase:
     """One set of measurements with its vessel and settings, the same for all methods.
 
-    ``ValueError`` names an entry that is missing, unknown, or of the wrong kind.
+    ``ValueError`` names an entry that is missing, unknown, or of the wrong type.
     """
 
     name: str
@@ -44,14 +45,14 @@ class MeasuredCase:
     file: str
     """path of the file or folder below `measured_folder`"""
     sha256: str
-    """of that file; of a folder, of its files one after another"""
+    """digest of that file, or of all files of the folder in the order of their names"""
     licence: str
     source: str
-    """where to download the file"""
+    """download page"""
     vessel: Mapping[str, Any]
     """entries of `read_vessel`"""
-    beside: Mapping[str, str] = field(default_factory=dict)
-    """name -> sha256 of files that the reader takes from the same folder"""
+    auxiliary_files: Mapping[str, str] = field(default_factory=dict)
+    """name -> sha256 of files that the reader loads from the same folder"""
     truth: Mapping[str, str] | None = None
     """``file`` and ``sha256`` of a segmentation for `read_truth`"""
     settings: Mapping[str, Any] = field(default_factory=dict)
@@ -61,55 +62,54 @@ class MeasuredCase:
             value = getattr(self, name)
             if not isinstance(value, str) or not value.strip():
                 raise ValueError(f"case.{name} must be a text, got {value!r}")
-        for name, entries in {"vessel": self.vessel, "beside": self.beside,
-                              "truth": self.truth or {}}.items():
+        for name, entries in {"vessel": self.vessel, "truth": self.truth or {},
+                              "auxiliary_files": self.auxiliary_files}.items():
             if not isinstance(entries, Mapping):
                 raise ValueError(f"case.{name} must be entries like 'name: value', got {entries!r}")
         if self.truth is not None and set(self.truth) != {"file", "sha256"}:
             raise ValueError(f"case.truth must have file and sha256, got {self.truth!r}")
-        digests = {"sha256": self.sha256, **self.beside}
-        if self.truth:
-            digests["truth.sha256"] = self.truth["sha256"]
+        digests = {"sha256": self.sha256, **self.auxiliary_files,
+                   **({"truth.sha256": self.truth["sha256"]} if self.truth else {})}
         for name, digest in digests.items():
             if not isinstance(digest, str) or not re.fullmatch("[0-9a-f]{64}", digest):
                 raise ValueError(f"case.{name} must be 64 hexadecimal digits, got {digest!r}")
-        match self.settings.get("span", [0, 1]):
-            case [int(first), int(end)] if 0 <= first < end:
-                pass
-            case span:
-                raise ValueError("case.span must be two increasing numbers such as [0, 800], got "
-                                 f"{span!r}")
+        span = self.settings.get("span", [0, 1])
+        if not (isinstance(span, list) and [*map(type, span)] == [int, int]
+                and 0 <= span[0] < span[1]):
+            raise ValueError("case.span must be two increasing numbers such as [0, 800], got "
+                             f"{span!r}")
         if unknown := sorted(set(self.settings) - set(_SETTINGS)):
-            known = (*_TEXTS, "vessel", *_OPTIONAL, *_SETTINGS)
-            raise ValueError(f"case has no {', '.join(unknown)}; there are {', '.join(known)}")
+            names = (*_TEXTS, "vessel", *_OPTIONAL, *_SETTINGS)
+            raise ValueError(f"case must have entries of {', '.join(names)}, got "
+                             f"{', '.join(unknown)}")
 
     @cached_property
     def digest(self) -> str:
-        """sha256 of all entries that numbers depend on; texts may change."""
-        content = {"sha256": self.sha256, "beside": dict(self.beside),
+        """sha256 of all entries that scores depend on, which texts are not."""
+        content = {"sha256": self.sha256, "beside": dict(self.auxiliary_files),
                    "truth": self.truth and self.truth["sha256"], "vessel": dict(self.vessel),
                    "withheld": WITHHELD_FRACTION, "settings": dict(self.settings)}
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
     @property
     def options(self) -> dict[str, Any]:
-        """Arguments of `MeasuredEnv` beside the measurements and the vessel."""
+        """Arguments of `MeasuredEnv` apart from the measurements and the vessel."""
         return {"withheld": WITHHELD_FRACTION} | {
             name: value for name, value in self.settings.items() if name not in ("format", "span")}
 
     def measurements(self, file: Path | str | None = None) -> Measurements:
-        """Read the measurements, by default from `measured_folder`; ``ValueError`` says which file
-        is missing or differs."""
+        """Read the measurements, by default from `measured_folder`; ``ValueError`` names a file
+        that is missing or has another sha256."""
         path = measured_folder() / self.file if file is None else Path(file)
-        for each, digest in {path: self.sha256, **{path.with_name(name): digest for name, digest
-                                                   in self.beside.items()}}.items():
-            self._check(each, digest)
+        self._check(path, self.sha256)
+        for name, digest in self.auxiliary_files.items():
+            self._check(path.with_name(name), digest)
         span = self.settings.get("span")
         return read(path, self.settings.get("format"), None if span is None else slice(*span))
 
     def truth_mask(self) -> np.ndarray | None:
-        """Read the segmentation (256, 256) of the truth; None if the case has none. ``ValueError``
-        as for `measurements`."""
+        """Read the segmentation (256, 256) of the ground truth; None if the case has none.
+        ``ValueError`` as for `measurements`."""
         if self.truth is None:
             return None
         path = measured_folder() / self.truth["file"]
@@ -119,16 +119,16 @@ class MeasuredCase:
     def _check(self, path: Path, digest: str) -> None:
         if not path.exists():
             raise ValueError(
-                f"{case_id(self.name)} needs a file that is not here: {path.name} with sha256 "
+                f"{case_id(self.name)} requires the file {path.name} with sha256 "
                 f"{digest}, from {self.source} (licence: {self.licence}). Save it as {path}, or "
                 f"set ${FOLDER_VARIABLE} to the folder that has {self.file}")
-        if (found := file_sha256(path)) != digest:
+        if (actual := file_sha256(path)) != digest:
             raise ValueError(f"{path} must have the sha256 {digest} of the case {self.name}, got "
-                             f"{found}")
+                             f"{actual}")
 
 
 def measured_folder() -> Path:
-    """$EITBENCH_MEASURED, else $XDG_DATA_HOME/eitbench/measured, else
+    """Return $EITBENCH_MEASURED, else $XDG_DATA_HOME/eitbench/measured, else
     ~/.local/share/eitbench/measured."""
     if folder := os.environ.get(FOLDER_VARIABLE):
         return Path(folder)
@@ -143,7 +143,7 @@ def case_id(name: str) -> str:
 
 def read_case(name: Path | str) -> MeasuredCase:
     """Read a built-in case by name, or the case of a YAML file. ``ValueError`` names the file and
-    the fault."""
+    the error."""
     path = Path(name)
     if path.suffix != ".yml":
         names = {each.stem: each for each in sorted(CASES.glob("*.yml"))}
@@ -163,7 +163,7 @@ def read_case(name: Path | str) -> MeasuredCase:
 
 
 def file_sha256(path: Path) -> str:
-    """Digest of a file, or of all files of a folder one after another, by name."""
+    """Return the digest of a file, or of all files of a folder in the order of their names."""
     files = sorted(path.iterdir()) if path.is_dir() else [path]
     digest = hashlib.sha256()
     for each in filter(Path.is_file, files):

@@ -1,4 +1,4 @@
-"""Readings predicted for a concentration, and the readings that an estimator is shown."""
+"""Observation model of an instrument, and the measurements that are visible to an estimator."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ from eitbench.physics.observation import ObservationModel
 
 @dataclass(eq=False)
 class MeasurementModel:
-    """Readings gain · D U(c) + offset of potentials U = 𝓡(c) I, where ``mask``; a `VoltageModel`.
+    """Voltages gain · D U(c) + offset of potentials U = 𝓡(c) I, where ``mask``; a `VoltageModel`.
 
-    A reading outside the mask is 0 for any concentration. Its innovation and its derivative are
-    0, so a Kalman filter or a least-squares fit gives exactly the result without that reading.
+    A measurement outside the mask is 0 for any concentration. Its innovation and its derivative
+    are 0, so a Kalman filter or a least-squares fit gives exactly the result without it.
     """
 
     observation: ObservationModel
     currents: np.ndarray
     """(K, L) A, each injection once"""
     matrix: np.ndarray
-    """(M, L) D, from potentials to readings"""
+    """(M, L) D, maps potentials to measured voltages"""
     depth: float = 1.0
     """m of fluid for a plane model, whose currents are in A/m; 1 in 3D"""
     _: KW_ONLY
     offset: Any = 0.0
     """(K, M) V, corrects the model on homogeneous fluid"""
     gain: Any = 1.0
-    """(K, M) factor of the model"""
+    """(K, M) channel gain, a factor of the model"""
     mask: Any = True
-    """(K, M) bool, readings that are predicted"""
+    """(K, M) bool, measurements that are predicted"""
 
     def __post_init__(self) -> None:
         shape = len(self.currents), len(self.matrix)
@@ -52,22 +52,22 @@ class MeasurementModel:
         return replace(self, mask=mask)
 
     def voltages(self, concentration: np.ndarray, currents: np.ndarray) -> np.ndarray:
-        """Predict readings (J, M) in V for ``concentration`` (n,) in mol/m³ and injections (J, L)
+        """Predict voltages (J, M) in V for ``concentration`` (n,) in mol/m³ and injections (J, L)
         in A."""
-        k = self._injections(currents)
+        k = self._injection_index(currents)
         potentials = self.observation.voltages(concentration, currents / self.depth)
         return self.mask[k] * (self.gain[k] * (potentials @ self.matrix.T) + self.offset[k])
 
     def linearise(self, concentration: np.ndarray,
                   currents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return `voltages` and their derivatives by c, (J, M, n) in V·m³/mol."""
-        k = self._injections(currents)
-        potentials, slopes = self.observation.linearise(concentration, currents / self.depth)
+        """Return `voltages` and their Jacobian ∂V/∂c, (J, M, n) in V·m³/mol."""
+        k = self._injection_index(currents)
+        potentials, jacobian = self.observation.linearise(concentration, currents / self.depth)
         gain = self.mask[k] * self.gain[k]
         return (gain * (potentials @ self.matrix.T) + self.mask[k] * self.offset[k],
-                gain[..., None] * (self.matrix @ slopes))
+                gain[..., None] * (self.matrix @ jacobian))
 
-    def _injections(self, currents: np.ndarray) -> list[int]:
+    def _injection_index(self, currents: np.ndarray) -> list[int]:
         rows = np.ascontiguousarray(currents, dtype=float)
         try:
             return [self._index[row.tobytes()] for row in rows]
@@ -77,33 +77,38 @@ class MeasurementModel:
 
 
 def complete_channels(measurements: Measurements) -> np.ndarray:
-    """(K, M) bool: readings that exist at every use of their injection; others are not used.
-    ``ValueError`` if there are none."""
-    finite = np.isfinite(measurements.readings)
+    """Return (K, M) bool: channels with a measurement at every use of their injection.
+
+    Other channels are not used. ``ValueError`` if no channel is complete.
+    """
+    finite = np.isfinite(measurements.voltages)
     complete = np.ones((len(measurements.currents), len(measurements.matrix)), dtype=bool)
     for k, row in enumerate(complete):
-        used = measurements.injections == k
+        used = measurements.injection_index == k
         row &= used.any() & finite[used].all(axis=0)
     if not complete.any():
-        raise ValueError("readings must hold some that exist at every use of their injection, got "
-                         "none")
+        raise ValueError("voltages must hold numbers at every use of an injection, got NaN in each "
+                         "channel")
     return complete
 
 
 def sample_withheld(available: np.ndarray, fraction: float, seed: int) -> np.ndarray:
-    """(K, M) bool: a random ``fraction`` of the available readings of each injection, at least
-    one of two or more; equal at each use of the injection, so a withheld reading is never shown."""
+    """Draw (K, M) bool: a random ``fraction`` of the available measurements of each injection.
+
+    At least one of two or more is withheld. All uses of an injection share the mask, so that a
+    withheld channel is never visible.
+    """
     random = np.random.default_rng(seed)
     withheld = np.zeros_like(available)
-    for row, hidden in zip(available, withheld, strict=True):
-        places = np.flatnonzero(row)
-        count = max(round(fraction * len(places)), 1) if fraction and len(places) > 1 else 0
-        hidden[random.choice(places, count, replace=False)] = True
+    for available_row, withheld_row in zip(available, withheld, strict=True):
+        channels = np.flatnonzero(available_row)
+        count = max(round(fraction * len(channels)), 1) if fraction and len(channels) > 1 else 0
+        withheld_row[random.choice(channels, count, replace=False)] = True
     return withheld
 
 
-def visible_reading(model: MeasurementModel, measurements: Measurements,
-                    t: int) -> tuple[np.ndarray, np.ndarray]:
-    """Readings (M,), 0 outside the model's mask, and currents (L,) of step t = 0, 1, …"""
-    k = measurements.injections[t]
-    return np.where(model.mask[k], measurements.readings[t], 0.0), measurements.currents[k]
+def visible_measurement(model: MeasurementModel, measurements: Measurements,
+                        t: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return voltages (M,), 0 outside the model's mask, and currents (L,) of step t = 0, 1, …"""
+    k = measurements.injection_index[t]
+    return np.where(model.mask[k], measurements.voltages[t], 0.0), measurements.currents[k]

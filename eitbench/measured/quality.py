@@ -1,4 +1,4 @@
-"""Data-quality warnings: wrong units, electrodes that are swapped, miscounted or dead."""
+"""Data-quality warnings: wrong units, and electrodes that are swapped, misnumbered or dead."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ CONDUCTIVITY_RANGE = (1e-4, 10.0)
 """S/m of fluids in vessels; sea water has 5."""
 GAIN_RANGE = (0.5, 2.0)
 RECIPROCITY_TOLERANCE = 0.05
-"""Relative change of readings when injection and reading are exchanged."""
+"""Relative change of voltages when injection and measurement are exchanged."""
 MAX_MISFIT = 0.3
-"""Relative misfit of the homogeneous model from which on other electrode orders are tried."""
+"""Relative misfit of the homogeneous model above which other electrode orders are tried."""
 REORDER_IMPROVEMENT = 0.5
-"""Factor to which another order must reduce the misfit to be reported."""
+"""Factor by which another order must reduce the misfit to be reported."""
 BAD_ELECTRODE_RATIO = 4.0
 """Misfit of a bad electrode relative to the median."""
 
 
 def quality_warnings(measurements: Measurements, calibration: Calibration,
                      electrodes: CompleteElectrodeModel) -> list[str]:
-    """Return sentences on whatever contradicts readings in volts of fluid in this vessel.
+    """Return a sentence for each contradiction between measurements, vessel and units.
 
     Checks conductivity and gain, reciprocity, whether another order of the electrodes fits far
-    better, and electrodes whose readings fit far worse than others. Where each channel has its own
-    gain, neither reciprocity nor a misfit that no order explains is reported.
+    better, and electrodes whose measurements fit far worse than others. Where each channel has its
+    own gain, neither reciprocity nor a misfit of all orders is reported.
     """
     return [*_unit_warnings(calibration), *_reciprocity_warnings(measurements, calibration),
             *_order_warnings(measurements, calibration, electrodes),
@@ -42,15 +42,15 @@ def quality_warnings(measurements: Measurements, calibration: Calibration,
 
 
 def _unit_warnings(calibration: Calibration) -> list[str]:
-    found = []
+    warnings = []
     (low, high), sigma, gain = CONDUCTIVITY_RANGE, calibration.conductivity, calibration.gain
     if not low <= sigma <= high:
-        found.append(f"The conductivity would be {sigma:.3g} S/m, outside the usual {low:g} to "
-                     f"{high:g}: currents, readings or lengths are in other units.")
+        warnings.append(f"The conductivity would be {sigma:.3g} S/m, outside the usual {low:g} to "
+                        f"{high:g}: currents, voltages or lengths are in other units.")
     if not GAIN_RANGE[0] <= gain <= GAIN_RANGE[1]:
-        found.append(f"Readings are {gain:.3g} times the values for this conductivity: they are "
-                     "not in volts, or currents not in amperes.")
-    return found
+        warnings.append(f"Measurements are {gain:.3g} times the values for this conductivity: they "
+                        "are not in volts, or currents not in amperes.")
+    return warnings
 
 
 def _reciprocity_warnings(measurements: Measurements, calibration: Calibration) -> list[str]:
@@ -58,61 +58,61 @@ def _reciprocity_warnings(measurements: Measurements, calibration: Calibration) 
     rows = measurements.matrix - measurements.matrix.mean(axis=1, keepdims=True)
     norms = np.outer(np.linalg.norm(currents, axis=1), np.linalg.norm(rows, axis=1))
     cosine = currents @ rows.T / np.maximum(norms, 1e-300)
-    has = cosine.max(axis=1) > 1.0 - 1e-9      # a reading is across the injecting electrodes
-    across = cosine.argmax(axis=1)[has]
-    injected = np.abs(currents[has]).max(axis=1, keepdims=True)
-    exchanged = calibration.measured[has][:, across] / injected
-    difference = exchanged - exchanged.T
-    known = np.isfinite(difference)
-    if not known.any() or calibration.correction == "gain":
+    paired = cosine.max(axis=1) > 1.0 - 1e-9   # a measurement is across the injecting electrodes
+    channel = cosine.argmax(axis=1)[paired]
+    injected = np.abs(currents[paired]).max(axis=1, keepdims=True)
+    resistance = calibration.mean_voltages[paired][:, channel] / injected
+    difference = resistance - resistance.T
+    finite = np.isfinite(difference)
+    if not finite.any() or calibration.correction == "gain":
         return []
-    scale = np.sqrt(2.0 * np.mean(exchanged[known]**2))
-    change = float(np.sqrt(np.mean(difference[known]**2)) / scale)
+    scale = np.sqrt(2.0 * np.mean(resistance[finite]**2))
+    change = float(np.sqrt(np.mean(difference[finite]**2)) / scale)
     if change <= RECIPROCITY_TOLERANCE:
         return []
-    return [f"Exchanging injection and reading changes readings by {100 * change:.2g} %, which "
-            "breaks reciprocity: the order of injections or of readings is wrong, or channels "
+    return [f"Exchanging injection and measurement changes voltages by {100 * change:.2g} %, which "
+            "breaks reciprocity: the order of injections or of measurements is wrong, or channels "
             "have different gains (then --correction gain helps)."]
 
 
 def _order_warnings(measurements: Measurements, calibration: Calibration,
                     electrodes: CompleteElectrodeModel) -> list[str]:
-    """Try other orders of the electrodes in the readings, and swapped pairs in both readings and
-    injections."""
+    """Try other orders of the electrodes in the measurements, and swapped pairs in both
+    measurements and injections."""
     L = electrodes.n_electrodes
     model = electrodes.with_contacts(CONTACT_PRIOR_MEAN * electrode_sizes(electrodes).mean())
     R = model.transfer_resistance(np.ones(model.mesh.n_nodes))
     numbers = np.arange(L)
-    known = np.isfinite(calibration.measured)
+    finite = np.isfinite(calibration.mean_voltages)
 
-    def misfit(injecting: np.ndarray, reading: np.ndarray) -> float:
-        """Relative misfit of the readings off the injecting electrodes."""
+    def misfit(injecting: np.ndarray, measuring: np.ndarray) -> float:
+        """Return the relative misfit of measurements without an injecting electrode."""
         currents = measurements.currents[:, injecting]
-        matrix = measurements.matrix[:, reading]
-        passive = known & (np.abs(currents) @ np.abs(matrix).T == 0.0)
-        used = passive if passive.any() else known
-        y, x = calibration.measured[used], (currents @ R @ matrix.T)[used]
+        matrix = measurements.matrix[:, measuring]
+        passive = finite & (np.abs(currents) @ np.abs(matrix).T == 0.0)
+        used = passive if passive.any() else finite
+        y, x = calibration.mean_voltages[used], (currents @ R @ matrix.T)[used]
         return float(np.linalg.norm(y - (x @ y) / (x @ x) * x) / np.linalg.norm(y))
 
     described = misfit(numbers, numbers)
     if described <= MAX_MISFIT:
         return []
-    orders = [("Readings seem to count electrodes the other way round than injections", numbers,
-               (first - numbers) % L) for first in range(L)]
-    orders += [(f"Readings seem to count electrodes from {turn} further than injections", numbers,
-                (numbers + turn) % L) for turn in range(1, L)]
+    orders = [("Measurements seem to number electrodes in the opposite direction of injections",
+               numbers, (first - numbers) % L) for first in range(L)]
+    orders += [(f"Measurements seem to number electrodes with an offset of {offset} to injections",
+                numbers, (numbers + offset) % L) for offset in range(1, L)]
     for a, b in combinations(range(L), 2):
         swapped = numbers.copy()
         swapped[[a, b]] = b, a
-        orders.append((f"Electrodes {a + 1} and {b + 1} are swapped, it seems", swapped, swapped))
-    misfits = [misfit(injecting, reading) for _, injecting, reading in orders]
+        orders.append((f"Electrodes {a + 1} and {b + 1} seem to be swapped", swapped, swapped))
+    misfits = [misfit(injecting, measuring) for _, injecting, measuring in orders]
     best = int(np.argmin(misfits))
     if misfits[best] <= REORDER_IMPROVEMENT * described:
         return [f"{orders[best][0]}: this reduces the misfit of the homogeneous model from "
                 f"{100 * described:.2g} % to {100 * misfits[best]:.2g} %."]
     if calibration.correction == "gain":
         return []
-    return [f"The homogeneous model has a misfit of {100 * described:.2g} % of the readings: the "
+    return [f"The homogeneous model has a misfit of {100 * described:.2g} % of the voltages: the "
             "vessel, the order of the electrodes or the units differ from the description."]
 
 
@@ -120,9 +120,9 @@ def _electrode_warnings(measurements: Measurements, calibration: Calibration) ->
     if (np.count_nonzero(measurements.matrix, axis=1) > 2).any():
         return []
     misfit = electrode_misfits(calibration, measurements.matrix)
-    misfit /= np.sqrt(np.nanmean(calibration.measured**2))
+    misfit /= np.sqrt(np.nanmean(calibration.mean_voltages**2))
     median = float(np.median(misfit))
-    return [f"Electrode {worst + 1} looks dead or loose: the misfit of its readings is "
-            f"{100 * misfit[worst]:.2g} % of a mean reading, the median of all electrodes "
+    return [f"Electrode {worst + 1} looks dead or loose: the misfit of its measurements is "
+            f"{100 * misfit[worst]:.2g} % of the RMS voltage, the median of all electrodes "
             f"{100 * median:.2g} %."
             for worst in np.flatnonzero((misfit > BAD_ELECTRODE_RATIO * median) & (misfit > 0.1))]

@@ -1,4 +1,4 @@
-"""`read`: measurements from a file of any known format; readers of Sciospec files and tables."""
+"""`read` measurements from a file of any supported format; readers of Sciospec files and tables."""
 
 from __future__ import annotations
 
@@ -18,30 +18,22 @@ from eitbench.measured.matlab import load_variables, provenance, read_eidors, re
 from eitbench.measured.measurements import Measurements
 
 AMPLITUDE, FREQUENCY, TIME, CHANNELS = 8, 4, 3, "MeasurementChannels:"
-"""Header lines of Sciospec's files, from 0: peak current in A, Hz, and the time of the frame."""
+"""Header lines of Sciospec files, from 0: peak current in A, frequency in Hz, time of the frame."""
 TIMESTAMP_FORMAT = "%Y.%m.%d. %H:%M:%S.%f"
 
 
 def read(path: Path | str, format: str | None = None, steps: slice | None = None,
          **options: Any) -> Measurements:
-    """Read measurements from a file or a folder.
+    """Read measurements, or only the measurement vectors ``steps``, from a file or a folder.
 
-    Parameters
-    ----------
-    path : path
-    format : str, optional
-        One of `READERS`; default: by the suffix and the variables of the file.
-    steps : slice, optional
-        Only these readings; other readings of an HDF5 file stay unread.
-    options
-        Arguments of the reader. A table may have them in a YAML file of the same name:
-        ``electrodes: 16`` and ``current: 0.001``, one per line.
-
-    ``ValueError`` names the file and the fault.
+    ``format`` is one of `READERS`; by default the suffix and the variables of the file determine
+    it. ``options`` are arguments of the reader; a table may have them in a YAML file of the same
+    name: ``electrodes: 16`` and ``current: 0.001``, one per line. ``ValueError`` names the file
+    and the error.
     """
     path = Path(path)
     if not path.exists():
-        raise ValueError(f"{path} must be a file or a folder, there is none")
+        raise ValueError(f"{path} must be a file or a folder, got a missing path")
     format = format or _detect_format(path)
     if format not in READERS:
         raise ValueError(f"format must be one of {', '.join(READERS)}, got {format!r}")
@@ -50,8 +42,8 @@ def read(path: Path | str, format: str | None = None, steps: slice | None = None
     try:
         if format == "hdf5" and steps is not None:
             return Measurements.load(path, steps).select(slice(None))
-        found = READERS[format](path, **options)
-        return found if steps is None else found.select(steps)
+        measurements = READERS[format](path, **options)
+        return measurements if steps is None else measurements.select(steps)
     except ValueError as error:
         if str(path) in str(error):
             raise
@@ -64,8 +56,8 @@ def _detect_format(path: Path) -> str:
     if path.suffix in (".h5", ".hdf5"):
         return "hdf5"
     if path.suffix == ".mat":
-        found = load_variables(path)
-        return "ktc" if {"Inj", "Injref", "CurrentPattern"} & set(found) else "eidors"
+        names = {"Inj", "Injref", "CurrentPattern"}
+        return "ktc" if names & set(load_variables(path)) else "eidors"
     if path.suffix in (".csv", ".tsv", ".txt"):
         return "table"
     raise ValueError(f"{path} must end in .h5, .mat, .eit, .csv, .tsv or .txt, or format must be "
@@ -73,27 +65,27 @@ def _detect_format(path: Path) -> str:
 
 
 def read_sciospec(path: Path) -> Measurements:
-    """Read one ``.eit`` file, or all of a folder in the order of their names.
+    """Read one ``.eit`` file, or all files of a folder in the order of their names.
 
-    Potentials refer to the instrument's ground; their real parts, relative to their mean, are
-    used. The current enters at the first electrode of a pair with the header's amplitude in A.
-    The injections of a frame are spaced evenly until the next frame.
+    The voltages are the real parts of the potentials relative to the mean of all electrodes. The
+    current enters at the first electrode of a pair with the header's amplitude in A. The
+    injections of a frame are evenly spaced until the next frame.
     """
     files = sorted(path.glob("*.eit")) if path.is_dir() else [path]
     if not files:
-        raise ValueError(f"{path} must hold .eit files, there are none")
-    begins, settings, readings = zip(*map(_read_frame, files), strict=True)
+        raise ValueError(f"{path} must hold .eit files, got none")
+    starts, settings, frames = zip(*map(_read_frame, files), strict=True)
     for file, setting in zip(files, settings, strict=True):
         if setting != settings[0]:
             raise ValueError(f"{file} must have the injections of {files[0]}")
     frequency, amplitude, pairs = settings[0]
-    potentials = np.array(readings)
+    potentials = np.array(frames)
     _, K, L = potentials.shape
     potentials -= potentials.mean(axis=2, keepdims=True)
-    frame_time = float(np.median(np.diff(begins))) if len(files) > 1 else 1.0
-    times = np.subtract(begins, begins[0])[:, None] + frame_time / K * np.arange(K)
+    frame_time = float(np.median(np.diff(starts))) if len(files) > 1 else 1.0
+    times = np.subtract(starts, starts[0])[:, None] + frame_time / K * np.arange(K)
     digest = hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
-    # every folder of frames is called setup, so its parent's name tells them apart
+    # every folder of frames is called setup; its parent's name identifies it
     name = f"{path.resolve().parent.name}/{path.name}" if path.is_dir() else path.name
     return Measurements(
         _pair_currents(np.array(pairs), amplitude, L), np.tile(np.arange(K), len(files)),
@@ -103,7 +95,7 @@ def read_sciospec(path: Path) -> Measurements:
 
 
 def _pair_currents(pairs: np.ndarray, current: float, L: int) -> np.ndarray:
-    """(K, L) A of ``current`` that enters and leaves at pairs (K, 2) of electrodes from 1."""
+    """Return currents (K, L) in A that enter and leave at pairs (K, 2) of electrodes from 1."""
     currents = np.zeros((len(pairs), L))
     rows = np.arange(len(pairs))
     currents[rows, pairs[:, 0] - 1] = current
@@ -112,7 +104,8 @@ def _pair_currents(pairs: np.ndarray, current: float, L: int) -> np.ndarray:
 
 
 def _read_frame(path: Path) -> tuple[float, tuple[float, float, list[list[int]]], np.ndarray]:
-    """Time in s; frequency in Hz, amplitude in A and electrode pairs; real parts (K, L) in V."""
+    """Return the time in s; frequency in Hz, amplitude in A and electrode pairs; real parts (K, L)
+    in V."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
         header = int(lines[0])
@@ -126,11 +119,11 @@ def _read_frame(path: Path) -> tuple[float, tuple[float, float, list[list[int]]]
     try:
         pairs = np.array(body[::2], dtype=int)
         parts = np.array(body[1::2], dtype=float)
-        sound = (pairs.shape == (len(parts), 2) and parts.shape[1] >= 2 * count
-                 and pairs.min() >= 1 and pairs.max() <= count)
+        is_valid = (pairs.shape == (len(parts), 2) and parts.shape[1] >= 2 * count
+                    and pairs.min() >= 1 and pairs.max() <= count)
     except (ValueError, IndexError):                    # lines of different lengths, text, or none
-        sound = False
-    if not sound:
+        is_valid = False
+    if not is_valid:
         raise ValueError(f"{path} must hold pairs of lines after its header: two electrodes from 1 "
                          f"to {count}, and {2 * count} numbers with decimal points, two for each "
                          "channel")
@@ -143,56 +136,56 @@ def read_table(path: Path, *, electrodes: int, current: float, time_step: float 
     """Read a text table with one row per injection.
 
     Columns are the electrode (from 1) at which ``current`` enters, the electrode at which it
-    leaves, and one reading per electrode: its potential, or, if a column title has a ``-``, its
+    leaves, and one voltage per electrode: its potential, or, if a column title has a ``-``, its
     difference from the next electrode. A first line that does not begin with a number holds the
     titles. Empty fields are NaN.
 
     Parameters
     ----------
-    path : path
     electrodes : int
-        L.
+        Number of electrodes L.
     current : float
-        A.
+        Amplitude in A.
     time_step : float
-        s between two rows.
+        Time between two rows in s.
     unit : float
-        Readings in V per unit of the table; 1e-3 for mV.
+        V per unit of the table; 1e-3 for mV.
     decimal : "." or ","
     separator : str, optional
         Default: a tab, a semicolon, or else a comma.
     reference_rows : int
-        The first rows, complete frames of homogeneous fluid, become the reference.
+        Number of first rows that become the reference: complete frames of homogeneous fluid.
     """
     L = _check.integer("electrodes", electrodes, low=2)
     _check.number("current", current, low=0.0, open_low=True, units="A")
     _check.number("time_step", time_step, low=0.0, open_low=True, units="s")
     R = _check.integer("reference_rows", reference_rows, low=0)
-    pairs, readings, are_differences = _read_rows(path, L, decimal, separator)
-    readings *= unit
+    pairs, voltages, are_differences = _read_rows(path, L, decimal, separator)
+    voltages *= unit
     matrix = np.eye(L)
     if are_differences:
         matrix -= np.roll(matrix, 1, axis=1)
     else:
-        known = np.isfinite(readings)
-        count = np.maximum(known.sum(axis=1, keepdims=True), 1)
-        readings -= np.where(known, readings, 0.0).sum(axis=1, keepdims=True) / count
+        finite = np.isfinite(voltages)
+        count = np.maximum(finite.sum(axis=1, keepdims=True), 1)
+        voltages -= np.where(finite, voltages, 0.0).sum(axis=1, keepdims=True) / count
     currents = _pair_currents(pairs, current, L)
-    source = provenance(path, assumed=f"{current:g} A, readings in {unit:g} V")
-    found = Measurements.from_sequence(currents[R:], matrix, readings[R:],
-                                       time_step * np.arange(len(readings) - R), source=source)
+    source = provenance(path, assumed=f"{current:g} A, voltages in {unit:g} V")
+    measurements = Measurements.from_sequence(
+        currents[R:], matrix, voltages[R:], time_step * np.arange(len(voltages) - R),
+        source=source)
     if not R:
-        return found
-    empty = Measurements.from_sequence(currents[:R], matrix, readings[:R], np.arange(float(R)))
-    if not np.array_equal(empty.currents, found.currents):
+        return measurements
+    empty = Measurements.from_sequence(currents[:R], matrix, voltages[:R], np.arange(float(R)))
+    if not np.array_equal(empty.currents, measurements.currents):
         raise ValueError("reference_rows must be complete frames of the table's injections, got "
                          f"{R}")
-    return replace(found, reference=empty.homogeneous(R))
+    return replace(measurements, reference=empty.reference_frames(R))
 
 
 def _read_rows(path: Path, L: int, decimal: str,
                separator: str | None) -> tuple[np.ndarray, np.ndarray, bool]:
-    """Electrode pairs (T, 2) from 1, readings (T, L), and whether titles name differences."""
+    """Return electrode pairs (T, 2) from 1, voltages (T, L), and whether they are differences."""
     if decimal not in (".", ","):
         raise ValueError(f"decimal must be '.' or ',', got {decimal!r}")
     try:
@@ -204,12 +197,12 @@ def _read_rows(path: Path, L: int, decimal: str,
                              "both")
         titles = "" if not lines or lines[0].split(separator)[0].strip().isdigit() else lines[0]
         if len(lines) <= bool(titles):
-            raise ValueError("there are no rows")
+            raise ValueError("it must hold rows, got none")
         numbers = np.loadtxt(
             lines, delimiter=separator, comments=None, skiprows=int(bool(titles)), ndmin=2,
             converters=lambda text: float(text.strip().replace(decimal, ".") or "nan"))
         if numbers.shape[1] != L + 2:
-            raise ValueError(f"rows must have {L + 2} columns, two electrodes and {L} readings, "
+            raise ValueError(f"rows must have {L + 2} columns, two electrodes and {L} voltages, "
                              f"got {numbers.shape[1]}")
     except (OSError, ValueError) as error:
         raise ValueError(f"{path} must be a text table of numbers with the decimal point "
@@ -226,26 +219,26 @@ def _read_rows(path: Path, L: int, decimal: str,
 def _table_options(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise ValueError("a table must be described by a YAML file of entries like 'electrodes: "
-                         f"16' and 'current: 0.001' (A), there is no {path}")
+                         f"16' and 'current: 0.001' (A), got no {path}")
     options = load_yaml(path, "table")
-    known = set(signature(read_table).parameters) - {"path"}
-    if not set(options) <= known:
-        raise ValueError(f"{path} must have entries of {', '.join(sorted(known))}, got {options!r}")
+    names = set(signature(read_table).parameters) - {"path"}
+    if not set(options) <= names:
+        raise ValueError(f"{path} must have entries of {', '.join(sorted(names))}, got {options!r}")
     if missing := {"electrodes", "current"} - set(options):
         raise ValueError(f"{path} must have {', '.join(sorted(missing))}")
     return options
 
 
-def load_yaml(path: Path, what: str) -> dict[str, Any]:
-    """Load the entries of a YAML file that describes ``what``; ``ValueError`` names the file."""
-    with needed_by(f"the YAML file of a {what}"):
+def load_yaml(path: Path, subject: str) -> dict[str, Any]:
+    """Load the entries of a YAML file that describes ``subject``; ``ValueError`` names the file."""
+    with needed_by(f"the YAML file of a {subject}"):
         import yaml
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ValueError(f"{what} must be a YAML file, got {path}: {error}") from None
+        raise ValueError(f"{subject} must be a YAML file, got {path}: {error}") from None
     if not isinstance(content, dict):
-        raise ValueError(f"{what} must be a YAML file of entries like 'name: value', got {path}")
+        raise ValueError(f"{subject} must be a YAML file of entries like 'name: value', got {path}")
     return content
 
 

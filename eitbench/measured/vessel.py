@@ -17,10 +17,10 @@ from eitbench.numerics.mesh import Mesh
 from eitbench.physics.cem import CompleteElectrodeModel
 from eitbench.worlds.vessels import MeshVessel, PlanePipe, RoundPipe, RoundTank
 
-DIRECTIONS = ("counter-clockwise", "clockwise")
+NUMBERING_DIRECTIONS = ("counter-clockwise", "clockwise")
 INITIAL_CONTACT_IMPEDANCE = 1e-4
 """Ω·m², before calibration."""
-ENTRIES = {
+VESSEL_ENTRIES = {
     "circle": ({"radius", "electrodes"}, {"width", "cover", "first", "direction", "depth"}),
     "rectangle": ({"length", "width", "electrodes"}, {"electrode_width", "cover", "depth", "flow"}),
     "cylinder": ({"length", "radius", "rings", "electrodes", "height", "cover"},
@@ -51,34 +51,35 @@ class FlowConfig:
 
     @property
     def is_estimated(self) -> bool:
-        """Whether the velocity is estimated."""
+        """True if the velocity is estimated too."""
         return self.velocity_std > 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class VesselConfig:
-    """A vessel, rotated or mirrored so that its electrodes are at those of the instrument.
+    """A vessel, rotated or mirrored so that its electrodes have the positions and numbers of the
+    instrument's.
 
-    Angles are those of a picture: 0° to the right, 90° at the top.
+    Angles are counter-clockwise: 0° is to the right, 90° at the top of a picture.
     """
 
     shape: RoundTank | PlanePipe | RoundPipe | MeshVessel
-    first: float = 0.0
-    """angle of the middle of the first electrode in degrees"""
+    first_electrode_deg: float = 0.0
+    """angle of the middle of the first electrode"""
     direction: str = "counter-clockwise"
-    """in which electrodes are counted"""
+    """direction in which electrodes are numbered"""
     depth: float = 1.0
     """m of fluid for a plane model; 1 in 3D"""
     conductivity: float | None = None
-    """S/m if known; then the gain of the instrument is calibrated"""
+    """S/m if specified; then the gain of the instrument is calibrated"""
     flow: FlowConfig | None = None
-    """of the fluid through a pipe; None for an unknown motion"""
+    """flow through a pipe; None for an unknown motion"""
 
     def __post_init__(self) -> None:
-        _check.number("first", self.first, units="degrees")
+        _check.number("first", self.first_electrode_deg, units="degrees")
         _check.number("depth", self.depth, low=0.0, open_low=True, units="m")
-        if self.direction not in DIRECTIONS:
-            raise ValueError(f"direction must be one of {', '.join(DIRECTIONS)}, "
+        if self.direction not in NUMBERING_DIRECTIONS:
+            raise ValueError(f"direction must be one of {', '.join(NUMBERING_DIRECTIONS)}, "
                              f"got {self.direction!r}")
         if self.conductivity is not None:
             _check.number("conductivity", self.conductivity, low=0.0, open_low=True, units="S/m")
@@ -88,12 +89,12 @@ class VesselConfig:
 
     @property
     def n_electrodes(self) -> int:
-        """L"""
+        """Number of electrodes L."""
         return self.shape.n_electrodes
 
     def transport_mesh(self) -> Mesh:
         """Return the mesh of the estimates."""
-        return self._turned(self.shape.carrier(fine=False)[0])
+        return self._rotate_mesh(self.shape.transport_mesh(fine=False)[0])
 
     def electrode_model(self, contact_impedance: np.ndarray | float) -> CompleteElectrodeModel:
         """Return the electrodes with these contact impedances, (L,) or a scalar, in Ω·m²."""
@@ -102,18 +103,17 @@ class VesselConfig:
     @cached_property
     def _electrodes(self) -> CompleteElectrodeModel:
         # finer than estimates need, as calibration corrects its error for homogeneous fluid only
-        model = self.shape.electrode_model(fine=self.shape.carrier(fine=False)[0].dim == 2)
-        mesh = self._turned(model.mesh)
-        if mesh is model.mesh:
-            return model
-        return CompleteElectrodeModel(mesh, model.electrodes, model.contact_impedance, model.order)
+        model = self.shape.electrode_model(fine=self.shape.transport_mesh(fine=False)[0].dim == 2)
+        mesh = self._rotate_mesh(model.mesh)
+        return model if mesh is model.mesh else CompleteElectrodeModel(
+            mesh, model.electrodes, model.contact_impedance, model.order)
 
-    def _turned(self, mesh: Mesh) -> Mesh:
-        """Mirror a mesh at y = 0 if electrodes are counted clockwise, then rotate it."""
-        if self.first == 0.0 and self.direction == DIRECTIONS[0]:
+    def _rotate_mesh(self, mesh: Mesh) -> Mesh:
+        """Mirror a mesh at y = 0 if electrodes are numbered clockwise, then rotate it."""
+        if self.first_electrode_deg == 0.0 and self.direction == NUMBERING_DIRECTIONS[0]:
             return mesh
-        angle = np.radians(self.first)
-        mirror = 1.0 if self.direction == DIRECTIONS[0] else -1.0
+        angle = np.radians(self.first_electrode_deg)
+        mirror = 1.0 if self.direction == NUMBERING_DIRECTIONS[0] else -1.0
         points = mesh.points.copy()
         points[:, :2] = mesh.points[:, :2] @ [[np.cos(angle), np.sin(angle)],
                                               [-mirror * np.sin(angle), mirror * np.cos(angle)]]
@@ -123,40 +123,42 @@ class VesselConfig:
 def read_vessel(source: Path | str | Mapping[str, Any]) -> VesselConfig:
     """Build the vessel that a YAML file, or a mapping of the same entries, describes.
 
-    Entries, in m and degrees, optional ones in brackets:
+    Entries, in m and degrees, optional entries in brackets:
 
-    - circle: ``radius``, ``electrodes`` (number), ``width`` of one or ``cover`` (fraction of the
-      wall), [``first``, ``direction``, ``depth``]
+    - circle: ``radius``, ``electrodes`` (number), ``width`` of an electrode or
+      ``cover`` (covered fraction of the wall), [``first``, ``direction``, ``depth``]
     - rectangle, a pipe with electrodes on both walls along the flow: ``length``, ``width``,
       ``electrodes`` (total number), ``electrode_width`` or ``cover``, [``depth``, ``flow``]
     - cylinder, a pipe with rings of electrodes: ``length``, ``radius``, ``rings``, ``electrodes``
-      (number per ring), ``height`` of one, ``cover``, [``first``, ``direction``, ``flow``]
+      (number per ring), ``height`` of an electrode, ``cover``, [``first``, ``direction``, ``flow``]
     - mesh: ``file``, ``electrodes`` (number), [``scale``, ``depth``]; see `MeshVessel`
 
     and for all [``conductivity``] in S/m, if known. ``flow`` has the entries of `FlowConfig`.
-    ``ValueError`` names the entry and the fault.
+    ``ValueError`` names the entry and the error.
     """
     if isinstance(source, Mapping):
-        return _vessel(dict(source), Path())
-    return _vessel(load_yaml(Path(source), "vessel"), Path(source).parent)
-
-
-def _vessel(entries: dict[str, Any], folder: Path) -> VesselConfig:
+        entries, folder = dict(source), Path()
+    else:
+        entries, folder = load_yaml(Path(source), "vessel"), Path(source).parent
     kind = entries.pop("kind", None)
-    if kind not in ENTRIES:
-        raise ValueError(f"vessel.kind must be one of {', '.join(ENTRIES)}, got {kind!r}")
-    required, optional = ENTRIES[kind]
+    if kind not in VESSEL_ENTRIES:
+        raise ValueError(f"vessel.kind must be one of {', '.join(VESSEL_ENTRIES)}, got {kind!r}")
+    required, optional = VESSEL_ENTRIES[kind]
     if missing := sorted(required - set(entries)):
         raise ValueError(f"vessel of kind {kind} must have {', '.join(missing)}")
     if unknown := sorted(set(entries) - required - optional - {"conductivity"}):
         raise ValueError(f"vessel of kind {kind} has no {', '.join(unknown)}; there are "
                          f"{', '.join(sorted(required | optional))} and conductivity")
-    placed: dict[str, Any] = {
-        name: entries[name] for name in ("first", "direction", "depth", "conductivity")
-        if name in entries}
+    options: dict[str, Any] = {"first_electrode_deg" if name == "first" else name: entries[name]
+                               for name in ("first", "direction", "depth", "conductivity")
+                               if name in entries}
     if "flow" in entries:
-        placed["flow"] = _flow(entries["flow"])
-    return VesselConfig(_shape(kind, entries, folder), **placed)
+        flow, names = entries["flow"], [each.name for each in fields(FlowConfig)]
+        if not isinstance(flow, Mapping) or not {"mean_velocity"} <= set(flow) <= set(names):
+            raise ValueError("vessel.flow must have mean_velocity (m/s), and may have "
+                             f"{', '.join(names[1:])}, got {flow!r}")
+        options["flow"] = FlowConfig(**flow)
+    return VesselConfig(_shape(kind, entries, folder), **options)
 
 
 def _shape(kind: str, entries: dict[str, Any], folder: Path) -> Any:
@@ -164,7 +166,7 @@ def _shape(kind: str, entries: dict[str, Any], folder: Path) -> Any:
     if kind == "circle":
         tank = RoundTank(radius=entries["radius"], n_electrodes=count)
         wall = 2.0 * np.pi * tank.radius
-        return replace(tank, electrode_cover=_cover(entries, "width", count / wall))
+        return replace(tank, electrode_coverage=_cover(entries, "width", count / wall))
     if kind == "rectangle":
         if count % 2:
             raise ValueError(f"vessel.electrodes must be even, half on each wall, got {count}")
@@ -172,11 +174,11 @@ def _shape(kind: str, entries: dict[str, Any], folder: Path) -> Any:
         pipe = PlanePipe(length=entries["length"], half_width=0.5 * width,
                          electrodes_per_wall=count // 2)
         cover = _cover(entries, "electrode_width", count // 2 / pipe.length)
-        return replace(pipe, electrode_cover=cover)
+        return replace(pipe, electrode_coverage=cover)
     if kind == "cylinder":
         return RoundPipe(length=entries["length"], radius=entries["radius"],
                          electrode_rings=entries["rings"], electrodes_per_ring=count,
-                         electrode_length=entries["height"], electrode_cover=entries["cover"])
+                         electrode_length=entries["height"], electrode_coverage=entries["cover"])
     path = folder / str(entries["file"])
     if not path.is_file():
         raise ValueError(f"vessel.file must be a mesh file, got {path}")
@@ -184,20 +186,11 @@ def _shape(kind: str, entries: dict[str, Any], folder: Path) -> Any:
     return MeshVessel(str(path), digest, str(path), digest, count, scale=entries.get("scale", 1.0))
 
 
-def _flow(entries: Any) -> FlowConfig:
-    known = [each.name for each in fields(FlowConfig)]
-    if not isinstance(entries, Mapping) or not {"mean_velocity"} <= set(entries) <= set(known):
-        raise ValueError("vessel.flow must have mean_velocity (m/s), and may have "
-                         f"{', '.join(known[1:])}, got {entries!r}")
-    return FlowConfig(**entries)
-
-
 def _cover(entries: Mapping[str, Any], width: str, density: float) -> float:
-    """Fraction of a wall that electrodes cover; ``density`` is their number per m."""
+    """Return the covered fraction of a wall with ``density`` electrodes per m."""
     if (width in entries) == ("cover" in entries):
         raise ValueError(f"vessel must have either {width} or cover, got "
                          f"{'both' if width in entries else 'neither'}")
     if "cover" in entries:
-        cover: float = entries["cover"]
-        return cover
+        return _check.number("vessel.cover", entries["cover"])
     return density * _check.number(f"vessel.{width}", entries[width], units="m")

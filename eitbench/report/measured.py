@@ -21,7 +21,7 @@ from eitbench.bench.measured import N_PLOTTED_FRAMES
 from eitbench.envs.rendering import draw_electrodes, draw_field
 from eitbench.measured.calibration import electrode_misfits
 from eitbench.measured.segmentation import ktc_score, require_round_tank, segment
-from eitbench.physics.rest import AtRest
+from eitbench.physics.stationary import StationaryTransport
 from eitbench.report.templates import data_uri, rendered
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ def write_report(path: Path, env: MeasuredEnv, runs: Sequence[MeasuredRun],
 
 
 def _is_at_rest(env: MeasuredEnv) -> bool:
-    return isinstance(env.task.transport, AtRest)
+    return isinstance(env.task.transport, StationaryTransport)
 
 
 def _facts(env: MeasuredEnv) -> dict[str, str]:
@@ -69,7 +69,7 @@ def _facts(env: MeasuredEnv) -> dict[str, str]:
     calibration, measurements, task = env.calibration, env.measurements, env.task
     contacts = 1e3 * calibration.contact_impedance
     facts = {
-        "readings": f"{len(measurements.injections)} times {len(measurements.matrix)}, of "
+        "readings": f"{len(measurements.injection_index)} times {len(measurements.matrix)}, of "
                     f"{len(measurements.currents)} different injections",
         "conductivity": f"{calibration.conductivity:.4g} S/m ± "
                         f"{100 * calibration.conductivity_std:.2g} %",
@@ -121,7 +121,7 @@ def _picture(env: MeasuredEnv, run: MeasuredRun, row: int) -> Figure:
         spread = scale * np.sqrt(run.variance[row])
         panels.append((spread, 0.0, float(spread.max()), "magma", "standard deviation / (mS/m)"))
     figure, axes = _panels(len(panels), (5.2 * len(panels), 4.4))
-    current = env.measurements.currents[env.measurements.injections[t - 1]]
+    current = env.measurements.currents[env.measurements.injection_index[t - 1]]
     for ax, (values, least, most, colours, label) in zip(axes, panels, strict=True):
         mappable = draw_field(ax, task.mesh, values, least, most, colours)
         draw_electrodes(ax, task, current, width=4.0)
@@ -195,9 +195,9 @@ def _frame_means(values: np.ndarray, frame: int) -> np.ndarray:
 def _fit(env: MeasuredEnv) -> Figure:
     """Measured readings of homogeneous fluid over those of the fitted model."""
     figure, (values, misfit) = _panels(2, (10.5, 3.6))
-    known = np.isfinite(env.calibration.measured)
-    measured = 1e3 * env.calibration.measured[known]
-    computed = 1e3 * env.calibration.computed[known]
+    known = np.isfinite(env.calibration.mean_voltages)
+    measured = 1e3 * env.calibration.mean_voltages[known]
+    computed = 1e3 * env.calibration.model_voltages[known]
     ends = [measured.min(), measured.max()]
     values.plot(ends, ends, color="0.8", linewidth=1)
     values.plot(computed, measured, ".", color=COLOURS[0], markersize=3)
@@ -213,13 +213,13 @@ def _contacts(env: MeasuredEnv) -> Figure:
     calibration = env.calibration
     figure, (impedance, misfit) = _panels(2, (10.5, 3.2))
     z = 1e3 * calibration.contact_impedance
-    number = np.arange(1, len(z) + 1)
-    factor = np.exp(calibration.contact_impedance_std)
+    number, factor = np.arange(1, len(z) + 1), np.exp(calibration.contact_impedance_std)
     impedance.errorbar(number, z, [z - z / factor, z * factor - z], fmt="o", color=COLOURS[0],
                        markersize=4, linewidth=1)
     impedance.set(xlabel="electrode", ylabel="contact impedance / (mΩ·m²)", yscale="log")
     misfits = electrode_misfits(calibration, env.measurements.matrix)
-    misfit.bar(number, 100 * misfits / np.nanmean(np.abs(calibration.measured)), color=COLOURS[1])
+    misfits *= 100 / np.nanmean(np.abs(calibration.mean_voltages))
+    misfit.bar(number, misfits, color=COLOURS[1])
     misfit.set(xlabel="electrode", ylabel="misfit of its readings / %\nof the mean reading")
     return figure
 

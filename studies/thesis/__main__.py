@@ -14,19 +14,19 @@ from thesis import FIGURES
 
 
 def main() -> None:
-    """Draw one figure and print where it agrees with the thesis and where it differs."""
+    """Draw one figure and print whether it agrees with the thesis."""
     parser = argparse.ArgumentParser(description=__doc__.split(":")[0])
     parser.add_argument("name", choices=FIGURES, help="figure or table of the thesis, or a study")
     parser.add_argument("--seeds", help="episodes, as in dev:0-1; a picture shows the first")
     parser.add_argument("--jobs", "-j", type=int, default=os.cpu_count(), help="processes")
     parser.add_argument("--out", "-o", type=Path, default=Path("results/figures"))
-    asked = parser.parse_args()
+    arguments = parser.parse_args()
     try:
-        seeds = None if asked.seeds is None else parse_seeds(asked.seeds)
+        seeds = None if arguments.seeds is None else parse_seeds(arguments.seeds)
     except ValueError as error:
         parser.error(str(error))
-    path, remark = FIGURES[asked.name](seeds, asked.jobs, asked.out)
-    print(f"wrote {path}\n{remark}")
+    path, description = FIGURES[arguments.name](seeds, arguments.jobs, arguments.out)
+    print(f"wrote {path}\n{description}")
 
 
 if __name__ == "__main__":

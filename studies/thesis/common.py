@@ -1,11 +1,13 @@
-"""What the figures share: playing an episode, judging it, laying out truth beside estimates."""
+"""Shared parts of the figures: run a baseline, score it, draw ground truth next to estimates."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from joblib import Parallel, delayed
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -15,57 +17,65 @@ from tqdm import tqdm
 from eitbench import scoring
 from eitbench.bench.methods import load_method
 from eitbench.bench.playing import estimates
-from eitbench.data.recordings import score_operators
+from eitbench.data.episode_cache import score_operators
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.envs.rendering import STD_COLORMAP, colour_range, draw_electrodes, draw_field
 from eitbench.numerics.mesh import Mesh
 from eitbench.physics.transport import VelocityField
 from eitbench.worlds.task import Estimate, Task
 
-INK, TRUE, ACCENT = "#0b6e75", "0.35", "#d1495b"
-"""Colours of curves: an estimate, the truth, a second estimate."""
+INK, GREY, ACCENT = "#0b6e75", "0.35", "#d1495b"
+"""Colours of curves: an estimate, the ground truth, a second estimate."""
 
 
-def estimates_of(env: EstimationEnv, baseline: str, seed: int) -> list[Estimate]:
-    """What a baseline says of t = 1 … T."""
+def run_baseline(env: EstimationEnv, baseline: str, seed: int) -> list[Estimate]:
+    """Return the estimates of a baseline for t = 1 … T."""
     steps = estimates(env, load_method(baseline, "estimation"), seed)
     with threadpool_limits(1):
         return [estimate for _, estimate in tqdm(steps, total=env.task.n_steps, desc=baseline,
                                                  unit="state", disable=None, leave=False)]
 
 
-def error_of(env: EstimationEnv, estimates: list[Estimate]) -> float:
-    """ẽ_c of the episode ``env`` has just played."""
+def episode_error(env: EstimationEnv, estimates: list[Estimate]) -> float:
+    """Return ẽ_c of the last episode of ``env``."""
     interpolation, mass = score_operators(env.world)
     scored = slice(env.task.warm_up, None)
     means = np.array([estimate.mean for estimate in estimates])
     return scoring.relative_error((interpolation @ means[scored].T).T, env.truth()[scored], mass)
 
 
-def verdict(claim: str, holds: bool) -> str:
-    """A line on what the thesis shows: whether our data show it too is computed, not written
-    down."""
-    return f"{'Agrees' if holds else 'DIFFERS'}: {claim}"
+def run_parallel(function: Callable[..., Any], cases: Sequence[tuple[Any, ...]], jobs: int,
+                 description: str) -> list[Any]:
+    """Return ``function(*case)`` for each case, computed in ``jobs`` processes."""
+    with Parallel(n_jobs=jobs, return_as="generator", batch_size=1, pre_dispatch=jobs) as parallel:
+        results = parallel(delayed(function)(*case) for case in cases)
+        return list(tqdm(results, total=len(cases), desc=description, disable=None))
 
 
-def milliseconds(env: EstimationEnv, t: int) -> str:
+def agreement_line(statement: str, holds: bool) -> str:
+    """Return a line on a statement of the thesis; ``holds`` is computed from the data."""
+    return f"{'Agrees' if holds else 'DIFFERS'}: {statement}"
+
+
+def format_milliseconds(env: EstimationEnv, t: int) -> str:
+    """Return the time of state t."""
     return f"{1e3 * t * env.task.transport.time_step:.0f} ms"
 
 
-def save(figure: Figure, path: Path) -> None:
-    """Write a PNG, and its folder if need be."""
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a PNG; create its folder if missing."""
     path.parent.mkdir(parents=True, exist_ok=True)
     FigureCanvasAgg(figure)
     figure.savefig(path)
 
 
-def idle_electrodes(axes: Axes, task: Task, width: float = 3) -> None:
-    """All electrodes in grey: which of them inject is not the point."""
+def draw_idle_electrodes(axes: Axes, task: Task, width: float = 3) -> None:
+    """Draw all electrodes in grey, without the active injection."""
     draw_electrodes(axes, task, np.zeros(task.currents.shape[1]), width=width)
 
 
-def pipe_grid(rows: int, columns: int, titles: list[str]) -> tuple[Figure, np.ndarray]:
-    """Panels for pictures of the pipe, titles above the columns."""
+def make_pipe_grid(rows: int, columns: int, titles: list[str]) -> tuple[Figure, np.ndarray]:
+    """Create panels for pictures of the pipe, with titles above the columns."""
     figure = Figure(figsize=(3.6 * columns, 0.95 * rows + 0.7), dpi=130, layout="constrained")
     axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     for column, title in enumerate(titles):
@@ -74,16 +84,16 @@ def pipe_grid(rows: int, columns: int, titles: list[str]) -> tuple[Figure, np.nd
     return figure, axes
 
 
-def shown_times(env: EstimationEnv, rows: int = 5) -> list[int]:
-    """The states that pictures of the pipe show."""
+def snapshot_times(env: EstimationEnv, rows: int = 5) -> list[int]:
+    """Return the states that pictures of the pipe show."""
     first = env.task.warm_up + 6
     return list(range(first, first + 5 * rows, 5))
 
 
 def draw_fields(env: EstimationEnv, axes: np.ndarray, times: list[int],
                 columns: Sequence[list[Estimate]]):
-    """Truth in the first column of ``axes``, estimates beside it, one state a row; returns the
-    mappable."""
+    """Draw ground truth in the first column of ``axes`` and estimates in the others, one state per
+    row; return the mappable."""
     truth = env.truth()
     (low, high) = colour_range(env.task)
     for row, t in zip(axes, times, strict=True):
@@ -91,26 +101,26 @@ def draw_fields(env: EstimationEnv, axes: np.ndarray, times: list[int],
         fields += [(env.task.mesh, estimates[t - 1].mean) for estimates in columns]
         for ax, (mesh, values) in zip(row, fields, strict=True):
             mappable = draw_field(ax, mesh, values, low, high)
-            idle_electrodes(ax, env.task)
+            draw_idle_electrodes(ax, env.task)
             ax.label_outer()
-        row[0].set_ylabel(f"{milliseconds(env, t)}\ny / cm", fontsize=9)
+        row[0].set_ylabel(f"{format_milliseconds(env, t)}\ny / cm", fontsize=9)
     return mappable
 
 
-def comparison(path: Path, env: EstimationEnv, columns: dict[str, list[Estimate]]) -> None:
-    """A figure of truth and estimates of the pipe over time, in one colour scale."""
-    times = shown_times(env)
-    figure, axes = pipe_grid(len(times), 1 + len(columns), ["truth", *columns])
+def draw_comparison(path: Path, env: EstimationEnv, columns: dict[str, list[Estimate]]) -> None:
+    """Draw ground truth and estimates of the pipe over time in one colour scale."""
+    times = snapshot_times(env)
+    figure, axes = make_pipe_grid(len(times), 1 + len(columns), ["truth", *columns])
     mappable = draw_fields(env, axes, times, list(columns.values()))
     figure.colorbar(mappable, ax=axes, label="concentration / (mol/m³)", extend="both", aspect=40)
-    save(figure, path)
+    save_figure(figure, path)
 
 
 def draw_flow(axes: Axes, mesh: Mesh, flow: VelocityField,
               inside: Callable[[np.ndarray], np.ndarray], top: float):
-    """Speed in colours up to ``top`` (m/s) and streamlines over it; returns the mappable, in cm/s.
+    """Draw the speed in colours up to ``top`` (m/s) and streamlines; return the mappable, in cm/s.
 
-    ``inside`` says of points (k, 2) in m whether a streamline may pass there.
+    ``inside`` maps points (k, 2) in m to True where streamlines may pass.
     """
     mappable = draw_field(axes, mesh, 100 * np.hypot(*flow(mesh.points).T), 0.0, 100 * top,
                           STD_COLORMAP)
@@ -125,6 +135,6 @@ def draw_flow(axes: Axes, mesh: Mesh, flow: VelocityField,
     return mappable
 
 
-def bare(axes: Axes) -> None:
-    """No frame above and to the right of a diagram."""
+def despine(axes: Axes) -> None:
+    """Remove the upper and right spine of a diagram."""
     axes.spines[["top", "right"]].set_visible(False)

@@ -1,5 +1,4 @@
-"""The pipe past an obstacle: what a model without the real flow costs; the thesis names it as a
-next step."""
+"""Pipe past an obstacle, a next step of the thesis: cost of a simplified flow model."""
 
 from __future__ import annotations
 
@@ -14,32 +13,32 @@ from eitbench.physics.transport import VelocityField
 from eitbench.worlds.world import World
 
 from .common import (
+    agreement_line,
     draw_fields,
     draw_flow,
-    error_of,
-    estimates_of,
-    idle_electrodes,
-    save,
-    shown_times,
-    verdict,
+    draw_idle_electrodes,
+    episode_error,
+    run_baseline,
+    save_figure,
+    snapshot_times,
 )
 
 
 def _env(flow: str) -> EstimationEnv:
-    """The pipe in which estimators believe in this flow."""
+    """Return the environment whose estimators assume this flow."""
     return EstimationEnv("eitbench/Pipe2DObstacle-v0", assume={"flow": flow})
 
 
 def obstacle(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
-    """The flow, true and assumed, and Kalman filters with either."""
+    """Draw the true and the assumed flow, and the Kalman filter with each of them."""
     columns = []
     errors = []
     for flow in ("parabolic", "real"):
         env = _env(flow)
-        columns.append(estimates_of(env, "kalman_filter", seeds[0]))
-        errors.append(error_of(env, columns[-1]))
-    constant = error_of(env, estimates_of(env, "homogeneous", seeds[0]))
-    times = shown_times(env, 4)
+        columns.append(run_baseline(env, "kalman_filter", seeds[0]))
+        errors.append(episode_error(env, columns[-1]))
+    constant = episode_error(env, run_baseline(env, "homogeneous", seeds[0]))
+    times = snapshot_times(env, 4)
     figure = Figure(figsize=(11.4, 7.0), dpi=130, layout="constrained")
     top, bottom = np.asarray(figure.subfigures(2, 1, height_ratios=(1.0, 2.3)))
     backwards = _draw_flows(top.subplots(1, 2, sharey=True), top, env, env.world)
@@ -52,20 +51,20 @@ def obstacle(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
         last.set_xlabel("x / cm")
     bottom.colorbar(mappable, ax=axes, label="concentration / (mol/m³)", extend="both", aspect=40)
     path = out / "obstacle.png"
-    save(figure, path)
+    save_figure(figure, path)
     return path, "\n".join([
         f"ẽ_c is {errors[0]:.4f} with the parabola, {errors[1]:.4f} with the true flow and "
-        f"{constant:.4f} for the "
-        f"homogeneous estimate. The fluid flows back in {100 * backwards:.0f} % of the pipe.",
-        verdict("the simple flow model still gives estimates of use: better than a constant",
-                errors[0] < constant),
-        verdict("the true flow is worth having", errors[1] < errors[0]),
-        "By choice: the obstacle, and the eddy viscosity on which the length of its eddy depends."])
+        f"{constant:.4f} for the homogeneous estimate. The fluid flows back in "
+        f"{100 * backwards:.0f} % of the pipe.",
+        agreement_line("the simple flow model gives better estimates than a constant",
+                       errors[0] < constant),
+        agreement_line("the true flow reduces the error", errors[1] < errors[0]),
+        "Not from the thesis: the obstacle, and the eddy viscosity, which determines the length of "
+        "the recirculation."])
 
 
 def _draw_flows(axes: np.ndarray, figure, env: EstimationEnv, world: World) -> float:
-    """The real and the assumed flow side by side; returns the part of the pipe's area where the
-    real one turns back."""
+    """Draw the true and the assumed flow; return the fraction of the pipe with reversed flow."""
     pipe = world.vessel
     mesh = env.truth_mesh()
     real = world.flow.nominal(world, fine=True)
@@ -76,11 +75,12 @@ def _draw_flows(axes: np.ndarray, figure, env: EstimationEnv, world: World) -> f
         return points[:, 1] > pipe.lower_wall(points[:, 0])
 
     flows: dict[str, VelocityField] = {"true flow (Navier–Stokes)": real,
-                                       "assumed: a parabola at each x": world.flow.believed(world)}
+                                       "assumed: a parabola at each x":
+                                           world.flow.assumed_velocity(world)}
     top = max(float(np.hypot(*flow(mesh.points).T).max()) for flow in flows.values())
     for ax, (title, flow) in zip(axes, flows.items(), strict=True):
         mappable = draw_flow(ax, mesh, flow, inside, top)
-        idle_electrodes(ax, env.task)
+        draw_idle_electrodes(ax, env.task)
         ax.set(xlim=(0, 100 * pipe.length), ylim=(-100 * pipe.half_width, 100 * pipe.half_width),
                xlabel="x / cm")
         ax.set_title(title, fontsize=10)

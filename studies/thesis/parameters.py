@@ -1,5 +1,4 @@
-"""How much the parameters of the evolution model matter, around the values of the thesis' Table
-5.1."""
+"""Sensitivity of the Kalman filter to the parameters of Table 5.1 of the thesis."""
 
 from __future__ import annotations
 
@@ -9,12 +8,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from joblib import Parallel, delayed
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from threadpoolctl import threadpool_limits
-from tqdm import tqdm
 
 from eitbench.bench.methods import load_method
 from eitbench.envs.estimation import EstimationEnv
@@ -23,13 +20,13 @@ from eitbench.physics.transport import Transport
 from eitbench.worlds.task import Task
 from eitbench.worlds.world import World
 
-from .common import ACCENT, save, verdict
+from .common import ACCENT, agreement_line, run_parallel, save_figure
 
 FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)
 
 
 class Factors(NamedTuple):
-    """By what each parameter of the table is multiplied; all one: the table itself."""
+    """Factors of the parameters of the table."""
 
     inflow_std: float = 1.0
     nodal_std: float = 1.0
@@ -40,7 +37,7 @@ class Factors(NamedTuple):
 LABELS = {"inflow_std": "std of the inflow noise η", "nodal_std": "std of the nodal noise e",
           "initial_std": "std of the initial state", "diffusivity": "diffusivity κ of the model"}
 MAPS = (("inflow_std", "nodal_std"), ("initial_std", "diffusivity"))
-"""The parameters that a heat map varies: up and across."""
+"""Pairs of parameters of a heat map: vertical and horizontal axis."""
 
 
 def _env() -> EstimationEnv:
@@ -48,16 +45,16 @@ def _env() -> EstimationEnv:
 
 
 def table5_1(seeds: list[int], jobs: int, out: Path) -> tuple[Path, str]:
-    """ẽ_c of the Kalman filter by factors on the table's parameters."""
+    """Draw ẽ_c of the Kalman filter for factors of the parameters of the table."""
     errors = sweep(seeds, jobs)
     path = out / "table5.1.png"
     figure = Figure(figsize=(11.0, 4.6), dpi=130, layout="constrained")
     axes = figure.subplots(1, 2)
     low, high = min(errors.values()), max(errors.values())
-    for ax, (up, across) in zip(axes, MAPS, strict=True):
-        image = _heat_map(ax, errors, up, across, (low, high))
+    for ax, (vertical, horizontal) in zip(axes, MAPS, strict=True):
+        image = _heat_map(ax, errors, vertical, horizontal, (low, high))
     figure.colorbar(image, ax=axes, label="ẽ$_c$ × 10³")
-    save(figure, path)
+    save_figure(figure, path)
     table = errors[Factors()]
     best = min(errors, key=lambda factors: errors[factors])
     alone = {name: np.array([errors[Factors(**{name: factor})] for factor in FACTORS])
@@ -73,33 +70,31 @@ def table5_1(seeds: list[int], jobs: int, out: Path) -> tuple[Path, str]:
         "Changed alone, four times less to four times more, ẽ_c rises by at most "
         + ", ".join(f"{100 * worst[name]:.1f} % ({label}, × {FACTORS[alone[name].argmax()]:g})"
                     for name, label in LABELS.items()) + ".",
-        verdict("the table's values are a good choice: within 10 % of the best",
-                table < 1.1 * errors[best]), f"What matters most is the {LABELS[most]}.",
-        "By choice: stds of e and of the initial state are ours, illegible in our copy of the "
-        "table; the truth's κ stays what it is."])
+        agreement_line("the values of the table are within 10 % of the best",
+                       table < 1.1 * errors[best]),
+        f"The most sensitive parameter is the {LABELS[most]}.",
+        "Not from the thesis: the stds of e and of the initial state, illegible in the available "
+        "copy. The true κ is not changed."])
 
 
 def sweep(seeds: list[int], jobs: int) -> dict[Factors, float]:
-    """Mean ẽ_c over the seeds for each cell of the `MAPS`."""
-    cells = list(dict.fromkeys(Factors(**{up: a, across: b}) for up, across in MAPS for a in FACTORS
-                               for b in FACTORS))
-    cells.sort(key=lambda cell: cell.diffusivity)         # a process keeps only the last few models
-    with Parallel(n_jobs=jobs, return_as="generator", batch_size=1, pre_dispatch=jobs) as parallel:
-        done = parallel(delayed(_error)(cell, seeds) for cell in cells)
-        return dict(zip(cells,
-                        tqdm(done, total=len(cells), desc="varying Table 5.1", unit="cell",
-                             disable=None), strict=True))
+    """Return the mean ẽ_c over the seeds for each cell of the `MAPS`."""
+    cells = list(dict.fromkeys(Factors(**{vertical: a, horizontal: b})
+                               for vertical, horizontal in MAPS for a in FACTORS for b in FACTORS))
+    cells.sort(key=lambda cell: cell.diffusivity)         # a process caches only the last models
+    errors = run_parallel(_error, [(cell, seeds) for cell in cells], jobs, "varying Table 5.1")
+    return dict(zip(cells, errors, strict=True))
 
 
 def _error(factors: Factors, seeds: list[int]) -> float:
     env = _env()
-    task = _changed(env, factors)
+    task = _with_factors(env, factors)
     with threadpool_limits(1):
-        return float(np.mean([_played(env, task, seed) for seed in seeds]))
+        return float(np.mean([_filter_error(env, task, seed) for seed in seeds]))
 
 
-def _changed(env: EstimationEnv, factors: Factors) -> Task:
-    """The environment's task with other parameters of the evolution model."""
+def _with_factors(env: EstimationEnv, factors: Factors) -> Task:
+    """Return the task with other parameters of the evolution model."""
     prior = env.task.prior
     stds = {name: getattr(factors, name) * value for name, value in asdict(prior).items()
             if name in factors._fields}
@@ -111,14 +106,14 @@ def _changed(env: EstimationEnv, factors: Factors) -> Task:
 
 @lru_cache(maxsize=1)
 def _transport(world: World, factor: float) -> Transport:
-    """The model's transport with another diffusivity; kept, since filters keep what they derive
-    from it with it."""
-    return world.changed({"flow": {"diffusivity": factor
-                                   * world.flow.diffusivity}}).model().transport
+    """Return the model's transport with another diffusivity; cached, since filters cache matrices
+    with it."""
+    return world.with_changes({"flow": {"diffusivity": factor
+                                        * world.flow.diffusivity}}).estimator_model().transport
 
 
-def _played(env: EstimationEnv, task: Task, seed: int) -> float:
-    """ẽ_c of a Kalman filter that believes ``task`` in an episode of ``env``."""
+def _filter_error(env: EstimationEnv, task: Task, seed: int) -> float:
+    """Return ẽ_c of a Kalman filter that assumes ``task`` in an episode of ``env``."""
     estimator = load_method("kalman_filter", "estimation").make(task)
     observation, _ = env.reset(seed=seed)
     done = False
@@ -129,10 +124,10 @@ def _played(env: EstimationEnv, task: Task, seed: int) -> float:
     return -float(np.mean(rewards[task.warm_up:]))
 
 
-def _heat_map(ax: Axes, errors: dict[Factors, float], up: str, across: str,
+def _heat_map(ax: Axes, errors: dict[Factors, float], vertical: str, horizontal: str,
               scale: tuple[float, float]):
-    """ẽ_c in colours and numbers; the table's own cell is framed. Returns the mappable."""
-    values = 1e3 * np.array([[errors[Factors(**{up: a, across: b})] for b in FACTORS]
+    """Draw ẽ_c in colours and numbers with the cell of Table 5.1 framed; return the mappable."""
+    values = 1e3 * np.array([[errors[Factors(**{vertical: a, horizontal: b})] for b in FACTORS]
                              for a in FACTORS])
     image = ax.imshow(values, origin="lower", cmap=FIELD_COLORMAP, vmin=1e3 * scale[0],
                       vmax=1e3 * scale[1])
@@ -144,8 +139,8 @@ def _heat_map(ax: Axes, errors: dict[Factors, float], up: str, across: str,
     ax.add_patch(Rectangle((middle - 0.5, middle - 0.5), 1, 1, fill=False, edgecolor=ACCENT,
                            linewidth=2.5))
     names = [{0.25: "¼", 0.5: "½"}.get(factor, f"{factor:g}") for factor in FACTORS]
-    ax.set(xlabel=f"{LABELS[across]}, parts of the assumed",
-           ylabel=f"{LABELS[up]}, parts of the assumed")
+    ax.set(xlabel=f"{LABELS[horizontal]}, relative to Table 5.1",
+           ylabel=f"{LABELS[vertical]}, relative to Table 5.1")
     ax.set_xticks(range(len(FACTORS)), names)
     ax.set_yticks(range(len(FACTORS)), names)
     ax.set_title("framed: the values of Table 5.1", fontsize=10)

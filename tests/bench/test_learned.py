@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from eitbench.bench.methods import load_method
-from eitbench.estimation import FirstFrame, corrected, inflow_filter, remember, suiting_priors
+from eitbench.estimation import CalibrationFrame, apply_correction, compatible_priors, gru_step, inflow_filter
 from eitbench.worlds import entry
 from eitbench.worlds.task import make_task
 
@@ -50,7 +50,7 @@ def test_numpy_answers_as_torch(study, both_ways, many):
         torch.nn.init.normal_(network.output.weight, std=0.1)
         network.half().double().eval()
     basis = np.random.default_rng(1).normal(size=(5, 3))
-    arrays = {name: each.astype(float) for name, each in study.joined(networks).items()} | {
+    arrays = {name: each.astype(float) for name, each in study.average_networks(networks).items()} | {
         "basis": basis, "rest": np.full(5, 0.1)}
     inputs = np.random.default_rng(0).normal(size=(20, 7))
     with torch.no_grad():
@@ -61,7 +61,7 @@ def test_numpy_answers_as_torch(study, both_ways, many):
     def memories(inputs, way=""):
         memory = np.zeros(24 * many)
         for seen in inputs:
-            memory = remember(arrays, seen, memory, way)
+            memory = gru_step(arrays, seen, memory, way)
             yield memory
 
     ways = [list(memories(inputs))]
@@ -69,7 +69,7 @@ def test_numpy_answers_as_torch(study, both_ways, many):
         ways.append(list(memories(inputs[::-1], "backward_"))[::-1])
     tolerance = 1e-6 if many == 1 else 2e-3  # means of biases are rounded once more
     for t, memory in enumerate(np.concatenate(ways, axis=1)):
-        mean, variance = corrected(arrays, 2.0, np.ones(3), inputs[t], memory)[:2]
+        mean, variance = apply_correction(arrays, 2.0, np.ones(3), inputs[t], memory)[:2]
         expected = 2.0 * (1.0 + basis @ (1.0 + (scale * correction)[0, t].numpy()))
         spread = 4.0 * (basis**2 @ (scale**2 * log_variance.exp())[0, t].numpy() + 0.1)
         np.testing.assert_allclose(mean, expected, rtol=tolerance, atol=1e-3 * tolerance)
@@ -78,15 +78,15 @@ def test_numpy_answers_as_torch(study, both_ways, many):
 
 @pytest.mark.parametrize("likelihood", ["modes", "nodes"])
 def test_a_seed_repeats_and_something_is_learned(study, data, likelihood):
-    lesson = replace(study.LESSONS["obstacle"], noise=0.1)
+    setup = replace(study.SETUPS["obstacle"], noise=0.1)
     modes = () if likelihood == "modes" else (np.eye(2), np.full(2, 1e-6))
-    judge = study.Judge(2, *modes)
-    first, error = study.trained(lesson, data, data, judge, seed=3, epochs=60)
-    again, same = study.trained(lesson, data, data, judge, seed=3, epochs=60)
-    _, other = study.trained(lesson, data, data, judge, seed=4, epochs=60)
+    loss = study.Loss(2, *modes)
+    first, error = study.train(setup, data, data, loss, seed=3, epochs=60)
+    again, same = study.train(setup, data, data, loss, seed=3, epochs=60)
+    _, other = study.train(setup, data, data, loss, seed=4, epochs=60)
     assert error == same != other
     assert all(torch.equal(a, b) for a, b in zip(first.parameters(), again.parameters(), strict=True))
-    assert error < 0.3 * study.filters_errors(data)[:, 2:].mean()
+    assert error < 0.3 * study.filter_errors(data)[:, 2:].mean()
 
 
 @pytest.fixture(scope="module")
@@ -97,10 +97,10 @@ def short(study):
     random = np.random.default_rng(0)
     root = np.linalg.cholesky(examples.mass.toarray())
     basis = np.linalg.solve(root.T, np.linalg.qr(random.normal(size=(len(root), 3)))[0])
-    first = FirstFrame(make_task(examples.world))
+    first = CalibrationFrame(make_task(examples.world))
     for measurement in zip(example.voltages[:first.length], example.currents, strict=False):
         first.add(*measurement)
-    return examples, example, basis, first.c_bh
+    return examples, example, basis, first.c_ref
 
 
 def test_scores_in_modes_are_scores(study, short):
@@ -119,7 +119,7 @@ def test_what_is_thought_later_is_of_the_same_state(study, short, monkeypatch):
     monkeypatch.setattr(study, "LAGS", (2,))
     found = study.features(examples, example, basis)
     task = make_task(examples.world)
-    prior = suiting_priors(ROOT / "baselines" / "priors", task, "logarithm")[0]
+    prior = compatible_priors(ROOT / "baselines" / "priors", task, "logarithm")[0]
     filter = inflow_filter(task, prior, level, lag=2)
     modes = np.linalg.pinv(basis)
     T = len(example.voltages)
@@ -129,8 +129,8 @@ def test_what_is_thought_later_is_of_the_same_state(study, short, monkeypatch):
             if state >= 0:
                 np.testing.assert_allclose(found["reduced 2"][state],
                                            modes @ (filter.estimate(t - state).mean / level - 1.0), rtol=1e-10)
-    lesson = replace(study.LESSONS["lag"], lag=2)
-    seen = study.asked(lesson, found)
+    setup = replace(study.SETUPS["lag"], lag=2)
+    seen = study.select_lag(setup, found)
     np.testing.assert_array_equal(seen["truth"], found["truth"][:-2])
     np.testing.assert_array_equal(seen["inputs"], np.concatenate([found["inputs"][2:], seen["reduced"]], axis=1))
 
@@ -142,7 +142,7 @@ def test_what_is_thought_later_is_of_the_same_state(study, short, monkeypatch):
 ])
 def test_it_plays_the_task_that_it_was_trained_for(changes, assumed, plays):
     """Other records of the same pipe too; no other vessel, and no other model of the flow."""
-    task = make_task(entry(ID).world.changed(changes), **assumed)
+    task = make_task(entry(ID).world.with_changes(changes), **assumed)
     assert load_method("learned_correction", "estimation").suits(task) == plays
 
 

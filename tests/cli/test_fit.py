@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 from eitbench.bench.methods import baseline_folder
-from eitbench.estimation import InflowPrior, suiting_priors
+from eitbench.estimation import InflowPrior, compatible_priors
 from eitbench.worlds.catalogue import PIPE_2D
 from eitbench.worlds.task import make_task
 
@@ -17,7 +17,7 @@ def test_writes_what_filters_read(tmp_path):
     code, _, err = eitbench("fit", "prior", "--env", "eitbench/Pipe2D-v0", "--seeds", "train:0-9",
                             "--out", tmp_path / "mine.json")
     assert code == 0, err
-    assert suiting_priors(tmp_path, make_task(PIPE_2D), "logarithm")
+    assert compatible_priors(tmp_path, make_task(PIPE_2D), "logarithm")
     source = json.loads((tmp_path / "mine.json").read_text())["source"]
     assert source == {"environment": "eitbench/Pipe2D-v0", "seeds": "train:0-9", "nugget": 0.01, "kept": 1e-4}
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from eitbench import make_task
-from eitbench.data.recordings import score_mass
+from eitbench.data.episode_cache import score_mass
 from eitbench.estimation import inflow_filter
 from eitbench.estimation.inflow_response import steady_response
 from eitbench.estimation.onboard.belief import Belief
@@ -75,7 +75,7 @@ def test_reduced_states_carry_inflows_as_the_flow_does(parts):
     h, r = len(model.transition), prior.modes.shape[1]
     draws = np.linalg.cholesky(toeplitz(prior.time_covariance(150)) + 1e-9 * np.eye(150))
     x = draws @ np.random.default_rng(0).standard_normal((150, r))
-    deviation = prior.inflow(x @ prior.modes.T) - 1.0
+    deviation = prior.inverse_link(x @ prior.modes.T) - 1.0
     mean, errors, sizes = np.zeros((1, h + D * r)), [], []
     zero = np.zeros((1, h + D * r, h + D * r))
     for t in range(150):

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 from eitbench import make_task
-from eitbench.data.recordings import cycle_voltages, recording
-from eitbench.estimation import FirstFrame, LinearisedObservations, kalman_filter, table_5_1
+from eitbench.data.episode_cache import cached_episode, cycle_voltages
+from eitbench.estimation import CalibrationFrame, LinearisedForwardModel, kalman_filter, table_5_1_filter
 from eitbench.estimation.onboard.linearisation import electrode_pairs
 
 from injection_envs import filter_of, make
@@ -22,20 +22,20 @@ def test_reduced_one_is_close_to_the_baselines():
     env = make("reduced")
     world = env.unwrapped.world
     task = make_task(world)
-    voltages = cycle_voltages(world, 5, recording(world, 5))
-    first = FirstFrame(task)
+    voltages = cycle_voltages(world, 5, cached_episode(world, 5))
+    first = CalibrationFrame(task)
     for k in range(16):
         first.add(voltages[k], world.currents[k])
-    start = table_5_1(task.transport, task.prior, first.c_bh)
-    linear = LinearisedObservations(task.observation, task.noise, start.mean)
+    start = table_5_1_filter(task.transport, task.prior, first.c_ref)
+    linear = LinearisedForwardModel(task.observation, task.noise, start.mean)
     full = kalman_filter(start, [linear(v, world.currents[t % 16]) for t, v in enumerate(voltages)])
     env.reset(seed=5)
     core = env.unwrapped.core
-    assert filter_of(env).concentration[0] == pytest.approx(first.c_bh, rel=0.011)
+    assert filter_of(env).concentration[0] == pytest.approx(first.c_ref, rel=0.011)
     for t in range(16, world.n_steps):
         env.step(number(world.currents[t % 16]))
         difference = core.estimate()[0][0] - full[t].mean
-        told = np.abs(full[t].mean - first.c_bh).max()
+        told = np.abs(full[t].mean - first.c_ref).max()
         assert np.sqrt((difference**2).mean()) < 1.0 < told
 
 
@@ -45,10 +45,10 @@ def test_full_one_is_that_of_the_baselines():
     world = env.unwrapped.world
     task = env.unwrapped.task
     core = env.unwrapped.core
-    voltages = cycle_voltages(world, 5, recording(world, 5))
+    voltages = cycle_voltages(world, 5, cached_episode(world, 5))
     env.reset(seed=5)
-    start = table_5_1(task.transport, task.prior, filter_of(env).concentration[0])
-    linear = LinearisedObservations(task.observation, task.noise, start.mean)
+    start = table_5_1_filter(task.transport, task.prior, filter_of(env).concentration[0])
+    linear = LinearisedForwardModel(task.observation, task.noise, start.mean)
     steps = kalman_filter(start, [linear(v, world.currents[t % 16]) for t, v in enumerate(voltages)])
     for t in range(16, world.n_steps):
         env.step(number(world.currents[t % 16]))

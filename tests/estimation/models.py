@@ -7,13 +7,13 @@ import numpy as np
 from eitbench.estimation import (
     Filter,
     InflowPrior,
-    LinearisedObservations,
+    LinearisedForwardModel,
+    LinearMeasurement,
     LowRankCovariance,
     Motion,
     NodalStates,
-    Observation,
     OpenLoopCovariance,
-    table_5_1,
+    table_5_1_filter,
 )
 from eitbench.numerics.mesh import rectangle_mesh
 from eitbench.physics.transport import ConvectionDiffusion
@@ -76,7 +76,7 @@ def draw(model, design, rng):
         c = model.F @ c + model.s + rng.multivariate_normal(np.zeros(len(c)), model.Q)
         truth.append(c)
         noise = rng.normal(size=len(H)) * np.sqrt(variance)
-        observations.append(Observation(H, H @ c + noise, variance))
+        observations.append(LinearMeasurement(H, H @ c + noise, variance))
     return np.array(truth), observations
 
 
@@ -134,17 +134,17 @@ def stacked(models, observations):
 def pipe(steps=5):
     """The thesis' pipe with n = 1701: its model in full matrices, a maker of its filter, observations, `dense_filter`.
 
-    The full matrices are put together from Table 5.1 here, the filter by ``table_5_1``.
+    The full matrices are put together from Table 5.1 here, the filter by ``table_5_1_filter``.
     """
     c_bh = 30.0
     rng = np.random.default_rng(11)
-    transport, observation = PIPE_2D.model()
+    transport, observation = PIPE_2D.estimator_model()
     evolution = transport.evolution_model()
     F, Y, H = evolution
     n, m = len(F), Y.shape[1]
     noise = evolution.state_noise_covariance((c_bh / 4)**2, (c_bh / 50)**2)
     model = LinearGaussian(F, Y @ np.full(m, c_bh), noise, np.full(n, c_bh), (c_bh / 4)**2 * np.eye(n))
-    linearised = LinearisedObservations(observation, PIPE_2D.noise, np.full(n, c_bh))
+    linearised = LinearisedForwardModel(observation, PIPE_2D.noise, np.full(n, c_bh))
     c = c_bh * rng.uniform(0.9, 1.1, n)
     observations = []
     for t in range(steps):
@@ -155,7 +155,7 @@ def pipe(steps=5):
     exact = dense_filter(model, observations)
 
     def make_filter():
-        return table_5_1(transport, PIPE_2D.prior, c_bh, rank_tolerance=1e-6)
+        return table_5_1_filter(transport, PIPE_2D.prior, c_bh, rank_tolerance=1e-6)
 
     return model, make_filter, observations, exact
 

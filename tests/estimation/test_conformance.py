@@ -8,22 +8,22 @@ from eitbench.estimation import (
     DenseCovariance,
     Filter,
     InflowWindow,
+    LinearMeasurement,
     LogStates,
     Motion,
     NodalStates,
-    Observation,
-    UnknownFlow,
     VelocityInflowWindow,
+    VelocityPrior,
     VelocityStates,
     fixed_interval_smoother,
     kalman_filter,
     modal_states,
-    smoothed_means,
-    smoothed_state,
+    smooth_means,
+    smooth_state,
     steady_response,
 )
-from eitbench.estimation.inflow_window import stationary
-from eitbench.estimation.walk import steady
+from eitbench.estimation.inflow_window import yule_walker
+from eitbench.estimation.walk import matern32_transition
 from eitbench.worlds.task import make_task
 from models import (
     MESH,
@@ -88,7 +88,7 @@ def at_rest():
 
 def modal():
     """Weights and their rates of change."""
-    A, Q = steady(0.3)
+    A, Q = matern32_transition(0.3)
     model = LinearGaussian(np.kron(A, np.eye(5)), np.zeros(10), 0.49 * np.kron(Q, np.eye(5)), np.zeros(10),
                            0.49 * np.eye(10))
     return Filter(modal_states(5, 0.7, lambda time: (A, Q))), [model] * T
@@ -110,14 +110,14 @@ def window_model(weights, variances, before):
 def inflow_window():
     task, prior = coarse_task(), two_modes(MESH.points[:7], link="linear")
     space = InflowWindow(task, prior, LEVEL, lag=T)
-    before, (weights, variance) = stationary(prior.time_covariance(space.window + 1))
+    before, (weights, variance) = yule_walker(prior.time_covariance(space.window_steps + 1))
     model = window_model(np.repeat(weights[:, None], 2, axis=1), np.full(2, variance), np.kron(before, np.eye(2)))
     return Filter(space), [model] * T
 
 
 def known_flow(k=2):
-    return UnknownFlow(lambda theta: coarse_transport(theta, 1e-2), directions(k), THETA[:k], np.zeros(k), np.zeros(k),
-                       shapes(k))
+    return VelocityPrior(lambda theta: coarse_transport(theta, 1e-2), directions(k), THETA[:k], np.zeros(k),
+                         np.zeros(k), shapes(k))
 
 
 def velocity():
@@ -148,7 +148,7 @@ def measured(filter_, models, m=3, noise=(0.1, 1.0), root=False):
         H = rng.normal(size=(m, n)) / np.sqrt(n)
         offset = H @ filter_.concentration
         common = 0.5 * rng.normal(size=(m, 2)) if root else None
-        observation = Observation(H, offset + rng.normal(size=m), rng.uniform(*noise, m), common)
+        observation = LinearMeasurement(H, offset + rng.normal(size=m), rng.uniform(*noise, m), common)
         slope = space.jacobian(mean, H)
         seen.append(observation)
         of_state.append(observation._replace(
@@ -209,7 +209,8 @@ def test_missing_readings_are_fewer_readings(form):
         step = lost.update(observation._replace(value=value))
         np.testing.assert_array_equal(step.accepted, keep)
         fewer.predict()
-        fewer.update(Observation(observation.matrix[keep], observation.value[keep], observation.noise_variance[keep]))
+        fewer.update(LinearMeasurement(observation.matrix[keep], observation.value[keep],
+                                       observation.noise_variance[keep]))
     assert_close(lost.mean, fewer.mean)
     assert_close(lost.covariance.diagonal(), fewer.covariance.diagonal())
 
@@ -252,7 +253,7 @@ def test_smoothed_means(form):
     filter_, models = form()
     seen, of_state = measured(filter_, models)
     expected = np.array([state.mean for state in stacked(models, of_state)])
-    assert_close(smoothed_means(filter_, seen), expected)
+    assert_close(smooth_means(filter_, seen), expected)
 
 
 def test_fixed_interval_and_fixed_lag_smoother():
@@ -266,7 +267,7 @@ def test_fixed_interval_and_fixed_lag_smoother():
     steps = kalman_filter(filter_, seen)
     for lag in (0, 1, 4):
         for t in (lag, 5):
-            state, expected = smoothed_state(filter_, steps[t - lag:t + 1]), stacked(models[:t + 1], of_state[:t + 1])
+            state, expected = smooth_state(filter_, steps[t - lag:t + 1]), stacked(models[:t + 1], of_state[:t + 1])
             assert_close(state.mean, expected[t - lag].mean)
             assert_close(state.variance, expected[t - lag].variance)
 
@@ -291,7 +292,7 @@ def test_windows_with_a_known_velocity_are_the_inflow_window():
     """Where the other one drops next to nothing: to 1e-3 of the deviation, which it has forgotten."""
     task, prior = coarse_task(), two_modes(MESH.points[:7], link="linear")
     other = Filter(InflowWindow(task, prior, LEVEL))
-    filter_ = Filter(VelocityInflowWindow(task, prior, LEVEL, known_flow(), other.space.window))
+    filter_ = Filter(VelocityInflowWindow(task, prior, LEVEL, known_flow(), other.space.window_steps))
     seen, _ = measured(other, range(4))
     for each in (filter_, other):
         run(each, seen)
@@ -351,4 +352,4 @@ def test_several_blocks_of_a_dense_covariance():
 
 def test_response_of_a_window_is_the_tasks_flow():
     space = InflowWindow(coarse_task(), two_modes(MESH.points[:7]), LEVEL)
-    assert space.memory == steady_response(coarse_transport(THETA, 1e-2)).weights.shape[1]
+    assert space.response_steps == steady_response(coarse_transport(THETA, 1e-2)).weights.shape[1]

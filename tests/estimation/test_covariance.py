@@ -6,12 +6,12 @@ import scipy.linalg
 from eitbench.estimation import (
     DenseCovariance,
     Filter,
+    LinearMeasurement,
     Motion,
     NodalStates,
-    Observation,
     OpenLoopCovariance,
     kalman_filter,
-    linearised,
+    linearise_voltages,
 )
 from eitbench.physics.observation import VoltageNoise
 from eitbench.scoring import normalised_innovations
@@ -82,7 +82,7 @@ def test_variances_are_never_negative():
     root = np.random.default_rng(9).normal(size=(n, n))
     covariance = DenseCovariance(1e6 * (root @ root.T + np.eye(n)))
     filter_ = Filter(NodalStates(np.zeros(n), covariance, Motion()))
-    filter_.update(Observation(np.eye(n), np.zeros(n), np.full(n, 1e-12)))
+    filter_.update(LinearMeasurement(np.eye(n), np.zeros(n), np.full(n, 1e-12)))
     assert 0.0 <= filter_.variance.min() <= filter_.variance.max() < 1e-6
 
 
@@ -136,7 +136,7 @@ def test_linearised_observation_is_the_tangent():
     model, point, current = QuadraticModel(rng), rng.uniform(1.0, 2.0, 6), rng.normal(size=4)
     voltages = rng.normal(size=4)
     noise = VoltageNoise(0.01, 0.001)
-    J, value, variance, _ = linearised(model, noise, point, voltages, current)
+    J, value, variance, _ = linearise_voltages(model, noise, point, voltages, current)
     at_point = model.voltages(point, current[None])[0]
     np.testing.assert_allclose(value, voltages - at_point + J @ point, rtol=1e-14)
     np.testing.assert_allclose(variance, noise.std(at_point)**2, rtol=1e-14)
@@ -144,6 +144,6 @@ def test_linearised_observation_is_the_tangent():
     misfits = []
     for h in (1e-2, 1e-3):
         exact = model.voltages(point + h * away, current[None])[0]
-        observation = linearised(model, noise, point, exact, current)
+        observation = linearise_voltages(model, noise, point, exact, current)
         misfits.append(np.abs(observation.value - J @ (point + h * away)).max())
     assert misfits[0] / misfits[1] == pytest.approx(100.0, rel=1e-3)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from eitbench.estimation.design import pair_gains
+from eitbench.estimation.design import pair_design_criteria
 from eitbench.estimation.onboard.linearisation import electrode_pairs
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -22,7 +22,7 @@ def a_state(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
 def gains_of(derivative, covariance, weight, noise_variance):
     rows = derivative.reshape(L * L, N)
     plain, weighted = (rows @ middle @ rows.T for middle in (covariance, covariance @ weight @ covariance))
-    return pair_gains(plain.reshape(L, L, L, L), weighted.reshape(L, L, L, L), PAIRS, noise_variance)
+    return pair_design_criteria(plain.reshape(L, L, L, L), weighted.reshape(L, L, L, L), PAIRS, noise_variance)
 
 
 def textbook(matrix: np.ndarray, covariance: np.ndarray, noise_variance: np.ndarray) -> np.ndarray:

@@ -10,10 +10,10 @@ from eitbench.estimation import (
     EnsembleFilter,
     Filter,
     InflowWindow,
-    Observation,
-    UnknownFlow,
-    about_prediction,
+    LinearMeasurement,
+    VelocityPrior,
     inflow_response,
+    linearise_at_prediction,
 )
 from eitbench.numerics.mesh import rectangle_mesh
 from eitbench.physics.transport import ConvectionDiffusion
@@ -45,17 +45,17 @@ def prior(link):
     return two_modes(MESH.points[:5], link=link)
 
 
-def ensemble(link="logarithm", members=40, std=0.5, lead_in=24):
-    flow = UnknownFlow(transport_at, [parabola], np.array([4.5]), np.array([std]), np.array([0.1 * std]),
+def ensemble(link="logarithm", members=40, std=0.5, spin_up_steps=24):
+    flow = VelocityPrior(transport_at, [parabola], np.array([4.5]), np.array([std]), np.array([0.1 * std]),
                        np.ones((1, 1)))
-    return EnsembleFilter(task(), prior(link), LEVEL, flow, members, lead_in, np.random.default_rng(0),
-                          about_prediction(task()))
+    return EnsembleFilter(task(), prior(link), LEVEL, flow, members, spin_up_steps, np.random.default_rng(0),
+                          linearise_at_prediction(task()))
 
 
 def observation(seed=5, m=6, variance=0.1):
     random = np.random.default_rng(seed)
     H = averages(MESH, random, m)
-    return Observation(H, LEVEL + 3.0 * random.normal(size=m), np.full(m, variance))
+    return LinearMeasurement(H, LEVEL + 3.0 * random.normal(size=m), np.full(m, variance))
 
 
 def together(filter_):
@@ -91,9 +91,9 @@ def test_members_move_with_their_own_flow():
     filter_ = ensemble(std=0.4, members=24)
     filter_.flow = replace(filter_.flow, walk_std=np.zeros(1))
     before = filter_.concentration.copy()
-    entered = filter_.level * np.exp(filter_.prior.modes @ filter_.inflows[0])
+    entered = filter_.c_ref * np.exp(filter_.prior.modes @ filter_.inflows[0])
     filter_.predict()
-    enters = filter_.level * np.exp(filter_.prior.modes @ filter_.inflows[0])
+    enters = filter_.c_ref * np.exp(filter_.prior.modes @ filter_.inflows[0])
     own, mean = (np.stack([transport_at(theta).step(before[:, i], entered[:, i], enters[:, i])
                            for i, theta in enumerate(flows)], axis=1)
                  for flows in (filter_.parameters.T, np.tile(filter_.parameters.mean(axis=1), (24, 1))))
@@ -103,8 +103,8 @@ def test_members_move_with_their_own_flow():
 def test_many_members_give_the_kalman_filter(monkeypatch):
     """With a linear prior in a flow that is known, from inflows that have filled the pipe to its walls: after four
     measurements the mean to a tenth (rms) of how far it has moved, variances to 15 %, five standard errors of 2,000."""
-    monkeypatch.setattr(inflow_response, "FORGOTTEN", 1e-6)
-    filter_ = ensemble("linear", 2000, std=0.0, lead_in=60)
+    monkeypatch.setattr(inflow_response, "DECAY_TOLERANCE", 1e-6)
+    filter_ = ensemble("linear", 2000, std=0.0, spin_up_steps=60)
     exact = Filter(InflowWindow(task(), prior("linear"), LEVEL))
     for seed in range(4):
         for each in (filter_, exact):
@@ -123,4 +123,4 @@ def test_mistakes_are_told():
         ensemble(members=1)
     with pytest.raises(ValueError, match="the prior must be of the task's inlet"):
         EnsembleFilter(make_task(TINY), prior("linear"), LEVEL, ensemble().flow, 10, 2, np.random.default_rng(0),
-                       about_prediction(task()))
+                       linearise_at_prediction(task()))

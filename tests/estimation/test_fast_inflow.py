@@ -5,7 +5,13 @@ from functools import lru_cache
 import numpy as np
 import pytest
 from eitbench.bench.methods import baseline_folder
-from eitbench.estimation import QuadraticVoltages, ScaledVoltages, reduced_response, steady_response, suiting_priors
+from eitbench.estimation import (
+    QuadraticVoltageModel,
+    ScaledVoltageModel,
+    compatible_priors,
+    reduced_response,
+    steady_response,
+)
 from eitbench.worlds.catalogue import PIPE_2D, PIPE_3D
 from eitbench.worlds.task import make_task
 from scipy.linalg import toeplitz
@@ -17,7 +23,7 @@ WORLDS = {"2D": PIPE_2D, "3D": PIPE_3D}
 def parts(name):
     """Task, prior of the inflow's logarithm, and what an inflow leaves in the pipe."""
     task = make_task(WORLDS[name])
-    return task, suiting_priors(baseline_folder() / "priors", task, "logarithm")[0], steady_response(task.transport)
+    return task, compatible_priors(baseline_folder() / "priors", task, "logarithm")[0], steady_response(task.transport)
 
 
 def states(response, prior, count=200, seed=0):
@@ -48,13 +54,13 @@ def fast():
     """Scaled quadratic voltages of the 2D pipe, and the 48 directions in which they are quadratic."""
     task, prior, response = parts("2D")
     basis = reduced_response(response, prior, 48).basis
-    return task, basis, ScaledVoltages(task.observation, task.expected_concentration, basis)
+    return task, basis, ScaledVoltageModel(task.observation, task.expected_concentration, basis)
 
 
 def test_level_costs_nothing():
     """Homogeneous fluid of any level has its voltages to a thousandth, where a quadratic about a level is far off."""
     task, basis, scaled = fast()
-    plain = QuadraticVoltages(task.observation, task.expected_concentration, basis)
+    plain = QuadraticVoltageModel(task.observation, task.expected_concentration, basis)
     off = {"scaled": [], "plain": []}
     for factor in (0.6, 1.8):
         c = np.full(task.mesh.n_nodes, factor * task.expected_concentration)
@@ -80,11 +86,11 @@ def test_slopes_are_those_of_the_voltages():
 def test_every_pair_of_electrodes_is_contracted_once(monkeypatch):
     """An agent that injects all 120 pairs in turn finds each again."""
     calls = []
-    real = QuadraticVoltages._contracted
-    monkeypatch.setattr(QuadraticVoltages, "_contracted",
+    real = QuadraticVoltageModel._contracted
+    monkeypatch.setattr(QuadraticVoltageModel, "_contracted",
                         lambda self, currents: calls.append(1) or real(self, currents))
     task, basis, _ = fast()
-    model = QuadraticVoltages(task.observation, task.expected_concentration, basis[:, :4])
+    model = QuadraticVoltageModel(task.observation, task.expected_concentration, basis[:, :4])
     pairs = np.eye(16)[:, None] - np.eye(16)
     pairs = pairs[np.triu_indices(16, 1)]
     c = np.full(task.mesh.n_nodes, task.expected_concentration)

@@ -10,17 +10,17 @@ import pytest
 from eitbench.data.dataset import Dataset
 from eitbench.data.seeds import parse_seeds
 from eitbench.estimation import (
-    FirstFrame,
+    CalibrationFrame,
     IdentifiedModel,
-    Observation,
-    QuadraticVoltages,
-    identified_model,
+    LinearMeasurement,
+    QuadraticVoltageModel,
+    compatible_models,
+    full_window_filter,
+    identify_model,
     inflow_filter,
-    linearised,
-    most_probable_inflow,
-    smoothed_inflow,
+    linearise_voltages,
+    maximise_posterior,
     steady_response,
-    suiting_models,
 )
 from eitbench.worlds.catalogue import PIPE_2D
 from eitbench.worlds.task import make_task
@@ -39,7 +39,7 @@ def examples(seeds):
 
 @lru_cache(maxsize=1)
 def model():
-    return identified_model(examples("train:0-23"), modes=24)
+    return identify_model(examples("train:0-23"), modes=24)
 
 
 @lru_cache(maxsize=1)
@@ -69,7 +69,7 @@ def test_makes_states_of_episodes_that_it_never_saw():
             error = made(response, seed) - truth
             kept.append(np.einsum("tn,nt->t", error, mass @ error.T).mean())
     assert np.mean(off) < 0.1 * np.mean(told)
-    assert 0.5 < np.mean(off) / model().spread.trace() < 6.0
+    assert 0.5 < np.mean(off) / model().residual_covariance.trace() < 6.0
 
 
 def test_corrects_the_flow_as_told_from_few_episodes():
@@ -77,10 +77,10 @@ def test_corrects_the_flow_as_told_from_few_episodes():
     eight on, where a model that begins from nothing is far worse; from 24 on it is below six tenths, and about what it
     says."""
     mass = examples("train:0").mass
-    corrected = identified_model(examples("train:0-23"), modes=24, correct=True)
+    corrected = identify_model(examples("train:0-23"), modes=24, residual_only=True)
     responses = {"told": steady_response(task().transport), "corrected by 24": corrected.response}
-    for name, correct in (("corrected by 8", True), ("begun from nothing by 8", False)):
-        responses[name] = identified_model(examples("train:0-7"), modes=24, correct=correct).response
+    for name, residual_only in (("corrected by 8", True), ("begun from nothing by 8", False)):
+        responses[name] = identify_model(examples("train:0-7"), modes=24, residual_only=residual_only).response
     off = dict.fromkeys(responses, 0.0)
     for seed in parse_seeds("train:40-47"):
         (example,) = Dataset("tiny", TINY, (seed,))
@@ -90,7 +90,7 @@ def test_corrects_the_flow_as_told_from_few_episodes():
             off[name] += np.einsum("tn,nt->t", error, mass @ error.T).mean() / 8
     assert off["corrected by 8"] < off["told"] < 0.5 * off["begun from nothing by 8"]
     assert off["corrected by 24"] < 0.6 * off["told"]
-    assert 0.5 < off["corrected by 24"] / corrected.spread.trace() < 6.0
+    assert 0.5 < off["corrected by 24"] / corrected.residual_covariance.trace() < 6.0
 
 
 def test_mean_error_is_that_of_the_readings():
@@ -112,7 +112,7 @@ def test_mean_error_is_that_of_the_readings():
 @lru_cache(maxsize=1)
 def once():
     """The model whose voltages are linearised once."""
-    return identified_model(examples("train:0-23"), modes=24, linearised=True)
+    return identify_model(examples("train:0-23"), modes=24, linearised=True)
 
 
 def test_scatter_is_that_of_linearised_readings():
@@ -121,11 +121,11 @@ def test_scatter_is_that_of_linearised_readings():
     whitened, in_noise = [], []
     for seed in parse_seeds("train:40-55"):
         (example,) = Dataset("tiny", TINY, (seed,))
-        first = FirstFrame(task())
+        first = CalibrationFrame(task())
         for t in range(first.length):
             first.add(example.voltages[t], example.currents[t])
         for voltages, currents, truth in zip(example.voltages, example.currents, example.truth, strict=True):
-            at = linearised(task().observation, task().noise, first.mean, voltages, currents)
+            at = linearise_voltages(task().observation, task().noise, first.mean, voltages, currents)
             std = np.sqrt(at.noise_variance)
             off = at.value - at.matrix @ truth.astype(float) - once().mean_error(currents, std)
             whitened.append(np.linalg.solve(once().error_root(currents, std), off))
@@ -147,27 +147,28 @@ def test_filter_linearises_once_if_the_model_says_so():
         before = copy.deepcopy(filter_.mean), filter_.covariance.copy()
         step = filter_.assimilate(voltages, currents)
         mean, covariance = filter_.space.propagate(*before, filter_.time)
-        at = linearised(task().observation, task().noise, level, voltages, currents)
+        at = linearise_voltages(task().observation, task().noise, level, voltages, currents)
         std = np.sqrt(at.noise_variance)
         slope = filter_.space.jacobian(mean, at.matrix)
         known = covariance.array[:slope.shape[1], :slope.shape[1]]
         flow = LEVEL * at.matrix @ once().basis
-        number = int(np.flatnonzero(np.isclose(once().patterns, currents).all(axis=1))[0])
-        S = (slope @ known @ slope.T + flow @ once().spread @ flow.T + std[:, None] * once().scatter[number] * std)
-        expected = at.value - at.matrix @ filter_.space.concentration(mean) - std * once().bias[number]
+        number = int(np.flatnonzero(np.isclose(once().current_patterns, currents).all(axis=1))[0])
+        S = (slope @ known @ slope.T + flow @ once().residual_covariance @ flow.T
+             + std[:, None] * once().voltage_error_covariance[number] * std)
+        expected = at.value - at.matrix @ filter_.space.concentration(mean) - std * once().mean_voltage_error[number]
         np.testing.assert_allclose(step.innovation_covariance, S, rtol=1e-9, atol=1e-12 * S.max())
         np.testing.assert_allclose(step.innovation, expected, atol=1e-12)
     with pytest.raises(ValueError, match="model must have voltages that are linearised anew"):
-        most_probable_inflow(filter_, task(), [], once())
+        maximise_posterior(filter_, task(), [], once())
 
 
 def test_learns_from_train_alone():
     with pytest.raises(ValueError, match=r"seeds must be of the split train.*dev:0"):
-        identified_model(examples("dev:0"))
+        identify_model(examples("dev:0"))
     with pytest.raises(ValueError, match="more states than modes, 24; got 5"):
-        identified_model(examples("train:0"), modes=24)
-    with pytest.raises(ValueError, match="at least 4 episodes to correct the flow as told, got 3"):
-        identified_model(examples("train:0-2"), modes=4, correct=True)
+        identify_model(examples("train:0"), modes=24)
+    with pytest.raises(ValueError, match="at least 4 episodes with residual_only, got 3"):
+        identify_model(examples("train:0-2"), modes=4, residual_only=True)
 
 
 def test_filter_is_gaussian_conditioning():
@@ -177,12 +178,13 @@ def test_filter_is_gaussian_conditioning():
     random = np.random.default_rng(3)
     n = task().mesh.n_nodes
     noise = np.array([0.01, 0.02, 0.1])
-    seen = [Observation(random.normal(size=(3, n)) / n, LEVEL + 0.3 * random.normal(size=3), noise) for _ in range(3)]
+    seen = [LinearMeasurement(random.normal(size=(3, n)) / n, LEVEL + 0.3 * random.normal(size=3), noise)
+            for _ in range(3)]
     for observation in seen:
         filter_.predict()
         root = LEVEL * observation.matrix @ model().root
         step = filter_.update(observation._replace(noise_root=root))
-    K, r = filter_.space.memory, filter_.space.modes
+    K, r = filter_.space.response_steps, filter_.space.n_modes
     basis, weights = model().response
     part = LEVEL * basis @ (weights @ linear.modes).reshape(len(weights), -1)
     G = np.zeros((3, n, (3 + K - 1) * r))
@@ -194,14 +196,14 @@ def test_filter_is_gaussian_conditioning():
     S = H @ covariance @ H.T
     for t, o in enumerate(seen):
         here = slice(3 * t, 3 * t + 3)
-        off = LEVEL**2 * o.matrix @ basis @ model().spread @ basis.T @ o.matrix.T
+        off = LEVEL**2 * o.matrix @ basis @ model().residual_covariance @ basis.T @ o.matrix.T
         S[here, here] += off + np.diag(o.noise_variance)
     gain = np.linalg.solve(S, H @ covariance).T
     rest = covariance - gain @ H @ covariance
     state = filter_.estimate()
     np.testing.assert_allclose(state.mean, LEVEL + G[-1] @ gain @ y, atol=1e-4 * LEVEL)
     variance = np.einsum("ij,jk,ik->i", G[-1], rest, G[-1])
-    variance += LEVEL**2 * np.einsum("ij,jk,ik->i", basis, model().spread, basis)
+    variance += LEVEL**2 * np.einsum("ij,jk,ik->i", basis, model().residual_covariance, basis)
     np.testing.assert_allclose(state.variance, variance, atol=1e-4 * variance.max())
     Sb = S[6:, 6:] - S[6:, :6] @ np.linalg.solve(S[:6, :6], S[:6, 6:])
     np.testing.assert_allclose(step.innovation_covariance, Sb, atol=1e-3 * Sb.max())
@@ -210,7 +212,7 @@ def test_filter_is_gaussian_conditioning():
 def surprise(space, before, covariance, x, voltages, currents):
     """−2 ln of the density of the newest inflows x given what was known before, and the readings."""
     concentration = space.concentration(x)
-    observation = linearised(task().observation, task().noise, concentration, voltages, currents)
+    observation = linearise_voltages(task().observation, task().noise, concentration, voltages, currents)
     off = (observation.value - observation.matrix @ concentration) / np.sqrt(observation.noise_variance)
     return (x - before) @ np.linalg.solve(covariance, x - before) + (off**2).sum()
 
@@ -232,16 +234,16 @@ def test_a_second_linearisation_is_nearer_to_the_most_probable():
 def test_smoother_takes_out_the_mean_error():
     """Readings that exceed the model's by just the mean error are explained by the inflows without it."""
     (example,) = examples("train:0")
-    plain = replace(model(), bias=np.zeros_like(model().bias))
+    plain = replace(model(), mean_voltage_error=np.zeros_like(model().mean_voltage_error))
     first = list(zip(example.voltages, example.currents, strict=True))
-    without = smoothed_inflow(task(), prior(), LEVEL, first, model=plain)
-    most_probable_inflow(without, task(), first, plain)
+    without = full_window_filter(task(), prior(), LEVEL, first, model=plain)
+    maximise_posterior(without, task(), first, plain)
     last = len(first) - 1
     stds = [task().noise.std(task().observation.voltages(without.estimate(last - t).mean, I[None])[0])
             for t, (_, I) in enumerate(first)]
     shifted = [(V + model().mean_error(I, std), I) for (V, I), std in zip(first, stds, strict=True)]
-    with_error = smoothed_inflow(task(), prior(), LEVEL, shifted, model=model())
-    most_probable_inflow(with_error, task(), shifted, model())
+    with_error = full_window_filter(task(), prior(), LEVEL, shifted, model=model())
+    maximise_posterior(with_error, task(), shifted, model())
     np.testing.assert_allclose(with_error.mean, without.mean, atol=0.02)
 
 
@@ -250,14 +252,16 @@ def test_a_file_says_all(tmp_path):
     model().save(tmp_path / "a.npz")
     again = IdentifiedModel.load(tmp_path / "a.npz")
     np.testing.assert_allclose(again.response.weights, model().response.weights, atol=1e-6)
-    np.testing.assert_allclose(again.spread, model().spread, atol=1e-7 * model().spread.max())
+    np.testing.assert_allclose(again.residual_covariance, model().residual_covariance,
+                               atol=1e-7 * model().residual_covariance.max())
     np.testing.assert_allclose(again.mean_error(task().currents[0], np.ones(4)),
                                model().mean_error(task().currents[0], np.ones(4)), atol=1e-6)
-    assert again.scatter is None
+    assert again.voltage_error_covariance is None
     once().save(tmp_path / "a.npz")
-    np.testing.assert_allclose(IdentifiedModel.load(tmp_path / "a.npz").scatter, once().scatter, atol=1e-6)
-    assert suiting_models(tmp_path, task())
-    assert not suiting_models(tmp_path, make_task(PIPE_2D))
+    np.testing.assert_allclose(IdentifiedModel.load(tmp_path / "a.npz").voltage_error_covariance,
+                               once().voltage_error_covariance, atol=1e-6)
+    assert compatible_models(tmp_path, task())
+    assert not compatible_models(tmp_path, make_task(PIPE_2D))
 
 
 def test_other_files_are_told(tmp_path):
@@ -265,15 +269,15 @@ def test_other_files_are_told(tmp_path):
         (tmp_path / "b.npz").write_bytes(content)
         with pytest.raises(ValueError, match=r"b\.npz must be a model of `eitbench fit model`"):
             IdentifiedModel.load(tmp_path / "b.npz")
-    with pytest.raises(ValueError, match=r"spread must have shape \(24, 24\)"):
-        replace(model(), spread=np.eye(3))
-    with pytest.raises(ValueError, match=r"scatter must have shape"):
-        replace(model(), scatter=np.eye(4))
+    with pytest.raises(ValueError, match=r"residual_covariance must have shape \(24, 24\)"):
+        replace(model(), residual_covariance=np.eye(3))
+    with pytest.raises(ValueError, match=r"voltage_error_covariance must have shape"):
+        replace(model(), voltage_error_covariance=np.eye(4))
 
 
 @lru_cache(maxsize=1)
 def quadratic():
-    return QuadraticVoltages(task().observation, LEVEL, model().basis)
+    return QuadraticVoltageModel(task().observation, LEVEL, model().basis)
 
 
 def along_modes(size):

@@ -6,18 +6,18 @@ from functools import lru_cache
 import numpy as np
 import pytest
 from eitbench.bench.methods import baseline_folder
-from eitbench.data.episodes import simulate, truth_discretisation
+from eitbench.data.episodes import cached_truth_model, simulate
 from eitbench.data.seeds import parse_seeds
 from eitbench.estimation import (
     Filter,
     InflowPrior,
     InflowWindow,
-    changing_responses,
+    compatible_priors,
     fit_inflow_prior,
-    learned_inflow_prior,
-    most_probable_inflow,
-    smoothed_inflow,
-    suiting_priors,
+    fit_prior_from_episodes,
+    full_window_filter,
+    maximise_posterior,
+    time_varying_responses,
 )
 from eitbench.worlds.catalogue import PIPE_2D_OBSTACLE
 from eitbench.worlds.catalogue import ROTATING_TANK_2D as ROTATING_TANK
@@ -52,7 +52,7 @@ def window(link="logarithm", lag=0, law=None):
 
 def some_inflows(space, seed=1):
     """A mean of other inflows than the expected ones."""
-    return 0.5 * np.random.default_rng(seed).standard_normal(2 * space.window)
+    return 0.5 * np.random.default_rng(seed).standard_normal(2 * space.window_steps)
 
 
 def stepped(inflow, lag=0):
@@ -69,9 +69,10 @@ def stepped(inflow, lag=0):
 
 def test_a_flow_that_changes_carries_each_inflow_by_what_flowed_then():
     """Inflows carried on step by step, each step by its own transport; before the first it was as in it."""
-    nominal, faster = (make_task(TINY.changed({"flow": {"mean_velocity": speed}})).transport for speed in (45.0, 60.0))
+    nominal, faster = (make_task(TINY.with_changes({"flow": {"mean_velocity": speed}})).transport
+                       for speed in (45.0, 60.0))
     transports = [nominal, faster, nominal]
-    response = changing_responses(lambda t: transports[t - 1], 3)[-1]
+    response = time_varying_responses(lambda t: transports[t - 1], 3)[-1]
     K, inlet = response.weights.shape[1:]
     inflow = 1.0 + 0.3 * np.random.default_rng(5).standard_normal((K + 2, inlet))        # the oldest first
     state, before = np.zeros(task().mesh.n_nodes), np.zeros(inlet)
@@ -88,7 +89,7 @@ def test_the_history_makes_what_the_flow_makes_of_it(link, lag):
     """Inflows carried on step by step by the transport: to 3e-3 of what they change, the part that is dropped."""
     space = window(link, lag)
     mean = some_inflows(space)
-    u = mean.reshape(-1, 2)[:lag + space.memory] @ prior(link).modes.T
+    u = mean.reshape(-1, 2)[:lag + space.response_steps] @ prior(link).modes.T
     expected = stepped(LEVEL * (np.exp(u) if link == "logarithm" else 1.0 + u), lag)
     off = space.concentration(mean, lag) - expected
     assert np.linalg.norm(off) < 3e-3 * np.linalg.norm(expected - LEVEL)
@@ -100,7 +101,7 @@ def test_derivatives_are_those_of_the_concentration(link):
     space = window(link, 1)
     mean = some_inflows(space)
     slope = space.jacobian(mean, np.eye(task().mesh.n_nodes)[::40], lag=1)
-    for k in (0, 1, 2 * space.memory - 1):
+    for k in (0, 1, 2 * space.response_steps - 1):
         step = np.zeros_like(mean)
         step[2 + k] = 1e-4
         difference = (space.concentration(mean + step, 1) - space.concentration(mean - step, 1))[::40] / 2e-4
@@ -132,16 +133,16 @@ def test_prediction_keeps_the_prior():
 
 @lru_cache(maxsize=1)
 def most_probable():
-    smoother = smoothed_inflow(task(), prior(), LEVEL, record())
+    smoother = full_window_filter(task(), prior(), LEVEL, record())
     first = smoother.mean.copy()
-    most_probable_inflow(smoother, task(), record())
+    maximise_posterior(smoother, task(), record())
     return smoother, first
 
 
 def density(smoother, x, std):
     """−2 ln of the posterior density, from its parts."""
     space = smoother.space
-    precision = np.linalg.inv(toeplitz(prior().time_covariance(space.window)))
+    precision = np.linalg.inv(toeplitz(prior().time_covariance(space.window_steps)))
     value = np.einsum("ik,ij,jk->", x.reshape(-1, 2), precision, x.reshape(-1, 2))
     for t, (voltages, currents) in enumerate(record()):
         there = task().observation.voltages(space.concentration(x, len(record()) - 1 - t), currents[None])[0]
@@ -194,22 +195,22 @@ def test_a_correlation_is_one():
 def test_inflows_are_those_of_the_simulation():
     """At the truth's inlet, where its nodes are the model's too."""
     sampled = TINY.sample_inflow(3)
-    assert sampled.shape == (TINY.lead_in + TINY.n_steps + 1, 21)
-    truth = truth_discretisation(TINY).transport
+    assert sampled.shape == (TINY.spin_up_steps + TINY.n_steps + 1, 21)
+    truth = cached_truth_model(TINY).transport
     fine = truth.mesh.points[truth.inlet][:, 1]
     coarse = task().mesh.points[task().transport.inlet][:, 1]
     same = [(i, k) for i, y in enumerate(coarse) for k, z in enumerate(fine) if abs(y - z) < 1e-9]
     assert len(same) > 5
     here, there = map(list, zip(*same, strict=True))
     simulated = simulate(TINY, 3).concentration[:, truth.inlet]
-    np.testing.assert_allclose(sampled[TINY.lead_in:, here], simulated[:, there], rtol=1e-6)
+    np.testing.assert_allclose(sampled[TINY.spin_up_steps:, here], simulated[:, there], rtol=1e-6)
 
 
 def test_learns_from_train_alone():
     with pytest.raises(ValueError, match=r"seeds must be of the split train.*dev:0"):
-        learned_inflow_prior(TINY, parse_seeds("dev:0-3"))
+        fit_prior_from_episodes(TINY, parse_seeds("dev:0-3"))
     with pytest.raises(ValueError, match="target must have an inflow, got"):
-        learned_inflow_prior(STATIONARY_TANK, [0])
+        fit_prior_from_episodes(STATIONARY_TANK, [0])
 
 
 def test_a_file_says_all(tmp_path):
@@ -218,17 +219,17 @@ def test_a_file_says_all(tmp_path):
     np.testing.assert_allclose(again.modes, prior().modes, rtol=1e-8)
     np.testing.assert_allclose(again.correlation, prior().correlation, rtol=1e-8)
     assert (again.link, again.time_step) == ("logarithm", prior().time_step)
-    assert suiting_priors(tmp_path, task(), "logarithm")
-    assert not suiting_priors(tmp_path, task(), "linear")
-    assert not suiting_priors(tmp_path, make_task(ROTATING_TANK), "logarithm")
+    assert compatible_priors(tmp_path, task(), "logarithm")
+    assert not compatible_priors(tmp_path, task(), "linear")
+    assert not compatible_priors(tmp_path, make_task(ROTATING_TANK), "logarithm")
 
 
 def test_an_inlet_that_hardly_differs_is_the_same():
     """Behind the obstacle's inlet, whose nodes lie nanometres beside the straight pipe's; not those of half a pipe."""
     shipped = InflowPrior.load(baseline_folder() / "priors" / "pipe2d-logarithm.json")
-    assert shipped.suits(make_task(PIPE_2D_OBSTACLE))
-    narrow = TINY.changed({"vessel": {"half_width": 0.04}})
-    assert not shipped.suits(make_task(narrow))
+    assert shipped.matches_task(make_task(PIPE_2D_OBSTACLE))
+    narrow = TINY.with_changes({"vessel": {"half_width": 0.04}})
+    assert not shipped.matches_task(make_task(narrow))
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{", '{"link": "linear"}', '{"link": 3}'])

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from eitbench.estimation import Filter, Observation, UnknownFlow, VelocityStates
+from eitbench.estimation import Filter, LinearMeasurement, VelocityPrior, VelocityStates
 from models import MESH, averages, coarse_transport, directions, shapes
 
 C_BH, N = 30.0, 147
@@ -27,7 +27,7 @@ def joint_filter(k=1, **changes):
     given = {"start": NOMINAL[:k], "start_std": STD[:k], "walk_std": np.full(k, 0.02), "profiles": shapes(k),
              "bounds": (0.01, 4.0), "mean": np.full(N, C_BH), "covariance": 50.0 * np.eye(N), "inflow": C_BH,
              "inflow_std": C_BH / 4, "nodal_noise": nodal_noise()} | changes
-    flow = UnknownFlow(transport_at, directions(k), *(given.pop(name) for name in (
+    flow = VelocityPrior(transport_at, directions(k), *(given.pop(name) for name in (
         "start", "start_std", "walk_std", "profiles", "bounds")))
     return Filter(VelocityStates(flow, **given))
 
@@ -47,8 +47,8 @@ def started(rng, k=3):
     for _ in range(3):
         filter_.predict()
         H = sensors(rng)
-        filter_.update(Observation(H, C_BH + rng.normal(size=16), np.full(16, 0.1)))
-    return filter_, Observation(sensors(rng), C_BH + rng.normal(size=16), np.full(16, 0.1))
+        filter_.update(LinearMeasurement(H, C_BH + rng.normal(size=16), np.full(16, 0.1)))
+    return filter_, LinearMeasurement(sensors(rng), C_BH + rng.normal(size=16), np.full(16, 0.1))
 
 
 def textbook_update(mean, P, observation, k):
@@ -121,7 +121,7 @@ def test_velocity_is_found(truth):
         c = transport.step(c, c[:7], C_BH + C_BH / 4 * rng.normal(size=7))
         H = sensors(rng)
         filter_.predict()
-        filter_.update(Observation(H, H @ c + 0.3 * rng.normal(size=16), np.full(16, 0.09)))
+        filter_.update(LinearMeasurement(H, H @ c + 0.3 * rng.normal(size=16), np.full(16, 0.09)))
     theta, variance = theta_of(filter_)
     miss, std = theta - truth, np.sqrt(variance)
     assert (np.abs(miss) < 3 * std).all()
@@ -158,7 +158,7 @@ def test_velocity_stays_within_its_bounds(k, far):
 
 @pytest.mark.parametrize(("changes", "name"), [
     ({"mean": np.zeros((N, 1))}, "^mean"), ({"covariance": np.eye(N - 1)}, "^covariance"),
-    ({"start": np.array([4.5, 0.0])}, "^start"), ({"start": np.array([np.nan])}, "^start"),
+    ({"start": np.array([4.5, 0.0])}, "^initial"), ({"start": np.array([np.nan])}, "^initial"),
     ({"inflow_std": -1.0}, "^inflow_std"), ({"nodal_noise": np.ones(N)}, "^nodal_noise"),
     ({"profiles": np.ones((5, 2))}, "^profiles"), ({"profiles": np.zeros((5, 1))}, "^profiles"),
     ({"bounds": (0.0, 5.0)}, "^bounds"), ({"bounds": (0.1, 0.9)}, "^bounds"), ({"bounds": (1.5, 2.0)}, "^bounds"),

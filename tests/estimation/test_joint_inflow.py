@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from eitbench.estimation import (
     Filter,
-    Observation,
-    UnknownFlow,
+    LinearMeasurement,
     VelocityInflowWindow,
+    VelocityPrior,
     VelocityStates,
-    asked_flow,
-    scaled_flow,
+    scaled_velocity_prior,
+    task_velocity_prior,
 )
 from eitbench.worlds.catalogue import PIPE_2D_SKEWED, STATIONARY_TANK_2D
 from eitbench.worlds.task import make_task
@@ -33,7 +33,7 @@ def transport_at(theta):
 
 def flow(std=(1.0, 2.0), walk=(0.05, 0.02)):
     """v = θ_1 v_1 + θ_2 v_2 with a mean of 4.5 m/s at first, which passes the pipe in 18 steps."""
-    return UnknownFlow(transport_at, DIRECTIONS, np.array([4.5, 0.0]), np.array(std), np.array(walk), shapes(2))
+    return VelocityPrior(transport_at, DIRECTIONS, np.array([4.5, 0.0]), np.array(std), np.array(walk), shapes(2))
 
 
 def started(belief, window, law=None):
@@ -59,7 +59,7 @@ def observations(count, seed=5, m=8):
     random = np.random.default_rng(seed)
     for _ in range(count):
         H = averages(MESH, random, m)
-        yield Observation(H, LEVEL + 3.0 * random.normal(size=m), np.full(m, 0.1))
+        yield LinearMeasurement(H, LEVEL + 3.0 * random.normal(size=m), np.full(m, 0.1))
 
 
 def near(actual, expected, part):
@@ -116,7 +116,7 @@ def test_a_white_inflow_gives_the_joint_filter():
                           *theta_of(each)])
         for ours, theirs in zip(*found, strict=True):
             near(ours, theirs, 1e-7)
-    assert np.linalg.norm(theta_of(filter_)[0] - belief.start) > 0.1
+    assert np.linalg.norm(theta_of(filter_)[0] - belief.initial) > 0.1
 
 
 @pytest.mark.parametrize("truth", [[3.4, 0.0], [5.0, 1.2]], ids=["slow", "skew"])
@@ -162,25 +162,25 @@ def test_velocity_stays_within_its_bounds():
 
 def test_flows_of_a_task():
     """What a task asks for is believed as it says; what it tells is the transport itself at a factor of 1."""
-    asked = asked_flow(make_task(PIPE_2D_SKEWED))
-    np.testing.assert_array_equal(asked.start, [4.5, 0.0, 0.0])
-    np.testing.assert_array_equal(asked.start_std, [1.0, 3.0, 1.0])
-    told = scaled_flow(task(), 0.3, 0.01)
+    asked = task_velocity_prior(make_task(PIPE_2D_SKEWED))
+    np.testing.assert_array_equal(asked.initial, [4.5, 0.0, 0.0])
+    np.testing.assert_array_equal(asked.initial_std, [1.0, 3.0, 1.0])
+    told = scaled_velocity_prior(task(), 0.3, 0.01)
     c = LEVEL + np.random.default_rng(0).normal(size=N)
     for factor in (1.0, 1.2):
         there = told.transport_at(np.array([factor])).step(c, LEVEL, LEVEL)
         near(there, transport_at([factor * 4.5, 0.0]).step(c, LEVEL, LEVEL), 1e-12)
-    assert (told.start_std, told.walk_std) == (0.3, 0.01)
+    assert (told.initial_std, told.walk_std) == (0.3, 0.01)
 
 
 def test_what_does_not_fit_is_told():
     with pytest.raises(ValueError, match="task must ask for the flow"):
-        asked_flow(task())
-    with pytest.raises(ValueError, match="task must have a flow, got AtRest"):
-        scaled_flow(make_task(STATIONARY_TANK_2D), 0.3, 0.0)
+        task_velocity_prior(task())
+    with pytest.raises(ValueError, match="task must have a flow, got StationaryTransport"):
+        scaled_velocity_prior(make_task(STATIONARY_TANK_2D), 0.3, 0.0)
     with pytest.raises(ValueError, match="walk_std"):
         flow(walk=(0.1,))
-    with pytest.raises(ValueError, match=r"profiles must give a positive velocity with start, got -4\.5"):
+    with pytest.raises(ValueError, match=r"profiles must give a positive velocity with initial, got -4\.5"):
         replace(flow(), profiles=-np.ones((3, 2)))
     with pytest.raises(ValueError, match="window"):
         started(flow(), 0)

@@ -6,10 +6,10 @@ import pytest
 from eitbench.estimation import (
     DenseCovariance,
     Filter,
+    LinearMeasurement,
     LogStates,
     Motion,
     NodalStates,
-    Observation,
     fixed_interval_smoother,
     kalman_filter,
 )
@@ -74,7 +74,7 @@ def test_extended_filter(logarithm):
 
     def forward(point, voltages, current):
         computed, slope = (array[0] for array in seen.linearise(point, current[None]))
-        return Observation(slope, voltages - computed + slope @ point, np.full(electrodes, std**2))
+        return LinearMeasurement(slope, voltages - computed + slope @ point, np.full(electrodes, std**2))
 
     ours = Filter(LogStates(states, 2.0) if logarithm else states, forward)
     steps = []

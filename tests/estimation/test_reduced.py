@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import scipy.linalg
-from eitbench.estimation import Observation, kalman_filter
+from eitbench.estimation import LinearMeasurement, kalman_filter
 from eitbench.estimation.reduced import ReducedFilter, ReducedModel, SteadyStates, reduced_model
 from models import LinearGaussian, dense_filter, draw, random_design, random_model
 
@@ -19,7 +19,7 @@ def world():
     return model, [draw(model, random_design(rng, 14, 9), rng)[1] for _ in range(3)]
 
 
-def run(filter_: ReducedFilter, records: list[list[Observation]]):
+def run(filter_: ReducedFilter, records: list[list[LinearMeasurement]]):
     """Means (T, B, r), covariances, innovations and their variances of records side by side."""
     steps = []
     for t in range(len(records[0])):
@@ -75,7 +75,7 @@ def test_in_all_directions_it_is_the_full_filter(world):
     assert_close(basis.T @ mass @ basis, np.eye(14), 1e-10)
     assert np.abs(np.tril(reduced.transition, -2)).max() == 0.0
     filter_ = ReducedFilter(SteadyStates(reduced), 1)
-    projected = [Observation(H @ basis, value, variance) for H, value, variance, _ in record]
+    projected = [LinearMeasurement(H @ basis, value, variance) for H, value, variance, _ in record]
     means, covariances, _, _ = run(filter_, [projected])
     for t, step in enumerate(kalman_filter(model.filter(), record)):
         assert_close(basis @ means[t, 0], step.mean, 1e-8)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from eitbench.estimation.reduced import ReducedFilter
-from eitbench.estimation.reduced_joint import JointStates, JointTables, joint_model
+from eitbench.estimation.reduced_joint import JointStates, TransitionSplines, joint_model
 
 
 @pytest.fixture(scope="module")
@@ -26,22 +26,22 @@ def model():
 def test_tables_are_galerkins_projection(model):
     """At velocities between those of the table, and with derivatives that are those of finite differences."""
     made, basis, mass, step = model
-    tables, theta, small = JointTables(made), np.array([1.0, 2.3, 4.4, 5.9]), 1e-5
-    A, slope, W = tables.at(theta)
+    tables, theta, small = TransitionSplines(made), np.array([1.0, 2.3, 4.4, 5.9]), 1e-5
+    A, slope, W = tables.evaluate(theta)
     for k, velocity in enumerate(theta):
         F, noise = step(velocity)
         np.testing.assert_allclose(A[k], basis.T @ mass @ F @ basis, atol=1e-12)
         np.testing.assert_allclose(W[k], basis.T @ mass @ noise @ mass @ basis, atol=1e-10)
     inner = theta[1:]
-    difference = (tables.at(inner + small)[0] - tables.at(inner - small)[0]) / (2 * small)
+    difference = (tables.evaluate(inner + small)[0] - tables.evaluate(inner - small)[0]) / (2 * small)
     np.testing.assert_allclose(slope[1:], difference, atol=1e-8)
-    for a, b in zip(tables.at(np.array([0.0, 9.0])), tables.at(made.velocities[[0, -1]]), strict=True):
+    for a, b in zip(tables.evaluate(np.array([0.0, 9.0])), tables.evaluate(made.velocities[[0, -1]]), strict=True):
         np.testing.assert_array_equal(a, b)                # beyond the table as at its ends
 
 
 def test_filter_is_the_textbooks(model):
     """Means and covariances are those of a dense joint EKF, written out here, for each of three records."""
-    tables, rng, walk, bounds = JointTables(model[0]), np.random.default_rng(1), 0.3, (2.5, 4.5)
+    tables, rng, walk, bounds = TransitionSplines(model[0]), np.random.default_rng(1), 0.3, (2.5, 4.5)
     mean = np.column_stack([rng.normal(size=(3, 5)), [3.0, 4.0, 4.4]])
     roots = rng.normal(size=(3, 6, 6))
     covariance = roots @ np.swapaxes(roots, 1, 2)
@@ -54,7 +54,7 @@ def test_filter_is_the_textbooks(model):
         innovation = residual - (matrix @ ours.mean[:, :5, None])[..., 0]
         predicted, accepted = ours.update(ours.states.jacobian(ours.mean, matrix), innovation, variance)
         for b in range(3):
-            A, slope, W = (part[0] for part in tables.at(x[b, -1:]))
+            A, slope, W = (part[0] for part in tables.evaluate(x[b, -1:]))
             J, Q = np.eye(6), np.zeros((6, 6))
             J[:5, :5], J[:5, 5] = A, slope @ x[b, :5]
             Q[:5, :5], Q[5, 5] = W, walk**2

@@ -5,10 +5,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from eitbench.estimation import LinearisedObservations, smoothness_covariance, starting_filter
+from eitbench.estimation import LinearisedForwardModel, nodal_filter, smoothness_covariance
 from eitbench.numerics.fem import mass_matrix, stiffness_matrix
 from eitbench.numerics.mesh import rectangle_mesh
-from eitbench.numerics.round import uniform_disc
+from eitbench.numerics.round_meshes import uniform_disc
 from eitbench.worlds.bodies import disc_indicator
 from eitbench.worlds.catalogue import STATIONARY_TANK_2D
 from eitbench.worlds.task import make_task
@@ -101,8 +101,8 @@ def frame():
 def filtered(order):
     """Mean and covariance (full) of the filter with F = I after the injections of this order."""
     task, voltages = frame()
-    filter_ = starting_filter(task.transport, task.prior, C_BH)
-    observe = LinearisedObservations(task.observation, task.noise, np.full(task.mesh.n_nodes, C_BH))
+    filter_ = nodal_filter(task.transport, task.prior, C_BH)
+    observe = LinearisedForwardModel(task.observation, task.noise, np.full(task.mesh.n_nodes, C_BH))
     for k in order:
         filter_.predict()
         filter_.update(observe(voltages[k], task.currents[k]))

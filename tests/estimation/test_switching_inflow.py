@@ -1,18 +1,19 @@
 """The filter of two regimes against exhaustive enumeration of what may have come when; and what is learned of them."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from eitbench.estimation import (
     Filter,
     InflowPrior,
-    Observation,
+    LinearMeasurement,
     ParticleInflowFilter,
     Regimes,
     SwitchingInflowFilter,
-    about_prediction,
     fit_inflow_prior,
+    linearise_at_prediction,
 )
 from eitbench.estimation.switching_inflow import resample
 from models import tiny_task as task
@@ -30,7 +31,7 @@ def prior(begins, ends):
 
 
 def switching(begins, ends):
-    return SwitchingInflowFilter(task(), prior(begins, ends), LEVEL, 0.03, about_prediction(task()))
+    return SwitchingInflowFilter(task(), prior(begins, ends), LEVEL, 0.03, linearise_at_prediction(task()))
 
 
 def observations(count, slug=2.5):
@@ -40,7 +41,7 @@ def observations(count, slug=2.5):
     for t in range(count):
         H = np.exp(-0.5 * ((x - random.uniform(0.0, 0.2, (ROWS, 1))) / 0.05)**2)
         H /= H.sum(axis=1, keepdims=True)
-        yield Observation(H, LEVEL + (slug if t >= 2 else 0.0) + 0.5 * random.standard_normal(ROWS),
+        yield LinearMeasurement(H, LEVEL + (slug if t >= 2 else 0.0) + 0.5 * random.standard_normal(ROWS),
                           np.full(ROWS, 0.25))
 
 
@@ -49,19 +50,19 @@ def enumerated(filter_, regimes, measured):
     regimes with a textbook Kalman filter of its own, from the same beginning, weighed by its prior and its fit."""
     quiet, _ = filter_.filters
     space = quiet.space
-    W, r = space.window, space.modes
+    W, r = space.window_steps, space.n_modes
     basis, weights = space.response()
     # (n, W·r) what the window makes of itself, by the response's own columns
     G = LEVEL * basis @ np.tensordot(weights, space.prior.modes, 1).reshape(len(weights), -1)
     G = np.concatenate([G, np.zeros((len(G), (W - weights.shape[1]) * r))], axis=1)
     steps = []
-    for move, variance in (each.space.regression for each in filter_.filters):
+    for move, variance in (each.space.ar_model for each in filter_.filters):
         A = np.eye(W * r, k=-r)
         A[:r] = np.concatenate([np.diag(row) for row in np.broadcast_to(move, (W, r))], axis=1)
         Q = np.zeros((W * r, W * r))
         Q[:r, :r] = np.diag(variance)
         steps.append((A, Q))
-    chain = [[1 - regimes.begins, regimes.begins], [regimes.ends, 1 - regimes.ends]]
+    chain = [[1 - regimes.p_onset, regimes.p_onset], [regimes.p_end, 1 - regimes.p_end]]
     start = [1 - regimes.share, regimes.share]
     found = []
     for sequence in itertools.product([0, 1], repeat=len(measured) + 1):
@@ -138,30 +139,30 @@ def test_regimes_are_counted():
     """Four quiet steps, then two of a slug, again and again: of 4 quiet steps 1 is followed by a slug."""
     u = np.tile([0.0, 0.001, -0.001, 0.0, 0.2, 0.4], 12)[:-1]
     ratios = np.exp(u)[None, :, None] * np.ones((1, 1, 3))
-    found = fit_inflow_prior(ratios, np.zeros((3, 2)), 0.005, quiet=0.02).regimes
-    assert found.begins == pytest.approx(1 / 4)
-    assert found.ends == pytest.approx(1 / 2)
+    found = fit_inflow_prior(ratios, np.zeros((3, 2)), 0.005, quiet_threshold=0.02).regimes
+    assert found.p_onset == pytest.approx(1 / 4)
+    assert found.p_end == pytest.approx(1 / 2)
     slugs = (12 * 0.2**2 + 11 * 0.4**2) / 23
-    assert found.quiet == pytest.approx(0.5e-6 / slugs)
-    assert found.share == pytest.approx(found.begins / (found.begins + found.ends))
+    assert found.quiet_variance_ratio == pytest.approx(0.5e-6 / slugs)
+    assert found.share == pytest.approx(found.p_onset / (found.p_onset + found.p_end))
 
 
 def test_mistakes_are_told(tmp_path):
     with pytest.raises(ValueError, match="prior must have regimes"):
-        SwitchingInflowFilter(task(), InflowPrior("linear", prior(0.1, 0.1).points, prior(0.1, 0.1).modes, np.ones(1),
-                                                  task().transport.time_step), LEVEL, 0.1, about_prediction(task()))
+        plain = replace(prior(0.1, 0.1), correlation=np.ones(1), regimes=None)
+        SwitchingInflowFilter(task(), plain, LEVEL, 0.1, linearise_at_prediction(task()))
     with pytest.raises(ValueError, match="level_std must be"):
-        SwitchingInflowFilter(task(), prior(0.1, 0.1), LEVEL, 0.0, about_prediction(task()))
-    with pytest.raises(ValueError, match="begins must be"):
+        SwitchingInflowFilter(task(), prior(0.1, 0.1), LEVEL, 0.0, linearise_at_prediction(task()))
+    with pytest.raises(ValueError, match="p_onset must be"):
         Regimes(0.0, 0.1, 0.1)
-    with pytest.raises(ValueError, match="quiet must be a size that some steps exceed"):
-        fit_inflow_prior(np.full((1, 40, 3), 1.1), np.zeros((3, 2)), 0.005, quiet=0.01)
+    with pytest.raises(ValueError, match="quiet_threshold must be exceeded in some steps only"):
+        fit_inflow_prior(np.full((1, 40, 3), 1.1), np.zeros((3, 2)), 0.005, quiet_threshold=0.01)
     prior(0.1, 0.2).save(tmp_path / "a.json")
     assert InflowPrior.load(tmp_path / "a.json").regimes == Regimes(0.1, 0.2, 1e-3)
 
 
 def particles(begins, ends, count=8):
-    return ParticleInflowFilter(task(), prior(begins, ends), LEVEL, 0.03, about_prediction(task()), count,
+    return ParticleInflowFilter(task(), prior(begins, ends), LEVEL, 0.03, linearise_at_prediction(task()), count,
                                 np.random.default_rng(0))
 
 
@@ -231,6 +232,6 @@ def test_missing_readings_are_fewer_readings(make):
         lost.predict()
         lost.update(seen._replace(value=np.where(keep, seen.value, np.nan)))
         fewer.predict()
-        fewer.update(Observation(seen.matrix[keep], seen.value[keep], seen.noise_variance[keep]))
+        fewer.update(LinearMeasurement(seen.matrix[keep], seen.value[keep], seen.noise_variance[keep]))
     np.testing.assert_allclose(lost.probabilities, fewer.probabilities, rtol=1e-9)
     np.testing.assert_allclose(lost.estimate().mean, fewer.estimate().mean, rtol=1e-9)

@@ -4,7 +4,15 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from eitbench.estimation import DenseCovariance, Filter, LogStates, Motion, NodalStates, Observation, UnscentedFilter
+from eitbench.estimation import (
+    DenseCovariance,
+    Filter,
+    LinearMeasurement,
+    LogStates,
+    Motion,
+    NodalStates,
+    UnscentedFilter,
+)
 from eitbench.estimation.unscented import moments
 from models import QuadraticModel, random_model
 
@@ -22,7 +30,7 @@ def test_linear_voltages_are_the_kalman_filter():
     model = random_model(rng, N)
     table = rng.normal(size=(L, L, N))
     ours = UnscentedFilter(states(model), lambda c: np.einsum("lmj,kj->klm", table, c), NOISE, np.eye(N), N)
-    theirs = Filter(states(model), lambda point, voltages, currents: Observation(
+    theirs = Filter(states(model), lambda point, voltages, currents: LinearMeasurement(
         np.einsum("lmj,m->lj", table, currents), voltages, np.full(L, 9.0)))
     for _ in range(T):
         voltages, currents = 30.0 * rng.normal(size=L), rng.normal(size=L)
@@ -57,7 +65,7 @@ def test_nearer_to_the_true_moments_than_linearising(std):
     currents = rng.normal(size=L)
     samples = np.exp(rng.standard_normal((400_000, n)) @ spread.T)**2 @ (seen.T @ currents)
     ours = UnscentedFilter(LogStates(start, 1.0), lambda c: np.einsum("kj,jlm->klm", c**2, seen.T), NOISE, np.eye(n), n)
-    linear = Filter(LogStates(start, 1.0), lambda point, voltages, currents: Observation(
+    linear = Filter(LogStates(start, 1.0), lambda point, voltages, currents: LinearMeasurement(
         seen.linearise(point, currents[None])[1][0], voltages - (seen.T @ currents).sum(axis=0)
         + seen.linearise(point, currents[None])[1][0] @ point, np.full(L, 9.0)))
     errors = []

@@ -4,11 +4,11 @@ from tanks import VESSEL, moving
 
 
 @pytest.fixture(scope="session")
-def record():
-    """A body that moves half round the tank."""
+def measurements():
+    """An inclusion that moves half round the tank."""
     return moving(frames=6)
 
 
 @pytest.fixture(scope="session")
-def env(record):
-    return MeasuredEnv(record, VESSEL, withheld=0.15)
+def env(measurements):
+    return MeasuredEnv(measurements, VESSEL, withheld=0.15)

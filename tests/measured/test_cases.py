@@ -1,4 +1,4 @@
-"""Measured cases: environment ids with records and a board, whose data are elsewhere."""
+"""Measured cases: environment ids, records and a leaderboard of data that users download."""
 
 import json
 import shutil
@@ -15,18 +15,18 @@ from eitbench.measured.cases import CASES, case_id, file_sha256, read_case
 from eitbench.measured.segmentation import ktc_score
 from eitbench.report.site.measured import Measured
 from scipy.io import savemat
-from tanks import VESSEL, moving, still
+from tanks import VESSEL, moving, stationary
 
 from commands import eitbench
 from tiny import record, write_baseline
 
-TEXTS = {"title": "A body moved round", "file": "moving.h5", "licence": "CC0", "source": "our simulator"}
+TEXTS = {"title": "A body moved round", "file": "moving.h5", "licence": "CC0", "source": "simulator"}
 ID = "eitbench/Measured-moving-v0"
 DIGESTS = {
     "iirc": "126193ab", "kit4-2.3": "4a810db8", "kit4-4.1": "b11a1403", "kit4-4.4": "63f64778",
     "ktc-1": "85e6dd58", "ktc-2": "46ab58db", "ktc-3": "563afdd8", "ktc-4": "e39f6c37",
     "montreal": "2264d525", "sciospec-13.19.50": "bac82c37", "sciospec-13.21.48": "40e35de3"}
-"""Beginning of the digest of each built-in case: other entries are another version of its id."""
+"""First digits of the digest of each built-in case: other entries require a new version of its id."""
 
 
 def write_case(path, data, **changes):
@@ -37,7 +37,7 @@ def write_case(path, data, **changes):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A folder of data with a file, and its registered case."""
+    """Folder with a data file, and its registered case."""
     path = tmp_path_factory.mktemp("measured")
     case = write_case(path / "moving.yml", moving(frames=3).save(path / "moving.h5"))
     gym.register(ID, entry_point=tracks.MEASURED, kwargs={"case": str(case)})
@@ -47,7 +47,7 @@ def folder(tmp_path_factory):
     gym.registry.pop(ID)
 
 
-def test_built_in_cases_are_ids_beside_the_suites():
+def test_built_in_cases_are_ids_outside_the_suites():
     assert {case_id(name) for name in DIGESTS} == set(tracks.measured_ids())
     assert {path.stem for path in CASES.glob("*.yml")} == set(DIGESTS)
     assert not set(tracks.measured_ids()) & set(tracks.ids())
@@ -55,7 +55,7 @@ def test_built_in_cases_are_ids_beside_the_suites():
 
 
 def test_missing_data_are_named(tmp_path, monkeypatch):
-    """By gymnasium.make and by `run`: which file, from where, and where to save it."""
+    """`gymnasium.make` and `run` name the file, its source, and where to save it."""
     monkeypatch.setenv("EITBENCH_MEASURED", str(tmp_path))
     case = read_case("iirc")
     with pytest.raises(ValueError, match=rf"iirc_data_2006\.mat with sha256 {case.sha256}, from .*eidors") as caught:
@@ -64,15 +64,16 @@ def test_missing_data_are_named(tmp_path, monkeypatch):
     code, _, err = eitbench("run", "--env", "eitbench/Measured-iirc-v0", "--baseline", "homogeneous",
                             "--out", tmp_path / "out")
     assert code == 2
-    assert "needs a file that is not here: iirc_data_2006.mat" in err
+    assert "requires the file iirc_data_2006.mat" in err
 
 
 def test_other_data_are_rejected(folder):
-    """Also a file that the reader takes from the same folder, and one given by the user."""
+    """Auxiliary files and the user's `file` are checked too."""
     (folder / "ref.mat").write_bytes(b"empty tank")
-    path = write_case(folder / "a.yml", folder / "moving.h5", beside={"ref.mat": file_sha256(folder / "ref.mat")})
+    path = write_case(folder / "a.yml", folder / "moving.h5",
+                      auxiliary_files={"ref.mat": file_sha256(folder / "ref.mat")})
     assert case_env(path).measurements.currents.shape == (8, 8)
-    (folder / "ref.mat").write_bytes(b"a body in it")
+    (folder / "ref.mat").write_bytes(b"not empty")
     with pytest.raises(ValueError, match=r"ref\.mat must have the sha256"):
         case_env(path)
     other = moving(frames=4).save(folder / "other.h5")
@@ -80,18 +81,19 @@ def test_other_data_are_rejected(folder):
         gym.make(ID, file=other)
 
 
-def test_a_span_is_another_case(folder):
+def test_a_span_changes_the_digest(folder):
     whole = read_case(folder / "moving.yml")
     part = read_case(write_case(folder / "part.yml", folder / "moving.h5", span=[8, 24]))
     assert part.digest != whole.digest
-    np.testing.assert_array_equal(part.measurements().readings, whole.measurements().readings[8:24])
+    np.testing.assert_array_equal(part.measurements().voltages, whole.measurements().voltages[8:24])
 
 
 @pytest.mark.parametrize(("change", "message"), [
     ({"licence": ""}, "case.licence"), ({"sha256": "abc"}, "case.sha256"), ({"vessel": 3}, "case.vessel"),
-    ({"frames": 3}, "case has no frames"), ({"beside": {"ref.mat": "1"}}, "case.ref.mat"),
+    ({"frames": 3}, "case must have entries of .*, got frames"),
+    ({"auxiliary_files": {"ref.mat": "1"}}, "case.ref.mat"),
     ({"span": "0:800"}, r"case\.span must be two increasing numbers"), ({"span": [5, 5]}, r"case\.span")])
-def test_bad_entries_are_named(folder, change, message):
+def test_invalid_entries_are_named(folder, change, message):
     with pytest.raises(ValueError, match=message):
         read_case(write_case(folder / "a.yml", folder / "moving.h5", **change))
 
@@ -105,7 +107,7 @@ def test_unknown_and_incomplete_cases_are_named(tmp_path):
 
 
 def test_run_shows_the_withheld_rmse(folder):
-    """In place of ẽ_c, which measurements do not have."""
+    """The table has the withheld RMSE instead of ẽ_c."""
     code, output, err = eitbench("run", "--env", ID, "--baseline", "homogeneous", "--seeds", "test:0-1", "--jobs", 1,
                                  "--out", folder / "out")
     assert code == 0, err
@@ -120,8 +122,8 @@ def test_run_shows_the_withheld_rmse(folder):
 @pytest.fixture(scope="module")
 def submitted(folder):
     """Records of a naive baseline and of a third-party method."""
-    mine = write_baseline(folder, "mine", update="return Estimate(1.1 * self.level)")
-    for method in ("homogeneous", mine):
+    method_file = write_baseline(folder, "mine", update="return Estimate(1.1 * self.level)")
+    for method in ("homogeneous", method_file):
         code, _, err = eitbench("submit", "--env", ID, "--baseline", method, "--to", folder / "results",
                                 "--out", folder / "store", "--jobs", 1)
         assert code == 0, err
@@ -130,18 +132,18 @@ def submitted(folder):
 
 @pytest.fixture
 def results(submitted, tmp_path):
-    """A copy of the records, to be changed."""
+    """Copy of the records that a test may change."""
     return shutil.copytree(submitted, tmp_path / "results")
 
 
-def of(results, method):
+def record_path(results, method):
     (path,) = results.glob(f"eitbench-Measured-moving-v0--{method}--*.json")
     return path
 
 
 def test_submit_writes_records_with_the_scores_of_a_run(results):
-    """Five episodes that withhold different readings; `verify` repeats them, and boards of worlds ignore them."""
-    written = read_record(of(results, "homogeneous"))
+    """Five episodes withhold different measurements; `verify` reruns them, and leaderboards of worlds ignore them."""
+    written = read_record(record_path(results, "homogeneous"))
     assert written["seeds"] == [f"test:{k}" for k in range(5)]
     env = gym.make(ID).unwrapped
     for k, episode in enumerate(written["episodes"][:2]):
@@ -151,7 +153,7 @@ def test_submit_writes_records_with_the_scores_of_a_run(results):
     assert written["role"] == "floor"
     assert not written["official"]
     assert read_records(results) == []
-    path = of(results, "homogeneous")
+    path = record_path(results, "homogeneous")
     assert eitbench("verify", path, "--episodes", 1, "--seed", 3)[0] == 0
     for episode in written["episodes"]:
         episode["scores"]["prediction_error"] *= 0.999
@@ -161,10 +163,10 @@ def test_submit_writes_records_with_the_scores_of_a_run(results):
     assert "prediction_error" in err
 
 
-def test_the_board_shows_records(results):
-    """On the site and as text; titles are escaped, and an invalid file is left out and named."""
-    mine = read_record(of(results, "mine")) | {"title": "<b>mine</b>"}
-    of(results, "mine").write_text(json.dumps(sealed(mine)), "utf-8")
+def test_the_leaderboard_shows_records(results):
+    """The site and the text show them; titles are escaped, and an invalid file is omitted and named."""
+    mine = read_record(record_path(results, "mine")) | {"title": "<b>mine</b>"}
+    record_path(results, "mine").write_text(json.dumps(sealed(mine)), "utf-8")
     write_record(results, record("homogeneous", [0.2, 0.3], role="floor"))
     assert eitbench("leaderboard", "--records", results)[0] == 0
     folder = results.parent
@@ -173,9 +175,9 @@ def test_the_board_shows_records(results):
     assert "&lt;b&gt;mine&lt;/b&gt;" in page
     assert "<b>mine" not in page
     text = (folder / "leaderboard.md").read_text("utf-8")
-    scores = [each["scores"]["prediction_error"] for each in read_record(of(results, "homogeneous"))["episodes"]]
+    path = record_path(results, "homogeneous")
+    scores = [each["scores"]["prediction_error"] for each in read_record(path)["episodes"]]
     assert f"{np.mean(scores):.3g}" in text[text.index("## measured"):]
-    path = of(results, "homogeneous")
     path.write_text(path.read_text("utf-8").replace('"official": false', '"official": true'), "utf-8")
     measured = Measured.of(folder)
     assert [each["method"] for each in measured.records["moving"]] == ["mine"]
@@ -186,7 +188,7 @@ def test_a_case_with_a_truth_has_the_ktc_score(folder):
     truth = np.zeros((256, 256), dtype=int)
     truth[100:150, 180:230] = 1
     savemat(folder / "truth.mat", {"truth": truth})
-    data = still().save(folder / "still.h5")
+    data = stationary().save(folder / "still.h5")
     case = write_case(folder / "still.yml", data, file="still.h5",
                       truth={"file": "truth.mat", "sha256": file_sha256(folder / "truth.mat")})
     env = case_env(case)
@@ -197,9 +199,9 @@ def test_a_case_with_a_truth_has_the_ktc_score(folder):
         run_on_measurements(env, "homogeneous").outcome(env)
 
 
-def test_tables_are_those_by_hand():
+def test_tables_equal_a_computation_by_hand():
     """Order by the mean withheld RMSE; relative to naive baselines by the geometric mean of a method's cases."""
-    def said(method, values, role=None):
+    def record_of(method, values, role=None):
         episodes = [{"seed": f"test:{k}", "status": "ok",
                      "scores": {"prediction_error": value, "seconds_per_step": 0.01}}
                     for k, value in enumerate(values)]
@@ -208,8 +210,8 @@ def test_tables_are_those_by_hand():
 
     cases = {name: read_case(name) for name in ("iirc", "montreal")}
     measured = Measured(cases, {
-        "iirc": [said("good", [1.0, 2.0, 3.0]), said("naive", [8.0], "floor")],
-        "montreal": [said("good", [1.0]), said("late", [3.0]), said("naive", [4.0], "floor")]}, [])
+        "iirc": [record_of("good", [1.0, 2.0, 3.0]), record_of("naive", [8.0], "floor")],
+        "montreal": [record_of("good", [1.0]), record_of("late", [3.0]), record_of("naive", [4.0], "floor")]}, [])
     assert [[cell.plain for cell in row.cells] for row in measured.case_table("iirc").rows] == [
         ["good good@v1", "2 1 to 3", "10"], ["naive naive@v1 (floor)", "8 8 to 8", "10"]]
     rows = [[cell.plain for cell in row.cells] for row in measured.all_cases_table().rows]
@@ -221,12 +223,12 @@ def test_tables_are_those_by_hand():
 PHOTOGRAPHS = {
     "kit4-2.3": [(0.063, 0.053, 1), (0.0355, -0.056, 1)], "kit4-4.1": [(-0.009, 0.091, 1), (0.040, -0.035, -1)],
     "kit4-4.4": [(0.069, -0.004, 1), (0.021, -0.057, -1)]}
-"""Centroids of bodies in m, read off photographs of the water's surface to about 2 mm; 1 is conductive."""
+"""Centroids of inclusions in m, read off photographs of the water's surface to about 2 mm; 1 is conductive."""
 
 
 @pytest.mark.parametrize("name", PHOTOGRAPHS)
-def test_real_bodies_are_where_photographs_show_them(name):
-    """Within 1 cm, in a tank of 28 cm; the public files are in $EITBENCH_MEASURED."""
+def test_inclusions_are_located_as_in_photographs(name):
+    """The centroid error is less than 1 cm in a tank of 28 cm; requires public files in $EITBENCH_MEASURED."""
     from scipy.ndimage import center_of_mass, label
     try:
         env = case_env(name)
@@ -237,8 +239,8 @@ def test_real_bodies_are_where_photographs_show_them(name):
     inside = x**2 + y**2 < 0.139**2
     field = np.zeros_like(x)
     field[inside] = env.task.mesh.interpolation_to(np.stack([x[inside], y[inside]], axis=1)) @ estimate
-    for at_x, at_y, sign in PHOTOGRAPHS[name]:
-        near = np.hypot(x - at_x, y - at_y) < 0.02
-        parts, _ = label(sign * field > 0.5 * (sign * field)[near].max())
-        row, column = center_of_mass(parts == np.bincount(parts[near & (parts > 0)]).argmax())
-        assert np.linalg.norm(-0.14 + 0.002 * np.array([column, row]) - [at_x, at_y]) < 0.01
+    for x_true, y_true, sign in PHOTOGRAPHS[name]:
+        near = np.hypot(x - x_true, y - y_true) < 0.02
+        labels, _ = label(sign * field > 0.5 * (sign * field)[near].max())
+        row, column = center_of_mass(labels == np.bincount(labels[near & (labels > 0)]).argmax())
+        assert np.linalg.norm(-0.14 + 0.002 * np.array([column, row]) - [x_true, y_true]) < 0.01

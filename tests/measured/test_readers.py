@@ -1,4 +1,4 @@
-"""Readers, on files of each format written here, and on real ones where there are some."""
+"""Readers on generated files of each format, and on public files where present."""
 
 import numpy as np
 import pytest
@@ -12,41 +12,41 @@ VALUES = np.random.default_rng(0).normal(size=(8, 8))
 
 
 def test_ktc(tmp_path):
-    """Columns are injections and patterns, readings stand injection by injection, in mA and V."""
-    ours = {"Inj": 1e3 * CURRENTS.T, "Mpat": MATRIX.T}
-    savemat(tmp_path / "data1.mat", ours | {"Uel": VALUES.reshape(-1, 1)})
-    empty = {"Injref": ours["Inj"], "Mpat": ours["Mpat"], "Uelref": 2 * VALUES.reshape(-1, 1)}
+    """Columns are injections and patterns; voltages are in the order of injections, in mA and V."""
+    patterns = {"Inj": 1e3 * CURRENTS.T, "Mpat": MATRIX.T}
+    savemat(tmp_path / "data1.mat", patterns | {"Uel": VALUES.reshape(-1, 1)})
+    empty = {"Injref": patterns["Inj"], "Mpat": patterns["Mpat"], "Uelref": 2 * VALUES.reshape(-1, 1)}
     savemat(tmp_path / "ref.mat", empty)
-    record = read(tmp_path / "data1.mat")
-    np.testing.assert_allclose(record.currents, CURRENTS, atol=1e-15)
-    np.testing.assert_array_equal(record.matrix, MATRIX)
-    np.testing.assert_array_equal(record.readings, VALUES)
-    np.testing.assert_array_equal(record.reference, 2 * VALUES[None])
-    assert len(record.source["sha256"]) == 64
+    measurements = read(tmp_path / "data1.mat")
+    np.testing.assert_allclose(measurements.currents, CURRENTS, atol=1e-15)
+    np.testing.assert_array_equal(measurements.matrix, MATRIX)
+    np.testing.assert_array_equal(measurements.voltages, VALUES)
+    np.testing.assert_array_equal(measurements.reference, 2 * VALUES[None])
+    assert len(measurements.source["sha256"]) == 64
 
 
 def test_kit4(tmp_path):
-    """A column of readings an injection."""
+    """Each column has the voltages of an injection."""
     savemat(tmp_path / "datamat_2_1.mat", {
         "CurrentPattern": 1e3 * CURRENTS.T, "MeasPattern": MATRIX[:5].T, "Uel": VALUES[:, :5].T})
-    record = read(tmp_path / "datamat_2_1.mat")
-    np.testing.assert_array_equal(record.readings, VALUES[:, :5])
-    assert record.reference is None
+    measurements = read(tmp_path / "datamat_2_1.mat")
+    np.testing.assert_array_equal(measurements.voltages, VALUES[:, :5])
+    assert measurements.reference is None
 
 
 def test_eidors(tmp_path):
-    """256 numbers a frame; those on electrodes that inject are missing."""
+    """A frame has 256 numbers; measurements with an injecting electrode are missing."""
     frames = np.random.default_rng(1).uniform(1, 2, (256, 3))
     savemat(tmp_path / "tank.mat", {"v_rotate": frames, "v_reference": frames[:, :1]})
-    record = read(tmp_path / "tank.mat")
-    assert record.readings.shape == (48, 16)
-    assert np.isnan(record.readings[17, [0, 1, 2]]).all()
-    assert record.readings[17, 5] == -frames[16 + 5, 1]
-    assert record.reference.shape == (1, 16, 16)
+    measurements = read(tmp_path / "tank.mat")
+    assert measurements.voltages.shape == (48, 16)
+    assert np.isnan(measurements.voltages[17, [0, 1, 2]]).all()
+    assert measurements.voltages[17, 5] == -frames[16 + 5, 1]
+    assert measurements.reference.shape == (1, 16, 16)
 
 
 def eit_file(path, potentials, *, second=0.0):
-    """A frame as Sciospec's instrument writes it: peak amplitude 5 mA, neighbours."""
+    """Write a Sciospec frame: peak amplitude 5 mA, adjacent electrodes."""
     L = potentials.shape[1]
     header = ["18", "2", path.stem, f"2025.02.12. 13:19:{second:06.3f}", "10000.0", "10000.0", "1",
               "1", "0.005", "20.0", "0.0", "1.0", "1", "1", "1", "1",
@@ -61,17 +61,17 @@ def eit_file(path, potentials, *, second=0.0):
 
 
 def test_sciospec(tmp_path):
-    """Real parts against their mean; frames in order."""
+    """Voltages are real parts relative to their mean; frames are in order."""
     values = np.random.default_rng(2).normal(size=(3, 8, 8)) * (1 + 0.1j)
     for f, frame in enumerate(values):
         eit_file(tmp_path / f"setup_0000{f}.eit", frame, second=0.05 * f)
-    record = read(tmp_path)
-    np.testing.assert_allclose(record.currents, 5 * CURRENTS)
+    measurements = read(tmp_path)
+    np.testing.assert_allclose(measurements.currents, 5 * CURRENTS)
     expected = values.real - values.real.mean(axis=2, keepdims=True)
-    np.testing.assert_allclose(record.readings, expected.reshape(-1, 8))
-    np.testing.assert_allclose(record.times[[0, 8, 16]], [0.0, 0.05, 0.1], atol=1e-6)
+    np.testing.assert_allclose(measurements.voltages, expected.reshape(-1, 8))
+    np.testing.assert_allclose(measurements.times[[0, 8, 16]], [0.0, 0.05, 0.1], atol=1e-6)
     one = read(tmp_path / "setup_00001.eit")
-    np.testing.assert_allclose(one.readings, expected[1])
+    np.testing.assert_allclose(one.voltages, expected[1])
 
 
 def test_truncated_frame_is_named(tmp_path):
@@ -97,43 +97,43 @@ def table(path, *, decimal=".", separator=","):
 
 
 def test_table(tmp_path):
-    """Of potentials in mV, described by two lines beside it, or by arguments."""
-    table(tmp_path / "readings.csv")
-    (tmp_path / "readings.yml").write_text("electrodes: 8\ncurrent: 0.001\nunit: 0.001\n",
+    """A table of potentials in mV is described by a YAML file or by arguments."""
+    table(tmp_path / "tank.csv")
+    (tmp_path / "tank.yml").write_text("electrodes: 8\ncurrent: 0.001\nunit: 0.001\n",
                                            encoding="utf-8")
-    record = read(tmp_path / "readings.csv")
-    np.testing.assert_allclose(record.currents, CURRENTS)
-    np.testing.assert_allclose(record.readings,
+    measurements = read(tmp_path / "tank.csv")
+    np.testing.assert_allclose(measurements.currents, CURRENTS)
+    np.testing.assert_allclose(measurements.voltages,
                                1e-3 * (VALUES - VALUES.mean(axis=1, keepdims=True)))
     table(tmp_path / "comma.csv", decimal=",", separator=";")
     same = read(tmp_path / "comma.csv", electrodes=8, current=1e-3, unit=1e-3, decimal=",")
-    np.testing.assert_array_equal(same.readings, record.readings)
+    np.testing.assert_array_equal(same.voltages, measurements.voltages)
 
 
-@pytest.mark.parametrize(("how", "said"), [
+@pytest.mark.parametrize(("options", "message"), [
     ({}, r"described by a YAML file.*comma\.yml"),
     ({"electrodes": 8, "current": 1e-3}, "numbers with the decimal point '.'"),
     ({"electrodes": 9, "current": 1e-3, "decimal": ","}, "rows must have 11 columns"),
     ({"electrodes": 8, "current": -1.0, "decimal": ","}, "current must be"),
 ])
-def test_tables_that_cannot_be_read(tmp_path, how, said):
+def test_invalid_tables_are_rejected(tmp_path, options, message):
     table(tmp_path / "comma.csv", decimal=",", separator=";")
-    with pytest.raises(ValueError, match=said):
-        read(tmp_path / "comma.csv", **how)
+    with pytest.raises(ValueError, match=message):
+        read(tmp_path / "comma.csv", **options)
 
 
 KTC = {"Inj": CURRENTS.T, "Mpat": MATRIX.T, "Uel": VALUES}
 
 
 @pytest.mark.parametrize(("content", "name", "format", "message"), [
-    (None, "a.mat", None, "there is none"),
+    (None, "a.mat", None, "got a missing path"),
     (b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + bytes(500), "a.mat", None, "`save -v7` writes: .*v7.3"),
     (b"", "a.mat", None, r"a\.mat must"),
     (b"MATLAB 5.0 MAT-file" + bytes(300), "a.mat", None, r"a\.mat must"),
-    ({"Inj": CURRENTS.T, "Uel": VALUES}, "a.mat", None, "must hold Mpat; there are"),
-    (KTC | {"Uel": np.full_like(VALUES, np.nan)}, "a.mat", None, r"a\.mat: readings must hold numbers, got NaN only"),
+    ({"Inj": CURRENTS.T, "Uel": VALUES}, "a.mat", None, "must hold Mpat, got"),
+    (KTC | {"Uel": np.full_like(VALUES, np.nan)}, "a.mat", None, r"a\.mat: voltages must hold numbers, got NaN only"),
     (b"x", "a.jpg", None, "must end in"), (KTC, "a.mat", "excel", "format must be one of")])
-def test_other_files_are_refused(tmp_path, content, name, format, message):
+def test_invalid_files_are_rejected(tmp_path, content, name, format, message):
     path = tmp_path / name
     if isinstance(content, bytes):
         path.write_bytes(content)
@@ -147,9 +147,9 @@ def test_other_files_are_refused(tmp_path, content, name, format, message):
     ("ktc-1", (76, 31)), ("kit4-2.3", (79, 16)), ("iirc", (1600, 16)), ("montreal", (1584, 16)),
     ("sciospec-13.19.50", (1600, 16)), ("sciospec-13.21.48", (1600, 16))])
 def test_real_files(case, shape):
-    """Where they are in $EITBENCH_MEASURED; docs/measured-data.md says where they are found."""
+    """Public files in $EITBENCH_MEASURED have their number of injections and channels."""
     try:
-        record = read_case(case).measurements()
+        measurements = read_case(case).measurements()
     except ValueError as error:
         pytest.skip(str(error))
-    assert record.readings.shape == shape
+    assert measurements.voltages.shape == shape

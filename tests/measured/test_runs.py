@@ -1,4 +1,4 @@
-"""Methods on measurements: predictions, bodies, velocities, residuals by electrode, and the command `estimate`."""
+"""Methods on measurements: predictions, inclusions, velocities, electrode residuals, and the command `estimate`."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from eitbench.envs.measured import MeasuredEnv
 from eitbench.measured import Measurements
 from eitbench.measured.vessel import read_vessel
 from scipy.io import savemat
-from tanks import BELIEVED, CYLINDER, PIPE, VESSEL, angle, centroid, instrument, measurements_of, moving
+from tanks import CYLINDER, FIXED_STDS, PIPE, VESSEL, angle, centroid, instrument, moving, simulate_measurements
 
 from commands import eitbench
 
@@ -25,12 +25,12 @@ def runs(env):
 
 
 @pytest.mark.parametrize("name", ["kalman_filter", "log_walk_filter"])
-def test_filters_predict_withheld_readings_better_than_naive_baselines(runs, name):
+def test_filters_predict_withheld_measurements_better_than_naive_baselines(runs, name):
     assert runs[name].withheld_rmse < 0.9 * min(runs[each].withheld_rmse for each in ("homogeneous", "persistence"))
 
 
-def test_the_body_is_found(env, runs):
-    """Within 1.5 cm, in a tank of 20 cm."""
+def test_inclusion_is_located(env, runs):
+    """The mean centroid error is less than 1.5 cm in a tank of 20 cm."""
     T = env.episode_steps
     errors = [centroid(env.task.mesh.points, runs["log_walk_filter"].mean[t])
               - 0.05 * np.array([np.cos(angle(t, T)), np.sin(angle(t, T))]) for t in range(16, T)]
@@ -39,28 +39,29 @@ def test_the_body_is_found(env, runs):
 
 @pytest.mark.parametrize("name", ["log_walk_filter", "homogeneous"])
 def test_a_failing_contact_is_visible(name):
-    """Electrode 4 has thirty times the contact impedance from the middle of the record on."""
-    sound = moving(frames=10, amplitude=0.0)
+    """The residual of electrode 4 rises when its contact impedance becomes thirty times larger."""
+    intact = moving(frames=10, amplitude=0.0)
     broken = moving(frames=10, amplitude=0.0, bad_contact=30.0)
-    readings = np.where(np.arange(80)[:, None] < 40, sound.readings, broken.readings)
-    record = Measurements(sound.currents, sound.injections, sound.matrix, readings, sound.times, sound.reference)
-    run = run_on_measurements(MeasuredEnv(record, VESSEL, **BELIEVED), name)
+    voltages = np.where(np.arange(80)[:, None] < 40, intact.voltages, broken.voltages)
+    measurements = Measurements(intact.currents, intact.injection_index, intact.matrix, voltages, intact.times,
+                                intact.reference)
+    run = run_on_measurements(MeasuredEnv(measurements, VESSEL, **FIXED_STDS), name)
     np.testing.assert_allclose(run.frame_times, 0.08 * np.arange(10))
     before, after = run.electrode_residual_rms[1:5].max(axis=0), run.electrode_residual_rms[6:].min(axis=0)
     assert after[3] > 3 * before.max()
     assert np.argmax(run.electrode_residual_rms[6:].mean(axis=0)) == 3
 
 
-def test_electrode_residuals_are_those_of_its_readings_while_it_carries_current(env, runs, record):
-    """One by one, at the estimate before each reading."""
+def test_electrode_residuals_use_measurements_with_a_driving_electrode(env, runs, measurements):
+    """The predicted voltages belong to the estimate of the previous step."""
     run = runs["homogeneous"]
     expected = [env.residuals(t + 1, run.mean[t - 1])[m] for t in range(40, 48) for m in range(8)
-                if record.matrix[m, 2] != 0 and record.currents[t % 8, 2] != 0]
+                if measurements.matrix[m, 2] != 0 and measurements.currents[t % 8, 2] != 0]
     assert run.electrode_residual_rms[-1, 2] == pytest.approx(np.sqrt(np.mean(np.square(expected))))
 
 
 def test_estimates_may_be_dropped(env, runs):
-    """Scores and residuals stay those of all steps."""
+    """Scores and residuals still use all steps."""
     kept = plotted_steps(env) - {20}
     run = run_on_measurements(env, "homogeneous", kept=kept)
     assert run.steps.tolist() == sorted(kept)
@@ -71,43 +72,43 @@ def test_estimates_may_be_dropped(env, runs):
 
 @pytest.fixture(scope="module")
 def pipe():
-    """An episode at 4.5 m/s, and three frames of homogeneous fluid in the same pipe."""
+    """An episode at 4.5 m/s, with three reference frames of the same pipe."""
     env = EstimationEnv("eitbench/Pipe2D-v0", world={"schedule": {"scored_steps": 12}})
-    episode = measurements_of(env, 0)
+    episode = simulate_measurements(env, 0)
     electrodes = env.world.vessel.electrode_model(fine=True)
     empty = episode.currents @ electrodes.transfer_resistance(np.full(electrodes.mesh.n_nodes, 0.3))
     noise = env.task.noise.std(empty) * np.random.default_rng(0).normal(size=(3, *empty.shape))
-    return Measurements(episode.currents, episode.injections, episode.matrix, episode.readings, episode.times,
+    return Measurements(episode.currents, episode.injection_index, episode.matrix, episode.voltages, episode.times,
                         empty + noise, episode.source)
 
 
-def test_a_filter_with_the_known_flow_predicts_better(pipe):
+def test_a_filter_with_the_flow_predicts_better(pipe):
     env = MeasuredEnv(pipe, PIPE | {"flow": {"mean_velocity": 4.5}})
     rmse = [run_on_measurements(env, name).withheld_rmse for name in ("log_inflow_filter", "homogeneous")]
     assert rmse[0] < rmse[1] / 3
 
 
 def test_an_unknown_velocity_is_estimated(pipe):
-    """From 3.5 m/s to within 0.3 of the true 4.5; methods without a velocity keep the nominal one."""
+    """The estimate starts at 3.5 m/s and ends within 0.3 m/s of the true 4.5 m/s."""
     env = MeasuredEnv(pipe, ESTIMATED)
     assert env.action_space.shape == (env.task.mesh.n_nodes + 1,)
     velocity = run_on_measurements(env, "joint_inflow_filter").velocity
-    assert velocity.shape == (len(pipe.readings), 1)
+    assert velocity.shape == (len(pipe.voltages), 1)
     assert velocity[-1, 0] == pytest.approx(4.5, abs=0.3)
     with pytest.raises(ValueError, match="carried by a flow that is estimated, got log_walk_filter"):
         run_on_measurements(env, "log_walk_filter")
 
 
-def estimate(folder, file, vessel, *more):
+def estimate(folder, file, vessel, *arguments):
     (folder / "vessel.yml").write_text(yaml.safe_dump(vessel))
-    return eitbench("estimate", file, "--vessel", folder / "vessel.yml", "--out", folder / "page.html", *more)
+    return eitbench("estimate", file, "--vessel", folder / "vessel.yml", "--out", folder / "page.html", *arguments)
 
 
 def test_command_writes_page_and_arrays(pipe, tmp_path):
-    """With velocities; bad input writes nothing."""
+    """Both contain velocities; invalid input writes nothing."""
     file = pipe.save(tmp_path / "pipe.h5")
-    given = "--baseline", "homogeneous", "--arrays", tmp_path / "arrays.npz"
-    code, output, err = estimate(tmp_path, file, ESTIMATED, *given)
+    arguments = "--baseline", "homogeneous", "--arrays", tmp_path / "arrays.npz"
+    code, output, err = estimate(tmp_path, file, ESTIMATED, *arguments)
     assert code == 0, err
     assert "withheld RMSE" in output
     assert "mean velocity at the end 3.5 m/s" in output
@@ -115,19 +116,19 @@ def test_command_writes_page_and_arrays(pipe, tmp_path):
     assert "<h2>Velocity</h2>" in page
     assert "3.5 m/s on average, ± 1 m/s" in page
     with np.load(tmp_path / "arrays.npz") as arrays:
-        assert arrays["mean"].shape == (len(pipe.readings), len(arrays["points"]))
+        assert arrays["mean"].shape == (len(pipe.voltages), len(arrays["points"]))
         np.testing.assert_array_equal(arrays["velocity"], 3.5)
     (tmp_path / "page.html").unlink()
-    code, _, err = estimate(tmp_path, file, VESSEL, *given)
+    code, _, err = estimate(tmp_path, file, VESSEL, *arguments)
     assert code == 2
     assert "vessel must have the 16 electrodes" in err
     assert not (tmp_path / "page.html").exists()
 
 
-def readings(vessel, at, radius, ratio=0.3, noise=1e-3):
-    """(2, 8, 8) V of homogeneous fluid, and with a body of lower conductivity there."""
+def simulate_voltages(vessel, centre, radius, ratio=0.3, noise=1e-3):
+    """Return voltages (2, 8, 8) in V without and with an inclusion of lower conductivity."""
     model = read_vessel(vessel).electrode_model(1e-3 * np.linspace(0.8, 1.2, 8))
-    distance = np.linalg.norm(model.mesh.points - at, axis=1)
+    distance = np.linalg.norm(model.mesh.points - centre, axis=1)
     currents, matrix = instrument()
     empty, full = (currents @ model.transfer_resistance(sigma) @ matrix.T
                    for sigma in (np.full(len(distance), 0.2), 0.2 * np.where(distance < radius, ratio, 1.0)))
@@ -135,8 +136,8 @@ def readings(vessel, at, radius, ratio=0.3, noise=1e-3):
     return np.stack([exact * (1.0 + noise * random.normal(size=(8, 8))) for exact in (empty, full)])
 
 
-def body_in(folder, file, vessel):
-    """(d,) m, its centroid by the command."""
+def locate_inclusion(folder, file, vessel):
+    """Return the centroid (d,) in m of the inclusion that the command estimates."""
     code, _, err = estimate(folder, file, vessel, "--baseline", "log_map", "--still", "--arrays",
                             folder / "arrays.npz")
     assert code == 0, err
@@ -144,13 +145,13 @@ def body_in(folder, file, vessel):
         return centroid(arrays["points"], arrays["mean"][-1])
 
 
-@pytest.mark.parametrize("maker", ["ktc", "kit4"])
-def test_bodies_in_files_of_kuopio_are_found(tmp_path, maker):
-    """In mA and V, with the empty tank's file in the same folder; within 1 cm, in a tank of 20 cm."""
-    at = np.array([-0.03, 0.04])
-    empty, full = readings(VESSEL, at, 0.025)
+@pytest.mark.parametrize("file_format", ["ktc", "kit4"])
+def test_inclusions_in_ktc_and_kit4_files_are_located(tmp_path, file_format):
+    """The centroid error is less than 1 cm in a tank of 20 cm; the reference is a file in the same folder."""
+    centre = np.array([-0.03, 0.04])
+    empty, full = simulate_voltages(VESSEL, centre, 0.025)
     currents, matrix = instrument()
-    if maker == "ktc":
+    if file_format == "ktc":
         file = tmp_path / "data1.mat"
         savemat(file, {"Mpat": matrix.T, "Inj": 1e3 * currents.T, "Uel": full.reshape(-1, 1)})
         savemat(tmp_path / "ref.mat", {"Mpat": matrix.T, "Injref": 1e3 * currents.T, "Uelref": empty.reshape(-1, 1)})
@@ -158,15 +159,16 @@ def test_bodies_in_files_of_kuopio_are_found(tmp_path, maker):
         file = tmp_path / "datamat_2_1.mat"
         for path, values in ((tmp_path / "datamat_1_0.mat", empty), (file, full)):
             savemat(path, {"CurrentPattern": 1e3 * currents.T, "MeasPattern": matrix.T, "Uel": values.T})
-    assert np.linalg.norm(body_in(tmp_path, file, VESSEL) - at) < 0.01
+    assert np.linalg.norm(locate_inclusion(tmp_path, file, VESSEL) - centre) < 0.01
 
 
-@pytest.mark.parametrize(("vessel", "at", "radius", "tolerance"), [
+@pytest.mark.parametrize(("vessel", "centre", "radius", "tolerance"), [
     (SHORT_PIPE, [0.12, 0.02], 0.02, 0.02),
     pytest.param(CYLINDER, [0.02, 0.02, 0.08], 0.02, 0.03, marks=pytest.mark.slow)], ids=["pipe", "cylinder"])
-def test_bodies_in_other_vessels_are_found(tmp_path, vessel, at, radius, tolerance):
-    """Few electrodes: within 2 cm in a pipe of 30 cm, and 3 cm in one of 20 cm."""
-    empty, full = readings(vessel, np.array(at), radius)
+def test_inclusions_in_other_vessels_are_located(tmp_path, vessel, centre, radius, tolerance):
+    """The centroid error is, with few electrodes, less than 2 cm in a pipe of 30 cm, and 3 cm in a pipe of 20 cm."""
+    empty, full = simulate_voltages(vessel, np.array(centre), radius)
     currents, matrix = instrument()
-    record = Measurements(currents, np.arange(8), matrix, full, np.arange(8.0), empty[None], {"file": "pipe"})
-    assert np.linalg.norm(body_in(tmp_path, record.save(tmp_path / "pipe.h5"), vessel) - at) < tolerance
+    measurements = Measurements(currents, np.arange(8), matrix, full, np.arange(8.0), empty[None], {"file": "pipe"})
+    file = measurements.save(tmp_path / "pipe.h5")
+    assert np.linalg.norm(locate_inclusion(tmp_path, file, vessel) - centre) < tolerance

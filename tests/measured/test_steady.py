@@ -1,46 +1,47 @@
-"""Targets that move steadily: the process in time, its filter against a dense one, and what it is good for."""
+"""Smooth motion: the Matérn-3/2 process in time, its modes, and the prediction of withheld measurements."""
 
 import numpy as np
 import pytest
 from eitbench.bench.playing import run_on_measurements
 from eitbench.envs.measured import MeasuredEnv
-from eitbench.estimation.walk import smooth_modes, steady
-from tanks import BELIEVED, VESSEL, moving
+from eitbench.estimation.walk import matern32_transition, matern_modes
+from tanks import FIXED_STDS, VESSEL, moving
 
 
-def test_correlation_is_that_of_a_matern_process():
-    """Of order 3/2: (1 + λτ) e^−λτ; many short steps make a long one, and the variance stays."""
+def test_correlation_is_matern():
+    """The correlation is (1 + λτ) e^−λτ; short steps compose to a long step, and the variance is stationary."""
     for phase in (0.1, 1.0, 4.0):
-        A, Q = steady(phase)
+        A, Q = matern32_transition(phase)
         assert A[0, 0] == pytest.approx((1 + phase) * np.exp(-phase))
         np.testing.assert_allclose(A @ A.T + Q, np.eye(2))
         assert np.linalg.eigvalsh(Q).min() > -1e-15
-        short, _ = steady(phase / 8)
+        short, _ = matern32_transition(phase / 8)
         np.testing.assert_allclose(np.linalg.matrix_power(short, 8), A, atol=1e-12)
 
 
-def test_what_is_new_is_what_white_noise_leaves():
+def test_process_noise_is_integrated_white_noise():
     """Q is ∫ e^Fs L Lᵀ e^Fᵀs ds of dx = F x dt + L dw, with λ = 1 and a spectral density of 4."""
     phase = 0.7
     s = (np.arange(20_000) + 0.5) / 20_000 * phase
-    moved = np.array([steady(each)[0] @ [0.0, 1.0] for each in s])
-    np.testing.assert_allclose(steady(phase)[1], 4 * moved.T @ moved * phase / len(s), rtol=1e-6, atol=1e-9)
+    responses = np.array([matern32_transition(each)[0] @ [0.0, 1.0] for each in s])
+    np.testing.assert_allclose(matern32_transition(phase)[1], 4 * responses.T @ responses * phase / len(s),
+                               rtol=1e-6, atol=1e-9)
 
 
-def test_modes_make_the_fields_covariance():
-    """But for a thousandth of the strongest one's variance."""
-    env = MeasuredEnv(moving(frames=3), VESSEL, **BELIEVED)
+def test_modes_reproduce_the_covariance_of_the_field():
+    """The residual is at most a thousandth of the variance of the strongest mode."""
+    env = MeasuredEnv(moving(frames=3), VESSEL, **FIXED_STDS)
     walk = env.task.transport
-    modes = smooth_modes(walk.mesh, walk.length)
+    modes = matern_modes(walk.mesh, walk.length)
     strongest = (modes**2).sum(axis=0).max()
-    left = np.linalg.eigvalsh(walk.covariance - modes @ modes.T)
-    assert -1e-9 * strongest < left.min()
-    assert left.max() <= 1.001e-3 * strongest
+    residual = np.linalg.eigvalsh(walk.covariance - modes @ modes.T)
+    assert -1e-9 * strongest < residual.min()
+    assert residual.max() <= 1.001e-3 * strongest
 
 
-def test_a_steady_body_is_predicted_better_than_by_a_walk():
-    """A body that goes half round a tank in 12 frames: by a tenth at least, withheld readings."""
+def test_smooth_motion_predicts_better_than_a_random_walk():
+    """The withheld RMSE is at least a tenth smaller for an inclusion that moves half round a tank in 12 frames."""
     env = MeasuredEnv(moving(frames=12), VESSEL, withheld=0.15)
-    walk, steady_one = (run_on_measurements(env, name).withheld_rmse
+    random_walk, smooth_motion = (run_on_measurements(env, name).withheld_rmse
                         for name in ("log_walk_filter", "log_steady_filter"))
-    assert steady_one < 0.9 * walk
+    assert smooth_motion < 0.9 * random_walk

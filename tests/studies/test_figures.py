@@ -1,4 +1,4 @@
-"""Every figure, drawn from tiny worlds and made-up estimates: what it draws, and that its words follow from them."""
+"""All figures, drawn from tiny worlds and synthetic estimates: pictures, and statements computed from the data."""
 
 import importlib
 import re
@@ -11,10 +11,10 @@ import pytest
 from eitbench.bench.methods import load_method
 from eitbench.bench.text import seed_ranges
 from eitbench.data.cache import CACHE_VARIABLE
-from eitbench.data.seeds import name_seed
+from eitbench.data.seeds import format_seed
 from eitbench.envs.estimation import EstimationEnv
-from eitbench.estimation import FirstFrame, initial_covariance
-from eitbench.physics.rest import AtRest
+from eitbench.estimation import CalibrationFrame, initial_covariance
+from eitbench.physics.stationary import StationaryTransport
 from eitbench.worlds import entry
 from eitbench.worlds.flows import FlowPastBulge, _past_bulge
 from eitbench.worlds.task import Estimate
@@ -30,10 +30,10 @@ FIGURES = importlib.import_module("thesis").FIGURES
 common, injection, obstacle, parameters, pipe2d, profiles, tanks, velocity = (
     importlib.import_module(f"thesis.{name}") for name in
     ("common", "injection", "obstacle", "parameters", "pipe2d", "profiles", "tanks", "velocity"))
-error_of, estimates_of = common.error_of, common.estimates_of
+episode_error, run_baseline = common.episode_error, common.run_baseline
 SEED = 100_000
 PIPE = merged(CHANGES, {"schedule": {"scored_steps": 32}})
-"""A fast fluid flushes the pipe in two steps; pictures of the pipe show states up to the 28th."""
+"""A fast fluid crosses the pipe in two steps; pictures of the pipe show states up to the 28th."""
 FLOW = merged(PIPE, {"flow": {"velocity_range": [55.0, 60.0], "velocity_std": 10.0}})
 OBSTACLE = merged(PIPE, {"flow": {"viscosity": 2e-2}})
 BULGE = (32, 8)
@@ -41,28 +41,28 @@ BULGE = (32, 8)
 KINDS = {"unknown": "Unknown", "time-varying": "TimeVarying", "skewed": "Skewed"}
 
 
-def played_in(name, world, **kwargs):
-    """An environment with a changed world."""
+def make_environment(name, world, **kwargs):
+    """Return an environment with a changed world."""
     return EstimationEnv(f"eitbench/{name}-v0", world=world, **kwargs)
 
 
 def perfect(env, name, seed):
-    """An estimator that knows the truth, where it is one of those that should be good; else it says the same always."""
+    """Return the ground truth for methods that should be good, and constant estimates for others."""
     env.reset(seed=seed)
     task = env.task
     if name in ("homogeneous", "gauss_newton"):
         return constant(env, name, seed)
     states = env.truth_mesh().interpolation_to(task.mesh.points) @ env.truth().T
-    if isinstance(task.transport, AtRest):    # two hills instead of two plains, that have no summit
+    if isinstance(task.transport, StationaryTransport):    # the cylinders need one maximum each
         smooth = initial_covariance(task.mesh, task.prior)
         states = 30.0 + smooth @ (states - 30.0) / smooth.sum(axis=1, keepdims=True)
     if name in ("kalman_filter", "filter_bank") and task.velocity is not None:
-        states = states + 1.0                     # what trusts a wrong flow is to be a little worse
+        states = states + 1.0                     # an error for methods with a wrong flow
     parameters = variance = None
     if task.velocity is not None:
         root = np.sqrt(task.velocity.weights)[:, None]
         parameters = np.linalg.lstsq(root * task.velocity.profiles, root * env.true_velocity().T, rcond=None)[0].T
-        variance = np.full(task.velocity.size, 0.01)
+        variance = np.full(task.velocity.n_parameters, 0.01)
     return [Estimate(state, np.full(len(state), 2.0 if "filter" in name else 1.0),
                      velocity=None if parameters is None else parameters[t],
                      velocity_variance=variance)
@@ -70,140 +70,143 @@ def perfect(env, name, seed):
 
 
 def constant(env, name, seed):
-    """An estimator of no use: a level that is nobody's, and the flow believed at first."""
+    """Return constant estimates without a velocity."""
     env.reset(seed=seed)
-    level = np.full(env.task.mesh.n_nodes, 29.0 if name == "homogeneous" else 28.0)
-    return [Estimate(level, np.ones_like(level)) for _ in range(env.task.n_steps)]
+    state = np.full(env.task.mesh.n_nodes, 29.0 if name == "homogeneous" else 28.0)
+    return [Estimate(state, np.ones_like(state)) for _ in range(env.task.n_steps)]
 
 
 @pytest.fixture(autouse=True)
 def tiny_worlds(monkeypatch, run_cache):
-    """Each figure's environment, small; episodes are shared by the tests, and kept from all others,
-    since the flow past the bulge is another's here, by its cells."""
+    """Make the environment of each figure small.
+
+    The tests use a separate cache, since the flow past the bulge has another mesh here.
+    """
     monkeypatch.setenv(CACHE_VARIABLE, "{}-bulge-{}x{}".format(run_cache, *BULGE))
-    monkeypatch.setattr(pipe2d, "_env", lambda lag=0, mean_velocity=None: played_in("Pipe2D", PIPE, lag=lag))
-    monkeypatch.setattr(velocity, "_env", lambda flow: played_in(f"Pipe2D{KINDS[flow]}Velocity", FLOW))
-    monkeypatch.setattr(obstacle, "_env", lambda flow: played_in("Pipe2DObstacle", OBSTACLE, assume={"flow": flow}))
+    monkeypatch.setattr(pipe2d, "_env", lambda lag=0, mean_velocity=None: make_environment("Pipe2D", PIPE, lag=lag))
+    monkeypatch.setattr(velocity, "_env", lambda flow: make_environment(f"Pipe2D{KINDS[flow]}Velocity", FLOW))
+    monkeypatch.setattr(obstacle, "_env", lambda flow: make_environment("Pipe2DObstacle", OBSTACLE,
+                                                                        assume={"flow": flow}))
     monkeypatch.setattr(FlowPastBulge, "nominal", lambda flow, world, fine: _past_bulge(world.vessel, flow, BULGE))
     for name, id, steps in (("_stirred", "RotatingTank2D", 24), ("_at_rest", "StationaryTank2D", 16)):
-        env = played_in(id, {"schedule": {"scored_steps": steps}})
+        env = make_environment(id, {"schedule": {"scored_steps": steps}})
         monkeypatch.setattr(tanks, name, lambda env=env: env)
     monkeypatch.setattr(profiles, "_error", lambda lag, baseline, profile,
                         seeds: np.full(len(seeds), 0.02 if (
         baseline == "homogeneous") else 0.004 if profile == "parabolic" else 0.006))
     monkeypatch.setattr(parameters, "_error", lambda factors, _: 0.005 * (
         1.0 + 0.1 * abs(np.log2(factors.inflow_std)) + 0.01 * np.log2(factors.diffusivity)**2))
-    velocity.run.cache_clear()
+    velocity.run_joint_filter.cache_clear()
     yield
-    velocity.run.cache_clear()
+    velocity.run_joint_filter.cache_clear()
 
 
 def draw(monkeypatch, name, folder, estimator):
-    """The remark of a figure whose estimates are made up, after a look at the picture."""
+    """Draw a figure of synthetic estimates, check the picture, and return the description."""
     for module in (pipe2d, velocity, obstacle, tanks):
-        monkeypatch.setattr(module, "estimates_of", estimator)
-    path, remark = FIGURES[name]([SEED], 1, folder / "new")
+        monkeypatch.setattr(module, "run_baseline", estimator)
+    path, description = FIGURES[name]([SEED], 1, folder / "new")
     picture = imread(path)
     assert path.parent == folder / "new" and path.name == f"{name}.png"
     assert min(picture.shape[:2]) > 250 and picture[..., :3].std() > 0.05   # neither tiny nor blank
-    return remark
+    return description
 
 
-DRAWN = [name for name in FIGURES if name not in ("fig5.8", "fig5.10", "injection")]
+FAST_FIGURES = [name for name in FIGURES if name not in ("fig5.8", "fig5.10", "injection")]
 """fig5.8 has a test below; fig5.10 in 3D and injection, which runs policies, take minutes."""
 
 
-@pytest.mark.parametrize("name", DRAWN)
+@pytest.mark.parametrize("name", FAST_FIGURES)
 def test_figure_is_drawn(name, monkeypatch, tmp_path):
-    """A picture, and words without a hole; with estimates that are right, all but what is about real methods agrees."""
-    remark = draw(monkeypatch, name, tmp_path, perfect)
-    assert not re.search(r"\b(nan|inf|None)\b", remark)
-    verdicts = [line for line in remark.splitlines() if line.startswith(("Agrees: ", "DIFFERS: "))]
-    assert verdicts
+    """Correct estimates agree with the thesis, except in statements about real methods."""
+    description = draw(monkeypatch, name, tmp_path, perfect)
+    assert not re.search(r"\b(nan|inf|None)\b", description)
+    statements = [line for line in description.splitlines() if line.startswith(("Agrees: ", "DIFFERS: "))]
+    assert statements
     if name in ("table5.1", "profiles", "fig6.1", "fig6.2", "fig6.4", "fig6.5", "fig6.6", "fig7.2", "fig7.4"):
-        assert all(line.startswith("Agrees") for line in verdicts), remark
+        assert all(line.startswith("Agrees") for line in statements), description
 
 
 @pytest.mark.parametrize("name", ["fig5.4", "fig6.1", "fig6.2", "fig6.5", "fig7.3", "fig7.4"])
-def test_words_follow_from_the_data(name, monkeypatch, tmp_path):
-    """Estimates of no use do not agree with the thesis."""
+def test_statements_follow_from_the_data(name, monkeypatch, tmp_path):
+    """Constant estimates do not agree with the thesis."""
     assert "DIFFERS" in draw(monkeypatch, name, tmp_path, constant)
 
 
-@pytest.mark.parametrize(("best", "verdicts"), [(4.5, ["Agrees", "Agrees"]), (5.5, ["DIFFERS", "Agrees"]),
-                                              (2.0, ["DIFFERS", "DIFFERS"])])
-def test_velocity_sweep_is_drawn(best, verdicts, monkeypatch, tmp_path):
-    """Fig. 5.8 of made-up scores: what it says follows from where they are least."""
-    off = np.repeat((pipe2d.VELOCITIES[:, None] - best)**2, 2, axis=1)
-    made = {"error": 0.005 + 0.001 * off, "voltage_discrepancy": 1e-6 * (1.0 + off), "nis": 1.0 + off}
-    monkeypatch.setattr(pipe2d, "velocity_sweep", lambda seeds, jobs: made)
-    remark = draw(monkeypatch, "fig5.8", tmp_path, perfect)
-    assert re.findall("^(Agrees|DIFFERS): ", remark, re.MULTILINE) == verdicts
-    assert f"Minimum at {100 * best:.0f} cm/s" in remark
+@pytest.mark.parametrize(("best", "labels"), [(4.5, ["Agrees", "Agrees"]), (5.5, ["DIFFERS", "Agrees"]),
+                                            (2.0, ["DIFFERS", "DIFFERS"])])
+def test_velocity_sweep_is_drawn(best, labels, monkeypatch, tmp_path):
+    """The statements of Fig. 5.8 follow from the minima of synthetic scores."""
+    distance = np.repeat((pipe2d.VELOCITIES[:, None] - best)**2, 2, axis=1)
+    sweep = {"error": 0.005 + 0.001 * distance, "voltage_discrepancy": 1e-6 * (1.0 + distance), "nis": 1.0 + distance}
+    monkeypatch.setattr(pipe2d, "velocity_sweep", lambda seeds, jobs: sweep)
+    description = draw(monkeypatch, "fig5.8", tmp_path, perfect)
+    assert re.findall("^(Agrees|DIFFERS): ", description, re.MULTILINE) == labels
+    assert f"Minimum at {100 * best:.0f} cm/s" in description
 
 
 @pytest.mark.parametrize("delay", [0, 3, 7])
-def test_lag_is_the_delay(delay):
-    """A sine and the same one some steps later, scaled and shifted: the delay, at a correlation of one."""
+def test_delay_is_estimated(delay):
+    """A delayed, scaled and shifted sine has its delay, at a correlation of one."""
     truth = np.sin(np.arange(80) / 9.0)
-    late = 2.0 + 0.5 * np.sin((np.arange(80) - delay) / 9.0)
-    assert velocity.lag_of(late, truth) == (delay, pytest.approx(1.0, abs=1e-12))
+    delayed = 2.0 + 0.5 * np.sin((np.arange(80) - delay) / 9.0)
+    assert velocity.estimate_delay(delayed, truth) == (delay, pytest.approx(1.0, abs=1e-12))
 
 
-def test_map_estimate_is_the_most_probable():
-    """At rest its objective, misfit and prior, is lower than the linearised filter's, and flat to the tolerance."""
-    env = played_in("StationaryTank2D", {"schedule": {"scored_steps": 3}})
+def test_map_estimate_minimises_its_objective():
+    """The sum of misfit and prior is smaller than for the linearised filter, and flat to the tolerance."""
+    env = make_environment("StationaryTank2D", {"schedule": {"scored_steps": 3}})
     assert load_method("map_estimate", "estimation").make.suits(env.task)
-    assert not load_method("map_estimate", "estimation").make.suits(played_in("RotatingTank2D", None).task)
-    task, first = env.task, FirstFrame(env.task)
+    assert not load_method("map_estimate", "estimation").make.suits(make_environment("RotatingTank2D", None).task)
+    task, first = env.task, CalibrationFrame(env.task)
     observation, _ = env.reset(seed=SEED)
-    seen = []
+    measurements = []
     for _ in range(3):
-        seen.append((observation["voltages"], observation["currents"]))
+        measurements.append((observation["voltages"], observation["currents"]))
         observation, *_ = env.step(np.full(task.mesh.n_nodes, 30.0))
-    first.add(*seen[0])
-    V, I = (np.array(part) for part in zip(*seen, strict=True))
-    precision = np.linalg.inv(first.c_bh**2 * initial_covariance(task.mesh, task.prior))
+    first.add(*measurements[0])
+    V, I = (np.array(part) for part in zip(*measurements, strict=True))
+    precision = np.linalg.inv(first.c_ref**2 * initial_covariance(task.mesh, task.prior))
 
     def objective(c):
         misfit = (V - task.observation.voltages(c, I)) / task.noise.std(V)
-        return (misfit**2).sum() + (c - first.c_bh) @ precision @ (c - first.c_bh)
+        return (misfit**2).sum() + (c - first.c_ref) @ precision @ (c - first.c_ref)
 
-    best, linear = (estimates_of(env, name, SEED)[2].mean for name in ("map_estimate", "kalman_filter"))
+    best, linear = (run_baseline(env, name, SEED)[2].mean for name in ("map_estimate", "kalman_filter"))
     assert objective(best) < objective(linear)
     for direction in (linear - best, first.mean - best):
         assert objective(best + 0.05 * direction) > 0.999 * objective(best)
 
 
 def test_injection_is_drawn(monkeypatch, run_cache, tmp_path):
-    """Scores as they were played, told in a table for each world, and an animation with a frame for
-    every step; when not told which episodes, in those of the boards."""
-    played = {}
+    """The default are the episodes of the leaderboards; the description has a table for each world, and the
+    animation a frame for each step."""
+    run_seeds = {}
 
     def rows(jobs, results):
         names = list(dict.fromkeys(job.load().name for job in jobs))
         return pd.DataFrame([{"policy": name, "seed": f"dev:{k}",
-                              "error": 0.01 * (1 + place) + 0.001 * k, "spent": 5,
-                              "seconds_per_step": 0.001} for place, name in enumerate(names)
+                              "error": 0.01 * (1 + rank) + 0.001 * k, "spent": 5,
+                              "seconds_per_step": 0.001} for rank, name in enumerate(names)
                               for k in range(3)])
 
-    monkeypatch.setattr(injection, "run_jobs", lambda jobs, *_, **__: played.update({
-        jobs[0].environment: seed_ranges(list(dict.fromkeys(name_seed(job.seed)
+    monkeypatch.setattr(injection, "run_jobs", lambda jobs, *_, **__: run_seeds.update({
+        jobs[0].environment: seed_ranges(list(dict.fromkeys(format_seed(job.seed)
                                                             for job in jobs)))}))
     monkeypatch.setattr(injection, "policy_rows", rows)
     monkeypatch.setattr(injection, "results_in", lambda folder: [])
-    shorten(monkeypatch, {injection.AT_WORK[0]: SHORT})
-    monkeypatch.setenv(CACHE_VARIABLE, run_cache)           # where other tests' reduced model lies
-    path, remark = FIGURES["injection"](None, 1, tmp_path / "new")
+    shorten(monkeypatch, {injection.ANIMATED[0]: SHORT})
+    monkeypatch.setenv(CACHE_VARIABLE, run_cache)           # has the reduced model of other tests
+    path, description = FIGURES["injection"](None, 1, tmp_path / "new")
     picture = imread(path)
     assert min(picture.shape[:2]) > 250 and picture[..., :3].std() > 0.05
-    assert list(played.items()) == [((env, "{}"), entry(env).seeds) for env in injection.WORLDS]
-    assert remark.count("best_pair ") == 6
-    with Image.open(tmp_path / "new" / "injection.gif") as moving:
-        assert moving.n_frames == 4                        # the first frame of 16, then four steps
+    assert list(run_seeds.items()) == [((env, "{}"), entry(env).test_seeds) for env in injection.WORLDS]
+    assert description.count("best_pair ") == 6
+    with Image.open(tmp_path / "new" / "injection.gif") as animation:
+        assert animation.n_frames == 4                        # the first frame of 16, then four steps
 
 
-def test_thesis_figures_show_dev_episodes_when_not_told(monkeypatch, tmp_path):
-    """Nothing is drawn from test episodes by chance."""
-    monkeypatch.setattr(pipe2d, "fig5_4", lambda seeds, jobs, out: (out, " ".join(map(name_seed, seeds))))
+def test_thesis_figures_show_dev_episodes_by_default(monkeypatch, tmp_path):
+    """Test episodes are never drawn by default."""
+    monkeypatch.setattr(pipe2d, "fig5_4", lambda seeds, jobs, out: (out, " ".join(map(format_seed, seeds))))
     assert FIGURES["fig5.4"](None, 1, tmp_path)[1] == "dev:0 dev:1"

@@ -1,7 +1,7 @@
-"""The 2D pipe as a whole, over dev seeds: the order of the methods and the velocity that fits best.
+"""2D pipe on dev episodes: order of the methods, and the best assumed velocity.
 
-By default one seed is played, dev:0; by `pytest -m slow` all twenty, and the sweep of
-velocities on one. Dev seeds are for choosing and testing, never reported.
+The default is one episode, dev:0; `pytest -m slow` runs twenty, and a sweep of velocities on one. Scores on dev
+episodes are never reported.
 """
 
 import importlib
@@ -14,7 +14,7 @@ from eitbench import make_task, simulate
 from eitbench.bench.methods import load_method
 from eitbench.bench.run import Job, run_episode
 from eitbench.bench.tracks import Environment
-from eitbench.data.recordings import score_operators
+from eitbench.data.episode_cache import score_operators
 from eitbench.data.seeds import parse_seeds
 from eitbench.estimation import best_homogeneous, gauss_newton
 from eitbench.numerics.fem import stiffness_matrix
@@ -34,8 +34,7 @@ METHODS = {
 
 @pytest.mark.parametrize("seeds", [SEEDS[:1], pytest.param(SEEDS, marks=pytest.mark.slow)], ids=len)
 def test_order_of_the_methods(seeds):
-    """Smoother < Kalman filter < 0.6 × homogeneous < stationary on average, the first two on every
-    seed; one seed by default, twenty if slow."""
+    """Smoother < Kalman filter < 0.6 × homogeneous < stationary on average, the first two on every episode."""
     errors = {}
     for method, (environment, baseline) in METHODS.items():
         results = [run_episode(Job(Environment(environment), baseline, seed))[0] for seed in seeds]
@@ -45,14 +44,14 @@ def test_order_of_the_methods(seeds):
     assert mean["smoother"] < mean["filter"] < 0.6 * mean["homogeneous"] < mean["stationary"], mean
     assert (errors["smoother"] < errors["filter"]).all(), errors
     assert (errors["filter"] < np.minimum(errors["homogeneous"], errors["stationary"])).all(), errors
-    # a stationary image is worse than saying nothing
+    # a stationary image is worse than a constant
     assert mean["homogeneous"] < mean["stationary"], mean
-    assert 0.015 < mean["homogeneous"] < 0.04, mean          # the contrast the world promises
+    assert 0.015 < mean["homogeneous"] < 0.04, mean          # the contrast of the world
 
 
 def test_stationary_method_works_on_a_stationary_target():
-    """The same Gauss–Newton, with the same α, beats the homogeneous estimate threefold when the
-    target stands still; three states of two seeds."""
+    """Gauss–Newton with the same α has at most a third of the homogeneous error if the target is stationary: three
+    states of two episodes."""
     task = make_task(PIPE_2D)
     interpolation, mass = score_operators(PIPE_2D)
     penalty = load_method("gauss_newton", "estimation").parameters["alpha"]**2 * stiffness_matrix(task.mesh)
@@ -75,9 +74,9 @@ def test_stationary_method_works_on_a_stationary_target():
 
 @pytest.mark.slow
 def test_velocity_sweep_finds_the_true_velocity():
-    """Over assumed mean velocities of 0, 50, …, 900 cm/s the error is smallest within 400–500; it is 450 in truth.
+    """Over assumed mean velocities of 0, 50, …, 900 cm/s the error is smallest within 400–500; the truth is 450.
 
-    The voltages alone, by discrepancy and by NIS, point near it too (thesis Fig. 5.8). One seed.
+    The minima of voltage discrepancy and NIS are near it too (thesis Fig. 5.8). One episode.
     """
     sweep = {key: values.mean(axis=1) for key, values in pipe2d.velocity_sweep(SEEDS[:1], jobs=1).items()}
     best = {key: pipe2d.VELOCITIES[values.argmin()] for key, values in sweep.items()}

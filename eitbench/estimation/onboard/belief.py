@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from eitbench.estimation.design import pair_gains
+from eitbench.estimation.design import pair_design_criteria
 from eitbench.estimation.onboard.linearisation import linearisation_table
 from eitbench.estimation.onboard.reduced_filters import ReducedFilters
 
@@ -148,7 +148,7 @@ class Belief:
                         jacobian: np.ndarray | None = None,
                         weight: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Return the A- and D-criterion of each pair, (pairs,) each, for a state with this
-        covariance; see `pair_gains`.
+        covariance; see `pair_design_criteria`.
 
         Electrodes that are not ``healthy`` contribute no measurement, and pairs with one of them
         score 0. ``jacobian`` defaults to that of `linearisation`; ``weight`` defaults to present
@@ -162,7 +162,7 @@ class Belief:
             variance = np.where(healthy, variance, np.inf)
         weight = self._weight if weight is None else weight
         tables = ((DP @ D.T).reshape(L, L, L, L), (DP @ weight @ DP.T).reshape(L, L, L, L))
-        criteria = pair_gains(*tables, self.rules.pairs, variance)
+        criteria = pair_design_criteria(*tables, self.rules.pairs, variance)
         if healthy is not None:
             usable = healthy[self.rules.pairs].all(axis=1)
             criteria = criteria[0] * usable, criteria[1] * usable

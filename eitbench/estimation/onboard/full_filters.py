@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from eitbench.data.recordings import score_mass, step_error
+from eitbench.data.episode_cache import score_mass, step_error
 from eitbench.estimation.filter import Filter, StateSpace
-from eitbench.estimation.gaussian import Observation
+from eitbench.estimation.gaussian import LinearMeasurement
 from eitbench.estimation.inflow_window import InflowWindow
 from eitbench.estimation.nodal import nodal_states
 from eitbench.estimation.onboard.inflow_states import fit_world_prior
@@ -39,7 +39,7 @@ class FullFilters:
         self._table = linearisation_table(rules.world)
         self._indices = self._table.nearest_indices(frames, rules.gate)
         self.c_ref = np.array([self._table.c_ref(k) for k in self._indices])
-        space = state_space(rules.world.sound, rules.inflow)
+        space = state_space(rules.world.fault_free, rules.inflow)
         self._filters = [Filter(space, gate=rules.gate) for _ in frames]
         self._last: list[tuple[np.ndarray, ...] | None] = []
         for k, currents in enumerate(rules.world.currents):
@@ -56,7 +56,7 @@ class FullFilters:
                 continue
             predicted, std, matrix, about = self._linearise(b, currents[b])
             value = (voltages[b] - predicted) / std + matrix @ about
-            step = filter_.update(Observation(matrix, value, np.ones(len(value))))
+            step = filter_.update(LinearMeasurement(matrix, value, np.ones(len(value))))
             accepted[b] = step.accepted
             innovations[b] = step.innovation / np.sqrt(step.innovation_covariance.diagonal())
             self._last[b] = step.innovation, step.innovation_covariance, std, accepted[b]

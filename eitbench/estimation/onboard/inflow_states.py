@@ -18,9 +18,9 @@ from scipy.linalg import toeplitz
 
 from eitbench._notice import say
 from eitbench.data.seeds import SPLITS
-from eitbench.estimation.inflow_prior import InflowPrior, learned_inflow_prior
-from eitbench.estimation.inflow_response import Response
-from eitbench.estimation.inflow_window import stationary
+from eitbench.estimation.inflow_prior import InflowPrior, fit_prior_from_episodes
+from eitbench.estimation.inflow_response import ImpulseResponse
+from eitbench.estimation.inflow_window import yule_walker
 from eitbench.estimation.reduced import matvec
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ class InflowModel(NamedTuple):
     """(s, s) covariance at t = 0, about x = 0"""
 
 
-def inflow_model(response: Response, prior: InflowPrior) -> InflowModel:
+def inflow_model(response: ImpulseResponse, prior: InflowPrior) -> InflowModel:
     """Return the reduced model of a steady flow's response and a prior of the inflow."""
     K = response.weights.shape[1]
     D = min(N_RECENT_INFLOWS, K - 1)
@@ -71,7 +71,7 @@ def inflow_model(response: Response, prior: InflowPrior) -> InflowModel:
     before, after = (np.concatenate(list(part), axis=1) for part in (aged[:-1], aged[1:]))
     transition = np.linalg.lstsq(before.T, after.T, rcond=1e-5)[0].T
     weights = np.tensordot(directions.T, response.weights[:, :D + 1], 1)
-    _, (regression, remainder) = stationary(prior.time_covariance(D + 1))
+    _, (regression, remainder) = yule_walker(prior.time_covariance(D + 1))
     r = prior.modes.shape[1]
     by_x = np.zeros((older.shape[1] + D * r, K * r))                  # of the state by all past x
     by_x[:older.shape[1], D * r:] = np.moveaxis(aged, 0, 1).reshape(older.shape[1], -1)
@@ -86,16 +86,16 @@ def fit_world_prior(world: World) -> InflowPrior:
     """Return the prior that training inflows of a world suggest."""
     say(f"learning the inflow prior of {world.name}, some seconds once a process")
     longer = replace(world, schedule=replace(world.schedule, scored_steps=N_PRIOR_STEPS))
-    return learned_inflow_prior(longer, SPLITS["train"][:N_PRIOR_EPISODES])
+    return fit_prior_from_episodes(longer, SPLITS["train"][:N_PRIOR_EPISODES])
 
 
-def sample_coordinates(model: InflowModel, response: Response, prior: InflowPrior,
+def sample_coordinates(model: InflowModel, response: ImpulseResponse, prior: InflowPrior,
                        count: int) -> np.ndarray:
     """Return coordinates (count, q) of concentrations that inflows drawn from the prior make."""
     K = response.weights.shape[1]
     root = np.linalg.cholesky(toeplitz(prior.time_covariance(K)) + 1e-9 * np.eye(K))
     draws = np.random.default_rng(0).standard_normal((count, K, prior.modes.shape[1]))
-    deviation = prior.inflow((root @ draws) @ prior.modes.T) - 1.0
+    deviation = prior.inverse_link((root @ draws) @ prior.modes.T) - 1.0
     in_response = np.tensordot(deviation, response.weights, ((1, 2), (1, 2)))
     return np.asarray(in_response @ (response.basis.T @ model.basis))
 

@@ -91,7 +91,7 @@ class LinearisationTable:
     def grid_averages(self) -> np.ndarray:
         """(patches, n) averages over the boxes of the vessel's grid along x and y, x first, with
         nodes weighted by the mass matrix. ``ValueError`` if a box has no node."""
-        grid = self.world.vessel.patches
+        grid = self.world.vessel.coarse_grid_shape
         points = self.task.mesh.points[:, :2]
         low = points.min(axis=0)
         high = points.max(axis=0)
@@ -131,7 +131,7 @@ _table = lru_cache(maxsize=2)(LinearisationTable)
 def linearisation_table(world: World) -> LinearisationTable:
     """Return the table of a world, built once a process for all worlds that differ in faults
     only."""
-    return _table(world.sound)
+    return _table(world.fault_free)
 
 
 def std_from_variance(variance: np.ndarray) -> np.ndarray:

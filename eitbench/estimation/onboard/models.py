@@ -9,18 +9,18 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from eitbench._notice import say
-from eitbench.data.cache import Key, cached, described, model_key
+from eitbench.data.cache import Key, cached, config_dict, model_key
 from eitbench.estimation.covariance import LowRankCovariance, OpenLoopCovariance
 from eitbench.estimation.filter import Filter
-from eitbench.estimation.forward import LinearisedObservations
-from eitbench.estimation.gaussian import Observation
+from eitbench.estimation.forward import LinearisedForwardModel
+from eitbench.estimation.gaussian import LinearMeasurement
 from eitbench.estimation.inflow_response import steady_response
 from eitbench.estimation.nodal import (
-    RANK_TOLERANCE,
+    FILTER_RANK_TOLERANCE,
     Motion,
     NodalStates,
     initial_covariance,
-    starting_filter,
+    nodal_filter,
 )
 from eitbench.estimation.onboard.full_filters import VELOCITY_BOUNDS
 from eitbench.estimation.onboard.inflow_states import (
@@ -36,8 +36,8 @@ from eitbench.estimation.reduced import (
     ReducedModel,
     ReducedStates,
     SteadyStates,
-    learnt_of,
-    main_directions,
+    covariance_reduction,
+    dominant_directions,
     reduced_model,
 )
 from eitbench.estimation.reduced_joint import JointModel, JointStates, joint_model
@@ -106,7 +106,8 @@ def _learned(world: World, part: str) -> dict[str, np.ndarray]:
         return {f"{part}.{name}": array.astype(np.float32) for part, arrays in parts.items()
                 for name, array in arrays.items()}
 
-    arrays = cached(model_key("learned", described(world.sound), LEARNED_MODEL_VERSION), build)
+    key = model_key("learned", config_dict(world.fault_free), LEARNED_MODEL_VERSION)
+    arrays = cached(key, build)
     return {name.removeprefix(part + "."): array.astype(float) for name, array in arrays.items()
             if name.startswith(part)}
 
@@ -128,7 +129,7 @@ def load_or_build_model(world: World) -> ReducedModel | JointModel:
 def reduced_model_key(world: World) -> Key:
     """Return the key of a reduced model, which depends neither on the target nor on the number of
     steps."""
-    sound = described(world.sound)
+    sound = config_dict(world.fault_free)
     numbers = {part: sound[part] for part in ("vessel", "flow", "instrument", "prior")}
     schedule = {part: sound["schedule"][part] for part in ("pattern", "time_step")}
     name = "reduced" if world.velocity_model is None else "joint"
@@ -169,7 +170,7 @@ def unpack_model(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 def build_steady_model(world: World) -> ReducedModel:
     """Return the model of a known flow in double precision, in half a minute."""
     task = make_task(world)
-    start = starting_filter(task.transport, task.prior, 1.0)
+    start = nodal_filter(task.transport, task.prior, 1.0)
     return reduced_model(start, mass_matrix(task.mesh).toarray(),
                          _random_pair_measurements(world, 90),
                          min(WHITE_INFLOW_RANK, task.mesh.n_nodes))
@@ -194,30 +195,30 @@ def build_joint_model(world: World) -> JointModel:
     learnt = np.zeros_like(mass)
     for part in BASIS_VELOCITIES:
         F, Y, noise = step(part)
-        covariance = LowRankCovariance(OpenLoopCovariance(F, noise), RANK_TOLERANCE)
+        covariance = LowRankCovariance(OpenLoopCovariance(F, noise), FILTER_RANK_TOLERANCE)
         states = NodalStates(np.ones(len(F)), covariance, Motion(F, Y.sum(axis=1)))
-        learnt += learnt_of(Filter(states), record, 10)
+        learnt += covariance_reduction(Filter(states), record, 10)
     parts = np.linspace(*VELOCITY_BOUNDS, N_TABULATED_VELOCITIES)
-    basis = main_directions(learnt, mass, min(WHITE_INFLOW_RANK, len(mass)))
+    basis = dominant_directions(learnt, mass, min(WHITE_INFLOW_RANK, len(mass)))
     return joint_model(basis, mass, initial, parts * flow.nominal[0],
                        (step(part)[::2] for part in parts))
 
 
 def require_scalar_velocity(task: Task) -> VelocityModel:
     """Return the velocity model; ``ValueError`` unless it has one parameter."""
-    if task.velocity is None or task.velocity.size != 1:
+    if task.velocity is None or task.velocity.n_parameters != 1:
         raise ValueError("world must have a flow with one unknown parameter, its mean velocity, "
                          f"got {task.velocity!r}")
     return task.velocity
 
 
-def _random_pair_measurements(world: World, length: int) -> list[Observation]:
+def _random_pair_measurements(world: World, length: int) -> list[LinearMeasurement]:
     """Return observations of random pairs, about the expected level and relative to it."""
     task = make_task(world)
     every = pair_currents(world)
     level = world.expected_concentration
     currents = every[np.random.default_rng(0).integers(len(every), size=length)]
-    linear = LinearisedObservations(task.observation, task.noise, np.full(task.mesh.n_nodes, level))
+    linear = LinearisedForwardModel(task.observation, task.noise, np.full(task.mesh.n_nodes, level))
     record = []
     for current in currents:
         seen = linear(np.zeros(current.shape), current)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 
-from eitbench.estimation.quadratic_voltages import Resistances, ScaledVoltages
+from eitbench.estimation.quadratic_voltages import ScaledVoltageModel, TransferResistanceModel
 from eitbench.estimation.reduced import matvec
 
 N_LOG_MODES = 80
@@ -20,7 +20,7 @@ MIN_RELATIVE_CONCENTRATION = 0.05
 
 
 class NodeVoltages(NamedTuple):
-    """`ScaledVoltages` of concentrations in a basis, evaluated at a few nodes."""
+    """`ScaledVoltageModel` of concentrations in a basis, evaluated at a few nodes."""
 
     level: np.ndarray
     """() c_0 in mol/m³"""
@@ -60,7 +60,7 @@ class NodeVoltages(NamedTuple):
         return voltages / scale, (by_u / (relative * scale)[:, None]) @ self.basis
 
 
-def node_voltages(model: Resistances, level: float, basis: np.ndarray,
+def node_voltages(model: TransferResistanceModel, level: float, basis: np.ndarray,
                   samples: np.ndarray) -> NodeVoltages:
     """Return the voltages of concentrations level·(1 + basis·y), such as ``samples`` (N, q) of y.
 
@@ -74,7 +74,7 @@ def node_voltages(model: Resistances, level: float, basis: np.ndarray,
     span = scipy.linalg.qr(level_too, mode="economic")[0]
     nodes = _interpolation_nodes(span, 2 * N_LOG_MODES)
     interpolation = span @ np.linalg.pinv(span[nodes])                                # (n, m)
-    quadratic = ScaledVoltages(model, level, modes[:, :N_QUADRATIC_MODES]).quadratic
+    quadratic = ScaledVoltageModel(model, level, modes[:, :N_QUADRATIC_MODES]).quadratic
     resistance, slope, to_modes, curvature = quadratic.tables
     L = len(resistance)
     by_modes = curvature.reshape(*curvature.shape[:2], L, L).transpose(0, 2, 3, 1)

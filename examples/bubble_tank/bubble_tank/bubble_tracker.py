@@ -6,7 +6,7 @@ A bubble conducts less than its liquid.
 import numpy as np
 
 from eitbench import Estimate, Task
-from eitbench.estimation import FirstFrame, LinearisedObservations, starting_filter
+from eitbench.estimation import CalibrationFrame, LinearisedForwardModel, nodal_filter
 
 
 class Estimator:
@@ -14,7 +14,7 @@ class Estimator:
 
     def __init__(self, task: Task) -> None:
         self.task = task
-        self.first = FirstFrame(task)
+        self.first = CalibrationFrame(task)
         self.filter = None
 
     def update(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate:
@@ -26,13 +26,13 @@ class Estimator:
 
     def start(self) -> None:
         task = self.task
-        self.filter = starting_filter(task.transport, task.prior, self.first.c_bh)
-        self.linear = LinearisedObservations(task.observation, task.noise, self.first.mean)
+        self.filter = nodal_filter(task.transport, task.prior, self.first.c_ref)
+        self.linear = LinearisedForwardModel(task.observation, task.noise, self.first.mean)
         for measurement in self.first.measurements:
             self.take_in(*measurement)
 
     def take_in(self, voltages: np.ndarray, currents: np.ndarray) -> Estimate:
         self.filter.predict()
         self.filter.update(self.linear(voltages, currents))
-        c = np.clip(self.filter.concentration, 0.0, 1.05 * self.first.c_bh)
+        c = np.clip(self.filter.concentration, 0.0, 1.05 * self.first.c_ref)
         return Estimate(c, self.filter.variance)
