@@ -198,7 +198,7 @@ class EstimationEnv(EpisodeEnv):
 
     def privileged_info(self) -> PrivilegedInfo:
         """Return the measurements and the true flow of this episode, for oracles only."""
-        velocity = self._episode("reveal()").velocity.copy()
+        velocity = self._episode("privileged_info()").velocity.copy()
         n_steps = self.world.n_steps
         self.core.load_until(n_steps)
         correct = make_task(self.world, self.lag)
