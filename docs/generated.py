@@ -67,7 +67,7 @@ def environments() -> Files:
             files[f"environments/{media.name}"] = media.read_bytes()
             parts.append(f"![An episode of {id}, in motion]({media.name})")
         parts.append(f'```python\nenv = gym.make("{id}")\n```')
-        parts.append(linked(eitbench.page(id)))
+        parts.append(linked(eitbench.describe_environment(id)))
         board = [row for row in rows if row["environment"] == slug]
         if board:
             parts.append(f"## Scores\n\n{table(board, 'method')}\n\n[The whole board, with "

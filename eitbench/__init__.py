@@ -18,20 +18,32 @@ if TYPE_CHECKING:
     from eitbench.bench.evaluation import evaluate
     from eitbench.data.dataset import dataset
     from eitbench.data.episodes import Episode, simulate
-    from eitbench.envs.pages import page
+    from eitbench.envs.env_docs import describe_environment
     from eitbench.estimation.onboard.rules import Rules
     from eitbench.report import plot
     from eitbench.worlds.task import Estimate, Task, make_task
     from eitbench.worlds.world import World
 
 __version__ = "0.1.0"
-__all__ = ["Episode", "Estimate", "Rules", "Task", "World",
-           "dataset", "evaluate", "make_task", "page", "plot", "register", "simulate"]
+__all__ = [
+    "Episode",
+    "Estimate",
+    "Rules",
+    "Task",
+    "World",
+    "dataset",
+    "describe_environment",
+    "evaluate",
+    "make_task",
+    "plot",
+    "register",
+    "simulate",
+]
 
 _LAZY_NAMES = {"Estimate": "worlds.task", "Task": "worlds.task", "make_task": "worlds.task",
                "World": "worlds.world", "Episode": "data.episodes", "simulate": "data.episodes",
                "dataset": "data.dataset", "Rules": "estimation.onboard.rules",
-               "page": "envs.pages", "evaluate": "bench.evaluation"}
+               "describe_environment": "envs.env_docs", "evaluate": "bench.evaluation"}
 """Public name -> the module that is imported on its first use."""
 _LAZY_MODULES = {"leaderboard": "bench", "plot": "report.plot"}
 

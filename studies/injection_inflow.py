@@ -17,7 +17,7 @@ from tqdm import tqdm
 from eitbench.bench.text import mean_and_interval, rounded
 from eitbench.data.seeds import parse_seeds
 from eitbench.envs.injection_core import InjectionCore
-from eitbench.estimation.onboard.rules import INFLOWS, Rules
+from eitbench.estimation.onboard.rules import INFLOW_MODELS, Rules
 from eitbench.worlds import entry
 
 
@@ -30,7 +30,7 @@ def main() -> None:
     seeds = parse_seeds(arguments.seeds)
     world = entry(arguments.env).world
     gate = entry(arguments.env).settings.get("gate", np.inf)
-    filters = [(inflow, each) for inflow in INFLOWS for each in arguments.estimators]
+    filters = [(inflow, each) for inflow in INFLOW_MODELS for each in arguments.estimators]
     schedules = fixed_schedules(Rules(world), world.n_steps - len(world.currents))
     print("| schedule | " + " | ".join(f"{inflow}, {each}" for inflow, each in filters)
           + " |\n|---|" + "---:|" * len(filters))
@@ -64,7 +64,7 @@ def fixed_schedules(rules: Rules, steps: int) -> dict[str, np.ndarray]:
 
 def errors(core: InjectionCore, seeds: list[int], pairs: np.ndarray) -> np.ndarray:
     """Return ẽ_c (B,) of each episode under these injections."""
-    core.begin(seeds)
+    core.reset(seeds)
     scored = []
     for pair in pairs:
         core.act(np.full(len(seeds), pair))

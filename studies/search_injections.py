@@ -54,8 +54,8 @@ class Search:
             observation, _ = env.reset(seed=self.seeds)
             world = rules.world
             for _ in range(world.n_steps - len(world.currents)):
-                injects = rules.spaced(observation["left"][0])
-                chosen = key[injected % len(key)] if injects else None
+                now = rules.is_injection_step(observation["left"][0])
+                chosen = key[injected % len(key)] if now else None
                 action = (np.array(chosen, np.float32) if isinstance(chosen, tuple)
                           else rules.action(chosen))
                 observation, reward, *_ = env.step(np.array([action] * env.num_envs))

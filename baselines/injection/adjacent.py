@@ -16,5 +16,5 @@ class Policy:
         self.cycle = cycle(numbers[frozenset((i, (i + 1) % L))] for i in range(L))
 
     def act(self, observation: dict[str, np.ndarray]) -> Any:
-        now = self.rules.spaced(observation["left"])
+        now = self.rules.is_injection_step(observation["left"])
         return self.rules.action(next(self.cycle) if now else None)

@@ -18,7 +18,7 @@ class Policy:
     @classmethod
     def suits(cls, rules: Rules) -> bool:
         found = cls.parameters
-        return (rules.name, rules.limit, rules.world.currents.shape[1]) == (
+        return (rules.tuning_key, rules.limit, rules.world.currents.shape[1]) == (
             found["world"], found["limit"], len(found["currents"]))
 
     def __init__(self, rules: Rules, random: np.random.Generator) -> None:

@@ -23,14 +23,14 @@ class Policy:
     @classmethod
     def suits(cls, rules: Rules) -> bool:
         pairs = rules.pairs.tolist()
-        found = cls.parameters["cycle"].get(rules.name, [None])
+        found = cls.parameters["cycle"].get(rules.tuning_key, [None])
         return all(pair in pairs for pair in found)
 
     def __init__(self, rules: Rules, random: np.random.Generator) -> None:
         pairs = rules.pairs.tolist()
         self.rules = rules
-        self.cycle = cycle(pairs.index(pair) for pair in self.parameters["cycle"][rules.name])
+        self.cycle = cycle(pairs.index(pair) for pair in self.parameters["cycle"][rules.tuning_key])
 
     def act(self, observation: dict[str, np.ndarray]) -> Any:
-        now = self.rules.spaced(observation["left"])
+        now = self.rules.is_injection_step(observation["left"])
         return self.rules.action(next(self.cycle) if now else None)

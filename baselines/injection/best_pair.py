@@ -21,11 +21,12 @@ class Policy:
 
     @classmethod
     def suits(cls, rules: Rules) -> bool:
-        return cls.parameters["pair"].get(rules.name) in rules.pairs.tolist()
+        return cls.parameters["pair"].get(rules.tuning_key) in rules.pairs.tolist()
 
     def __init__(self, rules: Rules, random: np.random.Generator) -> None:
         self.rules = rules
-        self.pair = rules.pairs.tolist().index(self.parameters["pair"][rules.name])
+        self.pair = rules.pairs.tolist().index(self.parameters["pair"][rules.tuning_key])
 
     def act(self, observation: dict[str, np.ndarray]) -> Any:
-        return self.rules.action(self.pair if self.rules.spaced(observation["left"]) else None)
+        injects = self.rules.is_injection_step(observation["left"])
+        return self.rules.action(self.pair if injects else None)

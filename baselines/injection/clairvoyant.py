@@ -44,7 +44,7 @@ class Policy:
             return
         pairs = rules.pairs.tolist()
         every = np.ones(core.length, dtype=int)
-        best = load_method("best_pair", "injection").parameters["pair"].get(rules.name)
+        best = load_method("best_pair", "injection").parameters["pair"].get(rules.tuning_key)
         fixed = sorted({pairs.index(pair) for pair in [*self.parameters["fixed_pairs"], best]
                         if pair in pairs})
         if rules.budget is None:
@@ -77,14 +77,14 @@ class Policy:
         covariance = None
         faults = core.faults
         if self.rules.world.velocity_model is not None:
-            belief.told(cached_episode(self.rules.world, core.seeds[0])[core.t - 1:])
+            belief.condition_on_truth(cached_episode(self.rules.world, core.seeds[0])[core.t - 1:])
         plan = np.empty(core.length, dtype=int)
         for k in range(core.length):
             sound = (core.t + k + 1 < faults.open_circuit_from[0]) & (faults.resistance[0] == 0.0)
-            predicted = belief.predicted(covariance, k)
-            weight = belief.foresight(horizon, k) if horizon else None
-            plan[k] = belief.gains(predicted, sound, weight=weight)[0].argmax()
-            covariance = belief.after(predicted, plan[k], sound)
+            predicted = belief.predict_covariance(covariance, k)
+            weight = belief.future_error_weight(horizon, k) if horizon else None
+            plan[k] = belief.design_criteria(predicted, sound, weight=weight)[0].argmax()
+            covariance = belief.posterior_covariance(predicted, plan[k], sound)
         return plan
 
     def changing(self) -> np.ndarray:
@@ -112,12 +112,12 @@ class Policy:
         twin = InjectionCore(self.rules, "reduced")
         plans = plans.copy()
         errors = []
-        twin.begin(self.core.seeds * len(plans))
+        twin.reset(self.core.seeds * len(plans))
         last = np.full(len(plans), -twin.length)
         for k in range(twin.length):
             if threshold is not None:
                 silent = (~(twin.errors() > threshold) | (k < last + interval)
-                          | (twin.spent >= self.rules.budget))
+                          | (twin.n_injections >= self.rules.budget))
                 plans[silent, k] = NOTHING
                 last[~silent] = k
             twin.act(np.array([self.action(number) for number in plans[:, k]]))

@@ -28,7 +28,7 @@ class Policy:
         self.alarmed = False
 
     def act(self, observation: dict[str, np.ndarray]) -> Any:
-        self.belief = Belief.follow(self.belief, self.rules, observation)
+        self.belief = Belief.create_or_update(self.belief, self.rules, observation)
         if observation["currents"].any():
             self.waited = 0
             # In predicted standard deviations: 0.4 to 0.6 in quiet fluid, which does less than the
@@ -46,4 +46,5 @@ class Policy:
             interval = self.parameters["quick"]
         if self.waited < min(interval, steps):
             return self.rules.action(None)
-        return self.rules.action(int(self.belief.gains(self.belief.predicted())[0].argmax()))
+        criterion = self.belief.design_criteria(self.belief.predict_covariance())[0]
+        return self.rules.action(int(criterion.argmax()))

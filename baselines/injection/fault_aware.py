@@ -5,12 +5,12 @@ from typing import Any
 
 import numpy as np
 
-from eitbench.estimation.onboard.belief import DOUBTFUL, FORGIVEN, Belief
+from eitbench.estimation.onboard.belief import FAULT_DECAY, FAULT_THRESHOLD, Belief
 from eitbench.estimation.onboard.rules import Rules
 
 
 class Policy:
-    parameters: dict[str, Any] = {"doubtful": DOUBTFUL, "forgiven": FORGIVEN}  # noqa: RUF012
+    parameters: dict[str, Any] = {"doubtful": FAULT_THRESHOLD, "forgiven": FAULT_DECAY}  # noqa: RUF012
 
     @classmethod
     def suits(cls, rules: Rules) -> bool:
@@ -21,8 +21,9 @@ class Policy:
         self.belief: Belief | None = None
 
     def act(self, observation: dict[str, np.ndarray]) -> Any:
-        self.belief = belief = Belief.follow(self.belief, self.rules, observation)
-        if belief.sound.sum() < 4:
-            return self.rules.action(belief.least_doubtful)
-        gains = belief.gains(belief.predicted(), belief.sound, belief.relinearised())[0]
-        return self.rules.action(int(gains.argmax()))
+        self.belief = belief = Belief.create_or_update(self.belief, self.rules, observation)
+        if belief.healthy_electrodes.sum() < 4:
+            return self.rules.action(belief.most_reliable_pair)
+        criterion = belief.design_criteria(belief.predict_covariance(), belief.healthy_electrodes,
+                                           belief.relinearised_jacobian())[0]
+        return self.rules.action(int(criterion.argmax()))

@@ -27,13 +27,14 @@ class Policy:
         self.recent: list[int] = []
 
     def act(self, observation: dict[str, np.ndarray]) -> Any:
-        self.belief = belief = Belief.follow(self.belief, self.rules, observation)
-        if not self.rules.spaced(observation["left"]):
+        self.belief = belief = Belief.create_or_update(self.belief, self.rules, observation)
+        if not self.rules.is_injection_step(observation["left"]):
             return self.rules.action(None)
         # The next measurement's state lies one step ahead; after the episode's end nothing counts.
         steps = min(self.parameters["steps"], int(observation["left"][0]) - 1)
-        gains = belief.gains(belief.predicted(), weight=belief.foresight(steps))[0]
-        gains[self.recent] = -np.inf
-        pair = int(gains.argmax())
+        criterion = belief.design_criteria(belief.predict_covariance(),
+                                           weight=belief.future_error_weight(steps))[0]
+        criterion[self.recent] = -np.inf
+        pair = int(criterion.argmax())
         self.recent = [*self.recent, pair][-self.rest:] if self.rest else []
         return self.rules.action(pair)

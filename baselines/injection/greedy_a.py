@@ -15,8 +15,10 @@ class Policy:
         self.belief: Belief | None = None
 
     def act(self, observation: dict[str, np.ndarray]) -> Any:
-        self.belief = Belief.follow(self.belief, self.rules, observation)
-        if not self.rules.spaced(observation["left"]):
+        self.belief = Belief.create_or_update(self.belief, self.rules, observation)
+        if not self.rules.is_injection_step(observation["left"]):
             return self.rules.action(None)
-        gains = self.belief.gains(self.belief.predicted(), derivative=self.belief.relinearised())[0]
-        return self.rules.action(int(gains.argmax()))
+        belief = self.belief
+        criterion = belief.design_criteria(belief.predict_covariance(),
+                                           jacobian=belief.relinearised_jacobian())[0]
+        return self.rules.action(int(criterion.argmax()))

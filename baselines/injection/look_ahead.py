@@ -17,7 +17,7 @@ class Policy:
         self.belief: Belief | None = None
 
     def act(self, observation: dict[str, np.ndarray]) -> Any:
-        self.belief = Belief.follow(self.belief, self.rules, observation)
-        if not self.rules.spaced(observation["left"]):
+        self.belief = Belief.create_or_update(self.belief, self.rules, observation)
+        if not self.rules.is_injection_step(observation["left"]):
             return self.rules.action(None)
         return self.rules.action(self.belief.look_ahead(**self.parameters))

@@ -15,6 +15,6 @@ class Policy:
         self.random = random
 
     def act(self, observation: dict[str, np.ndarray]) -> Any:
-        if not self.rules.spaced(observation["left"]):
+        if not self.rules.is_injection_step(observation["left"]):
             return self.rules.action(None)
         return self.rules.action(int(self.random.integers(len(self.rules.pairs))))

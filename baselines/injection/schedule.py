@@ -40,16 +40,16 @@ class Policy:
 @lru_cache(maxsize=8)
 def plan_of(rules: Rules) -> tuple[int | None, ...]:
     """The pair of each step, None for no injection."""
-    belief = Belief.beforehand(rules)
+    belief = Belief.from_prior(rules)
     steps = rules.world.n_steps - len(rules.world.currents)
-    plan: list[int | None] = [-1 if rules.spaced(np.array([steps - k])) else None
+    plan: list[int | None] = [-1 if rules.is_injection_step(np.array([steps - k])) else None
                               for k in range(steps)]
     # Before each step; None is the one after the first frame.
     states: list[np.ndarray | None] = [None] * (steps + 1)
 
     def follow(covariance: np.ndarray | None, pair: int | None) -> np.ndarray:
-        predicted = belief.predicted(covariance)
-        return predicted if pair is None else belief.after(predicted, pair)
+        predicted = belief.predict_covariance(covariance)
+        return predicted if pair is None else belief.posterior_covariance(predicted, pair)
 
     def cost(k: int, pairs: list[int | None]) -> float:
         covariance = states[k]
@@ -62,7 +62,7 @@ def plan_of(rules: Rules) -> tuple[int | None, ...]:
     for sweep in range(1 + SWEEPS):
         for k in range(steps):
             if plan[k] is not None:
-                gains = belief.gains(belief.predicted(states[k]))[0]
+                gains = belief.design_criteria(belief.predict_covariance(states[k]))[0]
                 best = np.argsort(-gains)[:CANDIDATES].tolist()
                 if sweep == 0:
                     plan[k] = best[0]

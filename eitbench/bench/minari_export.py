@@ -25,9 +25,9 @@ DESCRIPTION = """\
 {env}: process tomography in which an agent chooses every injection. Policy {policy}: {title}. \
 Episodes {seeds}; the seed of each is in its metadata, and with it and the actions the environment \
 gives the same observations and rewards again. Observations are scaled, as \
-eitbench.envs.injection_core.scaled says; rewards are the difference between the relative squared \
-errors of the best constant and of the estimate, zero in states that are not scored. Simulated by \
-eitbench {version}; no measured data, no personal data. Licence: MIT. {warning}"""
+eitbench.envs.injection_core.flatten_scaled says; rewards are the difference between the relative \
+squared errors of the best constant and of the estimate, zero in states that are not scored. \
+Simulated by eitbench {version}; no measured data, no personal data. Licence: MIT. {warning}"""
 
 
 def export_minari(name: str, env: str, policy: str, seeds: str | Sequence[int], *,

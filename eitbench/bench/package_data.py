@@ -10,7 +10,7 @@ import numpy as np
 from eitbench.bench.tracks import own_ids
 from eitbench.data.cache import PACKAGE_DATA, Arrays, File, load_shipped, ship
 from eitbench.data.episode_cache import csr_of, prefix_file, region_file, scoring_constants_file
-from eitbench.estimation.onboard.models import packed_model, stored_model_key, unpacked
+from eitbench.estimation.onboard.models import build_packed_model, reduced_model_key, unpack_model
 from eitbench.worlds.registry import Entry, entries, entry
 
 TOLERANCE = 1e-5
@@ -33,7 +33,7 @@ def _files(registered: Entry) -> Iterator[File]:
     if needed <= world.warm_up:
         yield prefix_file(world, needed)
     if registered.track == "injection":
-        yield File(stored_model_key(world), lambda: packed_model(world.fault_free))
+        yield File(reduced_model_key(world), lambda: build_packed_model(world.fault_free))
 
 
 def _needed_steps(registered: Entry) -> int:
@@ -80,7 +80,7 @@ def difference(shipped: Arrays | None, built: Arrays) -> str:
         if there.shape != array.shape or there.dtype != array.dtype:
             return f"{name} is {there.dtype} {there.shape}, built {array.dtype} {array.shape}"
     if "basis" in built:
-        shipped, built = unpacked(shipped), unpacked(built)
+        shipped, built = unpack_model(shipped), unpack_model(built)
         shipped = _in_basis(shipped, built["basis"])
     for name, array in built.items():
         off = np.abs(shipped[name].astype(float) - array).max() / (np.abs(array).max() or 1.0)

@@ -141,7 +141,7 @@ def injections(env: InjectionEnv, policy: Method, seed: int, actions: list[Any] 
         raise ValueError(f"policy {policy.name} does not suit {env.spec.id if env.spec else env}")
     with allow_test_seeds():
         observation, _ = env.reset(seed=seed)
-    t = env.core.first
+    t = env.core.n_initial
     random = policys_random(seed)
     begin = time.perf_counter()
     player = policy.make(env.rules, random, *[env.core] * policy.privileged)
@@ -180,8 +180,8 @@ def _estimates(env: EstimationEnv | MeasuredEnv, estimator: Method, seed: int,
         observation, _ = env.reset(seed=seed)
     if estimator.privileged and not isinstance(env, EstimationEnv):
         raise ValueError(f"{estimator.name} needs the ground truth, which measurements do not have")
-    shown = (env.task, env.reveal()) if isinstance(env, EstimationEnv) and estimator.privileged \
-        else (env.task,)
+    shown = (env.task, env.privileged_info()) \
+        if isinstance(env, EstimationEnv) and estimator.privileged else (env.task,)
     begin = time.perf_counter()
     player = estimator.make(*shown)
     setup = time.perf_counter() - begin
@@ -201,7 +201,7 @@ def _estimates(env: EstimationEnv | MeasuredEnv, estimator: Method, seed: int,
         if estimate is not None:
             _check_estimate(estimate, env.task, len(seen["voltages"]))
             if estimate.variance is not None:
-                env.spread = np.sqrt(estimate.variance)
+                env.estimate_std = np.sqrt(estimate.variance)
         observation, _, done, _, _ = env.step(_action(env.task, estimate, silence))
         yield t, estimate, seen, seconds
 

@@ -42,7 +42,7 @@ class EpisodeCore(ABC):
     Of an episode that is not recorded, only the first steps are simulated until more are needed.
     """
 
-    first = 0
+    n_initial = 0
     """measurements before the first action"""
     length: int
     """steps of an episode"""
@@ -56,7 +56,7 @@ class EpisodeCore(ABC):
         self.seeds: tuple[int, ...] = ()
         """episodes in progress"""
 
-    def begin(self, seeds: Sequence[int],
+    def reset(self, seeds: Sequence[int],
               provide: Callable[[World, int], None] | None = None) -> None:
         """Begin these episodes.
 
@@ -68,7 +68,8 @@ class EpisodeCore(ABC):
         if provide is None:
             self._load([cached_episode(self.world, seed) for seed in seeds])
         else:
-            self._load([cached_episode_prefix(self.world, seed, self.first + 1) for seed in seeds])
+            n_steps = self.n_initial + 1
+            self._load([cached_episode_prefix(self.world, seed, n_steps) for seed in seeds])
 
     def _load(self, recordings: Sequence[np.ndarray]) -> None:
         self._known = min(map(len, recordings))
@@ -173,7 +174,7 @@ class EpisodeEnv(FixedLengthEnv):
             self.pool.reset()
         number = self.pool.sample_seed(self.np_random) if seed is None else seed
         warn_test_seeds([number])
-        self.core.begin([number], self.pool.ensure_simulated)
+        self.core.reset([number], self.pool.ensure_simulated)
         self._step = 1
         return self._observe(), {"step": 1}
 
@@ -204,7 +205,7 @@ class EpisodeEnv(FixedLengthEnv):
         with needed_by("render()"):
             from eitbench.envs.rendering import draw_frame
         t, estimate, spread, currents = self._picture()
-        truth = concentration_at(self.world, self.core.seeds[0], t, self.core.first + 1)
+        truth = concentration_at(self.world, self.core.seeds[0], t, self.core.n_initial + 1)
         return draw_frame(self.task, self.truth_mesh(), truth, estimate, spread, currents,
                           t * self.world.time_step, self.world.region)
 
@@ -301,7 +302,7 @@ class EpisodeVectorEnv(gym.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
         for number in chosen:
             self.pool.ensure_simulated(self.world, number)
         for core, part in zip(self.cores, self._parts, strict=True):
-            core.begin(chosen[part])
+            core.reset(chosen[part])
         self._step = 1
         self._ended = False
         return self._observe(), self._info()

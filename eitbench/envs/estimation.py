@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from eitbench.physics.transport import Transport
 
 
-class Revealed(NamedTuple):
+class PrivilegedInfo(NamedTuple):
     """Data of the episode that only oracles are given."""
 
     voltages: np.ndarray
@@ -65,10 +65,10 @@ class EstimationCore(EpisodeCore):
             limit = np.append(limit, np.full(velocity.n_parameters, 10.0 * max(velocity.nominal)))
         self.action_space = spaces.Box(-limit, limit, dtype=np.float64)
 
-    def begin(self, seeds: Sequence[int],
+    def reset(self, seeds: Sequence[int],
               provide: Callable[[World, int], None] | None = None) -> None:
         self._step = 1
-        super().begin(seeds, provide)
+        super().reset(seeds, provide)
 
     def _read(self, recordings: Sequence[np.ndarray]) -> None:
         world = self.world
@@ -159,23 +159,23 @@ class EstimationEnv(EpisodeEnv):
                  world: dict[str, Any] | None = None, lag: int | str | None = None,
                  assume: dict[str, Any] | None = None, episodes: int | None = None,
                  render_mode: str | None = None) -> None:
-        played, self.lag, assumed = read_arguments(entry(name, variant), world, lag, assume)
+        played, self.lag, assumed = resolve_arguments(entry(name, variant), world, lag, assume)
         super().__init__(EstimationCore(played, self.lag), episodes, render_mode)
         self._task_options = {"lag": self.lag, **assumed}
         self.n_nodes = self.core.n_nodes
         """nodes of the mesh of the estimates"""
-        self.spread: np.ndarray | None = None
+        self.estimate_std: np.ndarray | None = None
         """(n,) standard deviation of the last estimate in mol/m³, if the caller has one"""
         self._last: np.ndarray | None = None
 
     def reset(self, *, seed: int | None = None,
               options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
         """Begin the episode with this seed (`eitbench.data.seeds`), or a random training one."""
-        self.spread = self._last = None
+        self.estimate_std = self._last = None
         return super().reset(seed=seed, options=options)
 
     def _checked(self, action: Any) -> np.ndarray:
-        checked = checked_actions(action, self.action_space, self.n_nodes)
+        checked = check_actions(action, self.action_space, self.n_nodes)
         if self._step > self.lag:
             self._last = checked[:self.n_nodes].copy()
         return checked[None]
@@ -186,7 +186,7 @@ class EstimationEnv(EpisodeEnv):
         if estimate is None:
             estimate = np.full(self.n_nodes, self.world.expected_concentration)
         currents = self.core.currents[t - 1] if t else np.zeros(self.core.currents.shape[1])
-        return t, estimate, self.spread, currents
+        return t, estimate, self.estimate_std, currents
 
     def truth(self) -> np.ndarray:
         """(T, n_truth) concentration in mol/m³, t = 1 … T; for scoring, never for agents."""
@@ -196,16 +196,16 @@ class EstimationEnv(EpisodeEnv):
         """(T, p) axial velocity in m/s at `VelocityModel.points`; for scoring, never for agents."""
         return self._episode("true_velocity()").velocity
 
-    def reveal(self) -> Revealed:
+    def privileged_info(self) -> PrivilegedInfo:
         """Return the measurements and the true flow of this episode, for oracles only."""
-        velocity = self._episode("reveal()").velocity.copy()
+        velocity = self._episode("privileged_info()").velocity.copy()
         n_steps = self.world.n_steps
         self.core.load_until(n_steps)
         correct = make_task(self.world, self.lag)
         transport = self.world.true_transport(
             Discretisation(correct.transport, correct.observation),
             episode_streams(self.core.seeds[0]).flow)
-        return Revealed(self.core.voltages[:n_steps, 0].copy(),
+        return PrivilegedInfo(self.core.voltages[:n_steps, 0].copy(),
                         self.core.currents[:n_steps].copy(), transport, velocity)
 
     def _episode(self, caller: str) -> Episode:
@@ -221,16 +221,16 @@ class EstimationVectorEnv(EpisodeVectorEnv):
                  world: dict[str, Any] | None = None, lag: int | str | None = None,
                  assume: dict[str, Any] | None = None, episodes: int | None = None,
                  max_episode_steps: int | None = None) -> None:
-        played, lag, _ = read_arguments(entry(name, variant), world, lag, assume)
+        played, lag, _ = resolve_arguments(entry(name, variant), world, lag, assume)
         super().__init__(lambda: EstimationCore(played, lag), num_envs, episodes,
                          max_episode_steps)
 
     def _checked(self, actions: np.ndarray) -> np.ndarray:
-        return checked_actions(actions, self.action_space, self.cores[0].n_nodes)
+        return check_actions(actions, self.action_space, self.cores[0].n_nodes)
 
 
-def read_arguments(registered: Entry, changes: dict[str, Any] | None, lag: int | str | None,
-                   assumed: dict[str, Any] | None) -> tuple[World, int, dict[str, Any]]:
+def resolve_arguments(registered: Entry, changes: dict[str, Any] | None, lag: int | str | None,
+                      assumed: dict[str, Any] | None) -> tuple[World, int, dict[str, Any]]:
     """Return the world, the lag and the assumptions on the flow of an id with these arguments;
     ``ValueError`` names an argument that is not allowed."""
     world = registered.world.with_changes(changes)
@@ -244,7 +244,7 @@ def read_arguments(registered: Entry, changes: dict[str, Any] | None, lag: int |
     return world, lag_steps(world, lag), dict(assumed)
 
 
-def checked_actions(actions: Any, space: Any, n_nodes: int) -> np.ndarray:
+def check_actions(actions: Any, space: Any, n_nodes: int) -> np.ndarray:
     """Return ``actions`` as float64 in the `Box` ``space``; ``ValueError`` names what is wrong.
 
     The first ``n_nodes`` numbers are concentrations, the others velocities.

@@ -71,7 +71,7 @@ class InjectionEnv(EpisodeEnv):
                  world: dict[str, Any] | None = None, estimator: str = "reduced",
                  observation: str = "scaled", gate: float | None = None, inflow: str | None = None,
                  episodes: int | None = None, render_mode: str | None = None) -> None:
-        self.rules = read_rules(entry(name, variant), world, gate, inflow, estimator)
+        self.rules = resolve_rules(entry(name, variant), world, gate, inflow, estimator)
         super().__init__(InjectionCore(self.rules, estimator, observation), episodes, render_mode)
 
     def _checked(self, action: Any) -> np.ndarray:
@@ -114,7 +114,7 @@ class InjectionVectorEnv(EpisodeVectorEnv):
                  observation: str = "scaled", gate: float | None = None, inflow: str | None = None,
                  episodes: int | None = None, threads: int = 1,
                  max_episode_steps: int | None = None) -> None:
-        self.rules = rules = read_rules(entry(name, variant), world, gate, inflow, estimator)
+        self.rules = rules = resolve_rules(entry(name, variant), world, gate, inflow, estimator)
         super().__init__(lambda: InjectionCore(rules, estimator, observation), num_envs, episodes,
                          max_episode_steps, threads=threads,
                          core_episodes=num_envs if estimator == "none" else MAX_CORE_EPISODES)
@@ -141,8 +141,8 @@ class InjectionVectorEnv(EpisodeVectorEnv):
         return chosen
 
 
-def read_rules(registered: Entry, changes: dict[str, Any] | None, gate: float | None,
-               inflow: str | None, estimator: str) -> Rules:
+def resolve_rules(registered: Entry, changes: dict[str, Any] | None, gate: float | None,
+                  inflow: str | None, estimator: str) -> Rules:
     """Return the rules of an id with these arguments; ``ValueError`` names an argument that is not
     allowed."""
     if gate is None:

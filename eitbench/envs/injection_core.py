@@ -11,21 +11,21 @@ from gymnasium import spaces
 from eitbench.data.episode_cache import instrument_faults, integrals, score_mass, scoring_constants
 from eitbench.envs.episodes import EpisodeCore, Observation
 from eitbench.estimation.onboard.innovation import Innovation
-from eitbench.estimation.onboard.onboard_filter import OnboardFilter, filters_type
+from eitbench.estimation.onboard.onboard_filter import OnboardFilter, filters_class
 from eitbench.estimation.onboard.rules import Rules
 from eitbench.worlds.instrument import Faults
 
 if TYPE_CHECKING:
     from eitbench.worlds.world import World
 
-OBSERVATIONS = ("scaled", "raw")
+OBSERVATION_FORMATS = ("scaled", "raw")
 MAX_SCALED = 5.0
 """Largest entry of a scaled observation."""
-RECENT = 4
+N_RECENT_CURRENTS = 4
 """Injections in an observation."""
 
 
-def scaled(rules: Rules, observation: Observation) -> np.ndarray:
+def flatten_scaled(rules: Rules, observation: Observation) -> np.ndarray:
     """Flatten a raw observation into one array (..., d), float32, each entry about between −1 and 1
     and never beyond ±5.
 
@@ -58,35 +58,36 @@ class InjectionCore(EpisodeCore):
     ----------
     rules : Rules
     estimator : str
-        One of `eitbench.estimation.onboard.onboard_filter.ESTIMATORS`.
+        One of `eitbench.estimation.onboard.onboard_filter.ESTIMATOR_OPTIONS`.
     observation : str
-        One of `OBSERVATIONS`; without an estimator observations are raw.
+        One of `OBSERVATION_FORMATS`; without an estimator observations are raw.
     """
 
     def __init__(self, rules: Rules, estimator: str, observation: str = "raw") -> None:
         super().__init__(rules.world)
-        if observation not in OBSERVATIONS:
-            raise ValueError(f"observation must be one of {', '.join(OBSERVATIONS)}, "
+        if observation not in OBSERVATION_FORMATS:
+            raise ValueError(f"observation must be one of {', '.join(OBSERVATION_FORMATS)}, "
                              f"got {observation!r}")
         self.rules = rules
-        self._filters_type = filters_type(rules, estimator)
+        self._filters_type = filters_class(rules, estimator)
         self._is_scaled = observation == "scaled" and self._filters_type is not None
-        self._table = rules.table if rules.limit is None else None
+        self._table = rules.action_currents if rules.limit is None else None
         if self._filters_type:
-            self.first = len(self.world.currents)
-        self.length = self.world.n_steps - self.first
+            self.n_initial = len(self.world.currents)
+        self.length = self.world.n_steps - self.n_initial
         self.action_space = rules.action_space
 
     @property
     def observation_space(self) -> spaces.Space:  # type: ignore[override]
         """Space of one observation, scaled or raw."""
-        raw = self.space()
+        raw = self.raw_space()
         if not self._is_scaled:
             return raw
         zeros: Observation = {name: np.zeros(space.shape or ()) for name, space in raw.items()}
-        return spaces.Box(-MAX_SCALED, MAX_SCALED, scaled(self.rules, zeros).shape, np.float32)
+        shape = flatten_scaled(self.rules, zeros).shape
+        return spaces.Box(-MAX_SCALED, MAX_SCALED, shape, np.float32)
 
-    def space(self) -> spaces.Dict:
+    def raw_space(self) -> spaces.Dict:
         """Space of one raw observation, in SI units."""
         world = self.world
         rules = self.rules
@@ -97,7 +98,8 @@ class InjectionCore(EpisodeCore):
         if self._filters_type:
             columns, rows = world.vessel.coarse_grid_shape
             mean = 1e3 * world.expected_concentration
-            shown |= {"recent": _box(current, RECENT, L), "frame": _box(largest, self.first, L),
+            shown |= {"recent": _box(current, N_RECENT_CURRENTS, L),
+                      "frame": _box(largest, self.n_initial, L),
                       "innovations": _box(1e6, L), "mean": _box(mean, columns * rows),
                       "std": _box(mean, columns * rows, low=0.0), "doubt": _box(1.0, 2, L, low=0.0)}
             flow = world.velocity_model
@@ -110,28 +112,28 @@ class InjectionCore(EpisodeCore):
                                    dtype=np.float64)
         return spaces.Dict(shown)
 
-    def begin(self, seeds: Sequence[int],
+    def reset(self, seeds: Sequence[int],
               provide: Callable[[World, int], None] | None = None) -> None:
-        """Begin these episodes, up to the agent's first injection; see `EpisodeCore.begin`."""
+        """Begin these episodes, up to the agent's first injection; see `EpisodeCore.reset`."""
         world = self.world
         B = len(seeds)
         L = world.currents.shape[1]
         T = world.n_steps
-        self.t = self.first
+        self.t = self.n_initial
         """injections so far, including those of the first frame"""
-        self.spent = np.zeros(B, dtype=int)
+        self.n_injections = np.zeros(B, dtype=int)
         """(B,) injections that the agents have made of a budget"""
         self._resistance = np.empty((T, B, L, L))
         self._draws = np.empty((T, B, L))
         self._deviations, self._squares, self._totals = np.empty((3, B, T))
         self._voltages, self.currents = np.zeros((2, B, L))
         """V and A (A/m in 2D), (B, L) each, of the last injections"""
-        self._recent = np.zeros((B, RECENT, L))
+        self._recent = np.zeros((B, N_RECENT_CURRENTS, L))
         self._homogeneous: np.ndarray | None = None
         faults = [instrument_faults(world, seed) for seed in seeds]
         self.faults = Faults(*(np.array(part) for part in zip(*faults, strict=True)))
         """faults of the instrument in these episodes, (B, L) each"""
-        super().begin(seeds, provide)
+        super().reset(seeds, provide)
         if not self._filters_type:
             return
         self._frames = np.stack([self._measure(k, np.repeat(cycle[None], B, axis=0))
@@ -140,8 +142,8 @@ class InjectionCore(EpisodeCore):
         self._filters = self._onboard.filters
         self._voltages = self._frames[:, -1].copy()
         self.currents = np.repeat(world.currents[-1:], B, axis=0)
-        for k in range(RECENT):
-            self._recent[:, k] = world.currents[(self.first - 1 - k) % self.first]
+        for k in range(N_RECENT_CURRENTS):
+            self._recent[:, k] = world.currents[(self.n_initial - 1 - k) % self.n_initial]
 
     def _read(self, recordings: Sequence[np.ndarray]) -> None:
         moments = []
@@ -164,7 +166,7 @@ class InjectionCore(EpisodeCore):
     def homogeneous_errors(self) -> np.ndarray:
         """(B, loaded steps) relative errors of the homogeneous estimates."""
         if self._homogeneous is None:
-            level = self._filters.concentration[:, None] - self.world.background
+            level = self._filters.c_ref[:, None] - self.world.background
             area = score_mass(self.world).sum()
             k = slice(self._known)
             error = area * level**2 - 2.0 * level * self._totals[:, k] + self._deviations[:, k]
@@ -180,8 +182,8 @@ class InjectionCore(EpisodeCore):
         """Inject the currents of actions (B,) or (B, L), and return the rewards (B,)."""
         currents = self.rules.currents(actions) if self._table is None else self._table[actions]
         if self.rules.budget is not None:
-            currents = currents * (self.spent < self.rules.budget)[:, None]
-            self.spent += currents.any(axis=1)
+            currents = currents * (self.n_injections < self.rules.budget)[:, None]
+            self.n_injections += currents.any(axis=1)
         self.currents = currents
         self.load_until(self.t + 1)
         self._voltages = self._measure(self.t, currents)
@@ -204,7 +206,7 @@ class InjectionCore(EpisodeCore):
         """(B,) relative errors (5.12) of the present estimates, NaN where the state is not scored
         or there is no estimator."""
         if self.t <= self.world.warm_up or not self._filters_type:
-            return np.full(len(self.spent), np.nan)
+            return np.full(len(self.n_injections), np.nan)
         k = self.t - 1
         return self._filters.errors(self._moments[:, k], self._deviations[:, k],
                                      self._squares[:, k])
@@ -213,14 +215,16 @@ class InjectionCore(EpisodeCore):
         """Present means and standard deviations (B, n) in mol/m³; without an estimator the expected
         concentration and zero."""
         if not self._filters_type:
-            shape = (len(self.spent), scoring_constants(self.world).mass.shape[0])
+            shape = (len(self.n_injections), scoring_constants(self.world).mass.shape[0])
             return np.full(shape, self.world.expected_concentration), np.zeros(shape)
-        return self._filters.means(), self._filters.spreads()
+        return self._filters.means(), self._filters.stds()
 
     def innovations(self) -> list[Innovation | None]:
         """Innovations of the measurements that the filters accepted last, by episode; for scores,
         never for agents. None without an injection, an accepted measurement or an estimator."""
-        return self._filters.innovations() if self._filters_type else [None] * len(self.spent)
+        if not self._filters_type:
+            return [None] * len(self.n_injections)
+        return self._filters.innovations()
 
     def action_masks(self) -> np.ndarray:
         """(B, actions) bool: numbered actions that have an effect; with the budget spent only the
@@ -228,9 +232,9 @@ class InjectionCore(EpisodeCore):
         if self._table is None:
             raise ValueError("action_masks is for environments whose actions are numbers; here "
                              "they are currents")
-        masks = np.ones((len(self.spent), len(self._table)), dtype=bool)
+        masks = np.ones((len(self.n_injections), len(self._table)), dtype=bool)
         if self.rules.budget is not None:
-            masks[self.spent >= self.rules.budget, :-1] = False
+            masks[self.n_injections >= self.rules.budget, :-1] = False
         return masks
 
     def observe(self) -> Observation:
@@ -238,15 +242,15 @@ class InjectionCore(EpisodeCore):
         shown = {"voltages": self._voltages.copy(), "currents": self.currents.copy()}
         if self._filters_type:
             shown |= {"recent": self._recent.copy(), "frame": self._frames.copy()}
-            shown |= self._onboard.shown()
-        left = [np.full(len(self.spent), float(self.world.n_steps - self.t))]
+            shown |= self._onboard.features()
+        left = [np.full(len(self.n_injections), float(self.world.n_steps - self.t))]
         if self.rules.budget is not None:
-            left.append(self.rules.budget - self.spent.astype(float))
+            left.append(self.rules.budget - self.n_injections.astype(float))
         return shown | {"left": np.stack(left, axis=1)}
 
     def format(self) -> Any:
         shown = self.observe()
-        return scaled(self.rules, shown) if self._is_scaled else shown
+        return flatten_scaled(self.rules, shown) if self._is_scaled else shown
 
 
 def _box(high: float, *shape: int, low: float | None = None) -> spaces.Space:

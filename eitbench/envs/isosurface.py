@@ -10,7 +10,7 @@ from matplotlib.colors import to_rgba_array
 from eitbench.numerics.mesh import Mesh
 from eitbench.physics.cem import CompleteElectrodeModel
 
-RICH, POOR = "#e08e0b", "#2f6db5"
+HIGH_COLOUR, LOW_COLOUR = "#e08e0b", "#2f6db5"
 _EYE = -np.linalg.qr(np.array([[0.30, 0.0, 1.0], [0.22, 1.0, 0.0], [0.9, -0.3, -0.3]]).T)[0].T
 """Rows: what is right, up and near on the picture; the pipe's axis z runs to the right."""
 
@@ -43,7 +43,8 @@ def isosurface(mesh: Mesh, values: np.ndarray, level: float) -> np.ndarray:
 def draw_isosurfaces(axes: Axes, mesh: Mesh, values: np.ndarray, poor: float, rich: float) -> None:
     """Surfaces of ``poor`` (blue) and ``rich`` (orange) mol/m³ in the outline of the pipe."""
     surfaces = [isosurface(mesh, values, level) for level in (poor, rich)]
-    _draw(axes, np.concatenate(surfaces), np.repeat([POOR, RICH], list(map(len, surfaces))), 0.5)
+    colours = np.repeat([LOW_COLOUR, HIGH_COLOUR], list(map(len, surfaces)))
+    _draw(axes, np.concatenate(surfaces), colours, 0.5)
     _outline(axes, mesh)
 
 

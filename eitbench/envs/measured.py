@@ -13,7 +13,7 @@ from gymnasium import spaces
 from eitbench import _check
 from eitbench._extras import needed_by
 from eitbench.envs.episodes import RENDER_MODES, RESET_NEEDED, FixedLengthEnv, Observation
-from eitbench.envs.estimation import checked_actions
+from eitbench.envs.estimation import check_actions
 from eitbench.measured import Measurements, quality, read
 from eitbench.measured.calibration import calibrate, noise_from_frames
 from eitbench.measured.cases import MeasuredCase, read_case
@@ -109,7 +109,7 @@ class MeasuredEnv(FixedLengthEnv):
         self.available = complete_channels(measurements)
         """(K, M) bool: readings that exist at every use of their injection"""
         self.episode_steps = T
-        self.spread: np.ndarray | None = None
+        self.estimate_std: np.ndarray | None = None
         """(n,) standard deviation of the last estimate in mol/m³, if the caller has one"""
         self._last: np.ndarray | None = None
         self._seed = -1
@@ -129,10 +129,11 @@ class MeasuredEnv(FixedLengthEnv):
         """Draw the withheld readings, and build the task without them."""
         if seed == self._seed:
             return
-        self.hidden = sample_withheld(self.available, self.withheld, seed)
+        self.withheld_mask = sample_withheld(self.available, self.withheld, seed)
         """(K, M) bool: readings that the agent is not shown"""
         self.task: Task = task_from_measurements(
-            self.vessel, self.calibration, self.measurements, mask=self.available & ~self.hidden,
+            self.vessel, self.calibration, self.measurements,
+            mask=self.available & ~self.withheld_mask,
             **self._options)
         """information for the agent"""
         self._full_model = self.model.with_mask(self.available)
@@ -154,7 +155,7 @@ class MeasuredEnv(FixedLengthEnv):
             seed = int(self.np_random.integers(WITHHOLDING_SEEDS))
         self._withhold(seed % WITHHOLDING_SEEDS)
         self._step = 1
-        self.spread = self._last = None
+        self.estimate_std = self._last = None
         return self._observe(), {"step": 1}
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -163,7 +164,7 @@ class MeasuredEnv(FixedLengthEnv):
         if not 1 <= self._step <= self.episode_steps:
             raise gym.error.ResetNeeded(RESET_NEEDED)
         n = self.task.mesh.n_nodes
-        self._last = estimate = checked_actions(action, self.action_space, n)[:n].copy()
+        self._last = estimate = check_actions(action, self.action_space, n)[:n].copy()
         reward = 0.0
         if steps := self.scoring_steps(self._step):
             residuals = np.concatenate([self.withheld_residuals(t, estimate) for t in steps])
@@ -202,7 +203,8 @@ class MeasuredEnv(FixedLengthEnv):
     def withheld_residuals(self, t: int, estimate: np.ndarray) -> np.ndarray:
         """Residuals of an estimate (n,) at the readings withheld at t = 1 … T, relative to the
         standard deviation of their noise."""
-        return self.residuals(t, estimate)[self.hidden[self.measurements.injection_index[t - 1]]]
+        injection = self.measurements.injection_index[t - 1]
+        return self.residuals(t, estimate)[self.withheld_mask[injection]]
 
     def residuals(self, t: int, estimate: np.ndarray) -> np.ndarray:
         """(M,) residuals of an estimate (n,) at all readings of t = 1 … T, relative to the

@@ -15,7 +15,7 @@ from matplotlib.tri import Triangulation
 from eitbench.numerics.mesh import Mesh, rectangle_mesh
 from eitbench.worlds.task import Task
 
-FIELD_MAP, SPREAD_MAP = "viridis", "magma"
+FIELD_COLORMAP, STD_COLORMAP = "viridis", "magma"
 SOURCE, SINK, IDLE = "#d1495b", "#2e86ab", "#5c5c5c"
 
 
@@ -25,7 +25,7 @@ def colour_range(task: Task) -> tuple[float, float]:
 
 
 def draw_field(axes: Axes, mesh: Mesh, values: np.ndarray, low: float, high: float,
-               colours: str = FIELD_MAP):
+               colours: str = FIELD_COLORMAP):
     """Draw nodal ``values`` as smooth colours, axes in cm, in 3D on the slice x = 0 with z to the
     right; return the mappable for a colour bar."""
     if mesh.dim == 3:
@@ -98,7 +98,7 @@ def draw_frame(task: Task, truth_mesh: Mesh, truth: np.ndarray, estimate: np.nda
         panels[2].text(0.5, 0.5, "no spread claimed", transform=panels[2].transAxes, ha="center",
                        va="center")
     shown = np.zeros(task.mesh.n_nodes) if spread is None else spread
-    colours, label = ("Greys", "") if spread is None else (SPREAD_MAP, "std / (mol/m³)")
+    colours, label = ("Greys", "") if spread is None else (STD_COLORMAP, "std / (mol/m³)")
     draw = draw_field(panels[2], task.mesh, shown, 0.0, spread_high, colours)
     if spread is not None or tank:                       # panels of tanks keep their size
         where = {"location": "bottom", "aspect": 20} if tank else {"aspect": 12}

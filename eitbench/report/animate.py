@@ -18,11 +18,11 @@ from eitbench.bench.methods import Method
 from eitbench.bench.run import Job
 from eitbench.bench.tracks import Environment, board_of
 from eitbench.envs.rendering import (
-    FIELD_MAP,
+    FIELD_COLORMAP,
     IDLE,
     SINK,
     SOURCE,
-    SPREAD_MAP,
+    STD_COLORMAP,
     draw_comparison,
 )
 from eitbench.report.plot import one_seed, played, states_at
@@ -56,7 +56,7 @@ def animate(environment: str, methods: Sequence[str], seed: str, step: int | Non
             if board_of(env) not in each.boards:
                 raise ValueError(f"baseline {each.name} plays {', '.join(each.boards)}, but "
                                  f"{environment} is a {board_of(env)} environment")
-        begin = env.core.first + 1 if asked.track == "injection" else 1
+        begin = env.core.n_initial + 1 if asked.track == "injection" else 1
         first, last = env.world.warm_up + 1, env.world.n_steps
         if step is not None:
             first = last = _check.integer("step", step, low=begin, high=last)
@@ -97,7 +97,7 @@ def _compared(env: Any, loaded: list[Method], seed: int, at: range) -> Iterator[
 def _palette() -> Image.Image:
     """The 256 colours of all frames, which keeps them steady: colour maps, greys, electrodes."""
     colours = [colormaps[name](np.linspace(0, 1, n))[:, :3]
-               for name, n in ((FIELD_MAP, 120), (SPREAD_MAP, 100))]
+               for name, n in ((FIELD_COLORMAP, 120), (STD_COLORMAP, 100))]
     greys = np.linspace(0, 1, 27)[:, None].repeat(3, axis=1)
     pairs = [to_rgb(colour) for colour in (SOURCE, SINK, IDLE)]
     halves = [tuple(0.5 + 0.5 * c for c in colour) for colour in pairs]  # at the edges of the bars

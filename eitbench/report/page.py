@@ -21,7 +21,7 @@ from eitbench.bench.store import EpisodeStore
 from eitbench.bench.text import seed_ranges
 from eitbench.bench.tracks import Environment
 from eitbench.data.seeds import allow_test_seeds, parse_seeds
-from eitbench.envs.rendering import FIELD_MAP, colour_range, draw_field
+from eitbench.envs.rendering import FIELD_COLORMAP, colour_range, draw_field
 from eitbench.numerics.mesh import Mesh
 from eitbench.report import tables
 from eitbench.report.boards import Board
@@ -50,7 +50,7 @@ def write_page(store: EpisodeStore, boards: Sequence[Board], sweeps: Sequence[Sw
         "page.html.j2", root="", sections=sections, explanations=tables.explanations(shown),
         sweeps=[(sweep, sweep.chart()) for sweep in sweeps],
         colour_bar=_bare(3.0, 0.12, lambda axes: axes.imshow(np.linspace(0, 1, 256)[None],
-                                                             cmap=FIELD_MAP, aspect="auto")),
+                                                             cmap=FIELD_COLORMAP, aspect="auto")),
         runs=[group[0] for group in alike(runs, "command")])
     path = store.folder / "index.html"
     write_atomically(path, html)

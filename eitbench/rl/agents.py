@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from eitbench.bench.methods import baseline_folder
-from eitbench.envs.injection_core import InjectionCore, scaled
+from eitbench.envs.injection_core import InjectionCore, flatten_scaled
 from eitbench.estimation.onboard.onboard_filter import OnboardFilter
 from eitbench.estimation.onboard.reduced_filters import ReducedFilters
 from eitbench.estimation.onboard.rules import Rules
@@ -45,15 +45,16 @@ class Agent:
             self.onboard = OnboardFilter(ReducedFilters, self.rules, observation["frame"][None])
         else:
             self.onboard.assimilate(observation["voltages"][None], observation["currents"][None])
-        observation = observation | {name: array[0] for name, array in self.onboard.shown().items()}
+        features = self.onboard.features()
+        observation = observation | {name: array[0] for name, array in features.items()}
         masks = {}
         if self.masked:
             spent = self.rules.budget is not None and observation["left"][1] == 0.0
             n = self.model.action_space.n
             masks["action_masks"] = np.arange(n) >= spent * (n - 1)
         action, self.memory = self.model.predict(
-            scaled(self.rules, observation), state=self.memory, episode_start=np.array([begins]),
-            deterministic=True, **masks)
+            flatten_scaled(self.rules, observation), state=self.memory,
+            episode_start=np.array([begins]), deterministic=True, **masks)
         return action
 
 

@@ -17,7 +17,7 @@ from tqdm import tqdm
 from eitbench import _check
 from eitbench.bench.methods import Method, load_method
 from eitbench.envs.injection import InjectionEnv
-from eitbench.envs.injection_core import scaled
+from eitbench.envs.injection_core import flatten_scaled
 from eitbench.estimation.onboard.rules import Rules
 
 DEFAULTS = {"rounds": 4, "episodes": 50, "epochs": 10, "batch": 256, "learning_rate": 1e-3}
@@ -102,7 +102,7 @@ def rollout(world: InjectionEnv, method: Method, episode: int, random: np.random
     ended = False
     while not ended:
         actions.append(policy.act(observation))
-        seen.append(scaled(world.rules, observation))
+        seen.append(flatten_scaled(world.rules, observation))
         observation, reward, ended, _, _ = world.step(
             actions[-1] if act is None else act(seen[-1]))
         rewards.append(reward)

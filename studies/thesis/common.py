@@ -19,7 +19,7 @@ from eitbench.bench.methods import load_method
 from eitbench.bench.playing import estimates
 from eitbench.data.episode_cache import score_operators
 from eitbench.envs.estimation import EstimationEnv
-from eitbench.envs.rendering import SPREAD_MAP, colour_range, draw_electrodes, draw_field
+from eitbench.envs.rendering import STD_COLORMAP, colour_range, draw_electrodes, draw_field
 from eitbench.numerics.mesh import Mesh
 from eitbench.physics.transport import VelocityField
 from eitbench.worlds.task import Estimate, Task
@@ -123,7 +123,7 @@ def draw_flow(axes: Axes, mesh: Mesh, flow: VelocityField,
     ``inside`` maps points (k, 2) in m to True where streamlines may pass.
     """
     mappable = draw_field(axes, mesh, 100 * np.hypot(*flow(mesh.points).T), 0.0, 100 * top,
-                          SPREAD_MAP)
+                          STD_COLORMAP)
     low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
     x, y = (np.linspace(*ends, round((ends[1] - ends[0]) / 0.0035) + 1)
             for ends in zip(low, high, strict=True))

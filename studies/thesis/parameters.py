@@ -15,7 +15,7 @@ from threadpoolctl import threadpool_limits
 
 from eitbench.bench.methods import load_method
 from eitbench.envs.estimation import EstimationEnv
-from eitbench.envs.rendering import FIELD_MAP
+from eitbench.envs.rendering import FIELD_COLORMAP
 from eitbench.physics.transport import Transport
 from eitbench.worlds.task import Task
 from eitbench.worlds.world import World
@@ -129,7 +129,7 @@ def _heat_map(ax: Axes, errors: dict[Factors, float], vertical: str, horizontal:
     """Draw ẽ_c in colours and numbers with the cell of Table 5.1 framed; return the mappable."""
     values = 1e3 * np.array([[errors[Factors(**{vertical: a, horizontal: b})] for b in FACTORS]
                              for a in FACTORS])
-    image = ax.imshow(values, origin="lower", cmap=FIELD_MAP, vmin=1e3 * scale[0],
+    image = ax.imshow(values, origin="lower", cmap=FIELD_COLORMAP, vmin=1e3 * scale[0],
                       vmax=1e3 * scale[1])
     for (row, column), value in np.ndenumerate(values):
         dark = value < 500 * sum(scale)

@@ -15,7 +15,7 @@ from eitbench.bench.playing import estimated
 from eitbench.bench.scores import scored
 from eitbench.data.episode_cache import score_operators
 from eitbench.envs.estimation import EstimationEnv
-from eitbench.envs.rendering import SPREAD_MAP, colour_range, draw_field
+from eitbench.envs.rendering import STD_COLORMAP, colour_range, draw_field
 
 from .common import (
     agreement_line,
@@ -68,7 +68,7 @@ def fig5_5(seeds: list[int], _jobs: int, out: Path) -> tuple[Path, str]:
     top = float(np.quantile(np.asarray(variances[0]), 0.995))
     for ax, variance, title in zip(axes, variances, ("Kalman filter", "fixed-interval smoother"),
                                    strict=True):
-        mappable = draw_field(ax, env.task.mesh, np.asarray(variance), 0.0, top, SPREAD_MAP)
+        mappable = draw_field(ax, env.task.mesh, np.asarray(variance), 0.0, top, STD_COLORMAP)
         draw_idle_electrodes(ax, env.task)
         ax.set(title=f"{title}, {format_milliseconds(env, t)}", xlabel="x / cm")
     figure.colorbar(mappable, ax=axes, label="variance / (mol/m³)²", extend="max")

@@ -12,7 +12,7 @@ from eitbench.bench.methods import baseline_folder, load_method, own_agents
 from eitbench.bench.run import Job, run_episode
 from eitbench.bench.tracks import Environment, ids
 
-from choosing import injected
+from injection_envs import injected
 
 FOLDER = baseline_folder() / "checkpoints"
 AGENTS = [path for env in ids("injection") for path in own_agents(env)]

@@ -18,7 +18,7 @@ from eitbench.report.policies import adaptivity_gap, errors_by_policy, gap_text,
 from eitbench.worlds.catalogue import PIPE_2D
 from scipy.stats import t as student
 
-from choosing import filter_of, injected
+from injection_envs import filter_of, injected
 from short import merged
 
 NAME, INFLOW = "eitbench/Pipe2DInjection-v0", "eitbench/Pipe2DInjectionInflow-v0"
@@ -70,29 +70,30 @@ def test_belief_is_the_filter_inside(name):
     observation, _ = env.reset(seed=SEED)
     belief = Belief(env.rules, observation)
     for pair in (7, 100, None if env.rules.budget else 3, 7):
-        predicted = belief.predicted()
+        predicted = belief.predict_covariance()
         observation, *_ = env.step(env.rules.action(pair))
-        belief.see(observation)
+        belief.update(observation)
         inside = filter_of(env)
         np.testing.assert_array_equal(belief.mean, inside.means()[0])
         np.testing.assert_array_equal(filter_of(belief).covariance, inside.covariance)
         if name == NAME:                         # what it foretells: nothing was left out
             expected = inside.covariance
-            np.testing.assert_allclose(belief.after(predicted, pair), expected, atol=2e-5 * np.abs(expected).max())
-            assert belief.gains(predicted)[0][pair] == pytest.approx((predicted - expected).trace(), rel=1e-3)
+            np.testing.assert_allclose(belief.posterior_covariance(predicted, pair), expected,
+                                       atol=2e-5 * np.abs(expected).max())
+            assert belief.design_criteria(predicted)[0][pair] == pytest.approx((predicted - expected).trace(), rel=1e-3)
 
 
 def test_unsound_electrodes_teach_nothing():
     """Pairs with one of them gain nothing, the others less than with all readings, but more than nothing."""
     env = environment(NAME)
     belief = Belief(env.rules, env.reset(seed=SEED)[0])
-    predicted, sound = belief.predicted(), np.arange(16) != 3
-    every, fewer = belief.gains(predicted)[0], belief.gains(predicted, sound)[0]
+    predicted, sound = belief.predict_covariance(), np.arange(16) != 3
+    every, fewer = belief.design_criteria(predicted)[0], belief.design_criteria(predicted, sound)[0]
     touched = (env.rules.pairs == 3).any(axis=1)
     assert not fewer[touched].any() and (fewer[~touched] > 0.0).all() and (fewer[~touched] < every[~touched]).all()
     k = int(np.flatnonzero(~touched)[0])
-    assert fewer[k] == pytest.approx((predicted - belief.after(predicted, k, sound)).trace(), rel=1e-6)
-    assert (belief.after(predicted, int(np.flatnonzero(touched)[0]), sound) == predicted).all()
+    assert fewer[k] == pytest.approx((predicted - belief.posterior_covariance(predicted, k, sound)).trace(), rel=1e-6)
+    assert (belief.posterior_covariance(predicted, int(np.flatnonzero(touched)[0]), sound) == predicted).all()
 
 
 def test_doubt_is_forgiven_to_those_who_rest():
@@ -100,26 +101,26 @@ def test_doubt_is_forgiven_to_those_who_rest():
     env = environment(FAULTS)
     observation, _ = env.reset(seed=SEED)
     belief, currents, doubt = Belief(env.rules, observation), np.zeros((2, 16)), np.zeros((2, 16))
-    assert belief.sound.all()
+    assert belief.healthy_electrodes.all()
     currents[0, [2, 9]], currents[1, [0, 15]], doubt[1, [2, 9]] = (1.0, -1.0), (1.0, -1.0), 0.36
-    belief.see(observation | {"currents": currents[0], "doubt": doubt})
-    assert np.flatnonzero(~belief.sound).tolist() == [2, 9]
+    belief.update(observation | {"currents": currents[0], "doubt": doubt})
+    assert np.flatnonzero(~belief.healthy_electrodes).tolist() == [2, 9]
     doubt[0, 9] = 0.2                            # whoever rests is doubted as driver by the environment for ever
-    belief.see(observation | {"currents": currents[1], "doubt": doubt})
-    assert np.flatnonzero(~belief.sound).tolist() == [9]
-    np.testing.assert_allclose(belief.doubt[[2, 9]], [0.8 * 0.36, 0.8 * 0.36 + 0.2])
-    assert not {2, 9} & set(env.rules.pairs[belief.least_doubtful])
+    belief.update(observation | {"currents": currents[1], "doubt": doubt})
+    assert np.flatnonzero(~belief.healthy_electrodes).tolist() == [9]
+    np.testing.assert_allclose(belief.fault_score[[2, 9]], [0.8 * 0.36, 0.8 * 0.36 + 0.2])
+    assert not {2, 9} & set(env.rules.pairs[belief.most_reliable_pair])
 
 
 def test_look_ahead_finds_the_best_plan():
     """With a beam that holds every pair, depth 2 is the minimum over all plans; depth 1 is greedy."""
     env = environment(NAME)
     belief, sound = Belief(env.rules, env.reset(seed=SEED)[0]), np.arange(16) % 3 != 0
-    predicted = belief.predicted()
-    gains, costs = belief.gains(predicted, sound)[0], []
+    predicted = belief.predict_covariance()
+    gains, costs = belief.design_criteria(predicted, sound)[0], []
     for pair, gain in enumerate(gains):
-        later = belief.predicted(belief.after(predicted, pair, sound))
-        costs.append(-gain + later.trace() - belief.gains(later, sound)[0].max())
+        later = belief.predict_covariance(belief.posterior_covariance(predicted, pair, sound))
+        costs.append(-gain + later.trace() - belief.design_criteria(later, sound)[0].max())
     assert belief.look_ahead(1, 4, sound) == gains.argmax()
     assert belief.look_ahead(2, len(gains), sound) == np.argmin(costs)
 
@@ -127,12 +128,12 @@ def test_look_ahead_finds_the_best_plan():
 def test_beforehand_is_the_expected_liquid():
     """A belief without data is linear about the expected level, and at the level both derivatives agree."""
     env = environment(NAME)
-    belief = Belief.beforehand(env.rules)
+    belief = Belief.from_prior(env.rules)
     assert filter_of(belief).concentration[0] == pytest.approx(env.world.expected_concentration, rel=1e-12)
     level = filter_of(belief).concentration[0]
     assert np.abs(belief.mean / level - 1.0).max() < 0.01
-    np.testing.assert_allclose(belief.relinearised(), belief.derivative, rtol=0.1,
-                               atol=0.02 * np.abs(belief.derivative).max())
+    np.testing.assert_allclose(belief.relinearised_jacobian(), belief.jacobian, rtol=0.1,
+                               atol=0.02 * np.abs(belief.jacobian).max())
 
 
 # -- rules ------------------------------------------------------------------------------------------------------------
@@ -159,7 +160,7 @@ def test_an_even_budget_is_spent_exactly(budget):
     """So many injections, or one at each step; between two of them the same number of steps, give or take one."""
     rules = Rules(PIPE_2D.with_changes({"schedule": {"scored_steps": 180, "budget": budget}}))
     steps = rules.world.n_steps - 16
-    when = np.flatnonzero([rules.spaced(np.array([left, 0.0])) for left in range(steps, 0, -1)])
+    when = np.flatnonzero([rules.is_injection_step(np.array([left, 0.0])) for left in range(steps, 0, -1)])
     assert len(when) == min(budget, steps)
     assert len(when) < 2 or np.ptp(np.diff([-1, *when])) <= 1
 

@@ -15,7 +15,7 @@ from eitbench.data.episode_cache import mass_between
 from eitbench.numerics.fem import mass_matrix
 from eitbench.worlds import entry
 
-from choosing import BUDGET, FAULTS, FLOW, NAME, make, world
+from injection_envs import BUDGET, FAULTS, FLOW, NAME, make, world
 
 SEED = 5
 CLAIMS = ("nis", "crps", "coverage_50", "coverage_90", "spread_ratio")

@@ -113,7 +113,7 @@ def test_calibration_cannot_be_bought_by_one_step(tmp_path):
 def test_estimators_see_the_task_and_measurements_only(environment):
     """One argument makes it: the task. Two feed it: voltages and currents. No reward, no info, no environment."""
     env, seen = environment.make(), []
-    env.reveal = None                                           # is not even called
+    env.privileged_info = None                                           # is not even called
 
     def update(*arguments):
         seen.append(arguments)

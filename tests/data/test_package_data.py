@@ -8,7 +8,7 @@ from eitbench.bench.tracks import own_ids
 from eitbench.data import cache, episodes
 from eitbench.data.cache import load_shipped
 from eitbench.data.episode_cache import prefix_file, region_file, scoring_constants_file
-from eitbench.estimation.onboard.models import packed, stored_model_key, unpacked
+from eitbench.estimation.onboard.models import pack_model, reduced_model_key, unpack_model
 from eitbench.estimation.reduced import ReducedModel
 from eitbench.worlds import entry
 
@@ -33,11 +33,11 @@ def test_shipped_is_what_would_be_built(file):
 def test_models_are_compared_in_one_basis():
     """Turned by a rotation it is the same model; with another number it is not."""
     shipped = next(load_shipped(file.key) for file in EXPECTED if file.key.name.startswith("reduced"))
-    full = unpacked(shipped)
+    full = unpack_model(shipped)
     turn, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(120, 120)))
     turned = {"basis": full["basis"] @ turn, **{name: turn.T @ full[name] @ turn
                                                 for name in ("transition", "noise", "initial")}}
-    again = packed(ReducedModel(**turned))
+    again = pack_model(ReducedModel(**turned))
     assert difference(shipped, again) == ""
     again["noise"] = 1.001 * again["noise"]
     assert "noise" in difference(shipped, again)
@@ -52,7 +52,7 @@ def test_models_are_compared_in_one_basis():
       {"instrument": {"current": 0.2}}]),
     (lambda world: region_file(world).key,
      [{"schedule": {"scored_steps": 3}}], [{"region": [0.1, 0.2]}, {"vessel": {"electrodes_per_wall": 4}}]),
-    (stored_model_key,
+    (reduced_model_key,
      [{"schedule": {"budget": 3, "scored_steps": 9}}, {"instrument": {"n_dead_range": [1, 1]}}],
      [{"instrument": {"noise_relative": 0.1}}, {"prior": {"nodal_std": 0.1}}, {"flow": {"mean_velocity": 4.0}},
       {"schedule": {"time_step": 4e-3}}, {"vessel": {"electrodes_per_wall": 4}}])])

@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-import choosing
+import injection_envs
 from short import short
 
 PIPE, SKEWED, TANK = "eitbench/Pipe2D-v0", "eitbench/Pipe2DSkewedVelocity-v0", "eitbench/RotatingTank2D-v0"
@@ -27,7 +27,7 @@ copied = pytest.mark.parametrize("how", COPIES)
 def changes(name: str, given: dict) -> dict:
     """Arguments for short episodes; where a reduced filter is built, of the world for which other tests build it."""
     is_reduced = "Injection" in name and "estimator" not in given
-    return ({"world": choosing.world(name), "episodes": 2} if is_reduced else short(name)) | given
+    return ({"world": injection_envs.world(name), "episodes": 2} if is_reduced else short(name)) | given
 
 
 def begun(name: str, given: dict, seed: int | None = 3):

@@ -15,7 +15,7 @@ from eitbench.data.episodes import Episode
 from eitbench.data.seeds import ReservedSeedWarning, allow_test_seeds
 from eitbench.envs.estimation import EstimationEnv
 from eitbench.worlds import Flow, Target, World, entries
-from estimating import ESTIMATION, PIPE, make, noise_actions, play
+from estimation_envs import ESTIMATION, PIPE, make, noise_actions, play
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
@@ -149,7 +149,7 @@ def test_frames_show_truth_estimate_and_spread(name):
 
     bright = after(44.0)
     flat = after(30.0)
-    base.spread = np.full(base.n_nodes, 4.0)
+    base.estimate_std = np.full(base.n_nodes, 4.0)
     spread = env.render()
     assert len({picture.tobytes() for picture in (first, flat, spread, bright)}) == 4
 

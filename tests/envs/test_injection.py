@@ -7,13 +7,13 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from eitbench.data.episode_cache import cached_episode, cycle_voltages, score_operators
-from eitbench.estimation.onboard.levels import electrode_pairs
+from eitbench.estimation.onboard.linearisation import electrode_pairs
 from eitbench.estimation.onboard.reduced_filters import ReducedFilters
 from eitbench.worlds import entries
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
-from choosing import (
+from injection_envs import (
     CURRENTS,
     FAULTS,
     FLOW,

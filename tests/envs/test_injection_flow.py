@@ -18,18 +18,18 @@ from eitbench.data.episode_cache import (
     scoring_constants,
 )
 from eitbench.data.presimulation import presimulate
-from eitbench.envs.injection_core import scaled
+from eitbench.envs.injection_core import flatten_scaled
 from eitbench.estimation import Filter, linearise_at_reference, velocity_states
 from eitbench.estimation.onboard.belief import Belief
-from eitbench.estimation.onboard.full_filters import BOUNDS
-from eitbench.estimation.onboard.levels import electrode_pairs
-from eitbench.estimation.onboard.models import stored_model
+from eitbench.estimation.onboard.full_filters import VELOCITY_BOUNDS
+from eitbench.estimation.onboard.linearisation import electrode_pairs
+from eitbench.estimation.onboard.models import load_or_build_model
 from eitbench.estimation.reduced_joint import TransitionSplines
 from eitbench.numerics.fem import mass_matrix
 from eitbench.worlds.catalogue import PIPE_2D_DRIFTING
 from eitbench.worlds.task import make_task
 
-from choosing import FLOW, NAME, filter_of, make, some_pairs
+from injection_envs import FLOW, NAME, filter_of, make, some_pairs
 from short import WANDERING
 
 WALK = 0.1
@@ -136,7 +136,7 @@ def test_velocity_is_a_walk_that_turns_back():
 def test_tables_hold_between_their_velocities(env):
     """A(θ), the noise and dA/dθ at a velocity that is not tabulated against F(θ) itself, projected."""
     task = env.task
-    model = stored_model(env.world)
+    model = load_or_build_model(env.world)
     theta = 0.5 * (model.velocities[6] + model.velocities[7])
     transport = task.transport.with_velocity(task.velocity.field([theta]))
     F, Y = transport.transition()
@@ -164,7 +164,7 @@ def test_full_operator_is_the_joint_filter_of_the_baselines():
     pairs = electrode_pairs(16).tolist()
     env.reset(seed=5)
     level = filter_of(env).concentration[0]
-    filter_ = Filter(velocity_states(task, level, BOUNDS), linearise_at_reference(task, level))
+    filter_ = Filter(velocity_states(task, level, VELOCITY_BOUNDS), linearise_at_reference(task, level))
     for t, voltages in enumerate(cycle_voltages(world, 5, cached_episode(world, 5))):
         current = world.currents[t % 16]
         filter_.assimilate(voltages, current)
@@ -186,10 +186,10 @@ def test_observation_shows_the_velocity(env):
     for action in some_pairs()[:3]:
         observation = env.step(int(action))[0]
     (velocity,), (std,) = observation["velocity"], observation["velocity_std"]
-    estimated, spread = filter_of(env).flow()
+    estimated, spread = filter_of(env).velocity()
     assert velocity == estimated[0, 0] > 0.0
     assert 0.0 < std == spread[0, 0] < 1.0
-    flat = scaled(env.rules, observation)
+    flat = flatten_scaled(env.rules, observation)
     np.testing.assert_allclose(flat[-2:], [2.0 * (velocity / 16.0 - 1.0), std], rtol=1e-6)
     plain = make("reduced", NAME, "scaled")
     assert flat.shape == (plain.observation_space.shape[0] + 2,)
@@ -200,12 +200,12 @@ def test_gains_are_of_errors_in_the_region(env):
     """By how much a pair's measurement lowers the expected error over the region, or over what the fluid brings."""
     belief = Belief(env.rules, env.reset(seed=3)[0])
     for action in some_pairs()[:4]:
-        belief.see(env.step(int(action))[0])
-    predicted = belief.predicted()
-    weight = belief.foresight(3)
+        belief.update(env.step(int(action))[0])
+    predicted = belief.predict_covariance()
+    weight = belief.future_error_weight(3)
     for pair in (3, 40, 101):
-        after = belief.after(predicted, pair)
-        gain = belief.gains(predicted)[0][pair]
+        after = belief.posterior_covariance(predicted, pair)
+        gain = belief.design_criteria(predicted)[0][pair]
         lower = belief.expected_error(predicted) - belief.expected_error(after)
         assert gain == pytest.approx(lower, rel=1e-6)
         total = 0.0
@@ -214,6 +214,6 @@ def test_gains_are_of_errors_in_the_region(env):
             total += belief.expected_error(changes)
             transition = belief._step(k + 1)[0]
             changes = transition @ changes @ transition.T
-        foreseen = belief.gains(predicted, weight=weight)[0][pair]
+        foreseen = belief.design_criteria(predicted, weight=weight)[0][pair]
         assert foreseen == pytest.approx(total, rel=1e-6)
         assert gain <= total

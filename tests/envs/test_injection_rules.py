@@ -3,12 +3,12 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from eitbench.estimation.onboard.levels import electrode_pairs
+from eitbench.estimation.onboard.linearisation import electrode_pairs
 from eitbench.estimation.onboard.rules import Rules
 from eitbench.worlds.catalogue import PIPE_2D
 from eitbench.worlds.instrument import Faults, Instrument
 
-from choosing import BUDGET, CURRENTS, FAULTS, make, play, some_pairs
+from injection_envs import BUDGET, CURRENTS, FAULTS, make, play, some_pairs
 
 
 @pytest.mark.parametrize(("limit", "order"), [("L1", 1), ("L2", 2), ("Linf", np.inf)])
@@ -63,7 +63,7 @@ def test_budget_is_spent_and_then_nothing_flows():
         assert masks[120]
         assert (masks[:120] == (left[-1] > 0)).all()
     assert left == [2, 2, 1, 1, 0, 0, 0]
-    assert env.unwrapped.core.spent == [2]
+    assert env.unwrapped.core.n_injections == [2]
 
 
 def test_dead_electrodes_read_nothing_and_carry_nothing():

@@ -10,15 +10,15 @@ from eitbench.estimation.onboard.belief import Belief
 from eitbench.estimation.onboard.inflow_states import (
     InflowModel,
     InflowStates,
+    fit_world_prior,
     inflow_model,
     sample_coordinates,
-    world_prior,
 )
-from eitbench.estimation.onboard.levels import levels_of, pair_currents
-from eitbench.estimation.onboard.models import stored_voltages
+from eitbench.estimation.onboard.linearisation import linearisation_table, pair_currents
+from eitbench.estimation.onboard.models import load_or_build_voltages
 from scipy.linalg import toeplitz
 
-from choosing import BUDGET, FAULTS, FLOW, INFLOW, TANK, filter_of, make, some_pairs
+from injection_envs import BUDGET, FAULTS, FLOW, INFLOW, TANK, filter_of, make, some_pairs
 
 
 def begun(estimator: str, seed: int = 3):
@@ -31,7 +31,7 @@ def test_full_one_is_that_of_the_baseline():
     env, observation = begun("full")
     world, task = env.unwrapped.world, env.unwrapped.task
     core = env.unwrapped.core
-    ours = inflow_filter(task, world_prior(world), float(filter_of(env).concentration[0]))
+    ours = inflow_filter(task, fit_world_prior(world), float(filter_of(env).concentration[0]))
     for voltages, currents in zip(observation["frame"], world.currents, strict=True):
         ours.assimilate(voltages, currents)
     for action in some_pairs()[:world.n_steps - 16]:
@@ -61,7 +61,7 @@ def test_reduced_one_is_close_to_the_full_one():
 def parts():
     """The steady response of a short world, its prior and the reduced model of both, in double precision."""
     world = make("none", INFLOW).unwrapped.world
-    response, prior = steady_response(make_task(world).transport), world_prior(world)
+    response, prior = steady_response(make_task(world).transport), fit_world_prior(world)
     return response, prior, inflow_model(response, prior)
 
 
@@ -129,7 +129,7 @@ def test_node_voltages_are_those_of_all_nodes(parts):
     world = make("none", INFLOW).unwrapped.world
     observation = make_task(world).observation
     level = world.expected_concentration
-    voltages = stored_voltages(world)
+    voltages = load_or_build_voltages(world)
     samples = sample_coordinates(InflowModel(*model), response, prior, 540)[500:]
     currents = pair_currents(world)[some_pairs(len(samples))]
     levels = level * np.linspace(0.9, 1.1, len(samples))
@@ -138,7 +138,7 @@ def test_node_voltages_are_those_of_all_nodes(parts):
     off = []
     for b, y in enumerate(samples):
         exact, by_c = observation.linearise(levels[b] * (1.0 + model.basis @ y), currents[b:b + 1])
-        std = levels_of(world).noise_std(exact[0], 0.0)
+        std = linearisation_table(world).noise_std(exact[0], 0.0)
         expected = levels[b] * by_c[0] @ model.basis @ directions / std[:, None]
         found = by[b] @ directions / std[:, None]
         off.append([np.sqrt(np.mean(((computed[b] - exact[0]) / std)**2)),
@@ -155,15 +155,15 @@ def test_what_a_pair_teaches_is_foretold():
     belief = Belief(env.unwrapped.rules, observation)
     rtol = 1e-3                                            # the filter has single precision
     for pair in (7, 100, 3):
-        predicted = belief.predicted()
-        after, expected = belief.after(predicted, pair), belief.expected_error(predicted)
-        gain = belief.gains(predicted)[0][pair]
+        predicted = belief.predict_covariance()
+        after, expected = belief.posterior_covariance(predicted, pair), belief.expected_error(predicted)
+        gain = belief.design_criteria(predicted)[0][pair]
         assert gain == pytest.approx(expected - belief.expected_error(after), rel=1e-6)
         observation = env.step(pair)[0]
         inside = filter_of(env).covariance
         np.testing.assert_allclose(after, inside, atol=rtol * np.abs(inside).max())
         assert gain < expected
-        belief.see(observation)
+        belief.update(observation)
 
 
 def test_expected_error_is_that_of_the_spread():
@@ -172,7 +172,7 @@ def test_expected_error_is_that_of_the_spread():
     env, observation = begun("reduced")
     belief = Belief(env.unwrapped.rules, observation)
     operator = filter_of(belief)
-    expected = belief.expected_error(belief.predicted())
+    expected = belief.expected_error(belief.predict_covariance())
     silent = np.zeros((1, 16))
     operator.assimilate(silent, silent)
     states = operator._shared.states

@@ -5,9 +5,9 @@ import pytest
 from eitbench import make_task
 from eitbench.data.episode_cache import cached_episode, cycle_voltages
 from eitbench.estimation import CalibrationFrame, LinearisedForwardModel, kalman_filter, table_5_1_filter
-from eitbench.estimation.onboard.levels import electrode_pairs
+from eitbench.estimation.onboard.linearisation import electrode_pairs
 
-from choosing import filter_of, make
+from injection_envs import filter_of, make
 
 PAIRS = electrode_pairs(16).tolist()
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from eitbench import scoring
 from eitbench.data.episode_cache import score_operators
-from estimating import AT_HOME, VELOCITY, best_velocity, make
+from estimation_envs import AT_HOME, VELOCITY, best_velocity, make
 
 each_velocity = pytest.mark.parametrize("name", VELOCITY)
 
@@ -105,7 +105,7 @@ def test_what_is_revealed_is_the_episode(name):
     """References are shown the whole record, which is what an agent sees step by step, and the flow that there was."""
     base = make(name).unwrapped
     seen = [base.reset(seed=1)[0]]
-    revealed = base.reveal()
+    revealed = base.privileged_info()
     level = np.zeros(base.action_space.shape)
     seen += [base.step(level)[0] for _ in range(base.world.n_steps - 1)]
     np.testing.assert_array_equal(revealed.voltages, [each["voltages"] for each in seen])

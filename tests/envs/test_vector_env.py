@@ -11,7 +11,7 @@ from eitbench.envs import estimation
 from eitbench.worlds import entry
 from eitbench.worlds.catalogue import PIPE_2D
 from eitbench.worlds.task import lag_steps
-from estimating import AT_HOME, ESTIMATION, PIPE
+from estimation_envs import AT_HOME, ESTIMATION, PIPE
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from eitbench.estimation.design import pair_design_criteria
-from eitbench.estimation.onboard.levels import electrode_pairs
+from eitbench.estimation.onboard.linearisation import electrode_pairs
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

@@ -24,7 +24,7 @@ observation, _ = env.reset(seed=3)
 print(observation["voltages"].shape, env.action_space.shape)
 many = gym.make_vec({INJECTION!r}, num_envs=3, episodes=3)
 print(len(many.reset(seed=3)[0]))
-print(eitbench.page({ID!r}))
+print(eitbench.describe_environment({ID!r}))
 """)
     assert said.startswith("(12,) (441,)\n3\n") and "A bubble rises" in said
     assert ID in eitbench(installed, "list") and INJECTION in eitbench(installed, "list")

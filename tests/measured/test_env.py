@@ -53,7 +53,7 @@ def test_rewards_are_withheld_residuals(quick):
 def test_withheld_measurements_are_never_visible(env, measurements):
     """Other withheld values leave the estimates bit-identical."""
     env.reset(seed=0)
-    hidden = env.hidden[measurements.injection_index]
+    hidden = env.withheld_mask[measurements.injection_index]
     assert 0.1 < hidden.mean() < 0.2
     changed = measurements.voltages.copy()
     changed[hidden] += 1e-4
@@ -64,7 +64,7 @@ def test_withheld_measurements_are_never_visible(env, measurements):
 
 def hidden_after_reset(env, **arguments):
     env.reset(**arguments)
-    return env.unwrapped.hidden.copy()
+    return env.unwrapped.withheld_mask.copy()
 
 
 def test_seeds_draw_the_withheld_measurements(quick):

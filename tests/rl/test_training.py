@@ -17,7 +17,7 @@ from eitbench.rl.vec_env import InjectionVecEnv
 from eitbench.worlds.catalogue import PIPE_2D
 from threadpoolctl import threadpool_limits
 
-from choosing import injected
+from injection_envs import injected
 from short import merged
 
 NAME = "eitbench/Pipe2DInjection-v0"

@@ -21,7 +21,7 @@ from eitbench.worlds.task import Estimate
 from matplotlib.image import imread
 from PIL import Image
 
-from choosing import SHORT
+from injection_envs import SHORT
 from short import merged, shorten
 from tiny_worlds import CHANGES
 

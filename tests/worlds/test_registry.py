@@ -72,8 +72,8 @@ def test_a_world_is_played_under_its_id():
     np.testing.assert_allclose(rewards, [0.0] * 3 + [-0.01] * 5, atol=1e-9)
     again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
     assert again.unwrapped.world is QUIET
-    assert "Nothing happens." in eitbench.page(ID)
-    assert "| `target.arrivals` | Never |" in eitbench.page(ID)
+    assert "Nothing happens." in eitbench.describe_environment(ID)
+    assert "| `target.arrivals` | Never |" in eitbench.describe_environment(ID)
 
 
 def test_an_id_belongs_to_one_world():

@@ -1,1 +1,1 @@
-"""Filters that run inside injection environments, and what a policy may believe of them."""
+"""Filters inside injection environments, and the belief that policies derive from them."""

@@ -1,5 +1,4 @@
-"""What an injection policy may believe: the filter inside the environment, followed from outside in
-reduced order."""
+"""Belief of an injection policy: the filter inside the environment, rerun from its observations."""
 
 from __future__ import annotations
 
@@ -9,89 +8,84 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from eitbench.estimation.design import pair_design_criteria
-from eitbench.estimation.onboard.levels import levels_of
+from eitbench.estimation.onboard.linearisation import linearisation_table
 from eitbench.estimation.onboard.reduced_filters import ReducedFilters
 
 if TYPE_CHECKING:
-    from eitbench.estimation.onboard.levels import Linearisation
+    from eitbench.estimation.onboard.linearisation import Linearisation
     from eitbench.estimation.onboard.rules import Rules
 
-DOUBTFUL = 0.3
-"""`Belief.doubt` from which on an electrode is taken for broken."""
-FORGIVEN = 0.8
-"""Part of the doubt after failed injections that is left one step on, if the electrode does not
-drive."""
+FAULT_THRESHOLD = 0.3
+"""`Belief.fault_score` from which an electrode counts as faulty."""
+FAULT_DECAY = 0.8
+"""Factor per step of the score after failed injections, while the electrode is not driven."""
 
 
 class Belief:
-    """The covariance of what the environment's filter knows, and what each injection would teach
-    it.
+    """Covariance of the environment's filter, and the design criteria of each injection.
 
-    It is made at the first observation of an episode and is shown every later one; all from raw
-    observations. The state is reduced (120 coordinates), in parts of the level, with the mass
-    matrix as the identity: the trace of its covariance is the expected squared error, integrated.
-    Where the flow is estimated too, the mean velocity (m/s) is the state's last entry; s counts all
-    of them.
+    It is created from the first raw observation of an episode and updated with every later one. The
+    state is reduced (120 coordinates), relative to c_ref, with the mass matrix as the identity: the
+    trace of its covariance is the expected squared error, integrated. If the velocity is estimated,
+    the mean velocity (m/s) is the last of the s entries.
 
     Parameters
     ----------
     rules : Rules
-        Of the environment.
+        Rules of the environment.
     observation : dict
-        The first one.
+        First raw observation.
     """
 
     def __init__(self, rules: Rules, observation: dict[str, np.ndarray]) -> None:
         self.rules = rules
         self._filters = ReducedFilters(rules, observation["frame"][None])
-        self._along: np.ndarray | None = None
-        self._forget()
-        reading, self._driving = observation["doubt"]
-        self.doubt = reading + self._driving
-        """(L,) share of an electrode's recent readings, and of the recent injections it drove, not
-        believed; summed."""
+        self._true_states: np.ndarray | None = None
+        self._clear_cache()
+        measuring, self._driving = observation["doubt"]
+        self.fault_score = measuring + self._driving
+        """(L,) fraction of an electrode's recent measurements that were rejected, plus that of the
+        recent injections through it"""
 
     @classmethod
-    def beforehand(cls, rules: Rules) -> Belief:
-        """Before any episode: as if a first frame without fault or noise had been measured in the
-        expected liquid."""
-        frame = rules.world.currents @ levels_of(rules.world).linearised(0).resistance
+    def from_prior(cls, rules: Rules) -> Belief:
+        """Return the belief after a first frame without faults and noise at the expected c_ref."""
+        frame = rules.world.currents @ linearisation_table(rules.world).linearisation(0).resistance
         return cls(rules, {"frame": frame, "doubt": np.zeros((2, frame.shape[1]))})
 
     @classmethod
-    def follow(cls, belief: Belief | None, rules: Rules,
-               observation: dict[str, np.ndarray]) -> Belief:
-        """One more observation: the first of an episode makes a belief, which is then shown the
-        others."""
+    def create_or_update(cls, belief: Belief | None, rules: Rules,
+                         observation: dict[str, np.ndarray]) -> Belief:
+        """Return a new belief from the first observation of an episode, or the updated one."""
         if belief is None:
             return cls(rules, observation)
-        belief.see(observation)
+        belief.update(observation)
         return belief
 
-    def see(self, observation: dict[str, np.ndarray]) -> None:
-        """Take in the outcome of the last injection.
+    def update(self, observation: dict[str, np.ndarray]) -> None:
+        """Assimilate the outcome of the last injection.
 
-        A failed injection does not say which of its two electrodes is broken. Both are doubted and,
-        if left alone, forgiven: whichever then reads what was predicted is trusted again, and a
-        broken one reads interference.
+        A failed injection does not identify which of its two electrodes is faulty, so both scores
+        rise. While an electrode is not driven, its score decays; a faulty one keeps a high score,
+        since it measures interference.
         """
         self._filters.assimilate(observation["voltages"][None], observation["currents"][None])
-        self._along = None
-        self._forget()
-        reading, driving = observation["doubt"]
-        self._driving = np.where(observation["currents"] == 0.0, FORGIVEN * self._driving, driving)
-        self.doubt = reading + self._driving
+        self._true_states = None
+        self._clear_cache()
+        measuring, driving = observation["doubt"]
+        self._driving = np.where(observation["currents"] == 0.0, FAULT_DECAY * self._driving,
+                                 driving)
+        self.fault_score = measuring + self._driving
 
-    def told(self, entries: np.ndarray) -> None:
-        """Be shown the truth, by the rest of an episode's recording from the present t on: for
-        bounds only."""
-        self._along = self._filters.truth(entries)
-        self._forget()
+    def condition_on_truth(self, entries: np.ndarray) -> None:
+        """Linearise later steps about the truth, the entries of the cached episode from the present
+        t on; for oracles only."""
+        self._true_states = self._filters.true_states(entries)
+        self._clear_cache()
 
-    def _forget(self) -> None:
-        """Drop what was computed for the last state."""
+    def _clear_cache(self) -> None:
         self._steps: list[tuple[np.ndarray, ...]] = []
-        vars(self).pop("linearised", None)
+        vars(self).pop("linearisation", None)
         vars(self).pop("_weight", None)
 
     @property
@@ -100,129 +94,134 @@ class Belief:
         return self._filters.means()[0]
 
     @property
-    def sound(self) -> np.ndarray:
-        """(L,) bool; electrodes that recent readings and injections give no reason to doubt."""
-        return np.asarray(self.doubt < DOUBTFUL)
+    def healthy_electrodes(self) -> np.ndarray:
+        """(L,) bool: electrodes whose fault score is below the threshold."""
+        return np.asarray(self.fault_score < FAULT_THRESHOLD)
 
     @property
-    def least_doubtful(self) -> int:
-        """The pair to inject where too few electrodes are sound."""
-        return int(self.doubt[self.rules.pairs].sum(axis=1).argmin())
+    def most_reliable_pair(self) -> int:
+        """Pair with the lowest fault score, for injections with too few healthy electrodes."""
+        return int(self.fault_score[self.rules.pairs].sum(axis=1).argmin())
 
-    def predicted(self, covariance: np.ndarray | None = None, ahead: int = 0) -> np.ndarray:
-        """(s, s) covariance one step on, before its measurement; from the present one or another.
+    def predict_covariance(self, covariance: np.ndarray | None = None,
+                           steps_ahead: int = 0) -> np.ndarray:
+        """Return the covariance (s, s) one step later, before its measurement.
 
-        ``ahead`` says how many steps from now that other one holds; it matters where the flow is
-        estimated, since what an error of the velocity does depends on what flows.
+        It is propagated from the present covariance, or from ``covariance``, which holds
+        ``steps_ahead`` steps from now. That number matters if the velocity is estimated, since the
+        effect of a velocity error depends on the concentration.
         """
-        transition, noise, _ = self._step(ahead)
-        now = self._filters.covariance if covariance is None else covariance
-        return transition @ now @ transition.T + noise
+        transition, noise, _ = self._step(steps_ahead)
+        start = self._filters.covariance if covariance is None else covariance
+        return transition @ start @ transition.T + noise
 
-    def _step(self, ahead: int) -> tuple[np.ndarray, ...]:
-        """Return the derivative of the step that begins ``ahead`` steps from now, the covariance of
-        its noise, and the mean after it."""
-        if ahead >= len(self._steps):
-            count = max(ahead + 1, 2 * len(self._steps))
-            if self._along is not None:
-                count = len(self._along)
-            self._steps = self._filters.steps(count, self._along)
-        return self._steps[ahead]
+    def _step(self, steps_ahead: int) -> tuple[np.ndarray, ...]:
+        """Return the Jacobian of the step that starts ``steps_ahead`` steps from now, its noise
+        covariance and the mean after it."""
+        if steps_ahead >= len(self._steps):
+            count = max(steps_ahead + 1, 2 * len(self._steps))
+            if self._true_states is not None:
+                count = len(self._true_states)
+            self._steps = self._filters.steps(count, self._true_states)
+        return self._steps[steps_ahead]
 
     def expected_error(self, covariance: np.ndarray) -> float:
-        """Expected squared error, integrated over what counts, in parts of the level's square."""
+        """Return the expected squared error, integrated over the scored region, relative to
+        c_ref²."""
         return float((self._weight * covariance).sum())
 
-    def foresight(self, steps: int, ahead: int = 0) -> np.ndarray:
-        """(s, s) weight of errors at the next measurement (the first after ``ahead`` more steps) by
-        all that they will do: the flow carries them, and the squared errors over what counts are
-        summed over this and so many steps more.
+    def future_error_weight(self, steps: int, steps_ahead: int = 0) -> np.ndarray:
+        """Return the weight (s, s) of an error at the next measurement (the first after
+        ``steps_ahead`` more steps) in the sum of squared errors over the scored region, at that
+        time and over ``steps`` later steps of the flow.
         """
         weight = total = self._weight
-        # The states of an episode are one more than the steps between them.
-        last = len(self._along) - 1 if self._along is not None else ahead + steps + 1
-        for k in range(min(ahead + steps, last - 1), ahead, -1):
+        # An episode has one state more than steps.
+        last = (len(self._true_states) - 1 if self._true_states is not None
+                else steps_ahead + steps + 1)
+        for k in range(min(steps_ahead + steps, last - 1), steps_ahead, -1):
             transition = self._step(k)[0]
             total = weight + transition.T @ total @ transition
         return total
 
-    def gains(self, covariance: np.ndarray, sound: np.ndarray | None = None,
-              derivative: np.ndarray | None = None,
-              weight: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """What each pair would teach about a state with this covariance: `pair_design_criteria`,
-        (pairs,) each.
+    def design_criteria(self, covariance: np.ndarray, healthy: np.ndarray | None = None,
+                        jacobian: np.ndarray | None = None,
+                        weight: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Return the A- and D-criterion of each pair, (pairs,) each, for a state with this
+        covariance; see `pair_design_criteria`.
 
-        Of electrodes that are not ``sound`` no reading counts, and pairs with one of them teach
-        nothing. ``derivative`` is that about the level, or another, such as `relinearised`.
-        ``weight`` is that of present errors over what counts, or another, such as `foresight`.
+        Electrodes that are not ``healthy`` contribute no measurement, and pairs with one of them
+        score 0. ``jacobian`` defaults to that of `linearisation`; ``weight`` defaults to present
+        errors in the scored region.
         """
         L = self.rules.pairs.max() + 1
-        D = (self.derivative if derivative is None else derivative).reshape(L * L, -1)
+        D = (self.jacobian if jacobian is None else jacobian).reshape(L * L, -1)
         DP = D @ covariance
         variance = self._noise_variance
-        if sound is not None:
-            variance = np.where(sound, variance, np.inf)
+        if healthy is not None:
+            variance = np.where(healthy, variance, np.inf)
         weight = self._weight if weight is None else weight
         tables = ((DP @ D.T).reshape(L, L, L, L), (DP @ weight @ DP.T).reshape(L, L, L, L))
-        gains = pair_design_criteria(*tables, self.rules.pairs, variance)
-        if sound is not None:
-            usable = sound[self.rules.pairs].all(axis=1)
-            gains = gains[0] * usable, gains[1] * usable
-        return gains
+        criteria = pair_design_criteria(*tables, self.rules.pairs, variance)
+        if healthy is not None:
+            usable = healthy[self.rules.pairs].all(axis=1)
+            criteria = criteria[0] * usable, criteria[1] * usable
+        return criteria
 
-    def after(self, covariance: np.ndarray, pair: int,
-              sound: np.ndarray | None = None) -> np.ndarray:
-        """(s, s) covariance once this pair has been injected into a state with ``covariance``."""
+    def posterior_covariance(self, covariance: np.ndarray, pair: int,
+                             healthy: np.ndarray | None = None) -> np.ndarray:
+        """Return the covariance (s, s) after an injection through this pair."""
         i, j = self.rules.pairs[pair]
         variance = self._noise_variance[pair]
-        matrix = (self.derivative[i] - self.derivative[j]) / np.sqrt(variance)[:, None]
-        if sound is not None:
-            if not sound[[i, j]].all():
+        matrix = (self.jacobian[i] - self.jacobian[j]) / np.sqrt(variance)[:, None]
+        if healthy is not None:
+            if not healthy[[i, j]].all():
                 return covariance
-            matrix = matrix[sound]
+            matrix = matrix[healthy]
         cross = matrix @ covariance
         root = np.linalg.cholesky(cross @ matrix.T + np.eye(len(matrix)))
-        learnt = np.linalg.solve(root, cross)
-        return covariance - learnt.T @ learnt
+        factor = np.linalg.solve(root, cross)
+        return covariance - factor.T @ factor
 
-    def look_ahead(self, depth: int, width: int, sound: np.ndarray | None = None) -> int:
-        """First pair of the plan of ``depth`` injections with the least sum of variances, by beam
-        search.
+    def look_ahead(self, depth: int, width: int, healthy: np.ndarray | None = None) -> int:
+        """Return the first pair of the plan of ``depth`` injections with the least sum of
+        variances, by beam search.
 
-        Each of the best ``width`` plans grows by the ``width`` pairs that teach most; only
-        ``sound`` electrodes count.
+        Each of the best ``width`` plans is extended by the ``width`` pairs with the largest
+        A-criterion; only ``healthy`` electrodes count.
         """
         beam: list[tuple[float, int | None, np.ndarray | None]] = [(0.0, None, None)]
-        for ahead in range(depth):
-            grown: list[tuple[float, int, np.ndarray, int]] = []
+        for steps_ahead in range(depth):
+            extended: list[tuple[float, int, np.ndarray, int]] = []
             for cost, first, covariance in beam:
-                predicted = self.predicted(covariance, ahead)
-                gains = self.gains(predicted, sound)[0]
-                # A pair's cost is known before its covariance is computed.
-                before = cost + self.expected_error(predicted)
-                grown += [(before - gains[pair], pair if first is None else first, predicted, pair)
-                          for pair in np.argsort(-gains)[:width].tolist()]
-            best = sorted(grown, key=lambda leaf: leaf[0])[:width]
-            beam = [(cost, first, self.after(predicted, pair, sound))
+                predicted = self.predict_covariance(covariance, steps_ahead)
+                criterion = self.design_criteria(predicted, healthy)[0]
+                # A pair's cost is available before its covariance is computed.
+                prior_cost = cost + self.expected_error(predicted)
+                extended += [(prior_cost - criterion[pair], pair if first is None else first,
+                              predicted, pair)
+                             for pair in np.argsort(-criterion)[:width].tolist()]
+            best = sorted(extended, key=lambda plan: plan[0])[:width]
+            beam = [(cost, first, self.posterior_covariance(predicted, pair, healthy))
                     for cost, first, predicted, pair in best]
         first = beam[0][1]
         assert first is not None
         return first
 
     @cached_property
-    def linearised(self) -> Linearisation:
-        """Linearisation of 𝓡 that the filter uses for the next measurement: about the level, or
-        with a learned inflow about the prediction."""
-        return self._filters.linearised(self._step(0)[2])
+    def linearisation(self) -> Linearisation:
+        """Linearisation of 𝓡 for the next measurement: about c_ref, or with a learned inflow about
+        the prediction."""
+        return self._filters.linearisation(self._step(0)[2])
 
     @property
-    def derivative(self) -> np.ndarray:
-        """(L, L, s) derivatives of `linearised`."""
-        return self.linearised.derivative
+    def jacobian(self) -> np.ndarray:
+        """(L, L, s) derivatives of `linearisation`."""
+        return self.linearisation.jacobian
 
-    def relinearised(self) -> np.ndarray:
-        """(L, L, s) derivatives of 𝓡 by the state, about the present estimate; some 10 ms."""
-        return self._filters.relinearised()
+    def relinearised_jacobian(self) -> np.ndarray:
+        """Return the derivatives (L, L, s) of 𝓡 about the present estimate, in about 10 ms."""
+        return self._filters.relinearised_jacobian()
 
     @cached_property
     def _weight(self) -> np.ndarray:
@@ -230,15 +229,15 @@ class Belief:
 
     @property
     def _noise_variance(self) -> np.ndarray:
-        return _noise_variance(self.rules, self.linearised.resistance.tobytes())
+        return _noise_variance(self.rules, self.linearisation.resistance.tobytes())
 
 
 @lru_cache(maxsize=64)
 def _noise_variance(rules: Rules, resistance: bytes) -> np.ndarray:
-    """(pairs, L) of the voltages of each pair, per current squared."""
+    """Return the noise variance (pairs, L) of the voltages of each pair, per current squared."""
     i, j = rules.pairs.T
     R = np.frombuffer(resistance).reshape(rules.pairs.max() + 1, -1)
-    levels = levels_of(rules.world)
-    std = [levels.noise_std(rules.amplitude * column, rules.instrument.noise_floor)
+    table = linearisation_table(rules.world)
+    std = [table.noise_std(rules.amplitude * column, rules.instrument.noise_floor)
            for column in R[i] - R[j]]
     return (np.array(std) / rules.amplitude)**2

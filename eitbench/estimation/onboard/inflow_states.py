@@ -26,16 +26,16 @@ from eitbench.estimation.reduced import matvec
 if TYPE_CHECKING:
     from eitbench.worlds.world import World
 
-RECENT = 8
+N_RECENT_INFLOWS = 8
 """D; with fewer, more of the nonlinearity is linearised before anything is measured of it."""
-OLDER = 48
+N_OLDER_COORDINATES = 48
 """Coordinates of what older inflows leave."""
-EPISODES = 200
+N_PRIOR_EPISODES = 200
 """Training inflows from which the prior is learned, the first ones."""
-STEPS = 80
+N_PRIOR_STEPS = 80
 """Scored steps of these, whatever the world has: short records would not show how inflows last."""
-DIRECTIONS = 100
-"""Coordinates of the concentration, including the `OLDER` ones."""
+LEARNED_INFLOW_RANK = 100
+"""Coordinates of the concentration, including the `N_OLDER_COORDINATES` ones."""
 
 
 class InflowModel(NamedTuple):
@@ -60,12 +60,12 @@ class InflowModel(NamedTuple):
 def inflow_model(response: ImpulseResponse, prior: InflowPrior) -> InflowModel:
     """Return the reduced model of a steady flow's response and a prior of the inflow."""
     K = response.weights.shape[1]
-    D = min(RECENT, K - 1)
+    D = min(N_RECENT_INFLOWS, K - 1)
     past = np.moveaxis(response.weights @ prior.modes, 1, 0)                        # (K, Q, r)
     root = np.linalg.cholesky(toeplitz(prior.time_covariance(K)) + 1e-9 * np.eye(K))
-    older = _directions(past[D:], root[:K - D, :K - D])[:, :OLDER]
+    older = _directions(past[D:], root[:K - D, :K - D])[:, :N_OLDER_COORDINATES]
     rest = past[:D] - older @ (older.T @ past[:D])
-    recent = _directions(rest, root[:D, :D])[:, :DIRECTIONS - older.shape[1]]
+    recent = _directions(rest, root[:D, :D])[:, :LEARNED_INFLOW_RANK - older.shape[1]]
     directions = np.concatenate([older, recent], axis=1)
     aged = older.T @ past[D:]                                                       # (K − D, h, r)
     before, after = (np.concatenate(list(part), axis=1) for part in (aged[:-1], aged[1:]))
@@ -82,11 +82,11 @@ def inflow_model(response: ImpulseResponse, prior: InflowPrior) -> InflowModel:
 
 
 @lru_cache(maxsize=4)
-def world_prior(world: World) -> InflowPrior:
+def fit_world_prior(world: World) -> InflowPrior:
     """Return the prior that training inflows of a world suggest."""
     say(f"learning the inflow prior of {world.name}, some seconds once a process")
-    longer = replace(world, schedule=replace(world.schedule, scored_steps=STEPS))
-    return fit_prior_from_episodes(longer, SPLITS["train"][:EPISODES])
+    longer = replace(world, schedule=replace(world.schedule, scored_steps=N_PRIOR_STEPS))
+    return fit_prior_from_episodes(longer, SPLITS["train"][:N_PRIOR_EPISODES])
 
 
 def sample_coordinates(model: InflowModel, response: ImpulseResponse, prior: InflowPrior,

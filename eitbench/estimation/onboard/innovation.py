@@ -1,4 +1,4 @@
-"""Innovations of filters inside injection environments, for scores."""
+"""Innovations of the filters inside injection environments, for scores."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ import numpy as np
 
 
 class Innovation(NamedTuple):
-    """Innovation of the m readings that a filter accepted."""
+    """Innovation of the m measurements that a filter accepted."""
 
     value: np.ndarray
-    """(m,) ν in V, measured less predicted"""
+    """(m,) ν in V, measured minus predicted"""
     covariance: np.ndarray
-    """(m, m) S in V², as predicted"""
+    """(m, m) predicted S in V²"""
 
     @classmethod
     def of(cls, innovation: np.ndarray, covariance: np.ndarray, std: np.ndarray,
-           used: np.ndarray) -> Innovation | None:
-        """Return the innovation of the readings ``used`` (L,), from ν (L,) and S (L, L) divided by
-        ``std`` (L,) V; None if no reading was used."""
-        if not used.any():
+           accepted: np.ndarray) -> Innovation | None:
+        """Return the innovation of the ``accepted`` measurements (L,), from ν (L,) and S (L, L)
+        divided by ``std`` (L,) V; None if all were rejected."""
+        if not accepted.any():
             return None
-        scale = std[used]
-        chosen = covariance[np.ix_(used, used)].astype(float)
-        return cls(innovation[used].astype(float) * scale, chosen * np.outer(scale, scale))
+        scale = std[accepted]
+        chosen = covariance[np.ix_(accepted, accepted)].astype(float)
+        return cls(innovation[accepted].astype(float) * scale, chosen * np.outer(scale, scale))

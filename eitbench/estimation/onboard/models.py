@@ -22,15 +22,15 @@ from eitbench.estimation.nodal import (
     initial_covariance,
     nodal_filter,
 )
-from eitbench.estimation.onboard.full_filters import BOUNDS
+from eitbench.estimation.onboard.full_filters import VELOCITY_BOUNDS
 from eitbench.estimation.onboard.inflow_states import (
     InflowModel,
     InflowStates,
+    fit_world_prior,
     inflow_model,
     sample_coordinates,
-    world_prior,
 )
-from eitbench.estimation.onboard.levels import pair_currents
+from eitbench.estimation.onboard.linearisation import pair_currents
 from eitbench.estimation.onboard.node_voltages import NodeVoltages, node_voltages
 from eitbench.estimation.reduced import (
     ReducedModel,
@@ -49,21 +49,21 @@ if TYPE_CHECKING:
     from eitbench.worlds.task import Task
     from eitbench.worlds.world import World
 
-RANK = 120
+WHITE_INFLOW_RANK = 120
 """Coordinates of the concentration with a white inflow."""
-VERSION = 1
+WHITE_MODEL_VERSION = 1
 """Version of the models with a white inflow that are kept."""
-LEARNED_VERSION = 1
+LEARNED_MODEL_VERSION = 1
 """Version of the models with a learned inflow that are kept."""
-TABLE = 16
+N_TABULATED_VELOCITIES = 16
 """Velocities within the bounds, evenly spaced, for which the joint model is computed."""
-LEARNING = (0.6, 1.0, 1.4)
+BASIS_VELOCITIES = (0.6, 1.0, 1.4)
 """Velocities, relative to the nominal one, at which the basis of the joint model is learned."""
-SAMPLES = 500
+N_SAMPLES = 500
 """Concentrations by which the nodes of the voltages are chosen."""
-SYMMETRIC = ("noise", "initial")
+COVARIANCE_ARRAYS = ("noise", "initial")
 """Arrays of a model that are covariances: one triangle is stored."""
-EXACT = ("velocities",)
+FLOAT64_ARRAYS = ("velocities",)
 """Arrays that are stored in double precision."""
 
 
@@ -72,11 +72,11 @@ def reduced_states(world: World, inflow: str) -> tuple[ReducedStates, ReducedSta
     if inflow == "learned":
         learned = InflowModel(**_learned(world, "model"))
         return InflowStates(learned), InflowStates(_single(learned))
-    model = stored_model(world)
+    model = load_or_build_model(world)
     if isinstance(model, ReducedModel):
         return SteadyStates(model), SteadyStates(_single(model))
-    flow = one_velocity(make_task(world))
-    bounds = (BOUNDS[0] * flow.nominal[0], BOUNDS[1] * flow.nominal[0])
+    flow = require_scalar_velocity(make_task(world))
+    bounds = (VELOCITY_BOUNDS[0] * flow.nominal[0], VELOCITY_BOUNDS[1] * flow.nominal[0])
     how = flow.nominal[0], flow.initial_std[0], flow.walk_std[0], bounds
     return JointStates(model, *how), JointStates(model, *how, np.float32)
 
@@ -85,7 +85,7 @@ def _single(model: Any) -> Any:
     return type(model)(*(array.astype(np.float32) for array in model))
 
 
-def stored_voltages(world: World) -> NodeVoltages:
+def load_or_build_voltages(world: World) -> NodeVoltages:
     """Return the voltages of a world in the basis of its learned inflow."""
     return NodeVoltages(**_learned(world, "voltages"))
 
@@ -95,92 +95,94 @@ def _learned(world: World, part: str) -> dict[str, np.ndarray]:
     `NodeVoltages`, rounded to single precision."""
     def build() -> dict[str, np.ndarray]:
         task = make_task(world)
-        prior = world_prior(world)
+        prior = fit_world_prior(world)
         response = steady_response(task.transport)
         with threadpool_limits(1):
             model = inflow_model(response, prior)
-            samples = sample_coordinates(model, response, prior, SAMPLES)
+            samples = sample_coordinates(model, response, prior, N_SAMPLES)
             voltages = node_voltages(task.observation, world.expected_concentration, model.basis,
                                      samples)
         parts = {"model": model._asdict(), "voltages": voltages._asdict()}
         return {f"{part}.{name}": array.astype(np.float32) for part, arrays in parts.items()
                 for name, array in arrays.items()}
 
-    arrays = cached(model_key("learned", config_dict(world.fault_free), LEARNED_VERSION), build)
+    key = model_key("learned", config_dict(world.fault_free), LEARNED_MODEL_VERSION)
+    arrays = cached(key, build)
     return {name.removeprefix(part + "."): array.astype(float) for name, array in arrays.items()
             if name.startswith(part)}
 
 
-def stored_model(world: World) -> ReducedModel | JointModel:
+def load_or_build_model(world: World) -> ReducedModel | JointModel:
     """Return the reduced model with a white inflow; making it takes half a minute. Its numbers are
     rounded to single precision."""
-    key = stored_model_key(world)
+    key = reduced_model_key(world)
 
     def build() -> dict[str, np.ndarray]:
         say(f"making the reduced filter of {world.name}, about half a minute; it is kept in "
             f"{key.path.parent}")
-        return packed_model(world)
+        return build_packed_model(world)
 
     kind = ReducedModel if world.velocity_model is None else JointModel
-    return kind(**unpacked(cached(key, build)))
+    return kind(**unpack_model(cached(key, build)))
 
 
-def stored_model_key(world: World) -> Key:
+def reduced_model_key(world: World) -> Key:
     """Return the key of a reduced model, which depends neither on the target nor on the number of
     steps."""
     sound = config_dict(world.fault_free)
     numbers = {part: sound[part] for part in ("vessel", "flow", "instrument", "prior")}
     schedule = {part: sound["schedule"][part] for part in ("pattern", "time_step")}
     name = "reduced" if world.velocity_model is None else "joint"
-    return model_key(name, numbers | schedule, VERSION)
+    return model_key(name, numbers | schedule, WHITE_MODEL_VERSION)
 
 
-def packed_model(world: World) -> dict[str, np.ndarray]:
+def build_packed_model(world: World) -> dict[str, np.ndarray]:
     """Make a model on one thread, whose number changes rounding, and return it as it is stored."""
-    make: Callable[[World], Any] = (make_steady_model if world.velocity_model is None
-                                    else make_joint_model)
+    make: Callable[[World], Any] = (build_steady_model if world.velocity_model is None
+                                    else build_joint_model)
     with threadpool_limits(1):
-        return packed(make(world))
+        return pack_model(make(world))
 
 
-def packed(model: NamedTuple) -> dict[str, np.ndarray]:
+def pack_model(model: NamedTuple) -> dict[str, np.ndarray]:
     """Return the arrays of a model with a ``basis`` (n, r) as they are stored."""
     arrays: dict[str, np.ndarray] = {}
     for name, array in model._asdict().items():
-        if name in SYMMETRIC:
+        if name in COVARIANCE_ARRAYS:
             upper = np.triu_indices(array.shape[-1])
             array = 0.5 * (array + np.swapaxes(array, -1, -2))[..., *upper]
-        arrays[name] = array if name in EXACT else array.astype(np.float32)
+        arrays[name] = array if name in FLOAT64_ARRAYS else array.astype(np.float32)
     return arrays
 
 
-def unpacked(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the arrays of a model in double precision, from those that `packed` returned."""
+def unpack_model(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the arrays of a model in double precision, from those that `pack_model` returned."""
     rank = arrays["basis"].shape[1]
     rows, columns = np.triu_indices(rank)
     model = {name: array.astype(float) for name, array in arrays.items()}
-    for name in SYMMETRIC:
+    for name in COVARIANCE_ARRAYS:
         full = np.empty((*model[name].shape[:-1], rank, rank))
         full[..., rows, columns] = full[..., columns, rows] = model[name]
         model[name] = full
     return model
 
 
-def make_steady_model(world: World) -> ReducedModel:
+def build_steady_model(world: World) -> ReducedModel:
     """Return the model of a known flow in double precision, in half a minute."""
     task = make_task(world)
     start = nodal_filter(task.transport, task.prior, 1.0)
-    return reduced_model(start, mass_matrix(task.mesh).toarray(), _record(world, 90),
-                         min(RANK, task.mesh.n_nodes))
+    return reduced_model(start, mass_matrix(task.mesh).toarray(),
+                         _random_pair_measurements(world, 90),
+                         min(WHITE_INFLOW_RANK, task.mesh.n_nodes))
 
 
-def make_joint_model(world: World) -> JointModel:
+def build_joint_model(world: World) -> JointModel:
     """Return the model of an unknown mean velocity in double precision, in some 45 s."""
     task = make_task(world)
-    flow = one_velocity(task)
+    flow = require_scalar_velocity(task)
     prior = task.prior
     mass = mass_matrix(task.mesh).toarray()
-    record = _record(world, 45)
+    record = _random_pair_measurements(world, 45)
     initial = initial_covariance(task.mesh, prior)
     nodal = task.evolution.state_noise_covariance(0.0, prior.nodal_std**2)
 
@@ -191,18 +193,18 @@ def make_joint_model(world: World) -> JointModel:
         return F, Y, prior.inflow_std**2 * (Y @ Y.T) + nodal
 
     learnt = np.zeros_like(mass)
-    for part in LEARNING:
+    for part in BASIS_VELOCITIES:
         F, Y, noise = step(part)
         covariance = LowRankCovariance(OpenLoopCovariance(F, noise), FILTER_RANK_TOLERANCE)
         states = NodalStates(np.ones(len(F)), covariance, Motion(F, Y.sum(axis=1)))
         learnt += covariance_reduction(Filter(states), record, 10)
-    parts = np.linspace(*BOUNDS, TABLE)
-    basis = dominant_directions(learnt, mass, min(RANK, len(mass)))
+    parts = np.linspace(*VELOCITY_BOUNDS, N_TABULATED_VELOCITIES)
+    basis = dominant_directions(learnt, mass, min(WHITE_INFLOW_RANK, len(mass)))
     return joint_model(basis, mass, initial, parts * flow.nominal[0],
                        (step(part)[::2] for part in parts))
 
 
-def one_velocity(task: Task) -> VelocityModel:
+def require_scalar_velocity(task: Task) -> VelocityModel:
     """Return the velocity model; ``ValueError`` unless it has one parameter."""
     if task.velocity is None or task.velocity.n_parameters != 1:
         raise ValueError("world must have a flow with one unknown parameter, its mean velocity, "
@@ -210,7 +212,7 @@ def one_velocity(task: Task) -> VelocityModel:
     return task.velocity
 
 
-def _record(world: World, length: int) -> list[LinearMeasurement]:
+def _random_pair_measurements(world: World, length: int) -> list[LinearMeasurement]:
     """Return observations of random pairs, about the expected level and relative to it."""
     task = make_task(world)
     every = pair_currents(world)

@@ -10,12 +10,12 @@ import scipy.linalg
 from eitbench.estimation.quadratic_voltages import ScaledVoltageModel, TransferResistanceModel
 from eitbench.estimation.reduced import matvec
 
-MODES = 80
+N_LOG_MODES = 80
 """Number of modes of the logarithms; voltages then differ by 0.05 standard deviations of the
 noise."""
-BENT = 24
+N_QUADRATIC_MODES = 24
 """Number of the first modes, in which voltages are quadratic."""
-SMALLEST = 0.05
+MIN_RELATIVE_CONCENTRATION = 0.05
 """Relative to the level; smaller concentrations count as this one when modes are computed."""
 
 
@@ -67,14 +67,14 @@ def node_voltages(model: TransferResistanceModel, level: float, basis: np.ndarra
     Twice as many nodes as modes determine the samples' logarithms at all nodes by least squares
     (discrete empirical interpolation; Chaturantabut and Sorensen 2010).
     """
-    logarithms = np.log(np.maximum(1.0 + samples @ basis.T, SMALLEST))
+    logarithms = np.log(np.maximum(1.0 + samples @ basis.T, MIN_RELATIVE_CONCENTRATION))
     logarithms -= logarithms.mean(axis=1, keepdims=True)
-    modes = np.linalg.svd(logarithms, full_matrices=False)[2][:MODES - 1].T
+    modes = np.linalg.svd(logarithms, full_matrices=False)[2][:N_LOG_MODES - 1].T
     level_too = np.concatenate([np.ones((len(basis), 1)), modes], axis=1)
     span = scipy.linalg.qr(level_too, mode="economic")[0]
-    nodes = _interpolation_nodes(span, 2 * MODES)
+    nodes = _interpolation_nodes(span, 2 * N_LOG_MODES)
     interpolation = span @ np.linalg.pinv(span[nodes])                                # (n, m)
-    quadratic = ScaledVoltageModel(model, level, modes[:, :BENT]).quadratic
+    quadratic = ScaledVoltageModel(model, level, modes[:, :N_QUADRATIC_MODES]).quadratic
     resistance, slope, to_modes, curvature = quadratic.tables
     L = len(resistance)
     by_modes = curvature.reshape(*curvature.shape[:2], L, L).transpose(0, 2, 3, 1)

@@ -13,16 +13,16 @@ if TYPE_CHECKING:
     from eitbench.estimation.onboard.innovation import Innovation
     from eitbench.estimation.onboard.rules import Rules
 
-ESTIMATORS = ("reduced", "full", "none")
+ESTIMATOR_OPTIONS = ("reduced", "full", "none")
 """Names: reduced filter for training, exact filter for scores, or no filter."""
-DOUBT = 0.2
+FAULT_EMA_WEIGHT = 0.2
 """Weight of the last injection in the running share of readings that were rejected."""
 
 
 class EpisodeFilters(Protocol):
     """Filters of B episodes, which start from t = 0 in the level of the first frame."""
 
-    concentration: np.ndarray
+    c_ref: np.ndarray
     """(B,) ĉ_bh in mol/m³"""
 
     def __init__(self, rules: Rules, frames: np.ndarray) -> None:
@@ -38,7 +38,7 @@ class EpisodeFilters(Protocol):
         """Return the last innovation of each episode, for scores; None where nothing was injected,
         or no reading was accepted."""
 
-    def grid(self) -> tuple[np.ndarray, np.ndarray]:
+    def coarse_grid(self) -> tuple[np.ndarray, np.ndarray]:
         """Return mean and standard deviation (B, patches) in mol/m³ on the coarse grid."""
 
     def errors(self, moments: np.ndarray, deviations: np.ndarray,
@@ -49,10 +49,10 @@ class EpisodeFilters(Protocol):
     def means(self) -> np.ndarray:
         """Return estimates (B, n) in mol/m³ on the task's mesh."""
 
-    def spreads(self) -> np.ndarray:
+    def stds(self) -> np.ndarray:
         """Return their standard deviations (B, n) in mol/m³."""
 
-    def flow(self) -> tuple[np.ndarray, np.ndarray] | None:
+    def velocity(self) -> tuple[np.ndarray, np.ndarray] | None:
         """Return velocity parameters θ and their standard deviations (B, k) in m/s, None where the
         flow is known."""
 
@@ -63,11 +63,12 @@ class EpisodeFilters(Protocol):
         wants them."""
 
 
-def filters_type(rules: Rules, estimator: str) -> type[EpisodeFilters] | None:
+def filters_class(rules: Rules, estimator: str) -> type[EpisodeFilters] | None:
     """Return the filters of this name, None for "none"; ``ValueError`` if there are none under
     these rules."""
-    if estimator not in ESTIMATORS:
-        raise ValueError(f"estimator must be one of {', '.join(ESTIMATORS)}, got {estimator!r}")
+    if estimator not in ESTIMATOR_OPTIONS:
+        raise ValueError(f"estimator must be one of {', '.join(ESTIMATOR_OPTIONS)}, "
+                         f"got {estimator!r}")
     if estimator == "none":
         return None
     if rules.inflow == "learned":
@@ -108,15 +109,15 @@ class OnboardFilter:
         drives = currents != 0.0
         failed = ~accepted.any(axis=1, keepdims=True)
         # A failed injection has no information on the electrodes that only measured.
-        reading += DOUBT * (injected & ~failed) * (~accepted - reading)
-        driving += DOUBT * drives * (failed - driving)
+        reading += FAULT_EMA_WEIGHT * (injected & ~failed) * (~accepted - reading)
+        driving += FAULT_EMA_WEIGHT * drives * (failed - driving)
 
-    def shown(self) -> dict[str, np.ndarray]:
+    def features(self) -> dict[str, np.ndarray]:
         """Return arrays (B, …): innovations, mean, std, doubt, and where the flow is estimated its
         velocity and the standard deviation of that."""
-        mean, std = self.filters.grid()
+        mean, std = self.filters.coarse_grid()
         shown = {"innovations": self._innovations.copy(), "mean": mean, "std": std,
                  "doubt": self._doubt.copy()}
-        if (flow := self.filters.flow()) is not None:
+        if (flow := self.filters.velocity()) is not None:
             shown |= {"velocity": flow[0], "velocity_std": flow[1]}
         return shown

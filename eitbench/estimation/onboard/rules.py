@@ -9,13 +9,13 @@ import numpy as np
 from gymnasium import spaces
 
 from eitbench import _check
-from eitbench.estimation.onboard.levels import electrode_pairs, pair_currents
+from eitbench.estimation.onboard.linearisation import electrode_pairs, pair_currents
 
 if TYPE_CHECKING:
     from eitbench.worlds.instrument import Instrument
     from eitbench.worlds.world import World
 
-INFLOWS = ("white", "learned")
+INFLOW_MODELS = ("white", "learned")
 """What may be believed of the inflow: white noise (Table 5.1), or its logarithm as coloured as in
 training episodes (``docs/methods.md``, 10)."""
 
@@ -35,7 +35,7 @@ class Rules:
     gate : float
         The estimator leaves out readings further from the prediction than this many standard
         deviations.
-    has_frame : bool
+    has_first_frame : bool
         Whether the first frame is measured before the agent's first injection.
     inflow : "white" or "learned"
         What the estimator believes of the inflow: Table 5.1, or what training episodes show.
@@ -43,14 +43,15 @@ class Rules:
 
     world: World
     gate: float = np.inf
-    has_frame: bool = True
+    has_first_frame: bool = True
     inflow: str = "white"
 
     def __post_init__(self) -> None:
         if self.gate != np.inf:
             _check.number("gate", self.gate, low=0.0, open_low=True)
-        if self.inflow not in INFLOWS:
-            raise ValueError(f"inflow must be one of {', '.join(INFLOWS)}, got {self.inflow!r}")
+        if self.inflow not in INFLOW_MODELS:
+            raise ValueError(f"inflow must be one of {', '.join(INFLOW_MODELS)}, "
+                             f"got {self.inflow!r}")
 
     @property
     def instrument(self) -> Instrument:
@@ -78,7 +79,7 @@ class Rules:
         return float(np.abs(self.world.currents).max())
 
     @property
-    def table(self) -> np.ndarray:
+    def action_currents(self) -> np.ndarray:
         """(actions, L) currents of each numbered action; the last is no current, where there is a
         budget."""
         pairs = pair_currents(self.world)
@@ -93,7 +94,7 @@ class Rules:
         return spaces.Box(-1.0, 1.0, self.world.currents.shape[1:], np.float32)
 
     @property
-    def name(self) -> str:
+    def tuning_key(self) -> str:
         """What was found by search is kept under: the world's name, and whether there are faults or
         a budget."""
         faults = " with faults" * (self.instrument.max_faulty > 0)
@@ -112,7 +113,7 @@ class Rules:
             raise ValueError("pair must be a number: in a world without a budget each step injects")
         return len(self.pairs) if pair is None else int(pair)
 
-    def spaced(self, left: np.ndarray) -> bool:
+    def is_injection_step(self, left: np.ndarray) -> bool:
         """Whether a budget that is spread evenly is spent at this step; ``left`` as observed.
         Always without a budget.
 
@@ -120,7 +121,7 @@ class Rules:
         """
         if self.budget is None:
             return True
-        steps = self.world.n_steps - self.has_frame * len(self.world.currents)
+        steps = self.world.n_steps - self.has_first_frame * len(self.world.currents)
         k = steps - int(left[0])
         return (k + 1) * self.budget // steps > k * self.budget // steps
 
@@ -128,7 +129,7 @@ class Rules:
         """(B, L) currents in A (A/m in 2D) of actions (B,) or (B, L); entries of the latter beyond
         ±1 are first taken for ±1."""
         if self.limit is None:
-            return self.table[actions]
+            return self.action_currents[actions]
         free = np.clip(np.asarray(actions, dtype=float), -1.0, 1.0)
         free = free - free.mean(axis=1, keepdims=True)
         order = {"L1": 1, "L2": 2, "Linf": np.inf}[self.limit]

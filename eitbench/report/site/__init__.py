@@ -24,7 +24,7 @@ from eitbench.bench.records import alike, file_name, finished, newest
 from eitbench.bench.table import NOTHING, Cell, Table, number_cell
 from eitbench.bench.text import scores_by_seed
 from eitbench.bench.tracks import home_of, named
-from eitbench.envs.pages import page
+from eitbench.envs.env_docs import describe_environment
 from eitbench.report import tables
 from eitbench.report.boards import (
     ALL,
@@ -284,7 +284,7 @@ def environment_page(site: Site, board: Board) -> bytes:
 
 def documentation(id: str) -> tuple[Markup, Markup]:
     """Return the description of an id and the remaining sections of its page, as HTML."""
-    text = re.sub(r"\A\s*## Description\s*", "", page(id))
+    text = re.sub(r"\A\s*## Description\s*", "", describe_environment(id))
     first, rest = re.split(r"^(?=## |\|)", text, maxsplit=1, flags=re.MULTILINE)
     return markdown(first), markdown(rest)
 

@@ -5,14 +5,14 @@ import re
 
 import gymnasium as gym
 import pytest
-from eitbench import page
+from eitbench import describe_environment
 from eitbench.worlds import entries
 
 
 @pytest.fixture(scope="module", params=list(entries()))
 def described(request):
     """Every id with its page and its environment."""
-    return request.param, page(request.param), gym.make(request.param).unwrapped
+    return request.param, describe_environment(request.param), gym.make(request.param).unwrapped
 
 
 def section(text: str, heading: str) -> str:

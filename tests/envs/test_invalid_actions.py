@@ -3,7 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from estimating import BIASED, PIPE, UNKNOWN, make
+from estimation_envs import BIASED, PIPE, UNKNOWN, make
 
 OBSTACLE, SOLID = "eitbench/Pipe2DObstacle-v0", "eitbench/Pipe3D-v0"
 STIRRED, STILL = "eitbench/RotatingTank2D-v0", "eitbench/StationaryTank2D-v0"
@@ -61,7 +61,7 @@ def test_wrong_actions_are_named(id, action, message):
         env.step(action)
 
 
-@pytest.mark.parametrize("ask", ["truth", "true_velocity", "reveal"])
+@pytest.mark.parametrize("ask", ["truth", "true_velocity", "privileged_info"])
 def test_there_is_nothing_to_show_before_a_reset(ask):
     """Nor is there a step to take."""
     env = make(PIPE).unwrapped

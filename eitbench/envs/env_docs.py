@@ -16,7 +16,7 @@ from gymnasium import spaces
 from eitbench.worlds.registry import entry
 from eitbench.worlds.world import World
 
-MEANINGS = {
+KEY_DESCRIPTIONS = {
     "voltages": "measured electrode potentials relative to their mean, V, with noise",
     "currents": "injected currents, A (in 2D A per metre of depth), summing to zero",
     "recent": "the last four of these, the latest first",
@@ -33,13 +33,13 @@ MEANINGS = {
 """Meaning of each entry of an observation."""
 
 
-def page(id: str) -> str:
+def describe_environment(id: str) -> str:
     """Compose the page of a registered id as Markdown; ``ValueError`` if the id is unknown."""
     registered = entry(id)
     env: Any = gym.make(id, disable_env_checker=True).unwrapped
     sections = inspect.cleandoc(type(env).__doc__ or "").split("\n\n", 1)[1]
     observation = sections.index("## Rewards")
-    shown = env.core.space() if registered.track == "injection" else env.observation_space
+    shown = env.core.raw_space() if registered.track == "injection" else env.observation_space
     parts = ["## Description", registered.description.strip(), _overview(env),
              sections[:observation].strip(), _observation_table(shown, env.world),
              sections[observation:].strip(), "## World", _world_table(registered.world)]
@@ -59,7 +59,7 @@ def _overview(env: Any) -> str:
         rows["lag"] = env.lag
     else:
         rules = env.rules
-        rows |= {"injections before the agent's first": env.core.first,
+        rows |= {"injections before the agent's first": env.core.n_initial,
                  "gate": f"{rules.gate:g}", "inflow": rules.inflow}
     return "\n".join(["| | |", "|---|---|", *(f"| {key} | `{value}` |"
                                               for key, value in rows.items())])
@@ -77,8 +77,10 @@ def _short(space: gym.Space) -> str:
 
 def _observation_table(space: spaces.Dict, world: World) -> str:
     columns, rows = world.vessel.coarse_grid_shape
-    lines = [f"| `{name}` | {inner.shape} | {MEANINGS[name].format(columns=columns, rows=rows)} |"
-             for name, inner in space.items()]
+    lines = []
+    for name, inner in space.items():
+        meaning = KEY_DESCRIPTIONS[name].format(columns=columns, rows=rows)
+        lines.append(f"| `{name}` | {inner.shape} | {meaning} |")
     return "\n".join(["| key | shape | meaning |", "|---|---|---|", *lines])
 
 

@@ -7,7 +7,7 @@ import pytest
 from eitbench import Estimate
 from eitbench.bench.playing import estimated
 from eitbench.bench.scores import scored
-from estimating import PIPE, SKEWED, VELOCITY, make
+from estimation_envs import PIPE, SKEWED, VELOCITY, make
 
 
 @pytest.mark.parametrize("name", VELOCITY)

@@ -5,10 +5,10 @@ import copy
 import numpy as np
 import pytest
 from eitbench.bench.scores import Outcome, scored
-from eitbench.estimation.onboard.levels import Levels
-from eitbench.estimation.onboard.reduced_filters import ReducedFilters, Shared
+from eitbench.estimation.onboard.linearisation import LinearisationTable
+from eitbench.estimation.onboard.reduced_filters import ReducedFilters, SharedData
 
-from choosing import BUDGET, FAULTS, FLOW, NAME, TANK, make, some_pairs
+from injection_envs import BUDGET, FAULTS, FLOW, NAME, TANK, make, some_pairs
 
 
 def predicted(filter_, estimator: str, n: int):
@@ -76,7 +76,7 @@ def nis_of(random, noise: float) -> float:
     their own model, with the noise so many times as large."""
     env = make("reduced").unwrapped
     world, rules, B = env.world, env.rules, 32
-    shared = Shared.of(rules)
+    shared = SharedData.of(rules)
     model, level = shared.states.model, shared.voltages._level(0)
     root, initial = (vectors * np.sqrt(np.maximum(values, 0.0)) for values, vectors in (
         np.linalg.eigh(model.noise), np.linalg.eigh(model.initial)))
@@ -88,7 +88,7 @@ def nis_of(random, noise: float) -> float:
         draws = noise * random.standard_normal((B, len(std)))
         return volts + state @ level.by_state(currents).T.astype(float) + std * draws
 
-    pairs = rules.table[some_pairs(40)]
+    pairs = rules.action_currents[some_pairs(40)]
     record = []
     for currents in [*world.currents, *pairs]:
         state = state @ model.transition.T + random.standard_normal(state.shape) @ root.T
@@ -106,7 +106,7 @@ def nis_of(random, noise: float) -> float:
 def test_nis_of_a_consistent_filter_averages_one(monkeypatch):
     """Innovations of a filter that knows its model are independent: the mean of 20,480 squares is
     within four of its standard deviations of 1, and is not where the noise is twice as large."""
-    monkeypatch.setattr(Levels, "best", lambda self, frames, gate: [0] * len(frames))
+    monkeypatch.setattr(LinearisationTable, "nearest_indices", lambda self, frames, gate: [0] * len(frames))
     random = np.random.default_rng(0)
     spread = np.sqrt(2 / (32 * 40 * 16))
     assert abs(nis_of(random, 1.0) - 1.0) < 4 * spread
